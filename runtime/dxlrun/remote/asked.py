@@ -69,7 +69,7 @@ class Asked(Generic[Body]):
 
     @property
     def origin(self) -> str:
-        """Client name for the log: printable, at most 64 characters; the process for a client without a name."""
+        """Client name for the log: printable, at most 64 characters; default: the client's process."""
         given = self.http.headers.get("x-dxlrun-client", "").encode("latin-1", "replace")
         name = "".join(filter(str.isprintable, given.decode(errors="replace")))[:LONGEST_ORIGIN]
         client = client_of(self.http)

@@ -327,8 +327,8 @@ class RemoteRobot:
         """Send a typed command to a controller; returns when the loop has accepted the command.
 
         Some joints by name: `send("arm", "position", {"elbow": 0.35})`, or `velocity`, `effort`, `pwm`. The
-        other joints keep their newest goals. Commands of a device: `send("board", "device_commands", {"led":
-        1})`; they go to the controller that commands the device.
+        other joints keep their newest goals. Commands of a device:
+        `send("board", "device_commands", {"led": 1})`; they go to the controller that commands the device.
 
         Args:
             controller: Name of the controller or the device.
@@ -336,8 +336,7 @@ class RemoteRobot:
             command: Fields of the command, in SI units.
             units: Quantities are texts with units as in a motion file, such as `"30 deg"`.
             seconds: Time in which a trajectory controller moves the named joints, s.
-            goal: Make the positions of a group controller a goal. A command that is a goal anyway needs
-                no `goal`.
+            goal: Make the positions of a group controller a goal.
 
         Returns:
             The reply. Its `goal` can be waited for when the command is a goal.
@@ -371,8 +370,7 @@ class RemoteRobot:
         return self._execute(requests.SWITCH, body=Switch(tuple(activate), tuple(deactivate)))
 
     def get(self, joint: str, item: str = "") -> dict[str, object]:
-        """Return a joint's newest state, SI units, or an item of its servo's control table, read in idle
-        time.
+        """Return a joint's newest state, SI units, or a control table item of its servo, read in idle time.
 
         Args:
             joint: Name of a joint; of a device or sensor; or of a state or command, such as
@@ -394,7 +392,10 @@ class RemoteRobot:
         Args:
             joints: Names of joints, of controllers (their joints), or "all".
             on: True switches torque on.
-            release: Deactivate the controllers that command these joints. Without it, the request is refused.
+            release: Deactivate the controllers that command these joints.
+
+        Raises:
+            Refused: A controller commands one of the joints, and `release` is False.
         """
         return self._execute(requests.TORQUE, body=TorqueRequest(_listed(joints), on, release))
 

@@ -1,4 +1,4 @@
-"""Motions for a robot that runs: checked as before a start, begun softly from where the joints are."""
+"""Motions for a running robot: checked as at start-up, with a slow approach from the present positions."""
 
 from __future__ import annotations
 
@@ -34,56 +34,56 @@ from dxlrun.plan.loop_plan import SETTLE_NS, JointPlan, ScheduledCommand
 from dxlrun.remote.preparation import Known, Prepared, travel_s
 
 SOFT_SPEED = 0.5
-"""rad/s on the way to the first pose; or the joint's limit, if that is lower."""
+"""rad/s; speed of the approach to the first pose, or the joint's limit, if that is lower."""
 LEAST_SPEED, MOST_SPEED = 0.01, 10.0
-"""Factors on a motion's speed."""
+"""Limits of the factor on a motion's speed."""
 _STILL = 0.005
-"""rad; a joint that is nearer to its first position is there."""
+"""rad; a joint within this distance of its first position needs no approach."""
 _LEAST_NS = 200_000_000
-"""Of a way to a first pose."""
+"""Shortest duration of an approach."""
 _SLOWEST = 0.05
-"""rad/s on that way, of joints that have almost none: a servo at 0 rad/s would not come to rest there."""
+"""rad/s; lowest speed of an approach: a servo at 0 rad/s, which is unlimited, would not come to rest."""
 _RAMP_NS = 20_000_000
 _MOST_STEPS = 500
-"""Between two commands of positions on that way; so many at most."""
+"""Upper limit of the position commands of an approach."""
 
 
 @dataclass(frozen=True, slots=True)
 class Running:
-    """The robot as it is now, for a motion that is to be played."""
+    """Present state of the robot, for a motion to be played."""
 
     controllers: Mapping[str, CompiledController]
-    """All that are loaded; `plan.active` as it is now."""
+    """All loaded controllers; `plan.active` is the present state."""
     joints: Mapping[str, JointPlan]
     record: CycleRecord
     """The newest cycle."""
 
     def position(self, joint: str) -> float:
-        """Return where a joint is sent, or where it is; NaN when neither is known, rad."""
+        """Return a joint's goal position, else its present position, rad; NaN when both are unknown."""
         row = self.record.layout.joints.index(joint)
         goal = float(self.record.goals.position[row])
         return goal if math.isfinite(goal) else float(self.record.states.position[row])
 
     def way(self, joint: str, position: float) -> float:
-        """Return the signed way of a joint to a position."""
+        """Return the signed distance from a joint's position to another position."""
         return self.joints[joint].way(self.position(joint), position)
 
 
 class Played(msgspec.Struct, frozen=True, tag="played"):
-    """A motion, ready for the loop."""
+    """A motion prepared for the loop."""
 
     data: bytes
-    """Of the loop's command `play`."""
+    """Payload of the loop's command `play`."""
     request: bytes
-    """What it was prepared from, see `Command.request`."""
+    """JSON from which the payload was prepared, see `Command.request`."""
     seconds: float
-    """Until all parts have ended."""
+    """Duration until all parts have ended."""
 
 
 def goal_of(prepared: Prepared, known: Known, record: CycleRecord) -> Played | None:
-    """Return a command of positions as a goal of the loop; None where the command has no positions.
+    """Return a position command as a goal of the loop; None for a command without positions.
 
-    Its motion has ended when each joint may be there, at its highest speed or the commanded one.
+    The goal's time ends when each joint can have arrived at the lower of its highest and its commanded speed.
     """
     content = msgspec.json.decode(prepared.request)
     positions = content.get("positions") if isinstance(content, dict) else None
@@ -94,7 +94,8 @@ def goal_of(prepared: Prepared, known: Known, record: CycleRecord) -> Played | N
     for joint, position, commanded in zip(known.joints, positions, speeds, strict=True):
         row = record.layout.joints.index(joint.name)
         way, speed = abs(joint.way(float(record.states.position[row]), position)), joint.highest_speed
-        if commanded:  # at 0 the servo goes as fast as it can
+        # A velocity of 0 means no limit (e-Manual, Profile Velocity).
+        if commanded:
             speed = min(speed, abs(commanded))
         if math.isfinite(way) and math.isfinite(speed):
             starting_s = 0.0 if joint.acceleration is None else speed / joint.acceleration
@@ -108,7 +109,7 @@ def goal_of(prepared: Prepared, known: Known, record: CycleRecord) -> Played | N
 
 @dataclass(frozen=True, slots=True)
 class _Part:
-    """What one controller shall do, by the time of the motion, at its final speed."""
+    """Samples of one controller on the motion's time axis, at the final speed."""
 
     controller: CompiledController
     kind: str
@@ -116,10 +117,10 @@ class _Part:
 
 
 def play(motion: MotionDescription, running: Running, speed: float) -> Played:
-    """Return a motion as it is played now, `speed` times as fast; raises InputError with all that is wrong.
+    """Return a motion as played now, `speed` times as fast; raises InputError with all problems.
 
-    What is beyond the limits of a joint is refused, as in a command. All controllers begin in one cycle, and
-    lead their joints to their first poses; the motion itself begins when the slowest is there.
+    Values beyond the limits of a joint are refused, as in a command. All controllers begin in one cycle and
+    move their joints to the first poses. The motion begins when the slowest joint has arrived.
     """
     problems = Problems()
     parts = _parts(motion, running, speed, problems) if affordable(motion, problems) else []
@@ -155,7 +156,7 @@ def play(motion: MotionDescription, running: Running, speed: float) -> Played:
 
 
 def _parts(motion: MotionDescription, running: Running, speed: float, problems: Problems) -> list[_Part]:
-    """Return one part for each controller, which has all parts of the file for it."""
+    """Return one part for each controller, joined from all parts of the file for that controller."""
     by_name: dict[tuple[str, str], list[tuple[int, Sequence[Sample]]]] = {}
     for index, part in enumerate(motion.motion.motions):
         controller = _controller(motion, index, running, problems)
@@ -187,7 +188,7 @@ def _controller(
 
 
 def _switch(name: str, running: Running) -> str:
-    """Return the command that activates a controller, and deactivates those that have its joints."""
+    """Return the CLI command that activates a controller and deactivates those that command its joints."""
     own = running.controllers[name].plan
     others = [
         plan.name
@@ -201,7 +202,7 @@ def _switch(name: str, running: Running) -> str:
 def _joined(
     pieces: Iterable[tuple[int, Sequence[Sample]]], speed: float, problems: Problems
 ) -> tuple[Sample, ...]:
-    """Return the samples of several parts on the time of the motion, `speed` times as fast."""
+    """Return the samples of several parts on the motion's time axis, `speed` times as fast."""
     joined: list[Sample] = []
     for start_ns, samples in pieces:
         for sample in samples:
@@ -230,7 +231,8 @@ def _faster(target: SampledTarget, speed: float) -> SampledTarget:
 
 def _check(part: _Part, running: Running, problems: Problems) -> None:
     peaks: Sequence[SpeedPeak] = ()
-    with suppress(InputError):  # a command that cannot be given is reported when it is made
+    # An invalid command is reported by `_commands`.
+    with suppress(InputError):
         commands = commands_of(part.controller, part.kind, part.samples, 0, 0)
         peaks = speed_peaks(part.controller, commands, part.samples[0].mark)
     check_samples(part.samples, 0, running.joints, problems, peaks)
@@ -245,19 +247,20 @@ def _check(part: _Part, running: Running, problems: Problems) -> None:
 
 
 def _refused(warning: Problem) -> Problem:
-    """Return the error for what a start of a robot only warns of; there the gate would hold the joint."""
+    """Return an error in place of a start-up warning: in a run, the gate would hold the joint."""
     return replace(warning, severity="error", fix=warning.fix.rpartition("; ")[2])
 
 
 def _way_ns(part: _Part, running: Running) -> int:
-    """Return how long the way to the first pose takes."""
+    """Return the duration of the approach to the first pose, ns."""
     ways = (
         (abs(running.way(joint, target.position)), running.joints[joint].highest_speed)
         for joint, target in part.samples[0].targets.items()
         if target.position is not None
     )
     smooth = any(target.velocity is not None for target in part.samples[0].targets.values())
-    peak = PEAK_OVER_MEAN if smooth and part.kind == TRAJECTORY else 1.0  # else the way has one speed
+    # Other approaches have a constant speed.
+    peak = PEAK_OVER_MEAN if smooth and part.kind == TRAJECTORY else 1.0
     longest = max(
         (way / min(speed / peak, SOFT_SPEED) for way, speed in ways if way > _STILL and speed), default=0.0
     )
@@ -265,7 +268,7 @@ def _way_ns(part: _Part, running: Running) -> int:
 
 
 def _commands(part: _Part, running: Running, lead_ns: int) -> tuple[ScheduledCommand, ...]:
-    """Return the commands of a part and when each is given; raises InputError."""
+    """Return the commands of a part with their times; raises InputError."""
     first_ns = lead_ns + part.samples[0].t_ns
     if part.kind == TRAJECTORY:
         return commands_of(
@@ -280,8 +283,11 @@ def _moved(samples: Iterable[Sample], by_ns: int) -> tuple[Sample, ...]:
 
 
 def _ramp(part: _Part, running: Running, first_ns: int) -> Iterable[Sample]:
-    """Yield what leads the joints to the first pose until that time: positions in small steps, or one
-    position with the speed to get there."""
+    """Yield the samples of the approach to the first pose.
+
+    A command with velocities needs one sample: the position and the speed to arrive in time. Other commands
+    get positions in small steps.
+    """
     first = part.samples[0]
     known = {joint: target for joint, target in first.targets.items() if target.position is not None}
     if not known or first_ns <= 0:

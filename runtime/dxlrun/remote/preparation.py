@@ -1,6 +1,6 @@
-"""Preparation: what a client sends, checked against plan and plug-ins, and made ready for the loop.
+"""Preparation: checks a client's input against plan and plug-ins, and converts it for the loop.
 
-All of a plug-in's code that a client can reach runs here, in the gateway's process, never in the loop's.
+All plug-in code that a client can reach runs here, in the gateway's process, never in the loop's.
 """
 
 from __future__ import annotations
@@ -47,20 +47,20 @@ from dxlrun.plan.loop_plan import ControllerPlan, JointPlan, ServoLimit, SourceP
 from dxlwire.joint_unit import LINEAR, ROTARY, JointUnit
 
 LONGEST_NAME = 64
-"""Of a controller that is loaded; the log cuts names there."""
+"""Upper limit of a loaded controller's name in characters; the log truncates longer names."""
 BUDGET_S = 5.0
-"""How long a plug-in may compute for one request, while every other client waits, `stop` too."""
+"""Timeout of a plug-in's code for one request. All other clients wait for it, even those that send `stop`."""
 _MOST_MISTAKES = 5
 _LONGEST_SENTENCE = 300
 _MOST_QUANTITIES = 20
-"""Mistaken ones that an answer names."""
+"""Upper limit of the wrong quantities in a reply."""
 _NAME: TypeAdapter[str] = TypeAdapter(Name)
 _GROUP_FIELDS = frozenset({"positions", "velocities", "efforts", "pwm"})
-"""What the commands of the group controllers have."""
+"""Fields of the commands of group controllers."""
 
 
 class RefusedRequest(Exception):
-    """A request that is not passed on, or that the loop refused."""
+    """A request that the gateway or the loop refused."""
 
     def __init__(self, refusal: Refusal) -> None:
         super().__init__(refusal.text)
@@ -73,7 +73,7 @@ def refused(code: Code, fields: Mapping[str, Field]) -> RefusedRequest:
 
 
 def travel_s(joint: JointPlan, distance: float, speed: float) -> float:
-    """Return how long a joint takes for a distance at a speed, s.
+    """Return the time that a joint needs for a distance at a speed, s.
 
     Raises:
         RefusedRequest: A register of its servo keeps the joint from moving.
@@ -86,19 +86,19 @@ def travel_s(joint: JointPlan, distance: float, speed: float) -> float:
 
 
 def invalid(problem: str) -> RefusedRequest:
-    """Return the exception for an input that is wrong in itself."""
+    """Return the exception for an input that is invalid in any state of the robot."""
     return refused(Code.INVALID, {"problem": problem})
 
 
 class _TooLong(BaseException):
-    """A plug-in computes for too long; no Exception, which it may catch."""
+    """A plug-in exceeded its timeout; not an Exception, which the plug-in could catch."""
 
 
 @contextmanager
 def bounded(controller: str) -> Iterator[None]:
-    """Interrupt a plug-in's Python code after BUDGET_S, in the main thread; raises RefusedRequest then.
+    """Limit the block's Python code to BUDGET_S, in the main thread; raises RefusedRequest after that time.
 
-    A call into C that never returns is not interrupted: then Ctrl-C in the robot's terminal is what is left.
+    A call into C that never returns is not interrupted; then only Ctrl-C in the robot's terminal helps.
     """
 
     def interrupt(*_: object) -> None:
@@ -117,39 +117,41 @@ def bounded(controller: str) -> Iterator[None]:
 
 @contextmanager
 def plugin_code(controller: str, where: str, model: type[BaseModel] | None = None) -> Iterator[None]:
-    """Run a plug-in's code, `bounded`; what it raises becomes a RefusedRequest that begins with `where`.
+    """Run a plug-in's code, `bounded`; its exceptions become a RefusedRequest that begins with `where`.
 
-    `model`: of an input, whose mistakes are named one by one.
+    `model`: type of a validated input, whose mistakes are listed one by one.
     """
     try:
         with bounded(controller):
             yield
     except RefusedRequest:
         raise
-    except ValueError as error:  # the way in which a plug-in refuses
+    # A plug-in refuses an input with ValueError.
+    except ValueError as error:
         if isinstance(error, ValidationError) and model is not None:
             raise invalid(mistakes(error, where, model)) from error
         raise invalid(f"{where}: {_one_line(str(error))}") from error
-    except (Exception, SystemExit) as error:  # its mistake
+    # A bug of the plug-in.
+    except (Exception, SystemExit) as error:
         raise invalid(f"{where}: {_one_line(f'{type(error).__name__}: {error}')}") from error
 
 
 @dataclass(frozen=True, slots=True)
 class Prepared:
-    """A command, ready for the loop."""
+    """A command prepared for the loop."""
 
     controller: str
     kind: str
     data: bytes
     """Little-endian float64"""
     beyond: tuple[BeyondLimit, ...]
-    """The values that are beyond their joints' limits."""
+    """Values beyond their joints' limits."""
     request: bytes = b""
     """The command as JSON, in SI units."""
 
     @property
     def joints_beyond(self) -> tuple[str, ...]:
-        """The joints of these values, each once."""
+        """Joints of the values beyond limits, without repeats."""
         return tuple(dict.fromkeys(one.joint for one in self.beyond))
 
     def require_within_limits(self) -> None:
@@ -164,7 +166,7 @@ class Prepared:
 
 @dataclass(frozen=True, slots=True)
 class Known:
-    """What is looked up once for a controller, and used for each of its commands."""
+    """Class, parameters and joints of a controller, looked up once for all its commands."""
 
     plan: ControllerPlan
     controller: ControllerClass
@@ -174,36 +176,37 @@ class Known:
 
 @dataclass(frozen=True, slots=True)
 class Preparation:
-    """Prepares commands by the controllers' classes, outside of the loop's process."""
+    """Preparation of commands by the controllers' classes, outside the loop's process."""
 
     joints: dict[str, JointPlan]
-    """The robot's, by name, in its order."""
+    """Joints of the robot by name, in the robot's order."""
     plugins: PlugIns
     sources: tuple[SourcePlan, ...] = ()
-    """Its devices and sensors."""
+    """Devices and sensors of the robot."""
     urdf: str | None = None
-    """The text of its URDF"""
+    """Text of the robot's URDF."""
     groups: Groups = field(default_factory=dict)
-    """Names that stand for some joints."""
+    """Groups of joints by name."""
     _known: dict[str, Known] = field(default_factory=dict, init=False)
-    """By the controller's name; one that is loaded later under the same name has another plan."""
+    """Cache by controller name; a controller that is loaded later under the same name has another plan."""
     _schemas: dict[str, dict[str, object]] = field(default_factory=dict, init=False)
     """Controller type -> schema of each command."""
 
     def take_servo_limits(self, joint: str, limits: tuple[ServoLimit, ...]) -> None:
-        """Judge commands by the registers that limit a joint's servo, too."""
+        """Add the registers that limit a joint's servo to the checks of commands."""
         if joint in self.joints:
             self.joints[joint] = replace(self.joints[joint], servo_limits=limits)
             self._known.clear()
 
     def takes(self, plan: ControllerPlan) -> dict[str, object]:
-        """Return the JSON Schema of each command that a controller takes; empty where it cannot be had."""
+        """Return the JSON Schema of each command that a controller accepts; empty when its code fails."""
         if plan.type not in self._schemas:
             offer = self.plugins.controllers.get(plan.type)
             commands = offer.controller.Commands if offer else {}
             try:
                 found: dict[str, object] = {k: model.model_json_schema() for k, model in commands.items()}
-            except (Exception, SystemExit):  # a plug-in's code; its commands can be taken all the same
+            # The plug-in's code failed; its commands can be sent without a schema.
+            except (Exception, SystemExit):
                 found = {kind: {} for kind in commands}
             self._schemas[plan.type] = found
         return self._schemas[plan.type]
@@ -216,28 +219,35 @@ class Preparation:
         return CompiledController(plan, self.plugins.controllers[plan.type], parameters)
 
     def goals(self, plan: ControllerPlan) -> list[str]:
-        """Return the names of the commands of a controller that are goals."""
+        """Return the names of a controller's commands that are goals."""
         offer = self.plugins.controllers.get(plan.type)
         return sorted(offer.controller.Goals) if offer else []
 
     def motions(self, plan: ControllerPlan) -> dict[str, float]:
-        """Return the motions that a controller plays by name, s; none where its code fails."""
+        """Return the motions that a controller plays, with durations, s; empty when its code fails."""
         try:
             known = self.known(plan)
             with bounded(plan.name):
                 return dict(known.controller.motions(known.parameters))
-        except (Exception, SystemExit):  # a plug-in's code; other controllers are shown all the same
+        # The plug-in's code failed; other controllers are still shown.
+        except (Exception, SystemExit):
             return {}
 
     def parameters(self, plan: ControllerPlan) -> ParametersModel:
-        """Return the parameters of a controller as they are now; raises RefusedRequest."""
+        """Return the present parameters of a controller; raises RefusedRequest."""
         return self.known(plan).parameters
 
     def command(self, plan: ControllerPlan, kind: str, body: bytes, *, units: bool = False) -> Prepared:
-        """Return a typed command that came as JSON (`true` and "1" are no numbers there).
+        """Decode and prepare a typed command from JSON (`true` and "1" are not numbers there).
 
-        `units`: where the command is one of those that motions are made of, its quantities are texts with
-        their units. Raises RefusedRequest.
+        Args:
+            plan: Plan of the controller.
+            kind: Name of the command.
+            body: JSON of the command.
+            units: The quantities are texts with units, if motions can use this command.
+
+        Raises:
+            RefusedRequest: The command is unknown, or its values are invalid.
         """
         known = self.known(plan)
         controller = known.controller
@@ -274,9 +284,9 @@ class Preparation:
     def controller(
         self, entry: Mapping[str, object], others: Mapping[str, ControllerPlan], rate: float
     ) -> ControllerPlan:
-        """Return the plan of a controller that is to be loaded beside `others`; raises RefusedRequest.
+        """Return the plan of a controller that is loaded in addition to `others`; raises RefusedRequest.
 
-        `entry` is one of the robot file, with its name; `rate` is the loop's, Hz.
+        `entry` is an entry of the robot file with its `name`; `rate` is the loop's rate, Hz.
         """
         try:
             name = _NAME.validate_python(entry.get("name", ""))
@@ -291,19 +301,20 @@ class Preparation:
             raise refused(Code.NAME_TAKEN, {"controller": name, "hint": hint})
         if entry.get("active"):
             raise invalid(f"{name} cannot be active at once; load it, then switch to it")
-        plan = self._compiled(
-            replace(plan_entry(name, written, every=1), active=False)
-        )  # the loop knows its own rate
-        known = self._mistakes(tuple(others.values()), rate)  # such as of one whose lower end was unloaded
+        # The divider is 1 here; the loop computes it for its own rate.
+        plan = self._compiled(replace(plan_entry(name, written, every=1), active=False))
+        # Ignore mistakes that exist without the new controller, such as an unloaded lower controller.
+        known = self._mistakes(tuple(others.values()), rate)
         if found := [one for one in self._mistakes((*others.values(), plan), rate) if one not in known]:
             raise _refuse_entry(found)
         return plan
 
     def _compiled(self, plan: ControllerPlan) -> ControllerPlan:
-        """Return a controller with what its class asks for; raises RefusedRequest."""
+        """Return a controller's plan with the interfaces that its class requests; raises RefusedRequest."""
         model: type[ParametersModel] = ParametersModel
         try:
-            # Unbounded: this imports a package, and an interrupted import leaves a part of it in the process.
+            # Unbounded, because this imports a package: an interrupted import would leave a partial module in
+            # the process.
             offer = find_offer(plan.name, plan.type, self.plugins)
             model = offer.controller.Parameters
             with bounded(plan.name):
@@ -317,10 +328,10 @@ class Preparation:
         return found.plan
 
     def _mistakes(self, plans: Sequence[ControllerPlan], rate: float) -> list[Mistake]:
-        """Return what is wrong with the controllers of a run as a graph, at this rate of the loop."""
+        """Return the mistakes in the graph of a run's controllers at this rate of the loop, Hz."""
         period_ns = round(1e9 / rate)
         now = [
-            # 0: one whose own rate does not divide the loop's, which the loop refuses
+            # The divider 0 marks a rate that does not divide the loop's rate; the loop refuses it.
             replace(plan, every=rate_divider(plan.rate, period_ns) if rate_fits(plan.rate, period_ns) else 0)
             for plan in plans
         ]
@@ -369,20 +380,26 @@ _QUANTITIES: Mapping[JointUnit, Mapping[str, Callable[[object], object]]] = {
         "accelerations": linear_acceleration,
     },
 }
-"""By the unit of a joint: keys of commands, and what makes a number in SI of a quantity with its unit."""
+"""Unit of a joint -> command field -> function that converts a quantity with its unit into SI."""
 
 
 def _of_motions(kind: str, model: type[BaseModel]) -> bool:
-    """Return whether a command is like those of the standard controllers: its quantities have units."""
+    """Return whether a command has the fields of a standard controller, whose quantities have units."""
     fields = set(model.model_fields)
     return kind == TRAJECTORY or (bool(fields) and fields <= _GROUP_FIELDS)
 
 
 def in_si(body: bytes, what: str, joints: Sequence[JointPlan] = ()) -> bytes:
-    """Return a command, JSON whose quantities have units, with plain numbers in rad, rad/s, rad/s^2 and s.
+    """Return a JSON command with its quantities converted from texts with units to numbers in SI units.
 
-    `joints`: in whose order its values are, unless it names its joints; those of linear ones become m. Raises
-    RefusedRequest with all mistakes: their sentences, and their places as JSON Pointers (RFC 6901).
+    Args:
+        body: JSON of the command.
+        what: Name of the command in a refusal.
+        joints: Joints in the order of the values, unless the command names its joints. Values of linear
+            joints become m, those of other joints rad.
+
+    Raises:
+        RefusedRequest: With all mistakes: sentences, and places as JSON Pointers (RFC 6901).
     """
     try:
         data = msgspec.json.decode(body)
@@ -399,7 +416,7 @@ def in_si(body: bytes, what: str, joints: Sequence[JointPlan] = ()) -> bytes:
 
 
 def _units_of(data: object, joints: Sequence[JointPlan]) -> tuple[JointUnit, ...]:
-    """Return the unit of the joint of each value in a command's lists; that of an unknown joint is ROTARY."""
+    """Return the joint unit of each value in a command's lists; ROTARY for an unknown joint."""
     units = {joint.name: joint.unit for joint in joints}
     named = data.get("joints") if isinstance(data, dict) else None
     names = named if isinstance(named, list) else [*units]
@@ -409,7 +426,7 @@ def _units_of(data: object, joints: Sequence[JointPlan]) -> tuple[JointUnit, ...
 def plain_quantities(
     values: Mapping[str, object], field: str, joints: Sequence[JointPlan]
 ) -> dict[str, object]:
-    """Return values by joint, whose quantities have the units of a command's field, as plain numbers.
+    """Return values by joint, converted from texts with the units of a command's field to numbers.
 
     Raises RefusedRequest as `in_si`.
     """
@@ -455,7 +472,7 @@ def _plain(
 
 
 def mistakes(error: ValidationError, what: str, model: type[BaseModel]) -> str:
-    """Return the mistakes of an input called `what` in one sentence; of many, the first."""
+    """Return the mistakes of an input called `what` in one sentence, up to _MOST_MISTAKES."""
     sentences = [
         sentence[:_LONGEST_SENTENCE] for sentence in sentences_of(error, what, model, _MOST_MISTAKES)
     ]
@@ -469,7 +486,7 @@ def _refuse_entry(found: Sequence[Mistake]) -> RefusedRequest:
 
 
 def unknown_controllers(names: Sequence[str], known: Sequence[str]) -> RefusedRequest:
-    """Return the refusal of controllers that there are not, with the names that may be meant."""
+    """Return the refusal for unknown controllers, with similar names as hints."""
     shown = tuple(name[:80] for name in names[:_MOST_MISTAKES])
     hints = [suggestion(name, known) for name in shown]
     if len(shown) > 1:

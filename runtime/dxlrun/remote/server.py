@@ -1,9 +1,9 @@
-"""Server: the gateway's process, and its connections: a timeout for each, limits for a process and for all.
+"""Server: the gateway's process and its connections, with a timeout for each and limits on their number.
 
-A client may hang in the middle of a request, never read its answer, or open connections without end. A
-process above its limit loses the connection of its own that was silent longest, so a flood closes none of
-another process, whose `stop` is served. The process ID comes from the Linux kernel (SO_PEERCRED, unix(7)).
-Of a client of another computer the name in its certificate counts instead; see `network/`.
+A client may stop in the middle of a request, never read its reply, or open connections without end. A process
+above its limit loses its own connection that was silent longest. A flood therefore closes no connection of
+another process, whose `stop` is still served. The process ID comes from the Linux kernel (SO_PEERCRED,
+unix(7)). Clients of other computers count by the name in their certificate; see `network/`.
 """
 
 from __future__ import annotations
@@ -47,10 +47,9 @@ from dxlrun.remote.sockets import Address, listen
 
 MOST_CONNECTIONS = 64
 MOST_OF_PROCESS = 16
-"""Connections of one process: three processes that flood leave a quarter of all to others."""
+"""Upper limit of one process: three flooding processes leave a quarter of all connections to others."""
 SILENCE_S = 30.0
-"""A connection is closed after so long without a byte from the other side, or in which it took none of what
-waits for it."""
+"""Timeout of a connection on which the client neither sends a byte nor reads the pending reply."""
 
 _CREDENTIALS = struct.Struct("3i")
 
@@ -59,11 +58,12 @@ def main() -> None:
     """Run the gateway's process: `--job-fd N --control-fd M`."""
     signal.signal(signal.SIGINT, signal.SIG_IGN)
     sys.stdout = sys.stderr = process.Printed(sys.stderr.fileno())
-    # a plug-in's endless `prepare` must not outlive the run
+    # An endless `prepare` of a plug-in must not outlive the run.
     ctypes.CDLL(None).prctl(PR_SET_PDEATHSIG, signal.SIGKILL)
     job = msgspec.json.decode(process.whole(int(sys.argv[2])), type=GatewayJob)
     control = socket.socket(fileno=int(sys.argv[4]))
-    channel = MessageChannel(control, Decoder(Finish))  # carries nothing here: the gateway ends with it
+    # The channel carries no message to the gateway, which ends when the socket closes.
+    channel = MessageChannel(control, Decoder(Finish))
     plan: Plan = from_json(process.whole(job.plan))
     try:
         link = Link(plan, job.memory, job.epoch_offset_ns)
@@ -86,7 +86,7 @@ def main() -> None:
 
 
 def _event_loop() -> asyncio.AbstractEventLoop:
-    """Return an event loop that waits parts of a millisecond: epoll(7), the usual way, counts whole ones."""
+    """Return an event loop with timeouts below 1 ms: the default, epoll(7), rounds to milliseconds."""
     return asyncio.SelectorEventLoop(selectors.SelectSelector())
 
 
@@ -97,7 +97,7 @@ async def serve(
     control: socket.socket,
     network: Listener | None = None,
 ) -> None:
-    """Serve until the other end of `control` is closed, or the link fails, whose error is raised."""
+    """Serve until the other end of `control` is closed or the link fails; raises the link's error."""
     config = config_of(gateway.app())
     server = _Server(config)
     config.load()
@@ -125,14 +125,14 @@ async def serve(
 async def serve_clients(
     listener: Listener, app: ASGIApp | uvicorn.Config, state: ServerState | None = None
 ) -> None:
-    """Serve an application to clients of other computers from now on, each by its certificate.
+    """Serve an application to clients of other computers from now on, each identified by its certificate.
 
-    `scope["client"]` of a request has the name and the role of its client. Silent connections are closed,
-    and those of a client that has too many.
+    `scope["client"]` of a request has the name and the role of its client. Silent connections are closed, and
+    excess connections of a client.
 
     Args:
         listener: A listener with TLS.
-        app: The application, or the loaded configuration of the server that serves it elsewhere too.
+        app: The application, or the loaded configuration of a server that also serves it elsewhere.
         state: State of that server.
     """
     if isinstance(app, uvicorn.Config):
@@ -144,7 +144,7 @@ async def serve_clients(
 
 
 def config_of(app: ASGIApp) -> uvicorn.Config:
-    """Return how requests of clients are served, each as a Connection."""
+    """Return the configuration of the HTTP server."""
     return uvicorn.Config(
         app,
         http=Connection,
@@ -156,28 +156,29 @@ def config_of(app: ASGIApp) -> uvicorn.Config:
         proxy_headers=False,
         server_header=False,
         backlog=MOST_CONNECTIONS,
-        timeout_keep_alive=math.ceil(SILENCE_S) + 1,  # the connection's own timeout ends before
+        # The connection's own timeout must expire first.
+        timeout_keep_alive=math.ceil(SILENCE_S) + 1,
         timeout_graceful_shutdown=1,
         h11_max_incomplete_event_size=16384,
     )
 
 
 class _Server(uvicorn.Server):
-    """Leaves signals alone: the supervisor closes the control socket to end it."""
+    """Server without signal handlers: the supervisor closes the control socket to stop it."""
 
     @contextmanager
     def capture_signals(self) -> Iterator[None]:
-        """Capture none."""
+        """Install no signal handlers."""
         yield
 
 
 class Connection(H11Protocol):
-    """HTTP/1.1 on one connection, closed when it is silent for too long, or one of too many."""
+    """HTTP/1.1 connection that is closed after a silence or above the limits of connections."""
 
     def connection_made(  # type: ignore[override]  # uvicorn leaves its type open
         self, transport: asyncio.Transport
     ) -> None:
-        """Begin, unless the client is another user's; close another connection when there are too many."""
+        """Accept the connection, unless another user opened it; close another one above the limits."""
         super().connection_made(transport)
         if listener := self.app_state.get("listener"):
             listener.admit(transport.get_extra_info("peername"))
@@ -194,8 +195,11 @@ class Connection(H11Protocol):
             min(crowded, key=lambda one: (one.busy, one.last_byte_s)).transport.abort()
 
     def _crowded(self) -> list[Connection]:
-        """Return the connections of which one must be closed because of this one: those of its process when
-        that has too many, of the process that has most when there are too many; none otherwise."""
+        """Return the candidates to close because of this connection.
+
+        These are the connections of its process when that is above its limit; those of the process with the
+        most when all together are above the limit; else none.
+        """
         others = [
             one
             for one in self.connections
@@ -210,13 +214,13 @@ class Connection(H11Protocol):
         return [one for one in others if one.client == process]
 
     def connection_lost(self, exc: Exception | None) -> None:
-        """Leave nothing behind: a timer would keep all of it until the timeout."""
+        """Cancel the timer, which would keep the connection in memory until the timeout."""
         self._timer.cancel()
         self._unset_keepalive_if_required()
         super().connection_lost(exc)
 
     def data_received(self, data: bytes) -> None:
-        """Take bytes."""
+        """Process received bytes while the certificate is valid."""
         self.last_byte_s = self.loop.time()
         if self._valid():
             super().data_received(data)
@@ -224,52 +228,54 @@ class Connection(H11Protocol):
             self.transport.abort()
 
     def _valid(self) -> bool:
-        """Return whether the client's certificate counts still; a client of this computer has none."""
+        """Return whether the client's certificate is still valid; clients on this computer need none."""
         return not self._certificate or counts(self._certificate)
 
     def resume_writing(self) -> None:
-        """Go on with an answer of which the other side has taken some."""
+        """Continue a reply after the client has read a part."""
         self.last_byte_s = self.loop.time()
         super().resume_writing()
 
     @property
     def busy(self) -> bool:
-        """True while one of its requests is answered."""
+        """True while a reply is not complete."""
         return self.cycle is not None and not self.cycle.response_complete
 
     @property
     def listening(self) -> bool:
-        """True while it has a stream, which has no end of its own."""
+        """True while a reply is being sent, such as a stream without a known end."""
         return self.cycle is not None and self.cycle.response_started and not self.cycle.response_complete
 
     def _check(self) -> None:
-        """Close it when it was silent for too long, else look again when that may be."""
+        """Close the connection after a silence of SILENCE_S, else set the timer again."""
         if self.listening and not self.transport.get_write_buffer_size():
             self.last_byte_s = self.loop.time()
         silent_s = self.loop.time() - self.last_byte_s
         if silent_s >= SILENCE_S or not self._valid():
-            self.transport.abort()  # not close: that would wait for a reader that may never read
+            # `close` would wait for a reader that may never read.
+            self.transport.abort()
         else:
             self._timer = self.loop.call_later(SILENCE_S - silent_s + 0.01, self._check)
 
 
 def _certificate(transport: asyncio.Transport) -> Certificate:
-    """Return the certificate of a client, which TLS has checked; empty: the client is of this computer."""
+    """Return the verified certificate of a client; empty for a client on this computer."""
     secured = transport.get_extra_info("ssl_object")
     found: Certificate = {} if secured is None else secured.getpeercert()
     return found
 
 
 def _client(transport: asyncio.Transport, certificate: Certificate) -> Client | None:
-    """Return name and role of a client; None: it may ask nothing."""
+    """Return name and role of a client; None when the client has no access."""
     if certificate:
         subject = dict(pair for pairs in certificate["subject"] for pair in pairs)
         role = subject.get("organizationalUnitName", "").upper()
-        name = f"client {subject.get('commonName', '')}"  # never as a process of this computer
+        # The prefix keeps a certificate from posing as a process of this computer.
+        name = f"client {subject.get('commonName', '')}"
         return Client(name, Role[role]) if role in Role.__members__ else None
     end = transport.get_extra_info("socket")
     process, user, _ = _CREDENTIALS.unpack(
         end.getsockopt(socket.SOL_SOCKET, socket.SO_PEERCRED, _CREDENTIALS.size)
     )
-    # another user's: the socket's mode forbids it too
+    # Refuse other users, which the mode of the socket excludes as well.
     return Client(f"process {process}", Role.ADMIN) if user in (0, os.getuid()) else None

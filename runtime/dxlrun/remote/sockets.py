@@ -1,8 +1,8 @@
-"""Sockets of running robots: where they are, which robots run, and a client's connection to one.
+"""Sockets: the socket files of running robots, their discovery, and a client's connection to a robot.
 
-A socket is in `$XDG_RUNTIME_DIR/dxlrun` (XDG Base Directory Specification) where this user owns that, else
-in `/tmp/dxlrun-<user ID>`; never in both. A service and a login shell that differ in the variable do not find
-each other's runs: set it alike.
+The sockets are in `$XDG_RUNTIME_DIR/dxlrun` (XDG Base Directory Specification) when this user owns
+XDG_RUNTIME_DIR, else in `/tmp/dxlrun-<user ID>`; never in both. A service and a login shell with different
+values of the variable do not find each other's runs; set it to the same value.
 """
 
 from __future__ import annotations
@@ -28,33 +28,33 @@ _HEAD = re.compile(rb"HTTP/1\.\d (\d{3}).*?\r\n\r\n", re.DOTALL)
 _LENGTH = re.compile(rb"\r\ncontent-length: *(\d+)")
 _CHUNK = 65536
 MOST_BYTES = 1 << 20
-"""The longest body of a request; longer ones are refused before they are read."""
+"""Upper limit of a request's body; longer ones are refused before they are read."""
 TIMEOUT_S = 10.0
-"""How long an answer may take: some two seconds, and six more for a switch that waits for modes."""
+"""Timeout for a reply: about two seconds, and six more for a switch that waits for mode changes."""
 _IDLE_S = 20.0
-"""The gateway closes silent connections after 30 s; one that was silent for so long is not used again."""
+"""Longest idle time of a reused connection; the gateway closes silent connections after 30 s."""
 _ENDING_S = 1.0
-"""How long a gateway that closed a connection may take to be gone, when the run has ended."""
+"""Timeout for the exit of a gateway that closed a connection at the end of a run."""
 LONGEST_PATH = 107
-"""Bytes; what Linux takes as the name of a Unix socket (unix(7)), without the final zero."""
+"""Bytes; limit of Linux for the path of a Unix socket (unix(7)), without the terminating zero."""
 
 
 def place(runtime_directory: str | None = None) -> Path:
     """Return the directory of this user's sockets; it may not exist yet.
 
-    `runtime_directory`: XDG_RUNTIME_DIR of another process; empty without one. None: our own.
+    `runtime_directory`: XDG_RUNTIME_DIR of another process; empty when unset there. None: of this process.
     """
     ours = os.environ.get("XDG_RUNTIME_DIR", "")
     runtime = Path(ours if runtime_directory is None else runtime_directory)
     with suppress(OSError):
-        # su and sudo may leave that of another user in the environment
+        # su and sudo may leave another user's XDG_RUNTIME_DIR in the environment.
         if runtime.is_absolute() and runtime.stat().st_uid == os.getuid():
             return runtime / "dxlrun"
     return Path(f"/tmp/dxlrun-{os.getuid()}")  # noqa: S108  entered only if this user owns it
 
 
 def owned(directory: Path) -> bool:
-    """Return whether a directory belongs to this user and no other may enter it; no link is followed."""
+    """Return whether a directory belongs to this user and only they may enter it; links are not followed."""
     try:
         found = directory.lstat()
     except OSError:
@@ -63,10 +63,10 @@ def owned(directory: Path) -> bool:
 
 
 def listen(robot: str) -> tuple[socket.socket, Path]:
-    """Return a listening socket of a robot (mode 0600) and its path.
+    """Create the listening socket of a robot (mode 0600); return the socket and its path.
 
-    A second run of the same robot has its process ID in the name. Raises DxlrunError when there is
-    no safe place for a socket.
+    The path of a second run of the same robot contains its process ID. Raises DxlrunError when the directory
+    is not safe.
     """
     directory = place()
     with suppress(OSError):
@@ -101,7 +101,7 @@ def _bound(path: Path) -> socket.socket:
 
 @contextmanager
 def _locked(directory: Path) -> Iterator[None]:
-    """Lock the directory: no other process sees a socket before it listens, or removes it then."""
+    """Lock the directory, so no process sees a socket before it listens, or removes it in that time."""
     descriptor = os.open(directory, os.O_RDONLY | os.O_DIRECTORY | os.O_NOFOLLOW)
     try:
         fcntl.flock(descriptor, fcntl.LOCK_EX)
@@ -111,12 +111,13 @@ def _locked(directory: Path) -> Iterator[None]:
 
 
 def alive(path: Path) -> bool:
-    """Return whether a process listens at a socket, also one that is busy or stopped; never waits."""
+    """Return whether a process listens at a socket, even if it is busy or stopped; does not block."""
     with socket.socket(socket.AF_UNIX, socket.SOCK_STREAM) as probe:
         probe.setblocking(False)
         try:
             probe.connect(str(path))
-        except BlockingIOError:  # its queue of connections is full
+        # The queue of connections is full, so a process listens.
+        except BlockingIOError:
             return True
         except OSError:
             return False
@@ -124,7 +125,7 @@ def alive(path: Path) -> bool:
 
 
 def listener(path: Path) -> int | None:
-    """Return the ID of the process that listens at a socket; None when it cannot be connected at once."""
+    """Return the ID of the listening process; None when the socket does not accept at once."""
     with socket.socket(socket.AF_UNIX, socket.SOCK_STREAM) as probe:
         probe.setblocking(False)
         with suppress(OSError):
@@ -135,7 +136,7 @@ def listener(path: Path) -> int | None:
 
 
 def running() -> tuple[str, ...]:
-    """Return the names of the robots that run and can be steered; sockets without a process are removed."""
+    """Return the names of running robots with a gateway, and remove sockets without a process."""
     return tuple(sorted(sockets()))
 
 
@@ -155,16 +156,16 @@ def sockets() -> dict[str, Path]:
 
 
 class Address(NamedTuple):
-    """Where the gateway of a robot listens."""
+    """Network address of a robot's gateway."""
 
     name: str
-    """In the robot's certificate."""
+    """Name in the robot's certificate."""
     host: str
     port: int
 
     @classmethod
     def parse(cls, text: str, name: str = "") -> Address:
-        """Return the address that `[NAME@]HOST:PORT` means; raises InputError."""
+        """Parse `[NAME@]HOST:PORT`, with a default for NAME; raises InputError."""
         found = _ADDRESS.fullmatch(text)
         if not found or not 0 < int(found[3]) < 1 << 16 or not (found[1] or name):
             raise InputError(f"{text[:80]!r} is no address; write [NAME@]HOST:PORT, such as torso@lab3:7660")
@@ -175,23 +176,23 @@ class Address(NamedTuple):
 
 
 class RobotLink(Protocol):
-    """How a client reaches a robot; everything raises OSError or ValueError when that does not answer."""
+    """A client's connection to a robot. Its methods raise OSError or ValueError without a valid reply."""
 
     def exchange(self, method: str, path: str, body: bytes | None) -> tuple[int, bytes]:
-        """Make one request; return status and answer."""
+        """Send one request; return status and body of the reply."""
         ...
 
     def stream(self, path: str) -> tuple[int, bytes, socket.socket]:
-        """Make a request whose answer goes on; return status, first bytes, and where the others come."""
+        """Send a request with a streamed reply; return status, first bytes, and a socket for the rest."""
         ...
 
     @property
     def alive(self) -> bool:
-        """True while the robot can be asked."""
+        """True while the robot's gateway accepts connections."""
         ...
 
     def ends(self) -> bool:
-        """Return whether a stream that was closed is of a run that has ended."""
+        """Return whether a stream was closed because its run has ended."""
         ...
 
     def close(self) -> None:
@@ -200,17 +201,17 @@ class RobotLink(Protocol):
 
 
 class SocketLink:
-    """HTTP on the socket of a run: one connection for requests, one at a time, and one for each stream."""
+    """HTTP over a run's Unix socket: one connection for sequential requests, and one for each stream."""
 
     def __init__(self, path: Path, client: str) -> None:
         self._path = path
         self._end: socket.socket | None = None
         self._used = time.monotonic()
         self.client = "".join(letter for letter in client if letter.isprintable())
-        """The name of the client for the log."""
+        """Client name for the log."""
 
     def exchange(self, method: str, path: str, body: bytes | None) -> tuple[int, bytes]:
-        """Ask once; return status and answer. Nothing is sent twice: the first may have been received."""
+        """Send one request; return status and body. No retry: the gateway may have received the first one."""
         content = body or b""
         head = (
             f"{method} {path} HTTP/1.1\r\nHost: localhost\r\nContent-Type: application/json\r\n"
@@ -223,7 +224,8 @@ class SocketLink:
         try:
             end.sendall(head.encode() + content)
             status, answer, closes = _answer(end)
-        except BaseException:  # Ctrl-C between question and answer: the answer must not meet the next one
+        # After Ctrl-C, the pending reply must not be taken for the reply to the next request.
+        except BaseException:
             self.close()
             raise
         if closes:
@@ -232,7 +234,7 @@ class SocketLink:
         return status, answer
 
     def stream(self, path: str) -> tuple[int, bytes, socket.socket]:
-        """Return status, first bytes and the connection of an answer that ends with the connection."""
+        """Send a GET request; return status, first bytes, and the connection with the rest of the reply."""
         end = self._connected()
         try:
             end.sendall(f"GET {path} HTTP/1.0\r\n\r\n".encode())
@@ -257,9 +259,9 @@ class SocketLink:
         return alive(self._path)
 
     def ends(self) -> bool:
-        """Return whether the run has ended, or ends within a second: its gateway's socket is removed then.
+        """Return whether the run ends within a second, when its gateway removes the socket.
 
-        Of a gateway that was killed it is left, or it listens still.
+        The socket file remains after a gateway was killed, and while it still listens.
         """
         until = time.monotonic() + _ENDING_S
         while self._path.exists():
@@ -270,10 +272,10 @@ class SocketLink:
 
 
 def _connected(path: Path) -> socket.socket:
-    """Connect to a socket; where its queue of connections is full, wait in the Linux kernel's.
+    """Connect to a socket; wait in the Linux kernel's queue when the backlog is full.
 
-    Linux serves those that wait in order (a socket with a timeout of Python does not wait: unix(7), EAGAIN),
-    so a process that floods the queue only delays this one.
+    Linux serves waiting processes first come, first served, so a process that floods the queue only delays
+    this one. A Python timeout would not wait: connect fails with EAGAIN on a non-blocking socket (unix(7)).
     """
     end = socket.socket(socket.AF_UNIX, socket.SOCK_STREAM)
     timeval = struct.pack("@2l", int(TIMEOUT_S), int(TIMEOUT_S % 1 * 1e6))
@@ -291,16 +293,22 @@ def _connected(path: Path) -> socket.socket:
 
 
 def _hung_up(end: socket.socket) -> bool:
-    """Return whether the other end has closed it; it sends nothing unasked, so any byte means that too."""
+    """Return whether the peer has closed the connection. It sends no unrequested bytes, so a byte counts as
+    well.
+    """
     look = select.poll()
     look.register(end, select.POLLIN)
     return bool(look.poll(0))
 
 
 def _answer(end: socket.socket) -> tuple[int, bytes, bool]:
-    """Return status and body of an answer, of one without a length its beginning, and whether it is the last.
+    """Return status and body of a reply, and whether the gateway closes the connection after it.
 
-    Raises OSError when the connection is closed before, ValueError for what is no answer.
+    The body of a reply without a length is its beginning.
+
+    Raises:
+        OSError: The connection was closed before the end of the reply.
+        ValueError: The reply is not HTTP.
     """
     data = b""
     while not (found := _HEAD.match(data)):

@@ -1,4 +1,4 @@
-"""Listening: messages of topics of a running robot as they come, for blocking and for asyncio programs."""
+"""Listening: the messages of a running robot's topics, for blocking and asyncio programs."""
 
 from __future__ import annotations
 
@@ -27,41 +27,46 @@ class TopicMessage(msgspec.Struct, frozen=True):
 
     topic: str
     type: str
-    """As ROS 2 writes it: `nav_msgs/msg/Odometry`."""
+    """Name of the type in ROS 2 format: `nav_msgs/msg/Odometry`."""
     number: int
-    """Counted from 1 by the robot."""
+    """Sequence number, counted from 1 by the robot."""
     time_ns: int
-    """Of the run's clock."""
+    """Time of the message on the run's clock, ns."""
     wall_ns: int
-    """The same as wall time."""
+    """Time of the message as wall time, ns since 1970."""
     lost: int
-    """Messages of the topic between this one and the one before that did not come."""
+    """Messages of the topic between the previous message and this one that were not received."""
     data: bytes
     """CDR, little-endian"""
     definition: str
-    """Of the type, as ROS 2 writes it (`ros2msg`)."""
+    """Definition of the type in ROS 2 format (`ros2msg`)."""
     joints: tuple[str, ...] = ()
-    """Whose rows its arrays have; empty: of none."""
+    """Joints of the rows of its arrays; empty: the arrays have no rows of joints."""
 
     @property
     def message(self) -> Mapping[str, Value]:
-        """Its fields; sequences of numbers are arrays, nested messages mappings. Decoded at each access."""
+        """Fields of the message: sequences of numbers are arrays, nested messages are mappings.
+
+        The message is decoded at each access.
+        """
         return _codec(self.type, self.definition).unpack(self.data)
 
 
 @lru_cache
 def _codec(kind: str, definition: str) -> Codec:
-    from dxlrun.messages.cdr import Codec  # numpy: most clients listen to nothing
+    # Imported here because it imports NumPy, which most clients do not need.
+    from dxlrun.messages.cdr import Codec
     from dxlrun.messages.definition import MessageType
 
     return Codec(MessageType(kind, definition))
 
 
 class Listening:
-    """Messages as they come, from the newest on, until the run ends: `for` or `async for`, then closed.
+    """Iterator over messages, from the newest one until the end of the run; then the connection is closed.
 
-    A stream of `newest` messages leaves out what has come meanwhile when this end is slower; `lost` counts
-    it. Raises DxlrunError when the gateway is gone while the run is not.
+    `for` and `async for` both work. A stream of `newest` messages skips older messages when this client is
+    slower than the robot; `lost` counts them. Raises DxlrunError when the gateway is gone before the run has
+    ended.
     """
 
     def __init__(self, name: str, link: RobotLink, end: socket.socket, first: bytes, *, newest: bool) -> None:
@@ -70,7 +75,7 @@ class Listening:
         self._bytes = bytearray(first)
         self._topics: dict[int, Opened] = {}
         self._last: dict[int, int] = {}
-        """Number of the newest message, by the topic's place."""
+        """Number of the newest message by the topic's place."""
         self._ended = False
 
     def __enter__(self) -> Listening:
@@ -95,7 +100,8 @@ class Listening:
             self.close()
 
     async def __aiter__(self) -> AsyncIterator[TopicMessage]:
-        import asyncio  # most clients do not use it
+        # Imported here because most clients do not use asyncio.
+        import asyncio
 
         receive = asyncio.get_running_loop().sock_recv
         try:
@@ -103,7 +109,8 @@ class Listening:
                 for message in self._arrived():
                     yield message
                 if not self._ended:
-                    with suppress(ConnectionError):  # then nothing more comes, which is seen there
+                    # A reset connection yields no more bytes, which `_arrived` detects.
+                    with suppress(ConnectionError):
                         async with asyncio.timeout(TIMEOUT_S):
                             self._bytes += await receive(self._end, _CHUNK)
         except TimeoutError:
@@ -112,10 +119,11 @@ class Listening:
             self.close()
 
     def _arrived(self) -> Iterator[TopicMessage]:
-        """Yield the messages that have come."""
+        """Yield the messages that have arrived."""
         closed = False
         with suppress(BlockingIOError):
-            while (more := self._received()) and self._newest:  # else the rest is taken later
+            # A stream of all messages reads the rest later.
+            while (more := self._received()) and self._newest:
                 pass
             closed = not more
         samples = self._samples()
@@ -141,7 +149,7 @@ class Listening:
             self._ended = True
 
     def _received(self) -> bytes:
-        """Take bytes that came and return them; none: the connection is closed."""
+        """Read and return received bytes; empty when the connection is closed."""
         try:
             more = self._end.recv(_CHUNK)
         except ConnectionError:
@@ -150,7 +158,7 @@ class Listening:
         return more
 
     def _samples(self) -> list[Sample]:
-        """Return the messages that are whole; note topics, and the end of the run."""
+        """Return the complete messages, and record topics and the end of the run."""
         found, at = [], 0
         while len(self._bytes) - at >= FRAME_LENGTH.size:
             begin = at + FRAME_LENGTH.size

@@ -1,4 +1,4 @@
-"""Live messages: those of the log's topics, made of what a running robot publishes."""
+"""Live messages: the messages of the log's topics, made from the messages of a running robot."""
 
 from __future__ import annotations
 
@@ -17,31 +17,31 @@ from dxlrun.remote.live.listening import TopicMessage
 from dxlrun.remote.requests.replies import TopicState
 
 _OF_EACH_CYCLE = "dxlrun_msgs/msg/SourceStates"
-"""Type of the gateway's own topics, which the log has not: /cycle has their values."""
+"""Type of topics that only the gateway has; the log has their values in /cycle."""
 
 
 class LiveMessages(RunMessages):
-    """Makes the messages of a run for a viewer on the other side of its gateway."""
+    """Converter from the messages of a gateway to the messages of the log, for a viewer."""
 
     def __init__(self, header: LogHeader) -> None:
         super().__init__(header)
         self._opened: dict[tuple[str, MessageType], int] = {}
-        """Channels by topic and type: a controller that is loaded anew may publish another type."""
+        """Channels by topic and type: a controller that is loaded again may publish another type."""
         self.on_changed: Callable[[str], object] = lambda controller: None
         """Called when live parameters of a controller were changed."""
 
     @staticmethod
     def heard(topics: Collection[TopicState]) -> set[str]:
-        """Return the topics to listen to: those of the log, and those that others of it are made of."""
+        """Return the topics to listen to: the log's topics, and the sources of derived topics."""
         return {one.name for one in topics if one.type != _OF_EACH_CYCLE} - {schemas.LogTopic.JOINT_STATES}
 
     def read_cycle(self, message: TopicMessage) -> np.void:
-        """Return the record of a message of /cycle: its fields by name, with a row for each joint."""
+        """Return the record of a message of /cycle: a structured scalar with one row for each joint."""
         record: np.void = np.frombuffer(message.data[len(ENCAPSULATION) :], dtype=self._layout.dtype)[0]
         return record
 
     def take(self, message: TopicMessage) -> None:
-        """Take a message of a topic of `heard`."""
+        """Convert a message of one of the topics of `heard`."""
         if message.topic == schemas.LogTopic.CYCLE:
             self.cycle(message.data[len(ENCAPSULATION) :])
         elif message.topic == schemas.LogTopic.EVENT:

@@ -20,25 +20,25 @@ _OF_JOINTS = (
 
 
 class RobotStates(msgspec.Struct, frozen=True):
-    """The newest cycle. Arrays have a row for each name, in its order; NaN: not known, or not commanded."""
+    """Snapshot of the newest cycle. Arrays have one row for each name; NaN is unknown or not commanded."""
 
     cycle: int
     time_ns: int
     """Wake-up of the cycle, ns of the run's clock."""
     late_ns: int
-    """How much later than its deadline that was."""
+    """Delay of the wake-up after its scheduled time."""
     joints: tuple[str, ...]
     units: tuple[str, ...]
-    """Of each joint's positions, `rad` or `m`; velocities are these a second."""
+    """Unit of each joint's position, `rad` or `m`; the unit of its velocity is this unit per second."""
     effort_units: tuple[str, ...]
-    """`Nm`, `N`, `A`; empty: the fraction of the servo's maximum."""
+    """Unit of each joint's effort: `Nm`, `N`, `A`; empty: fraction of the servo's maximum."""
     position: Floats
     velocity: Floats
     effort: Floats
     valid: Bools
-    """True where this cycle's reply arrived intact."""
+    """True for joints whose reply of this cycle was received intact."""
     age_ns: Integers
-    """Time since the reply that the row shows; -1 while none ever came."""
+    """Time since the reply that the row shows; -1 before the first reply."""
     goal_position: Floats
     goal_velocity: Floats
     goal_effort: Floats
@@ -47,52 +47,52 @@ class RobotStates(msgspec.Struct, frozen=True):
     """deg C"""
     voltage: Floats
     hardware_error: Integers
-    """Bits of the servo's Hardware Error Status."""
+    """Bits of the control table item Hardware Error Status."""
     mode: tuple[str, ...]
     torque: tuple[str, ...]
     """`on`, `doubt`, `limp`, `lost`, `rebooting`, `given`"""
     references: tuple[str, ...]
     reference: Floats
-    """What controllers command of each other."""
+    """Commands from controllers to other controllers."""
     source_states: tuple[str, ...]
-    """States of devices, sensors, and controllers that provide some: `imu/orientation.x`."""
+    """States of devices, sensors, and controllers that provide states: `imu/orientation.x`."""
     source_state: Floats
     """SI units"""
     sources: tuple[str, ...]
     source_valid: Bools
     source_age_ns: Integers
-    """-1: none ever came."""
+    """-1 before the first values."""
     device_commands: tuple[str, ...]
     """Items of devices that controllers command: `board/led`."""
     device_command: Floats
-    """What is commanded of each of them, in its unit."""
+    """Commanded value of each item, in the item's unit."""
     controllers: tuple[str, ...]
     controller_ns: Integers
-    """How long each controller's update took in this cycle; 0: it had none."""
+    """Duration of each controller's update in this cycle; 0 without an update."""
     source_units: dict[str, str] = {}
-    """SI units of the states of sources that have one, by `imu/angular_velocity.x`."""
+    """SI units of source states that have a unit, by `imu/angular_velocity.x`."""
     command_units: dict[str, str] = {}
-    """SI units of the commands of sources that have one, by `board/fan`."""
+    """SI units of source commands that have a unit, by `board/fan`."""
 
     @property
     def source_names(self) -> tuple[str, ...]:
-        """Names of sources, of their states and of their commands."""
+        """Names of sources, their states and their commands."""
         return (*self.sources, *self.source_states, *self.device_commands)
 
     def joint(self, name: str) -> dict[str, object]:
-        """Return the row of a joint by names of fields, `age` in s; None: not known. Raises ValueError."""
+        """Return the values of a joint by field name, with `age` in s; None is unknown. Raises ValueError."""
         row = self.joints.index(name)
         found = {field: _plain(getattr(self, field)[row]) for field in _OF_JOINTS}
         return {**found, "age": int(self.age_ns[row]) * 1e-9}
 
     def source(self, name: str) -> dict[str, object] | None:
-        """Return states, commands, their units, `valid` and `age`, s, of a source of states.
+        """Return states, commands, units, `valid` and `age` (s) of a device, a sensor or another source.
 
         Args:
-            name: Its own name, or that of one state or command, `imu/orientation.x`.
+            name: Name of the source, or of one state or command, such as `imu/orientation.x`.
 
         Returns:
-            None where there is no such source. A command is null where no controller commands it.
+            None for an unknown source. A command is null when no controller commands it.
         """
         owner = name.partition("/")[0]
         states, commands, units, command_units = (
@@ -129,7 +129,7 @@ def encoded(states: RobotStates) -> bytes:
 
 
 def array(kind: type, values: object) -> object:
-    """Return the array of a field; null becomes NaN."""
+    """Return the NumPy array of a field; null becomes NaN. Decoding hook of msgspec."""
     return np.array(values, get_args(get_args(kind)[1])[0])
 
 

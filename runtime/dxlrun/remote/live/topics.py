@@ -1,8 +1,8 @@
 """Live topics: messages of the loop's topics, of each cycle and of events, streamed to clients.
 
-Each stream reads the loop's rings at its own pace: the loop does not notice, and nothing piles up for a
-client that sleeps. What the rings have no more when it goes on, after some ten seconds, is missing in its
-numbers.
+Each stream reads the loop's rings at its own pace, so a slow client neither delays the loop nor fills memory.
+The rings hold about ten seconds. A client that is further behind misses messages, which shows as a gap in
+their numbers.
 """
 
 from __future__ import annotations
@@ -26,9 +26,9 @@ from dxlrun.messages.definition import MessageType
 from dxlrun.remote.requests.replies import FRAME_LENGTH, Frame, Opened, Sample, TopicState
 
 MOST_RECORDS = 64
-"""Of each ring that a stream takes at once, before the gateway looks after others."""
+"""Records of each ring that a stream reads at once, before the gateway serves other clients."""
 _TIMES = 64
-"""Messages over which a topic's rate is measured."""
+"""Number of messages over which a topic's rate is measured."""
 SOURCE_STATES = MessageType(
     "dxlrun_msgs/msg/SourceStates",
     """# States of a device, a sensor, or a controller that provides some, SI units; NaN = not known.
@@ -44,7 +44,7 @@ _encode = msgspec.msgpack.Encoder().encode
 
 
 class _CycleTopic(NamedTuple):
-    """A topic with a message of every cycle."""
+    """Topic with one message for every cycle."""
 
     type: MessageType
     joints: tuple[str, ...]
@@ -52,7 +52,7 @@ class _CycleTopic(NamedTuple):
 
 
 class _LoopTopic:
-    """What is known of a topic of the loop."""
+    """A topic of the loop, with its newest message and the times of recent messages."""
 
     __slots__ = ("count", "newest", "times", "topic")
 
@@ -62,12 +62,12 @@ class _LoopTopic:
         self.times: deque[int] = deque(maxlen=_TIMES)
 
     def take(self, message: TopicMessage) -> None:
-        """Note the newest message."""
+        """Record the newest message."""
         self.newest, self.count = message, message.number
         self.times.append(message.t_ns)
 
     def state(self) -> TopicState:
-        """Return what the list of topics has."""
+        """Return the entry of the list of topics."""
         rate = None
         if len(self.times) > 1 and (span_ns := self.times[-1] - self.times[0]) > 0:
             rate = (len(self.times) - 1) * 1e9 / span_ns
@@ -75,7 +75,7 @@ class _LoopTopic:
 
 
 class LiveTopics:
-    """All topics of a run; `events` are those that the gateway keeps, by number."""
+    """All topics of a run; `events` are the events that the gateway stores, with their numbers."""
 
     def __init__(
         self,
@@ -86,7 +86,7 @@ class LiveTopics:
         epoch_offset_ns: int,
     ) -> None:
         self.rings = messages, cycles
-        """Descriptors of the memory of the loop's messages and cycles."""
+        """File descriptors of the memory of the loop's messages and cycles."""
         self.layout, self.events, self.epoch_offset_ns = layout, events, epoch_offset_ns
         self.of_loop: dict[str, _LoopTopic] = {}
         self.by_number: dict[int, _LoopTopic] = {}
@@ -100,7 +100,7 @@ class LiveTopics:
         self.ring = RingReader(messages)
 
     def collect(self) -> list[tuple[PublishedTopic, TopicMessage]]:
-        """Return the messages since the last call; the log declares what was lost on the way."""
+        """Return the messages since the last call; the log reports lost ones."""
         found = []
         for message in _decoded(iter(self.ring.read, None)):
             if isinstance(message, OpenedTopic):
@@ -113,7 +113,7 @@ class LiveTopics:
         return found
 
     def described(self, name: str) -> PublishedTopic:
-        """Return a topic; raises KeyError when there is none of this name."""
+        """Return the description of a topic; raises KeyError for an unknown name."""
         if name in self.of_loop:
             return self.of_loop[name].topic
         if name == LogTopic.EVENT:
@@ -121,7 +121,7 @@ class LiveTopics:
         return PublishedTopic(name, self.of_cycles[name].type, self.of_cycles[name].joints)
 
     def states(self, cycles: int) -> list[TopicState]:
-        """Return what there is to listen to, after so many cycles."""
+        """Return the state of all topics after a number of cycles."""
         events = self.events[-1][0] if self.events else 0
         return [
             *(one.state() for one in self.of_loop.values()),
@@ -141,7 +141,7 @@ class LiveTopics:
 
 
 def _decoded(records: Iterable[Record | Gap]) -> Iterator[Tagged]:
-    """Yield the messages of records; what is none is not of ours: the loop encodes them."""
+    """Yield the messages of records. A malformed record is skipped: only the loop encodes them."""
     for record in records:
         if isinstance(record, Record):
             with suppress(ValueError):
@@ -157,11 +157,11 @@ def _source_states(source: str, record: CycleRecord) -> bytes:
 
 
 class TopicStream:
-    """The messages of some topics for one client, from the newest on: every one, or the newest each time."""
+    """Messages of some topics for one client, from the newest on: all of them, or the newest at each call."""
 
     def __init__(self, topics: LiveTopics, names: Sequence[str], *, newest: bool) -> None:
         self.behind = False
-        """Whether more has come than was taken at once."""
+        """True when more records have arrived than one call reads."""
         self._places = {name: place for place, name in enumerate(dict.fromkeys(names))}
         self._newest, self._events, self._offset_ns = newest, topics.events, topics.epoch_offset_ns
         self._first = [self._opened(topics.described(name)) for name in self._places]
@@ -181,11 +181,12 @@ class TopicStream:
         self._event = self._events[-1][0] - 1 if self._events else 0
 
     def frames(self) -> bytes:
-        """Return what has come since the last call, as frames of a stream; of much the first part."""
+        """Return the messages since the last call as frames, up to MOST_RECORDS of each ring."""
         self.behind = False
         found = [*self._first, *self._new_messages(), *self._new_cycles(), *self._new_events()]
         self._first = []
-        if self._newest:  # of each topic the last
+        # Keep the last message of each topic.
+        if self._newest:
             found = [*{(type(frame), frame.place): frame for frame in found}.values()]
         return b"".join(map(framed, found))
 
@@ -220,7 +221,8 @@ class TopicStream:
         for record in (newest,) if newest else () if self._newest else self._records(ring):
             if len(record.payload) == len(self._record.raw):
                 self._record.raw[:] = record.payload
-                number = ring.passed - 1  # the first record shows what was before the first cycle
+                # The first record shows the state before the first cycle.
+                number = ring.passed - 1
                 for place, pack in self._packers if number else ():
                     yield Sample(place, number, self._record.woken_ns, pack(self._record))
 
@@ -237,6 +239,6 @@ class TopicStream:
 
 
 def framed(frame: Frame) -> bytes:
-    """Return a frame of a stream behind its length."""
+    """Return an encoded frame, preceded by its length."""
     data = _encode(frame)
     return FRAME_LENGTH.pack(len(data)) + data

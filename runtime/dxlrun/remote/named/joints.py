@@ -1,4 +1,4 @@
-"""Joints of a running robot, as clients name them: groups, registers, and what their states are."""
+"""Joints: names of joints, groups and registers in requests, and the states of joints in replies."""
 
 from __future__ import annotations
 
@@ -24,13 +24,13 @@ from dxlwire.control_table import ControlTable, find_table
 from dxlwire.modes import Mode
 
 _LONGEST = 80
-"""Characters of a name in a refusal."""
+"""Upper limit of characters of a name in a refusal."""
 _MOST_NAMES = 5
-"""In a refusal."""
+"""Upper limit of names in a refusal."""
 
 
 def states_of(plan: Plan, record: CycleRecord, controllers: Mapping[str, int]) -> RobotStates:
-    """Return the states of a cycle; `controllers` with their places in its record."""
+    """Return the states of a cycle; `controllers` maps names to places in the cycle's record."""
     layout, states = record.layout, record.states
     row = np.frombuffer(record.raw, layout.dtype)[0]
     known = row.dtype.names or ()
@@ -60,7 +60,7 @@ def states_of(plan: Plan, record: CycleRecord, controllers: Mapping[str, int]) -
 
 
 def joint_row(plan: Plan, joint: str, others: Sequence[str] = ()) -> int:
-    """Return the row of a joint; raises RefusedRequest, whose hint may be one of `others`."""
+    """Return the row of a joint; raises RefusedRequest, with a hint from joints and `others`."""
     names = [one.name for one in plan.loop.joints]
     if joint not in names:
         hint = suggestion(joint[:_LONGEST], (*names, *others))
@@ -69,7 +69,7 @@ def joint_row(plan: Plan, joint: str, others: Sequence[str] = ()) -> int:
 
 
 def effort_units(plan: Plan) -> dict[str, str]:
-    """Return the unit in which each joint's servos measure effort; empty: the fraction of their maximum."""
+    """Return the effort unit of each joint's servos; empty: fraction of their maximum."""
     return {
         joint: servo.unit.effort_unit(find_table(servo.model, bus.protocol).effort_unit).replace("1", "")
         for joint, servos in plan.servos_by_joint.items()
@@ -83,7 +83,7 @@ def position_unit(plan: Plan, joint: str) -> str:
 
 
 def named_joints(plan: Plan, controllers: Iterable[ControllerPlan], names: Sequence[str]) -> tuple[str, ...]:
-    """Return the joints meant by names of joints, groups, controllers (their joints), or `all`; once each.
+    """Return the joints for names of joints, groups, controllers (their joints), or `all`, without repeats.
 
     Raises RefusedRequest.
     """
@@ -104,7 +104,7 @@ def named_joints(plan: Plan, controllers: Iterable[ControllerPlan], names: Seque
 
 
 def require_reboots(plan: Plan, joints: tuple[str, ...]) -> None:
-    """Raise RefusedRequest where a servo of these joints knows no reboot."""
+    """Raise RefusedRequest when a servo of these joints does not support the reboot instruction."""
     servos = plan.servos_by_joint
     cannot = [
         label
@@ -123,10 +123,13 @@ def require_reboots(plan: Plan, joints: tuple[str, ...]) -> None:
 
 
 def prepared_register(plan: Plan, name: str, item: str, value: int | str) -> Register:
-    """Return the data of the loop's command for a RAM item; raises RefusedRequest where it cannot be written.
+    """Return the loop's request to write a RAM item; raises RefusedRequest when it cannot be written.
 
-    `name`: of a joint, which means all its servos, or of one of them. `value`: the integer on the wire, or a
-    quantity with its unit.
+    Args:
+        plan: Plan of the run.
+        name: Name of a joint (all its servos), or of one servo.
+        item: Control table item.
+        value: Integer on the wire, or a quantity with its unit.
     """
     servo, table, fields = _servo(plan, name, item)
     try:
@@ -134,14 +137,15 @@ def prepared_register(plan: Plan, name: str, item: str, value: int | str) -> Reg
     except UnfitRegister as error:
         code = Code.INVALID_REGISTER if item in table.items else Code.UNKNOWN_REGISTER
         raise refused(code, fields | {"problem": str(error)}) from error
-    except ValueError as error:  # a quantity that is none
+    # The value is not a quantity.
+    except ValueError as error:
         problem = f"{item} of {name}: {error}"
         raise refused(Code.WRONG_QUANTITY, fields | {"problem": problem}) from error
     return Register(name, item, register.value, _row(plan, name, servo))
 
 
 def prepared_reading(plan: Plan, name: str, item: str) -> RegisterReading:
-    """Return the data of the loop's command for reading an item; raises RefusedRequest."""
+    """Return the loop's request to read an item; raises RefusedRequest."""
     servo, table, fields = _servo(plan, name, item)
     if item not in table.items:
         hint = suggestion(item[:_LONGEST], table.items, f"`dxlrun models {table.model}` lists them")
@@ -151,7 +155,7 @@ def prepared_reading(plan: Plan, name: str, item: str) -> RegisterReading:
 
 
 def read_register(plan: Plan, name: str, item: str, value: int | None) -> Mapping[str, object]:
-    """Return an item with its value as clients get it: the integer on the wire, and what it means."""
+    """Return an item as clients receive it: the integer on the wire, and the value with its unit."""
     _, table, _ = _servo(plan, name, item)
     entry = table.items[item]
     shown = "" if value is None else meaning(entry, value, table.errors)
@@ -162,15 +166,15 @@ def read_register(plan: Plan, name: str, item: str, value: int | None) -> Mappin
 
 
 def _row(plan: Plan, name: str, servo: ServoPlan) -> int | None:
-    """Return the row that a request has for one servo of several; None: it is for all servos of a joint."""
+    """Return the row of one servo of several in a request; None addresses all servos of a joint."""
     own = plan.mechanics.coupled and name == servo.own_name
     return len(plan.loop.joints) + servo.row if own else None
 
 
 def _servo(plan: Plan, name: str, item: str) -> tuple[ServoPlan, ControlTable, dict[str, Field]]:
-    """Return the servo that is named, or the first of a joint, its table, and the fields of a refusal.
+    """Return the named servo or the first servo of a joint, its control table, and fields for a refusal.
 
-    Raises RefusedRequest, also for a joint with servos of several models, whose registers differ.
+    Raises RefusedRequest, also for a joint whose servos have different models: their control tables differ.
     """
     fields: dict[str, Field] = {"joint": name[:_LONGEST], "item": item[:_LONGEST]}
     joints = plan.servos_by_joint

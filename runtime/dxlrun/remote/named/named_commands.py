@@ -1,10 +1,10 @@
-"""Commands by name: of some joints, or of a source; a controller's own command is made of them.
+"""Commands by name: values for some joints or for a source, converted into a controller's own command.
 
-Each command of the standard controllers has one number a joint and interface (`positions`, `velocities`,
-`efforts`, `pwm`), or is a trajectory. A trajectory that may be one of some `joints` names only these. In all
-other commands the joints that are not named get their newest goals, as the gateway reads them when the
-request arrives; what another client sends in the same few milliseconds may be replaced. Values for a source
-go to the controller that commands it now.
+A command of a standard controller has one number for each joint and interface (`positions`, `velocities`,
+`efforts`, `pwm`), or is a trajectory. A trajectory that accepts `joints` names only the given joints. In all
+other commands, the joints that are not named keep the newest goals that the gateway has when the request
+arrives. A command that another client sends within the same few milliseconds may be overwritten. Values for a
+source go to the controller that commands the source now.
 """
 
 from __future__ import annotations
@@ -25,16 +25,16 @@ from dxlrun.plan.loop_plan import ControllerPlan, JointPlan, SourcePlan
 from dxlrun.remote.preparation import Known, invalid, plain_quantities, refused, travel_s
 
 POINT_SPEED = 0.5
-"""rad/s of the joint that has the longest way, where a trajectory gets no time; or its limit, if lower."""
+"""rad/s; default speed of a trajectory without a time, or the joint's limit, if that is lower."""
 _SHORTEST_S = 0.1
 _FIELDS = {"position": "positions", "velocity": "velocities", "effort": "efforts", "pwm": "pwm"}
 INTERFACES = {**{name: name for name in _FIELDS}, **{field: name for name, field in _FIELDS.items()}}
-"""Singular and plural -> interface."""
+"""Singular and plural name -> interface."""
 
 
 @dataclass(frozen=True, slots=True)
 class JointCommand:
-    """A command of a controller, made of values for some of its joints."""
+    """A controller's command, made from values for some of its joints."""
 
     kind: str
     content: bytes
@@ -51,11 +51,20 @@ def joint_command(
     seconds: float | None,
     groups: Groups = NO_GROUPS,
 ) -> JointCommand | None:
-    """Return the command of a controller for joints by name; None where the body names no joints.
+    """Return a controller's command from values by joint name; None when the body does not name joints.
 
-    `kind` is an interface (`position` or `positions`), `body` JSON with a value for each joint, `record` the
-    newest cycle; a trajectory gets there in `seconds`. A group stands for those of its joints that are not
-    named beside it. Raises RefusedRequest.
+    Args:
+        known: The controller.
+        kind: Interface: `position` or `positions`.
+        body: JSON with a value for each joint or group. A value for a joint takes precedence over one for a
+            group that contains the joint.
+        record: The newest cycle.
+        units: The values are texts with units.
+        seconds: Duration of a trajectory, s; None uses POINT_SPEED.
+        groups: Names of groups of joints.
+
+    Raises:
+        RefusedRequest: The body names unknown joints, or its values are invalid.
     """
     plan, commands = known.plan, known.controller.Commands
     interface = INTERFACES.get(kind)
@@ -64,14 +73,16 @@ def joint_command(
     try:
         given = msgspec.json.decode(body)
     except (msgspec.MsgspecError, RecursionError):
-        return None  # refused as any other command
+        # Refused later, as any other malformed command.
+        return None
     named = given if isinstance(given, dict) and given else {}
     of_groups = {joint: named[name] for name in named if name in groups for joint in groups[name]}
     named = of_groups | {name: value for name, value in named.items() if name not in groups}
     strangers = [name for name in named if name not in plan.joints]
     if kind in commands and (strangers or not named):
         return None
-    if strangers and set(named) <= set(_FIELDS.values()):  # fields of a command, refused by its name
+    # Fields of a command: refused later, with the command's name.
+    if strangers and set(named) <= set(_FIELDS.values()):
         return None
     if not named:
         raise invalid(f"{kind} of {plan.name} names no joint; write for example {plan.joints[0]}=20deg")
@@ -90,7 +101,8 @@ def joint_command(
         return JointCommand(chosen, msgspec.json.encode({"points": [point], "start_in": 0.0} | named_too))
     if seconds is not None:
         raise invalid(f"{plan.name} takes no time, it goes there at once; leave it out")
-    still = "positions" not in fields_of  # a speed or an effort beside a position is the most there may be
+    # With a position, a velocity or an effort is an upper limit.
+    still = "positions" not in fields_of
     content = {
         each: _filled(known.joints, each, values if each == field else {}, record, still=still)
         for each in fields_of
@@ -104,7 +116,7 @@ def _numbers(
     """Return the values in SI units; raises RefusedRequest."""
     si = plain_quantities(named, field, known.joints) if units else named
     for joint, value in si.items():
-        # the largest integer of JSON may be beyond all floats
+        # An integer of JSON may exceed the range of float.
         if isinstance(value, bool) or not isinstance(value, int | float) or not -1e300 < value < 1e300:
             raise invalid(
                 f"{kind} of {known.plan.name}: {joint} is {str(value)[:40]!r}, but must be a finite number"
@@ -113,14 +125,15 @@ def _numbers(
 
 
 def _command_for(known: Known, interface: str) -> tuple[str, tuple[str, ...] | None]:
-    """Return the command by which an interface is commanded, with its fields; None: a trajectory."""
+    """Return the command for an interface with its fields; the fields of a trajectory are None."""
     field, commands = _FIELDS[interface], known.controller.Commands
     found: dict[str, tuple[str, ...]] = {}
     for kind, model in commands.items():
         fields = tuple(model.model_fields)
         if field in fields and set(fields) <= set(_FIELDS.values()):
             found[kind] = fields
-    if found:  # the one with the fewest fields: nothing else needs to be filled in
+    # Choose the command with the fewest fields, because the other fields need default values.
+    if found:
         kind = min(found, key=lambda one: len(found[one]))
         return kind, found[kind]
     if interface == "position" and TRAJECTORY in commands:
@@ -144,7 +157,7 @@ def _filled(
     *,
     still: bool = True,
 ) -> list[float]:
-    """Return one value a joint: the given ones, the newest goals for the others."""
+    """Return one value for each joint: the given value, or the newest goal."""
     return [
         values[joint.name] if joint.name in values else _present(joint, field, record, still=still)
         for joint in joints
@@ -152,8 +165,11 @@ def _filled(
 
 
 def _present(joint: JointPlan, field: str, record: CycleRecord, *, still: bool = True) -> float:
-    """Return what a joint is commanded now; where that is nothing, what keeps it as it is: its position, no
-    velocity and no effort, or unless it is to be `still`, the most of them."""
+    """Return a joint's present goal, or a default without a goal.
+
+    The default holds the joint: the present position, zero velocity, zero effort. With `still` False,
+    velocity and effort are upper limits, so their defaults allow motion.
+    """
     row = record.layout.joints.index(joint.name)
     goals, states = record.goals, record.states
     now, otherwise = {
@@ -171,7 +187,7 @@ def _present(joint: JointPlan, field: str, record: CycleRecord, *, still: bool =
 
 
 def _duration(joints: Sequence[JointPlan], positions: Sequence[float], record: CycleRecord) -> float:
-    """Return how long the way to these positions takes, s."""
+    """Return the duration of a movement to these positions, s."""
     ways = (
         travel_s(
             joint,
@@ -193,7 +209,7 @@ def source_command(
     active: Callable[[ControllerPlan], bool],
     takes: Callable[[ControllerPlan], Mapping[str, object]],
 ) -> tuple[str, bytes]:
-    """Return the controller that gets values for a source, and its command as JSON.
+    """Return the controller that receives values for a source, and its command as JSON.
 
     `body` is JSON with a value for each command, `{"led": 1}`, SI units. Raises RefusedRequest.
     """
@@ -233,7 +249,7 @@ def _commander(
     active: Callable[[ControllerPlan], bool],
     takes: Callable[[ControllerPlan], Mapping[str, object]],
 ) -> str:
-    """Return the active controller that takes values for a command of a source; raises RefusedRequest."""
+    """Return the active controller that accepts values for a command of a source; raises RefusedRequest."""
     claiming = [plan for plan in controllers if name in plan.source_commands]
     now = [plan for plan in claiming if active(plan)]
     if now and SOURCE_COMMANDS in takes(now[0]):

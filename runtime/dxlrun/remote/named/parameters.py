@@ -1,4 +1,4 @@
-"""Parameters of a controller in a run: all of them shown, live ones changed, checked whole by the model."""
+"""Parameters: a controller's parameters in a run, listed and changed; the model validates each change."""
 
 from __future__ import annotations
 
@@ -24,16 +24,16 @@ _BOUNDS = (("ge", "at least"), ("gt", "above"), ("le", "at most"), ("lt", "below
 
 @dataclass(frozen=True, slots=True)
 class Change:
-    """Live parameters with other values, ready for the loop."""
+    """A validated change of live parameters, prepared for the loop."""
 
     request: Parameters
     plan: ControllerPlan
-    """The controller's, with the new values."""
+    """The controller's plan with the new values."""
     shown: tuple[NewValue, ...]
 
 
 def parameters_of(model: BaseModel, prefix: str = "") -> Iterator[Parameter]:
-    """Return all parameters of a controller; those of nested models have dotted names."""
+    """Yield all parameters of a controller; parameters of nested models have dotted names."""
     live = frozenset(live_names(model))
     values = model.model_dump(mode="json")
     for name, field in type(model).model_fields.items():
@@ -55,7 +55,7 @@ def _range(field: FieldInfo) -> str:
 
 
 def changed(plan: ControllerPlan, now: ParametersModel, values: Mapping[str, Written]) -> Change:
-    """Return a change of live parameters, whose values are `now`; raises RefusedRequest with the reason."""
+    """Return a change of live parameters with the present values `now`; raises RefusedRequest."""
     if not values:
         raise invalid('nothing to change; write for example {"values": {"speed": "20 deg/s"}}')
     known = {parameter.name: parameter for parameter in parameters_of(now)}
@@ -77,7 +77,7 @@ def changed(plan: ControllerPlan, now: ParametersModel, values: Mapping[str, Wri
             raise invalid(problem + (f" ({'; '.join(ranges)})" if ranges else "")) from error
     before = {parameter.name: parameter.value for parameter in known.values()}
     after = {parameter.name: parameter.value for parameter in parameters_of(new)}
-    # one that a validator of the model derives from another changes with it
+    # A parameter that a validator derives from another one changes with it.
     differing = [name for name in live_names(new) if name in values or before[name] != after[name]]
     return Change(
         Parameters(plan.name, {name: _number(name, value_of(new, name)) for name in differing}),
@@ -99,7 +99,7 @@ def _require_live(controller: str, name: str, known: Mapping[str, Parameter]) ->
 
 
 def _put(written: dict[str, object], path: list[str], value: Written, now: object) -> None:
-    """Put a value into what the robot file has; what stands there in another form is written out."""
+    """Set a value in the parameters of the robot file; a nested model in short form is expanded first."""
     for key in path[:-1]:
         now = now[key] if isinstance(now, Mapping) else getattr(now, key)
         inner = written.get(key)
@@ -111,6 +111,7 @@ def _put(written: dict[str, object], path: list[str], value: Written, now: objec
 
 
 def _number(name: str, value: object) -> bool | int | float:
-    if not isinstance(value, bool | int | float):  # its plug-in may have marked anything
+    # A plug-in can mark a parameter of any type as live.
+    if not isinstance(value, bool | int | float):
         raise invalid(f"{name} = {value!r} is neither a number nor a bool, so it cannot change in a run")
     return value

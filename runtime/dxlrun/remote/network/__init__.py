@@ -1,4 +1,4 @@
 """Access from other computers: certificates, roles, one commander at a time, files of known robots.
 
-On the same computer a Unix socket is used, and nothing here.
+Access from the same computer uses a Unix socket and none of this package's network code.
 """

@@ -1,8 +1,8 @@
-"""Certificates: mutual TLS 1.3 between computers, by an authority of one's own.
+"""Certificates: mutual TLS 1.3 between computers, with the user's own certificate authority.
 
-Certificates and keys lie in `keys` of dxlrun's directory for settings: `ca.crt`, NAME.crt and NAME.key of
-each robot that runs here, client.crt and client.key of this user (`dxlrun keys` makes them). There is no way
-without: TLS checks the other end's certificate before any byte of a request is read.
+Certificates and keys are in `keys` of dxlrun's settings directory: `ca.crt`, NAME.crt and NAME.key of each
+robot that runs here, client.crt and client.key of this user (`dxlrun keys` makes them). Access without a
+certificate is impossible: TLS checks the other end's certificate before any byte of a request is read.
 """
 
 from __future__ import annotations
@@ -18,11 +18,11 @@ from typing import TypedDict
 from dxlrun.errors import InputError
 
 CLIENT = "client"
-"""Name of the files with the certificate and the key of a client."""
+"""File name of a client's certificate and key, without suffix."""
 
 
 class Certificate(TypedDict, total=False):
-    """The parts of `SSLSocket.getpeercert()` that count here."""
+    """The used fields of `SSLSocket.getpeercert()`."""
 
     subject: tuple[tuple[tuple[str, str], ...], ...]
     notAfter: str
@@ -40,16 +40,17 @@ def keys_place() -> Path:
 
 
 def server_context(name: str) -> ssl.SSLContext:
-    """Return TLS as a robot's gateway has it; raises InputError where its certificate would be refused."""
+    """Return the TLS context of a robot's gateway; raises InputError when clients would refuse it."""
     context = _context(ssl.PROTOCOL_TLS_SERVER, name, f"`dxlrun keys robot {name}` makes it")
-    context.num_tickets = 0  # no byte is sent that answers no request, and no session is resumed
+    # A ticket is sent unasked, and clients take any byte without a request for a closed connection.
+    context.num_tickets = 0
     _try(context, name)
     context.verify_mode = ssl.CERT_REQUIRED
     return context
 
 
 def client_context() -> ssl.SSLContext:
-    """Return TLS as a client has it; raises InputError."""
+    """Return the TLS context of a client; raises InputError."""
     made = "`dxlrun keys client NAME --output DIRECTORY` on the robot's computer makes it, to be copied here"
     return _context(ssl.PROTOCOL_TLS_CLIENT, CLIENT, made)
 
@@ -73,7 +74,7 @@ def _context(protocol: int, name: str, remedy: str) -> ssl.SSLContext:
 
 
 def _try(server: ssl.SSLContext, name: str) -> None:
-    """Shake hands with a robot's certificate as a client would; raises InputError where that refuses it."""
+    """Shake hands with a robot's certificate in memory; raises InputError when a client would refuse it."""
     trusting = ssl.SSLContext(ssl.PROTOCOL_TLS_CLIENT)
     trusting.load_verify_locations(keys_place() / "ca.crt")
     here, there = ssl.MemoryBIO(), ssl.MemoryBIO()
@@ -93,13 +94,13 @@ def _try(server: ssl.SSLContext, name: str) -> None:
 
 
 def counts(certificate: Certificate) -> bool:
-    """Return whether a certificate that TLS has checked counts still."""
+    """Return whether a certificate that TLS has verified is still valid: not expired, not revoked."""
     until = ssl.cert_time_to_seconds(certificate["notAfter"])
     return until > time.time() and certificate["serialNumber"] not in revoked()
 
 
 def revoked() -> frozenset[str]:
-    """Return the serial numbers of the file `revoked`, one a line, whose certificates robots here refuse."""
+    """Return the serial numbers of revoked certificates: one per line in the file `revoked`."""
     path = keys_place() / "revoked"
     try:
         found = path.stat()
@@ -110,5 +111,5 @@ def revoked() -> frozenset[str]:
 
 @lru_cache(maxsize=1)
 def _serials(path: Path, file: int, changed_ns: int) -> frozenset[str]:
-    """Return the numbers that a file has since it was written."""
+    """Return the serial numbers in a file; inode and modification time are the key of the cache."""
     return frozenset(path.read_text().upper().split())

@@ -1,4 +1,4 @@
-"""Commander: the one client that commands the robot, for as long as it goes on, and what a client may do."""
+"""Commander: the one client that may command the robot at a time, and the roles of clients."""
 
 from __future__ import annotations
 
@@ -11,25 +11,25 @@ from dxlrun.remote.preparation import refused
 from dxlrun.remote.requests.table import HALT, STOP, TAKE_OVER, Answer, Body, Request, Role
 
 LEASE_S = 5.0
-"""A client that sends no command for so long commands no longer; another may then."""
+"""A client that sends no command for this time is no longer the commander; another client may command."""
 HERE = "this computer"
-"""All clients on the robot's own computer together: they may command side by side."""
+"""Common commander name of all clients on the robot's own computer, which may command concurrently."""
 
 
 class Client(NamedTuple):
-    """The other end of a connection; where HTTP has host and port, so it comes along with each request."""
+    """Client of a connection. Takes the place of ASGI's (host, port), so every request carries it."""
 
     name: str
-    """`process N` of this computer, or `client NAME` with the name in a certificate."""
+    """`process N` on this computer, or `client NAME` with the name in a certificate."""
     role: Role
 
     @property
     def commands_as(self) -> str:
-        """Return as what it commands."""
+        """Name under which the client commands."""
         return HERE if self.name.startswith("process ") else self.name
 
     def require_role(self, request: Request[Body, Answer]) -> None:
-        """Raise RefusedRequest when its role does not allow a request."""
+        """Raise RefusedRequest when the client's role does not allow a request."""
         if self.role < request.role:
             needed, role = request.role.name.lower(), self.role.name.lower()
             raise refused(Code.NOT_ALLOWED, {"client": self.name, "role": role, "needed": needed})
@@ -37,15 +37,15 @@ class Client(NamedTuple):
 
 @dataclass(slots=True)
 class Commander:
-    """Lets one client command at a time; stop and halt are not its business, nor is what changes nothing."""
+    """Admission of one commanding client at a time; GET, halt, stop and take-over are always admitted."""
 
     now: Callable[[], float]
-    """Returns the time, s."""
+    """Clock, s."""
     name: str = HERE
     _until: float = field(default=-1.0, init=False)
 
     def admit(self, client: Client, request: Request[Body, Answer]) -> str | None:
-        """Return the client's predecessor when it begins to command with this request.
+        """Return the previous commander when this request changes the commander, else None.
 
         Raises RefusedRequest when another client commands.
         """
@@ -56,7 +56,7 @@ class Commander:
         return self.become(client)
 
     def become(self, client: Client) -> str | None:
-        """Make a client the commander, whether or not another one is; return that, None when it was."""
+        """Make a client the commander, whoever is; return the previous commander, None without a change."""
         before, self.name = self.name, client.commands_as
         self._until = self.now() + LEASE_S
         return before if before != self.name else None

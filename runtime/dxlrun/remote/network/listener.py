@@ -1,6 +1,6 @@
-"""Listener: a TCP port on which half-open connections cost neither memory nor files.
+"""Listener: a TCP port on which half-open connections occupy little memory and few file descriptors.
 
-Whatever connects is unproved until the server admits it: its certificate was checked, it has shown a token.
+A connection is unproved until the server admits it: TLS has checked its certificate, or it has sent a token.
 """
 
 from __future__ import annotations
@@ -23,12 +23,12 @@ from dxlrun.remote.sockets import Address
 
 LOOPBACK = "127.0.0.1"
 MOST_UNPROVED = 64
-"""Connections at once; one more ends the oldest of the computer that has most."""
+"""Upper limit of unproved connections; one more closes the oldest one of the host that has the most."""
 HANDSHAKE_S = 5.0
 
 
 class Listener(socket.socket):
-    """A listening TCP socket, of which a server of asyncio accepts connections."""
+    """Listening TCP socket for a server of asyncio."""
 
     def __init__(self, host: str, port: int, tls: ssl.SSLContext | None = None) -> None:
         """Raises OSError."""
@@ -44,42 +44,45 @@ class Listener(socket.socket):
             self.close()
             raise
         self.setblocking(False)
-        gc.freeze()  # so that a collection takes 0.1 ms
+        # Freeze the present objects, so that a garbage collection takes 0.1 ms.
+        gc.freeze()
 
     @classmethod
     def secured(cls, address: Address) -> Listener:
-        """Return where clients connect by mutual TLS; raises InputError and OSError."""
+        """Return a listener for clients with mutual TLS; raises InputError and OSError."""
         return cls(address.host, address.port, server_context(address.name))
 
     async def serve(self, make: Callable[[], asyncio.Protocol]) -> None:
-        """Make a protocol for each connection from now on, with TLS once its certificate was checked."""
+        """Serve connections from now on, each with a new protocol after the TLS handshake."""
         await asyncio.get_running_loop().create_server(
             make, sock=self, ssl=self.tls, ssl_handshake_timeout=HANDSHAKE_S, ssl_shutdown_timeout=HANDSHAKE_S
         )
 
     def accept(self) -> tuple[socket.socket, tuple[str, int]]:
-        """Take a connection, and end another one where there are too many."""
+        """Accept a connection, and close another unproved one above the limit."""
         end, peer = super().accept()
         self._accepted += 1
         if not self._accepted % MOST_UNPROVED:
-            gc.collect()  # asyncio leaves 256 kB of each TLS connection in a reference cycle
+            # asyncio leaves a reference cycle of 256 kB for each TLS connection.
+            gc.collect()
         if len(self._unproved) >= MOST_UNPROVED:
             self._unproved = {key: one for key, one in self._unproved.items() if one.fileno() >= 0}
         if len(self._unproved) >= MOST_UNPROVED:
             ((most, _),) = Counter(host for host, _ in self._unproved).most_common(1)
             oldest = next(one for one in self._unproved if one[0] == most)
-            with suppress(OSError):  # it is gone already
+            # The connection is already closed.
+            with suppress(OSError):
                 self._unproved.pop(oldest).shutdown(socket.SHUT_RDWR)
         self._unproved[peer[0], peer[1]] = end
         return end, peer
 
     def admit(self, peer: tuple[str, int]) -> None:
-        """Count a connection no longer, by the address of its other end (of IPv6 with more behind it)."""
+        """Remove a connection from the unproved ones, by its peer address (IPv6: with two more fields)."""
         self._unproved.pop((peer[0], peer[1]), None)
 
 
 def in_url(host: str) -> str:
-    """Return a host as a URL has it: an address of IPv6 in brackets."""
+    """Return a host as in a URL: IPv6 addresses in brackets."""
     return f"[{host}]" if ":" in host else host
 
 
@@ -88,11 +91,11 @@ class Place(NamedTuple):
 
     host: str = LOOPBACK
     port: int | None = None
-    """None: the usual one of the command, or if that is taken a free one."""
+    """None: the default port of the command, or a free port when that is in use."""
 
     @classmethod
     def parse(cls, text: str) -> Place:
-        """Return the place that `HOST:PORT`, `HOST` or `:PORT` means. Raises InputError."""
+        """Parse `HOST:PORT`, `HOST` or `:PORT`. Raises InputError."""
         found = re.fullmatch(
             r"(\[[^\]]+\]|[^:]*)(?::(\d{1,5}))?|([\da-fA-F]*:[\da-fA-F:]*:[\da-fA-F.]*)", text
         )
@@ -103,14 +106,14 @@ class Place(NamedTuple):
 
     @property
     def is_loopback(self) -> bool:
-        """True where only this computer reaches it."""
+        """True when only this computer can connect."""
         try:
             return ip_address(self.host).is_loopback
         except ValueError:
             return self.host == "localhost"
 
     def listener(self, usual: int, tls: ssl.SSLContext | None = None) -> Listener:
-        """Return a socket that listens here; without a port on the usual one. Raises InputError."""
+        """Return a socket that listens here, on port `usual` by default. Raises InputError."""
         port = usual if self.port is None else self.port
         try:
             return Listener(self.host, port, tls)

@@ -1,4 +1,4 @@
-"""Network link: a robot of another computer as a client reaches it, by HTTP on mutual TLS."""
+"""Network link: a client's connection to a robot of another computer, by HTTP over mutual TLS."""
 
 from __future__ import annotations
 
@@ -16,18 +16,20 @@ _CHUNK = 1 << 16
 
 
 class NetworkLink(SocketLink):
-    """A robot of another computer, by HTTP on TLS; streams come through a thread that decrypts them."""
+    """Connection to a robot of another computer. A thread decrypts each stream."""
 
     def __init__(self, address: Address, client: str) -> None:
-        """Raises InputError when there is no certificate to be shown."""
+        """Raises InputError when this user has no client certificate."""
         super().__init__(Path(), client)
         self._address, self._context = address, client_context()
 
     def exchange(self, method: str, path: str, body: bytes | None) -> tuple[int, bytes]:
-        """Ask once; return status and answer."""
+        """Send one request; return status and body of the reply."""
         try:
             return super().exchange(method, path, body)
-        except ConnectionResetError as error:  # TLS 1.3 tells a client so late, and asyncio not why
+        # In TLS 1.3, the server verifies the client's certificate after the client's handshake has ended, and
+        # asyncio does not send the reason.
+        except ConnectionResetError as error:
             raise ConnectionResetError(
                 f"{error}; the run may be at its end, or {keys_place() / CLIENT}.crt is expired, revoked "
                 "or of another authority"
@@ -45,7 +47,7 @@ class NetworkLink(SocketLink):
         return secured
 
     def stream(self, path: str) -> tuple[int, bytes, socket.socket]:
-        """Return status, first bytes, and a socket that gets what goes on."""
+        """Send a request with a streamed reply; return status, first bytes, and a socket for the rest."""
         status, first, end = super().stream(path)
         here, there = socket.socketpair()
         threading.Thread(target=_pass_on, args=(end, there), daemon=True).start()
@@ -53,7 +55,7 @@ class NetworkLink(SocketLink):
 
     @property
     def alive(self) -> bool:
-        """True while the other computer takes connections."""
+        """True while the other computer accepts connections."""
         try:
             socket.create_connection((self._address.host, self._address.port), _CONNECT_S).close()
         except OSError:
@@ -61,7 +63,7 @@ class NetworkLink(SocketLink):
         return True
 
     def ends(self) -> bool:
-        """Return whether the run has ended, or ends within a second: no connection is taken then."""
+        """Return whether the run ends within a second: its port then refuses connections."""
         for _ in range(20):
             if not self.alive:
                 return True
@@ -70,20 +72,21 @@ class NetworkLink(SocketLink):
 
 
 def _pass_on(end: socket.socket, to: socket.socket) -> None:
-    """Pass on what comes, until one of the two is closed."""
+    """Forward received bytes until one of the two sockets is closed."""
     with end, to, suppress(OSError):
         while data := end.recv(_CHUNK):
             to.sendall(data)
 
 
 def known_robots() -> dict[str, Address]:
-    """Return the robots of other computers that `robots.yaml` of the settings names.
+    """Return the robots of other computers in `robots.yaml` of the settings.
 
     Raises InputError with the place of each mistake.
     """
     path = settings() / "robots.yaml"
     if not path.is_file():
         return {}
-    from dxlrun.remote.network.robots_file import read_robots  # YAML: most clients ask for none
+    # Imported here because it imports YAML, which most clients do not need.
+    from dxlrun.remote.network.robots_file import read_robots
 
     return read_robots(path)

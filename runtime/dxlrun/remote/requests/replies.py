@@ -1,4 +1,4 @@
-"""Replies: what a running robot replies to a client, as JSON of these; gateway and client both go by them."""
+"""Replies: types of the JSON replies of a running robot, shared by gateway and client."""
 
 from __future__ import annotations
 
@@ -24,46 +24,47 @@ class ControllerInfo(msgspec.Struct, frozen=True):
     type: str
     active: bool
     held: bool
-    """Its joints are held because its stream ended."""
+    """True when the controller's joints are held because its stream ended."""
     rate: float
     """Hz"""
     joints: tuple[str, ...]
     command: tuple[str, ...]
-    """The interfaces that it commands of them."""
+    """Interfaces of the joints that the controller commands."""
     into: tuple[str, ...]
-    """Controllers that it commands."""
+    """Controllers that this controller commands."""
     fallback: str
     reference: tuple[str, ...]
-    """What those above it command of it."""
+    """References that controllers above this one command."""
     reads: tuple[str, ...]
     takes: dict[str, object]
     """JSON Schema of each command."""
     goals: tuple[str, ...]
-    """Those of its commands that are goals."""
+    """Commands that are goals."""
     motions: dict[str, float]
-    """Those that it plays by name, with their lengths, s."""
+    """Motions that the controller plays by name, with durations, s."""
 
 
 @dataclass(frozen=True)
 class RunInfo:
-    """A run, and the names that its robot file gives to joints and groups."""
+    """A run, with the joints and groups of its robot file."""
 
     robot: str
     rate: float
     """Hz"""
     paused: bool
     began: float | None
-    """s on the clock of the events: the first cycle, 0 s of the run's log; null: there was none yet."""
+    """Time of the first cycle on the clock of the events, s; 0 s of the run's log. null before the first
+    cycle."""
     cycles: int
     skipped: int
     joints: tuple[str, ...]
     groups: dict[str, tuple[str, ...]]
 
 
-# Dataclasses, as a Struct cannot have the fields of two bases; the fields are in the order of the JSON.
+# Dataclasses, because a Struct cannot have the fields of two bases; the fields are in the order of the JSON.
 @dataclass(frozen=True)
 class RobotInfo(JointValues, RunInfo):
-    """A run, its controllers and the commands that they take."""
+    """A run, its controllers and the commands that they accept."""
 
     controllers: tuple[ControllerInfo, ...]
     sources: tuple[object, ...]
@@ -74,7 +75,7 @@ class RobotInfo(JointValues, RunInfo):
 
 
 class Frames(msgspec.Struct, frozen=True):
-    """The URDF and what moves it: a client computes where frames lie by itself."""
+    """URDF and the plan of its moved frames, from which a client computes the poses of frames."""
 
     urdf: str | None
     frames: object
@@ -93,44 +94,45 @@ class EventRow(msgspec.Struct, frozen=True):
 
 
 class Events(msgspec.Struct, frozen=True):
-    """Events that are kept, and the newest's number."""
+    """Stored events, and the number of the newest event."""
 
     events: tuple[EventRow, ...]
     last: int
 
 
 class Executed(msgspec.Struct, Generic[AGoal], frozen=True, omit_defaults=True):
-    """The reply to a command that the robot executed."""
+    """Reply to a command that the robot executed."""
 
     cycle: int = -1
-    """The loop's cycle that did it; -1: not known."""
+    """Cycle of the loop that executed the command; -1: unknown."""
     goals: tuple[AGoal, ...] = ()
-    """The goals that the command began, or cancelled: their numbers, in the client RemoteGoals."""
+    """Goals that the command began or cancelled: numbers; in the client, RemoteGoals."""
     old: int | None = None
-    """What a register had before; None: it is no register, or not known."""
+    """Previous value of a register; None when unknown, or for any other command."""
     value: int | None = None
-    """What a register has now."""
+    """New value of a register."""
     below: tuple[str, ...] = ()
-    """Controllers that a switch activated too, because those above them were named."""
+    """Lower controllers that a switch activated in addition to the named ones."""
     joints: tuple[str, ...] = ()
-    """Those whose torque was switched, or whose servos were rebooted."""
+    """Joints whose torque was switched, or whose servos were rebooted."""
     deactivated: tuple[str, ...] = ()
-    """Controllers that torque or a reboot took the joints from."""
+    """Controllers that a torque or reboot request deactivated."""
     offered: tuple[str, ...] = ()
-    """Those of them, of this request and earlier ones, that are inactive and whose joints have torque now."""
+    """Controllers that this or an earlier torque or reboot request deactivated, and whose joints have
+    torque again."""
     seconds: float | None = None
-    """Until all parts of a motion have ended."""
+    """Duration until all parts of a motion have ended, s."""
     halted: Halted | None = None
-    """What was measured when a robot that was halted stood still."""
+    """Measurements of a halt, when all joints are at rest."""
 
     @property
     def goal(self) -> AGoal | None:
-        """The goal that the command is; None: it is none."""
+        """Goal that the command began; None when the command is not a goal."""
         return self.goals[0] if self.goals else None
 
 
 class Clamped(msgspec.Struct, frozen=True):
-    """The reply to a set-point: how many of its values are beyond their joints' limits, and whose."""
+    """Reply to a set-point: number and joints of the values beyond their joints' limits."""
 
     clamped: int
     clamped_joints: tuple[str, ...]
@@ -141,9 +143,9 @@ class Parameter(msgspec.Struct, frozen=True):
 
     name: str
     value: object
-    """As in the robot file; quantities with their units."""
+    """Value as in the robot file; quantities with their units."""
     live: bool
-    """True where it can be changed in a run."""
+    """True when the parameter can be changed in a run."""
     range: str = ""
     description: str = ""
 
@@ -163,7 +165,7 @@ class NewValue(msgspec.Struct, frozen=True):
 
 
 class Changed(msgspec.Struct, frozen=True):
-    """The reply to a change of live parameters."""
+    """Reply to a change of live parameters."""
 
     cycle: int
     changed: tuple[NewValue, ...]
@@ -176,42 +178,44 @@ class GoalState(msgspec.Struct, frozen=True):
     controller: str = ""
     kind: str = ""
     origin: str = ""
-    """The client that sent it, or the place in a motion file."""
+    """Client that sent the goal, or its place in a motion file."""
     status: str = "running"
-    """`running`, or how it ended: `reached`, `missed`, `aborted`, `cancelled`, `preempted`."""
+    """`running`, or the outcome: `reached`, `missed`, `aborted`, `cancelled`, `preempted`."""
     progress: float = 0.0
-    """0..1, as its controller reported it last."""
+    """0 to 1, as last reported by the controller."""
     error: float | None = None
-    """Largest distance from the desired state, at the end the worst joint's from the goal; SI units."""
+    """Largest distance from the desired state; after the end, the worst joint's distance from the goal. SI
+    units."""
     joint: str = ""
-    """The worst one at the end; empty: none was named."""
+    """Joint with the largest error at the end; empty when none was reported."""
     text: str = ""
-    """What the controller reported at the end."""
+    """Text of the controller's final report."""
     accepted: float = 0.0
     """s of the run's clock"""
     ended: float | None = None
-    """s of the run's clock; None while it runs."""
+    """Time of the end, s of the run's clock; None while the goal runs."""
 
     @property
     def seconds(self) -> float | None:
-        """From its beginning to its end; None while it runs."""
+        """Duration of the goal, s; None while it runs."""
         return None if self.ended is None else self.ended - self.accepted
 
     @property
     def reached(self) -> bool:
-        """True when it ended well."""
+        """True when the goal ended with `reached`."""
         return self.status == "reached"
 
     def describe(self) -> str:
         """Return how the goal ended: `goal 3 of left_arm reached after 1.02 s`."""
-        timed = self.seconds is None or self.text.startswith("after ")  # by its controller
+        # The controller's text already has the duration.
+        timed = self.seconds is None or self.text.startswith("after ")
         after = "" if timed else f" after {self.seconds:.2f} s"
         why = f"{' ' if timed and self.seconds is not None else ': '}{self.text}" if self.text else ""
         return f"goal {self.number} of {self.controller} {self.status}{after}{why}"
 
 
 class Goals(msgspec.Struct, frozen=True):
-    """The goals that run, and the last that ended."""
+    """Running goals, and the last ended goals."""
 
     running: tuple[GoalState, ...]
     ended: tuple[GoalState, ...]
@@ -223,30 +227,30 @@ class TopicState(msgspec.Struct, frozen=True):
     name: str
     """`/CONTROLLER/TOPIC`, `/goals`, `/events`, `/joint_states`."""
     type: str
-    """As ROS 2 writes it: `nav_msgs/msg/Odometry`."""
+    """Name of the type in ROS 2 format: `nav_msgs/msg/Odometry`."""
     joints: tuple[str, ...]
-    """Whose rows its arrays have; empty: of none."""
+    """Joints of the rows of its arrays; empty: the arrays have no rows of joints."""
     count: int
-    """Messages so far."""
+    """Number of messages so far."""
     rate: float | None
-    """Hz; None: not known yet."""
+    """Hz; None when unknown."""
 
 
 class Topics(msgspec.Struct, frozen=True):
-    """What there is to listen to."""
+    """Topics that a client can listen to."""
 
     topics: tuple[TopicState, ...]
 
 
 class Opened(msgspec.Struct, frozen=True, array_like=True, tag_field="frame", tag=0):
-    """What a topic of a stream is; before its first message, and again when another controller has it."""
+    """Description of a topic in a stream, sent before its first message and when its publisher changes."""
 
     place: int
-    """Of the topic in the stream, by which its messages name it."""
+    """Number of the topic in the stream, which its messages refer to."""
     name: str
     type: str
     definition: str
-    """The type's, as ROS 2 writes it (`ros2msg`)."""
+    """Definition of the type in ROS 2 format (`ros2msg`)."""
     joints: tuple[str, ...]
     epoch_offset_ns: int
     """Wall time minus the run's clock."""
@@ -257,25 +261,25 @@ class Sample(msgspec.Struct, frozen=True, array_like=True, tag_field="frame", ta
 
     place: int
     number: int
-    """Counted from 1 by the loop; numbers that do not come are missing."""
+    """Sequence number, counted from 1 by the loop; a gap in the numbers shows lost messages."""
     time_ns: int
-    """Of the run's clock."""
+    """Time of the message on the run's clock, ns."""
     data: bytes
     """CDR"""
 
 
 class RunEnded(msgspec.Struct, frozen=True, array_like=True, tag_field="frame", tag=2):
-    """The end of a stream whose run has ended in order."""
+    """End of a stream, sent when the run has ended normally."""
 
 
 Frame = Opened | Sample | RunEnded
-"""What a stream has, as MessagePack, each behind its length (uint32, little-endian); length 0: the gateway is
-alive."""
+"""Payload of a stream: MessagePack, each frame preceded by its length (uint32, little-endian). Length 0 is
+a sign of life without content."""
 FRAME_LENGTH = struct.Struct("<I")
 
 
 class NotDone(msgspec.Struct, frozen=True):
-    """The reply to what was refused: a sentence for a person; code and fields for a program."""
+    """Reply to a refused request: a sentence for a person; code and fields for a program."""
 
     refused: str = ""
     code: str = ""

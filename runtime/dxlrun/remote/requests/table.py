@@ -1,7 +1,7 @@
-"""Requests: all that clients may ask of a running robot, each with its path, its body and its answer.
+"""Requests: table of all requests of clients to a running robot, with path, body and reply.
 
-The gateway's routes, the client's methods and the description for other programs (`network/openapi.py`)
-follow from this table.
+The gateway's routes, the client's methods and the OpenAPI description (`network/openapi.py`) follow from this
+table.
 """
 
 from __future__ import annotations
@@ -32,7 +32,7 @@ from dxlrun.remote.requests.replies import (
 MOST_OPERATIONS = 200.0
 MOST_SET_POINTS = 4000.0
 MOST_LOOKS = 2000.0
-"""A second, of one process; a short burst may be as many at once as come in a tenth of it."""
+"""Rate limits of one process, requests per second; a burst may have up to a tenth of these at once."""
 _NAME = re.compile(r"\{\w+(?::path)?\}")
 
 Body = TypeVar("Body")
@@ -41,33 +41,35 @@ Answer = TypeVar("Answer")
 
 @unique
 class Role(IntEnum):
-    """What a client may request; each role may do what those before it may."""
+    """Permission of a client; each role includes the lower ones."""
 
     OBSERVE = 1
     COMMAND = 2
     ADMIN = 3
-    """Change registers, the loop's rate and its controllers; a client on the robot's own computer has it."""
+    """Change registers, the loop's rate and its controllers; clients on the robot's own computer have this
+    role."""
 
 
 class Request(msgspec.Struct, Generic[Body, Answer], frozen=True):
-    """A request that clients may make."""
+    """A kind of request."""
 
     method: str
     path: str
-    """Words in braces are names, with `:path` those that may have slashes."""
+    """Path with parameters in braces; `:path` marks parameters that may contain slashes."""
     body: type[Body]
-    """JSON of this; None: there is none; bytes: the gateway checks what it may be."""
+    """Type of the JSON body; NoneType: no body; bytes: the gateway's handler checks the content."""
     answer: type[Answer]
-    """JSON of this; bytes: anything else."""
+    """Type of the JSON reply; bytes: any content."""
     rate: float = MOST_OPERATIONS
-    """How many a second of one process, together with all others of this number; 0: it is always taken."""
+    """Rate limit of one process, requests per second, shared by all requests with the same number; 0: no
+    limit."""
     query: tuple[str, ...] = ()
-    """What may follow behind a question mark."""
+    """Names of query parameters."""
     role: Role = Role.COMMAND
-    """The least that a client needs; `network/commander.py` has what else."""
+    """Lowest role that may make the request; `network/commander.py` restricts commands further."""
 
     def target(self, *names: object) -> str:
-        """Return the path with these names, which cannot leave their places."""
+        """Return the path with quoted names; a slash in a name does not change the path's structure."""
         path = self.path
         for name in names:
             path = _NAME.sub(quote(str(name), safe=""), path, count=1)
@@ -75,7 +77,7 @@ class Request(msgspec.Struct, Generic[Body, Answer], frozen=True):
 
 
 class Value(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
-    """Body of a register's request: the integer on the wire, or a quantity with its unit."""
+    """Body of a request to write a register: the integer on the wire, or a quantity with its unit."""
 
     value: int | str
 
@@ -87,12 +89,12 @@ class NewValues(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
 
 
 class NewMotion(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
-    """Body of a motion that is to be played."""
+    """Body of a request to play a motion."""
 
     text: str
-    """Of the motion file."""
+    """Text of the motion file."""
     file: str = "motion"
-    """Its name, for the places of mistakes and the log."""
+    """Name of the motion file, for the places of mistakes and the log."""
     speed: float = 1.0
 
 
@@ -122,7 +124,7 @@ LOAD = Request("POST", "/controllers", Row, Done, role=Role.ADMIN)
 UNLOAD = Request("DELETE", "/controllers/{name}", NoneType, Done, role=Role.ADMIN)
 PLAY = Request("POST", "/play", NewMotion, Done)
 SWITCH = Request("POST", "/switch", Switch, Done)
-# paths, since servos that share joints have names such as hip/1
+# Paths, because servos that share joints have names such as hip/1.
 REGISTER = Request("POST", "/joints/{name:path}/registers/{item}", Value, Done, role=Role.ADMIN)
 READ_REGISTER = Request("GET", "/joints/{name:path}/registers/{item}", NoneType, Row)
 JOINT = Request("GET", "/joints/{name:path}", NoneType, Row, MOST_LOOKS, role=Role.OBSERVE)
@@ -137,7 +139,7 @@ TAKE_OVER = Request("POST", "/take-over", NoneType, Done)
 DESCRIPTION = Request("GET", "/openapi.json", NoneType, Row, MOST_LOOKS, role=Role.OBSERVE)
 
 REQUESTS = tuple(one for one in tuple(globals().values()) if isinstance(one, Request))
-"""All of them, in this order. Halt and stop are always taken, as far as there is room."""
+"""All requests. Halt and stop have no rate limit; the loop's mailbox may still be full."""
 
 EXAMPLES = {
     NewValues: '{"values": {"speed": "20 deg/s"}}',
@@ -149,4 +151,4 @@ EXAMPLES = {
     RebootRequest: '{"joints": ["elbow"]}',
     Rate: '{"rate": 100}',
 }
-"""Of each body, for what is refused."""
+"""Example of each body, for refusals."""
