@@ -89,16 +89,21 @@ def test_safe_stage_gets_plan_of_its_feature(calls: list[Any]) -> None:
     assert SafeEnd.of((NOTED,), {}).make_safe(started().hardware._lines) == ("1 lines, ",)
 
 
-def test_feature_that_fails_at_the_end_leaves_the_others_safe(tmp_path: Path, calls: list[Any]) -> None:
-    failing = tmp_path / "failing_feature"
+@pytest.mark.parametrize(
+    ("name", "call", "raised"),
+    [("failing", "plan[0]", "IndexError: index out of range"), ("exiting", "exit(3)", "SystemExit: 3")],
+)
+def test_feature_that_fails_at_the_end_leaves_the_others_safe(
+    name: str, call: str, raised: str, tmp_path: Path, calls: list[Any]
+) -> None:
+    failing = tmp_path / f"{name}_feature"
     failing.mkdir()
     (failing / "__init__.py").touch()
     (failing / "safe.py").write_text(
-        "from dxlrun.tooling.features import SafeStage\nSTAGE = SafeStage(lambda lines, plan: plan[0])\n"
+        f"from dxlrun.tooling.features import SafeStage\nSTAGE = SafeStage(lambda lines, plan: {call})\n"
     )
-    end = SafeEnd.of((Feature("failing", "failing_feature", "failing 1.0"), NOTED), {})
+    end = SafeEnd.of((Feature(name, f"{name}_feature", f"{name} 1.0"), NOTED), {})
     assert end.make_safe(started().hardware._lines) == (
-        "the section failing was not left safe (IndexError: index out of range); "
-        "report it to the author of failing 1.0",
+        f"the section {name} was not left safe ({raised}); report it to the author of {name} 1.0",
         "1 lines, ",
     )

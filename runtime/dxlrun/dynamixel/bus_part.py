@@ -166,7 +166,7 @@ class SafeEnd:
             try:
                 sentences += stage.make_safe(lines, plan)
             # Foreign code may raise anything; the other features must be made safe all the same.
-            except Exception as error:
+            except (Exception, SystemExit) as error:
                 author = (
                     f"; report it to the author of {feature.distribution}" if feature.distribution else ""
                 )
