@@ -1,8 +1,8 @@
 """Dynamixel servos on serial lines: control tables, packets, ports, and a cyclic exchange in C.
 
-It is a library and knows nothing of robots, logs or YAML. What a robot makes of servos belongs in
-`dxlrun.dynamixel`. `import dxlwire` is light: each name is imported when it is first used. The names are in
-`__init__.pyi` alone, a line each.
+The library does not know robots, logs or YAML. The mapping from servos to a robot belongs in
+`dxlrun.dynamixel`. `import dxlwire` is light: each name is imported on first use. The names are listed only
+in `__init__.pyi`, one per line.
 
 A control table has the address, size and unit of every item of a servo model:
 
@@ -11,7 +11,7 @@ A control table has the address, size and unit of every item of a servo model:
     >>> item.address, item.size, item.unit
     (116, 4, 'rad')
 
-A dialect builds the packets of a protocol and takes them apart:
+A dialect builds and parses the packets of a protocol:
 
     >>> from dxlwire import dialect_of
     >>> packets = dialect_of(2.0)

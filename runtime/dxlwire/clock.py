@@ -1,4 +1,4 @@
-"""The Clock seam: the same loop runs on the machine's monotonic time and on virtual time."""
+"""Clock protocol: the same loop runs on the machine's monotonic time and on virtual time."""
 
 from __future__ import annotations
 
@@ -10,22 +10,22 @@ from typing import Protocol
 
 
 class Clock(Protocol):
-    """Time as the loop, the hardware, the recorder and the bus see it; integers of nanoseconds."""
+    """Time source of the loop, the hardware, the recorder and the bus; integers of nanoseconds."""
 
     def now_ns(self) -> int:
-        """Return the time now, ns, from an arbitrary origin that never jumps."""
+        """Return the current time, ns. The origin is arbitrary and never jumps."""
         ...
 
     def wait_until(self, deadline_ns: int) -> int:
-        """Wait until `deadline_ns` and return the time after the wake-up, ns; never returns early."""
+        """Wait until `deadline_ns` and return the time after the wake-up, ns. Never returns early."""
         ...
 
 
 class MonotonicClock:
     """CLOCK_MONOTONIC: sleeps until shortly before the deadline, then polls the clock.
 
-    `spin_ns` is the margin that is polled away. A sleep alone wakes some 50-100 us late on a stock Linux;
-    polling the last of it costs `spin_ns / period` of one core.
+    A sleep alone wakes some 50-100 us late on a stock Linux. Polling for the last `spin_ns` avoids that and
+    costs `spin_ns / period` of one core.
     """
 
     __slots__ = ("spin_ns",)
@@ -34,7 +34,8 @@ class MonotonicClock:
         self.spin_ns = spin_ns
 
     now_ns = staticmethod(time.monotonic_ns)
-    """Return CLOCK_MONOTONIC, ns; the function itself, since the loop asks some hundred times a cycle."""
+    """Return CLOCK_MONOTONIC, ns. This is the function itself, because the loop calls it some hundred times a
+    cycle."""
 
     def wait_until(self, deadline_ns: int) -> int:
         """Sleep until `spin_ns` before the deadline, then poll; return the time after the wake-up, ns."""
@@ -48,7 +49,7 @@ class MonotonicClock:
 
 
 class VirtualClock:
-    """Time that passes only by waiting; two runs from one seed have the same times."""
+    """Clock that advances only in waits; two runs from one seed have the same times."""
 
     __slots__ = ("_calls", "_now_ns", "_order")
 
@@ -62,7 +63,7 @@ class VirtualClock:
         return self._now_ns
 
     def wait_until(self, deadline_ns: int) -> int:
-        """Jump to the deadline if it lies ahead; return virtual time, ns."""
+        """Advance to the deadline if it is in the future; return virtual time, ns."""
         while self._calls and self._calls[0][0] <= deadline_ns:
             due_ns, _, action = heapq.heappop(self._calls)
             self._now_ns = max(self._now_ns, due_ns)
@@ -71,5 +72,5 @@ class VirtualClock:
         return self._now_ns
 
     def call_at(self, t_ns: int, action: Callable[[], None]) -> None:
-        """Call something when that time comes, in the middle of whatever wait; it must not wait itself."""
+        """Schedule a call at a time, even in the middle of a wait. The action itself must not wait."""
         heapq.heappush(self._calls, (t_ns, next(self._order), action))

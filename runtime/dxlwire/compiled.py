@@ -1,4 +1,4 @@
-"""Loading of compiled C sources: shared objects, their structs as ctypes has them, and memory for them."""
+"""Loading of compiled C sources: shared objects, their structs for ctypes, and memory for them."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ from zlib import crc32
 
 from dxlwire.errors import NotCompiled
 
-_HINT = "install dxlrun again"  # the distribution that has dxlwire
+_HINT = "install dxlrun again"  # The distribution that contains dxlwire
 Library = TypeVar("Library", bound=ctypes.CDLL)
 
 
@@ -20,7 +20,7 @@ def load_compiled(source: Path, kind: type[Library], path: Path | None = None) -
     """Load the shared object that the build compiled from a C source.
 
     Args:
-        source: The C file. It defines `dxl_source`, which returns the checksum of what was compiled.
+        source: The C file. It defines `dxl_source`, which returns the checksum of the compiled source.
         kind: Type of the library, such as `ctypes.CDLL`.
         path: The shared object; None: the file next to the source.
 
@@ -40,9 +40,10 @@ def load_compiled(source: Path, kind: type[Library], path: Path | None = None) -
 
 
 def parse_structs(source: str) -> Mapping[str, type[ctypes.Structure]]:
-    """Return the structs that a C source defines, by name; a pointer is an address.
+    """Return the structs that a C source defines, by name. Pointers become addresses (`c_void_p`).
 
-    Their fields are numbers of fixed size, pointers to anything, structs above, and arrays of these.
+    Supported fields are numbers of fixed size, pointers, structs defined earlier in the source, and arrays of
+    these.
     """
     text = re.sub(r"/\*.*?\*/", "", source, flags=re.DOTALL)
     sizes = dict(re.findall(r"#define (\w+) (\d+)", text))
@@ -66,5 +67,5 @@ def parse_structs(source: str) -> Mapping[str, type[ctypes.Structure]]:
 
 
 def array_of(memory: memoryview) -> ctypes.Array[ctypes.c_char]:
-    """Return writable memory as an argument of compiled functions; the memory lives as long as this array."""
+    """Return writable memory as an argument of compiled functions. The array keeps the memory alive."""
     return (ctypes.c_char * len(memory)).from_buffer(memory)

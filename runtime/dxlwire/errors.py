@@ -1,4 +1,4 @@
-"""The root of all exceptions, the errors of files and of serial lines, and words that their messages share.
+"""Exception hierarchy, including the errors of files and serial lines, and helpers for messages.
 
 ```
 Exception
@@ -19,7 +19,7 @@ from typing import Literal
 
 @dataclass(frozen=True, slots=True, order=True)
 class Mark:
-    """A place in a file that a person can jump to; line and column count from 1."""
+    """Position in a file, in the form that editors can jump to; line and column count from 1."""
 
     file: str
     line: int = 1
@@ -31,7 +31,7 @@ class Mark:
 
 @dataclass(frozen=True, slots=True)
 class Problem:
-    """One thing that is wrong with an input: where, what, and how to fix it."""
+    """One problem of an input, with its position and fix."""
 
     mark: Mark
     what: str
@@ -44,7 +44,7 @@ class Problem:
 
 
 class DxlError(Exception):
-    """Base of every error that is raised on purpose, here and in the packages that build on dxlwire.
+    """Base class of every error that is raised on purpose, here and in the packages that build on dxlwire.
 
     A command line exits with `exit_code`.
     """
@@ -53,12 +53,12 @@ class DxlError(Exception):
 
     @property
     def sentences(self) -> tuple[str, ...]:
-        """The message, line by line, and the notes that were added to it."""
+        """Lines of the message, followed by the notes that were added to the exception."""
         return (*str(self).splitlines(), *getattr(self, "__notes__", ()))
 
 
 class InputError(DxlError, ValueError):
-    """A file or an argument is wrong; `problems` has all that were found, in file order."""
+    """A file or an argument is wrong. `problems` contains all problems in file order."""
 
     exit_code = 2
 
@@ -79,16 +79,16 @@ class PortError(DxlError, OSError):
 _WORD = re.compile(r"[A-Z]?[a-z]+|[A-Z]+(?![a-z])|[0-9]+")
 _SIDES = {"l": "left", "r": "right", "f": "front", "back": "rear", "hind": "rear", "top": "upper"}
 _SIDES |= {side: side for side in ("left", "right", "front", "rear", "upper", "lower", "inner", "outer")}
-"""Words that tell one limb from another, as numbers do."""
+"""Words that distinguish one limb from another, as numbers do."""
 _MOST_NEAR = 3
-"""Names that are equally near; more are no help."""
+"""Limit of equally near names; a longer list does not help."""
 
 
 def near(name: str, known: Iterable[str]) -> tuple[str, ...]:
-    """Return the known names that are a slip away: of two letters at most, or with the same words.
+    """Return the known names that are probably meant: at most two letters differ, or the words are the same.
 
-    The same words are those in another order, or with one more or less beside two that are the same. A name
-    of another side or with another number is never meant: it is another limb.
+    The words may be in another order, and one name may have an extra word next to at least two equal ones. A
+    name of another side or with another number is never suggested, because it belongs to another limb.
     """
     wanted = _folded(name)
     most = 0 if len(wanted) < 3 else 1 if len(wanted) < 5 else 2
@@ -112,7 +112,7 @@ def _words(name: str) -> list[str]:
 
 
 def _alike(words: list[str], others: list[str]) -> bool:
-    """Return whether they are the same in another order, or one has one word more than the other's two."""
+    """Return True if two or more words agree, in any order, and at most one more is left over."""
     few, many = sorted((sorted(words), sorted(others)), key=len)
     left = list(many)
     for word in few:
@@ -122,14 +122,14 @@ def _alike(words: list[str], others: list[str]) -> bool:
 
 
 def _other_limb(words: list[str], others: list[str]) -> bool:
-    """Return whether both have words of a side, or both have numbers, and not the same ones."""
+    """Return True if both have words of a side, or both have numbers, and these differ."""
     sides = [sorted(_SIDES[word] for word in each if word in _SIDES) for each in (words, others)]
     numbers = [sorted("".join(filter(str.isdigit, each))) for each in (words, others)]
     return any(all(each) and each[0] != each[1] for each in (sides, numbers))
 
 
 def _edits(one: str, other: str, most: int) -> int:
-    """Return how many letters are added, left out, changed or swapped with the next; or more than `most`."""
+    """Return the edit distance (insert, delete, replace, swap neighbors), or a number above `most`."""
     if abs(len(one) - len(other)) > most:
         return most + 1
     before: list[int] = []
@@ -145,7 +145,7 @@ def _edits(one: str, other: str, most: int) -> int:
 
 
 def suggestion(name: str, known: Iterable[str], otherwise: str = "") -> str:
-    """Return how to fix an unknown name: a near one, `otherwise`, or all that there are."""
+    """Return a fix for an unknown name: a near name, `otherwise`, or the list of known names."""
     known = sorted(set(known))
     if meant := near(name, known):
         return f"did you mean {' or '.join(meant)}?"
@@ -153,5 +153,5 @@ def suggestion(name: str, known: Iterable[str], otherwise: str = "") -> str:
 
 
 def counted(number: int, one: str, many: str) -> str:
-    """Return `1 period`, `2 periods`: one form for exactly one, the other for all else, zero included."""
+    """Return `1 period`, `2 periods`: the singular for exactly one, the plural otherwise, including zero."""
     return f"{number} {one if number == 1 else many}"

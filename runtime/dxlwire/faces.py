@@ -1,25 +1,25 @@
-"""Faces: modules that offer names of other modules and import each of them when it is first used."""
+"""Lazy modules: they offer names of other modules and import each one on first use."""
 
 from __future__ import annotations
 
 import sys
 from importlib import import_module
 
-TYPE_CHECKING = False  # typing, collections and functools take longer to import than a face
+TYPE_CHECKING = False  # Importing typing, collections and functools takes longer than the face itself
 if TYPE_CHECKING:
     from collections.abc import Callable
 
 
 def lazy_face(module: str, source: str) -> tuple[Callable[[str], object], Callable[[], list[str]]]:
-    """Return `__getattr__` and `__dir__` of a face; its `__all__` is an attribute, too.
+    """Return `__getattr__` and `__dir__` of a lazy module; `__all__` is an attribute, too.
 
-    Type checkers read the same lines as this function, so each name stands in one place. They are read when
-    the first name is used: most processes import a face on the way to a module below it.
+    Type checkers read the same stub file, so each name is listed only once. The file is read on first use of
+    a name, because most processes import the module only on the way to a submodule.
 
     Args:
-        module: Name of the face.
-        source: File with a line `from MODULE import NAME as NAME` for each name that the face offers;
-            a name may be that of a module.
+        module: Name of the lazy module.
+        source: File with a line `from MODULE import NAME as NAME` for each name of the module; a name may
+            be that of a module.
     """
 
     homes: dict[str, str] = {}
@@ -37,7 +37,7 @@ def lazy_face(module: str, source: str) -> tuple[Callable[[str], object], Callab
         if name not in read_homes():
             raise AttributeError(f"module {module!r} has no attribute {name!r}")
         home = import_module(homes[name])
-        # a name that its home has not loaded yet is a module in it
+        # A missing attribute is a submodule that its package has not loaded yet.
         value: object = getattr(home, name) if hasattr(home, name) else import_module(f"{homes[name]}.{name}")
         setattr(sys.modules[module], name, value)
         return value

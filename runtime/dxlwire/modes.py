@@ -1,6 +1,6 @@
-"""Modes: the command interfaces of a joint, which of them go together, and what a servo then does.
+"""Modes: the command interfaces of a joint, their valid combinations, and the servo modes for them.
 
-Without numpy: the guardian reads a bus' plan and is light.
+No numpy here: the guardian reads the plan of a bus and must stay small.
 """
 
 from __future__ import annotations
@@ -12,21 +12,21 @@ from typing import Literal
 CommandName = Literal["position", "velocity", "effort", "pwm"]
 
 EffortUnit = Literal["Nm", "A", "1"]
-"""Of an effort, as in the control tables; `1`: the fraction of the maximum."""
+"""Unit of an effort, as in the control tables; `1`: the fraction of the maximum."""
 
 COMMAND_INTERFACES: tuple[CommandName, ...] = ("position", "velocity", "effort", "pwm")
 
 
 @unique
 class Mode(IntEnum):
-    """What a servo does with its goals; the number is in the log."""
+    """Control mode of a servo; the number is in the log."""
 
-    UNKNOWN = 0  # Not known, or changing now: the joint gets no goals
-    POSITION = 1  # Goes to a position, as fast as it can or at a speed; of a continuous joint over many turns
-    VELOCITY = 2  # Turns at a speed, for ever
-    EFFORT = 3  # Exerts a torque, or draws a current
-    PWM = 4  # Gets a fraction of the full voltage
-    EFFORT_POSITION = 5  # Goes to a position with no more effort than is commanded
+    UNKNOWN = 0  # Unknown or changing: the joint gets no goals
+    POSITION = 1  # Moves to a position, at full speed or at a given one; counts turns for a continuous joint
+    VELOCITY = 2  # Rotates continuously at a speed
+    EFFORT = 3  # Applies a torque or a current
+    PWM = 4  # Applies a fraction of the full voltage
+    EFFORT_POSITION = 5  # Moves to a position with limited effort
 
 
 _MODES: dict[frozenset[str], Mode] = {
@@ -41,9 +41,10 @@ _MODES: dict[frozenset[str], Mode] = {
 
 
 def mode_of(names: Collection[str]) -> Mode:
-    """Return the mode in which a joint follows these command interfaces together.
+    """Return the mode for a combination of command interfaces.
 
-    Raises ValueError for interfaces that no mode has together, and for none.
+    Raises:
+        ValueError: No mode has this combination, or it is empty.
     """
     mode = _MODES.get(frozenset(names))
     if mode is None:

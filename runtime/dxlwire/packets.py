@@ -1,4 +1,4 @@
-"""Packets on a bus: their kinds, the record in which the exchange kernel writes them, and who takes them."""
+"""Packets on a bus: their kinds, the record format of the exchange kernel, and their receivers."""
 
 from __future__ import annotations
 
@@ -9,61 +9,63 @@ from enum import IntEnum, unique
 Bytes = bytes | bytearray | memoryview
 
 RECORD = struct.Struct("<BBBxI qq")
-"""Header in front of a packet: bus, kind, servo ID, length, time of the first and of the last byte in ns."""
-RECORD_HEADER = RECORD.size  # bytes; the two times are the last 16 of them
+"""Header before a packet: bus, kind, servo ID, length, time of the first and of the last byte in ns."""
+RECORD_HEADER = RECORD.size  # Bytes; the last 16 are the two times
 
 
 @unique
 class PacketKind(IntEnum):
-    """What a run of bytes was; the number is in the log."""
+    """Kind of a sequence of bytes; the number is in the log."""
 
     INSTRUCTION = 1
     STATUS = 2
-    """Of a fast form that was cut off or spoilt: its intact parts."""
+    """A status packet. For a truncated or corrupted fast form only its intact entries."""
     NOISE = 3
     """Bytes from the line that belong to no intact packet."""
     LATE = 4
-    """An intact status that came after it was given up; nothing was taken from it."""
+    """An intact status that arrived after its timeout and was not used."""
     OTHER_HOST = 5
-    """An intact packet that no servo sends: an instruction of another host on the line."""
+    """An intact packet that servos do not send: an instruction of another host on the line."""
     ECHO = 6
-    """An instruction of this host, given back by the adapter."""
+    """An instruction of this host, echoed by the adapter."""
 
 
 @dataclass(frozen=True, slots=True)
 class Desk:
-    """Memory of a batch that is not committed yet."""
+    """Memory of a log batch that is not committed yet."""
 
     records: memoryview
-    """The records, one behind the other."""
+    """Buffer with the records, one after the other."""
     used: memoryview
-    """One 64-bit word: how many of these bytes are used."""
+    """One 64-bit word: number of used bytes in the buffer."""
 
 
 class PacketSink:
-    """Takes packets; never blocks, never raises. This one forgets them."""
+    """Receiver of packets; never blocks, never raises. This base class discards them."""
 
     __slots__ = ()
 
     def packet(  # noqa: PLR0917  called for every packet in the loop: positional is quickest
         self, bus: int, kind: PacketKind, servo_id: int, first_ns: int, last_ns: int, data: Bytes
     ) -> None:
-        """Record bytes that were sent or received; `data` is copied before the call returns."""
+        """Record sent or received bytes; `data` is copied before the call returns."""
 
 
 class PacketLog(PacketSink):
-    """Takes packets of the cyclic exchange, too. This one forgets them: a run without a log."""
+    """Receiver that also gets the packets of the cyclic exchange. This base class discards them: a run
+    without log.
+    """
 
     __slots__ = ()
 
     @property
     def desk(self) -> Desk | None:
-        """Where the exchange kernel appends records by itself; None: what it exchanges is not recorded."""
+        """Memory for records of the exchange kernel; None: its packets are not recorded."""
         return None
 
     def wake(self, cycle: int) -> None:
-        """Note that a cycle begins: what follows is of its period."""
+        """Begin a cycle: later packets belong to its period."""
 
     def commit(self) -> object:
-        """Hand on what was collected."""
+        """Commit the collected packets."""
         return None

@@ -1,7 +1,6 @@
-"""Deviations: settings that another program left in a servo, judged by what they do.
+"""Deviations: settings that another program left in a servo, judged by their effect.
 
-`tables/deviations.toml` has the judgement of every item that can be written; the file of a model may have
-another one.
+`tables/deviations.toml` has the judgement of every writable item. The data file of a model may override it.
 """
 
 from __future__ import annotations
@@ -16,56 +15,57 @@ from typing import Literal
 import msgspec
 
 Judgement = Literal["refuse", "report", "harmless"]
-"""`refuse`: the servo gets no torque; `report`: an event at the start; `harmless`: nothing."""
+"""`refuse`: the servo gets no torque; `report`: an event at start-up; `harmless`: no action."""
 
 _NUMBER = re.compile(r"_\d+$")
 
 
 class Deviation(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
-    """Judgement of the values of an item that are not the factory's; see `deviations.toml`."""
+    """Judgement of values that differ from the factory's; see `deviations.toml`."""
 
     judgement: Judgement
     effect: str
-    """What such a value does: a verb with its object; of a harmless one, why it does nothing."""
-    bits: tuple[tuple[int, str], ...] = ()  # Each bit and what it does
-    refused: tuple[int, ...] = ()  # Values that are refused, whatever the judgement of the others
-    refused_effect: str = ""  # What these do; empty: `effect`
-    equivalent: tuple[int, ...] = ()  # Values that do the same as the factory's
+    """Effect of a deviating value: a verb with its object. For a harmless value the reason why it has no
+    effect."""
+    bits: tuple[tuple[int, str], ...] = ()  # Each bit with its effect
+    refused: tuple[int, ...] = ()  # Values that are always refused, whatever the judgement of the others
+    refused_effect: str = ""  # Effect of the refused values; empty: `effect`
+    equivalent: tuple[int, ...] = ()  # Values with the same effect as the factory's
     planned: bool = False
-    """True where the value is compared with the plan of a run instead of with the factory's."""
+    """True if the value is compared with the plan of a run instead of the factory value."""
     limited_by: str = ""
-    """Item that bounds this one, and with whose value it begins where it has no initial value."""
+    """Item that bounds this one, and that supplies its value at power-up if it lacks an initial value."""
     remedy: str = "declare what the robot needs in `registers`, or write it by `dxlrun servo`"
 
     @property
     def may_refuse(self) -> bool:
-        """True where there is a value with which a servo gets no torque."""
+        """True if some value of the item keeps a servo from getting torque."""
         return self.judgement == "refuse" or bool(self.refused)
 
     def judge(self, value: int, factory: int) -> Judgement:
-        """Return what a value means, both as integers on the wire."""
+        """Return the judgement of a value; both arguments are integers on the wire."""
         if value in self.refused:
             return "refuse"
         return "harmless" if value == factory or value in self.equivalent else self.judgement
 
     def effect_of(self, value: int) -> str:
-        """Return what a value does: a verb with its object."""
+        """Return the effect of a value: a verb with its object."""
         effect = self.refused_effect if value in self.refused and self.refused_effect else self.effect
         bits = " and ".join(words for bit, words in self.bits if value & bit) or "has no known meaning"
         return effect.replace("{value}", str(value)).replace("{bits}", bits)
 
 
 UNDESCRIBED = Deviation("report", "has an effect that its control table does not describe")
-"""Judgement of an item of a plug-in's model, where neither its own file nor `deviations.toml` has one."""
+"""Judgement of an item of a plug-in's model that neither its own file nor `deviations.toml` judges."""
 
 
 def deviation_of(name: str) -> Deviation:
-    """Return the judgement that items of a name have in all models."""
+    """Return the judgement of an item name, the same for all models."""
     return deviations_by_name().get(_NUMBER.sub("", name), UNDESCRIBED)
 
 
 @functools.cache
 def deviations_by_name() -> Mapping[str, Deviation]:
-    """Return the judgements of `deviations.toml`, by the name of an item without its number."""
+    """Return the judgements of `deviations.toml`, by item name without its number."""
     text = (Path(__file__).parent / "tables" / "deviations.toml").read_text("utf-8")
     return msgspec.convert(tomllib.loads(text), dict[str, Deviation])

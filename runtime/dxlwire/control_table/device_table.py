@@ -1,13 +1,17 @@
-"""Control tables of devices: what is on a servo bus and is no servo, such as an IMU or a power board.
+"""Control tables of devices: units on a servo bus that are not servos, such as an IMU or a power board.
 
-A data file of ours or of a plug-in describes one model, in the form of servo models (see AX-12A.toml) with
-`kind = "device"`, and for each item, where they apply: `encoding` may be float32, `offset` (with its unit) is
-added to what the ticks mean, `state` is the name of the state that the item makes (that of the item without
-it), `bit` is the bit of the place that the item is (a button; other items have the others), and `safe` is the
-integer that is written to the item at the end of a run. `cyclic` lists the items that are read each cycle
-where a robot file names none, and `units` the units of the file that are not in the list of all tables. Model
-number, firmware version and ID stand where servos have them, unless the file says otherwise. Without a
-`model_number` the device's own is not checked.
+A data file, shipped or from a plug-in, describes one model. It has the form of servo models (see AX-12A.toml)
+with `kind = "device"`. `cyclic` lists the items that are read in each cycle if a robot file names none.
+`units` lists additional units. Model number, firmware version and ID have the addresses of servos, unless the
+file says otherwise. Without a `model_number` the number of the device is not checked.
+
+Additional keys of an item:
+
+- `encoding` may be float32.
+- `offset` (with its unit) is added to ticks * scale.
+- `state` is the name of the item's state (default: the name of the item).
+- `bit` is the index of a single bit, such as a button; other items have the other bits.
+- `safe` is the integer that is written to the item at the end of a run.
 """
 
 from __future__ import annotations
@@ -33,7 +37,8 @@ from dxlwire.control_table.table import CAPABILITIES as SERVO_CAPABILITIES
 from dxlwire.control_table.table import ControlItem, Table
 
 WAITS = "waits_in_chain"
-"""Read alone: in a chain behind a servo that is missing such a board would never come back (protocol.md)."""
+"""Capability of a board that must be read alone: in a chain after a missing servo it would never answer again
+(protocol.md)."""
 CAPABILITIES: Mapping[str, str] = {
     **{
         name: SERVO_CAPABILITIES[name]
@@ -42,10 +47,10 @@ CAPABILITIES: Mapping[str, str] = {
     "broadcast_ping": "a reply to a ping to all IDs",
     WAITS: "in a sync or bulk read it waits for the status ahead of its own, and obeys nothing meanwhile",
 }
-"""What a device can do beside ping, read and write, in the words of a data file."""
+"""Capabilities of devices in data files, in addition to ping, read and write."""
 _SIZES = (1, 2, 4)
 _HIGHEST_ADDRESS = 0xFFFF - 4
-_MODEL_NUMBER = (0, 2)  # Address and size where a model number is read before the model is known
+_MODEL_NUMBER = (0, 2)  # Address and size from which a model number is read before the model is known
 _IDENTITY: Mapping[float, Mapping[str, Entry]] = {
     protocol: {
         "model_number": {"address": 0, "size": 2, "area": "EEPROM", "page": "Model Number (0)"},
@@ -62,38 +67,41 @@ _IDENTITY: Mapping[float, Mapping[str, Entry]] = {
     for protocol, firmware, servo_id, highest in ((1.0, 2, 3, 253), (2.0, 6, 7, 252))
 }
 STATE_NAME = re.compile(r"[A-Za-z][A-Za-z0-9_]*(\.[A-Za-z0-9_]+)*", re.ASCII)
-"""Of a state: `angular_velocity.x`."""
+"""Pattern of state names, such as `angular_velocity.x`."""
 
 
 _KEYS = {*ControlItem.__struct_fields__, "tick"} - {"name", "unit", "scale", "firmware", "deviation"}
 
 
 class DeviceTable(Table, frozen=True, kw_only=True):
-    """The control items of one model of devices."""
+    """Control items of one device model."""
 
     model_number: int | None
-    """None: it answers any, or one that says nothing, so it is not checked, and no scan knows it."""
-    cyclic: tuple[str, ...]  # Items that are read each cycle where the robot file names none
+    """Model number; None if the device reports any number or none. It is then not checked, and a scan cannot
+    identify it."""
+    cyclic: tuple[str, ...]  # Items that are read in each cycle if the robot file names none
     fast_sync_read_firmware: int | None = None
-    """First firmware version with the fast forms; None where the model has none."""
-    text: str = ""  # The data file, for processes that do not read it; empty: one of dxlrun's own
+    """First firmware version with the fast forms; None if the model has none."""
+    text: str = ""  # Text of the data file, for processes that do not read it; empty for a shipped file
 
 
 def is_device_table(text: str) -> bool:
-    """Check whether a data file says that it describes a device."""
+    """Return True if a data file describes a device."""
     return tomllib.loads(text).get("kind") == "device"
 
 
 def read_device_table(text: str) -> DeviceTable:
-    """Return the table that the TOML text of a data file describes.
+    """Return the table from the TOML text of a data file.
 
-    Raises ValueError (also tomllib.TOMLDecodeError) when it is not one, KeyError when an entry is missing.
+    Raises:
+        ValueError: The text is not a device table (also tomllib.TOMLDecodeError).
+        KeyError: An entry is missing.
     """
     return build_device_table(tomllib.loads(text))
 
 
 def build_device_table(data: Entry) -> DeviceTable:
-    """Return the table of a device's entry; raises ValueError and KeyError as `read_device_table`."""
+    """Return the table from the entry of a device; raises as `read_device_table`."""
     if data.get("kind") != "device":
         raise ValueError('the table of a device has kind = "device"')
     written = section(data["items"])
@@ -133,7 +141,7 @@ def build_device_table(data: Entry) -> DeviceTable:
 
 
 def _with_identity(entries: Entry, protocol: float) -> Entry:
-    """Return the items with those that every device has, where its protocol's servos have them.
+    """Add the items that every device has, at the addresses that servos of its protocol use.
 
     e-Manual, Protocol 1.0 and 2.0 models, Control Table: Model Number, Firmware Version, ID.
     """
@@ -142,7 +150,9 @@ def _with_identity(entries: Entry, protocol: float) -> Entry:
 
 
 def _check_places(items: Sequence[ControlItem]) -> None:
-    """Refuse items that overlap, but for different bits of one place; they are in the order of addresses."""
+    """Raise ValueError for overlapping items, except different bits of one place. Items are sorted by
+    address.
+    """
     for before, item in pairwise(items):
         if item.address >= before.address + before.size:
             continue

@@ -1,4 +1,4 @@
-"""All models of devices: those of our data files, and those that plug-ins add."""
+"""Device models: those of the shipped data files and those of plug-ins."""
 
 from __future__ import annotations
 
@@ -21,7 +21,8 @@ _ADDED: list[DeviceTable] = []  # Tables of plug-ins
 def device_table(model: str, protocol: float | None = None) -> DeviceTable:
     """Return the table of a device by its model's name or alias, in any case.
 
-    Raises LookupError when there is none, or none that speaks the protocol.
+    Raises:
+        LookupError: No device has the name, or none of them speaks the protocol.
     """
     found = [table for table in device_tables() if _key(model) in map(_key, (table.model, *table.aliases))]
     if not found:
@@ -34,27 +35,31 @@ def device_table(model: str, protocol: float | None = None) -> DeviceTable:
 
 
 def device_tables() -> tuple[DeviceTable, ...]:
-    """Return the tables of all devices, ours and those of plug-ins."""
+    """Return the tables of all devices, shipped ones and those of plug-ins."""
     return (*_shipped(), *_ADDED)
 
 
 def devices_by_number(number: int, protocol: float) -> tuple[DeviceTable, ...]:
-    """Return the tables of a model number; none where it is unknown."""
+    """Return the tables of a model number, or an empty tuple if it is unknown."""
     return tuple(
         table for table in device_tables() if (table.model_number, table.protocol) == (number, protocol)
     )
 
 
 def perhaps_meant_device(name: str) -> str:
-    """Return a hint for a name that no device has."""
+    """Return a hint for an unknown device name."""
     known = (each for table in device_tables() for each in (table.model, *table.aliases))
     return beginning_or_near(name, known)
 
 
 def add_device_table(text: str) -> DeviceTable:
-    """Add a plug-in's table, the TOML text of a data file; return it.
+    """Add and return a plug-in's device table.
 
-    Raises ValueError when the text is none, or when one of its names is taken.
+    Args:
+        text: TOML text of a data file.
+
+    Raises:
+        ValueError: The text is not a device table, or one of its names is taken.
     """
     try:
         table = read_device_table(text)
@@ -62,7 +67,7 @@ def add_device_table(text: str) -> DeviceTable:
         raise ValueError(f"the entry {error} is missing") from error
     for known in device_tables():
         if replace(known, text="") == table:
-            return known  # a process may load its plug-ins twice
+            return known  # A process may load its plug-ins twice
     _refuse_twins(table, device_tables())
     table = replace(table, text=text)
     _ADDED.append(table)
@@ -74,7 +79,7 @@ def _key(name: str) -> str:
 
 
 def _refuse_twins(table: DeviceTable, known: Iterable[DeviceTable]) -> None:
-    """Raise ValueError when a name or the number of a model is taken, by a servo or a device."""
+    """Raise ValueError if a servo or a device already has one of the names or the model number."""
     names = (table.model, *table.aliases)
     keys = set(map(_key, names))
     for each in known:

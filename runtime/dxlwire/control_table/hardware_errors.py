@@ -9,7 +9,7 @@ from typing import Literal
 import msgspec
 
 Fault = Literal["voltage", "overheating", "overload"]
-"""Faults that the analysis names, whatever the model's own words and values are."""
+"""Faults that the analysis distinguishes, independent of a model's own names and values."""
 
 STATUS_BYTE: Mapping[str, int] = {"input_voltage": 0x01, "overheating": 0x04, "overload": 0x20}
 """Errors in the error byte of Protocol 1.0, the same for every model; the other bits concern one instruction.
@@ -18,21 +18,21 @@ Source: e-Manual, "DYNAMIXEL Protocol 1.0", Error."""
 
 
 class HardwareErrors(msgspec.Struct, frozen=True):
-    """The error item of a model, and what its values mean."""
+    """Error item of a model, with the meaning of its values."""
 
     item: str = ""
-    """`hardware_error_status`, `error_code` (Y series), or empty: the error byte of each reply."""
+    """`hardware_error_status`, `error_code` (Y series), or empty for the error byte of each reply."""
     values: Mapping[str, int] = MappingProxyType({})
     """The e-Manual's name of an error in snake_case -> its bit, or its code where `has_codes`."""
 
     @property
     def has_codes(self) -> bool:
-        """True when the item holds the code of the newest error instead of a bit for each."""
+        """True if the item holds the code of the newest error instead of a bit for each error."""
         return self.item == "error_code"
 
     @property
     def mask(self) -> int:
-        """All bits that are errors; only for an item of bits."""
+        """Mask of all error bits; only for an item of bits."""
         return sum(self.values.values())
 
     def names(self, value: int) -> tuple[str, ...]:
@@ -54,7 +54,7 @@ class HardwareErrors(msgspec.Struct, frozen=True):
         return "; ".join(words)
 
     def is_warning(self, value: int) -> bool:
-        """Check whether a value is only a warning, with which the servo still takes torque and goals."""
+        """Return True if a value is only a warning: the servo still accepts torque and goals."""
         names = self.names(value)
         return bool(names) and all(map(is_warning, names))
 
@@ -64,15 +64,15 @@ class HardwareErrors(msgspec.Struct, frozen=True):
         return frozenset(kind for kind in kinds for name in self.names(value) if name.endswith(kind))
 
     def value_of(self, *names: str) -> int:
-        """Return bit or code of the first of these errors that the model has; 0: it has none of them."""
+        """Return the bit or code of the first of these errors that the model has; 0 if it has none."""
         return next((self.values[name] for name in names if name in self.values), 0)
 
 
 def is_warning(name: str) -> bool:
-    """Check whether an error is a warning by its name (e-Manual, Y series, Error Code (153))."""
+    """Return True for the name of a warning (e-Manual, Y series, Error Code (153))."""
     return name.endswith("_warning")
 
 
 def error_item(items: Mapping[str, object]) -> str:
-    """Return the item of a model that reports its hardware errors; empty when it has none."""
+    """Return the name of a model's hardware error item; empty if it has none."""
     return next((name for name in ("hardware_error_status", "error_code") if name in items), "")

@@ -1,4 +1,4 @@
-"""All models: those of the data files, and those that plug-ins add."""
+"""Servo models: those of the shipped data files and those of plug-ins."""
 
 from __future__ import annotations
 
@@ -13,17 +13,21 @@ from dxlwire.control_table.table import ControlTable
 from dxlwire.errors import suggestion
 
 _ADDED: dict[float, list[Listing]] = {1.0: [], 2.0: []}
-"""Tables of plug-ins; they are added while a process starts, before its first robot is compiled."""
-_MOST_MEANT = 4  # More suggestions than this are no help
+"""Tables of plug-ins; added during process start, before the first robot is compiled."""
+_MOST_MEANT = 4  # More suggestions than this do not help
 _SERIES = re.compile(r"[0-9]?[A-Z]+[0-9]{3}")
-_TEXTS: dict[str, str] = {}  # Name -> TOML text of the tables that were added
+_TEXTS: dict[str, str] = {}  # Name -> TOML text of the added tables
 
 
 def find_table(model: str, protocol: float | None = None) -> ControlTable:
-    """Return the control table of a model or of one of its aliases; `understood` has the rules.
+    """Return the control table of a model name; `understood` lists the accepted spellings.
 
-    MX servos carry one name with two firmwares: `protocol` then decides. Raises LookupError when the model is
-    unknown, does not speak the protocol, or speaks both and none was given.
+    Args:
+        model: Name or alias of the model.
+        protocol: 1.0 or 2.0. Required for MX servos, whose two firmwares share one name.
+
+    Raises:
+        LookupError: The model is unknown, does not speak the protocol, or speaks both and none was given.
     """
     if protocol is not None and (table := _table(model, protocol)) is not None:
         return table
@@ -37,22 +41,22 @@ def find_table(model: str, protocol: float | None = None) -> ControlTable:
     if protocol is None and len(spoken) > 1:
         raise LookupError(f"{model} exists with Protocol 1.0 and with Protocol 2.0: say which one")
     listing = understood(model, spoken[0] if protocol is None else protocol)
-    if listing is None:  # protocols_of has just found it
+    if listing is None:  # Unreachable, because protocols_of has just found it
         raise LookupError(f"no control table of the model {model!r}")
     return listing.build()
 
 
 def protocols_of(model: str) -> tuple[float, ...]:
-    """Return the protocols of a model, by whatever name it is understood; none: there is no such model."""
+    """Return the protocols of a model by any accepted name; empty if the model is unknown."""
     return tuple(each for each in (1.0, 2.0) if understood(model, each) is not None)
 
 
 def understood(name: str, protocol: float) -> Listing | None:
-    """Return the model of a protocol that a name means, None when there is none or more than one.
+    """Return the model of a protocol that a name identifies, or None if there are none or several.
 
-    Beside the names of models and their aliases these are understood: other case and punctuation (AX12,
-    xl_320), the product name with its connector (XL430-W250-T or -R), and the series of a model that is the
-    only one in it (XL430, XL-430).
+    Accepted in addition to the names of models and their aliases: other case and punctuation (AX12, xl_320),
+    the product name with its connector (XL430-W250-T or -R), and the series of a model that is the only one
+    in it (XL430, XL-430).
     """
     known = _index(protocol)
     if name in known:
@@ -75,17 +79,17 @@ def _key(name: str) -> str:
 
 
 def model_names(protocol: float | None = None) -> tuple[str, ...]:
-    """Return every name that `find_table` knows (of one protocol if given), aliases too, sorted."""
+    """Return every exact model name and alias, sorted; with `protocol` only those of that protocol."""
     return tuple(sorted({name for each in (1.0, 2.0) if protocol in (None, each) for name in _index(each)}))
 
 
 def perhaps_meant(name: str, protocol: float | None = None) -> str:
-    """Return a hint for a name that no model of servos has."""
+    """Return a hint for an unknown servo model name."""
     return beginning_or_near(name, model_names(protocol))
 
 
 def beginning_or_near(name: str, known: Iterable[str]) -> str:
-    """Return a hint for a name that no model has: those that begin with it, else the nearest ones."""
+    """Return a hint for an unknown name: the names that start with it, else the nearest ones."""
     keys = {_key(each): each for each in sorted(known, reverse=True)}
     key = _key(name)
     meant = sorted(each for each in keys if key and each.startswith(key))
@@ -95,16 +99,16 @@ def beginning_or_near(name: str, known: Iterable[str]) -> str:
 
 
 def all_tables() -> tuple[ControlTable, ...]:
-    """Return every control table once, by protocol, then model number, then firmware."""
+    """Return every control table once, sorted by protocol, model number and firmware."""
     tables = [listing.build() for listing in (*_listings(1.0), *_listings(2.0))]
     return tuple(sorted(tables, key=lambda each: (each.protocol, each.model_number, each.firmware)))
 
 
 def models_by_number(number: int, protocol: float, firmware: float = math.inf) -> tuple[ControlTable, ...]:
-    """Return the tables of a model number that a servo of this protocol answers, newest firmware first.
+    """Return the tables for a model number that a servo has reported, newest firmware first.
 
-    It is empty when the number is unknown; it has several when the table depends on the firmware: the first
-    one is that of a servo of this `firmware`.
+    The result is empty for an unknown number. It has several tables if the table depends on the firmware; the
+    first one then belongs to the given `firmware`.
     """
     found = [listing.build() for listing in _listings(protocol) if listing.model_number == number]
     fitting = [each for each in found if each.firmware <= firmware]
@@ -112,9 +116,13 @@ def models_by_number(number: int, protocol: float, firmware: float = math.inf) -
 
 
 def add_control_table(text: str) -> ControlTable:
-    """Add a plug-in's control table, the TOML text of a data file; return it.
+    """Add and return a plug-in's control table.
 
-    Raises ValueError when the text is no control table, or when one of its names or its number is taken.
+    Args:
+        text: TOML text of a data file.
+
+    Raises:
+        ValueError: The text is not a control table, or one of its names or its number is taken.
     """
     try:
         table = read_control_table(text)
@@ -124,7 +132,7 @@ def add_control_table(text: str) -> ControlTable:
     for listing in _listings(table.protocol):
         if listing.model_number == table.model_number or set(names) & set(listing.names):
             if listing.build() == table:
-                return table  # a process may load its plug-ins twice
+                return table  # A process may load its plug-ins twice
             raise ValueError(
                 f"{table.model} with model number {table.model_number} has a name or the number of the "
                 f"{listing.names[0]}, which is known already"
@@ -135,15 +143,15 @@ def add_control_table(text: str) -> ControlTable:
 
 
 def added_control_tables(models: Iterable[str]) -> tuple[str, ...]:
-    """Return the texts of the tables that were added for some models; models of our own have none.
+    """Return the texts of the added tables of some models; shipped models have none.
 
-    They are for a process that loads no plug-ins itself.
+    A process that does not load plug-ins can add them from these texts.
     """
     return tuple(dict.fromkeys(_TEXTS[model] for model in models if model in _TEXTS))
 
 
 def _table(name: str, protocol: float) -> ControlTable | None:
-    # no dict is built here: a servo that comes back is looked up while the loop runs
+    # No dict is built here: the lookup of a servo that comes back runs inside the loop.
     listing = _shipped(protocol).get(name)
     if listing is None:
         listing = next((each for each in _ADDED.get(protocol, ()) if name in each.names), None)
@@ -160,7 +168,9 @@ def _listings(protocol: float) -> tuple[Listing, ...]:
 
 @functools.cache
 def _shipped(protocol: float) -> Mapping[str, Listing]:
-    """The models of one protocol by name: those of the other one are not read before they are needed."""
+    """Return the shipped models of one protocol, by name. The other protocol's files are not read until
+    needed.
+    """
     found: dict[str, Listing] = {}
     for listing in listings(protocol):
         for name in listing.names:

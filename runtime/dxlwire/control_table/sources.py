@@ -1,4 +1,4 @@
-"""Data files -> control tables: one TOML file a model, and the rules for all of them."""
+"""Data files -> control tables: one TOML file per model, and the rules for all of them."""
 
 from __future__ import annotations
 
@@ -29,13 +29,14 @@ Entry: TypeAlias = Mapping[str, object]  # One table of a data file: an item, or
 
 
 class Listing(msgspec.Struct, frozen=True):
-    """A model whose table is built when it is needed."""
+    """Model whose table is built on demand."""
 
     names: tuple[str, ...]  # The model's own name first
     model_number: int
     firmware: int
     build: Callable[[], ControlTable]
-    """Return the same table at each call; raises ValueError or KeyError when its data file is broken."""
+    """Return the table, the same object at each call. Raises ValueError or KeyError if its data file is
+    invalid."""
 
 
 _SI = {
@@ -67,13 +68,16 @@ standard gravity (3rd CGPM, 1901)."""
 
 
 _TABLES = Path(__file__).parent / "tables"
-"""A folder for each protocol, in it folders of series where they are many; a TOML file a model."""
+"""Folder of the data files: one folder per protocol, with subfolders for large series; one TOML file per
+model."""
 
 
 def listings(protocol: float) -> tuple[Listing, ...]:
-    """Return the models of all data files of a protocol; their tables are built when they are needed.
+    """Return the models of all data files of a protocol; their tables are built on demand.
 
-    Raises ValueError or KeyError when a data file is broken.
+    Raises:
+        ValueError: A data file is invalid.
+        KeyError: A data file lacks an entry.
     """
     folder = _TABLES / f"protocol{protocol:.0f}"
     texts = {
@@ -85,7 +89,7 @@ def listings(protocol: float) -> tuple[Listing, ...]:
 
 
 def _listing(name: str, heads: Mapping[str, Entry], texts: Mapping[str, str]) -> Listing:
-    """Return a model by the heads of the files; those that it needs are read when its table is built."""
+    """Return a model from the heads of the files. Whole files are parsed when the table is built."""
     chain = _chain(name, heads)
     head = dict(ChainMap(*(dict(heads[each]) for each in chain)))
     return Listing(
@@ -99,7 +103,7 @@ def _listing(name: str, heads: Mapping[str, Entry], texts: Mapping[str, str]) ->
 
 
 def _chain(name: str, entries: Mapping[str, Entry]) -> list[str]:
-    """Return a model and those that it extends, one after the other."""
+    """Return the names of a model and of its ancestors by `extends`, in that order."""
     chain = [name]
     while (parent := entries[chain[-1]].get("extends")) is not None:
         if not isinstance(parent, str) or parent not in entries or parent in chain:
@@ -109,11 +113,14 @@ def _chain(name: str, entries: Mapping[str, Entry]) -> list[str]:
 
 
 def resolve(name: str, entries: Mapping[str, Entry]) -> Entry:
-    """Return a model's entry with what it takes over from the one that it `extends`.
+    """Return a model's entry merged with the entries that it `extends`.
 
-    Items are merged key by key; `left_out` names items that the model does not have; the baud rates are taken
-    over as a whole, the aliases not at all. Raises ValueError when the chain leads nowhere or in a circle,
-    KeyError when an item that is to be left out is not there.
+    Items are merged key by key. `left_out` names items that the model does not have. Baud rates are inherited
+    as a whole, aliases not at all.
+
+    Raises:
+        ValueError: The chain of `extends` ends at an unknown model or is circular.
+        KeyError: `left_out` names an unknown item.
     """
     merged: dict[str, object] = {}
     items: dict[str, dict[str, object]] = {}
@@ -129,17 +136,21 @@ def resolve(name: str, entries: Mapping[str, Entry]) -> Entry:
 
 
 def read_control_table(text: str) -> ControlTable:
-    """Return the control table that the TOML text of a data file describes.
+    """Return the control table from the TOML text of a data file.
 
-    Raises ValueError (also tomllib.TOMLDecodeError) when it is not one, KeyError when an entry is missing.
+    Raises:
+        ValueError: The text is not a control table (also tomllib.TOMLDecodeError).
+        KeyError: An entry is missing.
     """
     return build_table(tomllib.loads(text))
 
 
 def build_table(data: Entry) -> ControlTable:
-    """Return the control table of a model's entry, `extends` resolved.
+    """Return the control table from a model's entry, with `extends` resolved.
 
-    Raises ValueError when something in it is wrong, KeyError when an entry is missing.
+    Raises:
+        ValueError: The entry is invalid.
+        KeyError: An entry is missing.
     """
     entries = dict(section(data["items"]))
     number = whole(data, "model_number")
@@ -185,7 +196,7 @@ def build_table(data: Entry) -> ControlTable:
 
 
 def _hardware_errors(data: Entry, items: Mapping[str, ControlItem]) -> HardwareErrors:
-    """Return the errors of a model; raises ValueError for values that are not distinct bits or codes."""
+    """Return the errors of a model. Raises ValueError for values that are not distinct bits or codes."""
     item = error_item(items)
     entries = section(data.get("errors", STATUS_BYTE if not item else {}))
     values = {name: whole(entries, name) for name in entries}
@@ -200,7 +211,7 @@ def _hardware_errors(data: Entry, items: Mapping[str, ControlItem]) -> HardwareE
 
 
 def _figure(data: Entry, key: str, unit: str) -> float:
-    """Return a quantity of the motor; raises ValueError when it is negative or of another unit."""
+    """Return a quantity of the motor. Raises ValueError if it is negative or has another unit."""
     found, value = quantity(str(data[key]))
     if found != unit or not value >= 0:
         raise ValueError(f"{key}: {data[key]!r} is no quantity in {unit} from 0 on")
@@ -214,14 +225,14 @@ def _ratio(value: object) -> float:
 
 
 def section(value: object) -> Entry:
-    """Return a table of a data file; raises ValueError when the value is none."""
+    """Return a table of a data file. Raises ValueError if the value is not a table."""
     if not isinstance(value, Mapping):
         raise ValueError(f"{value!r} is no table")
     return value
 
 
 def whole(entry: Entry, key: str) -> int:
-    """Return a whole number of a table; raises ValueError when it is none, KeyError when it is missing."""
+    """Return an integer of a table. Raises ValueError if it is not an integer, KeyError if it is missing."""
     value = entry[key]
     if type(value) is not int:
         raise ValueError(f"{key} is not a whole number")
@@ -229,16 +240,21 @@ def whole(entry: Entry, key: str) -> int:
 
 
 def words(value: object) -> list[str]:
-    """Return a list of words; raises ValueError when the value is none."""
+    """Return a list of words. Raises ValueError if the value is not one."""
     if not isinstance(value, list) or not all(isinstance(word, str) for word in value):
         raise ValueError(f"{value!r} is no list of words")
     return value
 
 
 def quantity(text: str, own: Collection[str] = ()) -> tuple[str, float]:
-    """Return SI unit and value of `59 rpm` or `300/1023 deg`: the manual's ratio, rounded only once.
+    """Return SI unit and value of `59 rpm` or `300/1023 deg`. The manual's ratio is rounded only once.
 
-    A unit of `own` stays as it is. Raises ValueError when it is no quantity.
+    Args:
+        text: Number, or ratio of two numbers, and unit.
+        own: Additional units, which are not converted.
+
+    Raises:
+        ValueError: The text is not a quantity.
     """
     number, _, unit = text.partition(" ")
     if unit not in _SI and unit not in own:
@@ -254,7 +270,7 @@ def quantity(text: str, own: Collection[str] = ()) -> tuple[str, float]:
 
 
 def measure(name: str, entry: Entry, key: str, own: Collection[str] = ()) -> tuple[str, float]:
-    """Return SI unit and value of a quantity in an item's entry; raises ValueError when it is none."""
+    """Return SI unit and value of a quantity in an item's entry. Raises ValueError for other values."""
     try:
         return quantity(str(entry[key]), own)
     except ValueError as error:
@@ -262,7 +278,7 @@ def measure(name: str, entry: Entry, key: str, own: Collection[str] = ()) -> tup
 
 
 def _items(entries: Entry) -> Iterator[ControlItem]:
-    """Yield items; one that has a `repeat` is the first of as many: `indirect_address_1` of 1 to 28."""
+    """Yield items. An item with `repeat` is the first of a series: `indirect_address_1` to 28."""
     for name, value in entries.items():
         entry = section(value)
         if entry.get("access") == "RW":
@@ -279,7 +295,7 @@ def _items(entries: Entry) -> Iterator[ControlItem]:
 
 
 def read_item(name: str, entry: Entry, own: Collection[str] = ()) -> ControlItem:
-    """Return an item by its entry, where a tick is a quantity; raises ValueError when something is wrong."""
+    """Return an item from its entry, where `tick` is a quantity. Raises ValueError for an invalid entry."""
     unit, scale = measure(name, entry, "tick", own) if "tick" in entry else ("", 1.0)
     try:
         entry = {"initial": None, **entry, "name": name, "unit": unit, "scale": scale}
@@ -310,7 +326,7 @@ def _effort_unit(item: ControlItem) -> EffortUnit:
 
 
 def protocol_in(value: object) -> float:
-    """Return the protocol of a data file; raises ValueError when it is none."""
+    """Return the protocol of a data file. Raises ValueError if it is neither 1.0 nor 2.0."""
     if value not in (1.0, 2.0) or not isinstance(value, float):
         raise ValueError(f"protocol is 1.0 or 2.0, not {value!r}")
     return value

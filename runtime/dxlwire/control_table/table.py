@@ -1,4 +1,4 @@
-"""A control table: the control items of one model, their places and meanings, and what follows from them."""
+"""Control tables: the control items of one model, their addresses and units, and derived properties."""
 
 from __future__ import annotations
 
@@ -16,22 +16,22 @@ from dxlwire.control_table.hardware_errors import HardwareErrors, error_item
 Access = Literal["R", "RW"]
 Area = Literal["EEPROM", "RAM"]
 Encoding = Literal["unsigned", "sign_magnitude", "twos_complement", "float32"]
-"""`float32`: IEEE 754's binary32, of devices alone; its integer on the wire is that of its four bytes."""
+"""`float32`: IEEE 754 binary32, for devices only. Its integer on the wire consists of the same four bytes."""
 EffortUnit = Literal["1", "A", "Nm"]
 
 _TITLES = {"id": "ID", "cw": "CW", "ccw": "CCW", "led": "LED", "pwm": "PWM", "shadow": "(Shadow)"}
-"""Words of item names that are not merely capitalized."""
+"""Words of item names with a spelling other than capitalized."""
 SIGN_BIT = 10
 """Direction bit of sign-magnitude items: 0 counter-clockwise, 1 clockwise (e-Manual, Present Speed (38))."""
 _HIGHEST_VOLTAGE = 4 / 3
-"""Times the nominal voltage: 16 V of 12 V (e-Manual XM430-W350, Max Voltage Limit (32)), taken for all models
-[i]. Speed grows as the voltage [i]: that manual gives 46 rpm at 12 V and 57 rpm at 14.8 V."""
+"""Factor on the nominal voltage: 16 V of 12 V (e-Manual XM430-W350, Max Voltage Limit (32)), assumed for all
+models [i]. Speed is proportional to voltage [i]: that manual gives 46 rpm at 12 V and 57 rpm at 14.8 V."""
 
 
 class ControlItem(msgspec.Struct, frozen=True):
-    """One control item of a servo or a device: 1, 2 or 4 bytes, little-endian, and what they mean.
+    """One control item of a servo or a device: 1, 2 or 4 bytes, little-endian.
 
-    Its value is ticks * scale + offset. The fields from `offset` on are those of devices.
+    Its value is ticks * scale + offset. Only items of devices use the fields from `offset` on.
     """
 
     name: str
@@ -40,28 +40,34 @@ class ControlItem(msgspec.Struct, frozen=True):
     access: Access
     area: Area
     minimum: int
-    """As the e-Manual gives it: of the integer on the wire, where a direction bit counts as a bit; with two's
-    complement, and of devices, of the signed number. A float32 has the range of the integer of its bytes."""
+    """Lowest value in the e-Manual: of the integer on the wire, where a direction bit counts as a bit. With
+    two's complement, and for devices, of the signed number. A float32 has the range of the integer of its
+    bytes."""
     maximum: int
     initial: int | None
-    """Value of the integer on the wire after a factory reset or at power-up; None: the manual gives none."""
+    """Integer on the wire after a factory reset or at power-up; None if the manual gives none."""
     encoding: Encoding
     unit: str
     """SI unit of `scale`; empty for flags, numbers and steps; `1` for a fraction of the maximum."""
     scale: float  # SI units per tick
-    page: str  # Section of the manual's page of this model
-    firmware: int = 0  # First firmware version that has the item; 0: every one
+    page: str  # Section of the model's manual page
+    firmware: int = 0  # First firmware version that has the item; 0: every version
     deviation: Deviation | None = None
-    """Judgement of other values than the factory's; None where the item can only be read."""
+    """Judgement of values other than the factory's; None for a read-only item."""
     offset: float = 0.0  # SI units at tick 0
-    state: str = ""  # Name of the state that it makes: `angular_velocity.x`
+    state: str = ""  # Name of the item's state: `angular_velocity.x`
     safe: int | None = None
-    """Number on the wire that is written at the end of a run; None: nothing is."""
+    """Number on the wire that is written at the end of a run; None: no write."""
     bit: int | None = None
-    """Of the item's integer, which other items share; None: all of them. A bit cannot be written alone."""
+    """Index of the item's bit in an integer shared with other items; None: all bits. A single bit is
+    read-only."""
 
     def encode(self, raw: int) -> bytes:
-        """Return the bytes of a signed number of ticks; raises ValueError when they do not hold it."""
+        """Return the bytes of a signed number of ticks.
+
+        Raises:
+            ValueError: The number does not fit into the item.
+        """
         wire = raw
         if self.encoding == "sign_magnitude":
             if abs(raw) >= 1 << SIGN_BIT:
@@ -73,7 +79,11 @@ class ControlItem(msgspec.Struct, frozen=True):
             raise ValueError(f"{self.name}: {raw} does not fit into {self.size} bytes") from None
 
     def decode(self, data: bytes | bytearray | memoryview) -> int:
-        """Return the signed number of ticks; raises ValueError when `data` has not `size` bytes."""
+        """Return the signed number of ticks.
+
+        Raises:
+            ValueError: `data` does not have `size` bytes.
+        """
         if len(data) != self.size:
             raise ValueError(f"{self.name}: {self.size} bytes are needed, {len(data)} were given")
         wire = int.from_bytes(data, "little", signed=self.encoding == "twos_complement")
@@ -83,54 +93,56 @@ class ControlItem(msgspec.Struct, frozen=True):
         return wire
 
     def value(self, data: bytes | memoryview) -> float:
-        """Return what the item's own bytes mean, SI units."""
+        """Return the value of the item's bytes, SI units."""
         if self.bit is not None:
             return float(self.integer(data))
         ticks: float = struct.unpack("<f", data)[0] if self.encoding == "float32" else self.decode(data)
         return ticks * self.scale + self.offset
 
     def integer(self, data: bytes | memoryview) -> int:
-        """Return the integer that the item's own bytes are, signed where its range is; of a bit 0 or 1."""
+        """Return the integer of the item's bytes, signed if its range is; 0 or 1 for a bit."""
         if self.signed or self.minimum < 0:
             return self.decode(data)
         wire = int.from_bytes(data, "little")
         return wire if self.bit is None else wire >> self.bit & 1
 
     def wire_bytes(self, value: int) -> bytes:
-        """Return the bytes of such an integer; one below 0 is in two's complement, or has a direction bit."""
+        """Return the bytes of an integer as in `integer`. Negative numbers are in two's complement or have a
+        direction bit.
+        """
         if self.encoding == "sign_magnitude" and value < 0:
             return self.encode(value)
         return value.to_bytes(self.size, "little", signed=value < 0)
 
     @property
     def title(self) -> str:
-        """The item as the e-Manual writes it: `Torque Enable (24)`."""
+        """Title of the item in the e-Manual: `Torque Enable (24)`."""
         words = (_TITLES.get(word, word.capitalize()) for word in self.name.split("_"))
         return f"{' '.join(words)} ({self.address})"
 
     @property
     def limited_by(self) -> str:
-        """Name of the item that bounds this one; empty: none does."""
+        """Name of the item that bounds this one; empty if there is none."""
         return "" if self.deviation is None else self.deviation.limited_by
 
     @property
     def signed(self) -> bool:
-        """True when the integer on the wire is in two's complement, so that `minimum` may be below 0."""
+        """True if the integer on the wire is in two's complement, so that `minimum` may be negative."""
         return self.encoding == "twos_complement"
 
 
 class Table(msgspec.Struct, frozen=True):
-    """What the control tables of servos and devices have alike."""
+    """Common part of the control tables of servos and devices."""
 
-    model: str  # The model's own name, also where an alias was given
-    aliases: tuple[str, ...]  # Names of models with the same table
+    model: str  # The model's own name, even if the lookup used an alias
+    aliases: tuple[str, ...]  # Names of other models with the same table
     protocol: float
     items: Mapping[str, ControlItem]
-    """By the e-Manual's name in snake_case, in the order of addresses."""
+    """Items by the e-Manual's name in snake_case, in the order of addresses."""
     baud_rates: Mapping[int, int]  # Value of the baud rate item -> bit/s
-    capabilities: frozenset[str]  # What the model can do; `CAPABILITIES` explains each word
+    capabilities: frozenset[str]  # Capabilities of the model; `CAPABILITIES` explains each word
     errors: HardwareErrors = HardwareErrors()
-    """Where the model reports hardware errors, and what they mean."""
+    """Hardware errors of the model."""
 
     @property
     def size(self) -> int:
@@ -138,9 +150,10 @@ class Table(msgspec.Struct, frozen=True):
         return max(item.address + item.size for item in self.items.values())
 
     def has_baud_rate(self, rate: int) -> bool:
-        """Whether the model can run at a rate, bit/s; in Protocol 1.0 also by 2,000,000 / (value + 1).
+        """Return True if the model can run at a baud rate, bit/s.
 
-        True where the manual lists no rates (e-Manual, Baud Rate (4)).
+        In Protocol 1.0 also the rates 2,000,000 / (value + 1) count, within 3 %. A table without rates
+        accepts any rate (e-Manual, Baud Rate (4)).
         """
         if rate in self.baud_rates.values() or not self.baud_rates:
             return True
@@ -150,53 +163,53 @@ class Table(msgspec.Struct, frozen=True):
         return 0 <= value <= 254 and abs(2_000_000 / (value + 1) - rate) < 0.03 * rate
 
     def readable(self, start: int, end: int) -> bool:
-        """Check whether the addresses from `start` up to before `end` all belong to items."""
+        """Return True if all addresses from `start` up to but not including `end` belong to items."""
         items = self.items.values()
         known = {address for item in items for address in range(item.address, item.address + item.size)}
         return known.issuperset(range(start, end))
 
     def spare(self, end: int, most: int) -> int:
-        """Return how many bytes behind an end can be read too, `most` at most."""
+        """Return the number of readable bytes after an end address, at most `most`."""
         return next((count for count in range(most, 0, -1) if self.readable(end, end + count)), 0)
 
 
 class ControlTable(Table, frozen=True, kw_only=True):
-    """The control items of one model, and its exact units.
+    """Control items of one servo model, with its exact units.
 
     The angle of a servo is counted from the raw position 0: theta = raw * `rad_per_tick`.
     """
 
     model_number: int
     goal_speed_item: str
-    """Speed of the way to the goal: `moving_speed`, `profile_velocity`, or on PRO `goal_velocity`."""
+    """Item of the speed toward the goal: `moving_speed`, `profile_velocity`, or on PRO `goal_velocity`."""
     present_speed_item: str
-    effort_item: str  # `present_load`, or `present_current` where the model measures its current
+    effort_item: str  # `present_load`, or `present_current` if the model measures its current
     rad_per_tick: float
     min_tick: int
-    """Lowest value of goal and present position; below 0 where the middle of the travel is 0."""
+    """Lowest value of goal and present position; negative if the middle of the travel is 0."""
     max_tick: int  # Highest value of goal and present position
     rad_s_per_tick: float
-    max_speed_tick: int  # Highest value of a goal speed without its direction
+    max_speed_tick: int  # Highest magnitude of a goal speed
     effort_per_tick: float  # `effort_unit` per tick of `effort_item`
     effort_unit: EffortUnit
-    """`1`: fraction of the maximum, as the model measures no torque; `A`: motor current."""
+    """`1`: fraction of the maximum, for a model that measures no torque; `A`: motor current."""
     max_speed: float  # No-load speed, rad/s, at `nominal_voltage`
-    stall_torque: float  # Nm, at `nominal_voltage`; 0 where the manual gives none
+    stall_torque: float  # Nm, at `nominal_voltage`; 0 if the manual gives none
     fast_sync_read_firmware: int | None = None
-    """First firmware version with the fast forms; None where the model has none."""
-    firmware: int = 0  # First firmware version that has this table; 0: every one
-    gear_ratio: float = 0.0  # Turns of the motor for one of the horn; 0 where the manual gives none
-    stall_current: float = 0.0  # A drawn at `stall_torque`; 0 where the manual gives none
+    """First firmware version with the fast forms; None if the model has none."""
+    firmware: int = 0  # First firmware version with this table; 0: every version
+    gear_ratio: float = 0.0  # Revolutions of the motor per revolution of the horn; 0 if the manual gives none
+    stall_current: float = 0.0  # Current at `stall_torque`, A; 0 if the manual gives none
     nominal_voltage: float = 0.0
-    """V at which `max_speed`, `stall_torque` and `stall_current` hold; 0 where the manual gives none."""
+    """Voltage of `max_speed`, `stall_torque` and `stall_current`, V; 0 if the manual gives none."""
 
     @property
     def top_speed(self) -> float:
-        """The highest speed of the servo, rad/s: without load, at the highest voltage that it accepts."""
+        """Highest speed of the servo, rad/s: without load, at the highest accepted voltage."""
         return self.max_speed * _HIGHEST_VOLTAGE
 
     def with_firmware(self, firmware: int) -> ControlTable:
-        """Return the table that a servo of a firmware version has: without the items that came later."""
+        """Return the table for a firmware version, without the items that later versions added."""
         items = {name: item for name, item in self.items.items() if item.firmware <= firmware}
         return self if len(items) == len(self.items) else replace(self, items=MappingProxyType(items))
 
@@ -214,16 +227,16 @@ CAPABILITIES: Mapping[str, str] = {
     "sync_read": "sync read",
     "sync_write": "sync write",
 }
-"""What a model can do, in the words of `ControlTable.capabilities`."""
+"""Meaning of the words in `ControlTable.capabilities`."""
 
 DERIVED = frozenset({"hardware_error", "indirect", "operating_mode", "posvel", "state_block"})
-"""Capabilities that follow from the items; data files do not name them."""
+"""Capabilities that follow from the items; data files must not list them."""
 
 
 def derived_capabilities(
     items: Mapping[str, ControlItem], goal_speed: str, present_speed: str, effort: str
 ) -> frozenset[str]:
-    """Return the capabilities that follow from which items there are and where they stand."""
+    """Return the capabilities that follow from the presence and the addresses of items."""
     has = {
         "operating_mode": "operating_mode" in items or "control_mode" in items,
         "hardware_error": error_item(items) != "",
@@ -238,7 +251,7 @@ def derived_capabilities(
 def side_by_side(
     items: Iterable[ControlItem], most_bytes: int | None = None
 ) -> tuple[tuple[ControlItem, ...], ...]:
-    """Group items that one read can fetch: each begins where the one before ends, at most so many bytes."""
+    """Group items into blocks that one read can fetch: contiguous items, at most `most_bytes` per block."""
     blocks: list[list[ControlItem]] = []
     for item in sorted(items, key=lambda one: one.address):
         end = item.address + item.size
@@ -255,7 +268,7 @@ def side_by_side(
 
 
 def decoded(items: Iterable[ControlItem], start: int, data: bytes | memoryview) -> dict[str, int]:
-    """Return those of some items, by name, that lie whole in the bytes from an address on: signed ticks."""
+    """Return the signed ticks of the items inside the data, by name; `start` is the address of the data."""
     found: dict[str, int] = {}
     for item in items:
         at = item.address - start
@@ -265,18 +278,18 @@ def decoded(items: Iterable[ControlItem], start: int, data: bytes | memoryview) 
 
 
 class FoundDeviation(msgspec.Struct, frozen=True):
-    """A value of an item that is not the factory's, and matters."""
+    """Relevant deviation of an item's value from the factory value."""
 
     item: ControlItem
     found: int
     factory: int
     judgement: Judgement
-    effect: str  # What the value does: a verb with its object
+    effect: str  # Effect of the value: a verb with its object
     remedy: str
 
     @property
     def refused(self) -> bool:
-        """True when the servo gets no torque with this value."""
+        """True if this value keeps the servo from getting torque."""
         return self.judgement == "refuse"
 
     @property
@@ -286,10 +299,10 @@ class FoundDeviation(msgspec.Struct, frozen=True):
 
 
 def find_deviations(items: Iterable[ControlItem], values: Mapping[str, int]) -> tuple[FoundDeviation, ...]:
-    """Return which values of a servo are not the factory's and matter, in the order of addresses.
+    """Return the relevant deviations of a servo's values from the factory values, in the order of addresses.
 
-    Items without a value are not judged; neither are those without a factory value, and those that are
-    compared with the plan of a run instead.
+    Skipped are items without a value, without a factory value, or with a value that is compared with the plan
+    of a run.
     """
     found: list[FoundDeviation] = []
     for item in items:
@@ -300,7 +313,7 @@ def find_deviations(items: Iterable[ControlItem], values: Mapping[str, int]) -> 
         if factory is None:
             factory = values.get(item.limited_by)
             if factory is None or (value and abs(value) >= factory):
-                continue  # the item that bounds it may have been lowered since power-up
+                continue  # The item that bounds it may have been lowered since power-up
         judgement = rule.judge(value, factory)
         if judgement != "harmless":
             found.append(FoundDeviation(item, value, factory, judgement, rule.effect_of(value), rule.remedy))

@@ -1,4 +1,4 @@
 """Bus plan: transactions of each cycle, their due times and cost, and the retries at set-up.
 
-Executing a plan belongs in `exchange`.
+Execution of a plan belongs in `exchange`.
 """

@@ -1,4 +1,4 @@
-"""Devices: which bytes of a device are read each cycle and by how many reads."""
+"""Devices: the bytes of a device to read in each cycle, grouped into reads."""
 
 from __future__ import annotations
 
@@ -9,16 +9,21 @@ from dxlwire.control_table.device_table import DeviceTable
 from dxlwire.control_table.table import ControlItem
 from dxlwire.plan.line import MOST_SPARE, Line
 
-MOST_BYTES = 120  # The longest block of one read: a device has a small buffer [i]
+MOST_BYTES = 120  # Longest block of one read: devices have small buffers [i]
 
 
 def device_blocks(
     line: Line, table: DeviceTable, states: Mapping[str, ControlItem], first_column: int
 ) -> tuple[DeviceBlock, ...]:
-    """Return the reads that get the items of all states in the shortest time, in the order of addresses.
+    """Return the reads that fetch the items of all states in the shortest time, in the order of addresses.
 
-    Bytes between two items are read with them where that is quicker than a read of its own, and where they
-    belong to items. `states`: item of each state, by name, in the order of their columns.
+    A read includes the bytes between two items if they belong to items and one read is faster than two.
+
+    Args:
+        line: Timing of the line.
+        table: Control table of the device.
+        states: Item of each state, by name, in the order of their columns.
+        first_column: Column of the first state.
     """
     columns = {name: first_column + index for index, name in enumerate(states)}
     wanted = sorted(states.items(), key=lambda pair: pair[1].address)
@@ -33,7 +38,7 @@ def device_blocks(
 
 
 def _together(line: Line, table: DeviceTable, run: Sequence[ControlItem], item: ControlItem) -> bool:
-    """Check whether one more item is read with those before it, or by a read of its own."""
+    """Return True if one read of the run and another item is at least as fast as two reads."""
     start, end = run[0].address, max(one.address + one.size for one in run)
     upto = max(end, item.address + item.size)
     if upto - start > MOST_BYTES or not table.readable(end, item.address):

@@ -1,4 +1,4 @@
-"""Line: the times of one serial line, and the transactions that are made of them."""
+"""Line: timing of one serial line, and the transactions that follow from it."""
 
 from __future__ import annotations
 
@@ -13,59 +13,66 @@ from dxlwire.wire.dialect import Dialect
 
 BITS_PER_BYTE = 10  # 8N1: start bit, eight bits, stop bit (protocol.md, Line)
 LONGEST_RETURN_DELAY_NS = 508_000
-"""254 steps of 2 us (e-Manual, Return Delay Time (5)); what a servo may be set to before it was asked."""
+"""254 steps of 2 us (e-Manual, Return Delay Time (5)), assumed until a servo reports its setting."""
 TIMEOUT_MARGIN_NS = 10_000_000
-"""How long a servo that answered last time is awaited beyond the latest moment of its reply by the wire.
+"""Time that the host waits for a servo with a recent reply, after the latest arrival that the wire allows.
 
-A real servo is never late by more than microseconds, but the host may have to wait for its processor for a
-slice or two of the scheduler (3 ms each on a stock Linux), and so may a simulated servo that another program
-serves. Ten milliseconds keep that from being taken for a broken cable; only the first silence of a cycle
-costs them (the timeouts behind it are short), and they stay below the 15.6 ms after which a loop of 320 Hz
-would count as hanging. Servos that the run itself simulates are awaited for longer: `SimulatedPort`.
+A real servo is late by microseconds at most. But the host may have to wait for its processor for a slice or
+two of the scheduler (3 ms each on a stock Linux). The same holds for a simulated servo in another process.
+Ten milliseconds keep this stall from being reported as a broken cable. Only the first timeout of a cycle
+takes that long (the later ones are short). It stays below the 15.6 ms after which a loop of 320 Hz would
+count as hanging. Servos that the run itself simulates have a longer timeout: `SimulatedPort`.
 """
 SHORT_TIMEOUT_MARGIN_NS = 1_000_000
-"""The same for a servo that is silent already: it must not take the time of the others."""
+"""The same for a servo that is already silent: it must not use up the time of the other servos."""
 
 MOST_SPARE = 2
-"""Two longer forms of a read distinguish late replies from the newest (`exchange/owed.py`)."""
+"""Extra reply lengths per read; they distinguish late replies from the newest one (`exchange/owed.py`)."""
 
 
 class Line(msgspec.Struct, frozen=True):
-    """One serial line as the robot file assumes it; makes transactions with due times and timeouts, ns."""
+    """Timing of one serial line according to the robot file; builds transactions with due times and timeouts,
+    ns.
+    """
 
     baud_rate: int
-    latency_ns: int  # Of the adapter, once per request
+    latency_ns: int  # Latency of the adapter, once per request
     return_delay_ns: int
     dialect: Dialect = protocol1
     return_delays: Mapping[int, int] = {}
-    """Of servos of which it is known, by ID, ns; `return_delay_ns` is that of all others."""
+    """Known return delays by servo ID, ns; all other servos have `return_delay_ns`."""
     device_margin_ns: int = SHORT_TIMEOUT_MARGIN_NS
-    """How long a device is awaited beyond the latest moment of its reply by the wire: as briefly as a silent
-    servo, so that its loss does not take the servos' time."""
+    """Time that the host waits for a device after the latest arrival that the wire allows. It is as short as
+    for a silent servo, so that a lost device does not use up the time of the servos."""
 
     def wire_ns(self, count: int) -> int:
         """Return the time that `count` bytes take on the wire, ns."""
         return count * BITS_PER_BYTE * 1_000_000_000 // self.baud_rate
 
     def delay_ns(self, servo_id: int) -> int:
-        """Return what a servo waits before it answers, ns."""
+        """Return the return delay of a servo, ns."""
         return self.return_delays.get(servo_id, self.return_delay_ns)
 
     def ping(self, servo_id: int) -> Transaction:
-        """Return a ping."""
+        """Return a ping of one servo."""
         length = self.dialect.PING_LENGTH
         return self._answered(self.dialect.ping(servo_id), servo_id, Awaited(servo_id, length, PRESENCE))
 
     def read(self, servo_id: int, address: int, length: int, spare: int = 0) -> Transaction:
-        """Return a read of `length` bytes from `address` on, after which `spare` bytes can be read, too."""
+        """Return a read of `length` bytes from `address`, after which `spare` more bytes are readable."""
         packet = self.dialect.read(servo_id, address, length)
         read = self._answered(packet, servo_id, Awaited(servo_id, length, address))
         return replace(read, spare=spare) if spare else read
 
     def read_many(self, requests: Sequence[tuple[int, int, int]], *, fast: bool = False) -> Transaction:
-        """Return the read of several servos, each by (ID, address, length); of one alone a plain read.
+        """Return one read of several servos, or a plain read of a single servo.
 
-        `fast`: by a fast form, which all answer by one status. Raises ValueError where a protocol has none.
+        Args:
+            requests: ID, address and length for each servo.
+            fast: Use a fast form: all servos share one status packet.
+
+        Raises:
+            ValueError: The protocol has no fast form.
         """
         if len(requests) == 1:
             return self.read(*requests[0])
@@ -74,13 +81,14 @@ class Line(msgspec.Struct, frozen=True):
         if not fast:
             return self._answered(packet, BROADCAST_ID, *awaited)
         size = self.dialect.fast_size(sum(one.length for one in awaited), len(awaited))
-        # only the first one waits before it speaks: the others add their parts at once (protocol.md, Time)
+        # Only the first servo has a return delay: the others append their entries at once (protocol.md,
+        # Time).
         due_ns = self.wire_ns(len(packet) + size) + self.delay_ns(awaited[0].servo_id)
         timeout_ns = due_ns + self.latency_ns + TIMEOUT_MARGIN_NS
         return Transaction(packet, BROADCAST_ID, awaited, due_ns, timeout_ns, size, fast=True)
 
     def write(self, servo_id: int, address: int, data: bytes) -> Transaction:
-        """Return a write that the servo acknowledges; to all servos: without reply."""
+        """Return a write with acknowledgement; a write to the broadcast ID has none."""
         packet = self.dialect.write(servo_id, address, data)
         if servo_id == BROADCAST_ID:
             return self.unanswered(packet)
@@ -95,7 +103,7 @@ class Line(msgspec.Struct, frozen=True):
         return Transaction(packet, BROADCAST_ID, (), self.wire_ns(len(packet)), 0)
 
     def _answered(self, packet: bytes, servo_id: int, *awaited: Awaited) -> Transaction:
-        """Return a transaction whose replies come one after the other, each after a return delay."""
+        """Return a transaction whose replies follow one another, each after a return delay."""
         replies = sum(self.dialect.OVERHEAD + one.length for one in awaited)
         due_ns = self.wire_ns(len(packet) + replies) + sum(self.delay_ns(one.servo_id) for one in awaited)
         widest = self.dialect.widest(max(one.length for one in awaited))
@@ -105,7 +113,7 @@ class Line(msgspec.Struct, frozen=True):
 
 
 def lengthen(read: Transaction, more: int, dialect: Dialect, byte_ns: int) -> Transaction:
-    """Return the read of one servo with so many of its spare bytes."""
+    """Return the read of one servo with `more` spare bytes."""
     (awaited,) = read.awaited
     length = awaited.length + more
     return replace(
@@ -119,5 +127,5 @@ def lengthen(read: Transaction, more: int, dialect: Dialect, byte_ns: int) -> Tr
 
 
 def listen(duration_ns: int) -> Transaction:
-    """Return a transaction that sends nothing and hears what arrives unasked for `duration_ns`."""
+    """Return a transaction that sends nothing and receives unrequested bytes for `duration_ns`."""
     return Transaction(b"", BROADCAST_ID, (), duration_ns, 0)

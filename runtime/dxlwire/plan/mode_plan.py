@@ -1,14 +1,17 @@
-"""Modes of a model: what selects each, which goals it follows, and in which units; from its control table.
+"""Modes of a model: registers, goals and units of each mode, derived from the control table.
 
-Protocol 2.0: Operating Mode (11), or Control Mode (11) of the XL-320 (e-Manual XM430-W350, XL-320). Protocol
-1.0: the angle limits, both 0 for wheel mode, both at the highest tick for multi-turn mode (e-Manual MX-28,
-CW/CCW Angle Limit (6, 8)), and Torque Control Mode Enable (70) of MX-64 and MX-106. The effort of a position
-is limited by Goal Current (102) in a mode of its own, or in Protocol 1.0 in joint mode by Torque Limit (34)
-(e-Manual AX-12A, Torque Limit (34)): the fraction of the maximum, and never 0, which shows a shutdown.
+Protocol 2.0: Operating Mode (11), or Control Mode (11) of the XL-320 (e-Manual XM430-W350, XL-320).
 
-In wheel mode an AX, RX, DX, EX or XL-320 takes Moving Speed (32) for a fraction of full output and controls
-no speed (e-Manual AX-12A, Moving Speed (32)). That is `pwm`; as `velocity` it is the fraction of the no-load
-speed, which a loaded servo does not reach [i].
+Protocol 1.0: the angle limits, both 0 for wheel mode, both at the highest tick for multi-turn mode (e-Manual
+MX-28, CW/CCW Angle Limit (6, 8)), and Torque Control Mode Enable (70) of MX-64 and MX-106.
+
+Effort limit of a position: Goal Current (102) in a mode of its own. In Protocol 1.0 it is Torque Limit (34)
+in joint mode (e-Manual AX-12A, Torque Limit (34)): the fraction of the maximum, and never 0, which indicates
+a shutdown.
+
+In wheel mode an AX, RX, DX, EX or XL-320 does not control its speed. Moving Speed (32) is then a fraction of
+full output (e-Manual AX-12A, Moving Speed (32)). That is `pwm`; as `velocity` it is the fraction of the
+no-load speed, which a loaded servo does not reach [i].
 """
 
 from __future__ import annotations
@@ -33,16 +36,17 @@ from dxlwire.control_table import ControlItem, ControlTable
 from dxlwire.modes import Mode
 
 _CURRENT, _VELOCITY, _POSITION, _EXTENDED, _CURRENT_BASED, _PWM = 0, 1, 3, 4, 5, 16
-"""Operating Mode (11)"""
+"""Values of Operating Mode (11)."""
 _WHEEL, _JOINT = 1, 2  # Control Mode (11) of the XL-320
 _EXTENDED_TURNS = 256
-"""Reach of extended position control to either side (e-Manual XM430-W350, Goal Position (116): 1,048,575)."""
+"""Range of extended position control in either direction, revolutions (e-Manual XM430-W350, Goal Position
+(116): 1,048,575 ticks)."""
 _MULTI_TURN_TICKS = 28_672
-"""Reach of multi-turn mode to either side (e-Manual MX-28, Goal Position (30))."""
+"""Range of multi-turn mode in either direction, ticks (e-Manual MX-28, Goal Position (30))."""
 _FULL = 1023
-"""Moving Speed (32) at full output in wheel mode, and the most of Goal Torque (71), without the direction."""
+"""Moving Speed (32) at full output in wheel mode, and maximum of Goal Torque (71), without direction bit."""
 _ADDRESS_OF_P = 512
-"""Torque Enable stands there on P and PRO(A), which have no current-based position control."""
+"""Address of Torque Enable on P and PRO(A), which have no current-based position control."""
 
 
 LACKS: Mapping[Mode, str] = MappingProxyType(
@@ -54,11 +58,11 @@ LACKS: Mapping[Mode, str] = MappingProxyType(
         Mode.EFFORT_POSITION: "has no position control with a limit of the effort",
     }
 )
-"""Why a model cannot be in a mode."""
+"""Reason why a model lacks a mode."""
 
 
 def position_reach(table: ControlTable, continuous: bool) -> tuple[int, int]:
-    """Return the lowest and highest goal position, ticks; of a `continuous` joint over many turns."""
+    """Return the lowest and highest goal position, ticks. `continuous`: over many turns, if the model can."""
     if continuous and _EXTENDED in operating_modes(table):
         turns = round(_EXTENDED_TURNS * math.tau / table.rad_per_tick) - 1
         return -turns, turns
@@ -70,10 +74,15 @@ def position_reach(table: ControlTable, continuous: bool) -> tuple[int, int]:
 def mode_plans(
     table: ControlTable, lower_tick: int, upper_tick: int, continuous: bool
 ) -> tuple[ModePlan, ...]:
-    """Return the modes in which a model can be.
+    """Return the modes of a model.
 
-    `lower_tick`, `upper_tick`: what the joint's limits allow as a goal position, within `position_reach`. A
-    model that cannot count turns has no position control for a `continuous` joint.
+    A model that cannot count turns has no position control for a `continuous` joint.
+
+    Args:
+        table: Control table of the model.
+        lower_tick: Lowest goal position within the joint's limits and `position_reach`.
+        upper_tick: Highest goal position within the joint's limits and `position_reach`.
+        continuous: The joint is a wheel or turns more than once.
     """
     ends = (lower_tick, upper_tick)
     if "operating_mode" in table.items:
@@ -82,9 +91,9 @@ def mode_plans(
 
 
 def mode_in(servo: ServoPlan, found: Mapping[str, int]) -> Mode:
-    """Return the mode that a servo's registers select, UNKNOWN where the plan has none for them.
+    """Return the mode that a servo's registers select, UNKNOWN if the plan has none for them.
 
-    Where two modes are selected alike, as velocity and PWM in wheel mode, that of the start goes first.
+    If two modes have the same registers, as velocity and PWM in wheel mode, the start mode wins.
     """
     for plan in sorted(servo.modes, key=lambda plan: plan.mode != servo.start_mode):
         if in_mode(plan, found):
@@ -98,14 +107,15 @@ def model_modes(table: ControlTable, continuous: bool) -> tuple[Mode, ...]:
 
 
 def controls_speed(table: ControlTable) -> bool:
-    """Check whether a model keeps a speed that it is given; in wheel mode only MX do."""
+    """Return True if a model controls its speed; in wheel mode of Protocol 1.0 only MX models do."""
     return "operating_mode" in table.items or "resolution_divider" in table.items
 
 
 def in_mode(wanted: ModePlan, found: Mapping[str, int]) -> bool:
-    """Check whether registers, by name, select a mode; any angle limits in their order are joint mode.
+    """Return True if register values, by name, select a mode.
 
-    In no order are those of a servo whose mode was half changed: one was written, and the other was not.
+    Any pair of angle limits in ascending order selects joint mode. A pair in descending order selects no
+    mode: it belongs to a servo whose mode change was interrupted after one of the two writes.
     """
     values = {register.name: register.value for register in wanted.operating}
     low, high = values.pop("cw_angle_limit", None), values.pop("ccw_angle_limit", None)
@@ -117,7 +127,9 @@ def in_mode(wanted: ModePlan, found: Mapping[str, int]) -> bool:
 
 
 def own_limits(table: ControlTable) -> tuple[OwnLimit, ...]:
-    """Return where a servo keeps the limits beyond which it refuses a goal, in ticks of the goal."""
+    """Return the items with the servo's own limits, in ticks of the goal. The servo refuses a goal beyond
+    them.
+    """
     places: list[tuple[Literal["speed", "effort", "pwm"], str]] = [
         ("speed", "velocity_limit"),
         ("effort", "current_limit"),
@@ -133,12 +145,12 @@ def own_limits(table: ControlTable) -> tuple[OwnLimit, ...]:
 
 
 def limits_torque(table: ControlTable) -> bool:
-    """Check whether Torque Limit (34) limits the effort of positions: Protocol 1.0."""
+    """Return True if Torque Limit (34) limits the effort of positions: Protocol 1.0."""
     return table.protocol == 1.0 and "torque_limit" in table.items
 
 
 def position_layout(table: ControlTable) -> GoalLayout:
-    """Return the block of goal position and, when it stands beside it, of the speed toward it."""
+    """Return the block of the goal position, with the speed toward it if the two items are adjacent."""
     position, speed = table.items["goal_position"], table.items[table.goal_speed_item]
     start = min(position.address, speed.address)
     if abs(position.address - speed.address) != (speed.size if start == speed.address else position.size):
@@ -150,7 +162,8 @@ def position_layout(table: ControlTable) -> GoalLayout:
 def _by_operating_mode(table: ControlTable, ends: tuple[int, int], continuous: bool) -> list[ModePlan]:
     """Return the modes of a model with Operating Mode (e-Manual, section of that name, by model)."""
     items, listed = table.items, operating_modes(table)
-    effort = "goal_current" if "goal_current" in items else "goal_torque"  # PRO; it counts current as well
+    # PRO; its Goal Torque counts current as well
+    effort = "goal_current" if "goal_current" in items else "goal_torque"
     current = _scale(table, effort, _effort_of_ampere(table))
     to_goal = Scale(table.rad_s_per_tick, table.max_speed_tick)
     plain = ModePlan(Mode.UNKNOWN, (), (), *ends, table.rad_s_per_tick)
@@ -162,7 +175,7 @@ def _by_operating_mode(table: ControlTable, ends: tuple[int, int], continuous: b
     position = replace(plain, mode=Mode.POSITION, goals=(position_layout(table),), speed=to_goal)
     limited = position
     if _CURRENT_BASED in listed:
-        # the effort first: a position without its limit would be pursued with the limit of before
+        # The effort goes first. Otherwise the servo would briefly pursue the new position with the old limit.
         goals = (_alone(items[effort], "effort"), *position.goals)
         limited = replace(position, goals=goals, effort=current)
     if not continuous and _POSITION in listed:
@@ -186,7 +199,9 @@ def _by_operating_mode(table: ControlTable, ends: tuple[int, int], continuous: b
 
 
 def operating_modes(table: ControlTable) -> tuple[int, ...]:
-    """Return the values of Operating Mode that a model knows, if it has one (e-Manual, by model)."""
+    """Return the supported values of Operating Mode, or an empty tuple without that item (e-Manual, by
+    model).
+    """
     item = table.items.get("operating_mode")
     if item is None:
         return ()
@@ -206,7 +221,7 @@ def operating_modes(table: ControlTable) -> tuple[int, ...]:
 
 
 def _by_angle_limits(table: ControlTable, ends: tuple[int, int], continuous: bool) -> list[ModePlan]:
-    """Return the modes of a model whose angle limits, or Control Mode, choose between joint and wheel."""
+    """Return the modes of a model that chooses between joint and wheel by angle limits or Control Mode."""
     items = table.items
     many = continuous and "multi_turn_offset" in items
     controlled = controls_speed(table)
@@ -218,7 +233,7 @@ def _by_angle_limits(table: ControlTable, ends: tuple[int, int], continuous: boo
         limits = (table.max_tick, table.max_tick) if many else ends
         to_goal, layout = Scale(table.rad_s_per_tick, table.max_speed_tick), position_layout(table)
         if many:
-            # turns below 0 are in two's complement (e-Manual MX-28, Goal Position (30), Multi-turn Mode)
+            # Negative turns are in two's complement (e-Manual MX-28, Goal Position (30), Multi-turn Mode).
             layout = replace(layout, position=replace(layout.leading, encoding="twos_complement"))
         goals = (layout,)
         joint = replace(plain, mode=Mode.POSITION, operating=_selected(table, limits), goals=goals)
@@ -241,7 +256,7 @@ def _by_angle_limits(table: ControlTable, ends: tuple[int, int], continuous: boo
 
 
 def _selected(table: ControlTable, limits: tuple[int, int]) -> tuple[RegisterValue, ...]:
-    """Return what chooses joint mode within limits, or wheel mode: both 0."""
+    """Return the registers that select joint mode within limits, or wheel mode: both limits 0."""
     if "control_mode" in table.items:
         return (_value(table, "control_mode", _JOINT if any(limits) else _WHEEL),)
     chosen = [
@@ -280,5 +295,5 @@ def _value(table: ControlTable, name: str, value: int) -> RegisterValue:
 
 
 def field(item: ControlItem, start: int) -> Field:
-    """Return where an item stands in a block that begins at an address."""
+    """Return the field of an item in a block that begins at an address."""
     return Field(item.address - start, item.size, item.encoding)

@@ -1,4 +1,6 @@
-"""From joints and control tables to the plan of one bus: every packet of the cycle, its times, its cost."""
+"""Planning: builds the plan of one bus, with packets, times and cost of a cycle, from joints and control
+tables.
+"""
 
 from __future__ import annotations
 
@@ -42,7 +44,7 @@ Item = TypeVar("Item")
 
 
 class Wiring(msgspec.Struct, frozen=True):
-    """One joint and the servo that moves it, as `bus_plan` needs them."""
+    """One joint and its servo, as input of `bus_plan`."""
 
     joint: str
     row: int  # Row of the joint in the state and goal arrays of the whole robot
@@ -50,17 +52,18 @@ class Wiring(msgspec.Struct, frozen=True):
     table: ControlTable
     reference: float  # rad, counted from the servo's raw 0
     direction: int
-    lower: float  # rad or m, as the joint counts
-    upper: float  # rad or m, as the joint counts
+    lower: float  # rad or m, in the joint's terms
+    upper: float  # rad or m, in the joint's terms
     settings: tuple[RegisterValue, ...] = ()
-    """What its memory shall hold, in the order in which it is written."""
+    """Required register values, in the order of writing."""
     continuous: bool = False
-    """A wheel, or a joint of many turns, which positions count; without limits `lower`, `upper` are inf."""
+    """True for a wheel, or for a joint that counts several turns; without limits `lower` and `upper` are
+    infinite."""
     start_mode: Mode | None = None
-    """In which the servo is brought at the start; None: VELOCITY for a wheel, else POSITION."""
-    ratio: float = 1.0  # What the joint moves while the servo turns by 1 rad, rad or m
-    unit: JointUnit = ROTARY  # Of the joint's positions
-    name: str = ""  # The servo's own, where several move one joint
+    """Mode that the start-up selects; None: VELOCITY for a wheel, else POSITION."""
+    ratio: float = 1.0  # Movement of the joint per radian of the servo, rad or m
+    unit: JointUnit = ROTARY  # Unit of the joint's positions
+    name: str = ""  # Unique name of the servo if several servos move one joint
 
 
 def bus_plan(
@@ -74,10 +77,20 @@ def bus_plan(
     devices: Sequence[tuple[DevicePlan, DeviceTable]] = (),
     protocol: float = 1.0,
 ) -> BusPlan:
-    """Prepare everything that goes over one serial line.
+    """Return the plan of one serial line.
 
-    `latency_ns` is what the adapter adds to each request, `return_delay_ns` what each servo waits before it
-    answers. Raises ValueError when the servos cannot share one cycle.
+    Args:
+        name: Name of the bus.
+        port: Device path, or `sim`.
+        baud_rate: bit/s.
+        latency_ns: Latency that the adapter adds to each request.
+        return_delay_ns: Time that each servo waits before it answers.
+        joints: The joints with their servos.
+        devices: The devices with their tables.
+        protocol: 1.0 or 2.0.
+
+    Raises:
+        ValueError: The servos cannot share one cycle.
     """
     line = Line(baud_rate, latency_ns, return_delay_ns, dialect_of(protocol))
     servos = tuple(_servo(joint) for joint in joints)
@@ -110,7 +123,7 @@ def bus_plan(
 
 
 def plan_line(plan: BusPlan) -> Line:
-    """Return the line of a plan, as the robot file assumes it."""
+    """Return the line of a plan, with the timing of the robot file."""
     return Line(
         plan.baud_rate,
         plan.latency_ns,
@@ -121,7 +134,7 @@ def plan_line(plan: BusPlan) -> Line:
 
 
 def torque_off_ns(plan: BusPlan) -> int:
-    """Return how long torque off takes on a bus: to all at once, then to each servo, with read-back."""
+    """Return the time to switch torque off on a bus, ns: a broadcast, then each servo with read-back."""
     line, total_ns = plan_line(plan), sum(each.due_ns for each in plan.limp)
     for servo in plan.servos:
         write = line.write(servo.servo_id, servo.torque_address, b"\0")
@@ -131,18 +144,18 @@ def torque_off_ns(plan: BusPlan) -> int:
 
 
 def goal_layouts(servos: Sequence[ServoPlan]) -> tuple[GoalLayout, ...]:
-    """Return the different goal blocks of servos in their first modes; each needs a sync write of its own."""
+    """Return the distinct goal blocks of servos in their start modes; each needs its own sync write."""
     return tuple(dict.fromkeys(goal for servo in servos for goal in servo.mode_plan(servo.start_mode).goals))
 
 
 def goal_parts(dialect: Dialect, layout: GoalLayout, servos: Sequence[Item]) -> list[Sequence[Item]]:
-    """Split servos of one goal block into as many as one sync write takes."""
+    """Split the servos of one goal block into parts that fit one sync write each."""
     most = dialect.MOST_GOAL_BYTES // (layout.length + 1)
     return [servos[start : start + most] for start in range(0, len(servos), most)]
 
 
 def _empty_goals(line: Line, layout: GoalLayout, servos: Sequence[ServoPlan]) -> list[bytes]:
-    """Return the sync writes of zeros to all servos of one layout, for their sizes; they are never sent."""
+    """Return sync writes of zeros to all servos of one layout. They only provide sizes and are never sent."""
     here = [servo for servo in servos if layout in servo.mode_plan(servo.start_mode).goals]
     return [
         line.dialect.sync_write(
@@ -153,9 +166,9 @@ def _empty_goals(line: Line, layout: GoalLayout, servos: Sequence[ServoPlan]) ->
 
 
 def _torque_off(line: Line, servos: Sequence[ServoPlan]) -> list[Transaction]:
-    """Return torque off for all servos at once, without a reply.
+    """Return broadcasts that switch torque off, without a reply.
 
-    Where models differ in the address of torque enable, each gets a sync write of its own.
+    Each address of Torque Enable gets its own sync write if models differ in it.
     """
     addresses = dict.fromkeys(servo.torque_address for servo in servos)
     if len(addresses) == 1:
@@ -171,11 +184,11 @@ def _servo(joint: Wiring) -> ServoPlan:
         for angle in (joint.lower, joint.upper)
     )
     reach = position_reach(table, joint.continuous)
-    # inwards, so that no goal is outside; 1e-6 ticks forgive the rounding of degrees
+    # Round inwards so that no goal is outside; 1e-6 ticks absorb the rounding of degrees.
     lower = math.ceil(max(ends[0], reach[0]) - 1e-6)
     upper = math.floor(min(ends[1], reach[1]) + 1e-6)
     hardware_error = table.items.get(table.errors.item)
-    # a torque in Nm is the joint's; a current or a share of the maximum remains what the servo has
+    # A torque in Nm applies to the joint. A current or a fraction of the maximum stays that of the servo.
     effort = 1.0 / joint.ratio if table.effort_unit == "Nm" else 1.0
     modes = tuple(
         replace(mode, effort=None if mode.effort is None else _scaled(mode.effort, effort))
@@ -217,7 +230,7 @@ def _scaled(scale: Scale, factor: float) -> Scale:
 
 
 def _start_mode(joint: Wiring, modes: Sequence[ModePlan]) -> Mode:
-    """Return the first mode; raises ValueError when the model does not have it."""
+    """Return the start mode. Raises ValueError if the model does not have it."""
     wanted = joint.start_mode or (Mode.VELOCITY if joint.continuous else Mode.POSITION)
     if any(plan.mode == wanted for plan in modes):
         return wanted
@@ -225,7 +238,7 @@ def _start_mode(joint: Wiring, modes: Sequence[ModePlan]) -> Mode:
 
 
 def _torque_limit(table: ControlTable) -> TorqueLimit | None:
-    """Return where a model's torque is limited; see `dynamixel.torque_limit` for the manual's pages."""
+    """Return the torque limit of a model; see `dynamixel.torque_limit` for the pages of the manual."""
     for name, full in (("torque_limit", "max_torque"), ("goal_pwm", "pwm_limit")):
         item, own = table.items.get(name), table.items.get(full)
         if item is not None and own is not None and item.size == own.size:
@@ -235,9 +248,9 @@ def _torque_limit(table: ControlTable) -> TorqueLimit | None:
 
 
 def _state_layout(table: ControlTable, *, counts_turns: bool) -> StateLayout:
-    """Return the one block that holds position, speed and load or current.
+    """Return the single block that holds position, speed and load or current.
 
-    Raises ValueError when they do not stand together: an address without an item cannot be read.
+    Raises ValueError if other addresses between them are not items: these cannot be read.
     """
     names = ("present_position", table.present_speed_item, table.effort_item)
     items = [table.items[name] for name in names]
@@ -247,7 +260,7 @@ def _state_layout(table: ControlTable, *, counts_turns: bool) -> StateLayout:
         raise ValueError(f"{table.model}: {', '.join(names)} do not stand in one block, so no read gets all")
     position, velocity, effort = (field(item, start) for item in items)
     if counts_turns:
-        # turns below 0 are in two's complement, also in the 16 bits of multi-turn mode
+        # Negative turns are in two's complement, also in the 16 bits of multi-turn mode.
         position = replace(position, encoding="twos_complement")
     spare = table.spare(end, MOST_SPARE)
     return StateLayout(start, end - start, position, velocity, effort, spare)

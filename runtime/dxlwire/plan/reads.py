@@ -1,12 +1,12 @@
-"""Reads: what is read together on a bus, and by which instructions; the cheapest way is taken.
+"""Reads: grouping of a bus's servos and devices into read instructions, by the lowest cost.
 
-One instruction saves its own bytes and an adapter's latency for each servo that it asks beside the first one,
-and a fast form saves seven bytes of each reply and the return delays of all but the first (protocol.md, Time
-budget). Indirect addresses are no way: of each model in the control tables the state stands in one block
-without a byte between its items, so there is nothing that they could leave out.
+One instruction for several servos saves its own bytes and the adapter's latency for each servo after the
+first. A fast form saves seven bytes of each reply, and the return delays of all servos but the first
+(protocol.md, Time budget). Indirect addresses save nothing: in every control table the state is one block
+without gaps.
 
-Devices answer behind the servos of their read, so that one that is silent leaves the servos' replies as they
-are; of a device with several blocks each is in another read, as no instruction names an ID twice.
+Devices answer after the servos of their read, so that a silent device does not affect the servos' replies.
+The blocks of one device are in different reads, because an instruction must not contain an ID twice.
 """
 
 from __future__ import annotations
@@ -23,24 +23,30 @@ from dxlwire.plan.line import TIMEOUT_MARGIN_NS, Line
 from dxlwire.transaction import Transaction
 
 CHAIN = MappingProxyType({1.0: "bulk_read", 2.0: "sync_read"})
-"""Protocol -> the capability by which several servos of one layout answer one instruction in turn."""
-TOGETHER = "bulk_read"  # The capability by which servos of different layouts do
-FAST = "fast_sync_read"  # The capability by which they answer with one status packet
+"""Protocol -> capability of servos with one layout to answer a single instruction in turn."""
+TOGETHER = "bulk_read"  # The same capability for servos with different layouts
+FAST = "fast_sync_read"  # Capability to answer with one shared status packet
 
 
 class Reads(NamedTuple):
-    """Which servos and devices of a bus are read together, and how."""
+    """Grouping of a bus's servos and devices into reads."""
 
-    groups: tuple[tuple[int, ...], ...]  # Indices of members; a group of one is read by itself
-    fast: tuple[bool, ...]  # Which groups are to be read by a fast form
-    chosen: tuple[Transaction, ...]  # The read of each group in that form
-    plain: tuple[Transaction, ...]  # The read of each group in the form that every firmware knows
+    groups: tuple[tuple[int, ...], ...]  # Indices of members; a group of one is a plain read
+    fast: tuple[bool, ...]  # True for each group that is read by a fast form
+    chosen: tuple[Transaction, ...]  # Read of each group in that form
+    plain: tuple[Transaction, ...]  # Read of each group in the form that every firmware supports
 
 
 def state_read(line: Line, members: Sequence[Member], more: int = 0, *, fast: bool = False) -> Transaction:
-    """Return the one read of several members, servos first, each `more` bytes longer where it has as many.
+    """Return one read of several members, servos first.
 
-    Its devices are awaited for a moment only, once the servos have answered.
+    Devices get only a short timeout once the servos have answered.
+
+    Args:
+        line: Timing of the line.
+        members: Servos, then devices.
+        more: Extra bytes to read from each member, limited by its spare bytes.
+        fast: Use a fast form.
     """
     read = line.read_many(
         [(one.servo_id, one.address, one.length + min(more, one.spare)) for one in members], fast=fast
@@ -66,17 +72,23 @@ def servo_read(line: Line, servo: ServoPlan) -> Transaction:
 
 
 def slow_items(table: ControlTable) -> tuple[str, ...]:
-    """Return the items that are read between the cycles where the robot file names none."""
+    """Return the items that are read between cycles if the robot file names none."""
     return tuple(name for name in table.items if name in SLOW_STATES)
 
 
 def choose_reads(
     line: Line, members: Sequence[Member], able: Sequence[Set[str]], goals: Sequence[bytes]
 ) -> Reads:
-    """Return the cheapest way to read the servos and devices of a bus; of equal ones the simplest.
+    """Return the cheapest grouping of the servos and devices of a bus; among equal ones the simplest.
 
-    `able`: capabilities of each member; `goals`: the packets that are written each cycle. Raises ValueError
-    when they do not fit one instruction.
+    Args:
+        line: Timing of the line.
+        members: Blocks to read in each cycle.
+        able: Capabilities of each member.
+        goals: Packets that are written in each cycle.
+
+    Raises:
+        ValueError: No grouping has replies that fit into the longest packet.
     """
 
     def laid(groups: Sequence[Sequence[int]], fast: Sequence[bool]) -> tuple[Transaction, ...]:
@@ -94,7 +106,7 @@ def choose_reads(
 
 
 def read_budget(line: Line, reads: Sequence[Transaction], goals: Sequence[bytes]) -> Budget:
-    """Return the cost of one cycle: a sync write has no reply, so no latency counts (protocol.md)."""
+    """Return the cost of one cycle. A sync write has no reply, so it adds no latency (protocol.md)."""
     request_bytes = sum(len(read.packet) for read in reads) + sum(map(len, goals))
     reply_bytes = delays = 0
     for read in reads:
@@ -114,7 +126,7 @@ def read_budget(line: Line, reads: Sequence[Transaction], goals: Sequence[bytes]
 def _partitions(
     line: Line, members: Sequence[Member], able: Sequence[Set[str]]
 ) -> list[tuple[tuple[tuple[int, ...], ...], tuple[bool, ...]]]:
-    """Return what could be read together, and which groups by a fast form; the simplest first."""
+    """Return the possible groupings, with the groups that use a fast form; the simplest first."""
     chain = CHAIN[line.dialect.PROTOCOL]
     alone: list[Hashable] = list(range(len(members)))
     alike: list[Hashable] = [
@@ -143,7 +155,7 @@ def _grouped(keys: Sequence[Hashable]) -> tuple[tuple[int, ...], ...]:
 
 
 def read_by(protocol: float, members: Sequence[Member], reads: Reads) -> str:
-    """Return what the e-Manual calls the instructions of reads: `fast sync read + read`."""
+    """Return the e-Manual's names of the instructions of reads: `fast sync read + read`."""
     names: dict[str, None] = {}
     for group, fast in zip(reads.groups, reads.fast, strict=True):
         blocks = {(members[index].address, members[index].length) for index in group}

@@ -1,4 +1,4 @@
-"""Retries and longer timeouts of programs that have time: start-up, return, tools."""
+"""Retries and longer timeouts for programs without a deadline: start-up, recovery, tools."""
 
 from __future__ import annotations
 
@@ -12,29 +12,28 @@ from dxlwire.wire.dialect import dialect_of
 
 ATTEMPTS = 3
 LONGER_NS = 240_000_000
-"""Beyond the ordinary timeout [i]: hosts, virtual machines and USB adapters stall for tens of ms."""
+"""Extension of the ordinary timeout [i]: hosts, virtual machines and USB adapters stall for tens of ms."""
 MOST_SILENCE_NS = 960_000_000
-"""Beyond the ordinary timeouts, for all lost replies together: after four a servo is not merely late."""
+"""Total extension of timeouts for all lost replies: after four losses a servo is not merely late."""
 
 
 class ReplyTimes(msgspec.Struct):
     """Lateness of the replies on one bus, as `extend_timeouts` observes it."""
 
     late_ns: list[int] = []
-    """Time after the one due by the wire, without that in which simulated servos had no processor; of each
-    reply that can answer one request only."""
+    """Delay of each unambiguous reply after its due time, ns, without the stalls of simulated servos."""
     missing: int = 0
-    """Requests without a reply before their extended timeout."""
+    """Number of requests without a reply before their extended timeout."""
 
 
 def setup_line(plan: BusPlan) -> Line:
-    """Return the line before the servos' return delays are known: the longest is assumed."""
+    """Return the line for use before the servos' return delays are known; it assumes the longest delay."""
     delay_ns = max(plan.return_delay_ns, LONGEST_RETURN_DELAY_NS)
     return Line(plan.baud_rate, plan.latency_ns, delay_ns, dialect_of(plan.protocol))
 
 
 def retry(transaction: Transaction) -> Program[Reply]:
-    """Repeat a transaction until it is answered, at most ATTEMPTS times; return the last reply."""
+    """Repeat a transaction until it is answered, at most ATTEMPTS times in total; return the last reply."""
     reply = yield transaction
     for _ in range(ATTEMPTS - 1):
         if reply.answered:
@@ -44,19 +43,26 @@ def retry(transaction: Transaction) -> Program[Reply]:
 
 
 def pause(duration_ns: int) -> Program[None]:
-    """Let a moment pass, and take what still comes."""
+    """Wait, and receive bytes that still arrive."""
     yield listen(duration_ns)
 
 
 def limit_patience(
     program: Program[Result], patience_ns: int = 0, *, any_age: bool = False
 ) -> Program[Result]:
-    """Run a program whose transactions are not held back for late replies for longer than a time, ns.
+    """Run a program whose transactions are held back for late replies for at most `patience_ns`.
 
-    Torque off, and servos whose Bus Watchdogs run, cannot wait. A reply that may be that to an older request
-    is then charged to the older one, as replies come in the order of their requests. With `any_age` a reply
-    to an older read of the same registers counts instead: servos with armed watchdogs would stop during the
-    timeout of a reply that was charged.
+    This serves torque off and servos with a running Bus Watchdog, which cannot wait. An ambiguous reply is
+    then charged to the older request, because replies come in the order of their requests.
+
+    Args:
+        program: The program.
+        patience_ns: Longest wait for late replies to older requests, ns.
+        any_age: Accept the reply to an older read of the same registers. Otherwise servos with an armed
+            watchdog would stop during the timeout of a reply that was charged to an older request.
+
+    Returns:
+        The result of the program.
     """
     try:
         request = next(program)
@@ -73,10 +79,17 @@ def limit_patience(
 def extend_timeouts(
     program: Program[Result], most_ns: int = LONGER_NS, times: ReplyTimes | None = None
 ) -> Program[Result]:
-    """Run a program of one bus with longer timeouts, as long as few replies are lost.
+    """Run a program of one bus with longer timeouts while few replies are lost.
 
-    A servo that answers late costs what it takes; a bus without any servo is reported within about two
-    seconds. `times` collects how late replies came.
+    A late servo costs only its own delay. A bus without any servo is reported within about two seconds.
+
+    Args:
+        program: The program.
+        most_ns: Longest extension of one timeout, ns.
+        times: Collects the lateness of replies.
+
+    Returns:
+        The result of the program.
     """
     left_ns = MOST_SILENCE_NS
     try:

@@ -1,4 +1,4 @@
-"""Serial ports: opened, locked, reopened, with the latency timer of their adapter.
+"""Serial ports: opening, locking and reopening, with the latency timer of the adapter.
 
 Packets do not belong here: a port carries bytes.
 """

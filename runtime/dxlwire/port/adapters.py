@@ -1,4 +1,4 @@
-"""Adapters: the serial ports of this machine, and what on it may disturb them."""
+"""Adapters: the serial ports of this machine, and programs and settings that may disturb them."""
 
 from __future__ import annotations
 
@@ -11,31 +11,31 @@ import msgspec
 ROOT = Path("/")
 USB_PORTS = ("ttyUSB*", "ttyACM*")
 ONBOARD_PORTS = ("ttyAMA*", "ttyTHS*", "ttySC*", "serial0")
-"""UARTs of a Raspberry Pi, a Jetson, an SC16IS7xx on SPI or I2C; serial0 is the Pi's own name for one."""
+"""UARTs of a Raspberry Pi, a Jetson, an SC16IS7xx on SPI or I2C; serial0 is the Pi's own alias."""
 _BRAILLE = re.compile(r'^ENV\{PRODUCT\}=="(1a86/7523|10c4/ea60)/', re.MULTILINE)
-"""A rule that starts brltty for each CH340 or CP210x."""
+"""Pattern of a rule that starts brltty for each CH340 or CP210x."""
 _RULES = ("etc/udev/rules.d", "usr/lib/udev/rules.d", "lib/udev/rules.d")
 
 
 class Disturbance(msgspec.Struct, frozen=True):
-    """Something on this machine that may take a port, send to it, or suspend it."""
+    """Program or setting on this machine that may take a port, send to it, or suspend it."""
 
     what: str
     found: str
     why: str
     fix: str
-    """The command."""
+    """Command that removes the disturbance."""
 
 
 def serial_devices(root: Path = ROOT) -> tuple[str, ...]:
-    """Return the paths of the serial ports that this machine has, the lasting names first."""
+    """Return the paths of the serial ports of this machine, persistent names first."""
     folders = [("serial/by-id", "*"), *(("", pattern) for pattern in (*USB_PORTS, *ONBOARD_PORTS))]
     found = (sorted((root / "dev" / folder).glob(pattern)) for folder, pattern in folders)
     return tuple(f"/{path.relative_to(root)}" for paths in found for path in paths)
 
 
 def disturbances(root: Path = ROOT) -> Iterator[Disturbance]:
-    """Yield what may disturb the USB adapters of a machine."""
+    """Yield programs and settings that may disturb the USB adapters of a machine."""
     ports = [path.name for pattern in USB_PORTS for path in sorted((root / "dev").glob(pattern))]
     programs = {_text(path) for path in root.glob("proc/[0-9]*/comm")}
     if ports and "ModemManager" in programs:
@@ -74,7 +74,7 @@ def warnings_for(port: str, root: Path = ROOT) -> Iterator[str]:
 
 
 def _power_control(device: Path) -> Path | None:
-    """Return the file that lets the USB device of a port be suspended; None: it is not on USB."""
+    """Return the file that controls USB autosuspend of a port, or None if it is not on USB."""
     place = device.resolve()
     found = (folder for folder in (place, *place.parents) if (folder / "idVendor").is_file())
     usb = next(found, None)

@@ -1,7 +1,9 @@
-"""Latency timer: how long an FTDI adapter keeps the last bytes of a reply back, and how to shorten that.
+"""Latency timer: the delay with which an FTDI adapter holds back the last bytes of a reply, and ways to
+shorten it.
 
-Sources: FTDI AN232B-04; Linux, drivers/usb/serial/ftdi_sio.c, which has the timer in sysfs and shortens it to
-1 ms for a program that sets ASYNC_LOW_LATENCY on the open line. Other adapters have no such timer.
+Sources: FTDI AN232B-04; Linux, drivers/usb/serial/ftdi_sio.c. The driver shows the timer in sysfs and
+shortens it to 1 ms for a program that sets ASYNC_LOW_LATENCY on the open line. Other adapters have no such
+timer.
 """
 
 from __future__ import annotations
@@ -15,42 +17,43 @@ import msgspec
 
 SYSTEM = Path("/sys")
 _TIOCGSERIAL, _TIOCSSERIAL, _FLAGS, _ASYNC_LOW_LATENCY = 0x541E, 0x541F, 4, 1 << 13
-"""struct serial_struct (linux/serial.h): `flags` is the fifth integer."""
-SHIPPED_NS = 16_000_000  # The timer of an FTDI adapter as it is shipped (AN232B-04)
+"""Index of `flags` in struct serial_struct (linux/serial.h): the fifth integer."""
+SHIPPED_NS = 16_000_000  # Factory setting of an FTDI adapter's timer (AN232B-04)
 _SEEN_LESS_NS = 4_000_000
-"""It runs from the reply's first byte, or from what was heard before: so much less of it may be seen [i]."""
-_SEEN_MORE_NS = 2_000_000  # A host that takes the bytes late [i]
+"""Tolerance below the timer [i]: it starts with the reply's first byte or with earlier bytes, so the host may
+observe only the rest of its period."""
+_SEEN_MORE_NS = 2_000_000  # Tolerance above the timer [i], for a host that reads the bytes late
 
 
 class LatencyTimer(msgspec.Struct, frozen=True):
-    """The timer of one adapter."""
+    """Latency timer of one adapter."""
 
     found_ms: int
-    place: Path  # Where the Linux kernel shows it
+    place: Path  # File of the timer in sysfs
 
     @property
     def fix(self) -> str:
-        """The command that shortens it until the adapter is unplugged."""
+        """Command that shortens the timer until the adapter is unplugged."""
         return fix(str(self.place))
 
 
 def fix(place: str) -> str:
-    """Return the command that makes a timer as short as it can be, 1 ms, until the adapter is unplugged."""
+    """Return the command that sets a timer to its minimum, 1 ms, until the adapter is unplugged."""
     return f"echo 1 | sudo tee {place}"
 
 
 def is_simulated(port: str) -> bool:
-    """Return whether a port has no real servos: those of `dxlrun sim` are on a pseudo-terminal."""
+    """Return True if a port has no real servos: `dxlrun sim` serves its own on a pseudo-terminal."""
     return port == "sim" or os.path.realpath(port).startswith("/dev/pts/")
 
 
 def is_timer(extra_ns: float) -> bool:
-    """Return whether replies are so late that it looks like the timer of an FTDI adapter as it is shipped."""
+    """Return True if the lateness of replies suggests an FTDI timer at its factory setting."""
     return SHIPPED_NS - _SEEN_LESS_NS <= extra_ns <= SHIPPED_NS + _SEEN_MORE_NS
 
 
 def timer_ms(place: Path) -> int | None:
-    """Return what the Linux kernel shows at a place, ms; None: no number, or it may not be read."""
+    """Return the value of a timer file, ms, or None if it is unreadable or not a number."""
     try:
         return int(place.read_text())
     except (OSError, ValueError):
@@ -58,23 +61,31 @@ def timer_ms(place: Path) -> int | None:
 
 
 def latency_timer(path: str, system: Path = SYSTEM) -> LatencyTimer | None:
-    """Return the timer of the adapter whose device is `path`; None: it has none, or it may not be read."""
+    """Return the timer of the adapter with the device `path`, or None if it has none or may not be read."""
     place = system / "bus/usb-serial/devices" / Path(os.path.realpath(path)).name / "latency_timer"
     found = timer_ms(place)
     return None if found is None else LatencyTimer(found, place)
 
 
 def shorten(descriptor: int, path: str, most_ns: int, system: Path = SYSTEM) -> tuple[str, str]:
-    """Shorten the timer of an open line that is longer than `most_ns`, as far as this user may.
+    """Shorten the latency timer of an open line if it is longer than `most_ns` and this user may change it.
 
-    Return what was done, and what is wrong still; both are empty where nothing is to be done.
+    Args:
+        descriptor: The open line.
+        path: Its device.
+        most_ns: Longest acceptable timer, ns.
+        system: Root of sysfs, for tests.
+
+    Returns:
+        A sentence about the change, and a sentence about a timer that is still too long; empty if not
+            applicable.
     """
     before = latency_timer(path, system)
     if before is None or before.found_ms * 1_000_000 <= most_ns:
         return "", ""
-    import fcntl  # not above: Windows has none, and robots run there on virtual time
+    import fcntl  # Imported here because Windows has no fcntl; robots run there on virtual time
 
-    with suppress(OSError):  # also what has no such flag
+    with suppress(OSError):  # Some drivers have no such flag
         settings = array("i", bytes(128))
         fcntl.ioctl(descriptor, _TIOCGSERIAL, settings)
         settings[_FLAGS] |= _ASYNC_LOW_LATENCY

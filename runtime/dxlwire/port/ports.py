@@ -1,4 +1,4 @@
-"""Ports: the handles of serial lines; bytes out, bytes in before a deadline."""
+"""Ports: handles of serial lines, for writes and for reads with a deadline."""
 
 from __future__ import annotations
 
@@ -14,94 +14,104 @@ import msgspec
 
 from dxlwire.errors import PortError
 
-# found at once, some dozen times a cycle
+# Local names save attribute lookups: these are called some dozen times a cycle.
 _write, _now_ns = os.write, time.monotonic_ns
 
 _WRITE_TIMEOUT_NS = 20_000_000
-"""A goal packet for 50 servos takes 2.6 ms at 1 Mbit/s; a line that does not take it in 20 ms is stuck."""
+"""A goal packet for 50 servos takes 2.6 ms at 1 Mbit/s; a line that blocks for 20 ms is stuck."""
 
 LONGEST_STALL_NS = 500_000_000
-"""A simulated servo that has not answered by then is lost, whatever its process does: the shutdown of a run
-has two seconds, and a person notices a robot that stands still for half a second."""
-_STALL_STEP_NS = 1_000_000  # Between two looks at the progress of a process that has no core
-_SAME_STALL_NS = 10_000_000  # Waits that are no further apart count as one
+"""Longest wait for a stalled simulated servo, after which it counts as lost. The shutdown of a run has two
+seconds, and a person notices a robot that stops for half a second."""
+_STALL_STEP_NS = 1_000_000  # Interval at which the progress of a stalled process is checked
+_SAME_STALL_NS = 10_000_000  # Waits with a shorter gap than this count as one
 
 Reopened = Callable[[int], int | None]
-"""Asks the process that opens lines for one again; returns its descriptor once there is one; never waits."""
+"""Requests a new descriptor of a line from the process that opens lines; returns it, or None until it is
+available. Never waits."""
 
 
 AUTO_SHARE = 0.1
-"""Share of a core that polling for replies takes at most, if the file does not set how long to poll."""
-MOST_SHARE = 0.5  # The same where the file does
+"""Highest share of a core for reply polling, unless the file sets the polling time."""
+MOST_SHARE = 0.5  # The same if the file sets it
 
 
 class ReplyPolling(msgspec.Struct):
-    """How replies are polled for: asleep until shortly before they are due by the plan, then looked for.
+    """Settings of reply polling: the kernel sleeps until shortly before a reply is due, then polls for it.
 
-    Waking a process that blocks costs some 50 us on a stock Linux, of each reply. What is polled is credit:
-    a share of the time that passes, so that no more than that share of a core is ever spent on it. Only the
-    exchange kernel polls.
+    On a stock Linux the wake-up of a blocked process costs some 50 us per reply. Polling draws on a credit: a
+    share of the elapsed time, so that it never uses more than that share of a core. Only the exchange kernel
+    polls.
     """
 
     longest_ns: int = 1_000_000
-    """A reply is polled for at most so long: beyond that it is late, or lost."""
+    """Longest polling for one reply; a later reply is late or lost."""
     share: float = AUTO_SHARE
     margin_ns: int = 60_000
-    """How long before a reply is expected sleeping ends; as sleeps were measured to overshoot."""
+    """Time before the expected reply at which sleep ends, because sleeps were measured to overshoot."""
 
 
 class Port(Protocol):
-    """One serial line; nothing here waits. Raises PortError when the adapter is gone."""
+    """One serial line; no method waits.
+
+    Raises PortError when the adapter is gone.
+    """
 
     def write(self, data: bytes | bytearray | memoryview) -> None:
-        """Hand one whole packet to the line."""
+        """Write one whole packet to the line."""
         ...
 
     def read_into(self, buffer: memoryview) -> int:
-        """Copy what has arrived into `buffer`; return the number of bytes, 0 when there is nothing."""
+        """Copy received bytes into `buffer`; return their number, 0 without any."""
         ...
 
     def failure(self, code: int) -> PortError:
-        """Return the error of a write that ended with an errno, or with -1: it takes no more bytes."""
+        """Return the error for a failed write.
+
+        Args:
+            code: errno of the write, or -1 if the line accepts no more bytes.
+        """
         ...
 
     def extend_deadline(self, deadline_ns: int, off_wire_ns: int, heard_ns: int, now_ns: int) -> int:
-        """Return until when a reply is awaited of which not all has come by its deadline.
+        """Return the extended deadline of a reply that is incomplete at its deadline.
 
-        Later than `now_ns` only where the device behind the line itself had no processor to answer with, as
-        the process of simulated servos may have none; of real servos it is always `deadline_ns`.
+        It is later than `now_ns` only if the device at the other end had no processor, as the process of
+        simulated servos may have none. For real servos it is always `deadline_ns`.
 
         Args:
             deadline_ns: Deadline by the plan.
-            off_wire_ns: When the last byte of the request is off the wire.
-            heard_ns: When the newest byte was received on the line.
+            off_wire_ns: Time at which the last byte of the request is off the wire.
+            heard_ns: Time at which the newest byte was received on the line.
             now_ns: Time now.
         """
         ...
 
     def stalled_ns(self, since_ns: int, until_ns: int) -> int:
-        """Return for how long the device behind the line had no processor between two times; 0: a servo."""
+        """Return how long the device had no processor between two times, ns; 0 for real servos."""
         ...
 
     def late_ns(self, off_wire_ns: int, heard_ns: int) -> int:
-        """Return by how much the newest reply is late because the device behind the line had no processor.
+        """Return the part of the newest reply's lateness for which the device had no processor.
 
-        `off_wire_ns`: when its request was off the wire; `heard_ns`: when it was received.
+        Args:
+            off_wire_ns: Time at which its request was off the wire.
+            heard_ns: Time at which the reply was received.
         """
         ...
 
 
 class Ports(Protocol):
-    """All lines of a robot, waited for together."""
+    """All lines of a robot, with a common wait."""
 
     @property
     def polling(self) -> ReplyPolling | None:
-        """How replies are polled for; None: not at all."""
+        """Settings of reply polling; None: no polling."""
         ...
 
     @property
     def descriptors(self) -> Sequence[int] | None:
-        """The lines' file descriptors; None where there are none, on virtual time."""
+        """File descriptors of the lines; None on virtual time."""
         ...
 
     @property
@@ -110,24 +120,27 @@ class Ports(Protocol):
         ...
 
     def wait(self, deadline_ns: int) -> Sequence[int]:
-        """Wait for bytes on any line until `deadline_ns`; return the indices of lines with bytes.
+        """Wait for bytes on any line until `deadline_ns`; return the indices of the readable lines.
 
-        Empty when time is up. Advances virtual time where time is virtual. `deadline_ns` is on the run's
-        Clock; a deadline in the past only looks.
+        The result is empty after the deadline. On virtual time the wait advances the clock. A deadline in the
+        past only checks the lines.
+
+        Args:
+            deadline_ns: Time on the run's Clock.
         """
         ...
 
     def reopen(self, index: int) -> bool:
-        """Ask for a line that is lost again; return whether it is back, in its place in `ports`. Never waits.
+        """Request a lost line again; return True if its port is replaced in `ports`. Never waits.
 
-        From the first call on the line that is gone is not waited for any more. What stands behind a line
-        that is back was without a host, and maybe without power: all its servos count as rebooted.
+        From the first call on, the lost line is no longer part of `wait`. The devices on a reopened line were
+        without a host, and possibly without power, so all its servos count as rebooted.
         """
         ...
 
 
 class OwnProcessors:
-    """Part of the port of a line whose devices have processors of their own: the host does not delay them."""
+    """Mix-in for ports of devices with their own processors, which the host cannot delay."""
 
     def extend_deadline(self, deadline_ns: int, off_wire_ns: int, heard_ns: int, now_ns: int) -> int:
         """Return `deadline_ns`."""
@@ -143,19 +156,19 @@ class OwnProcessors:
 
 
 class SerialPort(OwnProcessors):
-    """A serial line by its descriptor, made non-blocking; opened, locked and set up by another process."""
+    """Serial line with a non-blocking descriptor, which another process opened, locked and configured."""
 
     def __init__(self, descriptor: int, name: str) -> None:
         os.set_blocking(descriptor, False)
         self.descriptor = descriptor
-        # makes no exception of an empty line, and knows no more than the number either
+        # FileIO returns None for an empty line instead of raising an exception.
         self._read_into = io.FileIO(descriptor, closefd=False).readinto
         self.name = name  # Device path, for messages
         self.announced = False
-        """True when a wait reported bytes: to find none then means that the line is lost."""
+        """True after a wait reported bytes. An empty read then means that the line is lost."""
 
     def write(self, data: bytes | bytearray | memoryview) -> None:
-        """Hand one whole packet to the line; raises PortError when the adapter is gone."""
+        """Write one whole packet to the line. Raises PortError when the adapter is gone."""
         try:
             count = _write(self.descriptor, data)
         except BlockingIOError:
@@ -166,7 +179,9 @@ class SerialPort(OwnProcessors):
             self._write_rest(memoryview(data)[count:])
 
     def _write_rest(self, data: memoryview) -> None:
-        """Wait for room in the output queue; packets are short, so a full queue is stuck."""
+        """Wait for room in the output queue. Packets are short, so a queue that stays full belongs to a stuck
+        line.
+        """
         deadline = time.monotonic_ns() + _WRITE_TIMEOUT_NS
         while data:
             left = deadline - time.monotonic_ns()
@@ -181,33 +196,34 @@ class SerialPort(OwnProcessors):
                 raise self._gone(error) from error
 
     def read_into(self, buffer: memoryview) -> int:
-        """Copy what has arrived into `buffer`; raises PortError when the adapter is gone."""
+        """Copy received bytes into `buffer`. Raises PortError when the adapter is gone."""
         try:
             count = self._read_into(buffer)
         except OSError as error:
             raise self._gone(error) from error
-        if count == 0 and self.announced:  # ready to be read, and at its end: the other side hung up
+        if count == 0 and self.announced:  # Readable without data means end of file: the other side hung up
             raise self._gone(None)
         self.announced = False
-        return count or 0  # None where a read would have waited
+        return count or 0  # None means that a read would have blocked
 
     def renewed(self) -> SerialPort:
-        """Return the port of the same line after it was opened again under the same descriptor."""
+        """Return a new port for the same line, which was reopened under the same descriptor."""
         return SerialPort(self.descriptor, self.name)
 
     def failure(self, code: int) -> PortError:
-        """Return the error of a write that ended with an errno, or with -1: it takes no more bytes."""
+        """Return the error for a failed write, given its errno, or -1 if the line accepts no more bytes."""
         if code < 0:
             return PortError(f"{self.name} takes no more bytes: is the adapter stuck, or the line held?")
         return self._gone(OSError(code, os.strerror(code)))
 
     def _gone(self, error: OSError | None) -> PortError:
-        why = f" ({error.strerror})" if error is not None and error.errno != errno.EBADF else ""  # set aside
+        # EBADF: the descriptor was set aside
+        why = f" ({error.strerror})" if error is not None and error.errno != errno.EBADF else ""
         return PortError(f"{self.name} is gone{why}: was the adapter unplugged?")
 
 
 class StallCounter:
-    """Time for which replies of simulated servos were awaited beyond their deadlines, of all lines."""
+    """Time that replies of simulated servos were awaited after their deadlines, over all lines."""
 
     __slots__ = ("_until_ns", "times", "waited_ns")
 
@@ -217,7 +233,7 @@ class StallCounter:
         self._until_ns = 0
 
     def count(self, begin_ns: int, end_ns: int) -> None:
-        """Count a wait, as far as it was not counted for another line; it may continue the one before."""
+        """Count a wait, without the time already counted for another line; it may extend the previous one."""
         if begin_ns - self._until_ns > _SAME_STALL_NS:
             self.times += 1
             self._until_ns = begin_ns
@@ -226,10 +242,10 @@ class StallCounter:
 
 
 class SimulatingProcess(Protocol):
-    """A process that simulates servos, as their ports see it."""
+    """Process that simulates servos, as seen by their ports."""
 
     def stalled_ns(self, since_ns: int, until_ns: int) -> int:
-        """Return for how long the process did not run between two times of CLOCK_MONOTONIC, ns."""
+        """Return how long the process did not run between two times of CLOCK_MONOTONIC, ns."""
         ...
 
 
@@ -238,17 +254,17 @@ class LineProgress(Protocol):
 
     @property
     def process(self) -> SimulatingProcess:
-        """The process."""
+        """Process that serves the line."""
         ...
 
     @property
     def taken_ns(self) -> int:
-        """Time at which the newest byte that the process received is off the wire; to be read first."""
+        """Time at which the newest byte received by the process is off the wire. Read this property first."""
         ...
 
     @property
     def served_ns(self) -> int:
-        """Time before which every byte that was due to the host was sent to it."""
+        """Time up to which all due bytes were sent to the host."""
         ...
 
     @property
@@ -258,30 +274,32 @@ class LineProgress(Protocol):
 
     @property
     def due_ns(self) -> int:
-        """Time at which these bytes were due."""
+        """Time at which the newest bytes were due."""
         ...
 
 
 class SimulatedPort(SerialPort):
     """Pseudo-terminal of simulated servos, whose process may have to wait for a core.
 
-    A reply is awaited beyond its deadline as long as `progress` shows that this process has not taken the
-    request, has not served the line up to the deadline, or has handed over bytes that the kernel still has;
-    at most LONGEST_STALL_NS after the request. The deadline counts from when the request was taken.
+    A reply is awaited beyond its deadline while `progress` shows one of these: the process has not read the
+    request, has not served the line up to the deadline, or has sent bytes that are still in the kernel's
+    buffer. The limit is LONGEST_STALL_NS after the request. The deadline is counted from the time at which
+    the process read the request.
     """
 
     def __init__(self, descriptor: int, name: str, progress: LineProgress, stalls: StallCounter) -> None:
         super().__init__(descriptor, name)
         self._progress = progress
         self._stalls = stalls
-        self._given_up: tuple[int, int] | None = None  # Progress of a process that was waited for in vain
+        # Progress at which waiting for the process was given up
+        self._given_up: tuple[int, int] | None = None
 
     def renewed(self) -> SimulatedPort:
-        """Return the port of the same line after it was opened again under the same descriptor."""
+        """Return a new port for the same line, which was reopened under the same descriptor."""
         return SimulatedPort(self.descriptor, self.name, self._progress, self._stalls)
 
     def extend_deadline(self, deadline_ns: int, off_wire_ns: int, heard_ns: int, now_ns: int) -> int:
-        """Return how long a reply is awaited whose deadline has passed."""
+        """Return the extended deadline of an overdue reply; see `Port.extend_deadline`."""
         progress = self._progress
         taken_ns, served_ns, given_ns = progress.taken_ns, progress.served_ns, progress.given_ns
         if (taken_ns, served_ns) == self._given_up:
@@ -291,7 +309,7 @@ class SimulatedPort(SerialPort):
             deadline_ns += taken_ns - off_wire_ns
             on_the_way = given_ns > max(heard_ns, off_wire_ns)
             if served_ns >= deadline_ns and not on_the_way:
-                return now_ns  # whatever comes is later than that on purpose
+                return now_ns  # The process was not delayed: any further reply is late on purpose
             until_ns = max(until_ns, min(deadline_ns, served_ns))
         latest_ns = off_wire_ns + LONGEST_STALL_NS
         if now_ns >= latest_ns:
@@ -301,11 +319,11 @@ class SimulatedPort(SerialPort):
         return min(until_ns, latest_ns)
 
     def stalled_ns(self, since_ns: int, until_ns: int) -> int:
-        """Return for how long the process of the simulated servos did not run between two times."""
+        """Return how long the process of the simulated servos did not run between two times, ns."""
         return self._progress.process.stalled_ns(since_ns, until_ns)
 
     def late_ns(self, off_wire_ns: int, heard_ns: int) -> int:
-        """Return by how much the newest reply is late by its process, which took or gave bytes late."""
+        """Return the part of the newest reply's lateness for which its process read or sent bytes late."""
         taken_late_ns = max(0, self._progress.taken_ns - off_wire_ns)
         return taken_late_ns + max(0, heard_ns - self._progress.due_ns)
 
@@ -313,7 +331,10 @@ class SimulatedPort(SerialPort):
 class SerialPorts:
     """The serial lines of a robot on the machine's monotonic time.
 
-    `reopened` asks for a line that is gone; without it such a line stays gone.
+    Args:
+        ports: The open lines.
+        reopened: Requests a lost line; without it a lost line stays lost.
+        polling: Settings of reply polling; None: no polling.
     """
 
     def __init__(
@@ -338,14 +359,16 @@ class SerialPorts:
 
     @property
     def descriptors(self) -> Sequence[int]:
-        """The lines' descriptors; one that is opened again keeps its number."""
+        """Descriptors of the lines; a reopened line keeps its number."""
         return [port.descriptor for port in self._ports]
 
     def wait(self, deadline_ns: int) -> Sequence[int]:
-        """Wait for bytes on any line until `deadline_ns` of CLOCK_MONOTONIC; a past deadline only looks."""
+        """Wait for bytes on any line until `deadline_ns` of CLOCK_MONOTONIC; a past deadline only checks
+        them.
+        """
         left_ns = deadline_ns - _now_ns()
         found: list[tuple[int, int]] = []
-        # poll has milliseconds, select has microseconds: what is left of a millisecond
+        # poll has a resolution of milliseconds, so select waits for the remaining microseconds.
         if left_ns >= 1_000_000:
             found = self._poll.poll(left_ns // 1_000_000)
             left_ns = 0 if found else deadline_ns - _now_ns()
@@ -363,7 +386,10 @@ class SerialPorts:
         return indices
 
     def reopen(self, index: int) -> bool:
-        """Ask for a line that is gone again; its descriptor keeps its number, and is of nothing meanwhile."""
+        """Request a lost line again.
+
+        Until it is back, its descriptor refers to the null device and keeps its number.
+        """
         gone = self._ports[index]
         if gone.descriptor in self._waited:
             self._waited.remove(gone.descriptor)
@@ -380,11 +406,12 @@ class SerialPorts:
 
 
 def set_aside(descriptor: int) -> None:
-    """Let go of a line that is gone: its device gets its old name again only when no process has it open."""
-    put_in_place(os.open(os.devnull, os.O_RDONLY | os.O_CLOEXEC), descriptor)  # a write then fails
+    """Release a lost line. Its device gets the same name again only if no process has it open."""
+    # Opened read-only so that writes fail
+    put_in_place(os.open(os.devnull, os.O_RDONLY | os.O_CLOEXEC), descriptor)
 
 
 def put_in_place(new: int, descriptor: int) -> None:
-    """Let `descriptor` be what `new` is, which is closed: code that has the number need not know."""
+    """Make `descriptor` refer to the file of `new`, and close `new`. Owners of the number need no update."""
     os.dup2(new, descriptor, inheritable=False)
     os.close(new)

@@ -1,4 +1,4 @@
-"""Reopening: a lost line is opened again by the process that keeps the lines."""
+"""Reopening: the process that holds the lines opens a lost line again."""
 
 from __future__ import annotations
 
@@ -18,19 +18,19 @@ from dxlwire.port.ports import put_in_place, set_aside
 from dxlwire.port.serial_open import DescribeProcess, describe_no_process, let_go, open_serial, rate_remark
 
 FIRST_PAUSE_S = 0.1
-LONGEST_PAUSE_S = 2.0  # Between two attempts at a line; each pause is twice the one before
+LONGEST_PAUSE_S = 2.0  # Longest pause between two attempts on a line; each pause is twice the one before
 
-_STACK = 1 << 18  # Bytes for a thread: memory may be locked, and bounded by the user's limit
+_STACK = 1 << 18  # Stack size of a thread, bytes: memory may be locked and limited per user
 
 _LASTING = Path("/dev/serial")
 
 
 def lasting_name(path: str, lasting: Path = _LASTING) -> str:
-    """Return the name under which the adapter at `path` is there again; empty when it would be another one.
+    """Return the persistent name of the adapter at `path`; empty if a later adapter could get the same name.
 
-    A link leads to its adapter wherever that is. A device such as /dev/ttyUSB0 may be another adapter's next
-    time: udev's link by the adapter's own number is taken instead where there is one. A pseudo-terminal is
-    gone for good, and its name goes to the next program that asks for one.
+    A link always leads to its adapter. A device such as /dev/ttyUSB0 may belong to another adapter next time,
+    so udev's link by serial number or by position is used if it exists. A pseudo-terminal is gone for good,
+    and the next program may get its name.
     """
     if os.path.islink(path):
         return path
@@ -42,13 +42,13 @@ def lasting_name(path: str, lasting: Path = _LASTING) -> str:
 
 
 class Wanted(msgspec.Struct, frozen=True):
-    """A line as the robot file wants it."""
+    """Requested properties of a line, from the robot file."""
 
     path: str
     baud_rate: int
-    latency_ns: int  # The longest that its adapter may keep replies back
+    latency_ns: int  # Longest acceptable latency timer of its adapter
     rs485: bool = False
-    boot_ns: int = 0  # How long its adapter boots after it was plugged in and opened
+    boot_ns: int = 0  # Boot time of the adapter after it was plugged in and opened
 
 
 class Opened(msgspec.Struct, frozen=True):
@@ -56,16 +56,17 @@ class Opened(msgspec.Struct, frozen=True):
 
     index: int
     descriptor: int
-    done: str  # What was done to its latency timer; empty: nothing
-    wrong: str  # What is wrong with it still; empty: nothing
-    remark: str = ""  # About the rate that its driver set; empty: it is as asked
+    done: str  # Sentence about a change of its latency timer; empty: unchanged
+    wrong: str  # Sentence about a remaining problem; empty: none
+    # Sentence about a baud rate that the driver did not set as requested; empty: as requested
+    remark: str = ""
 
 
 class KeptLines:
-    """The lines of a robot, kept open; one that is gone is opened again, however long that takes.
+    """The open lines of a robot. A lost line is reopened, however long that takes.
 
-    A descriptor keeps its number while the line behind it goes and comes. Opening happens in a thread, one a
-    lost line: a driver may take seconds over it, and the process that keeps the lines has a loop to watch.
+    A descriptor keeps its number while its line is lost and reopened. Each lost line is opened in a thread of
+    its own: a driver may need seconds for it, and the process also has to supervise the loop.
     """
 
     def __init__(
@@ -74,16 +75,19 @@ class KeptLines:
         system: Path = SYSTEM,
         describe_holder: DescribeProcess = describe_no_process,
     ) -> None:
-        """Open the lines; raises PortError when one cannot be opened, or keeps replies back for too long.
+        """Open the lines.
 
         Args:
             lines: The lines.
-            system: Where the kernel shows its devices, for tests.
+            system: Root of sysfs, for tests.
             describe_holder: As in `open_serial`.
+
+        Raises:
+            PortError: A line cannot be opened, or the latency timer of its adapter is too long.
         """
         self.descriptors: list[int] = []  # In the order of the lines
-        self.done: list[str] = []  # What was done to latency timers, one sentence each
-        self.remarks: list[str] = []  # About rates that drivers did not set as asked
+        self.done: list[str] = []  # One sentence for each changed latency timer
+        self.remarks: list[str] = []  # One sentence for each baud rate that a driver did not set as requested
         self._lines = tuple(lines)
         self._system = system
         self._describe_holder = describe_holder
@@ -106,23 +110,23 @@ class KeptLines:
         self._bell = os.eventfd(0, os.EFD_NONBLOCK | os.EFD_CLOEXEC)
 
     def fileno(self) -> int:
-        """Return the descriptor that becomes readable when a line is back, for select."""
+        """Return a descriptor for select that becomes readable when a line is back."""
         return self._bell
 
     def lost(self, index: int) -> bool:
-        """Let go of a line that is gone, and open it again; return whether that is tried."""
+        """Release a lost line and start to reopen it; return False if that is not possible."""
         set_aside(self.descriptors[index])
         if not self._names[index]:
             return False
         try:
-            # not before it is needed: a thread has the priority of the one that starts it
+            # Started only when needed: a thread inherits the priority of the thread that starts it
             threading.Thread(target=self._keep_trying, args=(index,), daemon=True).start()
-        except RuntimeError:  # the system has no thread left
+        except RuntimeError:  # The system has no thread left
             return False
         return True
 
     def returned(self) -> list[Opened]:
-        """Return which lines are back since the last look; their descriptors are the old ones."""
+        """Return the lines that are back since the last call. They have their old descriptors."""
         found: list[Opened] = []
         if select.select([self._bell], [], [], 0)[0]:
             os.eventfd_read(self._bell)
@@ -133,7 +137,7 @@ class KeptLines:
         return found
 
     def close(self) -> None:
-        """Let go of all lines."""
+        """Close all lines."""
         let_go(self.descriptors)
         self.descriptors.clear()
 
@@ -155,7 +159,7 @@ class KeptLines:
         while True:
             try:
                 self._back.put(self._open(index, self._names[index]))
-            except OSError:  # a PortError, or an adapter that went again in the middle of it
+            except OSError:  # A PortError, or the adapter was unplugged again during the opening
                 time.sleep(pause_s)
                 pause_s = min(2 * pause_s, LONGEST_PAUSE_S)
             else:

@@ -1,4 +1,4 @@
-"""Opening a serial line for one process alone; the guardian does it, the loop inherits the descriptor."""
+"""Opening of a serial line for exclusive use. The guardian opens it, and the loop inherits the descriptor."""
 
 from __future__ import annotations
 
@@ -18,47 +18,51 @@ from dxlwire.port.rights import command_for_access
 try:
     import fcntl
     import termios
-except ImportError:  # Windows, where a sensor's parameters are checked and no line is opened
+except ImportError:  # Windows checks only the parameters of sensors and opens no line
     fcntl = termios = None  # type: ignore[assignment]  # modules, or none
 
 _RATE_TOLERANCE = 0.02
-"""Of 8N1: a receiver samples the tenth bit within half a bit up to 5 %, for both ends together [i]."""
+"""Tolerance of the baud rate: an 8N1 receiver samples the tenth bit correctly up to 5 %, both ends together
+[i]."""
 _TCGETS2, _TCSETS2, _BOTHER = 0x802C542A, 0x402C542B, 0o010000
-"""Terminal settings with the rate as a number (Linux, asm-generic/ioctls.h): they know every rate."""
+"""Terminal settings with a numeric rate (Linux, asm-generic/ioctls.h): they support every rate."""
 _SETTINGS = struct.Struct("4I20s2I")
 """struct termios2 (asm-generic/termbits.h): flags of input, output, control, local; line; both rates."""
 _TIOCSRS485 = 0x542F
 _RS485 = struct.pack("8I", 0b11, *(0,) * 7)
-"""struct serial_rs485 (linux/serial.h): enabled, RTS is high while it sends, no delays."""
+"""struct serial_rs485 (linux/serial.h): enabled, RTS high during transmission, no delays."""
 
 DescribeProcess = Callable[[Path], str]
-"""Describes a process by its folder in /proc, and how to stop it; returns an empty text if it is unknown."""
+"""Describes the process of a folder in /proc, and how to stop it; returns an empty text if it is unknown."""
 
 
 class SerialLine:
-    """A serial device that no other process can open before it is closed: raw, 8N1, no flow control.
+    """Serial device for exclusive use: raw, 8N1, no flow control.
 
-    The lock belongs to the terminal, and the Linux kernel takes it off when no process has it open any more.
-    Simulated servos keep theirs open for the next program, so closing takes it off.
+    The lock belongs to the terminal, and the Linux kernel releases it when the last process closes the
+    device. Simulated servos keep their device open for the next program, so `close` releases the lock
+    explicitly.
 
-    Linux sets DTR when a port is opened, and boards such as an Arduino or an OpenCM reset then. It would
-    clear DTR when the port is closed; that is switched off here, so a board resets once, after it was
-    plugged in.
+    Linux sets DTR when a port is opened, which resets boards such as an Arduino or an OpenCM. By default it
+    also clears DTR when the port is closed. That is switched off here, so a board resets only once, at the
+    first opening after it was plugged in.
     """
 
     def __init__(self, path: str, baud_rate: int) -> None:
-        """Raises OSError."""
+        """Open and lock the device. Raises OSError."""
         self.path = path
         self.baud_rate = 0
-        """The rate that the driver really set, bit/s."""
+        """Rate that the driver actually set, bit/s."""
         self._descriptor = os.open(path, os.O_RDWR | os.O_NOCTTY | os.O_NONBLOCK)
         try:
-            fcntl.flock(self._descriptor, fcntl.LOCK_EX | fcntl.LOCK_NB)  # which pyserial programs respect
+            # An advisory lock, which pyserial programs respect
+            fcntl.flock(self._descriptor, fcntl.LOCK_EX | fcntl.LOCK_NB)
             self.set_dtr = bool(self._settings()[2] & termios.HUPCL)
-            """True when DTR was not set before: the port was not opened here since it was plugged in."""
+            """True if opening the port has set DTR: the first opening here since it was plugged in."""
             self.set_rate(baud_rate)
             termios.tcflush(self._descriptor, termios.TCIFLUSH)
-            fcntl.ioctl(self._descriptor, termios.TIOCEXCL)  # which every program meets, but for root's
+            # Blocks every other program, except those of root
+            fcntl.ioctl(self._descriptor, termios.TIOCEXCL)
         except BaseException:
             os.close(self._descriptor)
             raise
@@ -70,11 +74,13 @@ class SerialLine:
         self.close()
 
     def fileno(self) -> int:
-        """Return the descriptor."""
+        """Return the file descriptor."""
         return self._descriptor
 
     def set_rate(self, baud_rate: int) -> bool:
-        """Set the rate, bit/s; return whether the driver did, within 2 %. Raises OSError."""
+        """Set the baud rate, bit/s; return False if the driver's rate differs by more than 2 %. Raises
+        OSError.
+        """
         control = termios.CS8 | termios.CREAD | termios.CLOCAL | _BOTHER
         settings = _SETTINGS.pack(0, 0, control, 0, bytes(20), baud_rate, baud_rate)
         fcntl.ioctl(self._descriptor, _TCSETS2, settings)
@@ -82,12 +88,12 @@ class SerialLine:
         return is_rate(self.baud_rate, baud_rate)
 
     def detach(self) -> int:
-        """Return the descriptor, which is the caller's from now on; `let_go` closes it."""
+        """Return the descriptor, which the caller then owns; `let_go` closes it."""
         descriptor, self._descriptor = self._descriptor, -1
         return descriptor
 
     def close(self) -> None:
-        """Close the line, if it is still open here."""
+        """Close the line unless it is closed or detached."""
         if self._descriptor >= 0:
             let_go([self.detach()])
 
@@ -97,9 +103,9 @@ class SerialLine:
 
 
 def let_go(descriptors: Iterable[int]) -> None:
-    """Close lines that were detached, by this process or by one that is dead now."""
+    """Unlock and close detached lines, of this process or of one that has exited."""
     for descriptor in descriptors:
-        with suppress(OSError):  # the adapter is gone, and the lock with it
+        with suppress(OSError):  # The adapter is gone, and the lock with it
             fcntl.ioctl(descriptor, termios.TIOCNXCL)
         os.close(descriptor)
 
@@ -117,18 +123,19 @@ def open_serial(
     boot_ns: int = 0,
     describe_holder: DescribeProcess = describe_no_process,
 ) -> SerialLine:
-    """Open a serial device for this process alone: raw, 8N1; also a pseudo-terminal.
+    """Open a serial device for exclusive use: raw, 8N1. A pseudo-terminal works as well.
 
     Args:
         path: The device.
-        baud_rate: bit/s; `SerialLine.baud_rate` is what the driver made of it.
+        baud_rate: bit/s; `SerialLine.baud_rate` is the rate that the driver actually set.
         rs485: Let the kernel switch the direction of an RS-485 transceiver by RTS.
-        boot_ns: How long to wait for a board that resets when its port is opened; only where this did that.
+        boot_ns: Wait for a board that resets when its port is opened, ns; skipped if this opening did not
+            reset it.
         describe_holder: Describes a process that has the port open, for the message of the error.
 
     Raises:
-        PortError: There is no such device, this user may not open it, another process has it, or it cannot do
-            the baud rate or RS-485.
+        PortError: The device does not exist, this user may not open it, another process has it open, or
+            it does not support the baud rate or RS-485.
     """
     try:
         line = SerialLine(path, baud_rate)
@@ -149,12 +156,12 @@ def open_serial(
 
 
 def is_rate(found: int, asked: int) -> bool:
-    """Return whether a rate is near enough to another one, within 2 %."""
+    """Return True if two baud rates agree within 2 %."""
     return abs(found - asked) <= _RATE_TOLERANCE * asked
 
 
 def rate_remark(line: SerialLine, baud_rate: int) -> str:
-    """Return a sentence for a rate that a driver did not set as asked; empty: it did."""
+    """Return a sentence about a baud rate that the driver did not set as requested; empty otherwise."""
     if is_rate(line.baud_rate, baud_rate):
         return ""
     error = line.baud_rate / baud_rate - 1.0
@@ -190,11 +197,10 @@ def _what_exists() -> str:
 
 
 def _holder(path: str, describe: DescribeProcess) -> str:
-    """Name the processes that have the device open, and how to stop them.
+    """Return the processes that have the device open, and how to stop them.
 
-    The first description counts; without one each process is named by its command.
-
-    Only what this user may see is named.
+    The first non-empty description is used. Without one, each process is named by its command. Processes of
+    other users may be invisible.
     """
     device = os.path.realpath(path)
     found = [
@@ -220,8 +226,7 @@ def _has_open(process: Path, device: str) -> bool:
 def _command(process: Path) -> str:
     try:
         words = (process / "cmdline").read_bytes().split(b"\0")
-        # enough to read `python -P -m dxlsim`
-        # one line, whatever its words are
+        # Five words are enough to read `python -P -m dxlsim`; whitespace is joined into one line.
         return " ".join(b" ".join(words[:5]).decode(errors="replace").split())[:100] or "a process"
     except OSError:
         return "a process"

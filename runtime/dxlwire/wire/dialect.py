@@ -1,4 +1,4 @@
-"""Dialect: what the two protocols have in common, so that bus, plan and start-up know neither of them.
+"""Dialect: common interface of the two protocols, so that bus, plan and start-up are independent of them.
 
 The modules `protocol1` and `protocol2` are the two dialects.
 """
@@ -15,7 +15,7 @@ from dxlwire.wire import protocol1, protocol2
 
 
 class Dialect(Protocol):
-    """Packets of one protocol <-> bytes; pure functions, see the modules for what they raise."""
+    """Packets of one protocol <-> bytes. Pure functions; the modules document their exceptions."""
 
     PROTOCOL: float
     HEADER: bytes
@@ -29,23 +29,25 @@ class Dialect(Protocol):
     ALERT: int
 
     def size_at(self, buffer: Bytes, start: int, end: int) -> int:
-        """Return the size of the packet whose header is at `start`: 0 is not known yet, -1 false header."""
+        """Return the size of the packet with its header at `start`; 0: not known yet, -1: false header."""
         ...
 
     def intact(self, packet: memoryview) -> bool:
-        """Check whether the checksum of a whole packet is right."""
+        """Return True if the checksum of a whole packet is correct."""
         ...
 
     def opened(self, packet: memoryview) -> Status | None:
-        """Take an intact packet apart; None when it cannot be a status."""
+        """Parse an intact packet; return None if it cannot be a status."""
         ...
 
     def instructs(self, packet: memoryview) -> bool:
-        """Check whether an intact packet reads as a host's instruction; in Protocol 1.0 a status may, too."""
+        """Return True if an intact packet parses as an instruction of a host. In Protocol 1.0 a status may,
+        too.
+        """
         ...
 
     def refused(self, error: int, length: int, awaited: int) -> bool:
-        """Check whether a status reports that the instruction was not executed."""
+        """Return True if a status reports that the instruction was not executed."""
         ...
 
     def describe_error(self, error: int) -> str:
@@ -53,7 +55,7 @@ class Dialect(Protocol):
         ...
 
     def widest(self, length: int) -> int:
-        """Return the most bytes that a status of `length` parameters has on the line."""
+        """Return the largest size on the line of a status with `length` parameters, bytes."""
         ...
 
     def status_packet(self, servo_id: int, error: int = 0, parameters: bytes = b"") -> bytes:
@@ -61,27 +63,27 @@ class Dialect(Protocol):
         ...
 
     def ping(self, servo_id: int) -> bytes:
-        """Return the packet that asks whether a servo is there."""
+        """Return the packet that checks the presence of a servo."""
         ...
 
     def read(self, servo_id: int, address: int, length: int) -> bytes:
-        """Return the packet that asks for a part of the control table."""
+        """Return the packet that reads a range of the control table."""
         ...
 
     def write(self, servo_id: int, address: int, data: bytes) -> bytes:
-        """Return the packet that writes a part of the control table."""
+        """Return the packet that writes a range of the control table."""
         ...
 
     def read_many(self, requests: Sequence[tuple[int, int, int]], *, fast: bool = False) -> bytes:
-        """Return the one packet that asks several servos, each by (ID, address, length)."""
+        """Return a single packet that reads several servos, given ID, address and length for each."""
         ...
 
     def fast_size(self, length: int, count: int) -> int:
-        """Return the bytes of the one status by which `count` servos answer a fast form."""
+        """Return the size of a fast form's shared status for `count` servos and `length` bytes of data."""
         ...
 
     def fast_answers(self, packet: Bytes, lengths: Sequence[int]) -> list[Status]:
-        """Return the servos' parts of such a status, those before the first broken one."""
+        """Return the servos' entries in the status of a fast form, up to the first corrupted entry."""
         ...
 
     def sync_write(self, address: int, length: int, data: Mapping[int, bytes]) -> bytes:
@@ -93,12 +95,12 @@ _DIALECTS: Mapping[float, Dialect] = MappingProxyType({1.0: protocol1, 2.0: prot
 
 
 def dialect_of(protocol: float) -> Dialect:
-    """Return the dialect of Protocol 1.0 or 2.0; raises LookupError for another one."""
+    """Return the dialect of Protocol 1.0 or 2.0. Raises LookupError for another one."""
     return _DIALECTS[protocol]
 
 
 def sync_writes(dialect: Dialect, writes: Iterable[tuple[int, int, bytes]]) -> list[bytes]:
-    """Return the packets that write to servos, each by (ID, address, data): one for each place."""
+    """Return packets for writes, given ID, address and data for each: one packet per address and length."""
     places: dict[tuple[int, int], dict[int, bytes]] = {}
     for servo_id, address, data in writes:
         places.setdefault((address, len(data)), {})[servo_id] = data

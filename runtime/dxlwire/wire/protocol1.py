@@ -1,8 +1,8 @@
 """Protocol 1.0 packets as bytes: instructions of a host, replies of a servo; pure functions.
 
-Source: ROBOTIS e-Manual, "DYNAMIXEL Protocol 1.0". Instruction `FF FF ID LEN INST P.. CHK`, status
-`FF FF ID LEN ERR P.. CHK`; LEN = parameters + 2; CHK = ~(ID + LEN + INST or ERR + parameters) & FF.
-A status carries no mark that distinguishes it from an instruction: an echoed instruction parses as a status.
+Source: ROBOTIS e-Manual, "DYNAMIXEL Protocol 1.0". Instruction `FF FF ID LEN INST P.. CHK`, status `FF FF ID
+LEN ERR P.. CHK`; LEN = parameters + 2; CHK = ~(ID + LEN + INST or ERR + parameters) & FF. A status has no
+mark that distinguishes it from an instruction: an echoed instruction parses as a status.
 """
 
 from __future__ import annotations
@@ -15,22 +15,22 @@ from dxlwire.transaction import BROADCAST_ID, Status
 
 PROTOCOL = 1.0
 HEADER = b"\xff\xff"
-OVERHEAD = 6  # Bytes of a packet beside its parameters
+OVERHEAD = 6  # Bytes of a packet without parameters
 LONGEST = 0xFF + 4
-"""Bytes of the longest packet: LEN is one byte and counts everything behind itself."""
-CHECKSUM = 1  # Bytes of the checksum, the last one of a packet
-ID_AT = 2  # Where a packet has its ID, of the servo that is addressed or answers
+"""Size of the longest packet, bytes: LEN is one byte and counts everything after itself."""
+CHECKSUM = 1  # Size of the checksum at the end of a packet, bytes
+ID_AT = 2  # Offset of the ID, which is that of the addressed or the answering servo
 HIGHEST_ID = 0xFD
-PING_LENGTH = 0  # Parameters of the answer to a ping: the model number must be read
-MOST_GOAL_BYTES = 0xFF - 4  # Parameters of a sync write behind address and length: LEN is one byte
-ALERT = 0  # No bit of the error byte asks to read more: the byte is complete
+PING_LENGTH = 0  # Parameters of the answer to a ping; the model number needs a read
+MOST_GOAL_BYTES = 0xFF - 4  # Parameters of a sync write after address and length: LEN is one byte
+ALERT = 0  # The error byte has no alert bit that refers to another item
 NO_FAST_FORM = "Protocol 1.0 has no fast sync read and no fast bulk read"
 _MOST_PARAMETERS = 0xFF - 2
 
 
 @unique
 class Instruction(IntEnum):
-    """What a host can ask (e-Manual, "Instruction Details")."""
+    """Instruction codes of a host (e-Manual, "Instruction Details")."""
 
     PING = 0x01
     READ = 0x02
@@ -44,7 +44,7 @@ class Instruction(IntEnum):
 
 @unique
 class StatusError(IntFlag):
-    """Bits of a status packet's error byte; the servo's state, it comes with good data."""
+    """Bits of a status packet's error byte: the state of the servo, reported together with valid data."""
 
     INPUT_VOLTAGE = 0x01
     ANGLE_LIMIT = 0x02
@@ -56,7 +56,7 @@ class StatusError(IntFlag):
 
 
 REFUSALS = StatusError.RANGE | StatusError.CHECKSUM | StatusError.INSTRUCTION
-"""The bits of a servo that did not execute the instruction."""
+"""Bits of a servo that did not execute the instruction."""
 
 _LENGTHS: Mapping[int, tuple[int, int]] = {
     Instruction.PING: (2, 2),
@@ -66,7 +66,7 @@ _LENGTHS: Mapping[int, tuple[int, int]] = {
     Instruction.ACTION: (2, 2),
     Instruction.FACTORY_RESET: (2, 2),
 }
-"""The least and the most that LEN is in an instruction to one servo (e-Manual, "Instruction Details")."""
+"""Smallest and largest LEN of an instruction to one servo (e-Manual, "Instruction Details")."""
 _SENTENCES: Mapping[StatusError, str] = {
     StatusError.INPUT_VOLTAGE: "input voltage error: the voltage is out of the range of the control table",
     StatusError.ANGLE_LIMIT: "angle limit error: the goal position is outside the CW and CCW angle limits",
@@ -87,20 +87,21 @@ def describe_error(error: int) -> str:
 
 
 def refused(error: int, length: int, awaited: int) -> bool:
-    """Check whether a status of `length` parameters, where `awaited` were due, is a refusal.
+    """Return True if a status of `length` parameters, where `awaited` were expected, is a refusal.
 
-    The bits are the servo's state and come with good data; without it they are the reason.
+    The error bits describe the state of the servo if data is present. Without data they are the reason of the
+    refusal.
     """
     return length == 0 != awaited and error & REFUSALS != 0
 
 
 def widest(length: int) -> int:
-    """Return the most bytes that a status packet of `length` parameters has on the line."""
+    """Return the size on the line of a status packet with `length` parameters, bytes."""
     return OVERHEAD + length
 
 
 def size_at(buffer: Bytes, start: int, end: int) -> int:
-    """Return the size of the packet whose header is at `start`: 0 is not known yet, -1 a false header."""
+    """Return the size of the packet with its header at `start`; 0: not known yet, -1: false header."""
     known = end - start
     if known > 2 and buffer[start + 2] == 0xFF:
         return -1
@@ -111,22 +112,22 @@ def size_at(buffer: Bytes, start: int, end: int) -> int:
 
 
 def intact(packet: memoryview) -> bool:
-    """Check whether the checksum of a whole packet is right."""
+    """Return True if the checksum of a whole packet is correct."""
     return ~sum(packet[2:-1]) & 0xFF == packet[-1]
 
 
 def opened(packet: memoryview) -> Status | None:
-    """Take an intact packet apart; an instruction to one servo looks like a status, too.
+    """Parse an intact packet; return None for the broadcast ID, which is never in a status.
 
-    None when it cannot be a status: of the broadcast ID.
+    An instruction to one servo parses as a status, too.
     """
     return None if packet[2] == BROADCAST_ID else Status(packet[2], packet[4], packet[5:-1])
 
 
 def instructs(packet: memoryview) -> bool:
-    """Check whether an intact packet reads as a host's instruction, by its code and length.
+    """Return True if an intact packet parses as an instruction of a host, by its code and length.
 
-    A status of these bytes is possible, too: its error byte would be that code.
+    A status can have the same bytes: its error byte would then equal the code.
     """
     if packet[2] == BROADCAST_ID:
         return True
@@ -147,9 +148,10 @@ def _packet(servo_id: int, kind: int, parameters: bytes) -> bytes:
 
 
 def instruction_packet(servo_id: int, instruction: int, parameters: bytes = b"") -> bytes:
-    """Return any instruction packet.
+    """Return an instruction packet.
 
-    Raises ValueError when `servo_id` is neither 0..253 nor broadcast, or the parameters do not fit.
+    Raises:
+        ValueError: `servo_id` is neither 0..253 nor broadcast, or the parameters do not fit.
     """
     if not (0 <= servo_id <= HIGHEST_ID or servo_id == BROADCAST_ID):
         raise ValueError(f"{servo_id} is no ID: a servo has 0..{HIGHEST_ID}, broadcast is {BROADCAST_ID}")
@@ -157,7 +159,7 @@ def instruction_packet(servo_id: int, instruction: int, parameters: bytes = b"")
 
 
 def status_packet(servo_id: int, error: int = 0, parameters: bytes = b"") -> bytes:
-    """Return the status packet that a servo would send; raises ValueError when the parameters do not fit."""
+    """Return the status packet that a servo would send. Raises ValueError if the parameters do not fit."""
     return _packet(servo_id, error, parameters)
 
 
@@ -167,25 +169,27 @@ def ping(servo_id: int) -> bytes:
 
 
 def read(servo_id: int, address: int, length: int) -> bytes:
-    """Return the packet that asks for `length` bytes of the control table from `address` on."""
+    """Return the packet that reads `length` bytes of the control table from `address`."""
     return instruction_packet(servo_id, Instruction.READ, bytes((address, length)))
 
 
 def write(servo_id: int, address: int, data: bytes) -> bytes:
-    """Return the packet that writes `data` into the control table from `address` on."""
+    """Return the packet that writes `data` into the control table from `address`."""
     return instruction_packet(servo_id, Instruction.WRITE, bytes((address,)) + data)
 
 
 def factory_reset(servo_id: int) -> bytes:
-    """Return the packet that sets the control table to its factory values, ID and baud rate included."""
+    """Return the packet that resets the control table to factory values, including ID and baud rate."""
     return instruction_packet(servo_id, Instruction.FACTORY_RESET)
 
 
 def bulk_read(requests: Sequence[tuple[int, int, int]], *, fast: bool = False) -> bytes:
-    """Return the packet that asks two or more MX servos, each by (ID, address, length); they answer in turn.
+    """Return the packet that reads two or more MX servos in turn, given ID, address and length for each.
 
-    Each waits for the status of the one before it, so an absent servo ends the chain. Raises ValueError when
-    a fast form is asked for.
+    Each servo waits for the status of the servo before it, so an absent servo ends the chain.
+
+    Raises:
+        ValueError: `fast` is set: only Protocol 2.0 has fast forms.
     """
     if fast:
         raise ValueError(NO_FAST_FORM)
@@ -193,7 +197,7 @@ def bulk_read(requests: Sequence[tuple[int, int, int]], *, fast: bool = False) -
     return instruction_packet(BROADCAST_ID, Instruction.BULK_READ, parameters)
 
 
-read_many = bulk_read  # The one packet that asks several servos, as every protocol has one
+read_many = bulk_read  # Common name in both dialects
 
 
 def fast_size(length: int, count: int) -> int:
@@ -207,9 +211,10 @@ def fast_answers(packet: Bytes, lengths: Sequence[int]) -> list[Status]:
 
 
 def sync_write(address: int, length: int, data: Mapping[int, bytes]) -> bytes:
-    """Return the broadcast packet that writes `length` bytes from `address` on, per servo ID; no reply.
+    """Return the broadcast packet that writes `length` bytes from `address`, by servo ID; it has no reply.
 
-    Raises ValueError when a servo's data is not `length` bytes long, or the packet would be too long.
+    Raises:
+        ValueError: The data of a servo does not have `length` bytes, or the packet would be too long.
     """
     for one, chunk in data.items():
         if len(chunk) != length:

@@ -1,9 +1,9 @@
 """Protocol 2.0 packets as bytes: instructions of a host, replies of a servo; pure functions.
 
 Source: ROBOTIS e-Manual, "DYNAMIXEL Protocol 2.0". Instruction `FF FF FD 00 ID LENL LENH INST P.. CRCL CRCH`;
-a status is one with INST 55 and the error byte before its parameters. LEN counts everything behind itself.
-From INST to the last parameter `FF FF FD` goes over the line as `FF FF FD FD` (byte stuffing). The CRC covers
-everything before it, stuffing included: CRC-16 of polynomial 8005, not reflected, from 0.
+a status has INST 55 and an error byte before its parameters. LEN counts everything after itself. From INST to
+the last parameter `FF FF FD` is sent as `FF FF FD FD` (byte stuffing). The CRC covers everything before it,
+including stuffing: CRC-16 of polynomial 8005, not reflected, from 0.
 """
 
 from __future__ import annotations
@@ -18,21 +18,22 @@ from dxlwire.transaction import BROADCAST_ID, Status
 
 PROTOCOL = 2.0
 HEADER = b"\xff\xff\xfd\x00"
-OVERHEAD = 11  # Bytes of a status packet beside its parameters, without stuffing
+OVERHEAD = 11  # Bytes of a status packet without parameters and without stuffing
 LONGEST = 2048
-"""Bytes of the longest packet that a receiver waits for; a header that announces more is a false one.
+"""Size of the longest packet that a receiver waits for, bytes; a longer announced size means a false header.
 
 The protocol allows 65,542. No servo answers with more than a control table (about 1,000 bytes), or 140
-servos' states in a fast form, and a false header may not hold the line back for longer.
+servos' states in a fast form. A false header must not hold the line back for longer.
 """
-CHECKSUM = 2  # Bytes of the CRC, the last ones of a packet
-ID_AT = 4  # Where a packet has its ID, of the servo that is addressed or answers
+CHECKSUM = 2  # Size of the CRC at the end of a packet, bytes
+ID_AT = 4  # Offset of the ID, which is that of the addressed or the answering servo
 HIGHEST_ID = 0xFC
 PING_LENGTH = 3  # Parameters of the answer to a ping: model number (2), firmware version (1)
 MOST_GOAL_BYTES = 1024
-"""Parameters of a sync write behind address and length: stuffed, they still fit a batch of the log."""
+"""Limit of a sync write's parameters after address and length: even with stuffing they fit a batch of the
+log."""
 STATUS = 0x55
-ALERT = 0x80  # Bit of the error byte: read `ControlTable.errors`; it comes with good data
+ALERT = 0x80  # Bit of the error byte: a hardware error, see `ControlTable.errors`; the data is valid
 _MOST_PARAMETERS = 0xFFFF - 3
 _PATTERN = b"\xff\xff\xfd"
 _STUFFED = b"\xff\xff\xfd\xfd"
@@ -41,7 +42,7 @@ _BACKUP = b"\x43\x54\x52\x4c"
 
 @unique
 class Instruction(IntEnum):
-    """What a host can ask (e-Manual, "Instruction")."""
+    """Instruction codes of a host (e-Manual, "Instruction")."""
 
     PING = 0x01
     READ = 0x02
@@ -62,7 +63,7 @@ class Instruction(IntEnum):
 
 @unique
 class ErrorNumber(IntEnum):
-    """Bits 0..6 of the error byte: why the servo did not do what the instruction asked."""
+    """Bits 0..6 of the error byte: reason why the servo did not execute the instruction."""
 
     RESULT_FAIL = 1
     INSTRUCTION = 2
@@ -75,7 +76,7 @@ class ErrorNumber(IntEnum):
 
 @unique
 class Reset(IntEnum):
-    """What a factory reset keeps."""
+    """Scope of a factory reset: the settings that it keeps."""
 
     ALL = 0xFF
     KEEP_ID = 0x01
@@ -104,35 +105,36 @@ def describe_error(error: int) -> str:
 
 
 def refused(error: int, length: int, awaited: int) -> bool:
-    """Check whether a status of `length` parameters, where `awaited` were due, is a refusal.
+    """Return True if a status of `length` parameters, where `awaited` were expected, is a refusal.
 
-    An error number is one; an error reply to a read has no data. The alert bit alone is not.
+    An error number is a refusal, and an error reply to a read has no data. The alert bit alone is not a
+    refusal.
     """
     return error & ~ALERT != 0 and length in (0, awaited)
 
 
 def crc(data: Bytes) -> int:
-    """Return the CRC over a packet without its last two bytes (e-Manual, "CRC Calculation")."""
+    """Return the CRC of a packet without its last two bytes (e-Manual, "CRC Calculation")."""
     return crc16.umts(data)
 
 
 def stuffed(body: bytes) -> bytes:
-    """Return the bytes from INST to the last parameter as they go over the line."""
+    """Return the bytes from INST to the last parameter with byte stuffing."""
     return body.replace(_PATTERN, _STUFFED)
 
 
 def unstuffed(body: bytes) -> bytes:
-    """Return the bytes from INST to the last parameter without stuffing; the inverse of `stuffed`."""
+    """Return the bytes from INST to the last parameter without byte stuffing; the inverse of `stuffed`."""
     return body.replace(_STUFFED, _PATTERN)
 
 
 def widest(length: int) -> int:
-    """Return the most bytes that a status of `length` parameters has on the line: each third one stuffed."""
+    """Return the largest size on the line of a status: one stuffing byte per three of `length` parameters."""
     return OVERHEAD + length + (length + 2) // 3
 
 
 def size_at(buffer: Bytes, start: int, end: int) -> int:
-    """Return the size of the packet whose header is at `start`: 0 is not known yet, -1 a false header."""
+    """Return the size of the packet with its header at `start`; 0: not known yet, -1: false header."""
     known = end - start
     if known > 4 and buffer[start + 4] in (0xFD, 0xFF):
         return -1
@@ -143,14 +145,14 @@ def size_at(buffer: Bytes, start: int, end: int) -> int:
 
 
 def intact(packet: memoryview) -> bool:
-    """Check whether the CRC of a whole packet is right."""
+    """Return True if the CRC of a whole packet is correct."""
     return crc16.umts(packet[:-2]) == packet[-2] | packet[-1] << 8
 
 
 def opened(packet: memoryview) -> Status | None:
-    """Take an intact packet apart; None when it is no status, as an echoed instruction is.
+    """Parse an intact packet; return None if it is not a status, such as an echoed instruction.
 
-    The status of a fast form (from the broadcast ID) is not stuffed: `fast_answers` reads its parameters.
+    The status of a fast form (from the broadcast ID) has no stuffing: `fast_answers` reads its parameters.
     """
     if packet[7] != STATUS or len(packet) < OVERHEAD:
         return None
@@ -161,24 +163,30 @@ def opened(packet: memoryview) -> Status | None:
 
 
 def instructs(packet: memoryview) -> bool:
-    """Check whether an intact packet is a host's instruction: any but a status."""
+    """Return True if an intact packet is an instruction of a host: any packet but a status."""
     return packet[7] != STATUS
 
 
 def fast_size(length: int, count: int) -> int:
-    """Return the bytes of the one status of a fast form: `length` bytes of data of `count` servos.
+    """Return the size of the shared status of a fast form: `length` bytes of data of `count` servos.
 
-    Each part has an error byte, an ID and a CRC beside its data (e-Manual, "Fast Sync Read (0x8A)").
+    Each entry adds an error byte, an ID and a CRC to its data (e-Manual, "Fast Sync Read (0x8A)").
     """
     return 8 + length + 4 * count
 
 
 def fast_answers(packet: Bytes, lengths: Sequence[int]) -> list[Status]:
-    """Return the servos' parts of the status of a fast form, in their order.
+    """Return the servos' entries in the status of a fast form, in their order.
 
-    `lengths`: bytes of data of each servo, as they were asked for. Each part's CRC covers everything since
-    the first FF; the list ends before the first part that is cut off or whose CRC is wrong, so what came
-    before an absent servo can still be used. Raises ValueError when it is no status of a fast form.
+    Each entry's CRC covers everything since the first FF. The list ends before the first entry that is
+    truncated or has a wrong CRC, so the entries before an absent servo stay usable.
+
+    Args:
+        packet: The status packet, possibly truncated.
+        lengths: Requested bytes of data of each servo.
+
+    Raises:
+        ValueError: The packet is not the status of a fast form.
     """
     data = bytes(packet)
     if len(data) < 8 or data[:4] != HEADER or data[4] != BROADCAST_ID or data[7] != STATUS:
@@ -206,9 +214,10 @@ def _packet(address: int, body: bytes) -> bytes:
 
 
 def instruction_packet(servo_id: int, instruction: int, parameters: bytes = b"") -> bytes:
-    """Return any instruction packet.
+    """Return an instruction packet.
 
-    Raises ValueError when `servo_id` is neither 0..252 nor broadcast, or the parameters do not fit.
+    Raises:
+        ValueError: `servo_id` is neither 0..252 nor broadcast, or the parameters do not fit.
     """
     if not (0 <= servo_id <= HIGHEST_ID or servo_id == BROADCAST_ID):
         raise ValueError(f"{servo_id} is no ID: a servo has 0..{HIGHEST_ID}, broadcast is {BROADCAST_ID}")
@@ -216,7 +225,7 @@ def instruction_packet(servo_id: int, instruction: int, parameters: bytes = b"")
 
 
 def status_packet(servo_id: int, error: int = 0, parameters: bytes = b"") -> bytes:
-    """Return the status packet that a servo would send; raises ValueError when the parameters do not fit."""
+    """Return the status packet that a servo would send. Raises ValueError if the parameters do not fit."""
     return _packet(servo_id, stuffed(bytes((STATUS, error)) + parameters))
 
 
@@ -226,17 +235,17 @@ def ping(servo_id: int = BROADCAST_ID) -> bytes:
 
 
 def read(servo_id: int, address: int, length: int) -> bytes:
-    """Return the packet that asks for `length` bytes of the control table from `address` on."""
+    """Return the packet that reads `length` bytes of the control table from `address`."""
     return instruction_packet(servo_id, Instruction.READ, _word(address) + _word(length))
 
 
 def write(servo_id: int, address: int, data: bytes) -> bytes:
-    """Return the packet that writes `data` into the control table from `address` on."""
+    """Return the packet that writes `data` into the control table from `address`."""
     return instruction_packet(servo_id, Instruction.WRITE, _word(address) + data)
 
 
 def factory_reset(servo_id: int, what: Reset) -> bytes:
-    """Return the packet that sets the control table to its factory values."""
+    """Return the packet that resets the control table to factory values."""
     return instruction_packet(servo_id, Instruction.FACTORY_RESET, bytes((what,)))
 
 
@@ -251,19 +260,19 @@ def back_up(servo_id: int) -> bytes:
 
 
 def restore(servo_id: int) -> bytes:
-    """Return the packet that takes the EEPROM back from the backup; the servo reboots after it."""
+    """Return the packet that restores the EEPROM from the backup; the servo then reboots."""
     return instruction_packet(servo_id, Instruction.CONTROL_TABLE_BACKUP, b"\x02" + _BACKUP)
 
 
 def sync_read(address: int, length: int, servo_ids: Iterable[int], *, fast: bool = False) -> bytes:
-    """Return the packet that asks servos for the same bytes; `fast`: answered by one status of all."""
+    """Return the packet that reads the same bytes from servos; `fast`: they share one status."""
     instruction = Instruction.FAST_SYNC_READ if fast else Instruction.SYNC_READ
     parameters = _word(address) + _word(length) + bytes(servo_ids)
     return instruction_packet(BROADCAST_ID, instruction, parameters)
 
 
 def bulk_read(requests: Iterable[tuple[int, int, int]], *, fast: bool = False) -> bytes:
-    """Return the packet that asks servos for different bytes, each as (ID, address, length)."""
+    """Return the packet that reads different bytes from servos, given ID, address and length for each."""
     instruction = Instruction.FAST_BULK_READ if fast else Instruction.BULK_READ
     parameters = b"".join(
         bytes((servo_id,)) + _word(address) + _word(length) for servo_id, address, length in requests
@@ -272,7 +281,7 @@ def bulk_read(requests: Iterable[tuple[int, int, int]], *, fast: bool = False) -
 
 
 def read_many(requests: Sequence[tuple[int, int, int]], *, fast: bool = False) -> bytes:
-    """Return the one packet that asks several servos, each by (ID, address, length); they answer in turn."""
+    """Return a packet that reads several servos in turn, given ID, address and length for each."""
     _, address, length = requests[0]
     if all(request[1:] == (address, length) for request in requests):
         return sync_read(address, length, (servo_id for servo_id, _, _ in requests), fast=fast)
@@ -280,9 +289,10 @@ def read_many(requests: Sequence[tuple[int, int, int]], *, fast: bool = False) -
 
 
 def sync_write(address: int, length: int, data: Mapping[int, bytes]) -> bytes:
-    """Return the broadcast packet that writes `length` bytes from `address` on, per servo ID; no reply.
+    """Return the broadcast packet that writes `length` bytes from `address`, by servo ID; it has no reply.
 
-    Raises ValueError when a servo's data is not `length` bytes long.
+    Raises:
+        ValueError: The data of a servo does not have `length` bytes.
     """
     for servo_id, chunk in data.items():
         if len(chunk) != length:

@@ -1,6 +1,6 @@
-"""Receiver: bytes of one serial line in, intact packets of its protocol out; finds its way through noise.
+"""Receiver: extracts intact packets of a protocol from the byte stream of one serial line, despite noise.
 
-One preallocated buffer, no growth. Each byte leaves it exactly once: inside an intact packet, or as noise.
+One preallocated buffer, no growth. Each byte is delivered exactly once: inside an intact packet, or as noise.
 """
 
 from __future__ import annotations
@@ -11,19 +11,19 @@ from dxlwire.port.ports import Port
 from dxlwire.wire.dialect import Dialect
 
 Taker = Callable[[memoryview, int, int], None]
-"""Takes bytes with the times (ns) of the read() calls that brought the first and the last of them.
+"""Receives bytes with the times (ns) of the read() calls that returned the first and the last of them.
 
-The view is only good during the call.
+The view is valid only during the call.
 """
 
-_GOOD_READ = 765  # Bytes that one read may bring beside an unfinished packet
+_GOOD_READ = 765  # Bytes that one read may return in addition to an unfinished packet
 
 
 class Receiver:
-    """Takes packets out of a stream; decides on a header only when its whole packet is there.
+    """Extracts packets from a stream; decides on a header only when its whole packet has arrived.
 
-    A false header in noise can announce up to the protocol's longest packet and so hold back what follows
-    it; `flush` ends that when a deadline has passed.
+    A false header in noise can announce up to the protocol's longest packet and so hold back the bytes after
+    it; `flush` ends that after a deadline.
     """
 
     def __init__(self, packet: Taker, noise: Taker, dialect: Dialect) -> None:
@@ -35,15 +35,16 @@ class Receiver:
         self._buffer = bytearray(dialect.LONGEST + _GOOD_READ)
         self._view = memoryview(self._buffer)
         self.pending = 0  # Number of bytes that are neither packet nor noise yet
-        self._ends: list[int] = []  # where each read() ended in the buffer; as many as unfinished reads
+        self._ends: list[int] = []  # End of each read() in the buffer, for the bytes that are pending
         self._times: list[int] = []
         self._packet = packet
         self._noise = noise
 
     def read_from(self, port: Port, now_ns: Callable[[], int]) -> int:
-        """Take what the port has, deliver what became whole; return the number of bytes taken.
+        """Read from the port and deliver complete packets; return the number of bytes read.
 
-        Raises PortError when the adapter is gone.
+        Raises:
+            PortError: The adapter is gone.
         """
         count = port.read_into(self._view[self.pending :] if self.pending else self._view)
         if count:
@@ -51,7 +52,7 @@ class Receiver:
         return count
 
     def feed(self, data: bytes, now_ns: int) -> None:
-        """Take bytes that arrived at `now_ns`, deliver what became whole."""
+        """Deliver the complete packets of bytes that arrived at `now_ns`; keep an unfinished packet."""
         start = 0
         while start < len(data):
             chunk = data[start : start + min(_GOOD_READ, len(self._view) - self.pending)]
@@ -60,12 +61,12 @@ class Receiver:
             self._accept(len(chunk), now_ns)
 
     def skip_header(self) -> None:
-        """Give up the header that is being waited for, as false; what follows it gets its chance."""
+        """Discard the pending header as false, and scan the bytes after it."""
         if self.pending:
             self._forget(self._scan(1))
 
     def flush(self) -> None:
-        """Give up waiting for the rest of an unfinished packet: scan again behind its header."""
+        """Stop waiting for the rest of an unfinished packet: scan again after its header."""
         while self.pending:
             if self._buffer.startswith(self._header, 0, self.pending):
                 self._forget(self._scan(1))
@@ -90,9 +91,9 @@ class Receiver:
         taker(self._view[start:stop], times[first], times[last])
 
     def _scan(self, search: int) -> int:
-        """Deliver what is whole, looking for headers from `search` on; return the start of what is not."""
+        """Deliver complete packets with headers from `search` on; return the start of the remaining bytes."""
         buffer, end = self._buffer, self.pending
-        done = 0  # everything before it was delivered
+        done = 0  # Everything before this index was delivered
         while True:
             start = buffer.find(self._header, search, end)
             if start < 0:
@@ -117,7 +118,7 @@ class Receiver:
         return start
 
     def _beginning(self, search: int) -> int:
-        """Return where the last bytes may be the beginning of a header; their end when they cannot."""
+        """Return the index at which the last bytes may begin a header, or the end of the bytes."""
         for beginning in self._beginnings:
             if self._buffer.endswith(beginning, search, self.pending):
                 return self.pending - len(beginning)
