@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 import subprocess
 import sys
 from collections.abc import Callable
@@ -22,13 +23,23 @@ from dxlrun.features import FEATURES, RESERVED, stages
 from dxlrun.features.feature import Feature, JointKey, PolicyKey, Section, ServoKey
 from dxlrun.installed_plugins import InstalledPlugin
 
-ROBOT = Path(__file__).parents[2] / "robots" / "bioloid_torso.yaml"
+ROOT = Path(__file__).parents[2]
+ROBOT = ROOT / "robots" / "bioloid_torso.yaml"
 
 
 def test_each_feature_has_the_section_of_its_name() -> None:
     sections = {feature.name: section for feature, section in stages(Section, FEATURES)}
     assert {name: section.name for name, section in sections.items()} == {name: name for name in sections}
     assert robot_form().model_fields.keys() - Robot.model_fields.keys() == sections.keys()
+
+
+def test_all_files_of_features_are_on_the_page_of_the_architecture() -> None:
+    page = (ROOT / "docs" / "explanation" / "architecture.md").read_text()
+    declared = re.compile(r'    FILE: ClassVar\[str\] = "(\w+)"')
+    sources = [path.read_text() for path in (ROOT / "runtime" / "dxlrun").rglob("*.py")]
+    files = {name for source in sources for name in declared.findall(source)}
+    assert {"form", "process"} <= files
+    assert {name for name in files if f"| `{name}.py` |" not in page} == set()
 
 
 def test_feature_without_file_takes_no_part_in_stage() -> None:
