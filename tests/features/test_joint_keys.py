@@ -98,6 +98,8 @@ def test_groups_and_defaults_give_the_key_to_joints(tmp_path: Path) -> None:
         pytest.approx(np.radians(4)),
         pytest.approx(np.radians(1)),
     ]
+    alone = compiled(tmp_path, defaults.replace("backlash: 4 deg", "torque: on")).plan
+    assert alone.packages["dxlrun_backlash"] == "dxlrun-backlash"
     groups = f"{ROBOT}groups: {{leg: {{joints: [ankle], backlash: 2 deg}}}}\n"
     plan = compiled(tmp_path, groups.replace("backlash: 4 deg", "torque: on")).plan
     assert plan.loop.joints[1].keys["backlash"] == pytest.approx(np.radians(2))

@@ -122,7 +122,7 @@ class FormKey(Protocol):
 
     @property
     def before(self) -> str:
-        """Key that follows it in lists of all keys; empty: it is the last."""
+        """Key that follows it in lists of all keys; it is the last where there is no such key."""
 
 
 def with_keys(form: type[F], keys: Iterable[FormKey], **replaced: object) -> type[F]:

@@ -155,7 +155,7 @@ class Feature(msgspec.Struct, frozen=True):
     """A feature by its name and the package that has its files."""
 
     name: str
-    """Its key in the robot file, of a joint or of `policies`, such as `devices`."""
+    """Its key in the robot file, such as `devices`: at the top, of joints, of servos or of `policies`."""
     package: str
     """Package with its files, such as `dxlrun.features.devices`."""
     distribution: str = ""
