@@ -293,9 +293,7 @@ def _connected(path: Path) -> socket.socket:
 
 
 def _hung_up(end: socket.socket) -> bool:
-    """Return whether the peer has closed the connection. It sends no unrequested bytes, so a byte counts as
-    well.
-    """
+    """Return whether the peer has closed the connection; an unrequested byte counts as closed, too."""
     look = select.poll()
     look.register(end, select.POLLIN)
     return bool(look.poll(0))

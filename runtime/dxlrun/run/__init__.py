@@ -1,4 +1,4 @@
-"""Run: the processes of a robot, from the terminal to the loop, on both clocks.
+"""Run: the processes of a robot, from the terminal to the loop, in real and virtual time.
 
-What happens in a cycle belongs in `control`.
+The steps of a cycle belong in `control`.
 """

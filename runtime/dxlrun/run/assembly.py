@@ -1,4 +1,4 @@
-"""Assembly: a plan, ports and a clock become hardware, manager, gate and loop; the same on both clocks."""
+"""Assembly: builds hardware, manager, gate and loop from a plan, ports and a clock, for both clocks."""
 
 from __future__ import annotations
 
@@ -34,39 +34,39 @@ from dxlwire.port.ports import Ports
 
 @dataclass(slots=True)
 class Sinks:
-    """Where the records of a run go: into rings, straight into a log, or nowhere."""
+    """Destinations of a run's records: rings, a log, or none."""
 
     cycles: Appender
     packets: PacketLog
-    """Takes every packet that goes over a line."""
+    """Receives every packet on a line."""
     events: EventSink
     commands: CommandSink
     progress: Callable[[int, int], None] = lambda cycles, skipped: None
-    """Called after each cycle with how many ran and how many periods were skipped."""
+    """Called after each cycle with the number of cycles and of skipped periods."""
     messages: MessageSink = field(default_factory=MessageSink)
     epoch_offset_ns: int = 0
-    """Wall time = time of the run's clock + this, for the stamps of messages."""
+    """Wall time minus the run's clock, for the time stamps of messages."""
     wake: Callable[[int], None] = field(init=False)
-    """Note that a cycle begins: the packets that follow are of its period."""
+    """Mark the beginning of a cycle: later packets belong to its period."""
     _commit: Callable[[], object] = field(init=False)
     _keep: Callable[[], object] = field(init=False)
-    """Records the cycle; its memory is the same in each."""
+    """Records the cycle from memory that is reused in each cycle."""
     ran: int = field(default=0, init=False)
     skipped: int = field(default=0, init=False)
 
     def __post_init__(self) -> None:
-        """Let the packets know of a new cycle without a call between."""
+        """Bind `wake` directly to the packet log, which saves a call in each cycle."""
         self.wake = self.packets.wake
 
     def begin(self, record: CycleRecord) -> None:
-        """Record the packets of the start-up, and what the controllers are activated with."""
+        """Record the packets of the start-up, and the state in which the controllers are activated."""
         self._commit = self.packets.commit
         self._keep = self.cycles.repeat(RecordKind.CYCLE, record.raw)
         self._commit()
         self._keep()
 
     def append(self, record: CycleRecord) -> None:
-        """Record one finished cycle, and the packets since the one before."""
+        """Record a finished cycle and its packets."""
         self._commit()
         self._keep()
         self.ran += 1
@@ -76,19 +76,24 @@ class Sinks:
 
 @dataclass(slots=True)
 class AssembledRobot:
-    """A robot, ready to be started."""
+    """A robot that is ready to start."""
 
     hardware: Hardware
     manager: Manager
     loop: Loop
     record: CycleRecord
     failures: tuple[str, ...] = ()
-    """What could not be switched off at the end, one sentence each."""
+    """Servos and devices that could not be switched off at the end, one sentence each."""
 
     def run(self, enter: Callable[[Phase], None] = lambda _: None) -> LoopResult:
-        """Set up, run the loop to its end, switch torque off unless a policy holds; `enter` takes the phases.
+        """Set up, run the loop to its end, and switch torque off unless a policy holds.
 
-        Raises StartUpError and PortError; a controller's fault is in the result.
+        Args:
+            enter: Called with each phase that begins.
+
+        Raises:
+            StartUpError: The set-up failed.
+            PortError: A port failed.
         """
         self.hardware.start(partial(enter, Phase.ENGAGING))
         last: Last = "limp"
@@ -107,7 +112,7 @@ class AssembledRobot:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class LoopHost:
-    """A process as it hosts a loop: lines, time, log, clients, and the processes that watch the loop."""
+    """Environment of a loop: lines, time, log, clients, and the processes that watch the loop."""
 
     ports: Ports
     clock: Clock
@@ -115,9 +120,9 @@ class LoopHost:
     supervision: Supervision = field(default_factory=Unsupervised)
     inbox: Inbox = field(default_factory=NoInbox)
     activity: Activity = field(default_factory=Activity)
-    """Shows which controller's code runs."""
+    """Record of the controller whose code is running."""
     slots: Slots = field(default_factory=dict)
-    """What processes of features write into."""
+    """Shared memory that processes of features write."""
 
 
 def assemble(
@@ -128,14 +133,14 @@ def assemble(
     take_over: bool = False,
     kept: KeptStates | None = None,
 ) -> AssembledRobot:
-    """Build everything between the ports and the log; configures the controllers, sends nothing.
+    """Build everything between the ports and the log. Controllers are configured; no packet is sent.
 
     Args:
         plan: The robot.
-        plugins: Types of its controllers, and what decides about late cycles.
-        host: The process.
+        plugins: Controller types and overrun hooks.
+        host: Environment of the loop.
         take_over: The servos may have torque already.
-        kept: What controllers kept in earlier runs.
+        kept: States that controllers kept in earlier runs.
     """
     record, sinks = CycleRecord(plan.loop.layout), host.sinks
     layers = HardwareLayers(plan, record.states, record.goals, sinks.events)

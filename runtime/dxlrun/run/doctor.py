@@ -1,4 +1,4 @@
-"""The doctor: what on this machine keeps a robot from running, or from running smoothly."""
+"""Doctor: checks of this machine for problems that keep a robot from running, or from running smoothly."""
 
 from __future__ import annotations
 
@@ -32,13 +32,13 @@ from dxlwire.port.rights import command_for_access, serial_group
 from dxlwire.port.serial_open import is_rate, open_serial
 
 NEEDED = ("memfd_create", "pidfd_open", "sched_setscheduler")
-"""Calls of `os` without which no run starts; Linux has them all since 5.3."""
+"""Functions of `os` that a run needs; Linux has all of them since 5.3."""
 NEEDED_PRIORITY = 32
-"""The robot file's default priority for the loop, and one more for the guardian."""
+"""Default priority of the loop in the robot file, plus one for the guardian."""
 RATES = (57_600, 115_200, 1_000_000, 2_000_000, 3_000_000, 4_000_000)
-"""Tried at each port, bit/s: what servos have (e-Manual, Baud Rate)."""
+"""Rates that are tried at each port, bit/s: those of servos (e-Manual, Baud Rate)."""
 FAST_MS = 1
-"""The shortest latency timer of an FTDI adapter (FTDI application note AN232B-04)."""
+"""Shortest latency timer of an FTDI adapter, ms (FTDI application note AN232B-04)."""
 
 _CAPABILITIES = {SYS_NICE: "CAP_SYS_NICE", IPC_LOCK: "CAP_IPC_LOCK"}
 _REAL_TIME_KERNELS = {
@@ -59,12 +59,12 @@ _SHARE = "proc/sys/kernel/sched_rt_runtime_us"
 _DEFAULT_SHARE = "sudo sysctl kernel.sched_rt_runtime_us=950000"
 _CLOCK_SOURCE = "sys/devices/system/clocksource/clocksource0/current_clocksource"
 _SLOW_CLOCKS = ("hpet", "acpi_pm", "pit", "jiffies", "refined-jiffies")
-"""Sources that are read over a bus, in a microsecond or more, or that tick [i]."""
+"""Clock sources that are read over a bus, in a microsecond or more, or that only count ticks [i]."""
 _TIMERS = "sys/bus/usb-serial/devices/*/latency_timer"
 _GOVERNORS = "sys/devices/system/cpu/cpu[0-9]*/cpufreq/scaling_governor"
 
 State = Literal["good", "worse", "missing"]
-"""worse: robots run, but not as smoothly as they could; missing: no robot runs like this."""
+"""worse: robots run, but less smoothly than possible; missing: no robot can run."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -74,16 +74,16 @@ class Finding:
     what: str
     state: State
     found: str
-    """How it is here."""
+    """State of this machine."""
     why: str
-    """What it matters for."""
+    """Consequence for a robot."""
     fix: str = ""
-    """The command, or the step, that fixes it; empty where nothing is to be fixed."""
+    """Command or step that fixes the problem; empty when there is none."""
 
 
 @dataclass(frozen=True, slots=True)
 class _Check:
-    """What is looked at, and what it matters for."""
+    """Subject of a check and its consequence for a robot; makes the findings."""
 
     what: str
     why: str
@@ -99,9 +99,9 @@ class _Check:
 
 
 def may_schedule() -> bool:
-    """Return whether the kernel really gives a real-time policy: a container's group may have no share of it.
+    """Return whether the kernel grants a real-time policy, by requesting it for a moment.
 
-    Takes it for a moment, and gives it back.
+    A container's control group may have no real-time share even when the limits allow the policy.
     """
     try:
         os.sched_setscheduler(0, os.SCHED_RR, os.sched_param(1))
@@ -112,7 +112,7 @@ def may_schedule() -> bool:
 
 
 def set_rates(port: Path) -> Mapping[int, int]:
-    """Set rates of servos at a port that no other process has open; return what its driver set, bit/s."""
+    """Set servo baud rates at a free port; return the rate that the driver chose for each, bit/s."""
     found: dict[int, int] = {}
     with suppress(OSError), open_serial(str(port), RATES[0]) as line:
         for rate in RATES:
@@ -123,30 +123,31 @@ def set_rates(port: Path) -> Mapping[int, int]:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Machine:
-    """One machine and its user, as far as checks depend on them; the tests make up others."""
+    """Properties of a machine and its user that the checks read; tests construct other machines."""
 
     platform: str = sys.platform
     root: Path = Path("/")
     missing_calls: tuple[str, ...] = ()
     user: str = "nobody"
     cores: int = 1
-    """On which this process may run."""
+    """Number of cores on which this process may run."""
     capabilities: tuple[str, ...] = ()
-    """Those that matter here: CAP_SYS_NICE, CAP_IPC_LOCK."""
+    """Relevant capabilities: CAP_SYS_NICE, CAP_IPC_LOCK."""
     highest_priority: int = 0
-    """99 with the capability; 0: none."""
+    """Highest real-time priority; 99 with the capability, 0 without a permission."""
     lockable: int = 0
-    """Bytes; UNLIMITED with the capability."""
+    """Lockable memory, bytes; UNLIMITED with the capability."""
     compiled: str = ""
-    """Why what is compiled, the exchange with servos and the gate, cannot be used; empty: it can."""
+    """Reason why the compiled exchange and gate cannot be used; empty when they can."""
     may_schedule: Callable[[], bool] = field(default=may_schedule)
     may_write: Callable[[Path], bool] = field(default=partial(os.access, mode=os.R_OK | os.W_OK))
     set_rates: Callable[[Path], Mapping[int, int]] = field(default=set_rates)
-    """Returns what a port's driver sets for each of `RATES`, bit/s; empty where it cannot be opened."""
+    """Returns the rate that a port's driver sets for each of `RATES`, bit/s; empty for a port that cannot
+    be opened."""
 
     @classmethod
     def this(cls) -> Machine:
-        """Return the machine on which we run; never raises."""
+        """Return the present machine; never raises."""
         missing = tuple(name for name in NEEDED if not hasattr(os, name))
         if missing or not sys.platform.startswith("linux"):
             return cls(missing_calls=missing)
@@ -161,7 +162,7 @@ class Machine:
 
     @property
     def container(self) -> bool:
-        """True in a container: rights come with its start, the kernel from outside."""
+        """True in a container, whose rights are set at its start, and whose kernel is the host's."""
         return any((self.root / name).exists() for name in (".dockerenv", "run/.containerenv"))
 
     def read(self, path: str) -> str | None:
@@ -172,7 +173,7 @@ class Machine:
             return None
 
     def glob(self, pattern: str) -> list[Path]:
-        """Return the paths under the root that match a pattern, in order."""
+        """Return the sorted paths under the root that match a pattern."""
         return sorted(self.root.glob(pattern))
 
     def shown(self, path: Path) -> str:
@@ -181,7 +182,7 @@ class Machine:
 
 
 def diagnose(machine: Machine) -> tuple[Finding, ...]:
-    """Return the findings in the order in which to fix them; only the first where no robot can run."""
+    """Return the findings in the order in which to fix them; only the first when no robot can run here."""
     first = _system(machine)
     if first.state == "missing":
         return (first,)
@@ -217,7 +218,7 @@ def _system(machine: Machine) -> Finding:
 
 
 def _exchange(machine: Machine) -> Finding:
-    """Whether the compiled parts of a cycle can be used: the exchange with the servos, and the gate."""
+    """Check the compiled parts of a cycle: the exchange with the servos, and the gate."""
     check = _Check(
         "exchange", "compiled code limits goals and exchanges bytes with the servos in every cycle"
     )
@@ -238,7 +239,7 @@ def _ports(machine: Machine) -> Iterator[Finding]:
         yield _port(machine, path)
     for path in onboard:
         found = _port(machine, path)
-        # a robot on a USB adapter does not need it
+        # A robot on a USB adapter does not need an onboard port.
         yield replace(found, state="worse") if found.state == "missing" else found
     for path in (*usb, *onboard):
         yield from _rates(machine, path)
@@ -247,7 +248,7 @@ def _ports(machine: Machine) -> Iterator[Finding]:
 
 
 def _rates(machine: Machine, path: Path) -> Iterator[Finding]:
-    """The rates that the driver of a port sets as asked; nothing for a port that cannot be opened now."""
+    """Check the rates that a port's driver sets; yields nothing for a port that cannot be opened now."""
     name = machine.shown(path)
     check = _Check(f"baud rates of {name}", "servos do not receive what is sent at another rate than theirs")
     found = machine.set_rates(path)
@@ -273,7 +274,7 @@ def _port(machine: Machine, path: Path) -> Finding:
 
 
 def _timer(machine: Machine, path: Path) -> Finding:
-    """The latency timer of an FTDI adapter; other adapters have none."""
+    """Check the latency timer of an FTDI adapter; other adapters have none."""
     check = _Check(
         f"latency timer of {path.parent.name}",
         "the adapter keeps the last bytes of each reply back for so long",
@@ -287,7 +288,7 @@ def _timer(machine: Machine, path: Path) -> Finding:
 
 
 def _priority(machine: Machine) -> Finding:
-    """Whether a run may have real-time priority (RLIMIT_RTPRIO, CAP_SYS_NICE), and really gets it."""
+    """Check that a run is allowed real-time priority (RLIMIT_RTPRIO, CAP_SYS_NICE), and receives it."""
     check = _Check(
         "real-time priority", "with ordinary priority any busy program delays the loop by milliseconds"
     )
@@ -304,7 +305,7 @@ def _priority(machine: Machine) -> Finding:
 
 
 def _locked_memory(machine: Machine) -> Finding:
-    """Whether a run may lock all of its memory (RLIMIT_MEMLOCK, CAP_IPC_LOCK)."""
+    """Check that a run may lock all of its memory (RLIMIT_MEMLOCK, CAP_IPC_LOCK)."""
     check = _Check("locked memory", "a page that was swapped out delays the loop by milliseconds")
     if machine.lockable == UNLIMITED:
         return check.good(f"all of it, {_by(machine, 'CAP_IPC_LOCK', 'memlock')}")
@@ -322,7 +323,7 @@ def _raise_limit(machine: Machine, limit: str, value: int | str) -> str:
 
 
 def _kernel(machine: Machine) -> Finding:
-    """Whether the operating system's kernel is a real-time one.
+    """Check that the kernel is a real-time kernel.
 
     Source of the figures: wake-ups of a 1 kHz timer under full load, 1,000,000 each, in the bachelor thesis
     on real-time control of Dynamixel servos that dxlrun follows.
@@ -339,7 +340,7 @@ def _kernel(machine: Machine) -> Finding:
 
 
 def _preemption(machine: Machine) -> tuple[Finding, ...]:
-    """Whether a stock kernel interrupts its own work for the loop; nothing where it does not show that."""
+    """Check that a stock kernel preempts its own work for the loop; empty when its model is unknown."""
     model = preemption(machine)
     if model is None:
         return ()
@@ -348,7 +349,8 @@ def _preemption(machine: Machine) -> tuple[Finding, ...]:
         "with preempt=none or voluntary, another program's system call (writing 1 MiB takes 2 ms) keeps a "
         "loop of any priority waiting until it ends",
     )
-    if model in {"full", "lazy"}:  # lazy spares only ordinary programs (kernel/Kconfig.preempt)
+    # With lazy, only ordinary programs are preempted later (kernel/Kconfig.preempt).
+    if model in {"full", "lazy"}:
         return (check.good(f"preempt={model}"),)
     where = "of the machine that runs this container " if machine.container else ""
     fix = f"add preempt=full to the kernel's command line {where}and start it again"
@@ -356,10 +358,10 @@ def _preemption(machine: Machine) -> tuple[Finding, ...]:
 
 
 def preemption(machine: Machine) -> str | None:
-    """Return the preemption model of a kernel that has several (PREEMPT_DYNAMIC); None: it has one, or is
-    silent about it.
+    """Return the preemption model of a kernel with several models (PREEMPT_DYNAMIC), else None.
 
-    It is in debugfs for root, else the last `preempt=` of the command line, else what it was built with.
+    The model is in debugfs for root, else in the last `preempt=` of the command line, else in the build
+    configuration. None also means that none of these shows it.
     """
     if "PREEMPT_DYNAMIC" not in (machine.read("proc/sys/kernel/version") or ""):
         return None
@@ -376,7 +378,7 @@ def preemption(machine: Machine) -> str | None:
 
 
 def _kernel_config(machine: Machine) -> str:
-    """Return the configuration that the kernel was built with; empty where it cannot be read."""
+    """Return the build configuration of the kernel; empty when it cannot be read."""
     try:
         return gzip.decompress((machine.root / "proc/config.gz").read_bytes()).decode(errors="replace")
     except (OSError, EOFError):
@@ -384,7 +386,7 @@ def _kernel_config(machine: Machine) -> str:
 
 
 def _real_time_kernel(machine: Machine) -> str:
-    """Return how to get one on this distribution."""
+    """Return the step that installs a real-time kernel on this distribution."""
     if machine.container:
         return "install a PREEMPT_RT kernel on the machine that runs this container"
     lines = (machine.read("etc/os-release") or "").splitlines()
@@ -396,7 +398,7 @@ def _real_time_kernel(machine: Machine) -> str:
 
 
 def _real_time_share(machine: Machine) -> Finding:
-    """Whether a loop gone wild leaves the machine a share of its cores (sched(7))."""
+    """Check that a runaway real-time loop leaves a share of its core to other programs (sched(7))."""
     check = _Check(
         "real-time share",
         "a real-time loop that never sleeps would lock out everything else on its core, also you",
@@ -421,7 +423,7 @@ def _clock_source(machine: Machine) -> Finding:
 
 
 def _cores(machine: Machine) -> Finding:
-    """Whether the loop can have a core for itself."""
+    """Check that the loop can have its own core."""
     check = _Check("cores", "guardian, recorder and gateway work beside the loop")
     if machine.cores < 2:
         return check.worse(
@@ -433,7 +435,7 @@ def _cores(machine: Machine) -> Finding:
 
 
 def _governor(machine: Machine) -> Finding:
-    """Whether the cores always run at their full clock rate."""
+    """Check that the cores always run at their full clock rate."""
     check = _Check(
         "CPU governor", "a core that has to speed up first makes the first milliseconds of work slow"
     )
@@ -449,7 +451,7 @@ def _governor(machine: Machine) -> Finding:
 
 
 def _idle_latency(machine: Machine) -> Finding:
-    """Whether a run may keep the cores from deep idle states."""
+    """Check that a run may keep the cores out of deep idle states."""
     check = _Check(
         "idle latency",
         "a core in a deep idle state wakes up to some 100 us late; "

@@ -1,11 +1,11 @@
-"""Guardian: the process that keeps the ports, and leaves the robot safe when its loop is gone.
+"""Guardian: the process that holds the ports, and makes the robot safe when its loop has exited.
 
-A small process, one priority above the loop. It opens, locks and keeps the ports' descriptors, executes the
-loop's process on them as its child, and watches that child: by its pidfd, which shows at once that it ended,
-and by its heartbeat, which shows that it hangs. A loop that is gone before it reported DONE, or that stands
-still, is killed and reaped, and then every servo is made limp with the packets that the plan prepared. When
-the supervisor is dead or stopped, the loop is asked to stop (`watch.py`). A line that the loop has lost is
-opened again and handed over.
+A small process with a priority one above the loop. It opens and locks the ports, executes the loop's process
+as its child, which inherits the ports' descriptors, and watches that child. The pidfd shows at once that the
+loop has exited; the heartbeat shows that it hangs. A loop that exits before it has reported DONE, or that
+hangs, is killed and reaped. Then the guardian switches the torque of every servo off with the packets that
+the plan prepared. When the supervisor is dead or stopped, the guardian asks the loop to stop (`watch.py`). It
+also opens lines again that the loop has lost, and passes them on.
 """
 
 from __future__ import annotations
@@ -48,17 +48,20 @@ from dxlwire.port.reopening import KeptLines, Wanted
 _NEVER = 1 << 62
 
 LEAST_NAP_NS, LONGEST_NAP_NS = 5_000_000, 10_000_000
-"""It looks at the loop once a period within these bounds: a look takes some 60 us from a loop on its core."""
+"""Limits of the interval at which the guardian checks the loop, else the loop's period. A check takes
+about 60 us from a loop on the same core."""
 LONGEST_LOOK_NS = 20_000_000
-"""One look of the guardian counts for at most this: when it was not running, the loop may not have been."""
+"""Upper limit of the time that one check adds to a standstill: while the guardian was not running, the
+loop may not have run either."""
 
 Ending = Literal["done", "unused", "died", "hung", "late", "cut"]
-"""done: by itself, torque off; unused: before a byte was sent; the others leave torque off to us."""
+"""done: the loop ended normally; unused: before a byte was sent; after all others, the guardian makes the
+robot safe."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class GuardianPlan:
-    """The guardian's share of the robot's plan: enough to watch a loop, and to leave the robot safe."""
+    """The part of the robot's plan that the guardian needs to watch a loop and to make the robot safe."""
 
     buses: tuple[BusPlan, ...]
     features: tuple[Feature, ...]
@@ -66,40 +69,40 @@ class GuardianPlan:
     """`Contribution.plan` by feature."""
     period_ns: int
     exit_timeout_ns: int
-    """How long the loop may take to stop when it is asked to."""
+    """Timeout of the loop after a stop request."""
     priority: int
     """Real-time priority of the guardian; 0: none."""
     lock_memory: bool
     last: Last
-    """How the robot is left when the loop is gone in the middle of a run."""
+    """State in which the robot is left when the loop exits in the middle of a run."""
 
 
 @dataclass(frozen=True, slots=True)
 class GuardianJob:
-    """What the guardian works on: the plan, and the ports and descriptors that it and the loop inherit."""
+    """Job of the guardian: its plan, and the ports and descriptors that guardian and loop inherit."""
 
     plan: GuardianPlan
     ports: tuple[str, ...]
-    """Device paths, in the order of `plan.buses`; a simulated bus has its pseudo-terminal here."""
+    """Device paths in the order of `plan.buses`; for a simulated bus, its pseudo-terminal."""
     memory: RunMemory
     supervisor: int
     """Process ID."""
     take_over: bool = False
-    """The loop accepts servos that are already torqued."""
+    """The loop accepts servos that already have torque."""
     epoch_offset_ns: int = 0
-    """Wall time = time of the run's clock + this."""
+    """Wall time minus the run's clock."""
 
 
 @dataclass(frozen=True, slots=True)
 class LoopJob:
-    """What the loop's process works on."""
+    """Job of the loop's process."""
 
     memory: RunMemory
     take_over: bool
     ports: tuple[int, ...]
-    """Descriptors, in the order of the plan's buses."""
+    """File descriptors in the order of the plan's buses."""
     channel: int
-    """To the guardian, which opens lines that are gone again."""
+    """File descriptor of the channel to the guardian, which opens lost lines again."""
     supervisor: int
     """Process ID."""
     guardian: int
@@ -108,20 +111,20 @@ class LoopJob:
 
 
 class Started(msgspec.Struct, frozen=True, tag=True):
-    """Guardian to terminal: the loop is executed; the ports come along."""
+    """Guardian to supervisor: the loop is running. The message carries the ports."""
 
     loop: int
     """Process ID."""
     grants: tuple[realtime.Grant, ...]
-    """What the operating system granted to the guardian."""
+    """Real-time properties that the operating system granted to the guardian."""
 
 
 class Ended(msgspec.Struct, frozen=True, tag=True):
-    """Guardian to terminal: the loop is gone, and the robot is left as by its policy."""
+    """Guardian to supervisor: the loop has exited, and the robot is in the state of its policy."""
 
     ending: Ending
     outcome: tuple[str, ...] = ()
-    """What the guardian did in place of supervisor or loop, one sentence each."""
+    """Actions of the guardian in place of supervisor or loop, one sentence each."""
 
 
 GuardianMessage = Started | LineLost | LineReturned | Ended | Failed
@@ -136,14 +139,14 @@ def make_ports(
     memory: RunMemory,
     stalls: StallCounter,
 ) -> list[SerialPort]:
-    """Return the ports of all buses; those of simulated servos wait for a process that has no core.
+    """Return the ports of all buses. Ports of simulated servos wait while the simulation has no core.
 
     Args:
         buses: The plan's buses.
-        names: Names of their ports, for messages.
-        descriptors: Descriptors of their ports.
-        memory: Memory of the run, which has the progress of the simulation.
-        stalls: Counts these waits.
+        names: Names of the ports, for messages.
+        descriptors: File descriptors of the ports.
+        memory: Memory of the run, with the progress of the simulation.
+        stalls: Counter of these waits.
     """
     ports: list[SerialPort] = []
     simulated = 0
@@ -158,7 +161,7 @@ def make_ports(
 
 
 class SafeStop:
-    """Switches torque off instead of a loop that is gone, and reports the result to log and terminal."""
+    """Switches torque off in place of a loop that has exited, and reports the result to log and terminal."""
 
     def __init__(self, job: GuardianJob) -> None:
         self._job = job
@@ -169,9 +172,9 @@ class SafeStop:
         self._safe_end = SafeEnd.of(job.plan.features, job.plan.feature_plans)
 
     def end(self, descriptors: Sequence[int], how: str, severity: Severity) -> list[str]:
-        """Leave the robot as the policy for a fault does, without its steps; return that as sentences.
+        """Apply the final state of the fault policy, without its steps; return sentences about it.
 
-        A robot holds only when it ran: in a set-up some servos have torque and others have not.
+        The robot holds only when the loop was running: during set-up, only some servos have torque.
         """
         if self._job.plan.last == "limp" or self._heartbeat.phase is not Phase.RUNNING:
             return self.limp(descriptors, how, severity)
@@ -180,14 +183,14 @@ class SafeStop:
         return [how, TORQUE_STAYS, *standing]
 
     def stand(self, descriptors: Sequence[int]) -> tuple[str, ...]:
-        """Stop the joints that would go on moving with their torque on; return a sentence for each."""
+        """Stop the joints that would continue to move with torque on; return a sentence for each."""
         lines, packets = self._take_over(descriptors)
         sentences = (*stand(lines), *self._safe_end.make_safe(lines))
         packets.commit()
         return sentences
 
     def limp(self, descriptors: Sequence[int], how: str, severity: Severity) -> list[str]:
-        """Send torque off to every servo; return `how` it came to that, and the result, as sentences."""
+        """Send torque off to every servo; return `how` (the cause) and the result as sentences."""
         lines, packets = self._take_over(descriptors)
         outcome, unsafe = limp(lines), self._safe_end.make_safe(lines)
         packets.commit()
@@ -202,7 +205,7 @@ class SafeStop:
         return [how, result, *unsafe]
 
     def _take_over(self, descriptors: Sequence[int]) -> tuple[Lines, PacketBatch]:
-        """Bring what the loop had on its desk into the log; return its lines, and where packets go now."""
+        """Log the unfinished packets of the loop; return its lines, and the batch for further packets."""
         job, memory = self._job, self._job.memory
         cycle = salvage(mapped(memory.desk), RingReader(memory.packets).head, self._ring)
         ports = SerialPorts(make_ports(job.plan.buses, job.ports, descriptors, memory, StallCounter()))
@@ -210,16 +213,16 @@ class SafeStop:
         return Lines(job.plan.buses, ports, self._clock, packets, self._heartbeat.look), packets
 
     def report_grants(self, grants: Sequence[realtime.Grant]) -> None:
-        """Put into the log what the operating system granted to this process."""
+        """Log the real-time properties that the operating system granted to this process."""
         realtime.log_grants(grants, "guardian", self._events)
 
     def report(self, text: str, severity: Severity) -> None:
-        """Put a sentence into the log."""
+        """Log a sentence."""
         self._events.emit(EventCode.GUARDIAN, severity, "guardian", text)
 
 
 class Guardian:
-    """Watches one loop process from its start to its end."""
+    """Supervision of one loop process from its start to its end."""
 
     def __init__(self, job: GuardianJob, control: MessageChannel[Stop | Cut]) -> None:
         self._job = job
@@ -231,16 +234,16 @@ class Guardian:
         self._supervisor_signs = SignsOfLife(job.supervisor, LONGEST_LOOK_NS, self._clock.now_ns())
         self._stop_by_ns = _NEVER
         self._unsupervised = ""
-        """Why the loop was asked to stop although nobody requested that."""
+        """Reason why the guardian asked the loop to stop without a request."""
         self._killed: Literal["hung", "late", "cut"] | None = None
-        """Why the loop was killed."""
+        """Reason for which the loop was killed."""
         self._starved_ns: int | None = None
-        """The processor time that it got while it stood still, where it wanted more."""
+        """Processor time of a loop that stood still although it was ready to run, ns; None: not known."""
         self._halted = False
-        """The loop was killed because a signal had stopped it."""
+        """True when the loop was killed because a signal had stopped it."""
 
     def run(self) -> None:
-        """Open the ports, execute the loop, watch it, and see that the robot is limp when it is gone."""
+        """Open the ports, execute and watch the loop, and make the robot safe after the loop has exited."""
         lines = KeptLines(
             [
                 Wanted(path, bus.baud_rate, bus.latency_ns, bus.rs485, bus.boot_ns)
@@ -248,7 +251,7 @@ class Guardian:
             ],
             describe_holder=describe_run,
         )
-        # before the loop is executed, which inherits none of it
+        # The grants apply to this process only: the loop is executed later and inherits none of them.
         grants = realtime.apply_to_guardian(self._job.plan.priority, self._job.plan.lock_memory)
         self._safe_stop.report_grants(grants)
         for sentence in lines.done:
@@ -258,7 +261,7 @@ class Guardian:
         loop_channel, theirs = process.message_channel(_LINES_LOST)
         loop = self._execute(lines.descriptors, theirs.fileno())
         theirs.close()
-        # the terminal gets the ports too: should this process die, they are still held, and still open
+        # The supervisor receives the ports too. They stay open and locked if the guardian dies.
         self._control.send(Started(loop.pid, grants), lines.descriptors)
         ending = self._watch(loop, lines, loop_channel)
         outcome = [self._unsupervised] if self._unsupervised else []
@@ -267,7 +270,8 @@ class Guardian:
             outcome.append(f"{how}; nothing had been sent to the robot")
             self._safe_stop.report(outcome[-1], Severity.ERROR)
         elif ending != "done":
-            lines.returned()  # one that came back in this moment is to hear it, too
+            # Add a line that returned just now, so that its servos receive torque off as well.
+            lines.returned()
             if ending == "cut":
                 outcome += self._safe_stop.limp(lines.descriptors, how, Severity.WARNING)
             else:
@@ -296,13 +300,13 @@ class Guardian:
     def _watch(
         self, loop: subprocess.Popen[bytes], lines: KeptLines, channel: MessageChannel[LineLost]
     ) -> Ending:
-        """Return how the loop ended; it is dead and reaped then."""
+        """Wait for the end of the loop, and reap it; return the kind of its end."""
         watched = os.pidfd_open(loop.pid)
         processor = ProcessorTime(Path(f"/proc/{loop.pid}"))
         self._loop_signs = SignsOfLife(loop.pid, LONGEST_LOOK_NS, self._clock.now_ns())
         nap = min(max(self._job.plan.period_ns, LEAST_NAP_NS), LONGEST_NAP_NS) * 1e-9
         while True:
-            # a terminal that is gone would wake it for ever, a loop that is gone asks for nothing
+            # A closed channel is always readable and would cause a busy wait.
             channels = [one for one in (self._control, channel) if not one.closed]
             ready, _, _ = select.select([watched, lines, *channels], [], [], nap)
             self._heartbeat.look()
@@ -329,7 +333,7 @@ class Guardian:
                 loop.kill()
 
     def _ending(self, code: int) -> Ending:
-        """Return how a loop ended that was killed for a reason, or ended by itself."""
+        """Return the kind of end of a loop that has exited or was killed."""
         phase, killed = self._heartbeat.phase, self._killed
         if phase is Phase.DONE and (code in (0, 1) or killed == "hung"):
             return "done"
@@ -342,14 +346,14 @@ class Guardian:
         return "died"
 
     def _lose(self, lines: KeptLines, channel: MessageChannel[LineLost]) -> None:
-        """Open the lines again that the loop has lost."""
+        """Start to open the lines again that the loop has lost."""
         for message in channel.receive():
             self._control.send(message)
             if not lines.lost(message.bus):
                 self._safe_stop.report("a line is gone and is not opened again", Severity.ERROR)
 
     def _hand_over(self, lines: KeptLines, channel: MessageChannel[LineLost]) -> None:
-        """Hand lines that are back to the loop and to the terminal."""
+        """Pass lines that are open again to the loop and to the supervisor."""
         for opened in lines.returned():
             if opened.done:
                 self._safe_stop.report(opened.done, Severity.INFO)
@@ -361,9 +365,10 @@ class Guardian:
                 each.send(LineReturned(opened.index), [lines.descriptors[opened.index]])
 
     def _silent(self) -> frozenset[Watched]:
-        """Return which of the others do not respond; a supervisor that has ended closed its channel."""
+        """Return the watched processes that do not respond. A dead supervisor has closed its channel."""
         now_ns, phase = self._clock.now_ns(), self._heartbeat.phase
-        timeout_ns = self._timeout_ns()  # first: the loop beats before it asks for less of it
+        # Read before the heartbeat: the loop beats first, and shortens its timeout afterwards.
+        timeout_ns = self._timeout_ns()
         self._loop_signs.look((phase, self._heartbeat.beats), now_ns)
         self._supervisor_signs.look(self._heartbeat.supervisor_looks, now_ns)
         silent = {
@@ -373,7 +378,7 @@ class Guardian:
         return frozenset(which for which, is_silent in silent.items() if is_silent)
 
     def _reason_to_kill(self, duty: Duty) -> Literal["hung", "late"] | None:
-        """Return why the loop is not waited for any longer, if it is not."""
+        """Return the reason to kill the loop; None without one."""
         if duty is Duty.KILL_LOOP:
             return "hung"
         return "late" if self._clock.now_ns() > self._stop_by_ns else None
@@ -382,13 +387,13 @@ class Guardian:
         return loop_timeout_ns(self._heartbeat, self._job.plan.period_ns)
 
     def _note_standstill(self, reason: str, processor: ProcessorTime) -> None:
-        """Note why a loop stands still, before it is killed for that."""
+        """Record the cause of a standstill before the loop is killed for it."""
         if reason == "hung":
             self._halted = self._loop_signs.still_ns <= self._timeout_ns()
             self._starved_ns = processor.starved_ns(self._loop_signs.still_ns)
 
     def _report_unsupervised(self) -> None:
-        """Report that the supervisor is dead or stopped, so that nobody else could end the run."""
+        """Report that the supervisor is dead or stopped, so that nobody else can end the run."""
         what = (
             "left the run"
             if self._control.closed
@@ -400,14 +405,14 @@ class Guardian:
         self._safe_stop.report(self._unsupervised, Severity.WARNING)
 
     def _request(self) -> Literal["stop", "cut"] | None:
-        """Return what the terminal requests."""
+        """Return the request of the supervisor."""
         messages = self._control.receive()
         if any(isinstance(message, Cut) for message in messages):
             return "cut"
         return "stop" if messages else None
 
     def _how(self, ending: Ending, loop: subprocess.Popen[bytes]) -> str:
-        """Return how the loop came to its end, and in which controller's code."""
+        """Return a sentence on the end of the loop, with the controller whose code was running."""
         if ending == "cut":
             return "torque was cut on request"
         called = self._heartbeat.activity
@@ -423,7 +428,7 @@ class Guardian:
         return f"the loop's process ended by itself ({_manner(loop.returncode)}){where}"
 
     def _starved(self) -> str:
-        """Return as a clause that a loop was ready to run and could not; empty where that is not known."""
+        """Return a clause about a loop that was ready to run but got no processor; empty when not known."""
         if self._starved_ns is None:
             return ""
         got = f"; it was ready to run, but got a processor for only {self._starved_ns / 1e6:.1f} ms of that"
@@ -432,12 +437,12 @@ class Guardian:
 
 
 def _duration(time_ns: float) -> str:
-    """Write a time in the unit that a person would take."""
+    """Format a time in s or ms."""
     return f"{time_ns / 1e9:g} s" if time_ns >= 1e9 else f"{time_ns / 1e6:.0f} ms"
 
 
 def _manner(code: int | None) -> str:
-    """Return how a process ended."""
+    """Return the signal or the exit code of a process."""
     if code is not None and code < 0:
         return f"signal {signal.Signals(-code).name}"
     return f"exit code {code}"

@@ -1,7 +1,8 @@
-"""Files of kept states: read when a run starts, written while it runs, by a process that is not the loop's.
+"""Kept files: files of controllers' states, read at the start of a run and written during it.
 
-A file is replaced as a whole: it is written beside its place, brought to the disk, and renamed. Whatever
-ends at any time, also this process or the machine, there is the old file or the new one.
+A process other than the loop's writes them. A file is replaced atomically: the new file is written next to
+the old one, synced to the disk, and renamed. After a crash of this process or of the machine, either the old
+or the new file exists.
 """
 
 from __future__ import annotations
@@ -35,15 +36,15 @@ from dxlwire.port.latency_timer import is_simulated
 SUFFIX = ".kept"
 _POLL_S = 0.1
 _WRITING_TIMEOUT_S = 10.0
-"""How long the end of a run waits for a disk."""
+"""Timeout for the disk at the end of a run."""
 
 
 def state_directory(plan: Plan) -> Path | None:
-    """Return where the states of a robot's controllers are kept; None where there is no home directory.
+    """Return the directory of the states of a robot's controllers; None without a home directory.
 
-    `$XDG_STATE_HOME/dxlrun/ROBOT` (XDG Base Directory Specification; ~/.local/state by default), and
-    `simulated` below it when servos are simulated, also by `dxlrun sim`: what was learned there is not for
-    the real ones.
+    The directory is `$XDG_STATE_HOME/dxlrun/ROBOT` (XDG Base Directory Specification; ~/.local/state by
+    default), and `simulated` in it for simulated servos, including those of `dxlrun sim`: states learned in a
+    simulation are not valid for real servos.
     """
     named = Path(os.environ.get("XDG_STATE_HOME", ""))
     try:
@@ -55,17 +56,18 @@ def state_directory(plan: Plan) -> Path | None:
 
 
 def read_states(plan: Plan, directory: Path | None) -> KeptStates:
-    """Return what the controllers of a run may begin with: the files of its robot. Raises nothing."""
+    """Return the kept states of the robot's controllers. Raises nothing."""
     files: dict[str, KeptFile] = {}
     if directory is not None:
-        with suppress(OSError):  # no directory: nothing was kept
+        # Without a directory, no state was kept.
+        with suppress(OSError):
             for path in sorted(directory.glob(f"*{SUFFIX}")):
                 files[path.stem] = _read(path)
     return KeptStates(files, _facts_by_joint(plan))
 
 
 def _facts_by_joint(plan: Plan) -> dict[str, Facts]:
-    """Return what is known about the servos of each joint."""
+    """Return the properties of the servos of each joint."""
     servos, found = plan.servos_by_joint, dict[str, Facts]()
     for row, joint in enumerate(plan.loop.joints):
         mine = servos[joint.name]
@@ -81,7 +83,7 @@ def _facts_by_joint(plan: Plan) -> dict[str, Facts]:
 
 
 def _facts(plan: Plan, joint: JointPlan, bus: BusPlan, servo: ServoPlan) -> Facts:
-    """Return what is known about a servo of a joint before it is asked; its firmware is not."""
+    """Return the properties of a joint's servo that the plan has; the firmware is only known after a read."""
     facts = {
         "servo": "simulated" if is_simulated(bus.port) else "real",
         "model": servo.model,
@@ -93,7 +95,8 @@ def _facts(plan: Plan, joint: JointPlan, bus: BusPlan, servo: ServoPlan) -> Fact
         facts["ratio"] = repr(servo.ratio)
     facts |= {item: str(value) for item, value in servo.declared.items()}
     facts["motor file"] = _short(joint.motor)
-    if bus.port == "sim":  # of those on a pseudo-terminal, another process knows what they are
+    # For servos on a pseudo-terminal, only the other process has these figures.
+    if bus.port == "sim":
         simulation = plan.simulation
         load = simulation.loads.get(joint.name, NO_LOAD)
         facts["load"] = f"{load.inertia:g} kg m^2, {load.friction:g} Nm, {load.gravity or load.steady:g} Nm"
@@ -104,13 +107,13 @@ def _facts(plan: Plan, joint: JointPlan, bus: BusPlan, servo: ServoPlan) -> Fact
 
 
 def _short(many: object) -> str:
-    """Return figures that are too many for a sentence as their checksum."""
+    """Return the checksum of many figures, for a sentence."""
     return "none" if many is None else f"{crc32(repr(many).encode()):08x}"
 
 
 def _read(path: Path) -> KeptFile:
     try:
-        # a device or a pipe with this name must not block the start
+        # O_NONBLOCK, because a device or a pipe with this name must not block the start.
         descriptor = os.open(path, os.O_RDONLY | os.O_CLOEXEC | os.O_NONBLOCK)
         with open(descriptor, "rb") as file:
             if not stat.S_ISREG(os.fstat(descriptor).st_mode):
@@ -124,18 +127,19 @@ def _read(path: Path) -> KeptFile:
 
 
 class KeptFiles:
-    """Takes the records of the loop's messages, and writes the states in them to files."""
+    """Writer of the states in the loop's messages to files."""
 
     def __init__(self, directory: Path | None) -> None:
         self._directory = directory
         self._topic = -1
         self._assembly: Assembly | None = None
         self.problems: dict[str, str] = {}
-        """By controller: why its newest state is not in a file."""
+        """Controller -> reason why its newest state is not in a file."""
 
     def take(self, kind: int, payload: Payload) -> None:
-        """Take one record; those of other topics are passed by. Raises nothing."""
-        with suppress(ValueError):  # damaged: the recorder declares it
+        """Process a record; records of other topics are ignored. Raises nothing."""
+        # The recorder reports damaged records.
+        with suppress(ValueError):
             found = decode(payload) if kind == RecordKind.TAGGED else None
             if isinstance(found, OpenedTopic) and found.topic.name == TOPIC:
                 self._topic, self._assembly = found.number, Assembly(Codec(found.topic.type))
@@ -162,7 +166,7 @@ class KeptFiles:
 
     @property
     def sentences(self) -> tuple[str, ...]:
-        """What a person should know at the end of the run."""
+        """Problems for the user at the end of the run."""
         problems = dict(self.problems)
         for controller in self._assembly.unfinished if self._assembly else ():
             problems[controller] = "the loop ended while it left"
@@ -174,9 +178,9 @@ class KeptFiles:
 
 
 def replace_file(directory: Path, name: str, data: bytes) -> None:
-    """Make `data` the content of a file, all of it or nothing, also when the power fails. Raises OSError.
+    """Replace the content of a file with `data`, atomically even in a power failure. Raises OSError.
 
-    Files that processes left behind which were killed meanwhile are removed.
+    Temporary files of killed processes are removed.
     """
     directory.mkdir(mode=0o700, parents=True, exist_ok=True)
     for left in directory.glob(f".{name}.*"):
@@ -204,8 +208,10 @@ def replace_file(directory: Path, name: str, data: bytes) -> None:
 
 
 class KeptStateWriter(threading.Thread):
-    """Reads the ring of the loop's messages and writes the files, beside the process that waits for signals:
-    a disk may take seconds, and a second Ctrl-C cuts torque."""
+    """Thread that reads the ring of the loop's messages and writes the files.
+
+    A disk may block for seconds, and the main thread must wait for signals: a second Ctrl-C cuts torque.
+    """
 
     def __init__(self, ring: int, files: KeptFiles) -> None:
         super().__init__(name="kept states", daemon=True)
@@ -214,18 +220,19 @@ class KeptStateWriter(threading.Thread):
         self._ended = threading.Event()
 
     def run(self) -> None:
-        """Write until `finish` is called, then what is left."""
+        """Write until `finish` is called, then write the remaining records."""
         while not self._ended.wait(_POLL_S):
             self._drain()
         self._drain()
 
     def _drain(self) -> None:
         while (record := self._ring.read()) is not None:
-            if not isinstance(record, Gap):  # pieces that do not follow are left out
+            # Pieces after a gap do not fit together and are ignored later.
+            if not isinstance(record, Gap):
                 self._files.take(record.kind, record.payload)
 
     def finish(self) -> tuple[str, ...]:
-        """Write what is left; the loop has ended. Return what a person should know."""
+        """Write the remaining records after the end of the loop; return problems for the user."""
         self._ended.set()
         self.join(_WRITING_TIMEOUT_S)
         if self.is_alive():

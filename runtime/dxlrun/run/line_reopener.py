@@ -1,4 +1,4 @@
-"""Requests of the loop for lost lines, which the guardian opens again."""
+"""Line reopener: the loop's requests to the guardian to open lost lines again."""
 
 from __future__ import annotations
 
@@ -8,7 +8,7 @@ from dxlrun.channels.process import LineLost, LineReturned, MessageChannel
 
 
 class LineReopener:
-    """Requests lost lines from the guardian, which keeps them open; the `reopened` of `SerialPorts`."""
+    """Requests lost lines from the guardian, which opens them again; the `reopened` of `SerialPorts`."""
 
     def __init__(self, channel: MessageChannel[LineReturned]) -> None:
         self._channel = channel
@@ -16,7 +16,7 @@ class LineReopener:
         self._came: dict[int, int] = {}
 
     def __call__(self, index: int) -> int | None:
-        """Return the descriptor of a line that is back, once; None until then. Never waits."""
+        """Return the file descriptor of a line that is open again, once; None until then. Does not block."""
         if index not in self._asked:
             self._asked.add(index)
             self._channel.send(LineLost(index))

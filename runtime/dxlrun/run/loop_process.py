@@ -1,8 +1,8 @@
-"""The loop's process: plug-ins, set-up on the bus, real time, the loop, torque off.
+"""Loop process: plug-ins, set-up on the bus, real time, the loop, torque off.
 
-One thread, executed afresh (no fork), on descriptors that the guardian opened. It is asked to stop
-by SIGTERM, which the guardian sends, or the Linux kernel when the guardian is gone. When neither supervisor
-nor guardian responds, it ends of its own accord (`watch.py`).
+One thread in a newly executed process (no fork), on file descriptors that the guardian opened. SIGTERM asks
+it to stop; the guardian sends it, or the Linux kernel when the guardian has exited. The loop ends
+independently when neither supervisor nor guardian responds (`watch.py`).
 """
 
 from __future__ import annotations
@@ -56,30 +56,31 @@ from dxlwire.port.ports import (
 
 
 class LoopOutcome(msgspec.Struct, frozen=True):
-    """What the loop's process leaves behind for the terminal."""
+    """Result of the loop's process for the supervisor."""
 
     reason: str
-    """ended, stopped, fault, start-up"""
+    """Reason of the end: ended, stopped, fault, start-up."""
     cycles: int = 0
     skipped: int = 0
     sentences: tuple[str, ...] = ()
-    """What a person must know, one sentence each."""
+    """Errors for the user, one sentence each."""
     remarks: tuple[str, ...] = ()
-    """What a person should know beside that."""
+    """Remarks for the user, one sentence each."""
     traceback: str = ""
     invalid: tuple[int, ...] = ()
-    """Cycles in which the state of each joint was not valid."""
+    """Number of cycles with an invalid state, for each joint."""
     events: EventTotals = EventTotals()
     refused_for_replies: bool = False
-    """The start was refused for replies that came late or not at all."""
+    """True when the start was refused because of late or missing replies."""
     simulation_wait: SimulationWait = SimulationWait()
 
 
 def _keep_to_this_process(descriptors: Sequence[int]) -> None:
-    """See to it that no child process has the ports and the line to the guardian, executed or forked.
+    """Keep the ports and the channel to the guardian from executed and forked child processes.
 
-    A child that kept them could write to the servos, and would hold the lock of a port after the run. A
-    forked one ends by SIGTERM again, not by a flag that only the loop looks at; it keeps what is mapped.
+    A child with a port could write to the servos, and would hold the port's lock after the run. A forked
+    child also gets the default action of SIGTERM back, because only the loop reads the stop flag. It keeps
+    mapped memory.
     """
     for descriptor in descriptors:
         os.set_inheritable(descriptor, False)
@@ -94,14 +95,18 @@ def _keep_to_this_process(descriptors: Sequence[int]) -> None:
 
 
 def _looked_at(heartbeat: Heartbeat) -> Callable[[str], None]:
-    """Return the check after foreign code prepared something: it took its time, and left no second thread,
-    which is the fault of the newest, and no second loop."""
+    """Return a check to call after each plug-in was imported.
+
+    The check beats the heartbeat, since an import takes time. It raises PlugInError when the newest plug-in
+    left a thread, and exits a forked child that returned from the import, which would run a second loop.
+    """
     before, own = realtime.thread_count(), os.getpid()
 
     def check(name: str) -> None:
         nonlocal before
         if os.getpid() != own:
-            os._exit(0)  # a child that was forked while a plug-in was imported, and came back
+            # A child that was forked during an import has returned.
+            os._exit(0)
         heartbeat.beat()
         more, before = realtime.thread_count() - before, max(before, realtime.thread_count())
         if more > 0:
@@ -115,33 +120,37 @@ def _looked_at(heartbeat: Heartbeat) -> Callable[[str], None]:
     return check
 
 
-_WAIT_OVER_NS = 20_000_000  # The simulation answers again: no reply was late for so long
-_WAITS_EVENT_NS = 1_000_000_000  # Between two events, where most replies are late
+# No reply was late for this time, so the simulation responds again.
+_WAIT_OVER_NS = 20_000_000
+# Shortest interval between two events, when most replies are late.
+_WAITS_EVENT_NS = 1_000_000_000
 UNWATCHED = "neither the supervisor nor the guardian responds: the run ends by on_exit; start it again"
 
 
 class AskedToStop(Exception):
-    """A stop was requested before the robot ran: no torque may be switched on any more."""
+    """A stop was requested before the robot ran; torque must not be switched on any more."""
 
 
 class StallReport:
-    """Reports to the log for how long the loop waited for simulated servos, at most once a second."""
+    """Log events about waits for simulated servos, at most one per second."""
 
     def __init__(self, stalls: StallCounter, events: EventSink) -> None:
         self._stalls = stalls
         self._events = events
         self._reported_ns = self._reported_times = 0
-        self._seen_ns = 0  # What was waited when that was looked at last
-        self._grew_ns = 0  # When that had grown
+        # Total wait at the last check.
+        self._seen_ns = 0
+        # Time at which the total last increased.
+        self._grew_ns = 0
         self._emitted_ns = 0
 
     @property
     def total(self) -> SimulationWait:
-        """All waits since the start."""
+        """Total of the waits since the start."""
         return SimulationWait(self._stalls.waited_ns, self._stalls.times)
 
     def look(self, now_ns: int) -> None:
-        """Emit the event of waits that are over, or that last for more than a second."""
+        """Emit an event when waits are over, or have lasted for more than a second."""
         if self._stalls.times == self._reported_times and self._stalls.waited_ns == self._reported_ns:
             return
         if self._stalls.waited_ns != self._seen_ns:
@@ -151,7 +160,7 @@ class StallReport:
             self.emit()
 
     def emit(self) -> None:
-        """Emit what was not reported yet."""
+        """Emit an event with the waits since the last one."""
         total = self.total
         since = SimulationWait(total.waited_ns - self._reported_ns, total.times - self._reported_times)
         if since.waited_ns or since.times:
@@ -165,8 +174,8 @@ class StallReport:
 class Pulse:
     """Supervision of a loop by its own process, see `control.context.Supervision`.
 
-    `beat` is called while replies are awaited, and once a cycle: it looks at supervisor and guardian, reports
-    waits for simulated servos, and gives a set-up up that is to stop.
+    `beat` is called during waits for replies and once per cycle. It checks supervisor and guardian, reports
+    waits for simulated servos, and aborts a set-up on a stop request.
     """
 
     heartbeat: Heartbeat
@@ -176,10 +185,10 @@ class Pulse:
     stalls: StallReport
     now_ns: Callable[[], int]
     pacing: Pacing | None = None
-    """None: the clock does not poll."""
+    """None when the clock does not poll."""
 
     def beat(self) -> None:
-        """Beat. Raises AskedToStop, once, and only in the set-up: the loop looks at the flag itself."""
+        """Beat. Raises AskedToStop, once, and only during set-up: the running loop reads the stop flag."""
         self.heartbeat.beat()
         now_ns = self.now_ns()
         self.stalls.look(now_ns)
@@ -191,11 +200,11 @@ class Pulse:
             raise AskedToStop
 
     def limit_cycle(self, limit_ns: int) -> None:
-        """Let the guardian wait for so long for each cycle."""
+        """Set the guardian's timeout for each cycle, ns."""
         self.heartbeat.may_take(limit_ns)
 
     def set_period(self, period_ns: int) -> None:
-        """Keep the polling of the clock a small share of another period."""
+        """Adapt the polling of the clock, a small share of the period, to a new period."""
         if self.pacing is not None:
             self.pacing.set_period(period_ns)
 
@@ -207,7 +216,7 @@ def _reply_polling(longest_ns: int | None) -> ReplyPolling | None:
 
 
 def beside_simulation(plan: Plan) -> SchedulerPlan:
-    """Return the scheduler's plan, off the core of simulated servos: their process has more priority."""
+    """Return the scheduler's plan without the core of simulated servos, whose process has more priority."""
     scheduler = plan.loop.scheduler
     others = os.sched_getaffinity(0) - {process.spare_core(())}
     if scheduler.policy == "other" or scheduler.cores or not others:
@@ -217,7 +226,7 @@ def beside_simulation(plan: Plan) -> SchedulerPlan:
 
 
 def _run(plan: Plan, job: LoopJob, heartbeat: Heartbeat, sinks: Sinks, stalls: StallCounter) -> LoopOutcome:
-    """Execute the plan from plug-ins to torque off."""
+    """Execute the plan, from the import of plug-ins to torque off."""
     stop = StopFlag()
     signal.signal(signal.SIGTERM, lambda *_: stop.request())
     ports = SerialPorts(
@@ -242,8 +251,10 @@ def _run(plan: Plan, job: LoopJob, heartbeat: Heartbeat, sinks: Sinks, stalls: S
     )
     kept = msgspec.json.decode(process.whole(job.memory.kept), type=KeptStates)
     robot = assemble(plan, plugins, host, take_over=job.take_over, kept=kept)
-    heartbeat.enter(Phase.ENGAGING if job.take_over else Phase.SETUP)  # what is taken over may have torque
-    # before any servo has torque: it takes a while, and a Bus Watchdog waits for the first cycle
+    # Servos that are taken over may have torque already.
+    heartbeat.enter(Phase.ENGAGING if job.take_over else Phase.SETUP)
+    # Before any servo has torque, because it takes a while, and a Bus Watchdog expects the first cycle in
+    # time.
     _prepare(plan, job, heartbeat, sinks.events, pacing)
     if ports.polling:
         ports.polling.margin_ns = pacing.measured_ns
@@ -269,7 +280,7 @@ def _run(plan: Plan, job: LoopJob, heartbeat: Heartbeat, sinks: Sinks, stalls: S
 
 
 def _prepare(plan: Plan, job: LoopJob, heartbeat: Heartbeat, events: EventSink, pacing: Pacing) -> None:
-    """Ask the operating system for real time, measure how late sleeps wake, and report both."""
+    """Request real time from the operating system, measure the wake-up delay of sleeps, and report both."""
     grants = realtime.apply(beside_simulation(plan))
     heartbeat.beat()
     grants = (*grants, pacing.measure(plan.loop.period_ns, heartbeat.beat))
@@ -301,7 +312,8 @@ def main() -> None:
     stalls = StallCounter()
     try:
         if os.getppid() != job.guardian:
-            sys.exit(1)  # the guardian was gone before its death could be signalled
+            # The guardian exited before its death could be signalled.
+            sys.exit(1)
         plan = from_json(process.whole(job.memory.plan))
         events.goals.planned = plan.loop.origins
         outcome = _run(plan, job, heartbeat, sinks, stalls)
@@ -310,7 +322,8 @@ def main() -> None:
         for_replies = isinstance(error, StartUpError) and error.for_replies
         outcome = LoopOutcome("start-up", sentences=error.sentences, refused_for_replies=for_replies)
         events.emit(EventCode.SETUP, Severity.ERROR, "loop", "\n".join(error.sentences))
-    except Exception as error:  # the last resort: the run ends with a sentence and the log has the traceback
+    # Last resort: the run ends with a sentence, and the log has the traceback.
+    except Exception as error:
         sentence = f"dxlrun itself failed: {type(error).__name__}: {error}; --debug shows where"
         outcome = LoopOutcome("fault", sentences=(sentence,), traceback=traceback.format_exc())
         sys.stderr.write(outcome.traceback)

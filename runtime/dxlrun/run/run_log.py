@@ -1,4 +1,4 @@
-"""The log of a run before its first cycle: a file of its own, and the header that explains it."""
+"""Run log: the new file of a run's log, and its header."""
 
 from __future__ import annotations
 
@@ -29,9 +29,9 @@ _LIBRARIES = ("dxlrun", "mcap", "msgspec", "numpy", "pluggy", "pydantic")
 def log_header(
     plan: Plan, epoch_offset_ns: int, *, virtual: bool, kept: KeptStates | None = None
 ) -> LogHeader:
-    """Return everything that makes the log explain itself.
+    """Return the header that makes the log self-contained.
 
-    `epoch_offset_ns` is added to the run's clock to get wall time; `kept` is what controllers begin with.
+    `epoch_offset_ns` is wall time minus the run's clock; `kept` are the states that controllers begin with.
     """
     scheduler = plan.loop.scheduler
     machine = platform.uname()
@@ -75,7 +75,7 @@ def log_header(
 
 
 def _files(plan: Plan) -> dict[str, str]:
-    """Return the texts of the files that a plan was compiled from, by their keys of identity."""
+    """Return the texts of the files from which a plan was compiled, by their keys of identity."""
     return {
         file_key(ROBOT, Path(plan.source_file).name): plan.source_text,
         **{file_key(INCLUDED, name): text for name, text in plan.included.items()},
@@ -85,11 +85,11 @@ def _files(plan: Plan) -> dict[str, str]:
 
 
 def new_log(recording: RecordingPlan, robot: str) -> Path:
-    """Create an empty file for a log and return its path: `<robot>_<date>_<time>.mcap`.
+    """Create an empty file for a log, `<robot>_<date>_<time>.mcap`, and return its path.
 
-    A log in parts gets a directory, `<robot>_<date>_<time>`. It is created here, so that two runs which start
-    in the same second cannot take the same name. A directory of `~/logs` is in the user's home. Raises
-    InputError when nothing can be created there.
+    A log in parts gets a directory, `<robot>_<date>_<time>`. Creating the file reserves the name, so two runs
+    that start in the same second have different names. A directory of `~/logs` is in the user's home. Raises
+    InputError when the file or directory cannot be created.
     """
     directory, suffix = Path(recording.directory), "" if recording.in_parts else ".mcap"
     try:
@@ -122,16 +122,17 @@ def new_log(recording: RecordingPlan, robot: str) -> Path:
 
 
 def discard_log(log: Path) -> None:
-    """Remove the log of a run that never came to the robot."""
+    """Remove the log of a run that sent nothing to the robot."""
     if log.is_dir():
         for part in log.glob(PART_PATTERN):
             part.unlink(missing_ok=True)
-        with suppress(OSError):  # another program has put something into it
+        # Another program may have put a file there.
+        with suppress(OSError):
             log.rmdir()
     else:
         log.unlink(missing_ok=True)
 
 
 def incomplete_log(error: str) -> str:
-    """Return the sentence for a log that is not whole."""
+    """Return the sentence about an incomplete log."""
     return f"the log is incomplete: {error}"

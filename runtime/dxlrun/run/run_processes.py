@@ -1,4 +1,4 @@
-"""The processes of one run: simulated bus, recorder, guardian and, through it, the loop; in order."""
+"""Run processes: the shared memory and the start of each process of a run."""
 
 from __future__ import annotations
 
@@ -39,17 +39,18 @@ GatewayMessage = Listening | Failed
 Message = TypeVar("Message")
 
 RECORDER_NICE = -10
-"""Nine times the share of an ordinary program (sched(7)); the recorder needs a tenth of a core at 1 kHz."""
+"""nice(2) value; nine times the share of an ordinary program (sched(7)). The recorder needs a tenth of a
+core at 1 kHz."""
 _GUARDIAN_CAPACITY = 2 << 20
-"""Bytes: it sends and receives little, and reports little."""
+"""Bytes; the guardian exchanges few packets and reports few events."""
 _LONGEST_TAKEN = LONGEST_COMMAND + 64
-"""Bytes of a command's record when a cycle has taken it."""
+"""Bytes of the record of a command that a cycle has taken."""
 
 
 def create_memory(plan: Plan, kept: KeptStates | None = None) -> RunMemory:
-    """Create the memory of a run, its rings sized for ten seconds of this robot.
+    """Create the memory of a run, with rings for ten seconds of this robot.
 
-    `kept`: what its controllers kept in earlier runs. Raises NotCompiled where what shares it was
+    `kept`: states that controllers kept in earlier runs. Raises NotCompiled when the shared memory module was
     not compiled.
     """
     shared_memory.library()
@@ -94,7 +95,7 @@ def _create_slots(plan: Plan) -> dict[str, tuple[int, ...]]:
 
 
 def _published(plan: Plan) -> float:
-    """Return how many bytes a second the plan's controllers publish, one message a topic and update."""
+    """Return the controllers' published bytes per second, with one message per topic and update."""
     return sum(
         len(one.topics) * usual_message(len(one.joints)) * 1e9 / (plan.loop.period_ns * one.every)
         for one in plan.loop.controllers
@@ -102,15 +103,16 @@ def _published(plan: Plan) -> float:
 
 
 def loop_outcome(memory: RunMemory) -> LoopOutcome | None:
-    """Return what the loop's process left behind; None when it did not get to it."""
+    """Return the result of the loop's process; None when it wrote none."""
     try:
         return msgspec.json.decode(process.whole(memory.result), type=LoopOutcome)
-    except msgspec.MsgspecError:  # nothing, or what was cut short
+    # The result is missing or truncated.
+    except msgspec.MsgspecError:
         return None
 
 
 def loop_grants(memory: RunMemory) -> tuple[Grant, ...]:
-    """Return what the operating system granted to the loop; nothing before it runs."""
+    """Return the real-time properties granted to the loop; empty before the loop runs."""
     try:
         return msgspec.json.decode(process.whole(memory.grants), type=tuple[Grant, ...])
     except msgspec.MsgspecError:
@@ -122,8 +124,8 @@ def start_simulated_buses(
 ) -> tuple[Child[SimulationMessage], dict[str, str]]:
     """Start the simulated servos; return the process and the pseudo-terminal of each simulated bus.
 
-    With a loop in real time they get a priority above loop and guardian, and the last core that the loop was
-    not given: a servo's electronics do not wait for the host's processor.
+    With a real-time loop, the process gets a priority above loop and guardian, and the last core that is not
+    the loop's: a servo's electronics do not wait for the host's processor.
     """
     scheduler = plan.loop.scheduler
     real_time = (
@@ -157,8 +159,8 @@ def start_source(
 def start_recorder(log: Path, header: LogHeader, memory: RunMemory, plan: Plan) -> Child[RecorderMessage]:
     """Start the recorder and wait until the log is open.
 
-    With a loop in real time it gets a larger share of the processor, so that other programs do not keep it
-    from the rings. With an ordinary loop it does not: it would be ahead of that, too.
+    With a real-time loop, the recorder gets a larger share of the processor, so that other programs do not
+    delay it. With an ordinary loop it does not, because it would then delay the loop.
     """
     job = RecorderJob(str(log), header, memory.recorded, plan.recording, memory.span)
     child: Child[RecorderMessage] = _executed(
@@ -181,9 +183,9 @@ def start_recorder(log: Path, header: LogHeader, memory: RunMemory, plan: Plan) 
 def start_gateway(
     log: Path | None, memory: RunMemory, epoch_offset_ns: int, listen: str
 ) -> Child[GatewayMessage]:
-    """Start the gateway; it reports its socket when it is ready, and the run does not wait for that.
+    """Start the gateway without waiting; it reports its socket when it is ready.
 
-    Raises OSError when the system has no process left.
+    Raises OSError when the system cannot create a process.
     """
     shared = Descriptors(
         memory.heartbeat,
@@ -202,7 +204,7 @@ def start_gateway(
 def guardian_job(
     plan: Plan, ports: Mapping[str, str], memory: RunMemory, *, take_over: bool, epoch_offset_ns: int = 0
 ) -> GuardianJob:
-    """Return the job of the guardian, and through it of the loop."""
+    """Return the job of the guardian, from which it makes the job of the loop."""
     scheduler = plan.loop.scheduler
     share = GuardianPlan(
         buses=plan.buses,
@@ -221,8 +223,8 @@ def guardian_job(
 def start_guardian(job: GuardianJob, others: Iterable[int]) -> Child[GuardianMessage]:
     """Start the guardian; `ready` then waits until it holds the ports and has executed the loop.
 
-    It inherits `others`, our ends of the channels to simulated bus and recorder: should this process die,
-    they see the end of their channels only after the guardian has made the robot limp.
+    The guardian inherits `others`, our ends of the channels to simulated bus and recorder. If this process
+    dies, these processes see their channels close only after the guardian has made the robot safe.
     """
     memory = job.memory
     inherited = [memory.guardian, memory.stderr, *memory.of_loop, *others]
@@ -231,10 +233,10 @@ def start_guardian(job: GuardianJob, others: Iterable[int]) -> Child[GuardianMes
 
 
 class Program(NamedTuple):
-    """What is executed as a process of a run."""
+    """Program of a process of a run."""
 
     name: str
-    """As sentences have it."""
+    """Name in sentences."""
     module: str
 
 
@@ -245,12 +247,12 @@ def _executed(
     memory: RunMemory,
     messages: Decoder[Message],
 ) -> Child[Message]:
-    """Execute a program on a job, which it reads from a descriptor."""
+    """Execute a program, which reads its job from a file descriptor."""
     name, module = program
     descriptor = process.memory_file(f"dxlrun-{name}", msgspec.json.encode(job))
     arguments = ["--job-fd", str(descriptor)]
     try:
-        # each has the plan's memory: by that a process is known to belong to the run
+        # Each process inherits the plan's memory, by which the process table finds the processes of a run.
         shared = {descriptor, memory.plan, *inherited}
         return Child(name, module, arguments, sorted(shared), memory.stderr, messages)
     finally:

@@ -1,4 +1,4 @@
-"""What a terminal shows of a run: its options, what the system granted, its progress and its summary."""
+"""Run summary: a run's options, grants, progress and verdict in the terminal."""
 
 from __future__ import annotations
 
@@ -30,11 +30,12 @@ if TYPE_CHECKING:
 
 _REFRESH_S = 0.1
 FEW_INVALID = 2
-"""So few invalid states are tolerated however short the run: three in a row lose a servo."""
+"""Number of invalid states that is tolerated in any run; three in a row lose a servo."""
 INVALID_SHARE = 0.01
-"""A joint may have invalid states in so many cycles."""
+"""Tolerated share of cycles with invalid states of a joint."""
 SHORT_RUN_NS = 2_000_000_000
-"""A shorter run may skip as much as one of this: a machine that stalls once is not overloaded."""
+"""ns; a shorter run may skip as many periods as a run of this length: one stall of the machine is not an
+overload."""
 _MOST = 3
 _LOSSES = {
     EventCode.PORT_LOST: "lost",
@@ -43,31 +44,32 @@ _LOSSES = {
     EventCode.SERVO_REBOOTED: "rebooted",
 }
 _SLOW_REPLIES = frozenset((EventCode.SERVO_LOST, EventCode.DEVICE_LOST, EventCode.WATCHDOG))
-"""Errors that a machine that is too busy may have caused, besides invalid states and skipped periods."""
+"""Errors that a busy machine may cause, in addition to invalid states and skipped periods."""
 _LINE_S = 5.0
-"""Between two lines in a pipe or a file."""
+"""Interval of progress lines in a pipe or a file."""
 
 
 @dataclass(frozen=True, slots=True)
 class RunOptions:
-    """What the command line decides about one run."""
+    """Options of one run from the command line."""
 
     record: bool = True
     take_over: bool = False
-    """Accept servos that are already torqued."""
+    """Accept servos that already have torque."""
     debug: bool = False
     verbose: bool = False
-    """Show all that the system granted."""
+    """Show all grants of the operating system."""
     ledger: Path | None = None
-    """Where simulated buses write what they saw; None: beside the log, on virtual time nowhere."""
+    """File in which simulated buses record their traffic; None: next to the log, in virtual time not at
+    all."""
     gateway: bool = True
-    """Let others steer the run, over a Unix socket."""
+    """Start the gateway, by which clients steer the run over a Unix socket."""
     listen: str = ""
-    """And over mutual TLS, at this address; empty: not."""
+    """Address for clients over mutual TLS; empty: none."""
 
 
 class RunSummary(msgspec.Struct, frozen=True):
-    """How a run went, for the terminal and for `--json`."""
+    """Result of a run, for the terminal and for `--json`."""
 
     exit_code: int
     reason: str
@@ -75,28 +77,28 @@ class RunSummary(msgspec.Struct, frozen=True):
     skipped: int
     elapsed_s: float
     sentences: tuple[str, ...]
-    """What went wrong, one sentence each; empty after a good run."""
+    """Errors, one sentence each; empty after a good run."""
     remarks: tuple[str, ...] = ()
-    """What the operating system did not grant, and what went wrong beside the robot."""
+    """Refused grants, and problems outside the robot."""
     log: str | None = None
     messages: int = 0
-    """Messages in the log."""
+    """Number of messages in the log."""
     invalid: tuple[int, ...] = ()
-    """Cycles in which the state of each joint was not valid."""
+    """Number of cycles with an invalid state, for each joint."""
     events: EventTotals = EventTotals()
     virtual: bool = False
-    """It was on virtual time."""
+    """True for a run in virtual time."""
     refused_for_replies: bool = False
-    """The start was refused for replies that came late or not at all."""
+    """True when the start was refused because of late or missing replies."""
     start_up_load: MachineLoad = MachineLoad()
-    """Of the machine before the first cycle, as far as the recorder has sampled it."""
+    """Load of the machine before the first cycle, as far as the recorder has sampled it."""
     run_load: MachineLoad = MachineLoad()
-    """Of the machine from the first cycle on."""
+    """Load of the machine from the first cycle on."""
     simulation_wait: SimulationWait = SimulationWait()
-    """Time for which the loop waited for simulated servos that had no processor."""
+    """Time during which the loop waited for simulated servos that had no processor."""
 
     def describe_machine(self, plan: Plan) -> str:
-        """Return the sentence about a machine that was too busy for this run; empty when it was not."""
+        """Return the sentence about a machine that was too busy for this run; empty otherwise."""
         load = self.run_load if self.cycles else self.start_up_load
         observed = describe_busy_machine(load, self.simulation_wait)
         remedy = free_machine(bus.port for bus in plan.buses)
@@ -105,7 +107,7 @@ class RunSummary(msgspec.Struct, frozen=True):
 
 @contextmanager
 def caught_signals(act: Callable[[], None]) -> Iterator[None]:
-    """Call `act` at each SIGINT and SIGTERM; afterwards they do again what they did before."""
+    """Call `act` at each SIGINT and SIGTERM; restore the previous handlers afterwards."""
     before = {number: signal.signal(number, lambda *_: act()) for number in (signal.SIGINT, signal.SIGTERM)}
     try:
         yield
@@ -115,30 +117,32 @@ def caught_signals(act: Callable[[], None]) -> Iterator[None]:
 
 
 class RunVerdict(NamedTuple):
-    """Judgement of a run by the loop's own counters and events; `dxlrun analyze` finds the causes."""
+    """Verdict on a run from the loop's own counters and events; `dxlrun analyze` finds the causes."""
 
     exit_code: int
     """0 good, 1 failed, 130 interrupted."""
     line: str
-    """What happened to the robot, without the word for it."""
+    """Events of the run in one line, without the word for the verdict."""
     sentences: tuple[str, ...]
 
 
 def run_verdict(run: RunSummary, plan: Plan) -> RunVerdict:
-    """Judge a run: good where no event is an error, states were valid, played motions reached their goals
-    and no more periods were skipped than the robot file tolerates.
+    """Judge a run by its events, states, goals and skipped periods.
 
-    Controllers that failed and have a fallback are reported and tolerated; `plan` names them. A run that was
-    interrupted before its motions ended is interrupted, not failed.
+    A run is good when no event is an error, states were valid, played motions reached their goals, and no
+    more periods were skipped than the robot file tolerates. Failed controllers with a fallback are reported
+    and tolerated; `plan` names them. A run that was interrupted before its motions ended counts as
+    interrupted, not as failed.
     """
     if not run.cycles:
         return RunVerdict(run.exit_code, "the loop never ran a cycle.", ())
     loop, events, happened = plan.loop, run.events, list[str]()
     fallbacks = {one.name for one in loop.controllers if one.fallback}
     while above := {one.name for one in loop.controllers if fallbacks & {*one.into}} - fallbacks:
-        fallbacks |= above  # what a controller commands fails with it
+        # The controllers below a failed controller fail with it.
+        fallbacks |= above
     faults = [one for one in events.errors if one.code == EventCode.CONTROLLER_FAULT]
-    # where none took over, the fault ended the run
+    # Without a fallback, the fault ended the run.
     fell_back = [one for one in faults if one.source in fallbacks and run.reason != "fault"]
     taken_over = [one for one in events.errors if one.code == EventCode.TAKEOVER]
     errors = [one for one in events.errors if one not in (*fell_back, *taken_over)]
@@ -177,14 +181,14 @@ def run_verdict(run: RunSummary, plan: Plan) -> RunVerdict:
 
 
 def named(names: Iterable[str]) -> str:
-    """Return some names, the first three of them."""
+    """Return the first three names, and the number of the others."""
     shown = list(dict.fromkeys(names))
     more = f" and {len(shown) - _MOST} more" if len(shown) > _MOST else ""
     return ", ".join(shown[:_MOST]) + more
 
 
 def last_line(group: EventGroup) -> str:
-    """Return the last line of an event's text, of a traceback what was raised; without its full stop."""
+    """Return the last line of an event's text (of a traceback, the exception) without its full stop."""
     lines = group.text.strip().splitlines() or [group.name]
     return lines[-1].removesuffix(".")
 
@@ -202,9 +206,9 @@ def _rate(run: RunSummary, plan: Plan) -> tuple[bool, str]:
 
 
 class Progress:
-    """The status line of a run: how far it has come, and on virtual time how many times as fast as real time.
+    """Status line of a run: its time, and in virtual time the factor of its speed over real time.
 
-    A console that is no terminal shows no status; it gets a line every few seconds.
+    A console that is not a terminal gets a line every few seconds instead.
     """
 
     def __init__(self, plan: Plan, status: Status, *, virtual: bool = False) -> None:
@@ -215,17 +219,17 @@ class Progress:
         self._began = self._shown = time.monotonic()
 
     def setting_up(self) -> None:
-        """Show that the servos are set up."""
+        """Show that the servos are being set up."""
         self._status.update(f"{self._plan.robot}: checking servos, torque on")
 
     def ran(self, cycles: int, skipped: int) -> None:
-        """Show how many cycles ran and how many periods were skipped; cheap when called for every cycle."""
+        """Show the number of cycles and of skipped periods; cheap enough for every cycle."""
         now = time.monotonic()
         if now - self._shown < self._every_s:
             return
         self._shown, elapsed_s = now, now - self._began
         ran_ns, end_ns = (cycles + skipped) * self._plan.loop.period_ns, self._plan.loop.end_ns
-        # the steps of a policy come after the end: none is shown beside them
+        # The steps of a policy come after the end time, which is then omitted.
         end = f" of {end_ns / 1e9:.1f}" if end_ns and ran_ns <= end_ns else ""
         speed = f", {ran_ns / 1e9 / elapsed_s:.3g} x" if self._virtual else ""
         skips = f"{counted(skipped, 'period', 'periods')} skipped"
@@ -238,9 +242,9 @@ class Progress:
 
 
 def show_grants(grants: Sequence[Grant], out: Console, *, verbose: bool = False) -> None:
-    """Print one line where all was granted, else a table, and the commands that fix what was refused.
+    """Print one line when everything was granted, else a table and the commands that fix refusals.
 
-    Only on a terminal. `verbose`: the table in any case.
+    Prints only on a terminal. `verbose` always prints the table.
     """
     if not out.is_terminal:
         return
@@ -257,12 +261,12 @@ def show_grants(grants: Sequence[Grant], out: Console, *, verbose: bool = False)
 
 
 def refusals(grants: Sequence[Grant], out: Console) -> tuple[str, ...]:
-    """Return what was not granted, one sentence each, where no table has shown it."""
+    """Return the refused grants, one sentence each; empty when a table has shown them."""
     if out.is_terminal:
         return ()
     return tuple(one.text for one in grants if not one.granted)
 
 
 def granted_text(grants: Sequence[Grant]) -> dict[str, str]:
-    """Return the table as the log's metadata carries it."""
+    """Return the grants for the log's metadata."""
     return {one.name: f"{'yes' if one.granted else 'no'}: {one.sentence}" for one in grants}

@@ -1,7 +1,7 @@
 """Front: the process in this terminal while simulated servos serve other programs.
 
-It starts the process of the simulated buses, hands it the faults that a person types, shows an audience what
-comes back, and ends it in order when SIGINT or SIGTERM comes.
+It starts the process of the simulated buses, sends it the faults that a person types, passes its messages to
+an audience, and stops it at SIGINT or SIGTERM.
 """
 
 from __future__ import annotations
@@ -24,19 +24,19 @@ from dxlrun.errors import PortError
 from dxlsim.messages import Request, SimulationJob, SimulationMessage
 
 _LAST_LOOK_S = 1.0
-"""How long the last look may take: a process that does not answer in it ends without."""
+"""Timeout for the last snapshot; without an answer, the simulation ends without it."""
 _STOPS = frozenset((signal.SIGINT, signal.SIGTERM))
 _LONGEST_LINE = 1024
 _BACKGROUND_S = 0.5
 _ESCAPE = re.compile(r"\x1b(?:\[[0-9;?]*[ -/]*[@-~]|O.|.)?")
-"""What arrow and function keys send; they mean nothing here."""
+"""Escape sequences of arrow and function keys, which are ignored."""
 
 
 Messages = MessageChannel[SimulationMessage]
 
 
 def start_simulation(job: SimulationJob, errors: int) -> Child[SimulationMessage]:
-    """Start the process of simulated buses; `errors` takes what it prints."""
+    """Start the process of simulated buses; its output goes to `errors`."""
     descriptor = process.memory_file("dxlrun-simulation", msgspec.json.encode(job))
     arguments = ["--job-fd", str(descriptor)]
     inherited = [descriptor, *(one for one in (job.shafts, job.progress) if one >= 0)]
@@ -48,7 +48,7 @@ def start_simulation(job: SimulationJob, errors: int) -> Child[SimulationMessage
 
 
 def first_message(child: Child[SimulationMessage]) -> SimulationMessage:
-    """Return its first message, which has the ports; raises PortError when it cannot serve them."""
+    """Return the first message, which has the ports; raises PortError when the buses cannot be served."""
     message = child.ready()
     if message.error is not None:
         raise PortError(message.error)
@@ -56,57 +56,63 @@ def first_message(child: Child[SimulationMessage]) -> SimulationMessage:
 
 
 class Audience(Protocol):
-    """What shows a simulation: a terminal, or JSON."""
+    """Output of a simulation: a terminal, or JSON."""
 
-    look_every_s: float | None  # How often it wants a look; None: never
+    # Interval of snapshots, s; None: none.
+    look_every_s: float | None
 
     def opened(self, ports: Mapping[str, str], real_time: str) -> None:
-        """Take the device of each bus, and what the system granted of real time; called once."""
+        """Show the device of each bus, and the granted real-time properties; called once."""
 
     def take(self, message: SimulationMessage) -> None:
-        """Take anything but a look; of ports those that changed."""
+        """Show a message other than a snapshot; one with ports has only the changed ones."""
 
     def help(self) -> None:
-        """Show which faults there are."""
+        """Show the available faults."""
 
     def look(self, look: SimulationMessage, typed: str) -> None:
-        """Take the newest look, and what was typed so far of the next line."""
+        """Show the newest snapshot, and the pending input of the next line."""
 
 
 class Served(msgspec.Struct, frozen=True):
-    """How a simulation went."""
+    """Result of a simulation."""
 
     elapsed_s: float
     look: SimulationMessage
-    sentences: tuple[str, ...]  # what went wrong; nothing in one that ran until it was stopped
-    printed: str = ""  # What the process of the simulated buses printed
+    # Errors; empty for a simulation that ran until it was stopped.
+    sentences: tuple[str, ...]
+    # Output of the process of the simulated buses.
+    printed: str = ""
 
 
 class TypedLines:
-    """Lines of a descriptor without waiting for them; a terminal is read only in the foreground.
+    """Non-blocking reader of typed lines; a terminal is read only in the foreground.
 
-    A job in the background that reads its terminal would be stopped by the Linux kernel.
+    The Linux kernel would stop a background job that reads its terminal.
     """
 
     def __init__(self, descriptor: int) -> None:
         self._descriptor = descriptor
-        self.ended = False  # True after the end of what can be typed
-        self.pending = ""  # What was typed so far of the next line
+        # True after the end of the input.
+        self.ended = False
+        # Pending input of the next line.
+        self.pending = ""
 
     def fileno(self) -> int:
-        """Return the descriptor, for select."""
+        """Return the file descriptor, for select."""
         return self._descriptor
 
     @property
     def in_foreground(self) -> bool:
-        """Whether a read cannot stop this process."""
+        """True when a read cannot stop this process."""
         try:
             return os.tcgetpgrp(self._descriptor) == os.getpgrp()
-        except OSError:  # no terminal, or not ours
+        # Not a terminal, or not the controlling one.
+        except OSError:
             return True
 
     def receive(self) -> list[str]:
-        """Return the lines that were completed by what arrived; one read, which may wait."""
+        """Return the completed lines after one read, which may block."""
         try:
             data = os.read(self._descriptor, 4096)
         except OSError:
@@ -124,7 +130,8 @@ class TypedLines:
             if character in "\r\n":
                 lines.append(self.pending)
                 self.pending = ""
-            elif character in "\b\x7f":  # a terminal without its own line editing sends them on
+            # A terminal without line editing passes these characters on.
+            elif character in "\b\x7f":
                 self.pending = self.pending[:-1]
             elif character == "\x15":  # Ctrl-U
                 self.pending = ""
@@ -134,7 +141,7 @@ class TypedLines:
 
 
 def serve(job: SimulationJob, audience: Audience, typed: TypedLines | None) -> Served:
-    """Serve simulated buses until SIGINT or SIGTERM comes; nothing is left of them when it returns.
+    """Serve simulated buses until SIGINT or SIGTERM; their process has exited on return.
 
     Raises PortError when the process refuses its configuration, ProcessFault when it does not start.
     """
@@ -154,7 +161,7 @@ def serve(job: SimulationJob, audience: Audience, typed: TypedLines | None) -> S
 
 
 def _sentences(before: Sequence[str], code: int, printed: str) -> tuple[str, ...]:
-    """Return what went wrong: a process that ends with a code other than 0 prints why."""
+    """Return the errors: a process prints the reason of an exit code other than 0."""
     last = printed.strip().splitlines()[-1:]
     if before:
         return (*before, *(f"it printed last: {line} (--debug shows all)" for line in last))
@@ -180,7 +187,7 @@ class _Front:
         self.sentences: list[str] = []
 
     def run(self) -> None:
-        """Show the ports, then pass on what comes from either side until it is stopped."""
+        """Show the ports, then pass on messages and input until a stop signal."""
         first = first_message(self._child)
         self._ports = first.ports or {}
         self._audience.opened(self._ports, first.real_time)
@@ -205,7 +212,7 @@ class _Front:
         return sources
 
     def _timeout_s(self, look_s: float) -> float | None:
-        """Return for how long nothing must be done, s; a job that waits in the background looks up."""
+        """Return the timeout of select, s; a background job polls for its return to the foreground."""
         if self._audience.look_every_s is not None:
             return max(0.0, look_s - time.monotonic())
         waiting = self._typed is not None and not self._typed.ended and not self._typed.in_foreground
@@ -218,7 +225,8 @@ class _Front:
             else:
                 self._child.channel.send(Request(fault=line))
         if self._audience.look_every_s is not None:
-            self._audience.look(self.newest, typed.pending)  # a person sees each letter at once
+            # Echo each typed character at once.
+            self._audience.look(self.newest, typed.pending)
 
     def _listen(self) -> None:
         while (message := self._child.poll(0)) is not None:
@@ -235,7 +243,7 @@ class _Front:
                 self._audience.take(message)
 
     def _last_look(self) -> None:
-        """Show what has happened until now, and take the servos' last counts."""
+        """Request the last counts of the servos and show pending messages."""
         before = self.newest
         self._child.channel.send(Request(look=True))
         deadline = time.monotonic() + _LAST_LOOK_S
@@ -248,7 +256,7 @@ class _Front:
 
 @contextmanager
 def _stop_signals() -> Iterator[socket.socket]:
-    """Give a socket with the numbers of signals; SIGINT and SIGTERM do nothing else meanwhile."""
+    """Yield a socket that receives the numbers of signals; SIGINT and SIGTERM have no other effect."""
     wake, signalled = socket.socketpair()
     signalled.setblocking(False)
     before = {number: signal.signal(number, lambda *_: None) for number in _STOPS}

@@ -1,8 +1,7 @@
-"""The process of the simulated buses, one pseudo-terminal each, in real time.
+"""Simulation process: the simulated buses in real time, with one pseudo-terminal each.
 
-It runs until the other end of the control socket is closed. It sends the ports when it is ready, or an error
-and ends; then it answers requests, and reports each fault as it happens and the ports when they changed:
-`dxlsim.messages`.
+It runs until the other end of the control socket is closed. It first sends the ports, or sends an error and
+exits. Then it answers requests, and reports each fault and each change of the ports: `dxlsim.messages`.
 """
 
 from __future__ import annotations
@@ -29,7 +28,7 @@ from dxlwire.control_table import add_control_table
 
 
 def main() -> int:
-    """Serve the buses of a job until the control socket ends or SIGTERM comes: `--job-fd N --control-fd M`.
+    """Serve the buses of a job until the control socket closes or SIGTERM comes: `--job-fd N --control-fd M`.
 
     Return 0, 1 when the ledger could not be written, 2 when the configuration cannot be served.
     """
@@ -59,12 +58,13 @@ def main() -> int:
 
 
 def read_recordings(buses: Iterable[BusConfig]) -> Mapping[str, RecordedPackets]:
-    """Return the packets of the buses that are recorded. Raises LogError."""
+    """Return the recorded packets of buses that replay a log. Raises LogError."""
     recorded = [bus for bus in buses if bus.recorded]
     if not recorded:
         return {}
     from dxlrun.log.recorded_packets import (
-        read_recorded_packets,  # not above: no other simulation reads a log
+        # Imported here because no other simulation reads a log.
+        read_recorded_packets,
     )
 
     return {bus.name: read_recorded_packets(Path(bus.recorded), bus.name) for bus in recorded}

@@ -1,6 +1,6 @@
-"""A process of a feature: opens a source, and leaves its samples in the slot that the loop reads.
+"""Source process: a process of a feature that opens a source and writes its samples into the loop's slot.
 
-Executed afresh, in a session of its own; it ends by SIGTERM, or with the supervisor.
+It is newly executed, in its own session, and ends by SIGTERM or with the supervisor.
 """
 
 from __future__ import annotations
@@ -36,9 +36,9 @@ from dxlsim.motion.link_motion import LinkMotion, Shafts
 from dxlsim.simulation_plan import UrdfBodies
 
 END_S = 1.0
-"""How long a source may take to close its device."""
+"""Timeout for a source to close its device."""
 _SHORTEST_NAP_S = 0.001
-"""A device that should wait for a sample and does not must not take a whole core."""
+"""Shortest sleep between samples: a device whose read fails to block must not use a whole core."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -48,19 +48,19 @@ class SourceJob:
     feature: Feature
     process: SourceProcess
     slot: int
-    """Descriptor."""
+    """File descriptor of the slot for samples."""
     supervisor: int
-    """Its PID."""
+    """Process ID."""
     restarted: bool = False
-    """It was there before, in this run: it does not end when its device cannot be opened."""
+    """True for a restarted process, which continues even when its device cannot be opened."""
     bodies: UrdfBodies | None = None
-    """What the simulated servos move."""
+    """Bodies that the simulated servos move."""
     shafts: int = -1
-    """Descriptor of the slot in which the simulated bus leaves the state of its shafts."""
+    """File descriptor of the slot with the state of the simulated shafts."""
 
 
 class RemoteBody:
-    """The body of a simulation in another process, which leaves the state of its shafts in a slot."""
+    """Body of a simulation in another process, computed from the state of its shafts in a slot."""
 
     def __init__(self, bodies: UrdfBodies, reader: SlotReader) -> None:
         self._body = SimulatedBody(bodies)
@@ -70,7 +70,7 @@ class RemoteBody:
         self._shafts = Shafts(0, *(np.zeros(count) for _ in range(3)))
 
     def motion(self, link: str) -> LinkMotion:
-        """Return how a link moves now. Raises KeyError for one that the URDF does not have."""
+        """Return the present motion of a link. Raises KeyError for a link that the URDF does not have."""
         t_ns = self._reader.read()
         if t_ns is not None:
             angle, velocity, acceleration = self._reader.sample.copy().reshape(3, -1)
@@ -85,11 +85,12 @@ class RemoteBody:
 
 
 class _Stop(BaseException):
-    """SIGTERM came; no driver's fault, so nothing that takes those takes it."""
+    """SIGTERM arrived. Not an Exception, so handlers of driver errors do not catch it."""
 
 
 def _stop(*_: object) -> None:
-    # without a supervisor nothing else ends a driver that does not close; SIGALRM kills, as it is not caught
+    # Without a supervisor, nothing else ends a driver that does not close: the uncaught SIGALRM kills the
+    # process.
     signal.setitimer(signal.ITIMER_REAL, END_S)
     raise _Stop
 
@@ -100,14 +101,16 @@ def main() -> int:
     signal.signal(signal.SIGTERM, _stop)
     process.hold_foreign_code(signal.SIGTERM)
     if os.getppid() != job.supervisor:
-        return 1  # it was gone before its death could be signalled
+        # The supervisor exited before its death could be signalled.
+        return 1
     try:
         with suppress(_Stop):
             return _run(job, channel)
         return 0
     finally:
         if os.getppid() != job.supervisor:
-            os.killpg(0, signal.SIGKILL)  # nothing else ends what the driver has started
+            # Nothing else ends the processes that the driver has started.
+            os.killpg(0, signal.SIGKILL)
 
 
 def _run(job: SourceJob, channel: MessageChannel[msgspec.Struct]) -> int:
@@ -125,7 +128,8 @@ def _run(job: SourceJob, channel: MessageChannel[msgspec.Struct]) -> int:
         sampled.open_first()
     except _Stop:
         raise
-    except Exception as error:  # a driver's fault is a sentence, whatever it is
+    # Any error of a driver becomes a sentence.
+    except Exception as error:
         if not job.restarted:
             channel.send(Failed(f"{process.title} cannot be opened: {describe_error(error)}"))
             return 1
@@ -134,7 +138,8 @@ def _run(job: SourceJob, channel: MessageChannel[msgspec.Struct]) -> int:
         channel.send(Ready())
         _sample_for_ever(sampled, process.period_ns)
     finally:
-        signal.signal(signal.SIGTERM, signal.SIG_IGN)  # it is being stopped already
+        # The process is already stopping.
+        signal.signal(signal.SIGTERM, signal.SIG_IGN)
         sampled.close()
         writer.say(SlotState.ENDED, "")
 

@@ -1,4 +1,4 @@
-"""Supervisor: the process in this terminal; plan -> processes -> orderly end, and a summary for a person."""
+"""Supervisor: the process in this terminal, which starts the processes of a run, ends them, and sums up."""
 
 from __future__ import annotations
 
@@ -89,30 +89,32 @@ if TYPE_CHECKING:
 
 _POLL_S = 0.1
 _RESTART_S = 2.0
-"""Between the end of a source's process and the start of another one."""
+"""Delay between the end of a source's process and its restart."""
 _LOOK_NS = 100_000_000
-"""A look at another process counts for at most this: when this one did not run, that may not have either."""
+"""Upper limit of the time that one check adds to a standstill: while this process was not running, the
+other may not have run either."""
 _GONE_POLL_S = 0.02
-"""Between two looks at the guardian when the loop is gone."""
+"""Polling interval for the guardian after the loop has exited."""
 
 
 @dataclass(slots=True)
 class _SourceProcess:
-    """A process of a feature, started again a while after it ended by itself."""
+    """Process of a feature, which is restarted after an unexpected exit."""
 
     plan: Plan
     planned: PlannedProcess
     memory: RunMemory
     child: Child[SourceMessage] | None
     restart_s: float = 0.0
-    """When another one is started; of use only while there is none."""
+    """Time of the restart; valid only without a running process."""
 
     def look(self) -> None:
-        """Report the end of the process in its slot, which the loop reads; start another one when due."""
+        """Report the exit of the process in its slot, for the loop; restart the process when due."""
         if self.child is None:
             if time.monotonic() >= self.restart_s:
                 self.restart_s = time.monotonic() + _RESTART_S
-                with suppress(OSError):  # the system has no process left: later, perhaps
+                # The system cannot create a process now; try again later.
+                with suppress(OSError):
                     self.child = start_source(self.plan, self.planned, self.memory, restarted=True)
         elif self.child.exited():
             self.child.kill()
@@ -125,7 +127,7 @@ class _SourceProcess:
             writer.say(SlotState.ENDED, f"its process ended ({how}), another one is started")
 
     def end(self) -> None:
-        """Let it close its device; kill it when it does not."""
+        """Give the process time to close its device, then kill it."""
         if self.child is None:
             return
         self.child.process.terminate()
@@ -135,7 +137,7 @@ class _SourceProcess:
 
 
 class _Run:
-    """The processes of one run, as far as they were started, and what became of them."""
+    """Started processes of one run, and their results."""
 
     def __init__(
         self,
@@ -145,7 +147,7 @@ class _Run:
         out: Console,
         kept: KeptStates | None = None,
     ) -> None:
-        """`kept`: what controllers kept in earlier runs."""
+        """`kept`: states that controllers kept in earlier runs."""
         self.plan = plan
         self.options = options
         self.memory = memory
@@ -160,44 +162,44 @@ class _Run:
         self.sources: list[_SourceProcess] = []
         self.writer: KeptStateWriter | None = None
         self.socket: Path | None = None
-        """Where the gateway listens; None before it does."""
+        """Socket of the gateway; None before it listens."""
         self.remarks: list[str] = []
         self.job: GuardianJob | None = None
         self.loop: int | None = None
-        """A pidfd of the loop's process; None before there is one, and after it was seen to be gone."""
+        """pidfd of the loop's process; None before its start and after its exit was seen."""
         self.loop_signs: SignsOfLife | None = None
-        """None as long as there is no loop."""
+        """None before the start of the loop."""
         self.log: Path | None = None
         self.sentences: list[str] = []
         self.ended: Ended | None = None
-        """The guardian's last message."""
+        """Last message of the guardian."""
         self.messages = 0
         self.closed: LogClosed | None = None
-        """The recorder's last message; None: there was no recorder, or it ended early."""
+        """Last message of the recorder; None without a recorder, or after its early end."""
         self.guardian_grants: tuple[Grant, ...] = ()
         self.grants: tuple[Grant, ...] = ()
-        """What the operating system granted, once the loop runs."""
+        """Grants of the operating system; empty before the loop runs."""
         self.signals = 0
-        """How many SIGINT and SIGTERM came: the first asks the robot to stop in order, the second cuts
-        torque."""
+        """Number of SIGINT and SIGTERM: the first requests a normal stop, the second cuts torque."""
         self.steerable = options.gateway and plan.gateway
-        """False without a gateway, and after it ended."""
+        """False without a gateway, and after the gateway has ended."""
         self.held = self.steerable and (not plan.simulated or bool(options.listen))
-        """The loop is paused until the gateway answers, so that a robot can be stopped before it moves."""
+        """True while the loop is paused until the gateway responds, so that a client can stop the robot
+        before it moves."""
 
     @property
     def steering(self) -> Steering:
-        """Whether the run can be steered now."""
+        """State of the gateway, as other processes see it."""
         if not self.steerable:
             return Steering.IMPOSSIBLE
         return Steering.AWAITED if self.socket is None else Steering.POSSIBLE
 
     def count_signal(self) -> None:
-        """Take a signal."""
+        """Count a signal."""
         self.signals += 1
 
     def start(self) -> Child[GuardianMessage]:
-        """Start everything in order, return the guardian; raises PortError or ProcessFault."""
+        """Start all processes in sequence, and return the guardian; raises PortError or ProcessFault."""
         if self.options.record:
             self.log = new_log(self.plan.recording, self.plan.robot)
         ports: dict[str, str] = {}
@@ -225,26 +227,28 @@ class _Run:
             self.guardian_grants = started.grants
             if self.recorder:
                 self.recorder.channel.send(LoopRuns(started.loop))
-            with suppress(ProcessLookupError):  # the guardian has reaped it already, and knows what to do
+            # The guardian has already reaped the loop, and handles its end.
+            with suppress(ProcessLookupError):
                 self.loop = os.pidfd_open(started.loop)
                 self.loop_signs = SignsOfLife(started.loop, _LOOK_NS, time.monotonic_ns())
         return self.guardian
 
     def hold(self) -> None:
-        """Let the loop begin with a pause, where it is to wait for the gateway, which ends it."""
-        if self.held:  # nothing else writes there until the gateway does
+        """Post a pause, with which a loop that waits for the gateway begins; the gateway ends it."""
+        # Nothing else writes into the mailbox before the gateway.
+        if self.held:
             MailboxWriter(self.memory.mailbox).post(Command(0, LOOP, "pause", b"", "loop"))
 
     def discard(self) -> None:
-        """Remove the log of a run that never came to the robot."""
+        """Remove the log of a run that sent nothing to the robot."""
         if self.log:
             discard_log(self.log)
             self.log = None
 
     def watch(self, guardian: Child[GuardianMessage], show: Callable[[Heartbeat], None]) -> None:
-        """Wait for the guardian's last message; pass on what the signals request.
+        """Wait for the guardian's last message; pass on stop requests by signals.
 
-        Return too when the guardian is gone, or was killed because it did not respond.
+        Also returns when the guardian has exited, or was killed because it did not respond.
         """
         heartbeat = Heartbeat(self.memory.heartbeat)
         signs = SignsOfLife(guardian.process.pid, _LOOK_NS, time.monotonic_ns())
@@ -277,18 +281,19 @@ class _Run:
                 break
 
     def _duty(self, heartbeat: Heartbeat, *, guardian_silent: bool, loop_gone: bool = False) -> Duty:
-        """Look at the loop; return what this process has to do. One that is done is not silent."""
+        """Check the loop, and return this process' duty. A loop that is done does not count as silent."""
         silent = {Watched.GUARDIAN} if guardian_silent else set()
         phase, signs = heartbeat.phase, self.loop_signs
         if signs is not None and phase is not Phase.DONE:
-            timeout_ns = loop_timeout_ns(heartbeat, self.plan.loop.period_ns)  # first: as in the guardian
+            # Read before the heartbeat, as in the guardian.
+            timeout_ns = loop_timeout_ns(heartbeat, self.plan.loop.period_ns)
             signs.look((phase, heartbeat.beats), time.monotonic_ns())
             if loop_gone or signs.is_silent(timeout_ns):
                 silent.add(Watched.LOOP)
         return duty_of(Watched.SUPERVISOR, silent)
 
     def _look_after_simulation(self, guardian: Child[GuardianMessage]) -> None:
-        """End the run when the simulated servos are gone: unlike an adapter they do not come back."""
+        """Stop the run after the simulated servos have exited: unlike an adapter, they do not come back."""
         if self.simulation and self.simulation.process.poll() is not None:
             self.sentences.append("the simulated bus ended before the run did")
             self.simulation.end()
@@ -296,7 +301,7 @@ class _Run:
             guardian.channel.send(Stop())
 
     def _take(self, message: GuardianMessage, descriptors: list[int]) -> None:
-        """Note how the loop ended; let go of a line that is lost, and hold the one that returned."""
+        """Record the end of the loop; release a lost line, and hold a returned one."""
         match message:
             case Ended():
                 self.ended = message
@@ -306,12 +311,12 @@ class _Run:
                 put_in_place(descriptors.pop(len(self.plan.buses)), descriptors[bus])
 
     def _take_last_messages(self, guardian: Child[GuardianMessage]) -> None:
-        """Take what a guardian that is gone has sent before; of one that was killed here nothing is left."""
+        """Process the last messages of an exited guardian. A guardian that was killed here leaves none."""
         while guardian.channel.fileno() >= 0 and (message := guardian.poll(0)):
             self._take(message, guardian.channel.descriptors)
 
     def _look_at_grants(self) -> None:
-        """Show what the operating system granted, and record it, once the loop has reported it."""
+        """Show and record the grants of the operating system, once the loop has reported them."""
         loop = () if self.grants else loop_grants(self.memory)
         if loop:
             self.grants = (*loop, *(replace(one, process="guardian") for one in self.guardian_grants))
@@ -320,7 +325,7 @@ class _Run:
                 self.recorder.channel.send(LateMetadata({"granted": granted_text(self.grants)}))
 
     def _look_after_gateway(self, heartbeat: Heartbeat) -> None:
-        """Start it when the loop runs; only a loop on real ports waits for it."""
+        """Start the gateway when the loop runs, and process its messages."""
         if self.gateway is None:
             if self.steerable and heartbeat.phase is Phase.RUNNING:
                 try:
@@ -337,7 +342,7 @@ class _Run:
             self._without_gateway("ended")
 
     def _without_gateway(self, what: str) -> None:
-        """Report that the run cannot be steered any more, and start no other gateway; end one that waits."""
+        """Report that the run can no longer be steered, and end a run that waits for the gateway."""
         self.steerable = False
         if self.held and self.guardian is not None:
             fix = "without --listen it would" if self.options.listen else "--no-gateway runs without"
@@ -348,7 +353,7 @@ class _Run:
         self._end_gateway()
 
     def _end_gateway(self) -> None:
-        """End the gateway, which keeps nothing, and remove its socket."""
+        """Kill the gateway, which has no state to save, and remove its socket."""
         if self.gateway:
             message = self.gateway.poll(0)
             self.gateway.kill()
@@ -359,12 +364,15 @@ class _Run:
                 self.socket.unlink(missing_ok=True)
 
     def _without_guardian(self, loop: int, guardian: Child[GuardianMessage], job: GuardianJob) -> None:
-        """The guardian is gone, and Linux has signalled the loop: see that it stops, or cut torque."""
+        """Supervise the loop in place of an exited guardian.
+
+        Linux has signalled the loop. Kill it if it does not stop, and switch torque off if it does not.
+        """
         give_up = time.monotonic() + self.plan.exit_timeout_ns * 1e-9
         heartbeat = Heartbeat(self.memory.heartbeat)
         while not (gone := bool(select.select([loop], [], [], _GONE_POLL_S)[0])):
             silent = self._duty(heartbeat, guardian_silent=True) is Duty.KILL_BOTH
-            # the second request may have gone to a guardian that did not read it any more
+            # The second stop request may have gone to a guardian that no longer read it.
             if silent or time.monotonic() > give_up or self.signals > 1:
                 signal.pidfd_send_signal(loop, signal.SIGKILL)
                 select.select([loop], [], [])
@@ -383,7 +391,7 @@ class _Run:
             self.sentences += leave(guardian.channel.descriptors, how, Severity.ERROR)
 
     def end(self) -> None:
-        """End what is left, in order: guardian, recorder, simulated bus, gateway."""
+        """End the remaining processes in sequence: guardian, sources, recorder, simulated bus, gateway."""
         self._look_at_grants()
         if self.guardian:
             self._take_last_messages(self.guardian)
@@ -401,11 +409,13 @@ class _Run:
             self.remarks += self.writer.finish()
         if self.simulation:
             self.simulation.end()
-        self._end_gateway()  # the last one: when its socket is gone, the log is closed
+        # The gateway is the last: when its socket is gone, the log is closed.
+        self._end_gateway()
 
     def _end_recorder(self, recorder: Child[RecorderMessage]) -> None:
-        """Let the recorder drain the rings and close the log; report it when it could not."""
-        if self.sentences:  # no ring has them, and the log's verdict is to be that of the run
+        """Wait until the recorder has drained the rings and closed the log; report a failure."""
+        # No ring has these sentences, and the verdict in the log must be that of the run.
+        if self.sentences:
             failures = {str(number): sentence for number, sentence in enumerate(self.sentences)}
             recorder.channel.send(LateMetadata({FAILURES_NAME: failures}))
         recorder.channel.send(Finish())
@@ -433,7 +443,7 @@ class _Run:
 
 
 def run_robot(plan: Plan, options: RunOptions, out: Console) -> RunSummary:
-    """Run a robot until its end, a signal, or a fault; every process is gone when it returns.
+    """Run a robot until its end, a signal, or a fault; all processes have exited on return.
 
     Raises PortError (a port is missing, busy, forbidden) and ProcessFault (a child did not start).
     """
@@ -456,7 +466,7 @@ def run_robot(plan: Plan, options: RunOptions, out: Console) -> RunSummary:
 
 
 def _watching(progress: Progress) -> Callable[[Heartbeat], None]:
-    """Return what keeps the terminal's status line up to date."""
+    """Return a function that updates the terminal's status line."""
 
     def show(heartbeat: Heartbeat) -> None:
         if heartbeat.phase in (Phase.SETUP, Phase.ENGAGING):
@@ -468,12 +478,13 @@ def _watching(progress: Progress) -> Callable[[Heartbeat], None]:
 
 
 def _summary(run: _Run, elapsed_s: float) -> RunSummary:
-    """Judge the run: 0 good, 1 failed, 130 interrupted."""
+    """Return the summary of a run, with exit code 0 good, 1 failed, 130 interrupted."""
     outcome = loop_outcome(run.memory)
     heartbeat = Heartbeat(run.memory.heartbeat)
     sentences: list[str] = []
     if outcome is None and run.ended is not None and run.ended.ending == "done":
-        outcome = LoopOutcome("stopped")  # while it was still loading: no byte had been sent
+        # The loop was still loading: no byte had been sent.
+        outcome = LoopOutcome("stopped")
     elif outcome is None:
         outcome = LoopOutcome("fault", heartbeat.cycles, heartbeat.skipped, _last_words(run.memory))
     sentences += outcome.sentences
@@ -503,6 +514,6 @@ def _summary(run: _Run, elapsed_s: float) -> RunSummary:
 
 
 def _last_words(memory: RunMemory) -> tuple[str, ...]:
-    """Return what was printed last, by whichever process, if anything was: one of them ended early."""
+    """Return the last output of the run's processes, the probable reason of an early end."""
     lines = process.whole(memory.stderr).decode(errors="replace").strip().splitlines()
     return (f"the run's processes printed last: {lines[-1]} (--debug shows all)",) if lines else ()

@@ -1,7 +1,7 @@
-"""Runs that cannot be steered: they start, end, have no gateway, or have lost processes. They can be ended.
+"""Unsteered runs: runs that start, end, have no gateway, or have lost processes. They can be ended.
 
-The signals are those that the processes heed among themselves (`watch.py`), so torque goes off by the run's
-own policy: this process never writes to a port.
+The signals are those that the processes of a run send each other (`watch.py`), so torque goes off by the
+run's own policy. This process never writes to a port.
 """
 
 from __future__ import annotations
@@ -18,33 +18,33 @@ from dxlrun.process_table import SUPERVISOR, FoundRun, RunProcess, found_runs, i
 from dxlrun.remote.sockets import listener, place, sockets
 
 _END_S = 30.0
-"""For the steps of on_exit, and for the recorder on a slow disk."""
+"""Timeout for the steps of on_exit and the recorder on a slow disk."""
 _POLL_S = 0.05
 _ENDING = (Phase.STOPPING, Phase.DONE)
 
 
 @dataclass(frozen=True, slots=True)
 class UnsteeredRun:
-    """A run whose gateway does not take commands now."""
+    """A run whose gateway does not accept commands now."""
 
     run: FoundRun
     name: str
-    """Its name for `--robot`: with a process ID where another run has the robot's name."""
+    """Name for `--robot`, with a process ID when another run has the robot's name."""
     problem: str
-    """Why it cannot be steered, as a clause; empty while it starts or ends."""
+    """Reason why the run cannot be steered, as a clause; empty while it starts or ends."""
 
     def is_named(self, name: str) -> bool:
-        """Return whether a name for `--robot` means this run, with a process ID also where none is needed."""
+        """Return whether a name for `--robot` means this run; a name with a process ID is always accepted."""
         return name in {self.name, *(f"{self.run.robot}-{one.pid}" for one in self.run.processes)}
 
     @property
     def is_ours(self) -> bool:
-        """True when its gateway listens where ours would."""
+        """True when the run uses our directory of sockets."""
         return _is_ours(self.run)
 
 
 def unsteered_runs() -> list[UnsteeredRun]:
-    """Return the runs that cannot be steered; those of other runtime directories too.
+    """Return the runs that cannot be steered, including those of other runtime directories.
 
     A plain robot name belongs to the run that listens under it, else to the only run of that robot in our
     runtime directory, else to the only one on this computer.
@@ -65,7 +65,7 @@ def unsteered_runs() -> list[UnsteeredRun]:
 
 
 def describe(run: UnsteeredRun) -> str:
-    """Return a sentence for a person who wants to steer it."""
+    """Return a sentence for a person who tries to steer the run."""
     if run.problem:
         fix = f"`dxlrun stop --robot {run.name}` ends it"
         return f"{run.name} runs but cannot be steered: {run.problem}; {fix}"
@@ -75,13 +75,13 @@ def describe(run: UnsteeredRun) -> str:
 
 
 def end_run(unsteered: UnsteeredRun, *, wait: bool) -> str:
-    """Ask a run to end in order, and continue its stopped processes; return a sentence.
+    """Ask a run to stop normally, and continue its stopped processes; return a sentence.
 
-    `wait`: until all its processes have ended. Raises DxlrunError where one does not.
+    `wait` waits until all processes have exited. Raises DxlrunError when one does not.
     """
     run, name = unsteered.run, unsteered.name
-    # A supervisor switches torque off at its second signal, and Ctrl-C may have been the first. The loop
-    # takes any number of them, unless it has finished and is about to exit.
+    # A supervisor cuts torque at its second signal, and Ctrl-C may have been the first. The loop accepts any
+    # number of signals, unless it has finished and is about to exit.
     asked = run.process("loop") or run.process(SUPERVISOR)
     if asked is not None and not _is_ending(run):
         _send(asked, signal.SIGTERM)
@@ -100,7 +100,7 @@ def end_run(unsteered: UnsteeredRun, *, wait: bool) -> str:
 
 
 def _problem(run: FoundRun) -> str:
-    """Return why a run cannot be steered and will not get ready for it, as a clause; empty otherwise.
+    """Return the reason why a run cannot be steered and will not become steerable; empty otherwise.
 
     A supervisor that responds ends a run whose guardian or loop is dead or stopped.
     """
@@ -130,7 +130,7 @@ def _is_steerable(run: FoundRun) -> bool:
 
 
 def _is_ending(run: FoundRun) -> bool:
-    """Return whether its loop stops the robot, has done so, or has died."""
+    """Return whether the loop is stopping the robot, has stopped it, or has died."""
     heartbeat = _heartbeat(run)
     if heartbeat is None:
         return False
@@ -139,7 +139,8 @@ def _is_ending(run: FoundRun) -> bool:
 
 
 def _heartbeat(run: FoundRun) -> Heartbeat | None:
-    with suppress(OSError, ValueError):  # the process has just ended
+    # The process may just have exited.
+    with suppress(OSError, ValueError):
         if path := run.memory("heartbeat"):
             descriptor = os.open(path, os.O_RDWR)
             try:
@@ -164,5 +165,6 @@ def _not_ended(name: str, left: list[RunProcess]) -> str:
 
 def _send(process: RunProcess, number: signal.Signals) -> None:
     if is_alive(process):
-        with suppress(ProcessLookupError):  # it has just ended
+        # The process may just have exited.
+        with suppress(ProcessLookupError):
             os.kill(process.pid, number)

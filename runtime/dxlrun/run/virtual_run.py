@@ -1,4 +1,4 @@
-"""A run on virtual time: the same loop, hardware and log, with simulated servos, in one process."""
+"""Virtual run: loop, hardware and log of a run in one process, in virtual time with simulated servos."""
 
 from __future__ import annotations
 
@@ -53,14 +53,21 @@ if TYPE_CHECKING:
 
 
 class VirtualRobot:
-    """A robot and its simulated servos on virtual time; two of them from one plan do exactly the same.
+    """A robot and its simulated servos in virtual time. Runs of one plan are identical.
 
-    `log`: where the log goes, None for no log. `ledger`: where the simulated buses enter what they see, None
-    for one in memory; it is closed with the log. `watch` is called with each record, in the cycle that leaves
-    it, as a recorder would get it. `kept`: directory of what controllers keep, None: it is forgotten.
-    `inbox`: commands for the loop in place of those in `self.inbox`. Every bus of the plan is simulated,
-    whatever its port.
-    Raises InputError when the plan has a bus that is not `sim`.
+    Every bus of the plan is simulated.
+
+    Args:
+        plan: The robot.
+        log: Path of the log; None: no log.
+        take_over: The servos may have torque already.
+        ledger: Record of the simulated buses' traffic, closed with the log; None: a ledger in memory.
+        watch: Called with each record, in the cycle that makes it, as a recorder would receive it.
+        kept: Directory of the controllers' kept states; None: they are discarded.
+        inbox: Commands for the loop in place of those in `self.inbox`.
+
+    Raises:
+        InputError: The plan has a bus that is not `sim`.
     """
 
     def __init__(
@@ -78,22 +85,22 @@ class VirtualRobot:
         self.plan = plan
         self.clock = VirtualClock()
         self.ledger = Ledger() if ledger is None else ledger
-        """Every byte that the simulated servos received and sent."""
+        """All bytes that the simulated servos received and sent."""
         simulated = simulation_of(plan)
         mechanics = Mechanics(0, plant_of(simulated))
         self.buses = tuple(SimulatedBus(config, self.ledger, 0, mechanics) for config in simulated.buses)
-        """The simulated lines, in the order of the plan's buses; faults are injected here."""
+        """Simulated buses, in the order of the plan's buses; faults are injected here."""
         if simulated.sensed is not None:
             fix_to_links((one for bus in self.buses for one in bus.devices), mechanics, simulated.sensed)
         plugins = load_plugins(files=plan.included)
         slots = self._start_sources(plugins, mechanics)
         self.stop = StopFlag()
         self.inbox = QueueInbox()
-        """Commands put here are taken at the start of a cycle."""
+        """Commands put here are read at the start of a cycle."""
         self.result: LoopResult | None = None
         self.messages = 0
         self.log_error: str | None = None
-        """Why the log is not whole."""
+        """Reason why the log is incomplete."""
         states = read_states(plan, kept)
         header = log_header(plan, 0, virtual=True, kept=states) if log else None
         self._writer = open_writer(log, header, plan.recording) if log and header else None
@@ -129,12 +136,12 @@ class VirtualRobot:
         self.robot = assemble(plan, plugins, host, take_over=take_over, kept=states)
 
     def _start_sources(self, plugins: PlugIns, mechanics: Mechanics) -> dict[str, list[memoryview]]:
-        """Open what processes sample, and let the clock do it; return the slots. Raises PortError."""
+        """Open the sources of features, and schedule their samples; return the slots. Raises PortError."""
         bodies = sensed_bodies(self.plan)
         body = None if bodies is None else SensedBody(bodies, mechanics, self.clock.now_ns)
         slots: dict[str, list[memoryview]] = {}
         self.sensors: dict[str, Any] = {}
-        """What samples each source, as its plug-in made it, by the source's name."""
+        """Driver of each source, as its plug-in made it, by the source's name."""
         self._sampled: list[SampledSource] = []
         for planned in planned_processes(self.plan.loop):
             process, memory = planned.process, slot.private(planned.process.values)
@@ -145,17 +152,19 @@ class VirtualRobot:
             self.sensors[process.source] = sampled.driver
             try:
                 sampled.open_first()
-            except Exception as error:  # a driver's fault is a sentence, whatever it is
+            # Any error of a driver becomes a sentence.
+            except Exception as error:
                 raise PortError(f"{process.title} cannot be opened: {describe_error(error)}") from error
             self._sampled.append(sampled)
             self._sample(sampled, process.period_ns, self.clock.now_ns())
         return slots
 
     def _sample(self, sampled: SampledSource, period_ns: int, due_ns: int) -> None:
-        """Take a sample at a time, and one each period from then on."""
+        """Schedule a sample, and one in each later period."""
 
         def sample() -> None:
-            for bus in self.buses:  # what is on the wire acts at its own time
+            # Bytes on the wire must take effect at their own time, before the sample.
+            for bus in self.buses:
                 bus.advance(due_ns)
             sampled.sample()
             self._sample(sampled, period_ns, due_ns + period_ns)
@@ -164,32 +173,32 @@ class VirtualRobot:
 
     @property
     def cycles(self) -> int:
-        """How many cycles ran."""
+        """Number of cycles."""
         return self.sinks.ran
 
     @property
     def skipped(self) -> int:
-        """How many periods were skipped."""
+        """Number of skipped periods."""
         return self.sinks.skipped
 
     @property
     def record(self) -> CycleRecord:
-        """The memory of the cycle that ran last."""
+        """Record of the last cycle."""
         return self.robot.record
 
     @property
     def failures(self) -> tuple[str, ...]:
-        """What could not be switched off at the end, one sentence each."""
+        """Servos and devices that could not be switched off at the end, one sentence each."""
         return self.robot.failures
 
     @property
     def unkept(self) -> tuple[str, ...]:
-        """What controllers kept that is in no file, one sentence each."""
+        """Kept states that could not be written to a file, one sentence each."""
         return self._kept.sentences if self._kept else ()
 
     @property
     def events(self) -> EventTotals:
-        """What its events come to."""
+        """Totals of the run's events."""
         return self._events.totals
 
     def run(self) -> LoopResult:
@@ -214,7 +223,7 @@ class VirtualRobot:
 
 
 def require_simulated(plan: Plan) -> None:
-    """Raise InputError when a bus or a sensor of the plan is a real one: virtual time does not pass there."""
+    """Raise InputError when a bus or a sensor of the plan is real, to which virtual time does not apply."""
     real = [bus.name for bus in plan.buses if bus.port != "sim"]
     if real:
         raise InputError(
@@ -227,17 +236,17 @@ def require_simulated(plan: Plan) -> None:
 
 
 def _stop(stop: StopFlag) -> None:
-    """Stop the run in order at the first signal, at once at a second one, by KeyboardInterrupt."""
+    """Request a normal stop at the first signal; raise KeyboardInterrupt at the second."""
     if stop.requested:
         raise KeyboardInterrupt
     stop.request()
 
 
 def run_virtual(plan: Plan, options: RunOptions, out: Console) -> RunSummary:
-    """Run a plan on virtual time for the command line; the log has the times of the virtual clock."""
+    """Run a plan in virtual time for the command line; the log has the times of the virtual clock."""
     log = new_log(plan.recording, plan.robot) if options.record else None
     try:
-        # a command line does not need the entries afterwards: memory stays bounded
+        # A run at the command line needs no ledger in memory, which would grow without bound.
         ledger = open_ledger(options.ledger)
         kept = state_directory(plan)
         robot = VirtualRobot(plan, log=log, take_over=options.take_over, ledger=ledger, kept=kept)
