@@ -147,6 +147,10 @@ def test_key_of_plugin_with_name_of_the_core_is_refused(offer: Offer, name: str,
     }
 
 
+def test_key_that_a_form_cannot_have_is_refused(offer: Offer) -> None:
+    assert "a key begins with a letter" in offer("_lamps", "joint_key")[2]["_lamps"]
+
+
 def test_key_that_is_not_the_name_of_its_feature_is_refused(offer: Offer) -> None:
     assert (
         "joint_key.py, servo_key.py or policy_key.py declares it"

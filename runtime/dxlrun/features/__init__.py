@@ -106,6 +106,7 @@ def _find_fault(feature: Feature, found: Container[str]) -> str:
         "another feature has that name": name in found,
         "no form.py, joint_key.py, servo_key.py or policy_key.py declares it": name not in names,
         f"a file declares {', '.join(sorted(names - {name}))} instead": len(names) > 1,
+        "a key begins with a letter": name.startswith("_"),
         "dxlrun has a key of that name": any(name in RESERVED[type(key)].split() for key in keys),
         "it is a key of joints and of servos, and a joint has both": {JointKey, ServoKey}
         <= {*map(type, keys)},
