@@ -1,5 +1,5 @@
 """Description: forms of robot files and motion files, validated and frozen, with line and column.
 
-Only what one file says by itself is checked here. Checks against control tables and plug-ins belong in
+This package checks only what a single file determines. Checks against control tables and plug-ins belong in
 `compile`.
 """

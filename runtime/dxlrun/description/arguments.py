@@ -1,7 +1,7 @@
-"""Arguments: `arguments:` of a robot file, `name:=value` of the command line, and `${name}` in use.
+"""Arguments: `arguments:` of a robot file, `name:=value` on the command line, and `${name}` in values.
 
-A value that is nothing but `${name}` takes the argument's value with its type: text when the default is text,
-else what YAML reads in it. Inside longer text the argument is put in as text. `$${` writes a plain `${`.
+A value that consists of `${name}` alone has the argument's type: text if the default is text, otherwise the
+type that YAML reads. Inside longer text the argument is inserted as text. `$${` stands for a plain `${`.
 """
 
 from __future__ import annotations
@@ -17,7 +17,7 @@ from dxlrun.description.form import Form, key, refuse
 from dxlrun.description.problems import problems_of
 from dxlrun.errors import Mark, Problem, suggestion
 
-COMMAND_LINE = "command line"  # The file in the mark of a problem of `name:=value`
+COMMAND_LINE = "command line"  # file name in the mark of a problem of `name:=value`
 
 _NAME = re.compile(r"[A-Za-z_][A-Za-z0-9_]*", re.ASCII)
 _USE = re.compile(r"\$\$\{|\$\{([^{}]*)(\}?)")
@@ -39,10 +39,16 @@ class Argument(Form):
 
 
 class Arguments:
-    """The arguments of one run: declared in the file, given on the command line."""
+    """The arguments of one run: declared in the file, set on the command line."""
 
     def __init__(self, block: object, given: Mapping[str, str], marks: Marks) -> None:
-        """Take the `arguments:` block as it was read (None: there is none) and what was given."""
+        """Check the given values against the declarations.
+
+        Args:
+            block: The `arguments:` block as read from the file; None: there was none.
+            given: Values from the command line, by name.
+            marks: Places in the file.
+        """
         self.problems: list[Problem] = []
         self.texts: dict[str, str] = {}
         """Value of each argument as text."""
@@ -90,7 +96,7 @@ class Arguments:
         self.problems.append(Problem(self._marks.key(*path), what, fix))
 
     def fill(self, path: KeyPath, text: str, quoted: bool) -> Filled:
-        """Return the value of a scalar with the arguments put in."""
+        """Return the value of a scalar with its arguments inserted."""
         if "${" not in text:
             return literal(path, text, quoted)
         if path[:1] == ("arguments",):
@@ -118,7 +124,7 @@ class Arguments:
 
 
 def refuse_arguments(path: KeyPath, text: str, quoted: bool) -> Filled:
-    """Return the value of a scalar in a file that takes no arguments."""
+    """Return the value of a scalar in a file without arguments; a `${` is a problem."""
     if "${" in text:
         return _unusable("this file takes no arguments", "write the value itself")
     return literal(path, text, quoted)

@@ -12,8 +12,8 @@ from dxlrun.description.form import Form, ItemName, key, refuse
 from dxlrun.description.units import AutoDuration, Duration, Rate
 
 HIGHEST_BAUD_RATE = 10_500_000
-"""bit/s, of PRO, P and Y servos."""
-SIMULATED = "sim"  # The port of a simulated bus
+"""bit/s, the rate of PRO, P and Y servos."""
+SIMULATED = "sim"  # port of a simulated bus
 _HIGHEST_ID_OF_PROTOCOL_2 = 252  # 0xFD is in the header of each packet (e-Manual, Protocol 2.0, Packet ID)
 _LONGEST_TIMER_NS = 255_000_000  # The latency timer of an FTDI chip is one byte, ms (FTDI AN232B-04)
 
@@ -39,7 +39,7 @@ def _boot_time(value: int) -> int:
 
 
 _LEAST_LATENCY_NS: Mapping[str, int] = MappingProxyType({"ftdi": 1_000_000, "direct": 0})
-"""Kind of adapter -> what it keeps bytes back for at best (protocol.md, Time budget)."""
+"""Lowest latency of each kind of adapter (protocol.md, Time budget)."""
 
 
 class Adapter(Form):
@@ -67,14 +67,14 @@ class Adapter(Form):
 
     @property
     def assumed_latency(self) -> int:
-        """What it adds to each request, ns: as written, else by its kind, else as an FTDI is shipped."""
+        """Latency that it adds to each request, ns: as given, else by its kind, else an FTDI's default."""
         if self.kind is None or "latency" in self.model_fields_set:
             return self.latency
         return _LEAST_LATENCY_NS[self.kind]
 
 
 class BusSimulation(Form):
-    """What a simulated bus does beside its servos; a bus on a real port does not use it."""
+    """Properties of a simulated bus itself, without its servos; a bus on a real port ignores them."""
 
     latency_timer: Annotated[Duration, AfterValidator(_timer)] = key(
         "How long the simulated adapter gathers bytes before it hands them over, at most 255 ms.", "4 ms", 0
@@ -89,7 +89,7 @@ class BusSimulation(Form):
 
 
 class SlowRegisters(Form):
-    """What is read of the servos of a bus now and then, between the cycles."""
+    """Registers that are read periodically between the cycles."""
 
     items: Annotated[tuple[ItemName, ...], Field(strict=False)] | None = key(
         "Items by the names of the control table; without: temperature and voltage.",
@@ -126,17 +126,17 @@ class Bus(Form):
 
     @property
     def latency_timer(self) -> int:
-        """How long the simulated adapter gathers bytes, ns: as it is written, else as an FTDI does, or 0."""
+        """Time for which the simulated adapter gathers bytes, ns: as given, else that of an FTDI, or 0."""
         if "latency_timer" in self.simulation.model_fields_set or self.adapter.kind != "ftdi":
             return self.simulation.latency_timer
         return self.adapter.assumed_latency
 
     @property
     def latency(self) -> int:
-        """What its adapter adds to each request, ns."""
+        """Latency that the adapter adds to each request, ns."""
         return self.latency_timer if self.port == SIMULATED else self.adapter.assumed_latency
 
     @property
     def highest_id(self) -> int:
-        """Of its servos and devices."""
+        """Highest ID of servos and devices on the bus."""
         return _HIGHEST_ID_OF_PROTOCOL_2 if self.protocol == 2.0 else 253

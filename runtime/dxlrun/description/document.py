@@ -1,8 +1,8 @@
-"""Document: the bytes of a YAML file -> plain values, each with its place in the file.
+"""Document: converts the bytes of a YAML file into plain values, each with its place in the file.
 
-PyYAML does the scanning (YAML's grammar has two hundred rules). Nothing is constructed by it, so no tag of a
-file can name a class; limits are checked on its stream of events, before a tree exists. Arguments are put in
-while the values are made.
+PyYAML only scans and parses (YAML's grammar has two hundred rules). It constructs no objects, so a tag in a
+file cannot name a class. Limits are checked on its stream of events, before a tree exists. Arguments are
+inserted while the values are made.
 """
 
 from __future__ import annotations
@@ -27,12 +27,12 @@ from dxlrun.description.mistakes.syntax import explain_syntax
 from dxlrun.errors import InputError, Mark, Problem
 
 KeyPath = tuple[str | int, ...]
-"""The way from the top of a document to a value: keys of mappings, indices of lists."""
+"""Path from the top of a document to a value: keys of mappings, indices of lists."""
 LARGEST_FILE = 1024 * 1024
-"""The most bytes of a file that a person wrote."""
+"""Bytes; files that a person writes are smaller."""
 _folder: ContextVar[Path | None] = ContextVar("folder", default=None)
-DEEPEST = 32  # Mappings and lists inside each other
-MOST_NODES = 200_000  # Keys, values, mappings and lists of a file, with every use of an anchor counted
+DEEPEST = 32  # nested mappings and lists
+MOST_NODES = 200_000  # keys, values, mappings and lists of a file; each use of an anchor counts
 
 _SCALARS: Mapping[str, object] = {
     **dict.fromkeys(("", "~", "null", "Null", "NULL")),
@@ -41,34 +41,34 @@ _SCALARS: Mapping[str, object] = {
     **dict.fromkeys((".nan", ".NaN", ".NAN"), math.nan),
     **{f"{sign}{word}": float(f"{sign}inf") for sign in ("", "+", "-") for word in (".inf", ".Inf", ".INF")},
 }
-# underscores between digits are ours: 1_000_000 is easier to count than 1000000
+# Underscores between digits are an extension: 1_000_000 is easier to read than 1000000.
 _INT = re.compile(r"[-+]?[0-9]+(?:_[0-9]+)*")
 _BASED = re.compile(r"0o[0-7]+|0x[0-9a-fA-F]+")
 _FLOAT = re.compile(r"[-+]?(?:\.[0-9]+|[0-9]+(?:_[0-9]+)*(?:\.[0-9]*)?)(?:[eE][-+]?[0-9]+)?")
-_LONGEST_NUMBER = 64  # Characters; more is text: the conversion of a million digits takes long
+_LONGEST_NUMBER = 64  # characters; longer is text, because converting a million digits takes long
 _Loader: type[yaml.SafeLoader] = getattr(
     yaml, "CSafeLoader", yaml.SafeLoader
-)  # the fast one where it was built
+)  # the fast scanner, if PyYAML was built with it
 
 
 class Marks(msgspec.Struct, frozen=True):
-    """The places of all keys and values of one file, and which values came from arguments."""
+    """Places of all keys and values of one file, and the origins of values from arguments."""
 
     file: str
     values: Mapping[KeyPath, Mark]
     keys: Mapping[KeyPath, Mark]
-    origins: Mapping[KeyPath, str] = {}  # `rate:=100` for each value in which an argument was put
+    origins: Mapping[KeyPath, str] = {}  # `rate:=100` for each value with an argument
 
     def value(self, *path: str | int) -> Mark:
-        """Return the place of a value, or else of the nearest parent that the file has."""
+        """Return the place of a value, or of its nearest parent in the file."""
         return self.values.get(path) or self._parent(path)
 
     def key(self, *path: str | int) -> Mark:
-        """Return the place of a key, of a list's item (it has no key), or of the nearest parent."""
+        """Return the place of a key, of a list item (which has no key), or of the nearest parent."""
         return self.keys.get(path) or self.values.get(path) or self._parent(path)
 
     def has(self, path: KeyPath) -> bool:
-        """Return whether the file has a value there."""
+        """Return True if the file has a value at a path."""
         return path in self.values
 
     def _parent(self, path: KeyPath) -> Mark:
@@ -80,23 +80,24 @@ class Marks(msgspec.Struct, frozen=True):
 
 
 class _Place(Protocol):
-    """PyYAML's mark; its two scanners have a class each."""
+    """PyYAML's mark; each of its two scanners has its own class."""
 
     line: int
     column: int
 
 
 class Tree(msgspec.Struct, frozen=True):
-    """A file's nodes, and what is wrong with them although they could be read."""
+    """Nodes of a file, and problems that do not prevent reading them."""
 
     root: yaml.MappingNode
     problems: tuple[Problem, ...]
 
 
 def read_file(path: Path) -> bytes:
-    """Return the bytes of a regular file of at most `LARGEST_FILE`.
+    """Return the bytes of a regular file of at most `LARGEST_FILE` bytes.
 
-    Raises OSError, whose `strerror` is the reason, also for what is no such file.
+    Raises:
+        OSError: The file cannot be read, is too large or is not a regular file; `strerror` is the reason.
     """
     folder = _folder.get()
     if folder is not None and not path.resolve().is_relative_to(folder):
@@ -109,7 +110,7 @@ def read_file(path: Path) -> bytes:
 
 
 def _opened(name: str, flags: int) -> int:
-    """Open a file for `open`, without waiting for the other end of a pipe."""
+    """Open a file for `open`, without blocking on a pipe."""
     descriptor = os.open(name, flags | getattr(os, "O_NONBLOCK", 0))
     mode = os.fstat(descriptor).st_mode
     if stat.S_ISREG(mode):
@@ -122,7 +123,7 @@ def _opened(name: str, flags: int) -> int:
 
 @contextmanager
 def confined(folder: Path) -> Iterator[None]:
-    """Refuse every file outside of a folder: for a robot file that came from somebody else."""
+    """Refuse every file outside a folder, for a robot file from an untrusted source."""
     token = _folder.set(folder.resolve())
     try:
         yield
@@ -131,9 +132,14 @@ def confined(folder: Path) -> Iterator[None]:
 
 
 def read_text(path: Path, language: str = "YAML") -> str:
-    """Return the text of a file; raises InputError when it is missing, too large, or no UTF-8.
+    """Return the text of a file.
 
-    `language` is what the problems call it.
+    Args:
+        path: The file.
+        language: Name of the format in messages; for `YAML`, files of other programs are refused.
+
+    Raises:
+        InputError: The file is missing, too large or not UTF-8.
     """
     file = str(path)
     try:
@@ -171,7 +177,7 @@ def _decoded(data: bytes, file: str, language: str) -> str:
 
 
 def parse(text: str, file: str) -> Tree:
-    """Return the nodes of a text whose top is a mapping; raises InputError when it is no such YAML."""
+    """Return the nodes of a text whose top level is a mapping; raise InputError for anything else."""
     try:
         problems = tuple(_refused_tags(text, file))
         root = yaml.compose(text, _Loader)
@@ -187,7 +193,7 @@ def parse(text: str, file: str) -> Tree:
 
 
 def _refused_tags(text: str, file: str) -> Iterator[Problem]:
-    """Yield a problem for each tag; raises InputError beyond the limits."""
+    """Yield a problem for each tag; raise InputError beyond the limits."""
     depth = nodes = documents = 0
     for event in yaml.parse(text, _Loader):
         mark = _mark(event.start_mark, file)
@@ -215,7 +221,7 @@ def _refused_tags(text: str, file: str) -> Iterator[Problem]:
 
 
 def node_mark(node: yaml.Node, file: str) -> Mark:
-    """Return where a node starts."""
+    """Return the place where a node starts."""
     return _mark(node.start_mark, file)
 
 
@@ -235,7 +241,7 @@ def _mark_at(text: str, index: int, file: str) -> Mark:
 
 
 def _explained(error: yaml.MarkedYAMLError, text: str, file: str) -> Problem:
-    """Return the error of the scanner or parser in words of ours, with its fix."""
+    """Return an error of the scanner or parser in dxlrun's words, with its fix."""
     place = error.problem_mark or error.context_mark
     opened = error.context_mark
     reported = error.problem or ""
@@ -286,33 +292,33 @@ _WORDS = (
 
 
 class Filled(msgspec.Struct, frozen=True):
-    """A scalar after arguments were put into it."""
+    """A scalar after its arguments were inserted."""
 
     value: object
-    origin: str | None = None  # `rate:=100` when an argument is in it
-    problems: tuple[tuple[str, str], ...] = ()  # What is wrong, and how to fix it
-    unknown: bool = False  # The value could not be made; further checks of it are skipped
+    origin: str | None = None  # `rate:=100` if it contains an argument
+    problems: tuple[tuple[str, str], ...] = ()  # problem and fix
+    unknown: bool = False  # the value is not known; further checks must skip it
 
 
-Fill = Callable[[KeyPath, str, bool], Filled]  # Path, text and whether it was quoted -> the value
+Fill = Callable[[KeyPath, str, bool], Filled]  # Converts path, text and quoted or not into a value.
 
 
 def literal(path: KeyPath, text: str, quoted: bool) -> Filled:
-    """Return what a scalar means as it stands."""
+    """Return the value of a scalar without inserting arguments."""
     return Filled(text if quoted else plain_value(text))
 
 
 class Grown(msgspec.Struct, frozen=True):
-    """A document as plain values, with marks, and what was wrong on the way."""
+    """A document as plain values, with marks and the problems found so far."""
 
     data: dict[str, object]
     marks: Marks
     problems: tuple[Problem, ...]
-    unknown: frozenset[KeyPath]  # Where a problem was already reported, so that the value there means nothing
+    unknown: frozenset[KeyPath]  # places with a reported problem; their values mean nothing
 
 
 def grow(tree: Tree, file: str, fill: Fill) -> Grown:
-    """Return the values of a tree; raises InputError when its anchors make it endless or huge."""
+    """Return the values of a tree; raise InputError if its anchors make it endless or huge."""
     grower = _Grower(tree, file, fill)
     return Grown(
         grower.mapping(tree.root, ()),
@@ -323,7 +329,7 @@ def grow(tree: Tree, file: str, fill: Fill) -> Grown:
 
 
 class _Grower:
-    """Walks a tree once; depth is bounded by DEEPEST, so it may recurse."""
+    """Walks a tree once. It may recurse, because DEEPEST bounds the depth."""
 
     def __init__(self, tree: Tree, file: str, fill: Fill) -> None:
         self._file = file
@@ -339,7 +345,7 @@ class _Grower:
 
     @property
     def problems(self) -> list[Problem]:
-        """What was wrong; all merge keys of a file are one problem."""
+        """Problems of the file; all of its merge keys are one problem."""
         if not self._merge_keys:
             return self._problems
         more = len(self._merge_keys) - 1
@@ -348,7 +354,7 @@ class _Grower:
         return [*self._problems, Problem(self._merge_keys[0], what, fix)]
 
     def value(self, node: yaml.Node, path: KeyPath) -> object:
-        """Return what a node means."""
+        """Return the value of a node."""
         if isinstance(node, yaml.MappingNode):
             return self.mapping(node, path)
         self._enter(node, path)
@@ -358,7 +364,7 @@ class _Grower:
         return self._scalar(node, path)
 
     def mapping(self, node: yaml.MappingNode, path: KeyPath) -> dict[str, object]:
-        """Return a mapping; keys are text as written, the first of two equal ones counts."""
+        """Return a mapping. Keys are text as written; the first of two equal keys counts."""
         self._enter(node, path)
         result: dict[str, object] = {}
         for key_node, value_node in node.value:
@@ -389,7 +395,7 @@ class _Grower:
             self.unknown.add(path)
 
     def _key(self, node: yaml.Node, path: KeyPath) -> str | None:
-        """Return a key of the mapping at a path; None where it is none."""
+        """Return a key of the mapping at a path; None if it is not a valid key."""
         mark = node_mark(node, self._file)
         if not isinstance(node, yaml.ScalarNode):
             self._problems.append(
@@ -399,7 +405,7 @@ class _Grower:
         if node.value == "<<" and not _quoted(node):
             self._merge_keys.append(mark)
             if path:
-                self.unknown.add(path)  # it lacks what was to be merged
+                self.unknown.add(path)  # the merged keys are missing in it
             return None
         if not node.value:
             self._problems.append(Problem(mark, "a key is empty", "write a word before the ':'"))
@@ -421,15 +427,15 @@ class _Grower:
 
 
 def _quoted(node: yaml.ScalarNode) -> bool:
-    # a plain scalar has the style None in one scanner of PyYAML, "" in the other
+    # A plain scalar has the style None in one scanner of PyYAML, "" in the other.
     return bool(node.style)
 
 
 def plain_value(text: str) -> object:
-    """Return what a scalar without quotes means: None, bool, int, float or str.
+    """Return the value of a scalar without quotes: None, bool, int, float or str.
 
-    As the core schema of YAML 1.2: `yes` and `on` are text, `010` is ten. PyYAML follows YAML 1.1, where `no`
-    is false and `1:30` is ninety; so only its syntax is used, not its values.
+    Follows the core schema of YAML 1.2: `yes` and `on` are text, `010` is ten. PyYAML follows YAML 1.1, where
+    `no` is false and `1:30` is ninety, so only its syntax is used, not its values.
     """
     if text in _SCALARS:
         return _SCALARS[text]
@@ -443,7 +449,7 @@ def plain_value(text: str) -> object:
 
 
 def text_of(value: object) -> str:
-    """Return the text that `plain_value` reads to the same value."""
+    """Return a text that `plain_value` converts back to the same value."""
     if value is None:
         return "null"
     if isinstance(value, bool):

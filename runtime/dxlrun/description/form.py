@@ -1,4 +1,4 @@
-"""Form: the base of all parts of the files, what a name may be, and errors of validators."""
+"""Form: base class of all sections of the files, valid names, and errors of validators."""
 
 from __future__ import annotations
 
@@ -24,15 +24,15 @@ _NAME = re.compile(r"[A-Za-z][A-Za-z0-9_]*", re.ASCII)
 
 
 def refuse(what: str, fix: str) -> PydanticCustomError:
-    """Return the error of a validator: what is wrong and, apart from it, how to fix it.
+    """Return the error of a validator, with the problem and the fix as separate texts.
 
-    It is a ValueError too.
+    The error is also a ValueError.
     """
     return PydanticCustomError("dxlrun", "{what}; {fix}", {"what": what, "fix": fix})
 
 
 def _name(value: str) -> str:
-    # names become topics of the log and interfaces `<joint>/<interface>`
+    # Names become topics of the log and interfaces `<joint>/<interface>`.
     if not _NAME.fullmatch(value):
         raise refuse(
             f"{value!r} is not a name", _name_fix(re.sub(r"\W+", "_", value.strip(), flags=re.ASCII))
@@ -55,7 +55,7 @@ def _name_fix(name: str) -> str:
 
 
 def folded(name: str) -> str:
-    """Return a name in lower case, with `_` between its words: position_p_gain for `Position P Gain`."""
+    """Return a name in lower case with `_` between its words: position_p_gain for `Position P Gain`."""
     parts = re.sub(r"(?<=[a-z0-9])(?=[A-Z])|(?<=[A-Z])(?=[A-Z][a-z])", "_", name)
     return re.sub(r"[^a-z0-9]+", "_", parts.lower()).strip("_")
 
@@ -65,17 +65,17 @@ Name = Annotated[
     AfterValidator(_name),
     WithJsonSchema({"type": "string", "pattern": f"^{_NAME.pattern}$"}),
 ]
-"""Letters, digits and _, first a letter."""
+"""Letters, digits and _, starting with a letter."""
 ItemName = Annotated[
     str,
     AfterValidator(_item_name),
     WithJsonSchema({"type": "string", "pattern": f"^{_NAME.pattern}$"}),
 ]
-"""Name of an item of a control table: position_p_gain."""
+"""Name of an item of a control table, such as position_p_gain."""
 
 
 class Form(BaseModel):
-    """Base of all parts: frozen, unknown keys refused, finite numbers only, no number made from text."""
+    """Base of all sections: frozen; refuses unknown keys, non-finite numbers and text in place of numbers."""
 
     model_config = ConfigDict(frozen=True, extra="forbid", strict=True, allow_inf_nan=False, defer_build=True)
 
@@ -91,7 +91,18 @@ def key(
     lt: float | None = None,
     min_length: int | None = None,
 ) -> T:
-    """Return the field of a key: what it is, how it is written for example, and what it is when left out."""
+    """Return the field of a key with its description, example, default and bounds.
+
+    Args:
+        description: Meaning of the key.
+        example: Value in the notation of a file.
+        default: Value of an absent key; by default the key is required.
+        ge: Lowest value.
+        gt: Bound below all values.
+        le: Highest value.
+        lt: Bound above all values.
+        min_length: Fewest characters or entries.
+    """
     field: T = Field(
         cast("T", default),
         description=description,
@@ -114,24 +125,24 @@ class FormKey(Protocol):
 
     @property
     def form(self) -> object:
-        """Type of its value, or a function that returns it."""
+        """Type of the key's value, or a function that returns the type."""
 
     @property
     def field(self) -> object:
-        """Its field, as `key` returns it."""
+        """Field of the key, as `key` returns it."""
 
     @property
     def before(self) -> str:
-        """Key that follows it in lists of all keys; it is the last where there is no such key."""
+        """Key that follows this key in lists of all keys; if the form lacks it, this key is the last."""
 
 
 def with_keys(form: type[F], keys: Iterable[FormKey], **replaced: object) -> type[F]:
-    """Return a form with keys that features add.
+    """Return a form with additional keys of features.
 
     Args:
-        form: The form without them.
-        keys: The keys; one that the form has takes its place.
-        replaced: Other types of keys that the form has.
+        form: The form without the keys.
+        keys: The keys; a key that the form has already is replaced.
+        replaced: New types for keys of the form.
     """
     added = [*keys]
     definitions: dict[str, Any] = {name: (kind, form.model_fields[name]) for name, kind in replaced.items()}
@@ -145,13 +156,13 @@ def with_keys(form: type[F], keys: Iterable[FormKey], **replaced: object) -> typ
     for each in added:
         if each.name not in order:
             order.insert(order.index(each.before) if each.before in order else len(order), each.name)
-    # Pydantic puts the fields of a base first. Messages and the schema list keys in this order.
+    # Pydantic puts the fields of a base class first, but messages and the schema list keys in this order.
     made.__pydantic_fields__ = {name: made.model_fields[name] for name in order}
     return made
 
 
 class PlugInEntry(Form):
-    """An entry of a plug-in's type: the keys beside those that each type has are the type's parameters."""
+    """An entry of a plug-in's type. Keys that are not common to all types are the type's parameters."""
 
     parameters: dict[str, object] = Field(
         default={}, description="All other keys of the entry; its type says which there are."
@@ -167,11 +178,11 @@ class PlugInEntry(Form):
 
 
 Mistake = tuple[tuple[str | int, ...], str]
-"""A key's path below its model, such as `("motions", "walk", "next")`, and `what is wrong; how to fix it`."""
+"""Path of a key below its model, such as `("motions", "walk", "next")`, and the text `problem; fix`."""
 
 
 class Mistakes(ValueError):
-    """All mistakes that a model found between its keys."""
+    """All mistakes that a model found in combinations of its keys."""
 
     def __init__(self, found: Sequence[Mistake]) -> None:
         self.found = tuple(found)
@@ -184,10 +195,10 @@ class ParametersModel(BaseModel):
     model_config = ConfigDict(frozen=True, extra="forbid", allow_inf_nan=False, defer_build=True)
 
     def mistakes(self) -> Iterator[Mistake]:
-        """Yield what is wrong between the keys: the path of a key, and `what is wrong; how to fix it`.
+        """Yield mistakes in combinations of keys: the path of a key, and the text `problem; fix`.
 
-        All of them are reported at once, each at its place in the robot file. Override it for checks of
-        several keys, and `yield from super().mistakes()` first.
+        All of them are reported at once, each at its place in the robot file. Override this method for checks
+        of several keys, and start with `yield from super().mistakes()`.
         """
         yield from ()
 

@@ -1,8 +1,9 @@
-"""Including: a robot file and the fragments that it names become one document.
+"""Including: merges a robot file and the fragments that it names into one document.
 
-`include: [fragments/head.yaml]` is relative to the file that has it. Mappings are merged, key by key, at
-every depth; of two values the including file's counts, of two fragments the later one's. Marks stay with the
-file in which a value stands. A fragment that is reached twice counts once, where it is reached first.
+`include: [fragments/head.yaml]` is relative to the file that contains it. Mappings are merged key by key at
+every depth. The including file takes precedence over its fragments, and a later fragment over an earlier one.
+Marks refer to the file in which a value is written. A fragment that is reached twice counts once, where it is
+reached first.
 """
 
 from __future__ import annotations
@@ -28,27 +29,28 @@ from dxlrun.description.problems import shown
 from dxlrun.errors import InputError, Mark, Problem
 
 KEY = "include"
-MOST_LEVELS = 8  # Files that include each other in a row
-MOST_FILES = 64  # Of one robot
+MOST_LEVELS = 8  # longest chain of includes
+MOST_FILES = 64  # files of one robot
 
 
 class Source(msgspec.Struct, frozen=True):
-    """One file of a robot, as it was read."""
+    """One file of a robot, as read."""
 
     path: Path
     text: str
     tree: Tree
-    declared: Grown  # Its values before arguments are put in
+    declared: Grown  # values before arguments are inserted
 
     def grown(self, fill: Fill) -> Grown:
-        """Return its values with arguments put in."""
+        """Return the values of the file with arguments inserted."""
         return grow(self.tree, str(self.path), fill)
 
 
 def read_sources(path: Path) -> tuple[Source, ...]:
-    """Return the file and all that it includes, the weakest first, itself last.
+    """Return the file and all of its fragments: lowest precedence first, the file itself last.
 
-    Raises InputError when one of them is no YAML, or an `include` cannot be followed, with all such problems.
+    Raises:
+        InputError: A file is not YAML, or includes cannot be followed; all such problems at once.
     """
     text = read_text(path)
     collector = _Collector()
@@ -68,7 +70,7 @@ class _Collector:
         self._characters = 0
 
     def take(self, path: Path, text: str, tree: Tree, above: tuple[Path, ...]) -> None:
-        """Take what a file includes, then the file; `above` are the files that led to it."""
+        """Add the fragments of a file, then the file; `above` are the files that led to it."""
         declared = grow(tree, str(path), literal)
         self._done.add(path.resolve())
         self._characters += len(text)
@@ -140,7 +142,7 @@ class _Collector:
 
 
 def merged(documents: Iterable[Grown]) -> Grown:
-    """Return the documents as one, the weakest given first; problems of all of them are kept."""
+    """Merge documents, lowest precedence first; the problems of all of them are kept."""
     first, *others = documents
     for document in others:
         first = _over(first, document)
@@ -148,7 +150,7 @@ def merged(documents: Iterable[Grown]) -> Grown:
 
 
 def _over(low: Grown, high: Grown) -> Grown:
-    """Return `high` laid over `low`: where both have mappings these are merged, else `high` counts."""
+    """Return `high` merged over `low`: mappings are merged, other values of `high` replace those of `low`."""
     replaced: set[KeyPath] = set()
     data = _laid(low.data, high.data, (), replaced)
 

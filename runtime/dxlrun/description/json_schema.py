@@ -1,10 +1,10 @@
-"""JSON Schema of robot, motion and motor files, so that an editor completes keys and underlines mistakes.
+"""JSON Schema of robot, motion and motor files, for completion and checks in an editor.
 
-Pydantic's schema of the models is reshaped to what may stand in a file: `${name}` wherever a scalar stands
-(robot files only), numbers with groups of digits (1_000_000 is text in YAML 1.2), and the parameters of each
-type of controllers and sensors among the keys of its entry. Keys that a robot must have are asked for apart,
-because a file that includes others need not have them itself. What only the whole file shows (claims, reach,
-time) is for `dxlrun check`.
+Pydantic's schema of the models is adapted to the text of a file: `${name}` wherever a scalar is allowed
+(robot files only), numbers with grouped digits (1_000_000 is text in YAML 1.2), and the parameters of each
+controller and sensor type among the keys of its entry. Required keys are in a part of their own, because a
+file with includes need not have them itself. Checks that need the whole file (claims, reach, time) are left
+to `dxlrun check`.
 """
 
 from __future__ import annotations
@@ -32,7 +32,7 @@ from dxlrun.description.joints.motor_file import MotorForm
 from dxlrun.description.motion import Motion
 from dxlrun.description.robot import robot_form
 
-Schema = dict[str, Any]  # A JSON Schema: values are whatever JSON has, so nothing narrower than Any is true
+Schema = dict[str, Any]  # A JSON Schema. Its values can be any JSON, so no type narrower than Any is correct.
 
 DIALECT = "https://json-schema.org/draft/2020-12/schema"
 _ARGUMENT: Schema = {
@@ -55,23 +55,24 @@ _OF_MAPPINGS = ("properties", "additionalProperties", "required")
 _ABOUT = ("description", "default", "examples")
 
 
-Models = Mapping[str, type[BaseModel]]  # Models of parameters, by the type that has them
+Models = Mapping[str, type[BaseModel]]  # models of parameters, by controller or sensor type
 Entries = Mapping[str, tuple[str, Models]]
-"""Form of the entries of a section whose types plug-ins offer -> word for one of them, and the models."""
+"""For each form of entries with plug-in types: the word for one entry, and the models."""
 
 
 def robot_schema(controllers: Models, entries: Entries) -> Schema:
-    """Return the schema of robot files, with the parameters of the types that plug-ins offer."""
+    """Return the schema of robot files, with the parameters of the plug-ins' types."""
     robot = _robot(controllers, entries)
     lenient = _without_required(robot)
     needed = _Needs(robot).of_root()
-    joints = {"properties": {"joints": needed["properties"].pop("joints")}}  # but what others may give them
+    # joint keys may come from defaults or groups
+    joints = {"properties": {"joints": needed["properties"].pop("joints")}}
     needed |= {"if": {"anyOf": [{"required": [key]} for key in (DEFAULTS, GROUPS)]}, "else": joints}
     return {**lenient, "title": "dxlrun robot file", "if": {"required": [INCLUDE]}, "else": needed}
 
 
 def fragment_schema(controllers: Models, entries: Entries) -> Schema:
-    """Return the schema of files that a robot file includes: any part of one."""
+    """Return the schema of fragments that a robot file includes."""
     return {**_without_required(_robot(controllers, entries)), "title": "dxlrun fragment of a robot file"}
 
 
@@ -86,7 +87,7 @@ def motor_schema() -> Schema:
 
 
 def _without_arguments(model: type[BaseModel], title: str) -> Schema:
-    """Return the schema of files that take no arguments."""
+    """Return the schema of files without arguments."""
     schema = model.model_json_schema()
     shaped = _Shaper(arguments=False)
     definitions = {name: shaped.node(node) for name, node in schema.pop("$defs").items()}
@@ -95,7 +96,7 @@ def _without_arguments(model: type[BaseModel], title: str) -> Schema:
 
 
 def _robot(controllers: Models, entries: Entries) -> Schema:
-    """Return the schema of a robot file that includes nothing."""
+    """Return the schema of a robot file without includes."""
     schema = robot_form().model_json_schema()
     shaped = _Shaper(arguments=True)
     definitions = {name: shaped.node(node) for name, node in schema.pop("$defs").items()}
@@ -124,7 +125,7 @@ def _robot(controllers: Models, entries: Entries) -> Schema:
 
 
 def _shared(forms: Mapping[str, Schema]) -> Schema:
-    """Return the keys that joints of these forms may share; which of them a joint has is for `check`."""
+    """Return the keys that joints of these forms may share; `check` decides whether a joint has a key."""
     found: dict[str, list[Schema]] = {}
     for properties in forms.values():
         for key, node in properties.items():
@@ -160,7 +161,7 @@ def _include() -> Schema:
 
 
 def _entry_of(kind: str, entry: Schema, parameters: Schema) -> Schema:
-    """Return the schema of an entry of one type: the common keys and its own."""
+    """Return the schema of an entry of one type: the common keys and the type's own."""
     return {
         **parameters,
         "properties": {**entry["properties"], "type": {"const": kind}, **parameters.get("properties", {})},
@@ -170,9 +171,12 @@ def _entry_of(kind: str, entry: Schema, parameters: Schema) -> Schema:
 
 
 def _any_entry(entry: Schema, kinds: list[str], room: str) -> Schema:
-    """Return the schema of an entry that each type adds to; any other type is left to `dxlrun check`.
+    """Return the schema of an entry of any type; `dxlrun check` decides about unknown types.
 
-    `room` begins the names of the types' definitions: a controller and a sensor may have the same type.
+    Args:
+        entry: Schema of the common keys.
+        kinds: Known types.
+        room: Prefix of the types' definitions, because a controller and a sensor may have the same type.
     """
     written = {
         "description": entry["properties"]["type"]["description"],
@@ -190,7 +194,8 @@ def _any_entry(entry: Schema, kinds: list[str], room: str) -> Schema:
 
 
 def _any_joint(any_form: Schema) -> Schema:
-    """Return the schema of a joint: that of the form which its keys tell, so that mistakes have a place."""
+    """Return the schema of a joint. The keys of the joint select its form, so a mistake is reported at its
+    place."""
     branches: list[Schema] = []
     before: list[Schema] = []
     for form, told_by in joint_conditions():
@@ -205,7 +210,7 @@ def _and_none_of(condition: Schema, others: list[Schema]) -> Schema:
 
 
 class _Documented(GenerateJsonSchema):
-    """Pydantic's schema, where the docstring below a field describes its key."""
+    """Pydantic's schema, with the docstrings of fields as descriptions of their keys."""
 
     def model_schema(self, schema: ModelSchema) -> Schema:
         """Return the schema of a model."""
@@ -217,9 +222,9 @@ class _Documented(GenerateJsonSchema):
         return found
 
 
-@cache  # finding a class in its source takes long, and each class below it needs it
+@cache  # Finding a class in its source is slow, and each of its subclasses needs it.
 def _docstrings(kind: type) -> dict[str, str]:
-    """Return the docstrings below the fields of a class, by field; of a class without source none."""
+    """Return the docstrings of a class's fields, by field; empty for a class without source."""
     with suppress(OSError, TypeError, SyntaxError):
         (made,) = ast.parse(textwrap.dedent(inspect.getsource(kind))).body
         return {
@@ -233,16 +238,17 @@ def _docstrings(kind: type) -> dict[str, str]:
 
 
 class _Shaper:
-    """Turns nodes of pydantic's schema into nodes of ours; `used` are the definitions that these name."""
+    """Converts nodes of pydantic's schema; `used` are the definitions to which the new nodes refer."""
 
     def __init__(self, *, arguments: bool) -> None:
         self._arguments = arguments
         self.used: dict[str, Schema] = {}
 
     def node(self, node: Schema) -> Schema:
-        """Return a node, and all below it, as a file may be written."""
+        """Return a node, and all nodes below it, for the text of a file."""
         shaped = {key: value for key, value in node.items() if key != "title"}
-        if "patternProperties" in shaped:  # pydantic's keys must match: in its own words other keys pass
+        # pydantic requires matching keys, but `patternProperties` lets other keys pass
+        if "patternProperties" in shaped:
             ((pattern, values),) = shaped.pop("patternProperties").items()
             shaped |= {"propertyNames": {"pattern": pattern}, "additionalProperties": values}
         for key in ("items", "additionalProperties"):
@@ -252,7 +258,8 @@ class _Shaper:
             if key in shaped:
                 shaped[key] = [self.node(each) for each in shaped[key]]
         if "oneOf" in shaped and all("$ref" in arm for arm in shaped["oneOf"]):
-            # forms of one thing: where no key is asked for, an entry may be a part of several
+            # The alternatives are forms of one entry. Without required keys an entry may match several of
+            # them.
             return {**{key: shaped[key] for key in shaped if key != "oneOf"}, "anyOf": shaped["oneOf"]}
         if "properties" in shaped:
             shaped["properties"] = {key: self.node(each) for key, each in shaped["properties"].items()}
@@ -261,9 +268,10 @@ class _Shaper:
         return {key: value for key, value in shaped.items() if key not in ("default", "examples")}
 
     def _alternatives(self, shaped: Schema) -> Schema:
-        """Return the alternatives of one value: those of the model, an argument, or a grouped number.
+        """Return the alternatives of one value: those of the model, an argument, or a number with grouped
+        digits.
 
-        The properties of a mapping that may also be one value are kept next to the alternatives.
+        If a mapping can also be written as one value, its properties stay next to the alternatives.
         """
         about = {key: shaped.pop(key) for key in _ABOUT if key in shaped}
         given = shaped.pop("anyOf", None)
@@ -290,10 +298,10 @@ class _Shaper:
 
 
 def _readable(about: Schema, kinds: set[str | None], pattern: str) -> Schema:
-    """Return description, default and examples as they are written in a file.
+    """Return description, default and examples in the notation of a file.
 
-    A default of a quantity is held in SI, and gets its unit from the `pattern`; None means that a key is left
-    out, which cannot be written.
+    The default of a quantity is in SI, and gets a unit from the `pattern`. A default of None means an absent
+    key, which has no notation.
     """
     found = dict(about)
     text = kinds <= {"string", "null"}
@@ -310,7 +318,7 @@ def _readable(about: Schema, kinds: set[str | None], pattern: str) -> Schema:
 
 
 def _patterns(node: Schema) -> list[str]:
-    """Return the patterns of what may stand at one place, or in a mapping there, without names."""
+    """Return the patterns of values at one place, or in a mapping there, without names."""
     arms = [one for key in ("anyOf", "oneOf") for one in node.get(key, ())]
     inner = [node["additionalProperties"]] if isinstance(node.get("additionalProperties"), dict) else []
     own = [node["pattern"]] if r"\s*$" in node.get("pattern", "") else []
@@ -318,7 +326,7 @@ def _patterns(node: Schema) -> list[str]:
 
 
 def _written(default: float, pattern: str) -> str | None:
-    """Return a quantity in SI (a time in ns, as it is held) with a unit of a pattern that `units` made."""
+    """Return a quantity in SI (a time in ns) with a unit from a pattern that `units` made."""
     units = pattern.rpartition("(")[2].partition(")")[0].replace("\\", "").split("|")
     if units == ["%"]:
         return f"{default * 100:g} %"
@@ -330,7 +338,7 @@ def _written(default: float, pattern: str) -> str | None:
 
 
 def _without_required(node: Any) -> Any:  # noqa: ANN401 (any part of a JSON document)
-    """Return a schema that asks for no key, but for those by which an `if` decides."""
+    """Return a schema without required keys, except those in an `if`."""
     if isinstance(node, list):
         return [_without_required(each) for each in node]
     if not isinstance(node, dict):
@@ -343,14 +351,14 @@ def _without_required(node: Any) -> Any:  # noqa: ANN401 (any part of a JSON doc
 
 
 class _Needs:
-    """Collects which keys a schema asks for, and nothing else of it."""
+    """Collects the required keys of a schema."""
 
     def __init__(self, schema: Schema) -> None:
         self._schema = schema
         self._above: list[str] = []
 
     def of_root(self) -> Schema:
-        """Return the schema's own needs."""
+        """Return the required keys of the schema itself."""
         return self._of(self._schema)
 
     def _of(self, node: object) -> Schema:
@@ -374,7 +382,7 @@ class _Needs:
         return needs
 
     def _behind(self, reference: str) -> Schema:
-        if reference in self._above:  # a model of a plug-in that contains itself
+        if reference in self._above:  # a plug-in's model that contains itself
             return {}
         self._above.append(reference)
         needs = self._of(self._schema["$defs"][reference.removeprefix("#/$defs/")])

@@ -1,4 +1,4 @@
-"""Motion: the form of a motion file, and reading one."""
+"""Motion: the form of a motion file and its reader."""
 
 from __future__ import annotations
 
@@ -19,18 +19,18 @@ from dxlrun.description.units import Acceleration, Duration, Measure, Position, 
 
 
 def _expression(value: object) -> object:
-    # a constant is a formula too, and YAML has read it as a number
+    # A constant is a formula, too, and YAML has read it as a number.
     return repr(value) if isinstance(value, int | float) and not isinstance(value, bool) else value
 
 
 Expression = Annotated[
     str, BeforeValidator(_expression, json_schema_input_type=str | float), Field(min_length=1)
 ]
-"""A formula of t, s since the part's start; `compile` reads it."""
+"""Formula of t, s since the start of the part; `compile` evaluates it."""
 
 
 class Target(Form):
-    """Where a joint shall be at a point's time, and how it moves there."""
+    """Goal of a joint at the time of a point: position, velocity and acceleration."""
 
     position: Position | None = key("Angle of the joint, or position of a linear one.", "30 deg", None)
     velocity: Speed | None = key("Speed there.", "1 rad/s", None)
@@ -49,14 +49,14 @@ class Target(Form):
 
 
 class Point(Form):
-    """One moment of a part."""
+    """Targets at one time of a part."""
 
     time: Duration = key("Since the part's start.", "1 s")
     joints: dict[Name, Target] = key("Targets by joint.", "{head_joint: {position: 30 deg}}", min_length=1)
 
 
 class Formula(Form):
-    """The motion of one joint as formulas of t, s."""
+    """Motion of one joint as formulas of t, s."""
 
     position: Expression = key("rad", "0.5 * sin(2 * t)")
     velocity: Expression | None = key("rad/s", "cos(2 * t)", None)
@@ -64,7 +64,7 @@ class Formula(Form):
 
 
 class PointsPart(Form):
-    """What one controller shall do, point by point."""
+    """Motion of one controller, point by point."""
 
     refused: ClassVar[Mapping[str, str]] = dict.fromkeys(
         ("duration", "samples", "joints"),
@@ -79,7 +79,7 @@ class PointsPart(Form):
 
 
 class FormulaPart(Form):
-    """What one controller shall do, as formulas that are sampled before the loop starts."""
+    """Motion of one controller, as formulas that are sampled before the loop starts."""
 
     controller: str = key("Name of the controller.", "head", min_length=1)
     start: Duration = key("Since the loop's first deadline.", "1 s", 0)
@@ -90,7 +90,7 @@ class FormulaPart(Form):
 
 def _kind(part: object) -> str:
     points = not isinstance(part, dict | FormulaPart) or (isinstance(part, dict) and "points" in part)
-    return "<points>" if points else "<formulas>"  # no key of a file, so that an error's location is clear
+    return "<points>" if points else "<formulas>"  # not a possible key, so an error's location is unambiguous
 
 
 Part = Annotated[
@@ -109,12 +109,12 @@ class Motion(Form):
 
     @property
     def controllers(self) -> tuple[str, ...]:
-        """The controllers that it is for, each once."""
+        """Controllers of the motion, each once."""
         return tuple(dict.fromkeys(part.controller for part in self.motions))
 
     @property
     def joints(self) -> tuple[str, ...]:
-        """The joints that it moves, each once."""
+        """Joints that the motion moves, each once."""
         named = (
             part.joints
             if isinstance(part, FormulaPart)
@@ -125,7 +125,7 @@ class Motion(Form):
 
     @property
     def seconds(self) -> float:
-        """From its begin to the last target, s."""
+        """Time from the start of the motion to its last target, s."""
         ends = (
             part.start + (part.duration if isinstance(part, FormulaPart) else part.points[-1].time)
             for part in self.motions
@@ -134,21 +134,21 @@ class Motion(Form):
 
 
 class MotionDescription(msgspec.Struct, frozen=True):
-    """A motion file whose form is right, with the place of everything in it."""
+    """A motion file of valid form, with the places of its values."""
 
     motion: Motion
     marks: Marks
     path: Path
-    text: str  # As it was read
+    text: str  # text as read
 
 
 def read_motion(path: Path, groups: Groups = NO_GROUPS) -> MotionDescription:
-    """Read a motion file that may name groups of joints; raises InputError with all problems of its form."""
+    """Read a motion file, which may name groups of joints; raise InputError with all problems of its form."""
     return parse_motion(read_text(path), path, groups)
 
 
 def parse_motion(text: str, path: Path, groups: Groups = NO_GROUPS) -> MotionDescription:
-    """Return the motion of a file's text; raises InputError with all problems of its form."""
+    """Parse the text of a motion file; raise InputError with all problems of its form."""
     file = str(path)
     grown = put_in(grow(parse(text, file), file, refuse_arguments), groups)
     if "motions" not in grown.data and {"buses", "joints"} & grown.data.keys():

@@ -1,4 +1,4 @@
-"""Problems: what pydantic found, as sentences of ours at the place in the file where each thing is."""
+"""Problems: converts errors of pydantic into sentences with the place in the file."""
 
 from __future__ import annotations
 
@@ -34,10 +34,17 @@ def problems_of(
 ) -> list[Problem]:
     """Return one problem for each place that a model refused, in file order.
 
-    `prefix` is where the model's data stands in the file. With `model`, unknown keys get the nearest
-    known one, also of those that stand `beside` the model's, and missing keys an example. `document` is the
-    model of the whole file where `model` is of a part: a key may belong elsewhere. `unknown` paths and what
-    is below them are skipped. `most` of pydantic's errors are looked at, None: all.
+    With a model, unknown keys get the nearest known key, also from the keys in `beside`. Missing keys get an
+    example.
+
+    Args:
+        error: The model's errors.
+        marks: Places in the file.
+        prefix: Path of the model's data in the file.
+        model: The model.
+        document: Model of the whole file if `model` is a part: a key may belong elsewhere.
+        unknown: Paths to skip, with everything below them.
+        most: Most errors of pydantic to convert; None: all.
     """
     found: dict[KeyPath, list[_Error]] = {}
     for details in _each_of(error.errors(include_url=False)[:most]):
@@ -51,9 +58,9 @@ def problems_of(
 def _explain_unknown_keys(
     found: Mapping[KeyPath, list[_Error]], marks: Marks, document: type[BaseModel] | None
 ) -> Iterator[list[_Error]]:
-    """Yield the errors of each place; unknown keys get their remedies, a pair of them is one error.
+    """Yield the errors of each place; unknown keys get their remedies, and a pair of such keys is one error.
 
-    A missing key is not an error where an unknown one means it.
+    A missing key is not an error if an unknown key means it.
     """
     parents: dict[KeyPath, dict[str, _Error]] = {}
     for path, errors in found.items():
@@ -98,7 +105,7 @@ def _remedies_at(
 
 
 def _each_of(errors: Iterable[ErrorDetails]) -> Iterator[ErrorDetails]:
-    """Yield pydantic's errors, with one for each of the `Mistakes` of a model."""
+    """Yield pydantic's errors, with one error for each of the `Mistakes` of a model."""
     for details in errors:
         several = details.get("ctx", {}).get("error")
         if not isinstance(several, Mistakes):
@@ -111,7 +118,7 @@ def _each_of(errors: Iterable[ErrorDetails]) -> Iterator[ErrorDetails]:
 
 
 def read_form(grown: Grown, model: type[Form]) -> Form:
-    """Return what a document says; raises InputError with all problems of its form."""
+    """Validate a document; raise InputError with all problems of its form."""
     problems, form = [*grown.problems], None
     try:
         form = model.model_validate(grown.data)
@@ -123,24 +130,24 @@ def read_form(grown: Grown, model: type[Form]) -> Form:
 
 
 _ROUNDS = 3
-"""Repairs that are tried; a repaired value may be refused for another reason."""
+"""Attempts to repair values; a repaired value may be refused for another reason."""
 
 
 def errors_between_keys(
     data: Mapping[str, object], error: ValidationError, model: type[BaseModel]
 ) -> tuple[ValidationError, frozenset[KeyPath]] | None:
-    """Return the errors that a model finds between keys once the refused values are replaced by good ones.
+    """Return the errors in combinations of keys that appear after the refused values were replaced.
 
-    pydantic checks several keys together only where each of them is right by itself. The second part of the
-    result has the paths of the replaced values, about which nothing is to be said.
+    pydantic checks several keys together only if each of them is valid. The second part of the result
+    contains the paths of the replaced values, about which no error may be reported.
 
     Args:
-        data: What the model refused.
+        data: Data that the model refused.
         error: The model's errors.
         model: The model; its validators may be foreign code.
 
     Returns:
-        None where there are no such errors, or a refused value cannot be replaced.
+        None without errors, or if a refused value cannot be replaced.
     """
     repaired, replaced = copy.deepcopy(dict(data)), set[KeyPath]()
     for _ in range(_ROUNDS):
@@ -158,7 +165,7 @@ def errors_between_keys(
             model.model_validate(repaired)
         except ValidationError as further:
             error = further
-        except Exception:  # a plug-in's validator; what it raised first is reported
+        except Exception:  # a plug-in's validator; its first error is reported
             return None
         else:
             return None
@@ -170,7 +177,7 @@ def _is_between_keys(details: ErrorDetails) -> bool:
 
 
 def _repair(data: dict[str, object], error: _Error) -> KeyPath | None:
-    """Replace a refused value by a good one, or remove it where its key has a default; return its path."""
+    """Replace a refused value by a valid one, or remove it if its key has a default; return its path."""
     at: Any = data
     path: KeyPath = ()
     *above, key = error.location or ("",)
@@ -195,7 +202,7 @@ def _has_default(error: _Error) -> bool:
 
 
 def _good_value(error: _Error) -> object:
-    """Return a value that a place takes: its bound, or the example of its quantity; None: none is known."""
+    """Return a valid value for a place: its bound, or the example of its quantity; None: not known."""
     bound = error.context.get("ge", error.context.get("le"))
     if isinstance(bound, int | float):
         units = error.units
@@ -207,20 +214,25 @@ def _good_value(error: _Error) -> object:
 
 
 def sentences_of(error: ValidationError, what: str, model: type[BaseModel], most: int) -> list[str]:
-    """Return one sentence for each of the first places that a model refused in data without a file.
+    """Return one sentence for each place that a model refused in data without a file.
 
-    `what` is what the data are called: `posvel of head has no velocities; add ...`.
+    Args:
+        error: The model's errors.
+        what: Name of the data, as in `posvel of head has no velocities; add ...`.
+        model: The model.
+        most: Most errors of pydantic to convert.
     """
     places: dict[KeyPath, Mark] = {}
     for details in error.errors(include_url=False)[:most]:
-        location = [part for part in details["loc"] if not str(part).startswith("<")]  # which of a union
+        # the step names a member of a union
+        location = [part for part in details["loc"] if not str(part).startswith("<")]
         places |= {(what, *location[:end]): Mark(what) for end in range(len(location) + 1)}
     problems = problems_of(error, Marks(what, places, places), (what,), model=model, most=most)
     return [f"{problem.what}; {problem.fix}" for problem in problems]
 
 
 class _Error:
-    """One error of pydantic, and the place in the file that it is about."""
+    """One error of pydantic, with its place in the file."""
 
     def __init__(
         self,
@@ -244,13 +256,14 @@ class _Error:
         self.at_key = of_key or self.missing or self.kind == "extra_forbidden"
         self.remedy: Remedy | None = None
         self.unindented: list[str] = []
-        """Keys of an entry that are indented like the entry's name, this one first."""
+        """Keys of an entry with the same indentation as the entry's name, this one first."""
 
     @property
     def meant(self) -> bool:
-        """False for what follows from another error: a list is not too short because its items are wrong.
+        """False if the error follows from another one.
 
-        Nor does it lack an item where one is a range: `[-90..90 deg]`.
+        A list is not too short because its items are invalid. It does not lack an item if one is a range:
+        `[-90..90 deg]`.
         """
         least = self.context.get("min_length")
         if self.missing and isinstance(self.input, list) and any(map(_is_range, self.input)):
@@ -264,17 +277,17 @@ class _Error:
 
     @property
     def name(self) -> str:
-        """The path as text: `joints.head.limits.position[1]`."""
+        """Path as text: `joints.head.limits.position[1]`."""
         return path_text(self.path)
 
     @property
     def example(self) -> str | None:
-        """The example of the key's field; None: it has none."""
+        """Example of the key's field; None: it has none."""
         return None if self.model is None else _example_at(self.model, self.location)
 
     @property
     def units(self) -> Mapping[str, float]:
-        """The units of the value's quantity, each with its size in what the field holds; empty: none."""
+        """Units of the value's quantity, each with its size in the field's unit; empty: not a quantity."""
         notes = () if self.model is None else _notes_at(self.model, self.location)
         return next((units for units in map(units_of, notes) if units), {})
 
@@ -290,7 +303,7 @@ def path_text(path: KeyPath) -> str:
 
 
 def _in_file(location: Iterable[str | int], marks: Marks, prefix: KeyPath) -> KeyPath:
-    """Return the part of pydantic's location that the file has; names of union members are not in it."""
+    """Return the part of pydantic's location that is in the file; names of union members are not."""
     path = prefix
     for step in location:
         if marks.has((*path, step)):
@@ -299,7 +312,7 @@ def _in_file(location: Iterable[str | int], marks: Marks, prefix: KeyPath) -> Ke
 
 
 def _merged(errors: list[_Error], marks: Marks) -> Problem:
-    """Return one problem of a place; the members of a union each have complained about it."""
+    """Return one problem for a place, about which each member of a union has reported an error."""
     first = errors[0]
     mark = marks.key(*first.path) if first.at_key else marks.value(*first.path)
     expected = list(
@@ -317,7 +330,7 @@ def _merged(errors: list[_Error], marks: Marks) -> Problem:
 
 
 def shown(value: object) -> str:
-    """Return a value as an error shows it."""
+    """Return a value in the notation of error messages."""
     if value is None:
         return "empty"
     if isinstance(value, dict):
@@ -376,7 +389,7 @@ _REMEDIES: Mapping[str, str] = {
 
 
 def _expected(error: _Error) -> str | None:
-    """Return what the value must be, for errors that need no other words."""
+    """Return the requirement on the value, for errors with a fixed sentence."""
     if error.kind in _BOUNDS:
         plain = {key: _bound(value, error) for key, value in error.context.items()}
         return _BOUNDS[error.kind].format(**plain)
@@ -390,7 +403,7 @@ def _bound(value: object, error: _Error) -> str:
 
 
 def _remedy(error: _Error) -> str:
-    """Return how to fix a value of a wrong type or outside its range."""
+    """Return the fix for a value of a wrong type or outside its range."""
     expected = _TYPES.get(error.kind, "")
     if expected == "a list" and isinstance(error.input, str) and (items := list_text(error.input)):
         return f"write `{error.path[-1] if error.path else 'LIST'}: {items}`"
@@ -407,7 +420,7 @@ def _remedy(error: _Error) -> str:
 
 
 def _is_key_of_entry(error: _Error) -> bool:
-    """Return whether the name of an entry that is not a mapping is a key that entries have."""
+    """Return True if the name of an entry that is not a mapping is a key of such entries."""
     if _TYPES.get(error.kind) != "a mapping" or error.model is None or not error.path:
         return False
     form = _follow(error.model, error.location)
@@ -415,7 +428,8 @@ def _is_key_of_entry(error: _Error) -> bool:
 
 
 def _indentation(error: _Error) -> str:
-    """Return how to indent what should be a mapping; empty: its indentation is right, as far as is known."""
+    """Return the fix for the indentation of a value that should be a mapping; empty: nothing is known to be
+    wrong."""
     if error.unindented:
         *others, last = error.unindented
         named = f"{', '.join(others)} and {last} are keys" if others else f"{last} is a key"
@@ -433,7 +447,7 @@ def _example(error: _Error) -> str:
 
 
 def _sentence(error: _Error) -> tuple[str, str]:
-    """Return what is wrong and how to fix it, for the kinds that need more than a value."""
+    """Return problem and fix, for the kinds of errors that are not about a value alone."""
     sentence = _SENTENCES.get(error.kind)
     return sentence(error) if sentence is not None else (f"{error.name}: {error.kind}", "correct it")
 
@@ -471,7 +485,7 @@ def _sentence_length(error: _Error) -> tuple[str, str]:
 
 
 def _sentence_own(error: _Error) -> tuple[str, str]:
-    """Return the error of a validator, of ours or of a plug-in: `what; how to fix it`."""
+    """Return the error of a validator, which may be a plug-in's: `problem; fix`."""
     if "what" in error.context and "fix" in error.context:
         what, fix = str(error.context["what"]), str(error.context["fix"])
     else:
@@ -505,7 +519,7 @@ _SENTENCES: Mapping[str, Callable[[_Error], tuple[str, str]]] = {
 
 
 def _example_at(model: type[BaseModel], location: tuple[str | int, ...]) -> str | None:
-    """Return the example of the field at pydantic's location, as it is written in the file."""
+    """Return the example of the field at pydantic's location, in the notation of a file."""
     owner = _follow(model, location[:-1]) if location else None
     info = None if owner is None else owner.model_fields.get(str(location[-1]))
     return str(info.examples[0]) if info is not None and info.examples else None
@@ -514,10 +528,10 @@ def _example_at(model: type[BaseModel], location: tuple[str | int, ...]) -> str 
 def _keys_at(
     model: type[BaseModel], location: tuple[str | int, ...]
 ) -> tuple[tuple[str, ...], Mapping[str, str]]:
-    """Return the keys that the model at a location takes, and the refused ones with a sentence each.
+    """Return the keys of the model at a location, and a sentence for each refused key.
 
-    A model may say which keys a person may expect and are not possible (`refused`), and which ones are taken
-    out of the file before the model sees it (`read_before`).
+    A model can list expected keys that are not possible (`refused`), and keys that are removed before the
+    model is validated (`read_before`).
     """
     owner = _follow(model, location)
     if owner is None:
@@ -527,13 +541,13 @@ def _keys_at(
 
 
 def _follow(model: type[BaseModel], location: tuple[str | int, ...]) -> type[BaseModel] | None:
-    """Return the model at a location; steps that name a union's member choose it."""
+    """Return the model at a location; a step that names a union's member selects it."""
     at = _without_none(_annotation_at(model, location))
     return at if isinstance(at, type) and issubclass(at, BaseModel) else None
 
 
 def _annotation_at(model: type[BaseModel], location: tuple[str | int, ...]) -> object:
-    """Return the type of the value at a location, as it is annotated."""
+    """Return the annotated type of the value at a location."""
     at: object = model
     for step in location:
         at = _inner(at, step)
@@ -541,7 +555,7 @@ def _annotation_at(model: type[BaseModel], location: tuple[str | int, ...]) -> o
 
 
 def _notes_at(model: type[BaseModel], location: tuple[str | int, ...]) -> Iterator[object]:
-    """Yield the parts of the `Annotated` type of the value at a location."""
+    """Yield the metadata of the `Annotated` type of the value at a location."""
     at = _annotation_at(model, location)
     while get_origin(at) in (Annotated, Union, UnionType):
         if get_origin(at) is Annotated:
@@ -578,7 +592,7 @@ def _without_none(at: object) -> object:
 
 
 def _names(arm: object) -> tuple[str, ...]:
-    """Return by which names pydantic calls a member of a union."""
+    """Return pydantic's names of a member of a union."""
     tags = [note.tag for note in get_args(arm) if isinstance(note, Tag)]
     plain = _without_none(arm)
     return (*tags, plain.__name__) if isinstance(plain, type) else tuple(tags)

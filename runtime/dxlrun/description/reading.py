@@ -1,4 +1,4 @@
-"""Reading: a robot file -> a frozen description, or every problem of its form at once."""
+"""Reading: converts a robot file into a frozen description, or reports all problems of its form at once."""
 
 from __future__ import annotations
 
@@ -21,26 +21,26 @@ from dxlrun.errors import InputError, Problem, told_once
 
 
 class Description(msgspec.Struct, frozen=True):
-    """A robot file whose form is right, with the place of everything in it."""
+    """A robot file of valid form, with the places of its values."""
 
     robot: Robot
     marks: Marks
     path: Path
-    text: str  # As it was read
-    arguments: dict[str, str]  # All its arguments, with the values of this run
-    included: Mapping[str, str] = {}  # The text of each file that it includes, by name
+    text: str  # text as read
+    arguments: dict[str, str]  # all arguments, with their values in this run
+    included: Mapping[str, str] = {}  # text of each included file, by name
 
     @property
     def groups(self) -> dict[str, tuple[str, ...]]:
-        """The joints of each group."""
+        """Joints of each group."""
         return {name: group.joints for name, group in self.robot.groups.items()}
 
 
 class Replacement(msgspec.Struct, frozen=True):
-    """A value that stands in for what a robot file has at a place, or puts something there."""
+    """A value that replaces a value of a robot file, or is added to it."""
 
     path: KeyPath
-    value: object  # As the file would have it: `5 rad/s^2`, 0.5, true
+    value: object  # in the notation of a file: `5 rad/s^2`, 0.5, true
 
 
 def read_robot(
@@ -49,12 +49,12 @@ def read_robot(
     """Read a robot file with the values of `name:=value`, and with some of its values replaced.
 
     Raises:
-        InputError: The file, or one that it includes, cannot be read or is not YAML. Otherwise all problems
-            of its form.
+        InputError: The file or a fragment cannot be read or is not YAML; otherwise all problems of its form.
     """
     sources = read_sources(path)
     _refuse_other_files(sources[-1])
-    declared = merged(source.declared for source in sources)  # without arguments, to learn which there are
+    # Without arguments first, to learn which arguments are declared.
+    declared = merged(source.declared for source in sources)
     run = Arguments(declared.data.get("arguments"), arguments, declared.marks)
     grown = merged(source.grown(run.fill) for source in sources)
     grown = replace(grown, problems=(*run.problems, *grown.problems))
@@ -80,11 +80,11 @@ _OTHER_FILES = {
     "motions": ("motion", "run it with `dxlrun ROBOT.yaml --play {path}`"),
     "torque_constant": ("motor", "name it in a robot file, at the joint: `motor: {path}`"),
 }
-"""Keys by which files that are no robots are known: what they are called, and where they belong."""
+"""Keys that identify other kinds of files, with the kind and the fix."""
 
 
 def _refuse_other_files(source: Source) -> None:
-    """Raise InputError for a motion or motor file: nothing in it is wrong, but it stands for a robot."""
+    """Raise InputError for a valid motion or motor file that was given in place of a robot file."""
     data, marks = source.declared.data, source.declared.marks
     if kind := kind_of_data(data, source.path):
         raise refusal(marks.value(), *kind)
@@ -97,7 +97,7 @@ def _refuse_other_files(source: Source) -> None:
 
 
 def _refuse_misplaced_sections(grown: Grown) -> None:
-    """Raise InputError for sections of another name or place: their contents stay unchecked."""
+    """Raise InputError for misnamed or misplaced sections, whose contents cannot be checked."""
     own = {key: value for key, value in grown.data.items() if key not in Robot.read_before}
     problems: dict[str, Problem] = {}
     for path, fix in misplaced_sections(robot_form(), own):
@@ -108,9 +108,9 @@ def _refuse_misplaced_sections(grown: Grown) -> None:
 
 
 def _with(grown: Grown, replacement: Replacement) -> Grown:
-    """Return a document with a value at a place; what is wrong with the value is reported there.
+    """Return a document with a value at a path; problems of the value are reported there.
 
-    A place that the file does not have has the mark of the nearest one above it.
+    A place that the file does not have gets the mark of its nearest parent.
     """
     path, marks = replacement.path, grown.marks
     data = _put(grown.data, path, replacement.value)
@@ -124,7 +124,7 @@ def _with(grown: Grown, replacement: Replacement) -> Grown:
 
 
 def _put(at: object, path: KeyPath, value: object) -> object:
-    """Return a tree with a value at a path, whose mappings are made where they are missing."""
+    """Return a tree with a value at a path; missing mappings are created."""
     if not path:
         return value
     if isinstance(at, list):
@@ -134,5 +134,5 @@ def _put(at: object, path: KeyPath, value: object) -> object:
 
 
 def _in_order(problems: Iterable[Problem]) -> list[Problem]:
-    """Return the problems as a person meets them: first what was typed, then the file from its top."""
+    """Return the problems in the order of reading: first the command line, then the file from its top."""
     return sorted(problems, key=lambda problem: (problem.mark.file != COMMAND_LINE, problem.mark))

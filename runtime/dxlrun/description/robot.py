@@ -1,4 +1,4 @@
-"""Robot: the form of a robot file; what its parts mean together is checked by `compile`."""
+"""Robot: the form of a robot file. `compile` checks its sections against each other."""
 
 from __future__ import annotations
 
@@ -48,7 +48,7 @@ def _one_or_more(value: object) -> object:
 
 
 class Scheduler(Form):
-    """What the loop asks of the operating system."""
+    """Settings of the operating system for the loop."""
 
     policy: Literal["other", "fifo", "round_robin"] = key("Scheduling policy.", "round_robin", "other")
     priority: int = key("Real-time priority; only for fifo and round_robin.", "31", 31, ge=1, le=99)
@@ -84,7 +84,7 @@ class Loop(Form):
 
 
 class PoseStep(Form):
-    """A step of a policy: to a pose."""
+    """A step of a policy that moves to a pose."""
 
     pose: str = key("Name of a pose.", "home", min_length=1)
     speed: Annotated[AngularVelocity, Field(gt=0)] = key("How fast each joint goes there.", "60 deg/s")
@@ -94,14 +94,14 @@ class PoseStep(Form):
 
 
 class TorqueStep(Form):
-    """A step of a policy: less torque, little by little."""
+    """A step of a policy that reduces the torque gradually."""
 
     reduce_torque: float = key("What is left of each servo's own torque limit.", "0.3", gt=0, lt=1)
     steps: int = key("In how many steps.", "5", 5, ge=1, le=100)
     over: Annotated[Duration, Field(gt=0)] = key("How long it takes.", "1 s", 1_000_000_000)
 
 
-Word = Literal["limp", "hold"]  # Torque off; or torque on, every joint where it is
+Word = Literal["limp", "hold"]  # torque off; or torque on, every joint holding its position
 
 
 def _kind_of_step(step: object) -> str:
@@ -127,11 +127,12 @@ WrittenPolicy = Annotated[
     | Annotated[tuple[PolicyStep, ...], Field(strict=False, min_length=1), Tag("<steps>")],
     Discriminator(_kind_of_policy),
 ]
-"""What is done, in order; after the last step the robot is limp, unless that is `hold`."""
+"""Steps of a policy, in the order of execution. After the last step the robot is limp, unless that step is
+`hold`."""
 
 
 class Group(Form):
-    """Some joints by one name; what it has beside their names is in the joints when the file was read."""
+    """Joints under one name. Its other keys have been copied into the joints when the file was read."""
 
     joints: Annotated[tuple[Name, ...], Field(strict=False, min_length=1)] = key(
         "Its joints, or other groups.", "[left_shoulder, left_elbow]"
@@ -139,7 +140,7 @@ class Group(Form):
 
 
 class GroupPolicies(Form):
-    """What a group of joints does otherwise than the rest of the robot."""
+    """Policies of a group of joints that differ from those of the robot."""
 
     joints: Annotated[tuple[Name, ...], Field(strict=False)] = key(
         "Its joints, each in one at most; where it has none: the robot's group of that name.",
@@ -150,7 +151,7 @@ class GroupPolicies(Form):
 
 
 class Policies(Form):
-    """What happens at the end of a run, and on faults."""
+    """Actions at the end of a run and on faults."""
 
     on_exit: WrittenPolicy = key(
         "At Ctrl-C, SIGTERM, `dxlrun stop` and the end of the motions.",
@@ -171,7 +172,7 @@ class Policies(Form):
     exit_timeout: Duration = key("Longest orderly end of a run.", "2 s", 2_000_000_000, gt=0)
 
     def of_joint(self, name: str, joint: str) -> object:
-        """Return the value of a key for a joint: its group's, or the robot's where the group has none."""
+        """Return the value of a key for a joint: its group's, or the robot's if the group has none."""
         groups = (group for group in self.groups.values() if joint in group.joints)
         values = (getattr(owner, name, None) for owner in (*groups, self))
         return next((value for value in values if value is not None), None)
@@ -188,7 +189,7 @@ _ONE_OR_MORE = {"anyOf": [{"type": "string"}, {"type": "array", "minItems": 1, "
 
 
 class ControllerEntry(PlugInEntry):
-    """One controller; the keys beside type, active, rate, fallback and into are its own parameters."""
+    """One controller. Keys other than type, active, rate, fallback and into are its own parameters."""
 
     type: str = key("Type that a plug-in offers.", "joint_group_position_controller", min_length=1)
     active: bool = key("Active from the start.", "false", True)
@@ -206,13 +207,13 @@ class ControllerEntry(PlugInEntry):
 
 
 class Gateway(Form):
-    """The process by which others steer the run."""
+    """The process through which clients steer the run."""
 
     enabled: bool = key("Let this user's programs steer the run.", "false", True)
 
 
 class Processes(Form):
-    """Processes beside the loop."""
+    """Processes next to the loop."""
 
     refused: ClassVar[Mapping[str, str]] = {"view": "take it out; `dxlrun view` shows a run"}
 
@@ -238,7 +239,7 @@ class RobotModel(Form):
 
 
 class Simulation(Form):
-    """How simulated servos move what they move; servos on a real port do not use it."""
+    """Physics of the simulated servos' loads; servos on a real port ignore it."""
 
     physics: Literal["independent", "mujoco"] = key(
         "Each joint by itself, or all together by MuJoCo after the model's URDF.", "mujoco", "independent"
@@ -249,13 +250,13 @@ _POLICIES = ("What happens on faults and at the end.", "{exit_timeout: 2 s}")
 
 
 class Robot(Form):
-    """A robot file, without its arguments: the sections that are not features.
+    """A robot file without its arguments: the sections that are not features.
 
-    `robot_form` adds those; `Section.of` returns one of them.
+    `robot_form` adds the sections of features; `Section.of` returns one of them.
     """
 
     read_before: ClassVar[tuple[str, ...]] = ("arguments", "include", "joint_defaults")
-    """Keys of the file that are taken out of it before the model sees it."""
+    """Keys of the file that are removed before the model is validated."""
 
     name: Name = key("Name of the robot.", "bioloid_torso")
     buses: dict[Name, Bus] = key("Serial lines by name.", "{main: {port: sim, ...}}", min_length=1)

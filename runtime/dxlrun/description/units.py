@@ -1,8 +1,9 @@
-"""Units: angles, speeds and times as a person writes them, `60 deg` or `500 us`, held in SI.
+"""Units: angles, speeds and times in the notation of a person, `60 deg` or `500 us`, converted to SI.
 
-Each quantity reads text to a number in its SI unit and is the type of a model's field as `Angle`, `Duration`
-and so on. A bare number is an error, because `60` could be deg or rad; of a `Rate` it is in Hz, and of the
-seconds of a command line in s. In JSON a quantity is written back as text that is read to the same value.
+Each quantity converts text to a number in its SI unit, and is the type of a model's field, such as `Angle` or
+`Duration`. A number without a unit is an error, because `60` could be deg or rad. Two exceptions: a bare
+`Rate` is in Hz, and bare seconds of a command line are in s. In JSON a quantity is text that is read to the
+same value.
 """
 
 from __future__ import annotations
@@ -30,7 +31,7 @@ from dxlwire.joint_unit import JointUnit
 
 
 class Measure(float):
-    """A number with the SI unit in which it is, where a quantity may be in one of several."""
+    """A number with its SI unit, for a quantity that can have one of several units."""
 
     __slots__ = ("unit",)
     unit: str
@@ -43,19 +44,26 @@ class Measure(float):
 
     @property
     def joint_unit(self) -> JointUnit:
-        """Unit of the joints that have such a quantity; raises LookupError for one that no joint has."""
+        """Unit of the joints that have this quantity; raise LookupError if no joint has it."""
         return JointUnit.find_by_quantity(self.unit)
 
 
 def plain(measure: Measure | None) -> float | None:
-    """Return the number of a measure alone, as JSON takes it."""
+    """Return a measure as a plain number, for JSON."""
     return None if measure is None else float(measure)
 
 
 class Quantity:
-    """One kind of quantities; a call reads a text to SI, and raises ValueError with an example.
+    """One kind of quantity; a call converts text to SI, and raises ValueError with an example.
 
-    `units`: each with its size in the SI unit. `bare`: a number without a unit is in the SI unit.
+    Args:
+        what: Name with its article, for messages.
+        si: SI unit.
+        units: Size of each unit in the SI unit.
+        examples: Examples for messages.
+        bare: True: a number without a unit is in the SI unit.
+        least: Lowest value.
+        most: Highest value.
     """
 
     def __init__(
@@ -88,11 +96,11 @@ class Quantity:
         return value
 
     def text(self, value: float) -> str:
-        """Return the text that is read to a value."""
+        """Return a text that is read to a value."""
         return f"{value!r} {self.si}" if self.si in self.units else f"{value * 100:.12g} %"
 
     def __get_pydantic_core_schema__(self, source: Any, handler: GetCoreSchemaHandler) -> CoreSchema:  # noqa: ANN401 (pydantic's)
-        """Return the schema of a field that has this quantity."""
+        """Return the schema of a field with this quantity."""
         written = core_schema.plain_serializer_function_ser_schema(
             self.text, return_schema=core_schema.str_schema(), when_used="json"
         )
@@ -103,13 +111,13 @@ class Quantity:
     def __get_pydantic_json_schema__(
         self, schema: CoreSchema, handler: GetJsonSchemaHandler
     ) -> dict[str, Any]:
-        """Return the schema of a file in which it is written."""
+        """Return the JSON schema of the quantity in a file."""
         text = text_schema(example_of(self), self.units)
         return {"anyOf": [handler(schema), text]} if self._bare else text
 
 
 class Either(Quantity):
-    """A quantity of one of several kinds; a call reads a text to a `Measure`."""
+    """A quantity of one of several kinds; a call converts text to a `Measure`."""
 
     def __init__(
         self, what: str, kinds: tuple[Quantity, ...], examples: str, *, above_zero: bool = False
@@ -133,12 +141,12 @@ class Either(Quantity):
         return Measure(value, self._kinds[unit].si)
 
     def text(self, value: float) -> str:
-        """Return the text that is read to a value."""
+        """Return a text that is read to a value."""
         unit = value.unit if isinstance(value, Measure) else ""
         return f"{float(value) * 100!r} %" if unit == "1" else f"{float(value)!r} {unit}"
 
     def __get_pydantic_core_schema__(self, source: Any, handler: GetCoreSchemaHandler) -> CoreSchema:  # noqa: ANN401 (pydantic's)
-        """Return the schema of a field that has one of these."""
+        """Return the schema of a field with one of the quantities."""
         return core_schema.no_info_plain_validator_function(
             self,
             serialization=core_schema.plain_serializer_function_ser_schema(
@@ -148,10 +156,10 @@ class Either(Quantity):
 
 
 class Unlimited(Either):
-    """A quantity above 0 of one of several kinds, or `inf`."""
+    """A positive quantity of one of several kinds, or `inf`."""
 
     def __call__(self, text: object) -> Measure:
-        """Return the value in SI, with its unit; an infinite one has none."""
+        """Return the value in SI with its unit; an infinite value has no unit."""
         if text == "inf" or (isinstance(text, float) and math.isinf(text) and text > 0):
             return text if isinstance(text, Measure) else Measure(math.inf, "")
         found = super().__call__(text)
@@ -160,13 +168,13 @@ class Unlimited(Either):
         return found
 
     def text(self, value: float) -> str:
-        """Return the text that is read to a value."""
+        """Return a text that is read to a value."""
         return "inf" if math.isinf(value) else super().text(value)
 
     def __get_pydantic_json_schema__(
         self, schema: CoreSchema, handler: GetJsonSchemaHandler
     ) -> dict[str, Any]:
-        """Return the schema of a file in which it is written."""
+        """Return the JSON schema of the quantity in a file."""
         text = super().__get_pydantic_json_schema__(schema, handler)
         return {"anyOf": [text, {"type": "string", "const": "inf"}]}
 
@@ -245,9 +253,9 @@ _SIZE_BYTES: Mapping[str, int] = {
 
 
 def duration(text: object, *, bare: str = "") -> int:
-    """Return a time, ns, from `500 us`, `1 ms`, `2 s` or `1 min`; raises ValueError with an example.
+    """Return a time in ns from `500 us`, `1 ms`, `2 s` or `1 min`; raise ValueError with an example.
 
-    `bare` is the unit of numbers without one.
+    `bare` is the unit of numbers without a unit.
     """
     written = "500 us, 1 ms, 2 s or 1 min"
     number, unit = split(text, "a duration", DURATION_NS, written, bare=bare)
@@ -260,8 +268,12 @@ def duration(text: object, *, bare: str = "") -> int:
 def quantity(text: str, unit: str) -> float:
     """Return a quantity in an SI unit of the control tables, from text with any unit of its kind.
 
-    `unit` is rad, rad/s, rad/s^2, s, V, A, Nm, degC or 1 (a fraction: `40 %`). Raises ValueError
-    with an example.
+    Args:
+        text: The quantity.
+        unit: rad, rad/s, rad/s^2, s, V, A, Nm, degC or 1 (a fraction: `40 %`).
+
+    Raises:
+        ValueError: The text is not a quantity of this kind; the message has an example.
     """
     return _OF_TABLES[unit](text)
 
@@ -269,7 +281,7 @@ def quantity(text: str, unit: str) -> float:
 def split(
     text: object, what: str, units: Mapping[str, object], written: str, *, bare: str = ""
 ) -> tuple[str, str]:
-    """Return number and unit of a quantity, which are right; `bare` is the unit of numbers without one."""
+    """Return number and unit of a valid quantity; `bare` is the unit of numbers without a unit."""
     if isinstance(text, int | float) and not isinstance(text, bool):
         raise refuse(f"{text} has no unit", f"write {what} with its unit, such as {written}")
     if not isinstance(text, str):
@@ -308,11 +320,12 @@ _UNIT_WORDS: Mapping[str, str] = {
     "g": "gram grams",
     "kg": "kilogram kilograms",
 }
-"""Our units, and how others write them."""
+"""Units, each with other notations for it."""
 
 
 def _meant(text: str, units: Mapping[str, object]) -> str:
-    """Return how a quantity is written that has a unit by another name, or is two; empty: it is not known."""
+    """Return the fix for a quantity with another notation of its unit, or for two quantities; empty: not
+    known."""
     if several := list_text(text):
         return f"these are two values, so write a list: {several}"
     match = re.fullmatch(r"([-+]?[0-9_.]+(?:[eE][-+]?\d+)?)\s*(\D.*)", text.strip())
@@ -327,16 +340,16 @@ def _meant(text: str, units: Mapping[str, object]) -> str:
 
 
 def _unit_for(name: str) -> str:
-    """Return our unit for a name of it; the name itself, where it is not known."""
+    """Return the unit for another notation, or the notation itself if it is not known."""
     word = name.strip().lower()
     return next((unit for unit, words in _UNIT_WORDS.items() if word in words.split()), name.strip())
 
 
 def units_of(note: object) -> Mapping[str, float]:
-    """Return the units of a field's quantity, each with its size in what the field holds; empty: none.
+    """Return the units of a field's quantity, each with its size in the field's unit; empty: not a quantity.
 
     Args:
-        note: Part of the field's `Annotated` type.
+        note: Metadata of the field's `Annotated` type.
     """
     if isinstance(note, Quantity):
         return note.units
@@ -344,19 +357,20 @@ def units_of(note: object) -> Mapping[str, float]:
 
 
 def example_of(note: object) -> str:
-    """Return how a field's quantity is written, for example; empty: it is none. `note` as in `units_of`."""
+    """Return an example of a field's quantity; empty: not a quantity. `note` as in `units_of`."""
     if isinstance(note, Quantity):
         return note.examples.split(",")[0].split(" or ")[0]
     return "1 s" if units_of(note) else ""
 
 
 def bound_text(bound: float, units: Mapping[str, float], written: object) -> str:
-    """Return a bound of a quantity in the unit of a written value: of 10_000_000 ns beside `5 ms`, `10 ms`.
+    """Return a bound in the unit of the value that exceeds it: a bound of 10_000_000 ns for `5 ms` is `10
+    ms`.
 
     Args:
-        bound: In what the field holds: SI, or ns.
+        bound: In the field's unit: SI, or ns.
         units: See `units_of`.
-        written: The value as the file has it; where it has no unit, neither has the bound.
+        written: The value in the file; without a unit the bound is returned without a unit, too.
     """
     parts = split_quantity(written) if isinstance(written, str) else None
     if parts is None or parts[1] not in units or not bound:
@@ -366,7 +380,7 @@ def bound_text(bound: float, units: Mapping[str, float], written: object) -> str
 
 def text_schema(example: str, units: Mapping[str, object]) -> dict[str, Any]:
     """Return the JSON schema of a quantity as text."""
-    # an escaped space is none of the escapes that JSON Schema allows
+    # JSON Schema does not allow an escaped space.
     names = "|".join(re.escape(unit).replace("\\ ", " ") for unit in units)
     pattern = rf"^\s*[-+]?[0-9_.]+([eE][-+]?[0-9]+)?\s*({names})\s*$"
     return {"type": "string", "pattern": pattern, "examples": [example]}
@@ -415,7 +429,7 @@ Tolerance = Annotated[float, Field(allow_inf_nan=True), tolerance]
 RestSpeed = Annotated[float, Field(allow_inf_nan=True), rest_speed]
 """rad/s or m/s, above 0, or `inf`."""
 Angles = Annotated[tuple[Angle, ...], Field(strict=False)]
-"""Several angles, rad, from `[60 deg, 1 rad]`; shape (written ones,)."""
+"""Several angles, rad, from `[60 deg, 1 rad]`; shape (angles,)."""
 
 
 def _or_word(value: object, *words: str) -> int | str:
@@ -448,7 +462,7 @@ AutoDuration = Annotated[
     PlainSerializer(_nanoseconds, return_type=str, when_used="json"),
     WithJsonSchema({"anyOf": [_DURATION_SCHEMA, {"type": "string", "const": "auto"}]}),
 ]
-"""ns as Duration, or the word `auto`."""
+"""ns, like Duration, or the word `auto`."""
 
 Polling = Annotated[
     int | Literal["auto"],
@@ -456,11 +470,11 @@ Polling = Annotated[
     PlainSerializer(lambda value: _nanoseconds(value or "off"), return_type=str, when_used="json"),
     WithJsonSchema({"anyOf": [_DURATION_SCHEMA, {"type": "string", "enum": ["auto", "off"]}]}),
 ]
-"""ns as Duration, or the word `auto`; `off` is 0."""
+"""ns, like Duration, or the word `auto`; `off` is 0."""
 
 
 def size(text: str) -> int:
-    """Return bytes from `100 MB`, `10GB` or `64 MiB`; raises ValueError with an example."""
+    """Return bytes from `100 MB`, `10GB` or `64 MiB`; raise ValueError with an example."""
     number, unit = split(text, "a size", _SIZE_BYTES, "10 GB")
     return round(Fraction(number) * _SIZE_BYTES[unit])
 
@@ -486,4 +500,4 @@ SizeOrDuration = Annotated[
     ),
     WithJsonSchema(text_schema("100 MB", {**_SIZE_BYTES, **DURATION_NS})),
 ]
-"""Bytes from `100 MB` or `64 MiB`, or ns from `10 min`; with the word that says which."""
+"""Bytes from `100 MB` or `64 MiB`, or ns from `10 min`. The first element names the unit."""

@@ -1,4 +1,4 @@
-"""YAML files of their own form: read into a model, with the place of each mistake."""
+"""YAML files with a custom form: read into a model, with the place of each mistake."""
 
 from __future__ import annotations
 
@@ -13,8 +13,8 @@ def read_yaml(path: Path, model: type[Form]) -> Form:
     """Read a YAML file into a model.
 
     Args:
-        path: The file. It takes no arguments `${NAME}` and no tags.
-        model: A `dxlrun.tooling.files.Form`, or another model of pydantic.
+        path: The file. It may have neither arguments `${NAME}` nor tags.
+        model: A `dxlrun.tooling.files.Form`, or another pydantic model.
 
     Raises:
         InputError: All problems of the file, each with its line and column.

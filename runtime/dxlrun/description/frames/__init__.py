@@ -1,4 +1,4 @@
-"""Frames: the tree of a robot's links from its URDF, and their poses for given joint positions.
+"""Frames: the tree of a robot's links from its URDF, and their poses at given joint positions.
 
-Bodies that move by forces belong in the simulation.
+Bodies that move under forces belong in the simulation.
 """

@@ -1,7 +1,7 @@
-"""The tree of a robot's frames: what moves each, and where they lie at given positions of the joints.
+"""Tree of a robot's frames: the cause of each frame's motion, and its pose at given joint positions.
 
-Frames are called as the links of the URDF, after ROS REP 105: `base_link` is the robot's own, `odom` stands
-still. Joints, and where they are, come from the URDF alone; no library is needed.
+Frames have the names of the URDF's links, after ROS REP 105: `base_link` is the robot's own frame, `odom` is
+fixed. Joints and their origins come from the URDF alone; no library is needed.
 """
 
 from __future__ import annotations
@@ -26,11 +26,11 @@ from dxlsim.geometry.transform import (
 )
 from dxlsim.geometry.urdf import SLIDING, Urdf, UrdfJoint, leader, read_urdf
 
-ODOM = "odom"  # The frame that stands still, in which an IMU measures how it is turned (ROS REP 105)
+ODOM = "odom"  # fixed frame in which an IMU measures its orientation (ROS REP 105)
 _ABOVE_ODOM = ("world", "map", ODOM)
 ORIENTATION = ("orientation.x", "orientation.y", "orientation.z", "orientation.w")
-"""States of a source that turns a body."""
-IMU_LINKS = ("{}", "{}_link", "{}_frame")  # What the link of an IMU may be called, from the IMU's name
+"""States of a source that rotates a body."""
+IMU_LINKS = ("{}", "{}_link", "{}_frame")  # possible names of an IMU's link, from the IMU's name
 
 MovedBy = Literal["root", "fixed", "servo", "mimic", "imu", "nothing"]
 _UNKNOWN: Quaternion = (math.nan, math.nan, math.nan, math.nan)
@@ -38,35 +38,44 @@ _NOTHING_KNOWN: Mapping[str, float] = MappingProxyType({})
 
 
 class FramesPlan(msgspec.Struct, frozen=True):
-    """How the frames of a robot are logged."""
+    """Settings for logging the frames of a robot."""
 
-    rate: float  # Messages of /tf in a second, Hz; no more than there are cycles. 0: none.
-    moved: tuple[str, ...] = ()  # Joints of the robot that move joints of the URDF
-    imu: str = ""  # The source whose orientation turns the body; empty: its root stands still
-    imu_link: str = ""  # The link of the URDF whose orientation that is
+    rate: float
+    """Messages of /tf per second, Hz; at most one per cycle. 0: none."""
+    moved: tuple[str, ...] = ()  # joints of the robot that move joints of the URDF
+    imu: str = ""  # source whose orientation rotates the body; empty: the root is fixed
+    imu_link: str = ""  # link of the URDF with that orientation
 
 
 class Frame(msgspec.Struct, frozen=True):
     """One frame of the tree."""
 
     name: str
-    parent: str  # Empty: it has none
-    joint: UrdfJoint | None  # Of the URDF; None: the root, or a body that its IMU turns in `odom`
-    moved_by: MovedBy  # `nothing`: a joint that could move, but has no servo: it is where it rests
+    parent: str  # empty: none
+    joint: UrdfJoint | None  # joint of the URDF; None: the root, or a body that the IMU rotates in `odom`
+    moved_by: MovedBy  # `nothing`: a movable joint without a servo, which is at rest
 
     @property
     def moves(self) -> bool:
-        """True when it does not always lie in the same place of its parent."""
+        """True if its pose in its parent can change."""
         return self.moved_by in ("servo", "mimic", "imu")
 
 
 class FrameTree:
     """Frames of a robot.
 
-    `moved` are the joints that have servos. With `imu`, the name of a source, `odom` is the frame in which it
-    measures its orientation. Its link (`imu_link`, by default one of its name) hangs from `odom`, and what
-    hangs from it turns with it; or it lies anywhere in the body, and the whole body turns in an `odom` that
-    is put above it. Raises InputError when neither fits the URDF.
+    With an IMU, `odom` is the frame in which the IMU measures its orientation. There are two cases. If the
+    IMU's link is a child of `odom`, the link rotates together with everything below it. If the link is
+    anywhere in the body, an `odom` is added above the root and the whole body rotates in it.
+
+    Args:
+        urdf: The robot's URDF.
+        moved: Joints with servos.
+        imu: Source with the IMU's orientation; empty: none.
+        imu_link: Link of the IMU; empty: a link with its name.
+
+    Raises:
+        InputError: The URDF fits neither case.
     """
 
     def __init__(self, urdf: Urdf, moved: Collection[str], imu: str = "", imu_link: str = "") -> None:
@@ -76,18 +85,18 @@ class FrameTree:
         self.imu = imu
         self.imu_link = _imu_link(urdf, imu, imu_link) if imu else ""
         self._turned = ""
-        """The frame that the IMU turns; empty: none."""
+        """Frame that the IMU rotates; empty: none."""
         frames = [Frame(urdf.root, "", None, "root")]
         frames += [Frame(joint.child, joint.parent, joint, self._mover(joint)) for joint in urdf.joints]
         if self.imu_link:
             frames = self._with_imu(urdf, frames)
         self.frames: tuple[Frame, ...] = tuple(frames)
-        """From the root downwards, each behind its parent."""
+        """All frames from the root downwards, each after its parent."""
         self._frames = {frame.name: frame for frame in frames}
 
     @classmethod
     def of(cls, urdf: str, plan: FramesPlan) -> FrameTree:
-        """Return the tree of a URDF's text as a robot moves it. Raises InputError."""
+        """Return the tree for the text of a URDF and a plan; raise InputError as the constructor does."""
         return cls(read_urdf(urdf), plan.moved, plan.imu, plan.imu_link)
 
     def _mover(self, joint: UrdfJoint) -> MovedBy:
@@ -98,7 +107,7 @@ class FrameTree:
         return "mimic" if leader(self._joints, joint, self.moved)[0].name in self.moved else "nothing"
 
     def _with_imu(self, urdf: Urdf, frames: list[Frame]) -> list[Frame]:
-        """Return the frames with the one that the IMU turns."""
+        """Return the frames with the frame that the IMU rotates."""
         for number, frame in enumerate(frames):
             if (frame.name, frame.parent, frame.moved_by) == (self.imu_link, ODOM, "fixed"):
                 self._turned = frame.name
@@ -113,9 +122,9 @@ class FrameTree:
         return [Frame(ODOM, "", None, "root"), Frame(urdf.root, ODOM, None, "imu"), *frames[1:]]
 
     def position(self, name: str, positions: Mapping[str, float]) -> float:
-        """Return where a joint of the URDF is, rad or m: as given, or as it follows another one, or at rest.
+        """Return the position of a joint of the URDF, rad or m: as given, by its mimic rule, or at rest.
 
-        It rests at 0, or where its limits do not allow that, in their middle.
+        The rest position is 0, or the middle of the limits if they exclude 0.
         """
         joint, scale, offset = leader(self._joints, self._joints[name], positions)
         known = positions.get(joint.name)
@@ -124,7 +133,7 @@ class FrameTree:
     def local(
         self, frame: Frame, positions: Mapping[str, float], orientation: Quaternion = NO_TURN
     ) -> Transform | None:
-        """Return where a frame lies in its parent; None: a position that it depends on is not known (NaN)."""
+        """Return the pose of a frame in its parent; None: a position that it needs is not known (NaN)."""
         if frame.moved_by == "root":
             return Transform()
         if frame.moved_by == "imu":
@@ -143,9 +152,9 @@ class FrameTree:
         return Transform(base.translation, product(base.rotation, turn(frame.joint.axis, position)))
 
     def orientation(self, states: Mapping[str, float | None]) -> Quaternion:
-        """Return the IMU's orientation by the states of sources, `imu/orientation.x`; NaN: there is none.
+        """Return the IMU's orientation from the states of sources, `imu/orientation.x`; NaN: not known.
 
-        A tree without an IMU has none to be turned by: no turn.
+        Without an IMU the orientation is the identity.
         """
         if not self.imu:
             return NO_TURN
@@ -164,7 +173,7 @@ class FrameTree:
         return inside and Transform(rotation=product(orientation, conjugate(inside.rotation)))
 
     def _shared(self, one: str, other: str) -> str:
-        """Return the nearest frame that has two frames below it, or is one of them."""
+        """Return the nearest common ancestor of two frames, which can be one of them."""
         above = {one}
         while parent := self._frames[one].parent:
             above.add(one := parent)
@@ -175,7 +184,7 @@ class FrameTree:
     def _below(
         self, name: str, above: str, positions: Mapping[str, float], orientation: Quaternion = NO_TURN
     ) -> Transform | None:
-        """Return where a frame lies in one above it; None: not known."""
+        """Return the pose of a frame in one of its ancestors; None: not known."""
         found = Transform()
         frame = self._frames[name]
         while frame.name != above:
@@ -193,10 +202,17 @@ class FrameTree:
         positions: Mapping[str, float] = _NOTHING_KNOWN,
         orientation: Quaternion = NO_TURN,
     ) -> Transform:
-        """Return where a frame lies in another one, by default in the root of the tree.
+        """Return the pose of a frame in another frame.
 
-        `positions`: of joints, rad or m; those that are not given rest. `orientation`: of the IMU in `odom`.
-        Raises LookupError for a frame or joint that is not there, ValueError for a number that is none.
+        Args:
+            of: The frame.
+            relative_to: The other frame; empty: the root of the tree.
+            positions: Joint positions, rad or m; other joints are at rest.
+            orientation: Orientation of the IMU in `odom`.
+
+        Raises:
+            LookupError: A frame or joint does not exist.
+            ValueError: A position is not finite.
         """
         known = [each.name for each in self.frames]
         for name in filter(None, (of, relative_to)):
@@ -208,7 +224,7 @@ class FrameTree:
                 moving = [each.name for each in self._joints.values() if each.moves]
                 raise LookupError(f"there is no joint {name} that moves; {suggestion(name, moving)}")
         ends = (of, relative_to or known[0])
-        shared = self._shared(*ends)  # what is above it does not matter
+        shared = self._shared(*ends)  # The frames above the common ancestor do not matter.
         found, base = (self._below(name, shared, positions, orientation) for name in ends)
         if found is None or base is None:
             raise ValueError("a position is not known: give a number for each joint")
@@ -216,7 +232,7 @@ class FrameTree:
 
 
 def rest(joint: UrdfJoint) -> float:
-    """Return where a joint is drawn that nothing moves: at 0, or in the middle of limits without 0."""
+    """Return the position of a joint without a servo: 0, or the middle of limits that exclude 0."""
     lower, upper = joint.limits.lower, joint.limits.upper
     if lower is None or upper is None or joint.type == "continuous" or lower <= 0.0 <= upper:
         return 0.0
@@ -224,7 +240,7 @@ def rest(joint: UrdfJoint) -> float:
 
 
 def _imu_link(urdf: Urdf, imu: str, link: str) -> str:
-    """Return the link of an IMU: the one that is named, or that is called like the IMU."""
+    """Return the link of an IMU: the given one, or one with the IMU's name."""
     if link and link not in urdf.links:
         raise _refused(f"the URDF has no link {link} for the IMU {imu}", suggestion(link, urdf.links))
     names = [link] if link else [form.format(imu) for form in IMU_LINKS]

@@ -1,4 +1,4 @@
 """Forms of joints, groups, mechanics, servos and motor files.
 
-How a joint is moved on a bus is decided in `compile/joints`.
+`compile/joints` decides how servos on a bus move a joint.
 """

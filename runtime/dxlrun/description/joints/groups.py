@@ -1,7 +1,7 @@
-"""Groups and defaults of a robot file, put into its joints before they are validated.
+"""Groups and defaults of a robot file, merged into its joints before validation.
 
-`joint_defaults` has keys that every joint gets, a group keys that its joints get; what a joint has itself
-counts. Behind that a group is a name for some joints, which stands for them wherever a file names joints.
+`joint_defaults` has keys for every joint, a group has keys for its joints; a joint's own keys take
+precedence. After that a group is only a name for its joints, which replace it wherever a file names joints.
 All values keep the places in the file where they were written.
 """
 
@@ -24,15 +24,16 @@ DEFAULTS, GROUPS, ALL = "joint_defaults", "groups", "all"
 NAMING = ("joints", "pose", "torque")
 """Keys whose list or mapping names joints; so does each entry of `poses`."""
 
-Groups = Mapping[str, tuple[str, ...]]  # The joints that the name of a group stands for
+Groups = Mapping[str, tuple[str, ...]]  # joints of each group, by its name
 NO_GROUPS: Groups = {}
 Moves = dict[KeyPath, list[KeyPath]]
-"""Where the parts of a document are put, each at as many places as it is needed."""
+"""New paths of each part of a document; a part can be copied to several places."""
 _Value = TypeVar("_Value")
 
 
 def with_groups(grown: Grown) -> Grown:
-    """Return a robot file with plain joints, which its groups have as names and all else names itself."""
+    """Return a robot file with complete joints; groups keep only their names, and joints replace them
+    elsewhere."""
     data = grown.data
     if DEFAULTS not in data and GROUPS not in data:
         return grown
@@ -45,9 +46,9 @@ def with_groups(grown: Grown) -> Grown:
 
 
 def put_in(grown: Grown, groups: Groups) -> Grown:
-    """Return a document in which joints stand instead of the groups that it names.
+    """Return a document with joints in place of the groups that it names.
 
-    In a mapping a joint that is named by itself keeps its own value; one of two groups is a problem.
+    In a mapping, a joint that is named directly keeps its own value; a joint in two groups is a problem.
     """
     places = _Places(grown.marks, groups)
     data = places.value(grown.data, ())
@@ -56,12 +57,12 @@ def put_in(grown: Grown, groups: Groups) -> Grown:
 
 
 def without_groups(data: dict[str, object], groups: Groups) -> dict[str, object]:
-    """Return what did not come from a file with joints instead of groups."""
+    """Return data that did not come from a file, with joints in place of groups."""
     return put_in(Grown(data, Marks("", {}, {}), (), frozenset()), groups).data
 
 
 class _Places:
-    """Finds where a document names groups; `moves` are the values that change their places by that."""
+    """Finds the groups that a document names; `moves` are the values whose paths change."""
 
     def __init__(self, marks: Marks, groups: Groups) -> None:
         self._marks = marks
@@ -70,7 +71,7 @@ class _Places:
         self.problems: list[Problem] = []
 
     def value(self, value: object, path: KeyPath) -> object:
-        """Return a part of the document, with joints."""
+        """Return a part of the document with joints in place of groups."""
         naming = bool(path) and (path[-1] in NAMING or path[-2:-1] == ("poses",))
         if isinstance(value, dict):
             if naming and not self._groups.keys().isdisjoint(value):
@@ -107,7 +108,7 @@ class _Places:
 
 
 def _groups(data: Mapping[str, object]) -> dict[str, tuple[str, ...]]:
-    """Return the joints of each group, as far as its form is right."""
+    """Return the joints of each group; entries of a wrong form are skipped."""
     joints, entries = _mapping(data.get("joints")), _named(data)
     return {
         name: tuple(dict.fromkeys(one for one in _members(entries, name) if one in joints))
@@ -116,13 +117,13 @@ def _groups(data: Mapping[str, object]) -> dict[str, tuple[str, ...]]:
 
 
 def _named(data: Mapping[str, object]) -> dict[str, object]:
-    """Return the groups whose names mean nothing else."""
+    """Return the groups whose names have no other meaning."""
     joints = _mapping(data.get("joints"))
     return {name: one for name, one in _mapping(data.get(GROUPS)).items() if name not in (*joints, ALL)}
 
 
 def _members(entries: Mapping[str, object], name: str, above: tuple[str, ...] = ()) -> Iterator[str]:
-    """Yield the names in a group and in the groups that it names; a circle is left where it closes."""
+    """Yield the names in a group and in its groups; a cycle ends where it closes."""
     for _, one in _written(entries, name):
         if one not in entries:
             yield one
@@ -131,7 +132,7 @@ def _members(entries: Mapping[str, object], name: str, above: tuple[str, ...] = 
 
 
 def _written(entries: Mapping[str, object], name: str) -> Iterator[tuple[int, str]]:
-    """Yield the names in a group's own list, with their places in it."""
+    """Yield the names in a group's own list, with their indices."""
     names = _mapping(entries.get(name)).get("joints")
     for index, one in enumerate(names if isinstance(names, list) else ()):
         if isinstance(one, str):
@@ -143,7 +144,7 @@ def _mapping(value: object) -> dict[str, object]:
 
 
 def _mistakes(grown: Grown) -> Iterator[Problem]:
-    """Yield what is wrong with names in groups; the form of a group is the model's."""
+    """Yield problems of names in groups; the model checks the form of a group."""
     joints, entries = _mapping(grown.data.get("joints")), _named(grown.data)
     if not isinstance(defaults := grown.data.get(DEFAULTS, {}), dict):
         what = f"{DEFAULTS} is {shown(defaults)}, but must be a mapping"
@@ -169,7 +170,7 @@ def _mistakes(grown: Grown) -> Iterator[Problem]:
 
 
 def _circle(entries: Mapping[str, object], way: tuple[str, ...]) -> tuple[str, ...]:
-    """Return a way through groups back to its first one; only that of a circle which is first in the file."""
+    """Return a cycle of groups, reported only for the group in it that is first in the file; empty: none."""
     first, last = way[0], way[-1]
     if last == first:
         return way if first == min(way, key=list(entries).index) else ()
@@ -180,7 +181,7 @@ def _circle(entries: Mapping[str, object], way: tuple[str, ...]) -> tuple[str, .
 
 
 def _layer(grown: Grown, source: KeyPath, joints: tuple[str, ...], groups: Groups) -> Grown:
-    """Return a document of joints that have what stands at a place of another one."""
+    """Return a document of joints with the keys at a path of another document."""
     at: object = grown.data
     for step in source:
         at = _mapping(at).get(str(step))
@@ -203,7 +204,7 @@ def _layer(grown: Grown, source: KeyPath, joints: tuple[str, ...], groups: Group
 
 
 def _disagreements(grown: Grown, groups: Groups, layers: list[Grown]) -> Iterator[Problem]:
-    """Yield values that two groups give a joint which has none itself."""
+    """Yield problems of joints that get different values from two groups and have none themselves."""
     own = {path for path, _ in _leaves(_mapping(grown.data.get("joints")))}
     before: dict[KeyPath, tuple[str, object]] = {}
     for name, layer in zip(groups, layers, strict=True):
@@ -225,7 +226,7 @@ def _leaves(value: dict[str, object], path: KeyPath = ()) -> Iterator[tuple[KeyP
 
 
 def _without_defaults(grown: Grown, groups: Groups) -> Grown:
-    """Return a document whose groups are left as names: of joints, where their form is right."""
+    """Return a document without `joint_defaults`, whose groups have only the names of their joints."""
     data = {key: value for key, value in grown.data.items() if key != DEFAULTS}
     policies = _mapping(data.get("policies"))
     if any(name in groups for name in _mapping(policies.get(GROUPS))):
@@ -244,7 +245,7 @@ def _without_defaults(grown: Grown, groups: Groups) -> Grown:
 
 
 def moved(grown: Grown, moves: Moves, *, others: bool = True) -> Grown:
-    """Return a document whose marks are moved as its parts are, with or without those of other parts."""
+    """Return a document whose marks follow its moved parts; `others`: keep the marks of other parts."""
 
     def placed(table: Mapping[KeyPath, _Value]) -> dict[KeyPath, _Value]:
         found: dict[KeyPath, _Value] = {}

@@ -1,6 +1,6 @@
-"""Joints of a robot file: their forms, told apart by their keys, and what simulated servos move.
+"""Joints of a robot file: forms that are selected by their keys, and the simulated loads.
 
-How one or several servos move a joint is in `mechanics`.
+`mechanics` describes how one or several servos move a joint.
 """
 
 from __future__ import annotations
@@ -46,11 +46,11 @@ from dxlwire.joint_unit import LINEAR, ROTARY, JointUnit
 
 F = TypeVar("F", bound=Form)
 LONGEST_RESPONSE_DELAY_NS, LONGEST_WRITE_TIME_NS = 1_000_000_000, 100_000_000
-"""Of simulated servos; real ones are quicker by far."""
+"""Upper bounds for simulated servos; real servos are much faster."""
 
 
 def _on_or_off(value: object) -> object:
-    """Return true or false for the words on and off, which YAML 1.2 takes for texts."""
+    """Return a bool for the words on and off, which are text in YAML 1.2."""
     if isinstance(value, bool):
         return value
     if value not in ("on", "off"):
@@ -66,7 +66,7 @@ OnOff = Annotated[
 
 
 class JointSimulation(Form):
-    """What simulated servos move, at their joint, and how slow they are; real servos do not use it."""
+    """Load and delays of the simulated servos of a joint; real servos ignore it."""
 
     response_delay: Annotated[Duration, Field(le=LONGEST_RESPONSE_DELAY_NS)] = key(
         "Time between an instruction to the servo and its effect on the motor.", "20 ms", 0
@@ -98,7 +98,7 @@ class JointSimulation(Form):
 
 
 class BareJoint(Form):
-    """What every joint has; the servos of a joint with nothing else are in another section."""
+    """Keys that every joint has. A joint with only these keys has its servos in another section."""
 
     continuous: bool = key("A wheel, or a joint of many turns; it needs no position limits.", "true", False)
     torque: OnOff = key("off: it is limp from the start, until `dxlrun torque on`.", "off", True)
@@ -127,9 +127,9 @@ class BareJoint(Form):
 
 
 class ServoJoint(BareJoint):
-    """A joint with a servo of its own, or several: q = direction * (theta - reference) * ratio of each.
+    """A joint with one or several servos, for each of which q = direction * (theta - reference) * ratio.
 
-    One with `travel_per_turn` is linear, and its positions are lengths.
+    A joint with `travel_per_turn` is linear: its positions are lengths.
     """
 
     bus: str = key("Name of its bus.", "main")
@@ -148,12 +148,12 @@ class ServoJoint(BareJoint):
 
     @property
     def unit(self) -> JointUnit:
-        """Unit of its positions: lengths with `travel_per_turn`, angles without."""
+        """Unit of the joint's positions: lengths with `travel_per_turn`, angles without."""
         return ROTARY if self.travel_per_turn is None else LINEAR
 
     @property
     def ratio(self) -> float:
-        """What it moves while a servo turns by 1 rad, rad or m."""
+        """Travel of the joint while a servo turns by 1 rad, rad or m."""
         return 1.0 / self.gear_ratio if self.travel_per_turn is None else self.travel_per_turn / math.tau
 
 
@@ -177,28 +177,28 @@ class SharedJoint(ServoJoint):
 
 
 JointEntry: TypeAlias = Joint | SharedJoint | BareJoint
-"""A joint as the robot file has it."""
+"""A joint of the robot file."""
 
 
 def _keys_of_a_servo() -> frozenset[str]:
-    """Return the keys of a joint with a servo of its own; without any, its servos are in another section."""
+    """Return the keys that show that a joint has its own servo."""
     own = Joint.model_fields.keys() - BareJoint.model_fields.keys()
     return frozenset(own | {key.name for key in servo_keys()})
 
 
 def keys_of_servos() -> frozenset[str]:
-    """Return the keys that a joint without a servo of its own does not have."""
+    """Return the keys that a joint without its own servo does not have."""
     return _keys_of_a_servo() | SharedJoint.model_fields.keys() - BareJoint.model_fields.keys()
 
 
 def joint_conditions() -> tuple[tuple[str, dict[str, object]], ...]:
-    """Return the forms by their keys, as JSON Schemas: the first that fits, else any form."""
+    """Return the forms of joints with the JSON Schema of their keys; the first match counts."""
     own = [{"required": [key]} for key in sorted(_keys_of_a_servo())]
     return (("SharedJoint", {"required": ["servos"]}), ("Joint", {"anyOf": own}))
 
 
 def kind_of_joint(joint: object) -> str:
-    """Return which of the forms of a joint an entry has, by the keys that only one of them has."""
+    """Return the form of a joint entry, by the keys that only one form has."""
     if isinstance(joint, dict):
         if "servos" in joint:
             return "<several servos>"
@@ -224,13 +224,13 @@ def servo_keys() -> list[ServoKey[object]]:
 
 
 def servo_values(servo: Form, joint: Form | None = None) -> dict[str, object]:
-    """Return the keys of features that a servo has, or its joint for it."""
+    """Return the features' keys of a servo; a missing value is taken from its joint."""
     found = {key.name: getattr(servo, key.name) for key in servo_keys()}
     return {name: getattr(joint, name) if value is None else value for name, value in found.items()}
 
 
 def section_servo(form: type[F]) -> type[F]:
-    """Return the form of a servo in the section of a feature, with the keys of other features."""
+    """Return the form of a servo in a feature's section, with the keys of other features."""
     return with_keys(form, [replace(key, field=key.of_section) for key in servo_keys()])
 
 
@@ -255,13 +255,13 @@ def joint_form() -> object:
 
 
 def planned_keys(joint: BareJoint) -> dict[str, object]:
-    """Return the keys of features that the file gives a joint, as a plan has them."""
+    """Return the features' keys that the file sets for a joint, as in a plan."""
     given = {key.name: getattr(joint, key.name) for key in joint_keys() if key.name in joint.model_fields_set}
     return {name: _planned(value) for name, value in given.items() if value is not None}
 
 
 def _planned(value: object) -> object:
-    """Return a value as JSON has it; a quantity is a number in its SI unit."""
+    """Return a value for JSON; a quantity becomes a number in its SI unit."""
     if isinstance(value, Form):
         return {name: _planned(getattr(value, name)) for name in type(value).model_fields}
     if isinstance(value, dict):
@@ -282,9 +282,9 @@ _MEASURES: Mapping[KeyPath, tuple[Either, Mapping[JointUnit, str]]] = {
     ("tolerance", "position"): (position, {ROTARY: "2 deg", LINEAR: "2 mm"}),
     ("tolerance", "velocity"): (speed, {ROTARY: "2 deg/s", LINEAR: "2 mm/s"}),
 }
-"""Keys whose unit goes with the joint: how they are written where it turns, and where it is linear.
+"""Keys whose unit depends on the kind of joint, with an example for rotary and for linear joints.
 
-Features have others, see `JointKey.examples`.
+Features have further keys, see `JointKey.examples`.
 """
 _OF_OTHER_JOINTS: Mapping[JointUnit, Mapping[KeyPath, str]] = {
     ROTARY: {("simulation", "mass"): "write `inertia: 0.01 kg m^2`"},
@@ -298,9 +298,9 @@ _OF_OTHER_JOINTS: Mapping[JointUnit, Mapping[KeyPath, str]] = {
 
 
 def misfits(joints: object) -> Iterator[tuple[KeyPath, str, str]]:
-    """Yield what is of another kind of joint: path, problem, and fix.
+    """Yield keys and units that belong to another kind of joint: path, problem, and fix.
 
-    `joints` as the file has them; what is wrong with their form is for the model.
+    `joints` is the section of the file; the model checks its form.
     """
     measures = {**_MEASURES}
     measures |= {(key.name,): (kind, key.examples) for key in joint_keys() for kind in _kinds_of(key)}
@@ -318,10 +318,7 @@ def misfits(joints: object) -> Iterator[tuple[KeyPath, str, str]]:
 
 
 def units_of_key(key: JointKey[object]) -> dict[JointUnit, str]:
-    """Return the SI unit of a key's values for each kind of joint; empty where it does not depend on that.
-
-    It is empty for a list of quantities, too.
-    """
+    """Return the SI unit of a key's values for each kind of joint; empty if all joints have the same unit."""
     found: dict[JointUnit, str] = {}
     for kind in _kinds_of(key):
         for unit, example in key.examples.items():
@@ -331,7 +328,7 @@ def units_of_key(key: JointKey[object]) -> dict[JointUnit, str]:
 
 
 def _kinds_of(key: JointKey[object]) -> list[Either]:
-    """Return the quantity of a key whose unit goes with the joint, else nothing."""
+    """Return the quantity of a key whose unit depends on the kind of joint; otherwise an empty list."""
     return [*_quantities(key.form)] if key.examples else []
 
 
@@ -351,7 +348,8 @@ def _written(entry: object, path: KeyPath) -> object:
 
 
 def _units(kind: Either, value: object) -> Iterator[tuple[KeyPath, str]]:
-    """Yield the SI units of a value, or of those in a list with their places, as far as they can be read."""
+    """Yield the SI units of a value, or of the values in a list with their indices; unreadable values are
+    skipped."""
     places: list[tuple[KeyPath, object]] = [((), value)]
     if isinstance(value, list):
         places = [((index,), one) for index, one in enumerate(value)]

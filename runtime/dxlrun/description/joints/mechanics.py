@@ -1,7 +1,7 @@
 """Mechanics: limits and tolerances of a joint, and the keys of its servos.
 
-A servo's shaft turns by theta; s = direction * (theta - reference) * ratio is what it does at the joint. A
-joint of one servo is q = s, of several servos the mean of theirs.
+A servo's shaft turns by theta; s = direction * (theta - reference) * ratio is the resulting motion at the
+joint. The position of a joint is q = s with one servo, and the mean of all s with several servos.
 """
 
 from __future__ import annotations
@@ -35,12 +35,12 @@ from dxlrun.description.units import (
 from dxlwire.joint_unit import LINEAR, ROTARY, JointUnit
 
 LEAST_RATIO, MOST_RATIO = 0.01, 10_000.0
-"""Servo turns a joint turn; beyond them is a mistake: a tick would be 9 deg of the joint, or 30 nrad. [i]"""
-LEAST_TRAVEL_M, MOST_TRAVEL_M = 1e-5, 10.0  # Travel a servo turn; as above
+"""Servo turns per joint turn [i]; others are mistakes: a tick would be 9 deg or 30 nrad of the joint."""
+LEAST_TRAVEL_M, MOST_TRAVEL_M = 1e-5, 10.0  # travel per servo turn; values beyond are mistakes
 SERVO_TOLERANCES: Mapping[JointUnit, float] = {ROTARY: math.radians(3.0), LINEAR: 1e-3}
-"""By which the servos of one joint may disagree if the file gives nothing: backlash, a loaded gear. [i]"""
+"""Default tolerance between the servos of one joint: backlash and the elasticity of a loaded gear. [i]"""
 
-MotorFile = Annotated[str, Field(min_length=1)]  # Name of a motor file, as `dxlrun identify` writes it
+MotorFile = Annotated[str, Field(min_length=1)]  # name of a motor file from `dxlrun identify`
 _MOST_TOLERANCES: Mapping[JointUnit, float] = {ROTARY: math.radians(20.0), LINEAR: math.inf}
 """Servos that are further apart pull against each other, whatever they hold. [i]"""
 
@@ -55,11 +55,11 @@ def _useful(value: Measure) -> Measure:
 
 
 Tolerance = Annotated[Position, Field(gt=0), AfterValidator(_useful)]
-"""By how much servos of one joint may disagree, rad or m."""
+"""Largest difference between the servos of one joint, rad or m."""
 
 
 class GoalTolerance(Form):
-    """How near its goal a joint must come, and how slow, to have reached it."""
+    """Largest distance from the goal, and highest speed, of a joint that has reached its goal."""
 
     alone: ClassVar[str] = "position"
     """Key that a bare value sets."""
@@ -76,14 +76,14 @@ class GoalTolerance(Form):
     @model_validator(mode="before")
     @classmethod
     def _from_one_value(cls, data: object) -> object:
-        """Accept one value alone."""
+        """Accept a single value."""
         return {cls.alone: data} if isinstance(data, str | int | float) else data
 
     @classmethod
     def __get_pydantic_json_schema__(
         cls, core_schema: CoreSchema, handler: GetJsonSchemaHandler
     ) -> dict[str, Any]:
-        """Return the schema of a mapping, or of one value alone."""
+        """Return the schema of a mapping or of a single value."""
         mapping = dict(handler.resolve_ref_schema(handler(core_schema)))
         values = [one for one in mapping["properties"][cls.alone]["anyOf"] if one != {"type": "null"}]
         return mapping | {"anyOf": [{"type": mapping.pop("type")}, *values]}
@@ -101,7 +101,7 @@ class SharedTolerance(GoalTolerance):
 
 
 def _whole(value: object) -> object:
-    # True and 1.0 are equal to 1 in Python, but not what a person means by a direction
+    # True and 1.0 equal 1 in Python, but are not meant as a direction.
     if isinstance(value, bool | float):
         raise refuse("a direction is 1 or -1", "write 1 when the angle grows as the servo's does, else -1")
     return value
@@ -120,7 +120,7 @@ TravelPerTurn = Annotated[Length, Field(ge=LEAST_TRAVEL_M, le=MOST_TRAVEL_M)]
 
 
 class Limits(Form):
-    """Where a joint may go, and how fast; the last gate before the bus holds it there."""
+    """Limits of a joint's position, velocity, acceleration and effort; enforced last before the bus."""
 
     position: Annotated[tuple[Position, Position], Field(strict=False), AfterValidator(_ordered)] | None = (
         key(
@@ -141,11 +141,11 @@ class Limits(Form):
 
 
 class ServoEntry(Form):
-    """A servo that does not have a joint of its own; it has some of the keys of a joint."""
+    """A servo without a joint of its own; it has some of the keys of a joint."""
 
 
 class OneOfServos(ServoEntry):
-    """One of several servos on a joint; what it does not have is the joint's."""
+    """One of several servos on a joint; the joint supplies the missing keys."""
 
     id: ServoId = key("ID of the servo.", "2")
     bus: str | None = key("Name of its bus; none: the joint's.", "legs", None)

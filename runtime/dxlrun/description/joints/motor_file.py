@@ -1,4 +1,4 @@
-"""Motor file: what `dxlrun identify` writes and a joint's `motor` names; its form, reading and writing."""
+"""Motor file: written by `dxlrun identify` and named by a joint's `motor`; its form, reader and writer."""
 
 from __future__ import annotations
 
@@ -29,7 +29,7 @@ from dxlrun.errors import Mark
 from dxlsim.motor_model import MotorModel
 
 _ESSENTIAL = ("voltage", "torque_constant", "resistance", "inertia")
-"""Keys without any of which a file is something else."""
+"""Keys of every motor file; a file with none of them is something else."""
 
 
 _LONGEST_DELAY_NS = 100_000_000
@@ -52,7 +52,7 @@ class StribeckForm(Form):
 
 
 class LoadForm(Form):
-    """What the motor moves."""
+    """Load that the motor moves."""
 
     inertia: Annotated[Inertia, Field(ge=0)] = key(
         "Moment of inertia beside the motor's own.", "0.01 kg m^2", 0.0
@@ -78,7 +78,7 @@ _UNCERTAIN: Mapping[str, tuple[object, str]] = {
     "load_gravity": (Torque, "0.01 Nm"),
     "load_gravity_angle": (Angle, "2 deg"),
 }
-"""Figures whose uncertainty a file may have, with what they are and an example."""
+"""Figures that can have an uncertainty, with their quantity and an example."""
 UncertaintyForm = create_model(  # type: ignore[call-overload]  # fields by a table
     "UncertaintyForm",
     __base__=Form,
@@ -138,24 +138,24 @@ class MotorForm(Form):
     )
 
     def motor(self) -> MotorModel:
-        """Return its figures."""
+        """Return the motor model."""
         figures = self.model_dump(exclude={"delay", "uncertainty"})
         return msgspec.convert(figures | {"delay_ns": self.delay}, MotorModel)
 
 
 class MotorDescription(msgspec.Struct, frozen=True):
-    """A motor file whose form is right, with the place of everything in it."""
+    """A motor file of valid form, with the places of its values."""
 
     motor: MotorModel
     marks: Marks
     path: Path
-    text: str  # As it was read
+    text: str  # text as read
     uncertainty: Mapping[str, float] = {}
-    """Half-widths of the 95 % confidence intervals, SI (the delay's in s), by the names of its form."""
+    """Half-widths of the 95 % confidence intervals, SI (the delay's in s), by key."""
 
 
 def read_motor(path: Path) -> MotorDescription:
-    """Read a motor file; raises InputError with all problems of its form."""
+    """Read a motor file; raise InputError with all problems of its form."""
     file, text = str(path), read_text(path)
     grown = grow(parse(text, file), file, refuse_arguments)
     if not any(key in grown.data for key in _ESSENTIAL):
@@ -189,7 +189,10 @@ _UNITS: Mapping[str, str] = {
 def motor_text(motor: MotorModel, uncertainty: Mapping[str, float], *, comment: str = "") -> str:
     """Return the text of a motor file, which `read_motor` reads to the same figures up to rounding.
 
-    `uncertainty` as in `MotorDescription`; the lines of `comment` come first. Figures have six digits.
+    Args:
+        motor: The motor model; figures are written with six digits.
+        uncertainty: As in `MotorDescription`.
+        comment: Lines of a comment at the top.
     """
     return "\n".join(
         [*(f"# {line}".rstrip() for line in comment.splitlines()), *_lines(motor, uncertainty), ""]

@@ -1,4 +1,4 @@
-"""Servo: what the e-Manual and the control table say of a joint's servo, beyond what a cycle reads."""
+"""Servo: figures of a joint's servo from the e-Manual and the control table."""
 
 from __future__ import annotations
 
@@ -8,15 +8,16 @@ from dxlwire.modes import EffortUnit
 
 
 class ServoModel(msgspec.Struct, frozen=True):
-    """A joint's servo by its manual, as felt at the joint; a figure that is not known is None."""
+    """Figures of a joint's servo from its manual, at the joint; None: not known."""
 
     model: str
-    label: str  # ID and bus, as sentences name it
+    label: str  # ID and bus, for messages
     effort_unit: EffortUnit
-    """Of the effort that it measures; `1`: a part of its highest load, which is the motor's output"""
+    """Unit of the measured effort; `1`: a fraction of the highest load, which is the motor's output."""
     stall_torque: float | None = None  # Nm at `voltage`
     stall_current: float | None = None  # A at `voltage`
-    voltage: float | None = None  # V for which the manual gives its figures
+    voltage: float | None = None  # V; supply for which the manual gives the figures
     no_load_speed: float | None = None  # rad/s at `voltage`
     temperature_limit: float | None = None
-    """degrees C beyond which it cuts its torque: that of the robot file's `registers`, else as shipped"""
+    """degrees C; above it the servo cuts its torque. From the robot file's `registers`, else the factory's
+    value."""

@@ -1,4 +1,4 @@
-"""Turns of continuous joints to which a turn more is the same place."""
+"""Turns of continuous joints with `wrap`, for which a full turn leads to the same position."""
 
 from __future__ import annotations
 
@@ -15,6 +15,6 @@ Positions = TypeVar("Positions", "float", "NDArray[np.float64]")
 def nearest_turn(position: Positions, near: Positions) -> Positions:
     """Return the equivalent of a position that is at most half a turn from `near`, rad.
 
-    NaN where one of the two is. A position that is near enough is returned as it is.
+    NaN if either of them is NaN. A position within half a turn is returned unchanged.
     """
     return position - math.tau * ((position - near + math.pi) // math.tau)

@@ -1,4 +1,4 @@
-"""Mistakes of newcomers: words of other systems, files of other programs, brackets that are not closed.
+"""Mistakes of newcomers: terms of other systems, files of other programs, unclosed brackets.
 
-Each module only recognizes and explains. What is valid is decided by the forms.
+The modules only recognize and explain mistakes. The forms decide what is valid.
 """

@@ -1,4 +1,4 @@
-"""Files of other programs: how they are recognized, what they are called, and what to run or read instead."""
+"""Files of other programs: how to recognize them, their names, and what to use instead."""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ from pathlib import Path
 from dxlrun.description.form import folded
 
 Kind = tuple[str, str]
-"""`this is ...`, and the way out."""
+"""`this is ...`, and the fix."""
 
 _DRAFT = "`dxlrun scan PORT --output robot.yaml` writes a first robot file of the servos at a port"
 _ROSBAGS = (
@@ -64,17 +64,17 @@ _TEXTS: tuple[tuple[re.Pattern[str], Kind], ...] = (
 
 
 def kind_of_bytes(data: bytes, path: Path) -> Kind | None:
-    """Return what a file is whose first bytes are of another format; None: of none."""
+    """Return the kind of a file by its first bytes; None: not a known binary format."""
     return next((_filled(kind, path) for magic, kind in _MAGIC.items() if data.startswith(magic)), None)
 
 
 def kind_of_text(text: str, path: Path) -> Kind | None:
-    """Return what a text is that is not YAML, or not meant as such; None: it is not known."""
+    """Return the kind of a text that is not a YAML file of dxlrun; None: not known."""
     return next((_filled(kind, path) for pattern, kind in _TEXTS if pattern.match(text)), None)
 
 
 def kind_of_data(data: Mapping[str, object], path: Path) -> Kind | None:
-    """Return which other program a YAML or JSON file is for; None: it is not known."""
+    """Return the kind of a YAML or JSON file of another program; None: not known."""
     kind = next(_kinds(data), None)
     return None if kind is None else _filled(kind, path)
 
@@ -129,7 +129,7 @@ def _is_calibration(value: Mapping[str, object]) -> bool:
 
 
 def _lerobot(data: Mapping[str, object]) -> str | None:
-    """Return the way out of a configuration of LeRobot; None: it is none."""
+    """Return the fix for a configuration of LeRobot; None: it is something else."""
     parts = [data.get(key) for key in ("robot", "teleop", "follower", "leader")]
     if "buses" not in data and "joints" not in data:
         parts.append(data)
@@ -154,17 +154,18 @@ _ROS_TYPES: Mapping[str, str] = {
     "joint_velocity_controller": "joint_group_velocity_controller",
     "joint_effort_controller": "joint_group_effort_controller",
 }
-"""Types of ros2_control and ros_control with another name than ours; theirs are written as ours are."""
+"""Types of ros2_control and ros_control whose names differ from dxlrun's, and dxlrun's names."""
 
 
 def ros_type(type_name: str, known: Collection[str]) -> tuple[str, str, str] | None:
-    """Return what is wrong with a controller type of ROS, how to fix it, and ours in its place (empty: none).
-
-    None: it is not such a type.
+    """Return problem, fix and dxlrun's type for a controller type of ROS.
 
     Args:
         type_name: As written: `position_controllers/JointGroupPositionController`.
-        known: Our types.
+        known: Types of dxlrun.
+
+    Returns:
+        None if it is not a type of ROS. The third text is empty if dxlrun has no such type.
     """
     match = _ROS_TYPE.fullmatch(type_name)
     if match is None:

@@ -1,4 +1,4 @@
-"""Forms: which keys and entries a document may have, and where, read from its pydantic models."""
+"""Forms: the keys and entries that a document can have, and their places, read from its pydantic models."""
 
 from __future__ import annotations
 
@@ -13,12 +13,12 @@ from dxlrun.description.form import PlugInEntry
 from dxlrun.errors import near
 
 Place = tuple[str, ...]
-"""A key below a form: `("limits", "position")`; NAME stands for the name of an entry."""
+"""Path of a key below a form: `("limits", "position")`; NAME stands for the name of an entry."""
 NAME = "NAME"
 
 
 def example_at(form: type[BaseModel], place: Place) -> str:
-    """Return how a key's value is written, for example; empty: it has no example."""
+    """Return an example of a key's value; empty: it has none."""
     *above, key = place
     for step in above:
         form = next(_forms(_annotation(form, step)), form)
@@ -27,7 +27,7 @@ def example_at(form: type[BaseModel], place: Place) -> str:
 
 
 def places_of(root: type[BaseModel], key: str, value: object) -> list[Place]:
-    """Return the places of a document where a key may have a value."""
+    """Return the places of a document where a key can have a value."""
     return [
         place for place, annotation in _all_places(root) if place[-1] == key and _takes(annotation, value)
     ]
@@ -39,7 +39,7 @@ def keys_of(root: type[BaseModel]) -> set[str]:
 
 
 def section_of(root: type[BaseModel], value: object) -> str:
-    """Return the section whose entries have the keys of a mapping; empty: it is not an entry of any."""
+    """Return the section whose entries have the keys of a mapping; empty: no section matches."""
     best, most = "", 1
     if not isinstance(value, dict):
         return best
@@ -47,7 +47,7 @@ def section_of(root: type[BaseModel], value: object) -> str:
         for form in _forms(entries_of(root, name)):
             fields = form.model_fields.keys() - {"parameters"}
             own = [key for key in value if key in fields or len(near(key, fields)) == 1]
-            free = issubclass(form, PlugInEntry)  # it takes any other keys, and has a type
+            free = issubclass(form, PlugInEntry)  # it accepts any other key, and has a type
             score = len(own) + 2 * ("type" in own) if free else 2 * len(own) - len(value)
             if score > most:
                 best, most = name, score
@@ -55,12 +55,12 @@ def section_of(root: type[BaseModel], value: object) -> str:
 
 
 def entries_of(form: type[BaseModel], key: str) -> object:
-    """Return the type of the entries of a key whose value is a mapping by names; None: it has none."""
+    """Return the type of the entries of a key whose value is a mapping by names; None: it has no entries."""
     return _entries(_annotation(form, key))
 
 
 def may_be_entry(root: type[BaseModel], section: str, value: object) -> bool:
-    """Return whether a value may be an entry of a section, by any name; True where that has no forms."""
+    """Return True if a value can be an entry of a section under any name, or if the section has no forms."""
     forms = list(_forms(entries_of(root, section)))
     if not forms or not isinstance(value, dict):
         return True
@@ -86,7 +86,7 @@ def _entries(annotation: object) -> object:
 
 
 def _forms(annotation: object) -> Iterator[type[BaseModel]]:
-    """Yield the forms that a value may have; those of the items of a list or mapping are not its own."""
+    """Yield the possible forms of a value, without the forms of items of a list or mapping."""
     if isinstance(annotation, type) and issubclass(annotation, BaseModel):
         yield annotation
     elif get_origin(annotation) is Annotated:
@@ -98,7 +98,7 @@ def _forms(annotation: object) -> Iterator[type[BaseModel]]:
 
 @cache
 def _all_places(root: type[BaseModel]) -> tuple[tuple[Place, object], ...]:
-    """Return every key of a document with its type, those of few steps first."""
+    """Return every key of a document with its type, shortest path first."""
     found: dict[Place, object] = {}
 
     def visit(form: type[BaseModel], above: Place) -> None:
@@ -119,6 +119,6 @@ def _all_places(root: type[BaseModel]) -> tuple[tuple[Place, object], ...]:
 def _takes(annotation: object, value: object) -> bool:
     try:
         TypeAdapter(cast("type[object]", annotation)).validate_python(value)
-    except ValueError:  # what pydantic raises for a value that is refused
+    except ValueError:  # pydantic's error for a refused value
         return False
     return True

@@ -1,7 +1,7 @@
-"""Syntax: brackets that are not closed, and units and ranges as people write them.
+"""Syntax: unclosed brackets, and informal notations of units and ranges.
 
-A YAML parser gives up where it can no longer go on, which is often far below the mistake. Which bracket is
-not closed follows from the indentation of the keys below it.
+A YAML parser fails where it cannot continue, which is often far below the mistake. The indentation of the
+keys below shows which bracket is not closed.
 """
 
 from __future__ import annotations
@@ -14,7 +14,7 @@ from typing import NamedTuple
 from dxlrun.errors import Mark, Problem
 
 _CLOSERS = {"{": "}", "[": "]"}
-_DEEPEST = 32  # Levels; a text that is nested deeper is refused for that
+_DEEPEST = 32  # levels; a text that is nested deeper is refused for that reason
 _KEY = re.compile(r"( *)(?:- +)*(?:[\w./-]+|\"[^\"]*\"|'[^']*') *:(?= |$)")
 _NUMBER = r"[-+]?(?:\d+(?:\.\d*)?|\.\d+)(?:[eE][-+]?\d+)?"
 _UNIT = r"(?:%|°|[A-Za-z]+(?:/[A-Za-z]+)?(?:\^\d)?)"
@@ -27,11 +27,11 @@ _BLOCK_SCALAR = re.compile(r"(?:^|[ :-])[|>][-+0-9]*\s*$")
 
 
 class _OpenQuoteError(Exception):
-    """A quote is not closed, so what is behind it is unknown; the parser reports its place."""
+    """A quote is not closed, so the rest of the text is unknown; the parser reports its place."""
 
 
 class _Bracket(NamedTuple):
-    """A bracket that was opened: its place, counted from 0, and the indentation of its line."""
+    """An open bracket: its place, counted from 0, and the indentation of its line."""
 
     character: str
     line: int
@@ -40,7 +40,7 @@ class _Bracket(NamedTuple):
 
 
 def explain_syntax(text: str, file: str) -> list[Problem]:
-    """Return what is wrong with a text that is not YAML, as far as it is one of the mistakes known here."""
+    """Return the known mistakes in a text that is not YAML."""
     lines = text.splitlines()
     return [*_units_behind_lists(lines, file), *_missing_colons(lines, file)] or _open_brackets(lines, file)
 
@@ -83,7 +83,7 @@ def _missing_colons(lines: list[str], file: str) -> Iterator[Problem]:
 
 
 def _open_brackets(lines: list[str], file: str) -> list[Problem]:
-    """Return the brackets that are not closed; none are reported where all of them are."""
+    """Return the brackets that are not closed."""
     try:
         if not _scanned(lines, file, by_keys=False) or _depth(lines) > _DEEPEST:
             return []
@@ -98,12 +98,12 @@ def _depth(lines: list[str]) -> int:
 
 
 def _scanned(lines: list[str], file: str, *, by_keys: bool) -> list[Problem]:
-    """Return what is wrong with the brackets of a text.
+    """Return the problems of the brackets in a text.
 
     Args:
         lines: The text.
         file: Its name.
-        by_keys: A key that is indented no more than the line of an open bracket ends what is in it.
+        by_keys: True: a key that is not indented deeper than the line of an open bracket ends that bracket.
     """
     problems: list[Problem] = []
     opened: list[_Bracket] = []
@@ -138,11 +138,11 @@ def _scanned(lines: list[str], file: str, *, by_keys: bool) -> list[Problem]:
 def _structure(lines: list[str]) -> Iterator[tuple[int, int, str, str]]:
     """Yield the brackets outside of quotes, comments and block scalars.
 
-    Each with line and column from 0, and the character before it in its line, spaces left out. For a key at
-    the beginning of a line the bracket is empty, and the column is the indentation of the key.
+    Each has line and column from 0, and the last character before it that is not a space. For a key at the
+    beginning of a line the bracket is empty, and the column is the indentation of the key.
     """
     quote = ""
-    block: int | None = None  # Indentation of the line above a block scalar (`key: |`)
+    block: int | None = None  # indentation of the line above a block scalar (`key: |`)
     for number, line in enumerate(lines):
         indentation = len(line) - len(line.lstrip(" "))
         if block is not None and (not line.strip() or indentation > block):
@@ -167,7 +167,7 @@ def _structure(lines: list[str]) -> Iterator[tuple[int, int, str, str]]:
 
 
 def _not_closed(unclosed: list[_Bracket], lines: list[str], number: int, file: str) -> Problem:
-    """Return the problem of brackets on a line, or on several, that should be closed before a line."""
+    """Return the problem of brackets that should be closed before a line."""
     last = unclosed[-1]
     end = next((above for above in range(number - 1, last.line, -1) if lines[above].strip()), last.line)
     closers = "".join(_CLOSERS[each.character] for each in reversed(unclosed))

@@ -1,6 +1,6 @@
-"""Unknown keys: words of other systems for keys of ours, keys at the wrong place, entries indented wrongly.
+"""Unknown keys: terms of other systems, keys at the wrong place, wrongly indented entries.
 
-The words are in `words.toml`. Which keys exist where, and which entries have which, follows from the forms.
+The terms are in `words.toml`. The forms determine which keys exist at which place.
 """
 
 from __future__ import annotations
@@ -30,11 +30,11 @@ from dxlrun.description.mistakes.forms import (
 from dxlrun.errors import near, suggestion
 
 _REMARKS = {"comment", "comments", "description", "note", "notes", "remark", "remarks", "author", "version"}
-_LONGEST = 80  # Characters of a value that is repeated
-_TURN = 6.3  # rad; a larger number of a limit is in deg
+_LONGEST = 80  # characters of a value in a message
+_TURN = 6.3  # rad; a larger limit is in deg
 _LARGEST_ANGLE = 720  # deg; a larger number counts ticks of a servo
 _PARTS_OF_JOINT = {"Limits": "limits", "GoalTolerance": "tolerance", "SharedTolerance": "tolerance"}
-_SERVO_FORM = "ServoEntry"  # Base of the forms of servos that have keys of a joint
+_SERVO_FORM = "ServoEntry"  # base of the forms of servos with keys of a joint
 
 
 _NEEDLESS = {
@@ -46,20 +46,20 @@ _NEEDLESS = {
     "fixed": "take the joint out: one without a servo is in the URDF only",
     "position": "take it out: the mode of a servo follows from what the joint's controller commands",
 }
-"""Values of keys that a joint does not have, and what to do instead."""
+"""Values of keys that a joint does not have, each with the fix."""
 
 
 class Remedy(NamedTuple):
-    """What to do about one unknown key, or about two that are one key of ours."""
+    """Fix for one unknown key, or for two unknown keys that are one key of dxlrun."""
 
     keys: tuple[str, ...]
     fix: str
     means: str = ""
-    """The key of the form that is meant: that it is missing need not be said."""
+    """Key of the form that is meant; it need not be reported as missing."""
 
 
 class _Meaning(NamedTuple):
-    """A key of ours that a word means, and how the word's value is converted: a key of `_CONVERSIONS`."""
+    """Key that a term means, and the conversion of the term's value: a key of `_CONVERSIONS`."""
 
     place: Place
     kind: str
@@ -67,22 +67,22 @@ class _Meaning(NamedTuple):
 
 @dataclass(frozen=True, slots=True)
 class Context:
-    """The form that has unknown keys, and what the file has around them."""
+    """The form with the unknown keys, and its surroundings in the file."""
 
     root: type[BaseModel]
     """Form of the whole document."""
     form: type[BaseModel]
     path: tuple[str | int, ...]
-    """Where the form is in the document."""
+    """Path of the form in the document."""
     known: Collection[str]
-    """All keys that are possible there."""
+    """All keys that are possible at the path."""
     present: Collection[str]
-    """All keys that the file has there."""
+    """All keys of the file at the path."""
     sections: Mapping[str, Collection[str]]
-    """The names of the entries in each section of the file."""
+    """Names of the entries in each section of the file."""
 
     def remedies(self, unknown: Mapping[str, object]) -> Iterator[Remedy]:
-        """Yield what to do about unknown keys with their values, as far as their meaning is known."""
+        """Yield remedies for unknown keys with their values, if their meaning is known."""
         meant = {key: meaning for key in unknown if (meaning := self.meaning(key)) is not None}
         limits = {meaning.kind: key for key, meaning in meant.items() if meaning.kind in ("lower", "upper")}
         if limits:
@@ -104,13 +104,14 @@ class Context:
 
     @property
     def _is_misplaced_section(self) -> bool:
-        """True: this is taken for an entry of a section, but is a section itself, indented too far."""
+        """True if a supposed entry of a section is a section itself, indented too far."""
         return len(self.path) == 2 and self.path[1] in self.root.model_fields.keys() - self.sections.keys()
 
     def meaning(self, key: str) -> _Meaning | None:
-        """Return what a key means; None where it is not a known word, or the form has no such key.
+        """Return the meaning of a key; None if it is not a known term, or the form does not have the key
+        meant.
 
-        The words of a joint are those of its parts, too: `lower` means the same in a joint as in its limits.
+        The terms of a joint also apply to its parts: `lower` means the same in a joint as in its limits.
         """
         word, name = folded(key), self.form.__name__
         bases = [base.__name__ for base in self.form.__mro__]
@@ -126,7 +127,7 @@ class Context:
         return meaning if _SERVO_FORM in bases and meaning.place[0] in self.known else None
 
     def _limits(self, limits: Mapping[str, str], unknown: Mapping[str, object]) -> str:
-        """Return how a lower and an upper limit are written, either of which may be missing."""
+        """Return the fix for a lower and an upper limit, one of which may be missing."""
         values = [unknown.get(limits.get(side, "")) for side in ("lower", "upper")]
         of_urdf = not {"lower", "upper"}.isdisjoint(limits.values())
         length = ("m" if of_urdf else "mm") if "travel_per_turn" in self.present else ""
@@ -136,12 +137,12 @@ class Context:
         return f"{said} `{self._at(('limits', 'position'), text)}`{condition}"
 
     def _at(self, place: Place, text: str) -> str:
-        """Return a key with its value as it is written in the form: `limits: {velocity: 2 rad/s}`."""
+        """Return a key with its value in the notation of the form: `limits: {velocity: 2 rad/s}`."""
         here = place[1:] if place[0] == _PARTS_OF_JOINT.get(self.form.__name__, "") else place
         return _in_mappings(here[:-1], f"{here[-1]}: {text}")
 
     def _said_of(self, meaning: _Meaning, word: str, value: object) -> str:
-        """Return what to do about a word for a key of ours."""
+        """Return the fix for a term with a known meaning."""
         if meaning.kind == "needless" and (
             folded(word) != "type" or isinstance(value, int) or _yaml(value).lower() in _NEEDLESS
         ):
@@ -151,7 +152,7 @@ class Context:
         return self._renamed(meaning, word, value)
 
     def _renamed(self, meaning: _Meaning, word: str, value: object) -> str:
-        """Return how a word and its value are written with our key."""
+        """Return the fix that renames a term and converts its value."""
         place, key = meaning.place, meaning.place[0]
         called = "" if place[-1] == folded(word) else f"it is called `{'.'.join(place)}` here: "
         if key in self.present and len(place) == 1:
@@ -180,7 +181,7 @@ class Context:
         return f"write `reference`, the servo's angle where the joint is at zero, such as 180 deg; {measure}"
 
     def _misplaced(self, key: str, value: object) -> str:
-        """Return what to do about a key that does not mean another one here; empty: nothing is known."""
+        """Return the fix for a key without a known meaning at this place; empty: not known."""
         if fix := self._miswritten(key, value):
             return fix
         if self._is_misplaced_section:
@@ -194,7 +195,7 @@ class Context:
         return self._moved(ours, value, places) if places else ""
 
     def _miswritten(self, key: str, value: object) -> str:
-        """Return what to do about what is not a key at all; empty: it may be one."""
+        """Return the fix for a text that is not a key at all; empty: it may be a key."""
         word, sign, rest = (part.strip() for part in re.split(r"([:=]|$)", key, maxsplit=1))
         named = f"take it out: the entry is called {self.path[1]} already" if len(self.path) == 2 else ""
         if key.endswith((")", "]")) and value is None:
@@ -213,7 +214,7 @@ class Context:
         return fix
 
     def _moved(self, key: str, value: object, places: list[Place]) -> str:
-        """Return where a key belongs: at the place that shares most with where it is now."""
+        """Return the fix that moves a key to the place with the longest common path."""
         here = tuple(NAME if at == 1 else str(step) for at, step in enumerate(self.path))
 
         def shared(place: Place) -> int:
@@ -238,7 +239,7 @@ class Context:
 def misplaced_sections(
     root: type[BaseModel], data: Mapping[str, object]
 ) -> Iterator[tuple[tuple[str, ...], str]]:
-    """Yield the path of each section that has another name in a file, or is not at its top, and the fix."""
+    """Yield the path and the fix of each section that is misnamed or not at the top of the file."""
     context = Context(root, root, (), [*root.model_fields], [*data], {})
     for key, value in data.items():
         inner = value if isinstance(value, dict) else {}
@@ -258,13 +259,13 @@ def misplaced_sections(
 
 
 def words_for(form: str, keys: Collection[str]) -> frozenset[str]:
-    """Return the words of a form that mean one of some keys of ours."""
+    """Return the terms of a form that mean one of some keys."""
     return frozenset(word for word, meaning in _table()[form].items() if meaning.place[0] in keys)
 
 
 @cache
 def _table() -> Mapping[str, Mapping[str, _Meaning]]:
-    """Return what each word means, by the name of the form in which it is written."""
+    """Return the meaning of each term, by the name of the form in which it is written."""
     text = Path(__file__).with_name("words.toml").read_text("utf-8")
     found: dict[str, dict[str, _Meaning]] = {}
     for form, meanings in tomllib.loads(text).items():
@@ -281,7 +282,7 @@ def _in_mappings(keys: Place, written: str) -> str:
 
 
 def _yaml(value: object) -> str:
-    """Return a value as a file has it, cut where it is long."""
+    """Return a value in the notation of a file, truncated if it is long."""
     if isinstance(value, dict):
         text = f"{{{', '.join(f'{key}: {_yaml(each)}' for key, each in value.items())}}}"
     elif isinstance(value, list):
@@ -292,7 +293,7 @@ def _yaml(value: object) -> str:
 
 
 _Written = tuple[str, str] | None
-"""A value as our key has it, and the condition under which it is meant; None: it cannot be converted."""
+"""A value in dxlrun's notation, and the condition under which it is meant; None: it cannot be converted."""
 _UNIT = re.compile(r"[-0-9.]+ ([A-Za-z/^0-9%]+)")
 _PERIOD = re.compile(r"([0-9.]+) *(s|ms|us)?")
 _SECONDS = {None: 1.0, "s": 1.0, "ms": 1e-3, "us": 1e-6}
@@ -314,12 +315,12 @@ def _plain(value: object, example: str) -> _Written:
 
 
 def _limits_text(values: list[object], *, of_urdf: bool = False, length: str = "") -> _Written:
-    """Return a lower and an upper limit as a list; a missing one (None) is named in capitals.
+    """Return a lower and an upper limit as a list; a missing one (None) is a name in capitals.
 
     Args:
-        values: The limits as they are written.
-        of_urdf: They are written as in a URDF, in SI.
-        length: Unit of the limits of a linear joint; empty: the joint turns.
+        values: The limits as written.
+        of_urdf: True: they are written as in a URDF, in SI.
+        length: Unit of the limits of a linear joint; empty: the joint is rotary.
     """
     numbers = [abs(value) for value in values if isinstance(value, int | float)]
     if numbers and max(numbers) > _LARGEST_ANGLE and not of_urdf:
@@ -348,7 +349,7 @@ def _inverted(value: object, example: str) -> _Written:
 
 
 def _drive_mode(value: object, example: str) -> _Written:
-    # bit 0 of Drive Mode is Reverse Mode (e-Manual, Drive Mode)
+    # Bit 0 of Drive Mode is Reverse Mode (e-Manual, Drive Mode).
     return ("-1" if value & 1 else "1", "") if isinstance(value, int) else None
 
 
