@@ -1,4 +1,4 @@
-"""Gate: the last hand on every command before it becomes a goal. Its law is `gate.c`."""
+"""Gate: limit and check all commands before they become goals. `gate.c` has the computation."""
 
 from __future__ import annotations
 
@@ -23,12 +23,12 @@ from dxlwire.modes import Mode
 SOURCE = Path(__file__).with_name("gate.c")
 STRUCTS = parse_structs(SOURCE.read_text())
 BRAKING = 10.0
-"""rad/s^2, at which a joint that follows efforts brakes toward a limit, unless its acceleration limit is
-higher: what an XM430 of 1.2 A does with 0.2 kg m^2. A heavier one begins too late. [i]"""
+"""Deceleration toward a position limit in effort and PWM modes, rad/s^2. A higher acceleration limit replaces
+it. An XM430 at 1.2 A reaches this with 0.2 kg m^2. A heavier joint brakes too late. [i]"""
 LEAST_BAND = 1.0
-"""rad/s; a joint that is so much too fast is braked with all its effort, or more by `brake`. [i]"""
+"""rad/s; excess speed that is braked with the full effort; `brake` in gate.c may widen this band. [i]"""
 BACK_SPEED = 0.5
-"""rad/s; a joint that went beyond a limit goes back to it no faster, as ENGAGE_SPEED of `servo/modes.py`."""
+"""rad/s; highest speed of a joint that returns from beyond a limit, as ENGAGE_SPEED of `servo/modes.py`."""
 _WHAT = {
     Clamp.LOWER: "raised to the lower position limit",
     Clamp.UPPER: "lowered to the upper position limit",
@@ -44,68 +44,69 @@ _LIMITED: Mapping[Clamp, LimitedInterface] = {
     Clamp.EFFORT: "effort",
     Clamp.PWM: "pwm",
 }
-"""Clamps by a limit that a register of the servo may be tighter than."""
+"""Clamps whose limit a register of the servo may tighten."""
 CLAMP_ENDS_NS = 1_000_000_000
-"""A clamp that pauses for less goes on: a joint that is pressed against a limit swings there. [i]"""
+"""Shorter gaps do not end a clamp: a joint that is pressed against a limit oscillates there. [i]"""
 _NEUTRAL = {Mode.VELOCITY: "velocity", Mode.EFFORT: "effort", Mode.PWM: "pwm"}
-"""The goal that is 0 where a joint in this mode shall not move by its own."""
+"""Interface whose goal is 0 to keep a joint in this mode at rest."""
 
 
 @dataclass(slots=True)
 class _Clamped:
-    """One clamp of one joint, since it was reported."""
+    """One reported clamp of one joint."""
 
     what: str
     begun_ns: int
     last_ns: int
-    """Newest cycle in which it was done."""
+    """Newest cycle in which the clamp was active."""
 
 
 class Gate:
-    """Turns merged commands into goals that are finite, inside the limits, and near the last goal.
+    """Converts merged commands to goals that are finite, inside the limits, and near the last goal.
 
-    Each joint by the mode that it is in; one whose mode is not known has goals of NaN. Positions:
+    The mode of each joint decides which goals it gets. A joint whose mode is not known has goals of NaN.
 
-    - A position of NaN was not commanded: the last goal, position and speed, is kept. Infinity too, and is
+    Positions:
+
+    - NaN means "not commanded" and keeps the last goal, position and speed. Infinity does the same and is
       flagged.
-    - Positions are clamped to the joint's limits. A goal that starts outside of them (the present position of
-      a joint that hangs there) may stay or move toward them, never further out.
-    - The step from the last goal is at most `limits.velocity * dt`, which is the servo's top speed where the
-      file gives none, and at most SLOW_SPEED * dt in the first second after `ease_in`, and after the goal
-      moves for the first time since `anchor`.
-    - With `limits.acceleration` the step changes by at most `acceleration * dt^2` from cycle to cycle, also
-      when commands are withdrawn. It is never so long that the goal could not stop at the limit.
-    - The commanded speed is taken as a magnitude and clamped to `limits.velocity` and the servo's top speed.
-      Where none is commanded, a limit of the steps that is lower than the servo's top speed is the goal's
-      speed too, as the servo takes a step as fast as it may, however long the cycle is; else NaN stays NaN:
-      as fast as the servo can. No speed outlives the command that it came with.
-    - A goal outside of the limits has a speed of at most BACK_SPEED: its servo is sent to the limit.
-    - A joint without torque that is not commanded has the position where it stands.
+    - Positions are clamped to the joint's limits. A goal that starts outside of them, at the measured
+      position of a joint that hangs there, may stay or move toward the limits. It never moves further out.
+    - The step from the last goal is at most `limits.velocity * dt`. Without that limit in the file, the
+      servo's top speed applies. The step is at most SLOW_SPEED * dt in the first second after `ease_in`, and
+      in the first second in which the goal moves after `anchor`.
+    - With `limits.acceleration`, the step changes by at most `acceleration * dt^2` from cycle to cycle, also
+      when commands are withdrawn. It is always short enough for the goal to stop at the limit.
+    - The magnitude of the commanded speed is clamped to `limits.velocity` and the servo's top speed. If no
+      speed is commanded and the step limit is below the servo's top speed, the goal gets that limit as its
+      speed, because a servo executes a step as fast as it may, even in a long cycle. Otherwise NaN stays NaN:
+      the servo's top speed. A speed is valid only together with the command that it came with.
+    - A goal outside of the limits has a speed of at most BACK_SPEED, because the servo returns to the limit.
+    - A joint without torque has its measured position as the goal.
 
     Velocities, efforts and PWM:
 
-    - NaN was not commanded, and infinity is flagged: the goal is 0 then. A joint without a position to hold
-      goes nowhere by itself when it is not commanded any more.
-    - Velocities are cut to the speed that positions have, efforts to `limits.effort`, PWM to full voltage;
-      all of them to what the servo has, and to its own registers: see `take_servo_limits`.
-    - With `limits.acceleration` a velocity changes by at most `acceleration * dt` a cycle, also when it is
-      not commanded any more; faster only at a position limit, for a joint that did not follow its goals.
-    - Within position limits: a velocity that leads outward becomes smaller toward the limit and is 0 there,
-      in proportion to what is left, and with an acceleration limit so that it can brake; an effort or a PWM
-      becomes smaller, and pulls back against a joint that is too fast to stop at the limit, whatever is
-      commanded. Where the position is not known, each of them is 0. A wheel (a joint that is not `bounded`)
-      has none of this.
-    - In mode EFFORT_POSITION the effort is a limit: its magnitude counts, NaN keeps the last one.
+    - The goal is 0 for NaN, which means "not commanded", and for infinity, which is flagged. A joint without
+      a position to hold must not move without commands.
+    - Velocities are clamped to the speed limit of positions, efforts to `limits.effort`, PWM to full voltage.
+      The limits and registers of the servo apply to all of them: see `take_servo_limits`.
+    - With `limits.acceleration`, a velocity changes by at most `acceleration * dt` a cycle, also after the
+      last command. It changes faster only near a position limit, for a joint that lags its goals.
+    - Near a position limit, an outward velocity decreases in proportion to the remaining distance and is 0 at
+      the limit; with an acceleration limit, it decreases so that the joint can brake. An outward effort or
+      PWM decreases too, and is reversed if the joint is too fast to stop at the limit. If the position is
+      not known, these goals are 0. A wheel (a joint that is not `bounded`) has no position limits.
+    - In mode EFFORT_POSITION the magnitude of the effort is a limit. NaN keeps the last one.
 
-    `record.clamped` has what was done, bits of Clamp; an event reports when it begins, and one when it has
-    ended. `counts`, shape (joints, 8), counts cycles by joint and bit.
+    `record.clamped` has the clamps of the cycle, as bits of Clamp. Events report the begin and the end of a
+    clamp. `counts`, shape (joints, 8), counts cycles by joint and bit.
     """
 
     def __init__(self, plan: LoopPlan, record: CycleRecord, events: EventSink) -> None:
         count = len(plan.joints)
         self._plan = plan
         self._limited = plan.joints
-        """The joints with the registers that limit their servos."""
+        """Joints with the limiting registers of their servos."""
         self._record = record
         self._events = events
         self._sources = SourceGate(plan, record, events)
@@ -114,7 +115,7 @@ class Gate:
         self._begun, self._before = np.zeros((2, count), dtype=np.uint8)
         self._now_ns = 0  # Sum of the times between cycles
         self._clamps: dict[tuple[Clamp, int], _Clamped] = {}
-        """What was reported to have begun and not to have ended, by bit and row."""
+        """Clamps whose begin was reported and whose end was not, by bit and row."""
         states, commands, goals = record.states, record.commands, record.goals
         self._gate = STRUCTS["Gate"](
             joints=self._joints.ctypes.data,
@@ -133,17 +134,18 @@ class Gate:
         self._law.argtypes = (c_void_p, c_int64)
         self._address = ctypes.addressof(self._gate)
         self.modes = b""
-        """The joints' modes, as they were entered last."""
+        """Modes of the joints, as bytes of `states.mode`, for which goals were set last."""
         self._take_modes()
 
     def take_servo_limits(self, limits: Mapping[int, Sequence[ServoLimit]]) -> None:
-        """Hold goals to the registers of the servos, too, as read at the start and of a servo that returned.
+        """Apply the limits in the registers of the servos, as read at start-up and after a servo returned.
 
-        A servo refuses a goal beyond its register as a whole. One event for each joint whose limits changed
-        has them as data, for a replay; it is a warning where a register is tighter than the file's limit.
+        A servo rejects a goal beyond its register as a whole instead of clamping it. An event reports each
+        joint whose limits changed, with the limits as data for a replay. It is a warning if a register is
+        tighter than the file's limit.
 
         Args:
-            limits: by row of the joint.
+            limits: Limits by row of the joint.
         """
         joints = list(self._limited)
         for row, found in sorted(limits.items()):
@@ -163,7 +165,10 @@ class Gate:
             self._joints[name] = values
 
     def begin(self) -> None:
-        """Take the joints' modes and goals as they are: they belong together, and the goals are at rest."""
+        """Start from the current modes and goals of the joints.
+
+        The goals must match the modes and be at rest.
+        """
         self._take_modes()
         self._rest(np.ones(len(self._joints), dtype=np.bool_))
 
@@ -173,30 +178,31 @@ class Gate:
         self.modes = self._record.states.mode.tobytes()
 
     def _rest(self, rows: NDArray[np.bool_]) -> None:
-        """Take the goals of these joints as at rest."""
+        """Mark the goals of these joints as at rest."""
         self._joints["moving"][rows] = 0.0
         for known in ("target", "left"):
             self._joints[known][rows] = self._record.goals.position[rows]
 
     def enter_modes(self) -> None:
-        """Give the joints whose mode has changed goals that move nothing in the new one; after a read.
+        """Set goals at rest for the joints whose mode has changed. Called after a read.
 
-        They follow their next commands slowly.
+        These joints follow their next commands with a slow start.
         """
         changed = self._record.states.mode != self._joints["mode"]
         self._take_modes()
         self._hold_still(changed)
 
     def anchor(self, rows: NDArray[np.bool_]) -> None:
-        """Give joints goals that move nothing; the first second after they move again is slow.
+        """Set goals at rest. The slow start of these joints begins when their goals move again.
 
-        `rows`: shape (joints,).
+        Args:
+            rows: Mask of the joints, shape (joints,).
         """
         self._hold_still(rows)
         self._joints["anchored"][rows] = np.nan_to_num(self._record.goals.position[rows])
 
     def _hold_still(self, rows: NDArray[np.bool_]) -> None:
-        """Give these joints goals at rest: the measured position, or 0, by their mode."""
+        """Set the goals of these joints to the measured position or 0, depending on their modes."""
         states, goals = self._record.states, self._record.goals
         goals.values[:, rows] = np.nan
         led = np.isin(states.mode, (Mode.POSITION, Mode.EFFORT_POSITION))
@@ -207,14 +213,21 @@ class Gate:
         self.ease_in(np.flatnonzero(rows).tolist())
 
     def ease_in(self, rows: Sequence[int] | None = None) -> None:
-        """Limit the steps of the coming second to SLOW_SPEED, of all joints or of these rows.
+        """Limit the speed of joints to SLOW_SPEED for one second.
 
-        Torque was just switched on, or the joints were not commanded for a while.
+        Called when torque was just enabled, or after a time without commands.
+
+        Args:
+            rows: Rows of the joints; None: all joints.
         """
         self._joints["slow_ns"][slice(None) if rows is None else list(rows)] = SLOW_START_NS
 
     def apply(self, dt_ns: int) -> None:
-        """Move the goals toward the commands in place; `dt_ns` is the time since the cycle before."""
+        """Move the goals toward the commands, in place.
+
+        Args:
+            dt_ns: Time since the previous cycle.
+        """
         self._now_ns += dt_ns
         if self._law(self._address, dt_ns):
             self._report_begun()
@@ -229,7 +242,7 @@ class Gate:
                 if (bit, row) in self._clamps:
                     continue
                 name = self._plan.joints[row].name
-                # what commands it now may stand in for the controller whose fault this is, which has an event
+                # A fallback may command the joint by now. The fault's own event names the controller.
                 by = "" if bit is Clamp.NOT_FINITE else f", {self._owner(name)}"
                 own = self._limited[row].find_servo_limit(_LIMITED[bit]) if bit in _LIMITED else None
                 what_by = f"clamped by register {own.text}" if own else what
@@ -247,7 +260,7 @@ class Gate:
                 self._events.emit(EventCode.GATE, Severity.INFO, name, text)
 
     def _owner(self, joint: str) -> str:
-        """Return the controller that commands a servo, with those above it that command its references."""
+        """Return the controller that commands a servo, and the controllers above it, as text."""
         active = self._record.active
         plans = [plan for index, plan in enumerate(self._plan.controllers) if active >> index & 1]
         for plan in plans:
@@ -259,7 +272,7 @@ class Gate:
 
 
 def _speeds_and_efforts(joints: Sequence[JointPlan]) -> Mapping[str, Sequence[float]]:
-    """Return the fields of gate.c that registers of the servos may lower."""
+    """Return the fields of `Joint` in gate.c that registers of the servos may lower."""
     return {
         "speed": [joint.step_speed for joint in joints],
         "highest_speed": [joint.highest_speed for joint in joints],
@@ -269,9 +282,9 @@ def _speeds_and_efforts(joints: Sequence[JointPlan]) -> Mapping[str, Sequence[fl
 
 
 def _laid_out(joints: Sequence[JointPlan]) -> NDArray[np.void]:
-    """Return the structs of gate.c for the joints, which begin slowly."""
+    """Return the `Joint` structs of gate.c, at the begin of their slow start."""
     laid: NDArray[np.void] = np.zeros(len(joints), dtype=np.dtype(STRUCTS["Joint"]))
-    # what a speed of 1 rad/s is for each joint: for a linear one as many m/s as its slow start is
+    # The constants are in rad/s. They are scaled for linear joints by the ratio of the slow speeds.
     share = np.array([joint.slow_speed / SLOW_SPEED for joint in joints])
     acceleration = _limits([joint.acceleration for joint in joints])
     for name, values in {
@@ -297,7 +310,7 @@ def _limits(limits: Sequence[float | None]) -> Floats:
 
 
 class SourceGate:
-    """Keeps the commands of sources inside their ranges; NaN was not commanded and stays."""
+    """Clamps the commands of sources to their ranges. NaN means "not commanded" and stays NaN."""
 
     def __init__(self, plan: LoopPlan, record: CycleRecord, events: EventSink) -> None:
         ranges = [each for source in plan.sources for each in source.ranges]
@@ -305,13 +318,13 @@ class SourceGate:
         self._lowest, self._highest = np.array(ranges, dtype=np.float64).reshape(-1, 2).T
         self._events = events
         self.commands: Floats = record.source_commands
-        """Of the robot's sources."""
+        """Commands of the robot's sources."""
         self._outside = np.zeros(len(ranges), dtype=np.bool_)
         self._held = np.zeros(len(ranges), dtype=np.bool_)
-        """What is at an end of its range because it was commanded beyond."""
+        """Commands that are at an end of their range because they were clamped."""
 
     def apply(self) -> None:
-        """Clamp in place; an event reports when it begins."""
+        """Clamp the commands in place. An event reports the begin of a clamp."""
         commands, outside, held = self.commands, self._outside, self._held
         at_end = (commands == self._lowest) | (commands == self._highest)
         np.logical_or(commands < self._lowest, commands > self._highest, out=outside)
@@ -322,5 +335,5 @@ class SourceGate:
                 text = f"{source.label}: {name} was commanded {commands[index]:.6g}, held to {ends}"
                 self._events.emit(EventCode.GATE, Severity.WARNING, source.name, text)
             np.copyto(commands, np.clip(commands, self._lowest, self._highest), where=outside)
-        # what does not change is not commanded anew, so it is still held
+        # The clamped value stays in the array until the next command, so it still counts as clamped.
         np.logical_or(outside, held & at_end, out=held)

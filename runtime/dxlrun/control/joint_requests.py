@@ -1,7 +1,7 @@
-"""Joint requests: torque, reboots and registers of single joints, as clients request them of a running loop.
+"""Joint requests: torque, reboots and registers of single joints, requested by clients of a running loop.
 
-Decided by the record of the cycle that takes them, so that a replay decides alike; carried out by the
-hardware in idle time, and answered when that has come to an end.
+The record of the cycle that receives a request decides about it, so a replay makes the same decision. The
+hardware executes the request in idle time, and the answer follows after that.
 """
 
 from __future__ import annotations
@@ -19,12 +19,12 @@ from dxlrun.control.controllers.switching import Switching
 
 
 class _Pending(msgspec.Struct):
-    """A request for several joints that is not answered yet."""
+    """An unanswered request for several joints."""
 
     code: Code
-    """Of the refusal, where a servo did not do it."""
+    """Code of the refusal if a servo fails."""
     left: int
-    """Joints that are not answered."""
+    """Number of joints without a result."""
     joints: list[str] = msgspec.field(default_factory=list)
     problems: list[str] = msgspec.field(default_factory=list)
     deactivated: tuple[str, ...] = ()
@@ -32,12 +32,17 @@ class _Pending(msgspec.Struct):
 
 
 class JointRequests:
-    """Decides on requests for joints, hands them to the hardware, and answers them."""
+    """Checks requests for joints, passes them to the hardware, and answers them.
+
+    Args:
+        context: The run.
+        switching: Deactivates controllers that command the joints.
+        answer: Sends the answer to a command, by the command's number.
+    """
 
     def __init__(
         self, context: ControlContext, switching: Switching, answer: Callable[[int, Answer], None]
     ) -> None:
-        """`answer` sends a client an answer, by the number of its command."""
         self._joints = context.plan.joints
         self._rows = {joint.name: row for row, joint in enumerate(self._joints)}
         self._hardware = context.hardware
@@ -49,9 +54,14 @@ class JointRequests:
     def execute_request(
         self, number: int, request: TorqueRequest | RebootRequest | Register | RegisterReading
     ) -> Refusal | None:
-        """Execute a request by its command's number; None: it is answered later.
+        """Start a request. A request for several joints is executed for all of them or for none.
 
-        What is about several joints is done to all of them, or to none.
+        Args:
+            number: Number of the client's command.
+            request: The request.
+
+        Returns:
+            The refusal; None if the request is answered later.
         """
         match request:
             case TorqueRequest():
@@ -108,13 +118,13 @@ class JointRequests:
     def _await(
         self, number: int, code: Code, rows: dict[str, int], released: tuple[str, ...]
     ) -> list[tuple[int, Callable[[str], None]]]:
-        """Let a client wait; return the rows, each with what takes what came of it."""
+        """Answer that the request waits; return each row with the callback for its result."""
         pending = self._pending[number] = _Pending(code, len(rows), deactivated=released)
         self._answer(number, Waiting(()))
         return [(row, partial(self._done, number, pending, joint)) for joint, row in rows.items()]
 
     def end(self) -> None:
-        """Answer what the run's end interrupts."""
+        """Refuse the unanswered requests because the run ends."""
         for number in self._pending:
             self._answer(number, Refusal(Code.RUN_ENDING))
         self._pending.clear()
@@ -122,8 +132,7 @@ class JointRequests:
     # Inside
 
     def _known(self, joints: Sequence[str]) -> dict[str, int] | Refusal:
-        """Return the rows of joints, with those that the same servos move: what is done to one is done to
-        all."""
+        """Return the rows of joints, including all joints that the same servos move."""
         unknown = tuple(joint for joint in joints if joint not in self._rows)
         if unknown or not joints:
             return Refusal(Code.UNKNOWN_JOINT, {"joint": unknown})
@@ -161,7 +170,13 @@ class JointRequests:
     def _release(
         self, rows: dict[str, int], names: tuple[str, ...], release: bool
     ) -> tuple[str, ...] | Refusal:
-        """Deactivate controllers that command joints and return them, or refuse because of them."""
+        """Deactivate the controllers that command joints and return their names, or refuse.
+
+        Args:
+            rows: Rows of the joints by name.
+            names: Controllers that command the joints.
+            release: Whether the client allows the deactivation.
+        """
         if not names:
             return ()
         if release:
@@ -173,24 +188,25 @@ class JointRequests:
         return Refusal(Code.JOINT_COMMANDED, {"joint": joints, "controller": names})
 
     def _done(self, number: int, pending: _Pending, joint: str, problem: str) -> None:
-        """Take what came of one joint's request; the last one answers, until then the client waits on."""
+        """Store the result for one joint. The last result answers the request."""
         pending.left -= 1
         if problem:
             pending.joints.append(joint)
             pending.problems.append(problem)
         if self._pending.get(number) is not pending:
-            return  # the run's end has answered it
+            return  # answered by the end of the run
         if pending.left:
             self._answer(number, Waiting(()))
             return
         del self._pending[number]
         answer: Answer = Done(self._record.cycle, deactivated=pending.deactivated)
         if pending.problems:
-            problems = "; ".join(dict.fromkeys(pending.problems))  # joints of a transmission have the same
+            # Joints of one transmission report the same problem, which is named once.
+            problems = "; ".join(dict.fromkeys(pending.problems))
             answer = Refusal(pending.code, {"joint": tuple(pending.joints), "problem": problems})
         self._answer(number, answer)
 
     def _answer_register(self, number: int, code: Code, problem: str, found: int | None) -> None:
-        """Answer when the servo has a register, or what it has was read, or when that failed."""
+        """Answer a request for a register after it was written or read, or after that failed."""
         refusal = Refusal(code, {"problem": problem}) if problem else None
         self._answer(number, refusal or Done(self._record.cycle, value=found))

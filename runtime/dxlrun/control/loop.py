@@ -1,4 +1,4 @@
-"""Loop: read, update, gate, write, when the schedule has a cycle due."""
+"""Loop: read, update, gate and write, once a cycle of the schedule."""
 
 from __future__ import annotations
 
@@ -29,39 +29,39 @@ from dxlrun.plan.policy_plan import Last
 
 
 class CycleSink(Protocol):
-    """Takes finished cycles; never blocks, never raises."""
+    """Destination of finished cycles. Its methods never block and never raise."""
 
     def wake(self, cycle: int) -> None:
-        """Note that a cycle begins: what the buses exchange from here on is of its period."""
+        """Start a cycle. Packets that the buses exchange from now on belong to its period."""
 
     def append(self, record: CycleRecord) -> None:
-        """Keep a copy of the record; its memory is filled again in the next cycle."""
+        """Store a copy of the record. The next cycle overwrites its memory."""
 
     def begin(self, record: CycleRecord) -> None:
-        """Keep a copy of the record before the first cycle: the states and goals of the activation."""
+        """Store a copy of the record before the first cycle, with the states and goals of the activation."""
 
 
 class LoopResult(msgspec.Struct, frozen=True):
-    """How a loop ended; cycles + skipped = periods that have passed."""
+    """Result of a loop. `cycles` + `skipped` is the number of elapsed periods."""
 
     cycles: int
     skipped: int
     reason: Literal["ended", "stopped", "fault"]
     detail: str = ""
-    """One sentence where the reason is a fault."""
+    """One sentence if the reason is a fault."""
     last: Last = "limp"
-    """How the policy leaves the robot; done by the code that started the hardware."""
+    """Final state of the robot by the policy. The code that started the hardware brings it about."""
     invalid: tuple[int, ...] = ()
-    """Cycles in which the state of each joint was not valid; those of a requested reboot do not count."""
+    """Number of cycles with an invalid state, by joint. Cycles of a requested reboot do not count."""
 
 
 class Loop:
-    """One robot's control loop; hardware is started before and stopped after it by what built it.
+    """Control loop of one robot.
 
-    Cycle n is due by the Schedule, which also has the controllers' time: that of the wake-up since the first
-    deadline, pauses left out. Controllers get the true time since the cycle before too, at most PERIOD_CAP
-    periods.
-    Commands from the inbox are taken after the wake-up, a bounded number of them.
+    The code that builds the loop starts the hardware before and stops it after the loop. The Schedule decides
+    when a cycle is due and has the controllers' time: the time of the wake-up since the first deadline,
+    without pauses. Controllers also get the measured time since their last update, at most PERIOD_CAP
+    periods. A cycle executes a bounded number of commands from the inbox after its read.
     """
 
     def __init__(
@@ -73,21 +73,22 @@ class Loop:
         overrun_hooks: tuple[OverrunHook, ...] = (),
         readers: tuple[SourceReader, ...] = (),
     ) -> None:
-        """Build everything of the control side but the controllers.
+        """Build the loop with its gate, steering and monitors.
 
         Args:
             context: The run.
-            manager: Its controllers, whether they are configured by now or not.
-            sink: Takes its cycles.
-            overrun_hooks: Plug-ins that decide what becomes of a late cycle.
-            readers: Copy samples of processes beside the loop into the record; a replay's record has them.
+            manager: Controllers of the run. They may be configured later.
+            sink: Destination of finished cycles.
+            overrun_hooks: Hooks of plug-ins for late cycles.
+            readers: Copy the samples of source processes into the record. A replay has none, because its
+                record has the samples.
         """
         self.context = context
         self.manager = manager
         self.gate = Gate(context.plan, context.record, context.events)
         self.sink = sink
         self.readers = readers
-        # read in each cycle
+        # Attributes that each cycle reads, bound here to save lookups.
         self.plan, self.record = context.plan, context.record
         self.clock, self.hardware = context.clock, context.hardware
         self._stop, self._beat = context.supervision.stop, context.supervision.beat
@@ -98,7 +99,7 @@ class Loop:
         self._cycles = 0
         joints = len(context.plan.joints)
         self._invalid: NDArray[np.int64] = np.zeros(joints, np.int64)
-        """Cycles in which each joint's state was not valid, those of a requested reboot left out."""
+        """Number of cycles with an invalid state, by joint, without cycles of a requested reboot."""
         self._all_valid = bytes([True]) * joints
         self._skipped = 0
         self._late = False
@@ -108,13 +109,15 @@ class Loop:
         self._anchoring = self.steering.anchoring
         self._motion: SafeMotion | None = None
         self._servo_limits: Mapping[int, Sequence[ServoLimit]] = {}
-        """What the gate has of the hardware; compared by identity, as it changes when a servo returns."""
+        """Servo limits that the gate has. Compared by identity: the hardware replaces the mapping when a
+        servo returns."""
 
     def run(self) -> LoopResult:
-        """Activate the controllers, run until the plan's end, a stop or a fault, deactivate them; then go
-        through the steps of the policy for that, which leaves the robot limp or holding.
+        """Run until the plan's end, a stop request or a fault, and wind up by the policy for that.
 
-        What controllers raise, and PortError of the hardware, become the result; nothing else is caught.
+        Controllers are activated before the first cycle and deactivated after the last one. The steps of the
+        policy follow, and leave the robot limp or holding. Exceptions of controllers and PortError of the
+        hardware become the result; other exceptions pass through.
         """
         self._begin()
         try:
@@ -122,7 +125,7 @@ class Loop:
         except PortError as error:
             reason, detail = "fault", str(error)
         finally:
-            # behind the last cycle of a pause, the period until the next one is left out already
+            # The schedule already excludes the period that follows the last cycle of a pause.
             self.schedule.end_cycles(self.clock.now_ns())
             self.manager.deactivate()
             self.steering.end()
@@ -158,10 +161,10 @@ class Loop:
         self.gate.take_servo_limits(self._servo_limits)
 
     def _cycle_until_end(self) -> tuple[Literal["ended", "stopped", "fault"], str]:
-        """Run cycles; return why they ended, and a sentence for a fault."""
+        """Run cycles; return the reason of the end, and one sentence for a fault."""
         end_ns, schedule = self.plan.end_ns, self.schedule
         while self.manager.switching.fault is None:
-            # A motion that ends late must not cut the settling time of its goal.
+            # A motion that ends late must not shorten the settling time of its goal.
             if end_ns is not None and schedule.grid_ns >= end_ns and not self.manager.settles:
                 return "ended", ""
             if self._stop.requested:
@@ -174,7 +177,7 @@ class Loop:
         return "fault", self.manager.switching.fault
 
     def _one(self) -> None:
-        """Wait for the deadline, then read, take commands, update, gate and write."""
+        """Wait for the deadline, then read, execute commands, update, gate and write."""
         record, now_ns, schedule = self.record, self.clock.now_ns, self.schedule
         cycle, deadline_ns = schedule.cycle, schedule.due_ns
         self.hardware.idle(deadline_ns, schedule.grid_ns)
@@ -221,9 +224,9 @@ class Loop:
         self._beat()
 
     def _update(self, cycle: int, behind_ns: int) -> None:
-        """Let the monitors look, take commands, and update the controllers unless the loop is paused."""
+        """Run the monitors, execute commands, and update the controllers unless the loop is paused."""
         record, steering, manager = self.record, self.steering, self.manager
-        if behind_ns > 0:  # a cycle that was late when a pause began catches up
+        if behind_ns > 0:  # after a pause that began in a late cycle, time must not go back
             self.schedule.grid_ns += behind_ns
         time_ns = self.schedule.time_ns
         for monitor in self._monitors:
@@ -245,7 +248,7 @@ class Loop:
             steering.answer_late()
 
     def _wind_up(self, name: str) -> Last:
-        """Go through the steps of a policy in more cycles; return how it leaves the robot."""
+        """Execute the steps of a policy in additional cycles; return the final state of the robot."""
         policy = self.plan.policies.named(name)
         motion = SafeMotion(policy, self.context)
         if not motion.over:
@@ -273,11 +276,11 @@ class Loop:
         self.context.command_log.take(begun)
 
     def _next(self) -> bool:
-        """Go to the next cycle, past those that are declared skipped; return whether that ends the run."""
+        """Advance to the next cycle after any skipped periods; return whether an overrun ends the run."""
         schedule, cycle, due_ns = self.schedule, self.schedule.cycle, self.schedule.due_ns
         now_ns, policy, next_ns = self.clock.now_ns(), self.plan.overrun, due_ns + schedule.period_ns
         if self.steering.stood:
-            policy = "skip" if policy == "stop" else policy  # a pause may take its time
+            policy = "skip" if policy == "stop" else policy  # cycles of a pause may be long
         elif now_ns <= next_ns:
             schedule.advance(cycle + 1)
             self.record.skipped, self._late = 0, False
@@ -286,7 +289,7 @@ class Loop:
             policy = self._overruns.decide(cycle + 1, next_ns, now_ns)
         following = schedule.following(now_ns, policy)
         if self.plan.end_ns is not None and not self._motion and not self.steering.stood:
-            # nothing is skipped behind the end
+            # Periods after the end of the plan do not count as skipped.
             left_ns = self.plan.end_ns - schedule.grid_ns
             following = min(following, cycle + max(1, -(-left_ns // schedule.period_ns)))
         skipped = following - cycle - 1
@@ -316,7 +319,7 @@ class Loop:
         record.cycle = -1
         record.scheduled_ns = self.schedule.due_ns
         record.read_ns = record.updated_ns = record.written_ns = self.clock.now_ns()
-        record.woken_ns = self._woken_ns  # from which the first deadline is: a replay knows it
+        record.woken_ns = self._woken_ns  # a replay derives the first deadline from this time
         self.sink.begin(record)
 
     def _log_end(self, reason: str, detail: str) -> None:
@@ -329,9 +332,9 @@ class Loop:
 
 
 class Overruns:
-    """Decides what becomes of deadlines that passed in a late cycle: the plug-ins in turn, then the file.
+    """Selects the overrun policy for a late cycle: the first answer of the hooks, otherwise the robot file's.
 
-    A hook that raises, or answers with something else, is reported in an event and not called again.
+    A hook that raises or returns an invalid answer is reported in an event and not called again.
     """
 
     def __init__(self, policy: OverrunPolicy, hooks: tuple[OverrunHook, ...], events: EventSink) -> None:
@@ -344,7 +347,7 @@ class Overruns:
         for hook in tuple(self._hooks):
             try:
                 answer = hook.decide(cycle, scheduled_ns, actual_ns)
-            except BaseException as error:  # foreign code: it must not take the loop along
+            except BaseException as error:  # foreign code must not end the loop
                 if is_interrupt(error):
                     raise
                 self._dismiss(hook, f"raised {type(error).__name__}: {error}")

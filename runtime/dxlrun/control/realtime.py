@@ -1,7 +1,8 @@
-"""Real time: ask the operating system for what the plan requests, and report what was not granted.
+"""Real time: request scheduling, memory and power settings from the operating system, and report refusals.
 
-`apply` prepares the loop's process, `apply_to_guardian` the guardian's; `Pacing` measures how long before a
-deadline the clock is polled; what a process may ask for, and the command that allows more, is at the end.
+`apply` prepares the loop's process, `apply_to_guardian` the guardian's. `Pacing` measures the time for which
+the clock is polled before a deadline. The functions at the end of the module return the limits of this
+process and the commands that raise them.
 """
 
 from __future__ import annotations
@@ -28,41 +29,42 @@ _PR_SET_TIMERSLACK = 29  # linux/prctl.h
 _RESET_ON_FORK = 1  # SCHED_FLAG_RESET_ON_FORK, linux/sched.h: for this process, not for its children
 _TASKS = Path("/proc/self/task")
 IDLE_LATENCY = Path("/dev/cpu_dma_latency")
-"""As long as it is held open, cores wake from idle within the microseconds written to it
+"""Device with the longest wake-up time of idle cores, int32 in us. The request ends when the file is closed
 (kernel: Documentation/power/pm_qos_interface.rst)."""
 _AGAIN = "and log in again"
 P = ParamSpec("P")
 
 
 class Grant(msgspec.Struct, frozen=True):
-    """One request to the operating system, and what became of it."""
+    """A request to the operating system and its result."""
 
     request: str
     """collector, timer slack, memory in place, locked memory, cores, idle latency, scheduler, time slice,
     polling"""
     granted: bool
     sentence: str
-    """For a person; names the consequence where something was refused."""
+    """Result in one sentence; for a refusal, with its consequence."""
     fix: str = ""
-    """What to do where something was refused; empty where nothing helps."""
+    """Fix for a refusal; empty if there is none."""
     process: str = "loop"
 
     @property
     def text(self) -> str:
-        """Sentence and fix, with the process where that is not the loop."""
+        """Sentence and fix, prefixed with the process if it is not the loop."""
         text = f"{self.sentence}: {self.fix}" if self.fix else self.sentence
         return text if self.process == "loop" else f"{self.process}: {text}"
 
     @property
     def name(self) -> str:
-        """What was asked for; with the process where that is not the loop."""
+        """The request, prefixed with the process if it is not the loop."""
         return self.request if self.process == "loop" else f"{self.process}: {self.request}"
 
 
 def apply(plan: SchedulerPlan) -> tuple[Grant, ...]:
-    """Prepare the calling thread for the loop; never raises.
+    """Prepare the calling thread for the loop. Never raises.
 
-    Order matters: what allocates comes first, the policy last, so that nothing slow runs with priority.
+    Steps that allocate come first and the scheduling policy comes last, so that no slow step runs with
+    real-time priority.
     """
     grants = [freeze_collector(), _timer_slack()]
     grants += [_stay_on(plan.cores)] if plan.cores else []
@@ -76,7 +78,12 @@ def apply(plan: SchedulerPlan) -> tuple[Grant, ...]:
 
 
 def apply_to_guardian(priority: int, lock: bool) -> tuple[Grant, ...]:
-    """Prepare the guardian's process; a priority of 0 asks for none; never raises."""
+    """Prepare the guardian's process. Never raises.
+
+    Args:
+        priority: Real-time priority; 0: none.
+        lock: True to lock the memory.
+    """
     return (
         *((lock_memory(),) if lock else ()),
         *((set_policy("round_robin", priority),) if priority else ()),
@@ -84,7 +91,7 @@ def apply_to_guardian(priority: int, lock: bool) -> tuple[Grant, ...]:
 
 
 def log_grants(grants: Sequence[Grant], source: str, events: EventSink) -> None:
-    """Log what became of a process' requests."""
+    """Emit an event for each request of a process, a warning if it was refused."""
     for grant in grants:
         severity = Severity.INFO if grant.granted else Severity.WARNING
         data = msgspec.json.encode(Granted(grant.request, grant.granted))
@@ -92,9 +99,9 @@ def log_grants(grants: Sequence[Grant], source: str, events: EventSink) -> None:
 
 
 def freeze_collector() -> Grant:
-    """Collect garbage once, take what is left out of every later search, and switch the collector off.
+    """Collect garbage once, freeze the remaining objects, and disable the collector.
 
-    The loop makes no cycles of references, so nothing piles up; a collection takes milliseconds.
+    A collection takes milliseconds, and the loop creates no reference cycles that would need one.
     """
     gc.collect()
     gc.freeze()
@@ -103,19 +110,19 @@ def freeze_collector() -> Grant:
 
 
 def guardian_priority(plan: SchedulerPlan) -> int:
-    """Return the priority of the guardian, one above the loop's; 0: none."""
+    """Return the guardian's priority, one above the loop's; 0: no real-time priority."""
     return 0 if plan.policy == "other" else min(plan.priority + 1, 99)
 
 
 def thread_count() -> int:
-    """Return the number of threads of this process, in a microsecond; 1 where that is not known."""
+    """Return the number of threads of this process; 1 if it is not known. Takes a microsecond."""
     tasks = _tasks()
     return 1 if tasks is None else os.fstat(tasks).st_nlink - 2
 
 
 @cache
 def _tasks() -> int | None:
-    """Return a descriptor of the directory that has a directory in it for each thread."""
+    """Return a descriptor of /proc/self/task, whose link count is the number of threads plus 2."""
     try:
         return os.open(_TASKS, os.O_RDONLY | os.O_DIRECTORY)
     except OSError:
@@ -123,11 +130,14 @@ def _tasks() -> int | None:
 
 
 class _Refused(Exception):
-    """The sentence and the fix of a grant that was refused."""
+    """Refusal of a request. Its arguments are the sentence and the fix of the grant."""
 
 
 def _requested(request: str) -> Callable[[Callable[P, str]], Callable[P, Grant]]:
-    """Make a grant of what is returned, or raised: whatever fails is refused, as a robot runs without it."""
+    """Return a decorator that converts the result or exception of a request to a Grant.
+
+    A failed request is only reported, because a robot can run without it.
+    """
 
     def decorate(act: Callable[P, str]) -> Callable[P, Grant]:
         @wraps(act)
@@ -146,9 +156,12 @@ def _requested(request: str) -> Callable[[Callable[P, str]], Callable[P, Grant]]
 
 @_requested("scheduler")
 def set_policy(policy: Policy, priority: int, limit: int | None = None) -> str:
-    """Give the calling thread a real-time policy; a child process does not inherit it; never raises.
+    """Set the scheduling policy of the calling thread. Child processes do not inherit it. Never raises.
 
-    `limit` is the rtprio that a refusal asks for, where other processes need more than `priority`.
+    Args:
+        policy: Policy.
+        priority: Real-time priority, 1..99.
+        limit: rtprio limit for the fix of a refusal, if another process needs more than `priority`.
     """
     if policy == "other":
         return "the ordinary scheduler was asked for"
@@ -166,13 +179,13 @@ def set_policy(policy: Policy, priority: int, limit: int | None = None) -> str:
 
 @_requested("timer slack")
 def _timer_slack() -> str:
-    """Ask Linux to wake an ordinary thread within 1 ns of the timer instead of 50 us (prctl(2))."""
+    """Reduce the timer slack of an ordinary thread from 50 us to 1 ns (prctl(2))."""
     succeed(libc().prctl(_PR_SET_TIMERSLACK, ctypes.c_ulong(1), 0, 0, 0))
     return "timer slack 1 ns"
 
 
 SLICE_NS = 100_000
-"""The shortest time slice that Linux gives an ordinary program (kernel/sched/syscalls.c)."""
+"""Shortest time slice that Linux accepts for an ordinary process (kernel/sched/syscalls.c)."""
 _SCHED_ATTR = struct.Struct("<IIQiIQQQ")
 """struct sched_attr of sched_setattr(2): size, policy, flags, nice, priority, runtime, deadline, period."""
 _SCHED_CALLS = {"x86_64": (314, 315), "aarch64": (274, 275)}
@@ -180,9 +193,9 @@ _SCHED_CALLS = {"x86_64": (314, 315), "aarch64": (274, 275)}
 
 
 def _short_slice() -> tuple[Grant, ...]:
-    """Ask for short time slices, for which Linux interrupts other ordinary programs sooner; never raises.
+    """Request short time slices, with which Linux interrupts other processes sooner. Never raises.
 
-    Nothing is reported where the kernel has no such request (before 6.12): nothing can be done about it.
+    Kernels before 6.12 lack this request. They return an empty tuple, since a user cannot fix that.
     """
     try:
         set_attributes, get_attributes = _SCHED_CALLS[os.uname().machine]
@@ -201,7 +214,7 @@ def _short_slice() -> tuple[Grant, ...]:
 
 @_requested("cores")
 def _stay_on(cores: Sequence[int]) -> str:
-    """Bind the calling thread to cores; Linux drops those that there are not (sched_setaffinity(2))."""
+    """Bind the calling thread to cores. Linux ignores cores that do not exist (sched_setaffinity(2))."""
     before, fix = os.sched_getaffinity(0), "write others under loop.scheduler.cores"
     try:
         os.sched_setaffinity(0, cores)
@@ -233,7 +246,10 @@ def _keep_memory() -> str:
 
 @_requested("locked memory")
 def lock_memory() -> str:
-    """Lock all memory, now and later, but only where later allocations cannot fail by it; never raises."""
+    """Lock all current and future memory. Never raises.
+
+    Refused under a memory limit, where later allocations would fail.
+    """
     if not may_lock():
         raise _Refused(
             "memory is not locked, a page that was swapped out may delay it by milliseconds",
@@ -245,7 +261,7 @@ def lock_memory() -> str:
 
 @_requested("idle latency")
 def keep_awake() -> str:
-    """Keep the cores from deep idle states for as long as this process lives; never raises."""
+    """Keep the cores out of deep idle states until this process exits. Never raises."""
     try:
         descriptor = os.open(IDLE_LATENCY, os.O_WRONLY)
     except PermissionError:
@@ -256,7 +272,11 @@ def keep_awake() -> str:
 
 
 def allow_idle_latency(account: str = "") -> str:
-    """Return the command that lets a user (this one) keep cores from deep idle states, for good."""
+    """Return the command that permanently allows a user to keep cores out of deep idle states.
+
+    Args:
+        account: Name of the user; empty: the current user.
+    """
     rule = f'KERNEL=="cpu_dma_latency", OWNER="{account or user()}"'
     return (
         f"echo '{rule}' | sudo tee /etc/udev/rules.d/70-dxlrun.rules && sudo udevadm control --reload && "
@@ -265,11 +285,15 @@ def allow_idle_latency(account: str = "") -> str:
 
 
 def raise_share(process: int, nice: int) -> None:
-    """Give an ordinary process a larger share of a busy processor, as far as its user may; never raises.
+    """Lower the nice value of an ordinary process as far as its limit permits. Never raises.
 
-    Without CAP_SYS_NICE or a limit (RLIMIT_NICE), a process keeps its share. Linux may divide a processor
-    among sessions first (sched_autogroup, sched(7)): each process of a run is a session of its own, so the
-    nice value of the group counts there, which has the same limit.
+    The value stays unchanged without CAP_SYS_NICE or RLIMIT_NICE. Linux may share a processor among sessions
+    first (sched_autogroup, sched(7)). Each process of a run is a session, so the nice value of its group is
+    set too, which has the same limit.
+
+    Args:
+        process: Process ID.
+        nice: Requested nice value.
     """
     lowest = max(nice, lowest_nice())
     with suppress(OSError):
@@ -281,10 +305,10 @@ def raise_share(process: int, nice: int) -> None:
 # Memory
 
 HEAP = 8 << 20
-"""Bytes of heap that are touched; a loop of 20 servos allocates some kB in a cycle and frees them [i]."""
+"""Bytes of heap that are touched. A loop of 20 servos allocates and frees a few kB in a cycle [i]."""
 _STACK_DEPTH = 800
-"""Lists in each other, whose text is made in one C call a list: 800 touch some 100 kB of stack [measured];
-the recursion limit of Python is 1000."""
+"""Depth of nested lists for `repr`, which makes one C call a level: 800 levels touch some 100 kB of stack
+[measured]. Python's recursion limit is 1000."""
 _MCL_CURRENT, _MCL_FUTURE = 1, 2  # asm-generic/mman.h
 _M_TRIM_THRESHOLD, _M_MMAP_MAX = -1, -4  # glibc, malloc.h
 
@@ -297,20 +321,21 @@ def libc() -> ctypes.CDLL:
 
 
 def succeed(code: int) -> None:
-    """Raise OSError when a call of the C library returned something else than 0."""
+    """Raise OSError from errno if a call of the C library did not return 0."""
     if code != 0:
         raise OSError(ctypes.get_errno(), os.strerror(ctypes.get_errno()))
 
 
 def may_lock() -> bool:
-    """Return whether all memory may be locked: under a limit a later allocation would fail."""
+    """Return whether all memory may be locked. Under a limit, a later allocation would fail."""
     return lockable_bytes() == UNLIMITED
 
 
 def keep_freed() -> bool:
-    """Have malloc give nothing back to the Linux kernel: the next allocation finds it touched (mallopt(3)).
+    """Configure malloc to keep freed memory, so that later allocations cause no page faults (mallopt(3)).
 
-    Returns False where the C library has no mallopt (musl): the pages then come and go.
+    Returns:
+        False if the C library has no mallopt (musl).
     """
     try:
         mallopt = libc().mallopt
@@ -320,49 +345,57 @@ def keep_freed() -> bool:
 
 
 def touch() -> None:
-    """Touch heap and stack once, so that no page is missing when a cycle first comes that far."""
+    """Touch heap and stack once, so that no cycle has the page faults of a first use."""
     bytearray(HEAP)  # zeroed, so each page is written; freed at once, and kept by `keep_freed`
     nested: list[object] = []
     for _ in range(_STACK_DEPTH):
         nested = [nested]
-    with suppress(RecursionError):  # called from deep down, or a Python with a lower limit: less is touched
+    with suppress(RecursionError):  # with a deep call stack or a lower limit, less is touched
         repr(nested)
 
 
 # Polling before a deadline
 
 AUTO_SHARE = 10
-"""Where the file does not set it, at most one part in so many of the period is polled."""
+"""Divider of the period for the longest polling time, if the robot file sets none."""
 _TRIES = 32
 _NAP_NS = 2_000_000
-"""All tries together take 64 ms; longer sleeps overshoot more, which _RESERVE is for."""
+"""All tries together take 64 ms. Longer sleeps overshoot more, which _RESERVE covers."""
 _QUANTILE = 0.95
 _RESERVE = 1.5
 """Sleeps of 20 ms overshoot 1.4 times as much as those of 2 ms [measured, round_robin, x86-64]."""
 
 
 def overshoot_ns(nap_ns: int) -> int:
-    """Return how late a sleep of so many ns wakes, ns."""
+    """Sleep for a time, and return the delay of the wake-up, ns."""
     deadline_ns = time.monotonic_ns() + nap_ns
     time.sleep(nap_ns * 1e-9)
     return time.monotonic_ns() - deadline_ns
 
 
 class Pacing:
-    """Sets a clock's margin to what was measured once, bounded by the file and by the period."""
+    """Sets a clock's polling margin to a measured value, bounded by the robot file and the period.
+
+    Args:
+        clock: The clock.
+        most_ns: Longest margin, as `SchedulerPlan.polling_ns`; None: a share of the period.
+    """
 
     def __init__(self, clock: MonotonicClock, most_ns: int | None) -> None:
         self._clock = clock
         self._most_ns = most_ns
         self.measured_ns = clock.spin_ns
-        """The margin that was measured, without the bounds."""
+        """Measured margin before bounds are applied."""
 
     def measure(
         self, period_ns: int, beat: Callable[[], None], nap: Callable[[int], int] = overshoot_ns
     ) -> Grant:
-        """Sleep a few times, set the margin for a period, and report it; `beat` is called between.
+        """Measure the delay of sleeps, and set the margin to 1.5 times its 95th percentile.
 
-        The margin covers 19 of 20 sleeps and half as much again.
+        Args:
+            period_ns: Period of the loop.
+            beat: Called after each sleep, for the guardian.
+            nap: Sleeps for a time in ns and returns the delay in ns.
         """
         late: list[int] = []
         for _ in range(_TRIES):
@@ -381,7 +414,7 @@ class Pacing:
         )
 
     def set_period(self, period_ns: int) -> None:
-        """Keep the margin within its share of another period, ns."""
+        """Apply the bounds of a new period, ns, to the measured margin."""
         most_ns = period_ns // AUTO_SHARE if self._most_ns is None else self._most_ns
         self._clock.spin_ns = min(self.measured_ns, most_ns, period_ns // MOST_SHARE)
 
@@ -389,14 +422,14 @@ class Pacing:
 # What a process may ask for
 
 IPC_LOCK, SYS_NICE = 14, 23
-"""Capabilities, by their bit (linux/capability.h)."""
+"""Bit numbers of capabilities (linux/capability.h)."""
 LIMITS = Path("/etc/security/limits.d/dxlrun.conf")
 UNLIMITED = -1
 _STATUS = Path("/proc/self/status")
 
 
 def has_capability(bit: int, status: Path = _STATUS) -> bool:
-    """Return whether this process has an effective capability; False where the system has none."""
+    """Return whether this process has an effective capability; False on systems without capabilities."""
     try:
         text = status.read_text()
     except OSError:
@@ -406,9 +439,10 @@ def has_capability(bit: int, status: Path = _STATUS) -> bool:
 
 
 def highest_priority() -> int:
-    """Return the highest real-time priority that this process may take by its limit (RLIMIT_RTPRIO).
+    """Return the highest real-time priority that this process may request (RLIMIT_RTPRIO).
 
-    99 with CAP_SYS_NICE. 0: none, or the system has no such limit.
+    Returns:
+        99 with CAP_SYS_NICE; 0 if none is permitted or the system lacks this limit.
     """
     import resource
 
@@ -419,15 +453,16 @@ def highest_priority() -> int:
 
 
 def missing_priority(plan: SchedulerPlan) -> str:
-    """Return the command that lets this user take the priorities of a plan; empty where they may already."""
+    """Return the command that permits this user the priorities of a plan; empty if they are permitted."""
     needed = guardian_priority(plan)
     return "" if highest_priority() >= needed else allow("rtprio", needed)
 
 
 def lowest_nice() -> int:
-    """Return the lowest nice value that this process may take by its limit (RLIMIT_NICE, getrlimit(2)).
+    """Return the lowest nice value that this process may request (RLIMIT_NICE, getrlimit(2)).
 
-    -20 with CAP_SYS_NICE; 20: none lower than its own.
+    Returns:
+        -20 with CAP_SYS_NICE; 20 if the process may not lower its value.
     """
     import resource
 
@@ -438,7 +473,7 @@ def lowest_nice() -> int:
 
 
 def lockable_bytes() -> int:
-    """Return how much memory this process may lock (RLIMIT_MEMLOCK); UNLIMITED, also with CAP_IPC_LOCK."""
+    """Return the number of bytes that this process may lock (RLIMIT_MEMLOCK); UNLIMITED with CAP_IPC_LOCK."""
     import resource
 
     if has_capability(IPC_LOCK):
@@ -447,12 +482,18 @@ def lockable_bytes() -> int:
 
 
 def allow(limit: str, value: int | str, account: str = "") -> str:
-    """Return the command that raises a limit of a user (this one) from the next log-in on, limits.conf(5)."""
+    """Return the command that raises a limit of a user from the next login on, limits.conf(5).
+
+    Args:
+        limit: `rtprio` or `memlock`.
+        value: New limit.
+        account: Name of the user; empty: the current user.
+    """
     return f"echo '{account or user()} - {limit} {value}' | sudo tee -a {LIMITS}"
 
 
 def user() -> str:
-    """Return this user as limits.conf(5) names one."""
+    """Return the name of the current user for limits.conf(5), or `UID:UID` without a name."""
     if not hasattr(os, "getuid"):
         return sys.platform
     import pwd

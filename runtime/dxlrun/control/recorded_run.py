@@ -1,6 +1,6 @@
-"""Recorded run: a loop that is fed from a log: its clock, servos and clients; its goals go nowhere.
+"""Recorded run: run a loop with the clock, servos and clients of a log. Its goals are not sent to servos.
 
-These are the seams of the loop: a replay changes nothing above them.
+A replay replaces only these interfaces of the loop.
 """
 
 from __future__ import annotations
@@ -35,28 +35,29 @@ from dxlrun.log.schemas import KEPT_ATTACHMENT
 from dxlrun.plan.loop_plan import ControllerPlan, LoopPlan, ServoLimit
 from dxlwire.modes import COMMAND_INTERFACES
 
-_STATES = tuple(field.name for field in fields(States) if field.name != "motion")  # which shows three of them
+_STATES = tuple(field.name for field in fields(States) if field.name != "motion")  # a view of three others
 
 
 class RunInputs(msgspec.Struct, frozen=True, eq=False):
-    """The inputs of one run."""
+    """Inputs of one run."""
 
-    log: Log  # All that the log has, but packets and topics; of its cycles the scalars
+    log: Log  # Without packets and topics; only the scalars of cycles
     loop: LoopPlan
-    """The plan's loop with those of its commands that cycles really took. It ends, skips periods and begins a
-    policy where the run did, not by itself."""
+    """The plan's loop with the planned commands that cycles executed. The recording decides when it ends,
+    skips periods and begins a policy."""
     activation: np.void  # States and goals when the controllers were activated
     start_ns: int  # Deadline of cycle 0
-    steered: tuple[ClientCommand, ...]  # The commands from outside
-    end: int  # Number of cycles that can be run again, at least one
-    ends: int  # Index of the first cycle that is a policy's; in those the controllers are not active
-    kept: KeptStates  # What controllers began with that they had kept in earlier runs
+    steered: tuple[ClientCommand, ...]  # Commands of clients
+    end: int  # Number of cycles that can be replayed, at least one
+    ends: int  # Index of the first cycle of a policy, from which on controllers are not active
+    kept: KeptStates  # States of earlier runs that the controllers started with
 
 
 def kept_states_of(log: Log) -> KeptStates:
-    """Return the kept states that controllers began with; none in logs from before kept states.
+    """Return the kept states that the controllers started with. Older logs have none.
 
-    Raises LogError when they cannot be read.
+    Raises:
+        LogError: The attachment cannot be read.
     """
     data = log.attachments.get(KEPT_ATTACHMENT)
     try:
@@ -66,7 +67,7 @@ def kept_states_of(log: Log) -> KeptStates:
 
 
 class RecordedClock:
-    """Time as the loop read it in the recorded run, at each place where it matters to controllers."""
+    """Clock with the recorded times, at each point of a cycle that matters to controllers."""
 
     __slots__ = ("_now_ns", "wake_ns")
 
@@ -79,21 +80,28 @@ class RecordedClock:
         return self._now_ns
 
     def wait_until(self, deadline_ns: int) -> int:
-        """Return when the loop woke then, ns."""
+        """Return the recorded wake-up time, ns."""
         self._now_ns = self.wake_ns
         return self._now_ns
 
     def move(self, now_ns: int) -> None:
-        """Let it be `now_ns`."""
+        """Set the time, ns."""
         self._now_ns = now_ns
 
 
 class RecordedHardware:
-    """Servos with the states of the run, bit for bit, that take no goals; see `contract.hardware.Hardware`.
+    """Hardware with the recorded states, bit for bit. Goals are ignored; see `contract.hardware.Hardware`.
 
-    After each cycle it moves the clock to the deadline of the next recorded one, so that the loop skips the
-    periods that were skipped. After the cycle before number `inputs.ends` it asks the loop to stop: those
-    from there on are a policy's. After the last one there is no bus any more.
+    Each write moves the clock to the deadline of the next recorded cycle, so the loop skips the same periods
+    as the run. The loop is stopped before cycle `inputs.ends`, where the policy begins. After the last cycle,
+    `idle` raises PortError.
+
+    Args:
+        inputs: The inputs of the run.
+        row: Returns a cycle by its index.
+        record: The cycle's record.
+        clock: The clock that the loop uses.
+        stop: Receives the stop request.
     """
 
     def __init__(
@@ -104,21 +112,20 @@ class RecordedHardware:
         clock: RecordedClock,
         stop: StopFlag,
     ) -> None:
-        """`row` returns a cycle by its index."""
         self._inputs = inputs
         self._row = row
         self._record = record
         self._clock = clock
         self._stop = stop
-        self._outside = len(inputs.loop.sources)  # Sources that are no controllers: they come first
+        self._outside = len(inputs.loop.sources)  # Devices and sensors; they precede controllers
         self._outside_states = sum(len(one.states) for one in inputs.loop.sources)
-        self.index = 0  # Of the cycle that is replayed
+        self.index = 0  # Index of the replayed cycle
         self.servo_limits: Mapping[int, Sequence[ServoLimit]] = {}
-        """The registers of the servos in the run, from the events until this cycle"""
+        """Limiting registers of the servos, from the events up to this cycle, by row."""
         self._limit_events = deque(_read_limits(inputs))
 
     def start(self, engaging: Callable[[], None] = lambda: None) -> None:
-        """Fill states and goals with those of the activation."""
+        """Copy the states and goals of the activation into the record."""
         record, activation = self._record, self._inputs.activation
         for name in _STATES:
             np.copyto(getattr(record.states, name), activation[name])
@@ -133,20 +140,20 @@ class RecordedHardware:
             self.servo_limits = {**self.servo_limits, row: limits}
 
     def _take_sources(self, row: np.void) -> None:
-        """Take what devices and sensors had; what controllers provide is computed again."""
+        """Copy the states of devices and sensors. Controllers compute their provided states again."""
         sources, states, count = self._record.sources, self._outside_states, self._outside
         np.copyto(sources.values[:states], row["source_state"][:states])
         np.copyto(sources.valid[:count], row["source_valid"][:count])
         np.copyto(sources.age_ns[:count], row["source_age_ns"][:count])
 
     def idle(self, until_ns: int, time_ns: int) -> None:
-        """Let the coming wait end when it ended then. Raises PortError behind the last cycle."""
+        """Set the end of the next wait to the recorded one. Raises PortError after the last cycle."""
         if self.index == self._inputs.end:
             raise PortError("the log ends")
         self._clock.wake_ns = int(self._inputs.log.cycles["woken_ns"][self.index])
 
     def read(self) -> None:
-        """Fill the states of this cycle."""
+        """Copy the states of this cycle into the record."""
         row = self.recorded()
         for name in _STATES:
             np.copyto(getattr(self._record.states, name), row[name])
@@ -155,11 +162,11 @@ class RecordedHardware:
         self._take_limits(int(row["updated_ns"]))
 
     def recorded(self) -> np.void:
-        """Return the cycle that is replayed as it was recorded."""
+        """Return the recorded data of the current cycle."""
         return self._row(self.index)
 
     def write(self) -> None:
-        """Take no goals: go to where the next cycle was due."""
+        """Ignore the goals, and move the clock to the deadline of the next recorded cycle."""
         following, cycles = self.index + 1, self._inputs.log.cycles
         if following < self._inputs.end:
             self._clock.move(int(cycles["scheduled_ns"][following]))
@@ -169,29 +176,29 @@ class RecordedHardware:
             self._stop.request()
 
     def next(self) -> None:
-        """Go to the next cycle: this one was compared."""
+        """Advance to the next cycle, after the current one was compared."""
         self.index += 1
 
     def set_modes(self, modes: NDArray[np.uint8]) -> None:
-        """Switch nothing: the states have the mode of each servo."""
+        """Do nothing: the recorded states have the modes."""
 
     def set_register(self, row: int, item: str, value: int, done: Callable[[str, int | None], None]) -> None:
-        """Write nothing and report nothing: the states have the result."""
+        """Do nothing: the recorded states have the result."""
 
     def read_register(self, row: int, item: str, done: Callable[[str, int | None], None]) -> None:
-        """Read nothing and report nothing."""
+        """Do nothing: the answer does not affect controllers."""
 
     def switch_torque(self, row: int, on: bool, done: Callable[[str], None]) -> None:
-        """Switch nothing and report nothing: the states have the result."""
+        """Do nothing: the recorded states have the torque."""
 
     def follow_goals(self, rows: Sequence[int]) -> None:
-        """Send nothing: the states have the result."""
+        """Do nothing: the recorded states have the positions."""
 
     def reboot(self, row: int, done: Callable[[str], None]) -> None:
-        """Reboot nothing and report nothing: the states have the result."""
+        """Do nothing: the recorded states have the result of the reboot."""
 
     def limit_torque(self, fraction: float) -> None:
-        """Limit nothing: the states have the result."""
+        """Do nothing: the recorded states have the positions under this limit."""
 
     def stop(self) -> tuple[str, ...]:
         """Do nothing: no servo has torque."""
@@ -202,7 +209,7 @@ class RecordedHardware:
 
 
 def _read_limits(inputs: RunInputs) -> Iterator[tuple[int, int, Sequence[ServoLimit]]]:
-    """Yield when the limits of a joint's servo were read, the joint's row, and the limits."""
+    """Yield time, row and limits of each event that reports the limits of a servo."""
     rows = {joint.name: row for row, joint in enumerate(inputs.loop.joints)}
     for event in inputs.log.events:
         if event.code == EventCode.SERVO_LIMITS and event.source in rows:
@@ -212,9 +219,14 @@ def _read_limits(inputs: RunInputs) -> Iterator[tuple[int, int, Sequence[ServoLi
 
 
 class RecordedInbox:
-    """Gives each cycle the commands that it took in the run, however many.
+    """Inbox that returns the recorded commands of each cycle.
 
-    `remarks`: a sentence for each command that was done in the run and is refused now, or the other way.
+    `remarks` has a sentence for each command whose acceptance differs between run and replay.
+
+    Args:
+        steered: Commands of clients, in the order of the run.
+        record: The cycle's record.
+        prepared: Returns the data of a command, prepared again.
     """
 
     def __init__(
@@ -223,7 +235,6 @@ class RecordedInbox:
         record: CycleRecord,
         prepared: Callable[[TakenCommand], bytes],
     ) -> None:
-        """`prepared` returns the data of a command, prepared again."""
         self.remarks: list[str] = []
         self._steered = tuple(steered)
         self._answered: set[int] = set()
@@ -234,16 +245,16 @@ class RecordedInbox:
             self._by_cycle.setdefault(one.command.cycle, []).append((number, one.command))
 
     def take(self) -> Sequence[Command]:
-        """Return what this cycle took then."""
+        """Return the recorded commands of this cycle."""
         return [
             Command(number, then.controller, then.kind, self._prepared(then), then.origin, then.lease_ns)
             for number, then in self._by_cycle.get(self._record.cycle, ())
         ]
 
     def answer(self, number: int, answer: Answer) -> None:
-        """Compare the first answer to a command with the one in the run."""
+        """Compare the first answer to a command with the recorded one."""
         if number in self._answered:
-            return  # a switch that waited for modes: the states decide about it, and they are compared
+            return  # the late answer of a switch follows from states, which are compared anyway
         self._answered.add(number)
         then = self._steered[number]
         refusal = answer.text if isinstance(answer, Refusal) else ""
@@ -261,7 +272,7 @@ def _outcome(refusal: str) -> str:
 
 
 class PlannedCommands:
-    """Checks that each planned command is taken by the same cycle as in the run."""
+    """Checks that each planned command is executed in the same cycle as in the run."""
 
     def __init__(self, commands: Iterable[TakenCommand], log: str) -> None:
         self._log = log
@@ -270,7 +281,7 @@ class PlannedCommands:
         }
 
     def take(self, command: TakenCommand) -> None:
-        """Compare one command. Raises LogError when another cycle took it in the run."""
+        """Check one command. Raises LogError if another cycle executed it in the run."""
         if command.planned >= 0 and (command.cycle, command.controller, command.kind) not in self._then:
             raise LogError(
                 f"{self._log}: {command.kind} of the plan for {command.controller} was not taken by cycle "
@@ -279,7 +290,7 @@ class PlannedCommands:
 
 
 class _NoEvents:
-    """Drops the events of a recorded run: those of the run itself are in the log."""
+    """Event sink that drops the events of a replay; the log has the original ones."""
 
     def emit(self, code: EventCode, severity: Severity, source: str, text: str, data: bytes = b"") -> None:
         """Drop an event."""
@@ -291,7 +302,7 @@ Compare = Callable[[CycleRecord, np.void, int], None]
 
 @dataclass(frozen=True, slots=True)
 class _ComparingSink:
-    """Passes each cycle with the recorded one to the caller."""
+    """Cycle sink that passes each replayed and recorded cycle to a function."""
 
     hardware: RecordedHardware
     compare: Compare
@@ -300,10 +311,10 @@ class _ComparingSink:
         """Do nothing: no packets are exchanged."""
 
     def begin(self, record: CycleRecord) -> None:
-        """Do nothing: nothing was commanded yet."""
+        """Do nothing: commands follow in the first cycle."""
 
     def append(self, record: CycleRecord) -> None:
-        """Compare one finished cycle and go to the next."""
+        """Compare a finished cycle and advance to the next one."""
         self.compare(record, self.hardware.recorded(), self.hardware.index)
         self.hardware.next()
 
@@ -313,11 +324,11 @@ class RecordedRun:
 
     Args:
         inputs: The inputs of the run.
-        plan: The loop to run: that of the inputs, with changes.
-        plugins: The types of its controllers.
+        plan: Plan to run; that of the inputs, possibly changed.
+        plugins: Controller types.
         row: Returns a cycle of the log by its index.
-        messages: Takes the messages that controllers publish.
-        prepare: Returns the data of a command that a client sent; it gets the command, and a function that
+        messages: Destination of the controllers' messages.
+        prepare: Returns the data of a client's command. Its arguments are the command and a function that
             returns a controller by its name.
     """
 
@@ -361,24 +372,23 @@ class RecordedRun:
 
     @property
     def controllers(self) -> tuple[ControllerPlan, ...]:
-        """The plans of all controllers by their bits in the record's masks."""
+        """Plans of all controllers, by bit in the record's masks."""
         return self._manager.plans
 
     @property
     def remarks(self) -> Sequence[str]:
-        """A sentence for each feature that is not installed, and for each command that was done in the run
-        and is refused now, or the other way round."""
+        """A sentence for each feature that is not installed, and each command whose acceptance differs."""
         return [*self._missing, *self._inbox.remarks]
 
     def run(self, compare: Compare) -> LoopResult:
-        """Run all cycles that can be run again.
+        """Run all cycles that can be replayed.
 
         Raises:
             LogError: The log is damaged.
             ControllerFault: A controller cannot be configured.
         """
         loop = Loop(self._context, self._manager, _ComparingSink(self._hardware, compare))
-        self._row(0)  # what is published before the first cycle finds its messages
+        self._row(0)  # position the log, so that messages before the first cycle are found
         self._manager.configure()
         self._hardware.start()
         return loop.run()

@@ -1,6 +1,6 @@
-"""Safe motion: the steps of a policy, carried out by the loop cycle by cycle, through gate and hardware.
+"""Safe motion: execute the steps of a policy cycle by cycle, through gate and hardware.
 
-Nothing here reads a clock: times are those of the cycles, so that a replay does the same.
+All times are those of the cycles, so a replay gives the same result.
 """
 
 from __future__ import annotations
@@ -19,24 +19,26 @@ from dxlwire.joint_unit import LINEAR, ROTARY, JointUnit
 from dxlwire.modes import Mode
 
 ARRIVED: Mapping[JointUnit, float] = {ROTARY: 0.05, LINEAR: 0.002}
-"""So near to its pose a joint counts as there. Ten ticks of an AX-12: friction holds it off by some."""
+"""Tolerance of a pose, rad or m: ten ticks of an AX-12. Friction stops it some ticks short of its goal."""
 MODES_NS = 500_000_000
-"""How long a policy waits for modes: its own time runs on. Some twenty transactions a servo. [i]"""
+"""Timeout for mode changes, part of the policy's own time. They take some twenty transactions a servo. [i]"""
 STAND_NS = 100_000_000
-"""How long at least a pose, and goals of 0 rad/s to joints that keep their torque, are sent: a write may be
-lost, and a servo that missed a reply gets its goal a cycle later."""
+"""Shortest time for which a pose, or a goal of 0 rad/s for joints that keep their torque, is sent. A write
+may be lost, and a servo that missed a reply gets its goal a cycle later."""
 
 
 @dataclass(slots=True)
 class SafeMotion:
-    """A policy under way; `over` when its last step has ended, or its time has.
+    """Execution of a policy. It is `over` after its last step or its time limit.
 
-    Joints that would not hold still, and those that a pose moves, are brought into other modes first; joints
-    in velocity mode stand from the first cycle on, those with an acceleration limit as soon as it lets them.
-    A pose: goals move toward it at the step's speed, from where they are (the gate lets those with an
-    acceleration limit begin and end within it), and it is reached STAND_NS later if
-    the joints are there, or SETTLE_NS later. Less torque: so many times within the step's time a smaller
-    limit, from the servos' own one down to `fraction` of it.
+    Joints that would not hold still, and joints that a pose moves, change their modes first. Joints in
+    velocity mode stop in the first cycle, or as fast as their acceleration limit permits.
+
+    Step with a pose: goals move toward it at the step's speed, within acceleration limits. The step ends
+    STAND_NS after the goals have arrived if the joints have arrived too, otherwise SETTLE_NS after the goals.
+
+    Step with less torque: the torque limit decreases in `levels` steps within the step's time. It goes from
+    the servos' own limit down to the share `fraction`.
     """
 
     policy: Policy
@@ -45,24 +47,24 @@ class SafeMotion:
     joints: tuple[JointPlan, ...] = field(init=False)
     over: bool = field(default=False, init=False)
     unfinished: str = field(default="", init=False)
-    """Which step ended before it was done, or is a pose that was not reached, and why; empty: none."""
+    """Step that ended early, or pose that was not reached, with the reason; empty: none."""
     _index: int = field(default=0, init=False)
     _began_ns: int = field(default=-1, init=False)
     _step_ns: int = field(default=0, init=False)
     _there_ns: int = field(default=-1, init=False)
     _level: int = field(default=0, init=False)
     _modes: NDArray[np.uint8] = field(init=False)
-    """That joints need first; UNKNOWN: any will do."""
+    """Mode that each joint must enter before the steps; UNKNOWN: no change."""
     _wait_ns: int = field(default=0, init=False)
-    """How long the steps wait for modes, and for joints to stand."""
+    """Timeout for modes and for joints to stop, before the steps."""
     _stand_ns: int = field(init=False)
-    """How long joints are given to stand before the robot holds."""
+    """Time that joints get to stop before the robot holds."""
     _reach: Floats = field(init=False)
-    """How far ahead of a goal its command may be, as a part of the step's way in a cycle."""
+    """Longest lead of a command over its goal, in units of the step's way in a cycle."""
     _speeds: list[Floats] = field(init=False)
-    """How fast each joint moves toward its target in each step, rad/s or m/s."""
+    """Speed of each joint toward its target, by step, rad/s or m/s."""
     _arrived: Floats = field(init=False)
-    """How near to its target each joint has arrived, rad or m."""
+    """Tolerance of each joint's target, rad or m."""
 
     def __post_init__(self) -> None:
         self.record, self.joints = self.context.record, self.context.plan.joints
@@ -76,7 +78,7 @@ class SafeMotion:
         self._stand_ns = STAND_NS + round(min(max(stops_s) * 1e9, limit_ns) if holds else 0)
         standing_ns = self._stand_ns if holds and (Mode.VELOCITY in now or max(stops_s) > 0) else 0
         self._wait_ns = max(MODES_NS if self._modes.any() else 0, standing_ns)
-        # one that brakes within its limit must know its target, not only the next step to it
+        # A joint with an acceleration limit must know its final target to brake in time.
         self._reach = np.array([1.0 if joint.acceleration is None else np.inf for joint in self.joints])
         self._speeds = [
             np.array([step.speed_of(joint.unit) for joint in self.joints]) for step in self.policy.steps
@@ -85,12 +87,12 @@ class SafeMotion:
         self.over = not self.policy.steps and not self._wait_ns
 
     def begin(self) -> None:
-        """Begin a cycle, before its states are read: ask for the modes that joints need, once."""
+        """Request the required modes in the first cycle. Called before the states are read."""
         if self._began_ns < 0 and self._modes.any():
             self.context.hardware.set_modes(self._modes)
 
     def command(self) -> None:
-        """Command this cycle's part of the step; the robot's commands are empty when there is none left."""
+        """Write the commands of this cycle. They are all NaN after the last step."""
         record = self.record
         now_ns = record.woken_ns
         record.commands.clear()
@@ -106,14 +108,14 @@ class SafeMotion:
             self.over = self._index == len(self.policy.steps)
 
     def give_up(self, why: str) -> None:
-        """End before the steps are done."""
+        """End the policy before its steps are complete, and record the reason."""
         if not self.over:
             self.over = True
             step = self.policy.steps[self._index].text if self.policy.steps else "the change of modes"
             self.unfinished = f"{step} ends early: {why}"
 
     def _needed(self, row: int, mode: Mode) -> Mode:
-        """Return into which mode a joint must be brought before the steps."""
+        """Return the mode that a joint must enter before the steps; UNKNOWN: no change."""
         if self.policy.last == "limp" and not self.policy.steps:
             return Mode.UNKNOWN
         if any(step.targets and step.targets[row] is not None for step in self.policy.steps):
@@ -121,7 +123,7 @@ class SafeMotion:
         return Mode.UNKNOWN if mode in {Mode.POSITION, Mode.VELOCITY} else self.joints[row].rest
 
     def _changing(self, now_ns: int) -> bool:
-        """Say whether the steps wait for modes still; they begin when the time for that is over, too."""
+        """Return whether the steps must wait for modes. They begin after the timeout in any case."""
         if not self._wait_ns:
             return False
         away = (self._modes != Mode.UNKNOWN) & (self._modes != self.record.states.mode)
@@ -139,7 +141,7 @@ class SafeMotion:
         record = self.record
         goal, commands = record.goals.position, record.commands
         target: Floats = np.array([np.nan if one is None else one for one in step.targets])
-        # the goal of a limp joint is where it stands, and goes nowhere
+        # The goal of a limp joint follows its measured position, so it never arrives at the pose.
         posed = np.isfinite(target)
         named = posed & ~np.isin(record.states.torque, LIMP)
         if not np.any(named & (np.abs(target - goal) > 1e-9)):
@@ -158,7 +160,7 @@ class SafeMotion:
         return False
 
     def _judge(self, step: Step, posed: list[int], target: Floats, away: NDArray[np.bool_]) -> None:
-        """Say what of a pose was not reached, at its end; the first joint stands for the others."""
+        """Record the worst joint as the reason if a pose was not reached."""
         states = self.record.states
         found = states.unable(posed) or states.doubtful(np.flatnonzero(away).tolist())
         if found is None and away.any():

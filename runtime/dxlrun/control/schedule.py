@@ -1,7 +1,7 @@
-"""When the cycles of a loop are due, and what the controllers' time is then; times in ns of the loop's clock.
+"""Schedule: deadlines of a loop's cycles and the controllers' time, in ns of the loop's clock.
 
-`absolute` is how robots run. `sequential` is how the library did it that the thesis compares its loop with
-(M. A. Araujo, UFU 2017, equation 2.2): it keeps no time, and exists as the yardstick of
+Robots run with the `absolute` schedule. The `sequential` schedule is that of the library to which the thesis
+compares its loop (M. A. Araujo, UFU 2017, equation 2.2). It does not keep time, and serves as the baseline of
 `dxlrun experiment tracking`.
 """
 
@@ -12,39 +12,44 @@ from dataclasses import dataclass
 from dxlrun.plan.loop_plan import LoopPlan, OverrunPolicy
 
 MOST_CAUGHT_UP = 5
-"""Deadlines that `catch_up` makes up for in a row, what is more is skipped; the guardian waits as long."""
+"""Most missed deadlines that `catch_up` makes up for in a row. The guardian waits for as many periods."""
 
 
 @dataclass(slots=True)
 class Schedule:
-    """When the next cycle is due, and the controllers' time then; a cycle is numbered by its period.
+    """Deadline of the next cycle and the controllers' time. Cycles are numbered by period.
 
-    Absolute, t_d[i] = t_0 + i * T: a grid that keeps its phase, however late a cycle begins; controllers see
-    the time of the wake-up. Sequential, t_d[i+1] = t[i] + T: a cycle is due one period after the one before
-    it *began*, so delays add up; controllers see the number of the cycle times the period, whatever the clock
-    says, so a motion is sent pose after pose, by number: no cycle is left out, a late end goes unnoticed.
-    A change of `period_ns` counts from the cycle on that is due now.
+    Absolute, t_d[i] = t_0 + i * T: a grid that keeps its phase, even if cycles begin late. Controllers get
+    the time of the wake-up.
+
+    Sequential, t_d[i+1] = t[i] + T: a cycle is due one period after the *begin* of the previous one, so
+    delays add up. Controllers get the number of the cycle times the period instead of the time of the clock.
+    A motion is thus sent pose by pose: no cycle is skipped, and a late end is not noticed.
+
+    A change of `period_ns` applies from the cycle that is due now.
     """
 
     period_ns: int
     sequential: bool = False
     cycle: int = 0
     due_ns: int = 0
-    """When `cycle` is due, if all before it begin on time."""
+    """Deadline of `cycle`, if all earlier cycles begin on time."""
     grid_ns: int = 0
-    """The controllers' time in `cycle`, if that begins on time: since the first deadline, pauses left out."""
+    """Controllers' time at the deadline of `cycle`: time since the first deadline, without pauses."""
     time_ns: int = 0
-    """The controllers' time in the cycle that runs; it never goes back."""
+    """Controllers' time in the running cycle. It never goes back."""
 
     def start(self, now_ns: int) -> None:
-        """Make the first deadline one period from now."""
+        """Set the first deadline to one period from now."""
         self.cycle = self.grid_ns = self.time_ns = 0
         self.due_ns = now_ns + self.period_ns
 
     def begin_cycle(self, woken_ns: int) -> int:
-        """Begin the cycle that is due; return by how much its time would go back.
+        """Begin the cycle that is due, and set the controllers' time.
 
-        That is more than 0 after a pause that a cycle began late.
+        Returns:
+            Time by which the controllers' time would go back, ns. Positive after a pause that began in a late
+            cycle, otherwise at most 0.
         """
         if self.sequential:
             self.due_ns = woken_ns
@@ -55,22 +60,25 @@ class Schedule:
         return behind_ns
 
     def end_cycles(self, now_ns: int) -> None:
-        """Let the controllers' time pass until now, after the last cycle."""
+        """Advance the controllers' time to now, after the last cycle."""
         passed_ns = 0 if self.sequential else now_ns - self.due_ns
         self.time_ns = max(self.time_ns, self.grid_ns + passed_ns)
 
     def advance(self, cycle: int) -> None:
-        """Go to a later cycle."""
+        """Advance to a later cycle."""
         passed_ns = (cycle - self.cycle) * self.period_ns
         self.cycle = cycle
         self.due_ns += passed_ns
         self.grid_ns += passed_ns
 
     def following(self, now_ns: int, policy: OverrunPolicy) -> int:
-        """Return the cycle to run after the one that ended now.
+        """Return the number of the cycle to run next.
 
-        `skip`: the first whose deadline has not passed, so that two cycles never follow each other in a
-        burst. `catch_up`: the next one, as long as at most MOST_CAUGHT_UP are due. `stop`: as `skip`.
+        Args:
+            now_ns: End of the current cycle.
+            policy: `skip` and `stop` select the first cycle whose deadline has not passed, so that cycles do
+                not run in a burst. `catch_up` selects the next cycle, and skips cycles only if more than
+                MOST_CAUGHT_UP are due.
         """
         first = self.cycle - (self.due_ns - now_ns) // self.period_ns
         if policy == "catch_up":
@@ -79,5 +87,5 @@ class Schedule:
 
 
 def schedule_of(plan: LoopPlan) -> Schedule:
-    """Return the schedule that a plan has."""
+    """Return the schedule of a plan."""
     return Schedule(plan.period_ns, plan.schedule == "sequential")

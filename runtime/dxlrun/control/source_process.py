@@ -1,6 +1,6 @@
-"""Source processes: what a feature samples beside the loop, and the readers of its samples in the loop.
+"""Source processes: processes that sample the sources of features, and their readers in the loop.
 
-Each process writes its newest sample into a slot of shared memory, and a reader copies it into the record.
+Each process writes its newest sample into a slot of shared memory. A reader copies it into the record.
 """
 
 from __future__ import annotations
@@ -22,7 +22,7 @@ from dxlrun.plan.loop_plan import LoopPlan
 from dxlsim.motion.link_motion import Body
 
 Slots = Mapping[str, Sequence[memoryview]]
-"""Slots of the processes of each feature, by its name."""
+"""Slots of the processes of each feature, by name of the feature."""
 _NUMBER = re.compile(r"\[Errno -?\d+\] ")
 
 
@@ -32,35 +32,38 @@ class SourceProcess(msgspec.Struct, frozen=True):
     source: str
     """Name of the source."""
     kind: str
-    """Word for it in sentences: `sensor`."""
+    """Noun for messages: `sensor`."""
     values: int
-    """States of a sample."""
+    """Number of states in a sample."""
     period_ns: int
     """Time between two samples."""
     plan: bytes
-    """What the feature needs to open the source."""
+    """Data with which the feature opens the source."""
     has_body: bool = False
-    """It senses the simulated body."""
+    """True if it senses the simulated body."""
 
     @property
     def title(self) -> str:
-        """The source as sentences name it: `sensor imu`."""
+        """Name of the source in messages: `sensor imu`."""
         return f"{self.kind} {self.source}"
 
 
 class SampledSource(Protocol):
-    """A source at work, which writes its samples into a slot. Only `open_first` raises what it raises."""
+    """A running source, which writes its samples into a slot.
+
+    Only `open_first` may raise exceptions of the driver.
+    """
 
     reopen_ns: int
-    """When it is opened again; of use only while it is not `open`."""
+    """Time of the next attempt to open the device. Valid only while it is not `open`."""
 
     @property
     def driver(self) -> object:
-        """Object of a plug-in that samples."""
+        """Driver object of a plug-in."""
 
     @property
     def open(self) -> bool:
-        """True while its device is open."""
+        """True while the device is open."""
 
     @property
     def waits(self) -> bool:
@@ -70,10 +73,10 @@ class SampledSource(Protocol):
         """Open the device at the start of a run."""
 
     def sample(self) -> bool:
-        """Take one sample, or open the device again when that is due; return whether there was a sample."""
+        """Sample once, or reopen the device when that is due; return whether there was a sample."""
 
     def fail(self, error: Exception) -> None:
-        """Close the device for what was raised, and open it again after a while."""
+        """Close the device after an error, and schedule an attempt to reopen it."""
 
     def close(self) -> None:
         """Close the device."""
@@ -81,7 +84,7 @@ class SampledSource(Protocol):
 
 @dataclass(frozen=True, slots=True)
 class SourceContext:
-    """What a source gets from the process that samples it."""
+    """Objects that a source gets from its process."""
 
     plugins: PlugIns
     writer: SlotWriter
@@ -93,21 +96,21 @@ class SourceContext:
 
 @dataclass(frozen=True)
 class ProcessStage:
-    """`STAGE` of `process.py`: processes of a feature beside the loop; in the loop's own on virtual time."""
+    """`STAGE` of `process.py`: processes of a feature. On virtual time, they run in the loop's process."""
 
     FILE: ClassVar[str] = "process"
 
     processes: Callable[[bytes], Sequence[SourceProcess]]
-    """Returns the processes of `Contribution.plan`."""
+    """Returns the processes for `Contribution.plan`."""
     build: Callable[[bytes, SourceContext], SampledSource]
-    """Builds the source of `SourceProcess.plan`, in its process. Raises PlugInError."""
+    """Builds the source for `SourceProcess.plan`, in its process. Raises PlugInError."""
     refuse_virtual_time: Callable[[bytes], str] = lambda plan: ""
-    """Returns why a run with `Contribution.plan` cannot be on virtual time; empty if it can."""
+    """Returns the reason why a run with `Contribution.plan` cannot use virtual time; empty if it can."""
 
 
 @dataclass(frozen=True, slots=True)
 class PlannedProcess:
-    """A process of a run, with its place among those of its feature."""
+    """A process of a run, with its index among the processes of its feature."""
 
     feature: Feature
     stage: ProcessStage
@@ -116,36 +119,36 @@ class PlannedProcess:
 
 
 def planned_processes(loop: LoopPlan) -> Iterator[PlannedProcess]:
-    """Yield the processes of all features of a robot, in their order."""
+    """Yield the processes of all features of a robot, in order of features and processes."""
     for feature, stage in stages(ProcessStage, loop.features):
         for index, process in enumerate(stage.processes(loop.feature_plans.get(feature.name, b""))):
             yield PlannedProcess(feature, stage, index, process)
 
 
 class SourceReader(Protocol):
-    """Copies newest samples into the record."""
+    """Copies the newest samples into the record."""
 
     def read(self) -> None:
-        """Fill the rows of its sources. Called in each cycle after the servos were read; never waits."""
+        """Update the rows of its sources. Called in each cycle after the servos were read. Never waits."""
 
 
 @dataclass(frozen=True, slots=True)
 class ReaderContext:
-    """What a reader gets in the loop's process."""
+    """Objects that a reader gets in the loop's process."""
 
     plan: bytes
     """`Contribution.plan` of the feature."""
     slots: Sequence[memoryview]
-    """Slots of its processes, in their order."""
+    """Slots of its processes, in the order of the processes."""
     record: CycleRecord
     now_ns: Callable[[], int]
-    """The clock by which the slots have times."""
+    """Clock of the times in the slots."""
     events: EventSink
 
 
 @dataclass(frozen=True)
 class ReaderStage:
-    """`STAGE` of `reader.py`: the loop's end of the processes of a feature. A replay has no readers."""
+    """`STAGE` of `reader.py`: reads the samples of a feature in the loop. A replay has no readers."""
 
     FILE: ClassVar[str] = "reader"
 
@@ -165,6 +168,6 @@ def build_readers(
 
 
 def describe_error(error: BaseException) -> str:
-    """Return an error in one line."""
+    """Return an error as one line of text."""
     text = _NUMBER.sub("", " ".join(str(error).split()))
     return text if isinstance(error, OSError) and text else f"{type(error).__name__}: {text}"

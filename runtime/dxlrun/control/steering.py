@@ -1,7 +1,7 @@
-"""Steering: after a cycle's read, take commands from outside, a bounded number, and answer each of them.
+"""Steering: execute and answer a bounded number of client commands after each cycle's read.
 
-A command for the loop itself has a kind and the data of it, one form each (FORMS); here is what each of them
-does, with the rate of the loop and its pauses.
+Commands for the loop itself have a kind and data of a form (FORMS). This module executes them, including
+changes of the loop's rate and pauses.
 """
 
 from __future__ import annotations
@@ -36,20 +36,20 @@ from dxlrun.control.monitors.policy_actions import PolicyActions
 from dxlrun.plan.loop_plan import ControllerPlan
 
 MOST_RATE = 100_000.0
-"""Hz; as in the robot file."""
+"""Hz; same limit as in the robot file."""
 LEAST_RATE = 1.0
-"""Hz, the lowest rate that can be requested while the loop runs: requests are taken once a cycle, `stop` too,
-and the guardian's limit follows the rate."""
+"""Hz; lowest rate that clients can request. Commands, also `stop`, are executed once a cycle, and the
+guardian's timeout follows the rate."""
 PAUSE_LEASE_NS = 60_000_000_000
-"""A pause ends by `on_stale_command` when no client gave the loop a command for so long."""
+"""A pause ends by `on_stale_command` after so long without a command for the loop."""
 PAUSED_CYCLE_NS = 200_000_000
-"""How long a cycle may take while the loop is paused: a controller may be loaded in it."""
+"""Timeout of a cycle while the loop is paused. It is longer because a cycle may load a controller."""
 LONGEST_SHOWN = 120
-"""Characters of a command's data in the event that reports it."""
+"""Longest data of a command in its event, characters."""
 
 
 class Play(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
-    """Data of `play`: what controllers are given from this cycle on; the array has all commands in a row."""
+    """Data of `play`: parts of a motion. An array with all their commands follows the JSON text."""
 
     parts: tuple[PlayedPart, ...]
 
@@ -72,15 +72,15 @@ FORMS: Mapping[str, type[msgspec.Struct] | None] = {
     "commander": NewCommander,
     "stop": None,
 }
-"""Commands for the loop, with the form of their data; None: they carry nothing."""
+"""Kinds of commands for the loop with the form of their data; None: no data."""
 
 
 class Steering:
-    """Executes the commands of an inbox, logs them, and answers them; the loop's rate, and its pauses.
+    """Executes, logs and answers the commands of an inbox, and controls the loop's rate and pauses.
 
-    Most are answered in the cycle that takes them. A switch that waits for modes is answered by `Waiting`
-    first, and again when its controllers are active or given up; so are torque, reboots, and a halt when the
-    joints stand still. A register is answered when the servo has it.
+    Most commands are answered in the cycle that executes them. A switch that waits for modes is first
+    answered with `Waiting`, and again when its controllers are active or dropped. Torque requests, reboots
+    and halts are answered twice in the same way. A register is answered when the servo has responded.
     """
 
     def __init__(
@@ -95,9 +95,9 @@ class Steering:
         self.halt = Halt(context, manager.switching, self._answer)
         self.anchoring = Anchoring(context, manager.switching, gate)
         self.paused_until_ns = 0
-        """When a pause ends without its client; 0: no pause."""
+        """Time at which a pause ends without further commands, ns; 0: no pause."""
         self.stood = False
-        """True in a cycle that is, or just was, in a pause: a controller may have been loaded."""
+        """True in cycles of a pause and in the cycle that ends it, which may be long."""
         self._context = context
         self._record = context.record
         self._supervision = context.supervision
@@ -110,9 +110,15 @@ class Steering:
         self.inbox.answer(number, answer)
 
     def execute_commands(self, commands: Sequence[Command]) -> int:
-        """Execute what has come, and end streams and pauses whose lease ran out; called where anything may.
+        """Execute commands, and end streams and pauses whose lease expired.
 
-        Returns the number of commands for controllers.
+        The loop calls it only if there are commands, streams, a pause or a halt.
+
+        Args:
+            commands: Commands from the inbox.
+
+        Returns:
+            Number of accepted commands for controllers.
         """
         count = 0
         record, manager = self._record, self._manager
@@ -162,18 +168,18 @@ class Steering:
         return count
 
     def refuse(self) -> None:
-        """Refuse what has come, because the run is ending; it is not in the log, as it changes nothing."""
+        """Refuse new commands because the run is ending. They are not logged, as they have no effect."""
         for command in self.inbox.take():
             self.inbox.answer(command.number, Refusal(Code.RUN_ENDING))
 
     def end(self) -> None:
-        """Answer what waits still: the controllers are inactive."""
+        """Answer all commands that still wait, after the controllers were deactivated."""
         self.answer_late()
         self.joints.end()
         self.halt.end()
 
     def answer_late(self) -> None:
-        """Answer the switches that waited for modes and have come to an end."""
+        """Answer the switches whose wait for modes has ended."""
         ended = self._manager.switching.ended
         for number, refusal in ended:
             self.inbox.answer(number, refusal or Done(self._record.cycle))
@@ -187,7 +193,14 @@ class Steering:
         return self.paused_until_ns > 0
 
     def change_rate(self, rate: float) -> Refusal | None:
-        """Run in another period from the next cycle on, Hz."""
+        """Change the rate of the loop from the next cycle on.
+
+        Args:
+            rate: Hz.
+
+        Returns:
+            The refusal, or None on success.
+        """
         if not LEAST_RATE <= rate <= MOST_RATE:
             bounds = {"rate": rate, "lowest": LEAST_RATE, "highest": MOST_RATE}
             return Refusal(Code.RATE_OUT_OF_RANGE, bounds)
@@ -207,8 +220,7 @@ class Steering:
         return None
 
     def pause(self) -> Refusal | None:
-        """Stop the controllers' time after this cycle's read: servos are read and held, no controller is
-        updated."""
+        """Stop the controllers' time in this cycle. Servos are read and held; controllers are not updated."""
         if self.paused:
             return Refusal(Code.PAUSED_ALREADY)
         self.stood = True
@@ -218,7 +230,7 @@ class Steering:
         return None
 
     def resume(self) -> Refusal | None:
-        """Let the controllers' time run again; goals that moved away meanwhile are approached slowly."""
+        """Resume the controllers' time, with a slow start toward commands that differ from the goals."""
         if not self.paused:
             return Refusal(Code.NOT_PAUSED)
         self.paused_until_ns = 0
@@ -228,13 +240,13 @@ class Steering:
         return None
 
     def _set_cycle_limit(self) -> None:
-        """Set how long a cycle may take; what this one took until now does not count."""
+        """Set the guardian's timeout of a cycle. The time of this cycle counts from now."""
         self._supervision.beat()
         period_ns = self._schedule.period_ns
         self._supervision.limit_cycle(max(period_ns, PAUSED_CYCLE_NS) if self.paused else period_ns)
 
     def _stale(self, why: str) -> str:
-        """End the run where the policy for a stale command ends it, and return that in words."""
+        """End the run if the policy for stale commands requires it; return that as text, or an empty one."""
         policy = self._context.plan.policies.on_stale_command
         if policy.goes_on:
             return ""
@@ -244,7 +256,7 @@ class Steering:
     # Commands
 
     def _for_loop(self, command: Command) -> Answer | None:
-        """Execute a command for the loop itself; None: it is answered later."""
+        """Execute a command for the loop itself; return None if it is answered later."""
         kind, data, numbers = command.kind, command.data, b""
         if kind not in FORMS:
             problem = f"the loop has no command {kind}; known: {', '.join(FORMS)}"
@@ -263,7 +275,7 @@ class Steering:
         return self._execute(command, request, numbers) or Done(self._record.cycle)
 
     def _execute(self, command: Command, request: msgspec.Struct | None, numbers: bytes) -> Answer | None:
-        """Execute a command for the loop; None: it is done, and there is nothing to say about it."""
+        """Execute a decoded command for the loop; return None on success without a result."""
         manager = self._manager
         found: Answer | None = None
         match request:
@@ -281,7 +293,7 @@ class Steering:
                 found = self.change_rate(request.rate)
             case ControllerPlan():
                 place = manager.load(request)
-                self._supervision.beat()  # the guardian waits for each of them
+                self._supervision.beat()  # loading takes long: the guardian's timeout applies to each load
                 found = place if isinstance(place, Refusal) else Done(self._record.cycle, place)
             case Unload():
                 found = manager.unload(request.controller)
@@ -300,7 +312,7 @@ class Steering:
     # Reports
 
     def _report(self, command: Command, answer: Answer | None, place: int) -> None:
-        """Report a command that was refused, or is for the loop; what a controller took has its event."""
+        """Report a refused command or a command for the loop. `Manager` reports those for controllers."""
         refusal = answer if isinstance(answer, Refusal) else None
         if refusal is not None:
             code, severity, source = EventCode.COMMAND_REFUSED, Severity.WARNING, command.controller or "loop"
@@ -309,7 +321,7 @@ class Steering:
             code, severity, source = EventCode.STEERED, Severity.INFO, "loop"
             shown = command.data.partition(b"\n")[0].decode(errors="replace")
             if len(shown) > LONGEST_SHOWN:
-                shown = f"{shown[:LONGEST_SHOWN]} ..."  # all of it is among the log's commands
+                shown = f"{shown[:LONGEST_SHOWN]} ..."  # the log of commands has all data
             text = f"{f'{command.kind} {shown}'.strip()} from {command.origin}"
         data = msgspec.json.encode(CommandOutcome(command.kind, command.origin, refusal, place))
         self._context.events.emit(code, severity, source, text, data)

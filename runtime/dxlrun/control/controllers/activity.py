@@ -114,7 +114,7 @@ class Activity:
         raised: BaseException | None = None
         try:
             call(*arguments, **named)
-        except BaseException as error:  # foreign code: it must not take the loop along
+        except BaseException as error:  # foreign code must not end the loop
             if is_interrupt(error):
                 raise
             raised = error

@@ -1,7 +1,7 @@
-"""Monitors: what is watched in every cycle; what a run does then is in its `policies`.
+"""Monitors: checks of every cycle that act according to the run's `policies`.
 
-A policy that reacts to states is a feature whose `monitor.py` has a class such as `LostServos`, which acts by
-`PolicyActions`. Neither the loop nor `check` changes for it.
+A policy that reacts to states is a feature with a class such as `LostServos` in its `monitor.py`, which acts
+through `PolicyActions`. A new one changes neither the loop nor `check`.
 """
 
 from __future__ import annotations
@@ -14,6 +14,6 @@ from dxlrun.plan.loop_plan import LoopPlan
 
 
 def build_monitors(plan: LoopPlan, record: CycleRecord, actions: PolicyActions) -> tuple[Monitor, ...]:
-    """Return the monitors that have something to watch in this robot, in the order of a cycle."""
+    """Return the monitors that apply to this robot, in the order in which a cycle calls them."""
     built = (stage.monitor.build(plan, record, actions) for _, stage in stages(MonitorStage, plan.features))
     return tuple(one for one in built if one is not None)

@@ -1,4 +1,4 @@
-"""Monitor: what every monitor of the loop has."""
+"""Monitor: interface of the loop's monitors."""
 
 from __future__ import annotations
 
@@ -11,18 +11,18 @@ from dxlrun.plan.loop_plan import LoopPlan
 
 
 class Monitor(Protocol):
-    """Watches one thing in every cycle, and acts when it is not as planned.
+    """Check of one condition in every cycle.
 
-    It decides by the record and the plan alone, so a replay decides like the run. It allocates nothing that
-    grows from cycle to cycle.
+    Its decisions depend on the record and the plan only, so a replay makes the same ones. Its memory must not
+    grow from cycle to cycle.
     """
 
     @classmethod
     def build(cls, plan: LoopPlan, record: CycleRecord, actions: PolicyActions) -> Self | None:
-        """Return a monitor for this robot; None: it has nothing to watch, and costs nothing."""
+        """Return a monitor for this robot, or None if it does not apply."""
 
     def check(self, time_ns: int) -> None:
-        """Look at the states of this cycle, before commands and controllers; not while a run ends.
+        """Check the states of this cycle. Called before commands and controllers, except while a run ends.
 
         Args:
             time_ns: The controllers' time.
@@ -31,7 +31,7 @@ class Monitor(Protocol):
 
 @dataclass(frozen=True)
 class MonitorStage:
-    """`STAGE` of `monitor.py`: asked when a loop is built."""
+    """`STAGE` of `monitor.py`, used when a loop is built."""
 
     FILE: ClassVar[str] = "monitor"
 
