@@ -29,7 +29,7 @@ examples:
   python -m dxlsim --servo AX-12A:1-3 --servo MX-28:4 --protocol 1.0 --baud 1000000
   python -m dxlsim --servo XL430-W250:1 --fault "silence servo=1 at=5s for=1s" --ledger bus.jsonl
 """
-_BUFFER = 1 << 16  # Bytes of the ledger that are written out together
+_BUFFER = 1 << 16  # Write buffer of the ledger, bytes
 
 
 def _parser() -> argparse.ArgumentParser:
@@ -98,7 +98,8 @@ def _parser() -> argparse.ArgumentParser:
 def main(words: Sequence[str] | None = None) -> int:
     """Serve until SIGINT or SIGTERM.
 
-    Return 0, 1 when the ledger could not be written to its end, 2 when the words are wrong.
+    Returns:
+        0; 1 if the ledger is incomplete after a write error; 2 if the arguments are wrong.
     """
     parser = _parser()
     given = parser.parse_args(words)
@@ -167,4 +168,4 @@ def _text_of(bus: BusConfig) -> str:
 if __name__ == "__main__":
     with suppress(BrokenPipeError):
         sys.exit(main())
-    os._exit(1)  # whoever read the output is gone
+    os._exit(1)  # The reader of the output has exited

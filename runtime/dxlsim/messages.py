@@ -1,4 +1,4 @@
-"""What the process of the simulated buses and the one that started it send each other: JSON, one a line."""
+"""Messages between the process of the simulated buses and the process that started it: JSON, one per line."""
 
 from __future__ import annotations
 
@@ -8,25 +8,25 @@ from dxlsim.simulation_plan import SimulationConfig
 
 
 class SimulationJob(msgspec.Struct, frozen=True):
-    """What the process of the simulated buses does, as JSON through a descriptor."""
+    """Task of the process of the simulated buses, sent as JSON through a descriptor."""
 
     config: SimulationConfig
-    ledger: str | None = None  # JSON-lines file of every byte on the buses
-    priority: int = 0  # Real-time priority that it asks for, 1 to 99; 0: none
-    core: int = -1  # Core that it stays on; -1: any
-    shafts: int = -1  # Descriptor of the slot into which it writes how its shafts move; -1: none
-    progress: int = -1  # Descriptor of the memory into which it writes how far it has come; -1: none
+    ledger: str | None = None  # JSON-lines file for every byte on the buses
+    priority: int = 0  # Requested real-time priority, 1 to 99; 0: none
+    core: int = -1  # Core to run on; -1: any
+    shafts: int = -1  # Descriptor of the slot for the motion of the shafts; -1: none
+    progress: int = -1  # Descriptor of the memory for the progress of the process; -1: none
 
 
 class Request(msgspec.Struct):
-    """To the simulation."""
+    """Message to the simulation."""
 
-    look: bool = False  # answered by every servo as it is now
-    fault: str | None = None  # a line of a fault to plan, as a person types it
+    look: bool = False  # Request the current state of every servo
+    fault: str | None = None  # Line of a fault to plan, as typed by a person
 
 
 class ServoLook(msgspec.Struct, frozen=True):
-    """One servo as it is now."""
+    """Current state of one servo."""
 
     bus: str
     id: int
@@ -36,19 +36,22 @@ class ServoLook(msgspec.Struct, frozen=True):
     present: float  # rad
     temperature: float  # degrees C
     voltage: float  # V
-    error: int  # present error: the error byte (Protocol 1.0), or the value of the error item
-    heard: int  # instruction packets to it since the start
-    answered: int  # status packets from it since the start
+    error: int  # Current errors: the error byte (Protocol 1.0), or the value of the error item
+    heard: int  # Instruction packets received since the start
+    answered: int  # Status packets sent since the start
 
 
 class SimulationMessage(msgspec.Struct, frozen=True, omit_defaults=True):
-    """From the simulation: one of these, `real_time` with the first ports, `lateness_us` with servos."""
+    """Message from the simulation: one of these fields, `real_time` with the first ports, `lateness_us` with
+    servos.
+    """
 
-    ports: dict[str, str] | None = None  # the device of each bus; empty where an adapter is unplugged
-    real_time: str = ""  # what the system granted of it
+    ports: dict[str, str] | None = None  # Device of each bus; empty while an adapter is unplugged
+    real_time: str = ""  # Real-time properties that the system granted
     servos: tuple[ServoLook, ...] | None = None
     lateness_us: dict[str, float] = {}
-    """How late replies were handed over, by what it is of, such as median and p99; empty before the first."""
-    happened: str | None = None  # a fault that was injected now
-    fault: str | None = None  # a fault line that was understood, in its canonical writing
-    error: str | None = None  # Why the configuration cannot be served, or what is wrong with a fault line
+    """Lateness of the deliveries to the host, us, by statistic, such as median and p99; empty before the
+    first."""
+    happened: str | None = None  # Fault that was just injected
+    fault: str | None = None  # Accepted fault line in canonical form
+    error: str | None = None  # Reason why the configuration or a fault line is invalid

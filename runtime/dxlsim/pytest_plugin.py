@@ -1,11 +1,11 @@
-"""The pytest fixture `dynamixel_bus`: a simulated bus on a pseudo-terminal, for tests of any program.
+"""Pytest fixture `dynamixel_bus`: a simulated bus on a pseudo-terminal, for tests of any program.
 
-A project turns it on in its `conftest.py`:
+A project enables it in its `conftest.py`:
 
     pytest_plugins = ["dxlsim.pytest_plugin"]
 
-It is not an entry point: pytest imports those in each run of every project of the environment, and rewrites
-the assertions in all modules of a distribution that has one.
+It is not an entry point: pytest would import it in each run of every project of the environment, and rewrite
+the assertions in all modules of the distribution.
 """
 
 from __future__ import annotations
@@ -17,7 +17,7 @@ import pytest
 from dxlsim.serving.served_bus import ServedBus, serve_bus
 
 SERVOS = "XL430-W250:1,2"
-"""Servos of a test that names none."""
+"""Servos of a test without the mark."""
 
 
 def pytest_configure(config: pytest.Config) -> None:
@@ -33,7 +33,7 @@ def pytest_configure(config: pytest.Config) -> None:
 def dynamixel_bus(request: pytest.FixtureRequest) -> Iterator[ServedBus]:
     """Serve simulated Dynamixel servos on a pseudo-terminal: XL430-W250 with IDs 1 and 2.
 
-    `@pytest.mark.dynamixel_bus("AX-12A:1-6", faults=["silence servo=3"])` chooses others.
+    `@pytest.mark.dynamixel_bus("AX-12A:1-6", faults=["silence servo=3"])` selects other servos.
     """
     mark = request.node.get_closest_marker("dynamixel_bus")
     with serve_bus(*(mark.args or (SERVOS,)), **mark.kwargs) if mark else serve_bus(SERVOS) as bus:

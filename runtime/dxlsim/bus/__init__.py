@@ -1,4 +1,4 @@
-"""Bus: one simulated line and its adapter, the bytes on it and their times, and the ledger of them.
+"""Bus: one simulated line with its adapter, the bytes on it with their times, and the ledger.
 
-What a servo answers belongs in `servo`.
+The replies of a servo belong in `servo`.
 """

@@ -1,7 +1,7 @@
-"""The USB adapter between line and host: when it hands over what it has received, and in what pieces.
+"""Simulated USB adapter between line and host: timing and splitting of the bytes that it delivers.
 
-Not modelled: the frames of USB itself (125 us or 1 ms), what a hub or another device on it costs, the way of
-the host's bytes to the line, and modem lines.
+Not modelled: the frames of USB itself (125 us or 1 ms), delays by hubs and other devices, the transfer of the
+host's bytes to the line, and modem lines.
 """
 
 from __future__ import annotations
@@ -14,54 +14,55 @@ from dxlsim.bus.line import Transmission
 from dxlsim.simulation_plan import AdapterConfig
 
 BURST = 62
-"""Bytes that an FTDI chip hands over without waiting for its timer: a USB packet of 64 bytes less two of
-status (FTDI, AN232B-04, "Data Throughput, Latency and Handshaking")."""
+"""Bytes that an FTDI chip delivers without waiting for its timer: a USB packet of 64 bytes minus two status
+bytes (FTDI, AN232B-04, "Data Throughput, Latency and Handshaking")."""
 
 UNREAD_LIMIT = 4096
-"""Bytes that wait for a host that does not take them; more are lost, as in the kernel's terminal buffer."""
+"""Size of the receive buffer for a host that does not read; further bytes are lost, as in the kernel's
+terminal buffer."""
 
-_LONGEST_PIECE = 8  # Bytes of the longest piece of `random`
+_LONGEST_PIECE = 8  # Longest piece with the split `random`, bytes
 
 
 HandOver = tuple[int, bytes, Sequence[Transmission]]
-"""When bytes are planned for the host, the bytes, and what the host has then received to its end."""
+"""Planned time of a delivery to the host, its bytes, and the transmissions that it completes."""
 
 
 class SimulatedAdapter:
-    """Holds what has passed the wire until the host receives it."""
+    """Buffer for bytes that have passed the wire, until the host receives them."""
 
     def __init__(self, config: AdapterConfig, start_ns: int) -> None:
         self.timer_ns = config.latency_timer_ns
         self._split = config.split
         self.immediate = config.latency_timer_ns == 0 and config.split == "whole"
-        """True: what ends on the wire is with the host at that moment."""
+        """True if the host receives a transmission at the moment at which it ends on the wire."""
         self._arrived: deque[Transmission] = deque()
-        """What has passed the wire to its end and is not all handed over."""
+        """Transmissions that have ended on the wire and are not fully delivered."""
         self._chance = random.Random(config.seed)
-        self._piece = self._next_piece()  # Bytes of the next piece
+        self._piece = self._next_piece()  # Size of the next piece, bytes
         self._timed_ns = start_ns
-        """When the latency timer last ran out, or a burst went before it did."""
-        self._burst: deque[HandOver] = deque()  # Pieces of what the timer let go
+        """Time at which the latency timer last expired, or at which a full burst was sent before that."""
+        self._burst: deque[HandOver] = deque()  # Pieces of the burst that is being delivered
 
     def set_timer(self, timer_ns: int, now_ns: int) -> None:
-        """Change the latency timer; it starts anew."""
+        """Change and restart the latency timer."""
         self.timer_ns, self._timed_ns = timer_ns, now_ns
         self.immediate = timer_ns == 0 and self._split == "whole"
 
     def accept(self, new: Transmission) -> bool:
-        """Take what has passed the wire; False: there is no room for it."""
+        """Accept a transmission that has ended on the wire; return False if the buffer is full."""
         if self._arrived and sum([len(each.data) for each in self._arrived]) + len(new.data) > UNREAD_LIMIT:
             return False
         self._arrived.append(new)
         return True
 
     def forget(self) -> None:
-        """Lose everything that the host has not received."""
+        """Discard all bytes that the host has not received."""
         self._arrived.clear()
         self._burst.clear()
 
     def next_ns(self, passing: Sequence[Transmission]) -> int | None:
-        """Return when the next bytes are handed over, were nothing to disturb them; None: never."""
+        """Return the time of the next delivery if nothing else happens; None without bytes."""
         if self._burst:
             return self._burst[0][0]
         if not (self._arrived or passing):
@@ -72,7 +73,7 @@ class SimulatedAdapter:
         return first.passed_ns(min(len(first.data), first.given + self._piece) - 1)
 
     def hand_over(self, now_ns: int, passing: Sequence[Transmission]) -> list[HandOver]:
-        """Return what the host receives by a time."""
+        """Return the deliveries to the host up to a time."""
         given: list[HandOver] = []
         while (due_ns := self.next_ns(passing)) is not None and due_ns <= now_ns:
             if self._burst:
@@ -88,9 +89,9 @@ class SimulatedAdapter:
         return given
 
     def _timer_end_ns(self, queue: Sequence[Transmission]) -> int:
-        """Return when the timer runs out with a byte there, or so many are there that it does not count.
+        """Return the time at which the timer expires with a byte waiting, or a full burst is complete.
 
-        It starts anew with each hand-over and runs out with nothing to give, too (AN232B-04).
+        The timer restarts with each delivery. It also expires with an empty buffer (AN232B-04).
         """
         timer_ns = self.timer_ns
         oldest_ns = max(queue[0].passed_ns(queue[0].given), self._timed_ns + 1)
@@ -104,7 +105,7 @@ class SimulatedAdapter:
         return runs_out_ns
 
     def _gather(self, now_ns: int, most: int, passing: Sequence[Transmission]) -> HandOver:
-        """Take up to so many bytes that have passed the wire."""
+        """Collect up to `most` bytes that have passed the wire."""
         data, ended = b"", []
         for each in (*self._arrived, *passing):
             if each.first_ns >= now_ns:
@@ -122,7 +123,7 @@ class SimulatedAdapter:
         return now_ns, data, ended
 
     def _pieces(self, due_ns: int, burst: HandOver) -> list[HandOver]:
-        """Return a burst in pieces, so far from each other that a host can distinguish them [i]."""
+        """Split a burst into pieces with pauses that are long enough for a host to distinguish them [i]."""
         if self._split == "whole":
             return [burst]
         _, data, ended = burst

@@ -1,4 +1,4 @@
-"""The ledger of a simulated bus: every byte in and out with its time; the runtime cannot edit it."""
+"""Ledger of a simulated bus: every byte in and out with its time. The runtime cannot edit it."""
 
 from __future__ import annotations
 
@@ -13,29 +13,30 @@ from dxlwire.errors import InputError
 
 Direction = Literal["in", "out", "note"]
 
-FLUSH_NS = 500_000_000  # A ledger file is never further behind than this
+FLUSH_NS = 500_000_000  # Longest time before an entry is written to the file
 
 
-FAULT = "fault: "  # How the note of a fault that happens begins; its text follows
+FAULT = "fault: "  # Prefix of the note of a fault; the fault's text follows
 
 
 class LedgerEntry(NamedTuple):
-    """Bytes that passed the wire together, or a note about something that was done to the bus."""
+    """Bytes that passed the wire together, or a note about an action on the bus."""
 
-    t_ns: int  # `in`: when the host handed them over; `out`: when the last of them had passed the wire
+    # `in`: time at which the host wrote them; `out`: time at which the last byte had passed the wire
+    t_ns: int
     bus: str
-    direction: Direction  # Seen from the servos: `in` came from the host, `out` went to it
+    direction: Direction  # As seen from the servos: `in` came from the host, `out` went to the host
     data: bytes
     note: str
-    late_ns: int = 0  # `out`, in real time: how long after it should have been the host got the last of them
+    late_ns: int = 0  # `out`, in real time: delay until the host got the last byte
 
 
-# 73 years on the clock of the machine; differences of two such times fit into 64 bits
+# Range of 73 years on the machine's clock; the difference of two such times fits into 64 bits.
 _Time = Annotated[int, msgspec.Meta(ge=-(1 << 62), le=1 << 62)]
 
 
 class _Line(msgspec.Struct, omit_defaults=True):
-    """An entry as one line of the file; a busy bus has thousands of them a second."""
+    """One entry as a line of the file; a busy bus has thousands of them per second."""
 
     t_ns: _Time
     bus: str
@@ -49,15 +50,17 @@ _encoder, _decoder = msgspec.json.Encoder(), msgspec.json.Decoder(_Line)
 
 
 class Ledger:
-    """Keeps entries in memory, in a JSON-lines file, or both; `keep=False` bounds the memory of long runs.
+    """Record of a bus in memory, in a JSON-lines file, or both; `keep=False` bounds the memory of long runs.
 
-    The file is open for writing, and buffered: a busy bus has thousands of entries a second.
-    `close` closes it. A full disk ends the file, never the simulation.
+    Args:
+        file: File open for buffered writing: a busy bus has thousands of entries per second. `close`
+            closes it. A full disk ends the file, never the simulation.
+        keep: Keep the entries in memory.
     """
 
     def __init__(self, file: IO[bytes] | None = None, *, keep: bool = True) -> None:
         self.entries: list[LedgerEntry] = []
-        self.error: str | None = None  # Why the file is not complete; None: it is
+        self.error: str | None = None  # Reason why the file is incomplete; None: it is complete
         self.on_note: Callable[[str], None] | None = None  # Called with each note
         self._keep = keep
         self._file = file
@@ -73,7 +76,7 @@ class Ledger:
         *,
         late_ns: int = 0,
     ) -> None:
-        """Enter bytes or a note; `flush_if_due` brings it into a file, at the latest its end."""
+        """Add bytes or a note. `flush_if_due` or `close` writes it to the file."""
         if self._keep:
             self.entries.append(LedgerEntry(t_ns, bus, direction, data, note, late_ns))
         if self._file is not None:
@@ -88,17 +91,19 @@ class Ledger:
             self.on_note(note)
 
     def flush_due_ns(self) -> int | None:
-        """Return when the file must be flushed, ns on the clock of the entries; None: all is written."""
+        """Return the time by which the file must be flushed, ns on the clock of the entries; None without
+        need.
+        """
         return None if self._unflushed_ns is None else self._unflushed_ns + FLUSH_NS
 
     def flush_if_due(self, now_ns: int) -> None:
-        """Write the file out when its oldest unwritten entry is half a second old."""
+        """Flush the file if its oldest unwritten entry is half a second old."""
         due = self.flush_due_ns()
         if due is not None and now_ns >= due:
             self.flush()
 
     def flush(self) -> None:
-        """Write the file out."""
+        """Flush the file."""
         self._unflushed_ns = None
         if self._file is not None:
             try:
@@ -107,7 +112,7 @@ class Ledger:
                 self._give_up(error)
 
     def close(self) -> None:
-        """Write the file out and close it; the entries in memory stay."""
+        """Flush and close the file; the entries in memory stay."""
         self.flush()
         if self._file is not None:
             self._file.close()
@@ -117,7 +122,7 @@ class Ledger:
         self.error = f"the ledger is not complete: {error}"
         self._unflushed_ns = None
         if self._file is not None:
-            with contextlib.suppress(OSError):  # it tries once more to write what does not fit
+            with contextlib.suppress(OSError):  # Closing tries once more to write the data that does not fit
                 self._file.close()
             self._file = None
 
@@ -129,12 +134,14 @@ class Ledger:
 
 
 def read_ledger(path: Path) -> tuple[LedgerEntry, ...]:
-    """Return the entries of a ledger file; a last line that was cut off in writing is left out.
+    """Return the entries of a ledger file, without a truncated last line.
 
-    Raises InputError when another line is not an entry, OSError when the file cannot be read.
+    Raises:
+        InputError: Another line is not an entry.
+        OSError: The file cannot be read.
     """
     lines = path.read_bytes().split(b"\n")
-    complete = lines[:-1]  # what follows the last newline is empty, or was cut off
+    complete = lines[:-1]  # The text after the last newline is empty or truncated
     entries: list[LedgerEntry] = []
     try:
         for line in complete:

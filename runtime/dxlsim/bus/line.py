@@ -1,8 +1,8 @@
-"""The half-duplex line: what is transmitted toward the host, and what becomes of collisions.
+"""Half-duplex line: transmissions toward the host, and their collisions.
 
-Not modelled: what servos make of noise and of each other's replies (of those they receive only the end of the
-one before them in a group read), framing errors and breaks, garbage between rates that differ by less than
-3 %, levels and reflections on the cable.
+Not modelled: reception of noise and of other servos' replies by servos (except for the end of the previous
+reply in a group read), framing errors and breaks, garbage between rates that differ by less than 3 %, levels
+and reflections on the cable.
 """
 
 from __future__ import annotations
@@ -17,54 +17,54 @@ from msgspec.structs import replace
 from dxlsim.wire.packets import ServoReply
 
 MOST_PASSING = 512
-"""Packets on their way to the host at once: a host that floods a line on virtual time fills no memory."""
+"""Limit of packets on their way to the host. It bounds the memory if a host floods a line on virtual time."""
 
-ECHO = "echo"  # Note of the host's own bytes, which its adapter gives back
+ECHO = "echo"  # Note of the host's own bytes, echoed by its adapter
 
 
 class Turn(NamedTuple):
-    """One servo's turn in a group read."""
+    """Turn of one servo in a group read."""
 
     servo_id: int
     replies: tuple[tuple[ServoReply, bytes], ...]
-    """Reply and its bytes; two servos may share an ID, and an absent one has none."""
-    slot_bytes: int  # Bytes of a whole reply: the turn is over when they would have passed
+    """Replies with their bytes: several if servos share an ID, none if the servo is absent."""
+    slot_bytes: int  # Size of a whole reply: the turn ends after that time on the wire
 
 
 class GroupReply(msgspec.Struct):
-    """The replies to a group read, each sent after the end of the one before it."""
+    """Replies to a group read; each one is sent after the end of the previous reply."""
 
     turns: Sequence[Turn]
     has_slots: bool
-    """True: a servo that misses the end of the reply before it waits for the end of that turn; False: it
-    never replies [?]."""
-    sent: int = 0  # So many turns are decided
+    """True: a servo that misses the end of the previous reply waits for the end of that turn. False: the
+    servo never replies [?]."""
+    sent: int = 0  # Number of decided turns
 
 
 class Transmission(msgspec.Struct):
-    """Bytes on their way to the host, one after the other without a pause."""
+    """Contiguous bytes on their way to the host."""
 
-    first_ns: int  # When the first of them begins to pass the wire
-    due_ns: int  # When the last of them has passed it
+    first_ns: int  # Time at which the first byte begins to pass the wire
+    due_ns: int  # Time at which the last byte has passed the wire
     data: bytes
     note: str = ""
-    group: GroupReply | None = None  # The group read that continues when this has passed
-    turn: int = 0  # Which of its turns this is
-    turn_end_ns: int = 0  # When that turn is over
-    broken: bool = False  # True when the servos cannot make out the packet
-    given: int = 0  # So many of its bytes the adapter has handed to the host already
+    group: GroupReply | None = None  # Group read that continues after this transmission
+    turn: int = 0  # Index of the turn in the group read
+    turn_end_ns: int = 0  # Time at which that turn ends
+    broken: bool = False  # True if the servos cannot parse the packet
+    given: int = 0  # Number of bytes that the adapter has already delivered
 
     def passed_ns(self, index: int) -> int:
-        """Return when one of its bytes has passed the wire."""
+        """Return the time at which the byte at `index` has passed the wire."""
         return self.first_ns + (self.due_ns - self.first_ns) * (index + 1) // len(self.data)
 
     def overlaps(self, begin_ns: int, end_ns: int) -> bool:
-        """Return whether it is on the wire within a time; what an adapter echoes never is."""
+        """Return True if the bytes are on the wire within an interval. An adapter's echo never is."""
         return self.note != ECHO and self.first_ns < end_ns and begin_ns < self.due_ns
 
 
 class SimulatedLine:
-    """What servos and noise put on one line, in the order in which it ends."""
+    """Transmissions of servos and noise on one line, ordered by their end."""
 
     def __init__(self, baud_rate: int, note: Callable[[str], None]) -> None:
         self.passing: list[Transmission] = []
@@ -72,16 +72,16 @@ class SimulatedLine:
         self._note = note
 
     def duration_ns(self, size: int) -> int:
-        """Return how long so many bytes take: 10 bits each (e-Manual, 8N1)."""
+        """Return the duration of `size` bytes: 10 bits each (e-Manual, 8N1)."""
         return size * 10_000_000_000 // self.baud_rate
 
     def send(self, new: Transmission) -> None:
-        """Put bytes on their way to the host, mixed with what is on the wire at the same time."""
+        """Add a transmission to the host. It is mixed with those that are on the wire at the same time."""
         passing = self.passing
         if len(passing) >= MOST_PASSING:
             self._note(f"{len(new.data)} bytes to the host are lost: too many are on their way")
             return
-        if not passing or passing[-1].due_ns <= new.first_ns:  # nearly always: the line is free by then
+        if not passing or passing[-1].due_ns <= new.first_ns:  # Almost always true: the line is free by then
             passing.append(new)
             return
         for other in [each for each in passing if each.overlaps(new.first_ns, new.due_ns)]:
@@ -91,11 +91,11 @@ class SimulatedLine:
         insort(passing, new, key=_due)
 
     def echo(self, own: Transmission) -> None:
-        """Let the adapter receive what the host itself sends."""
+        """Add the adapter's echo of the host's own bytes."""
         insort(self.passing, own, key=_due)
 
     def withdraw(self, group: GroupReply) -> None:
-        """Take back the replies of a group read that wait for the end of another one."""
+        """Remove the replies of a group read that wait for the end of another reply."""
         under_way = [each for each in self.passing if each.group is group]
         if not under_way:
             return
@@ -103,9 +103,9 @@ class SimulatedLine:
         self.passing[:] = [each for each in self.passing if each.group is not group or each.turn < group.sent]
 
     def talk_over(self, sent: bytearray, position: int, start_ns: int) -> None:
-        """Spoil what the host sends from `position` on while a servo sends, and the rest of that reply.
+        """Corrupt the host's bytes from `position` while a servo sends, and truncate that servo's reply.
 
-        A servo does not receive while it sends: there the host's bytes arrive as 0 [i].
+        A servo does not receive while it sends: it sees the host's bytes as 0 [i].
         """
         byte_ns = self.duration_ns(1)
         begin_ns, end_ns = start_ns + self.duration_ns(position), start_ns + self.duration_ns(len(sent))
@@ -122,7 +122,9 @@ class SimulatedLine:
                 insort(self.passing, cut, key=_due)
 
     def _mixed(self, one: Transmission, other: Transmission) -> Transmission:
-        """Return what two senders give: their bytes ANDed, as drivers that both pull low would [i]."""
+        """Return the result of two simultaneous senders: the AND of their bytes, as two drivers pulling low
+        [i].
+        """
         early, late = sorted((one, other), key=_first)
         offset = round((late.first_ns - early.first_ns) / self.duration_ns(1))
         mixed = bytearray(early.data).ljust(offset + len(late.data), b"\xff")
@@ -141,7 +143,7 @@ class SimulatedLine:
 
 
 def flipped(packet: bytes, index: int, flip: int) -> bytes:
-    """Return a packet with bits of one byte flipped; raises IndexError when it is shorter."""
+    """Return a packet with flipped bits in one byte. Raises IndexError if the packet is shorter."""
     broken = bytearray(packet)
     broken[index] ^= flip
     return bytes(broken)

@@ -1,11 +1,11 @@
-"""A recorded bus: a host hears what the host of a recording heard, with the delays of then.
+"""Recorded bus: replays to a host the answers that the host of a recording received, with their delays.
 
-- An instruction that was sent in the recording gets what was heard after it then, bytes, errors, noise and
-  silence; each time what came the next time, and behind the end of the recording the last again.
-- A ping, or a read that was never sent as such, is answered where all of it is known from other reads: with
-  the values that were heard last, without an error, after the recorded return delay at the least.
-- Anything else is not answered; where an answer was due it is a note in the ledger.
-- A host at another rate than the recorded one is not heard.
+- A recorded instruction gets its recorded answer: bytes, errors, noise and silence. Each repetition gets the
+  next recorded answer. After the end of the recording the last answer is repeated.
+- A ping, or a read that is not in the recording, is answered if all its bytes are known from other reads. The
+  answer has the newest known values, no error, and a return delay at the factory setting.
+- Other instructions are not answered. If an answer was due, the ledger gets a note.
+- Instructions at another baud rate than the recorded one are ignored.
 """
 
 from __future__ import annotations
@@ -28,13 +28,17 @@ from dxlsim.wire.packets import (
 )
 
 _MODEL, _FIRMWARE = (0, 1), (6,)
-"""Addresses of what a ping of Protocol 2.0 answers (e-Manual, X series, Control Table); of other models the
-firmware is elsewhere, and a ping that was not recorded is not answered."""
-_ANSWER_NS = 500_000  # Delay of an answer that is put together: Return Delay Time as shipped (e-Manual)
+"""Addresses of the data in a ping answer of Protocol 2.0 (e-Manual, X series, Control Table). Other models
+have the firmware elsewhere, so their unrecorded pings are not answered."""
+_ANSWER_NS = 500_000  # Delay of a constructed answer: Return Delay Time at its factory setting (e-Manual)
 
 
 class RecordedBus(SimulatedBus):
-    """The line of a recording, without servos. Raises InputError where the recording has no instruction."""
+    """Line of a recording, without servos.
+
+    Raises:
+        InputError: The recording has no instruction.
+    """
 
     def __init__(
         self,
@@ -61,11 +65,11 @@ class RecordedBus(SimulatedBus):
         self._count_packet()
 
     def _transmissions(self, heard: tuple[Heard, ...], end_ns: int) -> Iterator[Transmission]:
-        """Yield what was heard as it passes the wire; what came at once is one."""
+        """Yield the recorded bytes as transmissions; bytes that overlap in time are joined."""
         waiting: Transmission | None = None
         for delay_ns, data in heard:
             wire_ns = self._line.duration_ns(len(data))
-            # of a host that sent into a reply the bytes that arrived all the same came before its own end
+            # If a host sent into a reply, bytes of that reply arrived before the end of the host's own bytes.
             due_ns = max(end_ns + delay_ns, self.now_ns)
             if waiting is not None and due_ns <= waiting.due_ns:
                 waiting = Transmission(waiting.first_ns, waiting.due_ns, waiting.data + data)
@@ -73,7 +77,7 @@ class RecordedBus(SimulatedBus):
             first_ns = due_ns - wire_ns
             if waiting is not None:
                 yield waiting
-                first_ns = max(first_ns, waiting.due_ns)  # an adapter kept the one before back
+                first_ns = max(first_ns, waiting.due_ns)  # An adapter held the previous bytes back
             waiting = Transmission(first_ns, due_ns, data)
         if waiting is not None:
             yield waiting
@@ -92,14 +96,14 @@ class RecordedBus(SimulatedBus):
                 yield instruction, (entry,)
 
     def _read(self, packet: InstructionPacket) -> ReadEntry | None:
-        """Return what a read of one servo reads; None: it is none."""
+        """Return the target of a read of one servo, or None for another instruction."""
         if packet.instruction != Instruction.READ or packet.servo_id == BROADCAST:
             return None
         place = self._codec.read(packet.parameters)
         return None if place is None else ReadEntry(packet.servo_id, *place)
 
     def _known(self, packet: InstructionPacket) -> tuple[Heard, ...] | None:
-        """Return the answer to a ping or a read by what was heard of other reads; None: not all is known."""
+        """Return the answer to a ping or a read from other recorded reads, or None if a byte is unknown."""
         if not packet.intact or packet.servo_id == BROADCAST:
             return None
         entry = self._read(packet)
@@ -117,7 +121,7 @@ class RecordedBus(SimulatedBus):
         return (Heard(_ANSWER_NS + self._line.duration_ns(len(data)), data),)
 
     def _registers(self, servo_id: int) -> dict[int, int]:
-        """Return the bytes of a servo's control table that were heard, by address."""
+        """Return the known bytes of a servo's control table, by address."""
         known: dict[int, int] = {}
         for instruction, entries in self._reads:
             asked = {entry.servo_id: entry for entry in entries}
@@ -127,7 +131,8 @@ class RecordedBus(SimulatedBus):
                 status = InstructionReceiver(self._codec).feed(data)
                 if status is None or not status.intact or status.servo_id != servo_id:
                     continue
-                # a status packet has its error where an instruction has its kind, or behind that
+                # A status packet has its error in place of the instruction code (Protocol 1.0), or after that
+                # code.
                 content = status.parameters[1:] if self._codec is protocol2.CODEC else status.parameters
                 entry = asked[servo_id]
                 if len(content) == entry.length:

@@ -1,4 +1,4 @@
-"""Recording of a bus: what a host asked on it, and what it heard each time."""
+"""Recording of a bus: the instructions of a host, and the answers that it received."""
 
 from __future__ import annotations
 
@@ -14,28 +14,31 @@ from dxlwire.errors import InputError
 
 
 class RecordedPackets(msgspec.Struct, frozen=True):
-    """Packets that passed one bus, in any order: one row each. Times are ns of one clock."""
+    """Packets that passed one bus, one row each, in any order. Times are ns of one clock."""
 
-    is_instruction: NDArray[np.bool_]  # True: the host sent it; False: the host received it
-    first_ns: NDArray[np.int64]  # Before the write that sent it; after the read that brought its first byte
-    last_ns: NDArray[np.int64]  # After the write; after the read that brought its last byte
-    start: NDArray[np.int64]  # Index in `data` of its first byte
+    is_instruction: NDArray[np.bool_]  # True: sent by the host; False: received by the host
+    first_ns: NDArray[np.int64]  # Before the write() of the packet, or after the read() of its first byte
+    last_ns: NDArray[np.int64]  # After the write(), or after the read() of its last byte
+    start: NDArray[np.int64]  # Index of its first byte in `data`
     length: NDArray[np.int64]  # Bytes
-    data: bytes  # Of all packets, and possibly of others
+    data: bytes  # Bytes of all packets, possibly with others between them
 
 
 class Heard(NamedTuple):
     """Bytes that the host received together."""
 
-    delay_ns: int  # From the end of the instruction on the wire to the last of them, as the host saw it
+    delay_ns: int  # From the end of the instruction on the wire to the last byte's arrival at the host
     data: bytes
 
 
 class Recording:
-    """Every instruction of a bus with what was heard after it, in order; each is given once, the last again.
+    """Instructions of a bus with the bytes received after each one.
 
-    What was heard before the next instruction belongs to the one before it. Raises InputError where there is
-    no instruction.
+    `take` returns the recorded answers of an instruction one after the other, and then repeats the last one.
+    Bytes belong to the instruction before them.
+
+    Raises:
+        InputError: The packets contain no instruction.
     """
 
     def __init__(self, packets: RecordedPackets, baud_rate: int) -> None:
@@ -48,7 +51,7 @@ class Recording:
             raise InputError("no instruction was sent on the recorded bus, so there is nothing to answer")
         wire_ns = length[rows] * 10_000_000_000 // baud_rate
         behind = np.cumsum(wire_ns)
-        # several that were written together pass the wire one after the other
+        # Several instructions in one write pass the wire one after the other.
         sent_ns = behind + np.maximum.accumulate(first_ns[rows] - (behind - wire_ns))
         self._data = data
         self._rows = rows
@@ -61,15 +64,15 @@ class Recording:
 
     @property
     def instructions(self) -> Sequence[bytes]:
-        """The different instructions."""
+        """The distinct instructions."""
         return tuple(self._exchanges)
 
     def newest(self, instruction: bytes) -> tuple[Heard, ...]:
-        """Return what was given last for an instruction, or what will be given first."""
+        """Return the last answer that was given to an instruction, or its first one if none was given."""
         return self._heard(self._exchanges[instruction][max(0, self._next[instruction] - 1)])
 
     def take(self, instruction: bytes) -> tuple[Heard, ...] | None:
-        """Return what was heard after an instruction the next time; None: it was never sent."""
+        """Return the next recorded answer to an instruction, or None if it is not in the recording."""
         exchanges = self._exchanges.get(instruction)
         if exchanges is None:
             return None

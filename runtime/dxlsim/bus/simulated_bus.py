@@ -1,16 +1,16 @@
-"""A simulated bus: bytes in -> timed bytes out; one half-duplex line, its servos, faults and ledger.
+"""Simulated bus: bytes in -> timed bytes out, on one half-duplex line with servos, faults and a ledger.
 
 The rules of the line:
 
-- A byte takes 10 bits. An instruction acts when its last byte has passed; a reply starts after the servo's
-  return delay, and the host receives it when its last byte has passed and the adapter hands it over.
-- A servo does not receive while it sends. Where the host sends into a reply, its bytes arrive as 0, and the
-  reply is lost from there on.
-- Servos that send at once (a broadcast ping, two servos with one ID) give one reply of their bytes ANDed, as
-  drivers that both pull a line low would [i].
+- A byte takes 10 bits. An instruction takes effect when its last byte has passed. A reply starts after the
+  servo's return delay, and the host receives it when its last byte has passed and the adapter delivers it.
+- A servo does not receive while it sends. If the host sends during a reply, the servo sees its bytes as 0,
+  and the rest of the reply is lost.
+- Servos that send at once (a broadcast ping, two servos with one ID) produce one reply, the AND of their
+  bytes, as drivers that both pull a line low would [i].
 - A pause inside an instruction ends it: more than 100 ms (Protocol 1.0), more than 1.5 ms (Protocol 2.0).
-- Servos of a group read reply one after the other, each its return delay after the end of the reply before
-  it; what they reply is their state when the instruction ended [i].
+- Servos of a group read reply one after the other, each its return delay after the end of the previous reply.
+  They report their state at the end of the instruction [i].
 - A servo at another baud rate receives nothing.
 """
 
@@ -41,18 +41,20 @@ from dxlsim.wire import protocol1, protocol2
 from dxlsim.wire.packets import GroupRead, InstructionPacket, InstructionReceiver, ServoReply
 
 _STATUS_BYTES = 11
-"""Bytes of a status packet of Protocol 2.0 without data: the slot of an absent servo is as long [i]."""
+"""Size of a status packet of Protocol 2.0 without data, bytes: the slot of an absent servo has this length
+[i]."""
 
-SUPPLY_VOLTS = 12.0  # Of a line without servos
-RATE_TOLERANCE = 0.03  # Rates of host and servo may differ by less (e-Manual, Baud Rate (4))
+SUPPLY_VOLTS = 12.0  # Supply voltage of a line without servos
+# Largest relative difference between the rates of host and servo (e-Manual, Baud Rate (4))
+RATE_TOLERANCE = 0.03
 
-Alteration = Callable[[bytes], bytes]  # What becomes of a packet's bytes
+Alteration = Callable[[bytes], bytes]  # Changes the bytes of a packet
 
 Action = Callable[[], None]
 
 
 class PacketFault(NamedTuple):
-    """What happens to the next packet of a servo, or of the host."""
+    """Fault of the next packet of a servo, or of the host."""
 
     text: str
     alter: Alteration
@@ -61,7 +63,7 @@ class PacketFault(NamedTuple):
 
 
 class SimulatedBus:
-    """One line; time comes from the caller and never goes back."""
+    """One simulated line; time comes from the caller and never goes back."""
 
     def __init__(
         self, config: BusConfig, ledger: Ledger, start_ns: int, mechanics: Mechanics | None = None
@@ -71,32 +73,32 @@ class SimulatedBus:
         self.absent = config.adapter.absent
         self.echo = config.adapter.echo
         self.ledger = ledger
-        self.plugged = True  # False: nothing is between the host and the line
+        self.plugged = True  # False: the adapter is unplugged
         self.times_unplugged = 0
         self.servos: tuple[SimulatedServo, ...] = ()
         self.devices: tuple[SimulatedDevice, ...] = ()
         self.nodes: tuple[SimulatedNode, ...] = ()
-        """All that is on the line: servos, then devices."""
+        """All units on the line: servos, then devices."""
         self.mechanics = mechanics or Mechanics(start_ns)
-        """What the servos move; several buses of one robot share it."""
-        self.now_ns = start_ns  # The time that the bus has reached
+        """Mechanics of the servos; several buses of one robot share them."""
+        self.now_ns = start_ns  # Current time of the bus
         self.host_free_ns = start_ns
-        """When the last byte that the host handed over has passed the wire."""
+        """Time at which the host's last byte has passed the wire."""
         self.lateness_ns: deque[int] = deque(maxlen=1000)
-        """How long after its time the host received the last bytes of each hand-over, in real time."""
+        """Delay of the recent deliveries to the host in real time, ns."""
         self._codec = protocol2.CODEC if config.protocol == 2.0 else protocol1.CODEC
         self._receiver = InstructionReceiver(self._codec)
         self._line = SimulatedLine(config.baud_rate, self.note)
         self._adapter = SimulatedAdapter(config.adapter, start_ns)
         self._wedged = False
-        self._group: GroupReply | None = None  # The group read whose replies are under way
+        self._group: GroupReply | None = None  # The group read in progress
         self._nodes_by_id: dict[int, tuple[SimulatedNode, ...]] = {}
         self._reply_faults: dict[int, deque[PacketFault]] = {}
         self._instruction_faults: deque[PacketFault] = deque()
         self._planned: list[tuple[int, int, Action]] = []
-        """Actions by their time, those of one moment in the order in which they were planned."""
+        """Actions ordered by their time; actions of the same time in the order of planning."""
         self._planned_after: list[tuple[int, int, Action]] = []
-        """Actions by the number of packets that pass before them."""
+        """Actions ordered by the number of packets after which they run."""
         self._packets = 0
         self._order = itertools.count()
         for servo in config.servos:
@@ -107,7 +109,7 @@ class SimulatedBus:
     # The line
 
     def receive(self, data: bytes | bytearray | memoryview, at_ns: int) -> None:
-        """Take bytes that the host hands to its adapter at `at_ns`; they follow those still on the wire."""
+        """Receive bytes that the host writes to its adapter at `at_ns`. They are sent after earlier bytes."""
         sent = bytes(data)
         self._pass_time(at_ns)
         self.ledger.add(at_ns, self.name, "in", sent)
@@ -125,7 +127,7 @@ class SimulatedBus:
 
     @property
     def baud_rate(self) -> int:
-        """The host's rate, bit/s."""
+        """The host's baud rate, bit/s."""
         return self._line.baud_rate
 
     @baud_rate.setter
@@ -135,22 +137,22 @@ class SimulatedBus:
         self._nodes_by_id.clear()
 
     def change_rate(self, baud_rate: int) -> None:
-        """Let the host send and receive at another rate from now on, bit/s."""
+        """Change the host's baud rate, bit/s."""
         self.note(f"the host's rate is {baud_rate} bit/s")
         self.baud_rate = baud_rate
 
     def next_due_ns(self) -> int | None:
-        """Return when something happens by itself: bytes can be taken, a fault comes; None: nothing will."""
+        """Return the time of the next event without input: bytes to deliver, or a fault; None without any."""
         passing = self._line.passing
         due_ns = None if self._wedged else self._adapter.next_ns(passing)
         if passing and (due_ns is None or passing[0].due_ns < due_ns):
-            due_ns = passing[0].due_ns  # a group read may go on at its end
+            due_ns = passing[0].due_ns  # A group read may continue after its end
         if self._planned and (due_ns is None or self._planned[0][0] < due_ns):
             return self._planned[0][0]
         return due_ns
 
     def next_delivery_ns(self, gather_ns: int) -> int | None:
-        """Return `next_due_ns`, or when the last reply has passed that follows it within a time."""
+        """Return `next_due_ns`, or the end of the last reply that follows it within `gather_ns`."""
         due_ns = self.next_due_ns()
         passing = self._line.passing
         if due_ns is None or not passing or due_ns != passing[0].due_ns or not self._adapter.immediate:
@@ -163,7 +165,9 @@ class SimulatedBus:
     def take(self, now_ns: int, *, handed_ns: int | None = None) -> bytes:
         """Return the bytes that have reached the host by `now_ns`, each once.
 
-        `handed_ns`: when the host really receives them; how late that is belongs into the ledger.
+        Args:
+            now_ns: Time of the bus.
+            handed_ns: Real time of the delivery, for the lateness in the ledger.
         """
         self._pass_time(now_ns)
         if self._wedged:
@@ -182,11 +186,11 @@ class SimulatedBus:
     # What tests see and do
 
     def servo(self, servo_id: int) -> SimulatedServo:
-        """Return the first servo that has this ID now; raises LookupError when none has."""
+        """Return the first servo with this ID. Raises LookupError without one."""
         return self._first(self.servos, servo_id, "servo")
 
     def add_servo(self, config: ServoConfig) -> SimulatedServo:
-        """Connect one more servo to the line, now."""
+        """Connect another servo to the line."""
         servo = make_servo(
             config, self.baud_rate, self.now_ns, self.note, self.protocol, mechanics=self.mechanics
         )
@@ -196,7 +200,7 @@ class SimulatedBus:
         return servo
 
     def add_device(self, config: DeviceConfig) -> SimulatedDevice:
-        """Connect one more device to the line, now; its supply is that of the first servo."""
+        """Connect another device to the line; it has the supply of the first servo."""
         world = Measured(self.servos[0].voltage if self.servos else SUPPLY_VOLTS)
         device = make_device(
             config, self.protocol, world, baud_rate=self.baud_rate, note=self.note, now_ns=self.now_ns
@@ -208,7 +212,7 @@ class SimulatedBus:
         return device
 
     def device(self, servo_id: int) -> SimulatedDevice:
-        """Return the first device that has this ID now; raises LookupError when none has."""
+        """Return the first device with this ID. Raises LookupError without one."""
         return self._first(self.devices, servo_id, "device")
 
     def _first(self, nodes: Sequence[Node], servo_id: int, called: str) -> Node:
@@ -218,48 +222,48 @@ class SimulatedBus:
         raise LookupError(f"bus {self.name} has no {called} with ID {servo_id}")
 
     def advance(self, now_ns: int) -> None:
-        """Bring every servo to a time, so that a test can look at it."""
+        """Advance every servo and device to a time, so that a test can inspect them."""
         self._pass_time(now_ns)
         for node in self.nodes:
             node.advance(now_ns)
 
     def excuse(self, duration_ns: int) -> None:
-        """Leave out of the servos' Bus Watchdogs for how long this process did not run, ns."""
+        """Exclude a stall of this process, ns, from the time of the servos' Bus Watchdogs."""
         for servo in self.servos:
             servo.excuse(duration_ns)
 
     def at(self, t_ns: int, action: Action) -> None:
-        """Plan a fault: `action` is called when the bus' time reaches `t_ns`."""
+        """Plan a fault: call `action` when the bus reaches `t_ns`."""
         heapq.heappush(self._planned, (t_ns, next(self._order), action))
 
     def after(self, packets: int, action: Action) -> None:
-        """Plan a fault: `action` is called when so many more instruction packets have passed; 0: now."""
+        """Plan a fault: call `action` after that many more instruction packets; 0: now."""
         heapq.heappush(self._planned_after, (self._packets + packets, next(self._order), action))
         self._act_after_packets()
 
     def note(self, text: str) -> None:
-        """Enter a note into the ledger, at the bus' time."""
+        """Add a note to the ledger, at the time of the bus."""
         self.ledger.add(self.now_ns, self.name, "note", note=text)
 
     def alter_next(
         self, servo_id: int, text: str, alter: Alteration, *, delay_ns: int = 0, copies: int = 1
     ) -> None:
-        """Alter a servo's next reply, let it start later or come several times; the ledger gets `text`."""
+        """Alter, delay or repeat a servo's next reply; `text` describes it in the ledger."""
         self._withdraw_waiting()
         self._reply_faults.setdefault(servo_id, deque()).append(PacketFault(text, alter, delay_ns, copies))
 
     def alter_next_instruction(self, text: str, alter: Alteration) -> None:
-        """Alter what the servos receive of the next whole instruction; b"" loses it."""
+        """Alter the next whole instruction as received by the servos; b"" loses it."""
         self._instruction_faults.append(PacketFault(text, alter))
 
     def inject_noise(self, data: bytes, at_ns: int) -> None:
-        """Put bytes on the line that no servo sent, toward the host, beginning at `at_ns`."""
+        """Send noise toward the host, beginning at `at_ns`."""
         self._withdraw_waiting()
         self.note(f"noise of {len(data)} bytes at {at_ns} ns")
         self._line.send(Transmission(at_ns, at_ns + self._line.duration_ns(len(data)), data, "noise"))
 
     def unplug(self) -> None:
-        """Pull the adapter: what it holds is lost, and the host sees its port go."""
+        """Unplug the adapter: its buffer is lost, and the host's port disappears."""
         if self.plugged:
             self.note("adapter unplugged")
             self.plugged = False
@@ -268,23 +272,23 @@ class SimulatedBus:
             self._receiver.forget()
 
     def plug_in(self) -> None:
-        """Plug the adapter in again: a host has to open its port anew."""
+        """Plug the adapter in again: a host must open its port again."""
         if not self.plugged:
             self.note("adapter plugged in")
             self.plugged = True
 
     @property
     def latency_timer_ns(self) -> int:
-        """Latency timer of the adapter; 0: it hands bytes over at once."""
+        """Latency timer of the adapter, ns; 0: it delivers bytes at once."""
         return self._adapter.timer_ns
 
     def set_latency_timer(self, timer_ns: int) -> None:
-        """Give the adapter another latency timer, ns; 0: none."""
+        """Set the adapter's latency timer, ns; 0: none."""
         self.note(f"adapter's latency timer {timer_ns} ns")
         self._adapter.set_timer(timer_ns, self.now_ns)
 
     def wedge(self, on: bool = True) -> None:
-        """Let the adapter take the host's bytes and pass none on, in either direction; False: no longer."""
+        """Make the adapter accept bytes without passing them on, in both directions; False ends it."""
         self.note("adapter wedged" if on else "adapter works again")
         self._wedged = on
         self._adapter.forget()
@@ -292,7 +296,7 @@ class SimulatedBus:
     # Inside: time
 
     def _pass_time(self, now_ns: int) -> None:
-        """Let everything happen that happens by itself until `now_ns`, in order."""
+        """Process all events up to `now_ns`, in the order of their times."""
         passing, planned = self._line.passing, self._planned
         while True:
             due_ns = passing[0].due_ns if passing else now_ns + 1
@@ -306,7 +310,7 @@ class SimulatedBus:
         self.now_ns = max(self.now_ns, now_ns)
 
     def _arrive(self, each: Transmission) -> None:
-        """Let the adapter have what has passed the wire, and the group read go on that waited for its end."""
+        """Pass a finished transmission to the adapter, and continue a group read that waited for it."""
         self.now_ns = max(self.now_ns, each.due_ns)
         if not self.plugged or self._wedged:
             self.note(f"{len(each.data)} bytes to the host are lost: {each.data.hex(' ')}")
@@ -317,7 +321,7 @@ class SimulatedBus:
                 device.overhear(each.data[len(self._codec.header)], each.due_ns)
         group = each.group
         if group is None or group is not self._group or group.sent > each.turn + 1:
-            return  # no reply waits for its end
+            return  # No reply waits for its end
         if not each.broken:
             self._send_turns(group, each.due_ns)
         elif group.has_slots:
@@ -327,14 +331,14 @@ class SimulatedBus:
             self._group = None
 
     def _withdraw_waiting(self) -> None:
-        """Take back the replies of a group read that have not begun: something may happen before them."""
+        """Remove the replies of a group read that have not begun: an event may precede them."""
         if self._group is not None:
             self._line.withdraw(self._group)
 
     # Inside: instructions
 
     def _transmit(self, sent: bytes | bytearray, start_ns: int) -> None:
-        """Bring the host's bytes to the servos, which execute each whole instruction in them."""
+        """Send the host's bytes to the servos, which execute each complete instruction."""
         position = 0
         while position < len(sent):
             self._withdraw_waiting()
@@ -359,11 +363,11 @@ class SimulatedBus:
         while (other := self._receiver.feed(received, position)) is not None:
             position = other.end
             self._execute(other, end_ns)
-        if not position:  # it was one all the same
+        if not position:  # Even an unparsable instruction counts as a packet
             self._count_packet()
 
     def _execute(self, packet: InstructionPacket, end_ns: int) -> None:
-        self._group = None  # servos that wait for their turn receive another instruction
+        self._group = None  # Servos that wait for their turn stop at another instruction
         read = self._codec.group_read(packet)
         if read is not None:
             slots = read.has_slots and self.absent == "slot"
@@ -384,7 +388,7 @@ class SimulatedBus:
         self._count_packet()
 
     def _nodes_of(self, servo_id: int) -> tuple[SimulatedNode, ...]:
-        """Return what receives an ID, at the host's rate; kept until one changes ID or rate."""
+        """Return the nodes that receive an ID at the host's rate; cached until an ID or a rate changes."""
         found = self._nodes_by_id.get(servo_id)
         if found is None:
             rate, tolerance = self.baud_rate, RATE_TOLERANCE * self.baud_rate
@@ -394,7 +398,7 @@ class SimulatedBus:
         return found
 
     def _turns(self, read: GroupRead, slots: bool, end_ns: int) -> Sequence[Turn]:
-        """Return what each servo of a group read replies to it, in its state at a time."""
+        """Return the replies of each servo to a group read, with their state at a time."""
         self.mechanics.advance(end_ns)
         turns: list[Turn] = []
         shared = protocol2.FastStatusPacket(read.lengths) if read.fast else None
@@ -402,7 +406,7 @@ class SimulatedBus:
             replies = []
             for node in self._nodes_of(entry.servo_id):
                 if node.servo_id != entry.servo_id:
-                    continue  # only by its secondary ID, to which it never replies
+                    continue  # Addressed by its secondary ID, to which a servo never replies
                 node.counts.received += 1
                 reply = node.reply_to_group_read(read, entry, end_ns)
                 if reply is not None:
@@ -410,25 +414,25 @@ class SimulatedBus:
                     replies.append((reply, shared.part(reply) if shared else self._status(reply)))
             turns.append(Turn(entry.servo_id, tuple(replies), _STATUS_BYTES + entry.length))
             if not replies and not slots:
-                break  # those after it wait for it in vain
+                break  # The servos after it wait in vain
         return turns
 
     def _send_turns(self, group: GroupReply, free_ns: int) -> None:
-        """Send the next replies of a group read, from when the line is free.
+        """Send the next replies of a group read, starting when the line is free.
 
-        A reply is sent ahead of the end of the one before it when nothing else is on the line: whatever may
-        yet come between them withdraws it again.
+        If nothing else is on the line, a reply is sent before the previous one has ended. Any event between
+        them removes it again.
         """
         alone, sent_any = not self._line.passing, False
         while group.sent < len(group.turns):
             turn = group.turns[group.sent]
             plain = alone and len(turn.replies) == 1 and not self._reply_faults.get(turn.servo_id)
             if sent_any and not plain:
-                return  # it is decided when the reply before it has passed
+                return  # Decided when the previous reply has passed
             slot_ns = self._line.duration_ns(turn.slot_bytes) if group.has_slots else 0
             end_ns = due_ns = free_ns + slot_ns
             sent = False
-            for reply, data in turn.replies:  # two servos with one ID send at once
+            for reply, data in turn.replies:  # Two servos with one ID send at once
                 first_ns = free_ns + reply.delay_ns
                 end_ns, due_ns = first_ns + slot_ns, first_ns + self._line.duration_ns(len(data))
                 each = Transmission(first_ns, due_ns, data, "", group, group.sent, end_ns)
@@ -445,7 +449,7 @@ class SimulatedBus:
             self._group = None
 
     def _send_reply(self, servo_id: int, reply: Transmission) -> bool:
-        """Send a servo's reply, faults and all; return whether anything was sent."""
+        """Send a servo's reply with its faults; return True if anything was sent."""
         faults = self._reply_faults.get(servo_id)
         if not faults:
             self._line.send(reply)

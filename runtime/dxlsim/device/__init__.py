@@ -1,4 +1,4 @@
 """Simulated devices: units on a simulated line that are not servos.
 
-Their memory is that of servos (`registers`).
+They use the memory of servos (`registers`).
 """

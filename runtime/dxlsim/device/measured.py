@@ -1,4 +1,4 @@
-"""What a simulated device measures: each item shows a quantity, by the name of its state."""
+"""Measurements of a simulated device: each item shows a quantity, chosen by the name of its state."""
 
 from __future__ import annotations
 
@@ -30,20 +30,22 @@ _TURNS = ("roll", "pitch", "yaw")
 
 
 class Measured(msgspec.Struct):
-    """The world around one device, in SI units."""
+    """Physical quantities at one device, in SI units."""
 
     volts: float
     angular_velocity: Vector = (0.0, 0.0, 0.0)  # rad/s, in the device's own axes
     linear_acceleration: Vector = (0.0, 0.0, STANDARD_GRAVITY)
-    """m/s^2, in the device's own axes; gravity counts as upward, as of every accelerometer at rest."""
+    """m/s^2, in the device's own axes. Gravity counts as upward, as in every accelerometer at rest."""
     orientation: Quaternion = NO_TURN  # Quaternion x, y, z, w of the device in the world
     celsius: float = ROOM_CELSIUS
-    update: Callable[[], None] = lambda: None  # Brings what moves to the time of the device
+    update: Callable[[], None] = lambda: None  # Updates the motion to the time of the device
 
     def tip(self, axis: str, angle: Callable[[], tuple[float, float]]) -> None:
-        """Let the device be turned about an axis of its own from now on, beside what moves it otherwise.
+        """Rotate the device about an axis of its own, in addition to its other motion.
 
-        `angle` returns how far it is turned, rad, and how fast, rad/s.
+        Args:
+            axis: x, y or z.
+            angle: Returns the angle, rad, and its speed, rad/s.
         """
         update, about = self.update, _UNIT[axis]
         upright = self.angular_velocity, self.linear_acceleration, self.orientation
@@ -62,17 +64,17 @@ class Measured(msgspec.Struct):
 
     @property
     def roll_pitch_yaw(self) -> Vector:
-        """The orientation as angles about the fixed axes x, y, z, rad (ROS REP 103)."""
+        """Orientation as angles about the fixed axes x, y, z, rad (ROS REP 103)."""
         return Transform(rotation=self.orientation).rpy
 
 
 def shown(
     items: Mapping[str, ControlItem], config: Shown, world: Measured, random: Random
 ) -> dict[str, Callable[[], int]]:
-    """Return for each item that measures something what its integer on the wire is now.
+    """Return a function for each measuring item that returns its current integer on the wire.
 
-    An item shows the value that the configuration gives it, else what the name of its state says; one that
-    can be written, and that no robot reads, keeps what was written. What the simulation does not know is 0.
+    The configured value or state of an item comes first, then the name of its own state. A writable item
+    without a configured state keeps its written value. An unknown quantity is 0.
     """
     live: dict[str, Callable[[], int]] = {}
     for name, item in items.items():
@@ -94,7 +96,7 @@ def _constant(value: float) -> Callable[[], float]:
 
 
 def _value(state: str, world: Measured) -> Callable[[], float] | None:
-    """Return what is measured under the name of a state; None: nothing that the simulation knows."""
+    """Return a function for the quantity of a state name, or None if the simulation does not model it."""
     what, _, axis = state.partition(".")
     index = _AXES.find(axis) if axis else -1
     if 0 <= index < _VECTORS.get(what, 0):
@@ -127,7 +129,7 @@ def _reading(
 
 
 def on_the_wire(item: ControlItem, value: float) -> int:
-    """Return the integer that means a value, SI units, within the item's range."""
+    """Return the integer on the wire for a value in SI units, clamped to the item's range."""
     if item.bit is not None:
         return int(value != 0)
     number = (value - item.offset) / item.scale

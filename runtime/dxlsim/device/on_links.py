@@ -1,4 +1,4 @@
-"""Simulated devices on links of the robot's URDF: an IMU feels how its link turns and moves."""
+"""Simulated devices on links of the robot's URDF: an IMU measures the motion of its link."""
 
 from __future__ import annotations
 
@@ -16,9 +16,10 @@ from dxlsim.simulation_plan import UrdfBodies
 
 
 def fix_to_links(devices: Iterable[SimulatedDevice], mechanics: Mechanics, sensed: UrdfBodies) -> None:
-    """Let each device that is on a link measure that link's motion, at the time of each reading.
+    """Connect each device with a link to that link's motion, at the time of each reading.
 
-    Raises KeyError for a link that the URDF does not have.
+    Raises:
+        KeyError: The URDF does not have the link.
     """
     body, count = SimulatedBody(sensed), sensed.servos
     mechanics.sense()
@@ -31,7 +32,7 @@ def fix_to_links(devices: Iterable[SimulatedDevice], mechanics: Mechanics, sense
 def _feeling(
     device: SimulatedDevice, body: SimulatedBody, shafts: Callable[[int], Shafts]
 ) -> Callable[[], None]:
-    """Return what brings what a device measures to its time, once for all items of a reading."""
+    """Return a function that updates a device's measurements once for all items of a reading."""
     at_ns = -1
 
     def update() -> None:
@@ -45,7 +46,7 @@ def _feeling(
 
 
 def feel(world: Measured, motion: LinkMotion) -> None:
-    """Let a device measure the motion of its link: an accelerometer at rest shows gravity upward."""
+    """Set a device's measurements to the motion of its link, with gravity upward for a link at rest."""
     x, y, z, w = motion.orientation.tolist()
     pull = np.array(rotated((-x, -y, -z, w), (0.0, 0.0, STANDARD_GRAVITY)))
     ax, ay, az = (motion.linear_acceleration + pull).tolist()

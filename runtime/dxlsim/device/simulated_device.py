@@ -1,8 +1,8 @@
-"""A simulated device: registers that show what it measures and keep what is written; no torque, no motion.
+"""Simulated device: registers that show measurements and keep written values; no torque, no motion.
 
-It knows ping, read and write, and of the others what its control table names. An instruction that it does not
-know stays without a reply, as of boards with the maker's Dynamixel2Arduino (utility/slave.cpp, processInst).
-Its EEPROM is never locked.
+It supports ping, read and write, and the other instructions of its control table. It does not answer unknown
+instructions, like boards with ROBOTIS' Dynamixel2Arduino (utility/slave.cpp, processInst). Its EEPROM is
+never locked.
 """
 
 from __future__ import annotations
@@ -25,13 +25,13 @@ from dxlwire.control_table.device_table import WAITS, DeviceTable, read_device_t
 from dxlwire.control_table.devices import device_table
 
 CHAIN_WAIT_NS = 50_000_000
-"""How long a board that `waits_in_chain` waits for the status ahead of its own (ROBOTIS' OpenCR firmware,
+"""Time for which a board with `waits_in_chain` waits for the status before its own (ROBOTIS' OpenCR firmware,
 built natively); each other status restarts it."""
-BOOT_NS = 100_000_000  # How long it receives nothing after a reboot [i]
+BOOT_NS = 100_000_000  # Time without reception after a reboot [i]
 
 
 class SimulatedDevice(SimulatedNode):
-    """One device: the bus calls `execute` and `reply_to_group_read`; faults and tests do the rest."""
+    """One device. The bus calls `execute` and `reply_to_group_read`; faults and tests call the rest."""
 
     kind = "device"
 
@@ -48,13 +48,13 @@ class SimulatedDevice(SimulatedNode):
         self.table = table
         self._line_rate = baud_rate
         self.link = config.shown.link
-        """Link of the robot's URDF with which it moves; empty: it stands upright and still."""
-        self.world = world  # What it measures
+        """Link of the robot's URDF that carries the device; empty: the device is upright and at rest."""
+        self.world = world  # Quantities that it measures
         self.now_ns = now_ns
         self._bits = {name: (item.address, item.size, item.bit) for name, item in table.items.items()}
-        random = Random(f"{config.servo_id} {table.model}")  # noise repeats itself
+        random = Random(f"{config.servo_id} {table.model}")  # A seed of its own makes the noise repeatable
         self._shown = shown(table.items, config.shown, world, random)
-        self._awaited_id: int | None = None  # Whose status it waits for in a group read
+        self._awaited_id: int | None = None  # ID whose status it awaits in a group read
         self._waits_until_ns = 0
         registers = _registers(table)
         self._place_names = {(item.address, item.size): item.name for item in registers.items.values()}
@@ -74,15 +74,15 @@ class SimulatedDevice(SimulatedNode):
 
     @property
     def baud_rate(self) -> int:
-        """The rate at which it listens, bit/s: that of the line where it has no item for it."""
+        """Baud rate of the device, bit/s: that of the line if the device has no item for it."""
         return super().baud_rate if "baud_rate" in self.registers else self._line_rate
 
     def advance(self, now_ns: int) -> None:
-        """Bring what it measures to a time; going back is ignored."""
+        """Advance the measurements to a time; an earlier time is ignored."""
         self.now_ns = max(self.now_ns, now_ns)
 
     def receives(self, now_ns: int) -> bool:
-        """Take an instruction on the line at a time; return whether it reaches the device."""
+        """Return True if the device receives an instruction at a time."""
         if self._silent or now_ns < self._deaf_until_ns:
             return False
         if self._awaited_id is not None and now_ns < self._waits_until_ns:
@@ -93,21 +93,21 @@ class SimulatedDevice(SimulatedNode):
         return all(contact() for contact in self._contacts)
 
     def chain(self, read: GroupRead, now_ns: int) -> None:
-        """Wait for the status ahead of its own in a group read, if it is a board that does."""
+        """Wait for the status before its own in a group read, if the board has this behaviour."""
         listed = [entry.servo_id for entry in read.entries]
         place = listed.index(self.servo_id) if self.can(WAITS) and self.servo_id in listed else 0
         if place and self.receives(now_ns):
             self._awaited_id, self._waits_until_ns = listed[place - 1], now_ns + CHAIN_WAIT_NS
 
     def overhear(self, servo_id: int, now_ns: int) -> None:
-        """Take notice of a status packet on the line."""
+        """Process a status packet of another unit on the line."""
         if self._awaited_id == servo_id:
             self._awaited_id = None
         elif self._awaited_id is not None and now_ns < self._waits_until_ns:
             self._waits_until_ns = now_ns + CHAIN_WAIT_NS
 
     def can(self, capability: str) -> bool:
-        """Return whether it knows an instruction, in the words of control tables."""
+        """Return True if the device has a capability, in the words of control tables."""
         return capability in self.table.capabilities
 
     # Instructions
@@ -122,7 +122,7 @@ class SimulatedDevice(SimulatedNode):
         return instruction in known or (instruction in needs and self.can(needs[Instruction(instruction)]))
 
     def _replies_to(self, packet: InstructionPacket, own: bool) -> bool:
-        """Return whether a status packet follows: of broadcasts only to a ping, if it takes part in that."""
+        """Return True if a status packet follows. Of the broadcasts only a ping is answered, if supported."""
         known = self._knows(packet.instruction) and (own or self.can("broadcast_ping"))
         return known and super()._replies_to(packet, own)
 
@@ -138,7 +138,7 @@ class SimulatedDevice(SimulatedNode):
         return 0
 
     def _written(self, names: frozenset[str]) -> None:
-        """Do nothing: only bytes change."""
+        """Do nothing: writes only change bytes."""
 
     def _takes_part(self, read: GroupRead) -> bool:
         bulk = read.instruction in (Instruction.BULK_READ, Instruction.FAST_BULK_READ)
@@ -164,7 +164,7 @@ class SimulatedDevice(SimulatedNode):
         return live
 
     def _set(self, name: str, wire: int) -> None:
-        """Set an item as if it had been so before; what it measured there it shows no more."""
+        """Set an item without a write instruction; it no longer shows a measurement."""
         address, size, bit = self._bits[name]
         place = self._place_names[address, size]
         if bit is not None:
@@ -175,15 +175,22 @@ class SimulatedDevice(SimulatedNode):
     # What faults do
 
     def protect(self, refused: int = 0) -> None:
-        """Do nothing: a device has no torque to take away."""
+        """Do nothing: a device has no torque to switch off."""
 
     def reset(self) -> None:
-        """Cut and give back its power: RAM is lost."""
+        """Power-cycle the device: RAM is lost."""
         self.note(f"{self.called}: power cycle")
         self.registers.restore_ram()
 
     def tip(self, axis: str, by: float, for_ns: int) -> None:
-        """Turn it about one of its own axes, x, y or z, by an angle, rad, evenly in a time; it stays so."""
+        """Rotate the device by an angle, rad, about one of its own axes, evenly within a time. The angle
+        persists.
+
+        Args:
+            axis: x, y or z.
+            by: Angle, rad.
+            for_ns: Duration, ns.
+        """
         begin_ns = self.now_ns
 
         def angle() -> tuple[float, float]:
@@ -194,18 +201,20 @@ class SimulatedDevice(SimulatedNode):
         self.note(f"{self.called}: tips by {math.degrees(by):g} deg about {axis}")
 
     def set_voltage(self, volts: float) -> None:
-        """Supply it with another voltage, V."""
+        """Change the supply voltage, V."""
         self.world.volts = volts
         self.note(f"{self.called}: voltage {volts} V")
 
     @property
     def voltage(self) -> float:
-        """Voltage of the supply, V."""
+        """Supply voltage, V."""
         return self.world.volts
 
 
 def _registers(table: DeviceTable) -> ControlTable:
-    """Return a device's items as a control table; bits of one place are one item, of the first bit's name."""
+    """Return a device's items as a control table. Bits of one place become one item with the first bit's
+    name.
+    """
     items: dict[str, ControlItem] = {}
     places: set[tuple[int, int]] = set()
     for name, item in table.items.items():
@@ -221,7 +230,7 @@ def _registers(table: DeviceTable) -> ControlTable:
         items=MappingProxyType(items),
         baud_rates=table.baud_rates,
         capabilities=table.capabilities,
-        # it has no shaft, so these say nothing
+        # Not used: a device has no shaft
         goal_speed_item="",
         present_speed_item="",
         effort_item="",
@@ -246,9 +255,11 @@ def make_device(
     note: Callable[[str], None],
     now_ns: int,
 ) -> SimulatedDevice:
-    """Return a device that was just switched on, and listens at a rate, bit/s.
+    """Return a device that was just switched on at a baud rate, bit/s.
 
-    Raises LookupError for a model without a table of the protocol, ValueError for a rate that it lacks.
+    Raises:
+        LookupError: The model has no table of the protocol.
+        ValueError: The model does not support the baud rate.
     """
     table = (
         read_device_table(config.shown.table) if config.shown.table else device_table(config.model, protocol)

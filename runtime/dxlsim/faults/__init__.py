@@ -1,4 +1,4 @@
-"""Faults: what goes wrong on a simulated bus, by script or by chance.
+"""Faults: disturbances of a simulated bus, by script or at random.
 
-A fault changes bytes, times or registers; how the runtime reacts is none of its business.
+A fault changes bytes, times or registers. The reaction of the runtime is out of scope.
 """

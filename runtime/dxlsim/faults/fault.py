@@ -1,4 +1,4 @@
-"""A fault as one line of text, `lose servo=3 at=2s`: read, checked, and written back."""
+"""Fault as one line of text, `lose servo=3 at=2s`: parsing, validation and formatting."""
 
 from __future__ import annotations
 
@@ -12,32 +12,32 @@ from dxlwire.errors import InputError, suggestion
 
 
 class Fault(msgspec.Struct, frozen=True):
-    """One thing that goes wrong on simulated buses; `str()` gives the line that `parse_fault` reads back."""
+    """One fault of simulated buses; `str()` returns the line that `parse_fault` parses."""
 
-    kind: str  # one of KINDS
+    kind: str  # Key of KINDS
     given: Mapping[str, Value]
-    """By key; times are ns, angles degrees. It happens at `at`, counted from the start of the simulation, or
-    after `packet` more instruction packets on the bus; without both of them now."""
+    """Values by key; times are ns, angles degrees. The fault happens `at` a time after the start of the
+    simulation, or after `packet` more instruction packets on the bus. Without both it happens at once."""
 
     def number(self, key: str) -> int | None:
-        """Return a whole number of it, such as an ID or a time; None: not given."""
+        """Return an integer value, such as an ID or a time; None if the key is missing."""
         value = self.given.get(key)
         return value if isinstance(value, int) else None
 
     @property
     def bus(self) -> str | None:
-        """Name of the bus; None: the only one there is."""
+        """Name of the bus; None: the only bus."""
         value = self.given.get("bus")
         return value if isinstance(value, str) else None
 
     @property
     def servo(self) -> int | None:
-        """ID; for a packet: of the servo whose reply it is."""
+        """ID of the servo; for a fault of a packet, the servo that sends the reply."""
         return self.number("servo")
 
     @property
     def at_ns(self) -> int | None:
-        """When it happens."""
+        """Time of the fault after the start of the simulation, ns; None: not given."""
         return self.number("at")
 
     def __str__(self) -> str:
@@ -49,7 +49,8 @@ class Fault(msgspec.Struct, frozen=True):
 def parse_fault(text: str) -> Fault:
     """Return the fault of one line such as `silence servo=3 at=1s for=500ms`.
 
-    Raises InputError with one sentence: what is wrong and how to write it.
+    Raises:
+        InputError: The line is wrong; the message is one sentence with the problem and its fix.
 
     >>> str(parse_fault("silence for=500ms servo=3 at=1.0s"))
     'silence servo=3 at=1s for=500ms'
@@ -81,14 +82,14 @@ def parse_fault(text: str) -> Fault:
 
 
 def usage(name: str) -> str:
-    """Return how a kind is written: `lose [servo=ID] [from=host] ...`; raises KeyError for no kind."""
+    """Return the syntax of a kind: `lose [servo=ID] [from=host] ...`. Raises KeyError for an unknown kind."""
     kind = KINDS[name]
     keys = [(key, f"{key}={reader.example}") for key, reader in kind.readers.items()]
     return " ".join((name, *(text if key in kind.needs else f"[{text}]" for key, text in keys)))
 
 
 def fault_help() -> tuple[str, ...]:
-    """Return what a person can write: for each kind its line, and what it does."""
+    """Return the syntax and the effect of each kind, one line per kind."""
     return tuple(f"{usage(name)}: {kind.does}" for name, kind in KINDS.items())
 
 

@@ -1,8 +1,8 @@
-"""Every kind of fault: the keys of its line, what a storm draws of it, and what it does to a bus.
+"""Kinds of faults: the keys of each kind's line, its random values in a storm, and its effect on a bus.
 
-Simpler than the world: noise and a babbling servo reach the host and spoil what servos send meanwhile, but no
-servo takes their bytes for an instruction; a supply changes from one moment to the next; a servo without
-power is limp at once; a second servo with an ID is at the angle of the first one, and carries no load [i].
+Simplifications: noise and a babbling servo reach the host and corrupt simultaneous replies of servos, but
+servos never parse their bytes as instructions. A supply voltage changes instantly. A servo without power is
+limp at once. A second servo with an ID has the angle of the first one and carries no load [i].
 """
 
 from __future__ import annotations
@@ -25,42 +25,42 @@ from dxlsim.servo.simulated_servo import SimulatedServo
 from dxlsim.simulation_plan import ServoConfig
 
 NOISE_BYTES = 8
-TIMER_NS = 16_000_000  # latency timer of an FTDI adapter as it is shipped (AN232B-04)
+TIMER_NS = 16_000_000  # Factory setting of an FTDI adapter's latency timer (AN232B-04)
 HOT_CELSIUS = 90.0
-"""Above Temperature Limit (31) as every model has it from the factory: 85 degrees C at most."""
-BOOT_NS = 100_000_000  # How long a servo that starts again receives nothing; no manual names it [i]
+"""Above the factory setting of Temperature Limit (31) in every model: 85 degrees C at most."""
+BOOT_NS = 100_000_000  # Time without reception after a restart; the manuals give no value [i]
 BROWNOUT_NS = 200_000_000
 BABBLE_NS = 200_000_000
 BABBLE_PAUSE_NS = 2_000_000
 TURN_NS = 1_000_000_000
-_SHORTEST_BOOT_NS = 50_000_000  # no servo is back sooner after it lost its power [i]
-_STEP_NS = 1000  # times that a storm draws are multiples of it
-_SUPPLY_NS = 10_000_000  # how often a supply with a resistance is worked out
+_SHORTEST_BOOT_NS = 50_000_000  # No servo restarts faster after a loss of power [i]
+_STEP_NS = 1000  # Resolution of the times in a storm
+_SUPPLY_NS = 10_000_000  # Update interval of a supply with a resistance
 _MS, _S = 1_000_000, 1_000_000_000
 
 LINE, PACKET, NODE, SERVO, DEVICE = "line", "packet", "node", "servo", "device"
-"""What a fault happens to: the line or its adapter, a packet of a servo or of the host, all that is on the
-line, what has a shaft or a servo's model, other devices."""
+"""Targets of a fault: the line or its adapter; a packet of a servo or of the host; any unit on the line; a
+servo (with a shaft, or of a model); another device."""
 
 
 class Hold(msgspec.Struct):
-    """What lasts as long as any fault of its kind does, on one servo or one adapter."""
+    """State that persists as long as any fault of its kind lasts, on one servo or one adapter."""
 
-    restore: Callable[[], None]  # brings back what was before the first of them
+    restore: Callable[[], None]  # Restores the state from before the first fault
     faults: int = 0
 
 
 Holds = dict[tuple[str, int], Hold]
-"""By kind and what it holds; one for all faults of a script, since they may overlap."""
+"""Hold by kind and target; shared by all faults of a script, because they may overlap."""
 
 
 _Act = TypeVar("_Act", bound=Callable[..., None])
 
-Draw = Callable[[Random], Mapping[str, Value]]  # What a storm draws of a kind: values by key
+Draw = Callable[[Random], Mapping[str, Value]]  # Draws random values of a kind for a storm, by key
 
 
 class Kind(NamedTuple):
-    """One kind of fault: what it does in words, to what it happens, and its keys, needed ones first."""
+    """One kind of fault: its effect in words, its target, and its keys, required ones first."""
 
     does: str
     of: str
@@ -70,13 +70,13 @@ class Kind(NamedTuple):
     needs: tuple[str, ...]
 
 
-KINDS: dict[str, Kind] = {}  # By name, in the order in which they are listed
+KINDS: dict[str, Kind] = {}  # By name, in the order of the help
 
-WHEN = ("bus", "at", "packet")  # Keys of every kind, which say where and when; a storm begins at no packet
+WHEN = ("bus", "at", "packet")  # Keys of every kind for place and time; a storm cannot begin at a packet
 
 
 def _kind(of: str, draw: Draw = lambda random: {}) -> Callable[[_Act], _Act]:
-    """Take up a function as the kind of its name: its arguments are the keys of the kind's line."""
+    """Register a function as the kind of its name; its parameters are the keys of the kind's line."""
 
     def take_up(act: _Act) -> _Act:
         name, does = act.__name__.removeprefix("_"), inspect.cleandoc(act.__doc__ or "")
@@ -112,10 +112,18 @@ def _stretch(random: Random) -> dict[str, Value]:
 
 
 class Happening:
-    """One fault on its way to one bus; it enters the ledger once, when it happens."""
+    """One planned fault of one bus; it adds a note to the ledger when it happens."""
 
     def __init__(self, kind: str, text: str, bus: SimulatedBus, random: Random, holds: Holds) -> None:
-        """`text`: its line; `random` is for what the fault leaves open."""
+        """Prepare a fault.
+
+        Args:
+            kind: Key of KINDS.
+            text: Line of the fault.
+            bus: The bus.
+            random: Source of values that the line leaves open.
+            holds: Shared by all faults of a script.
+        """
         self.bus, self.random = bus, random
         self.happened = False
         self._kind, self._text, self._holds = kind, text, holds
@@ -126,13 +134,13 @@ class Happening:
             self.bus.note(f"{FAULT}{self._text}")
 
     def _named(self, nodes: Sequence[Node], servo: int | None) -> list[Node]:
-        """Return the one that has an ID, or all of the bus, at the bus' time: it happens to them.
+        """Return the unit with an ID, or all units of the bus, and note that the fault happens.
 
-        None is left when the host has given it another ID meanwhile: the fault does not happen.
+        The result is empty if the host has changed the ID since planning. The fault then does not happen.
         """
         named = [node for node in nodes if servo in (None, node.servo_id)]
         if servo is not None:
-            named = named[:1]  # of two with one ID the first is meant
+            named = named[:1]  # If two units share the ID, the fault concerns the first
         for node in named:
             node.advance(self.bus.now_ns)
         if named:
@@ -150,7 +158,7 @@ class Happening:
             self.bus.at(self.bus.now_ns + for_ns, action)
 
     def _hold(self, target: object, restore: Callable[[], None], for_ns: int | None) -> None:
-        """Call `restore` after a time, and after that of the last one that overlaps with it."""
+        """Call `restore` after a time, or after the end of the last overlapping fault of the same kind."""
         hold = self._holds.setdefault((self._kind, id(target)), Hold(restore))
         hold.faults += 1
 
@@ -172,7 +180,7 @@ class Happening:
         delay_ns: int = 0,
         copies: int = 1,
     ) -> None:
-        """Alter the next packets of a servo; None: of the host."""
+        """Alter the next packets of a servo; None: those of the host."""
 
         def altered(packet: bytes) -> bytes:
             self._enter()
@@ -205,9 +213,9 @@ class Happening:
         from_: str | None = None,
         count: int = 1,
     ) -> None:
-        """A byte of it (default: the last) has bits flipped (default 0x01)."""
+        """A byte of the packet (default: the last) has bits flipped (default 0x01)."""
 
-        def corrupted(packet: bytes) -> bytes:  # an index beyond the packet means its nearest byte
+        def corrupted(packet: bytes) -> bytes:  # An index beyond the packet selects its nearest byte
             return flipped(packet, max(-len(packet), min(byte, len(packet) - 1)), flip)
 
         self._alter(servo, count, "corrupted", corrupted)
@@ -268,7 +276,7 @@ class Happening:
 
     @_kind(NODE, _boot)
     def _reboot(self, servo: int, for_: int = BOOT_NS) -> None:
-        """A servo starts again by itself: RAM is lost, and it receives nothing for 100 ms (for=)."""
+        """A servo restarts: RAM is lost, and it receives nothing for 100 ms (for=)."""
         for node in self._nodes(servo):
             node.cut_power(self.bus.now_ns + for_)
 
@@ -279,7 +287,7 @@ class Happening:
 
         def start_again(node: SimulatedNode) -> None:
             node.advance(end_ns)
-            node.reset()  # some switch their torque on by themselves when the power is back
+            node.reset()  # Some models enable torque at power-up
 
         for node in self._nodes(servo):
             node.cut_power(end_ns)
@@ -314,7 +322,7 @@ class Happening:
 
     @_kind(SERVO, lambda random: {"by": float(random.randint(-90, 90) or 1), **_while(random)})
     def _turn(self, servo: int, by: float, for_: int = TURN_NS) -> None:
-        """A hand turns the shaft of a servo in 1 s (for=); it gives way to one that holds or drives it."""
+        """A hand turns the shaft of a servo in 1 s (for=), unless the servo holds or drives the shaft."""
         for each in self._servos(servo):
             each.turn(math.radians(by), for_)
 
@@ -419,12 +427,12 @@ class Happening:
 
 
 PASSING = ("lose", "corrupt", "truncate", "delay", "duplicate", "noise", "silence", "babble")
-"""Kinds after which everything is as it was: a storm has these when it names none."""
-_HOST_SHARE = 0.25  # so many of the packets that are lost or broken are the host's
+"""Kinds without lasting effects: the default of a storm."""
+_HOST_SHARE = 0.25  # Fraction of lost or corrupted packets in a storm that are the host's
 
 
 Strike = Callable[[SimulatedBus, str, dict[str, Value]], None]
-"""Takes what a storm draws: bus, kind, and values by key."""
+"""Receives the choices of a storm: bus, kind, and values by key."""
 
 
 @_kind(LINE)
@@ -439,7 +447,7 @@ def _storm(
     buses: Sequence[SimulatedBus],
     begin_ns: int,
 ) -> None:
-    """So many faults at random times within a time, of those in kinds= (default: those that pass)."""
+    """A number of faults at random times within a time, of those in kinds= (default: those that pass)."""
     for _ in range(faults):
         kind = random.choice(kinds)
         bus = random.choice(buses)

@@ -1,4 +1,4 @@
-"""Faults of simulated buses: planned from lines of text, and entered in the ledger as they happen."""
+"""Fault script: plans faults from lines of text and enters them in the ledger when they happen."""
 
 from __future__ import annotations
 
@@ -15,10 +15,10 @@ from dxlwire.errors import InputError
 
 
 class FaultScript:
-    """Faults that happen to buses at their times; what they leave open is drawn from `seed`.
+    """Faults of buses, at their times; open values are drawn from `seed`.
 
-    A fault that happens is a note in the ledger, `fault: ` and its text, exactly once: one of a packet
-    when that packet passes, any other at its time. A storm's faults are there one by one.
+    A fault that happens adds exactly one note to the ledger, `fault: ` and its text: a fault of a packet when
+    that packet passes, any other fault at its time. Each fault of a storm has a note of its own.
     """
 
     def __init__(self, faults: Sequence[Fault], seed: int = 0) -> None:
@@ -31,18 +31,29 @@ class FaultScript:
         self._holds: Holds = {}
 
     def attach(self, buses: Sequence[SimulatedBus], *, start_ns: int = 0, now_ns: int | None = None) -> None:
-        """Plan every fault on its bus; those without a time happen at `now_ns`, at `start_ns` when None.
+        """Plan every fault on its bus.
 
-        `start_ns` is when the simulation started, on the clock of the buses. Raises InputError with one
-        sentence for each fault that could never happen; then none is planned.
+        Args:
+            buses: The buses.
+            start_ns: Start of the simulation, on the clock of the buses.
+            now_ns: Time of the faults without a time; None: `start_ns`.
+
+        Raises:
+            InputError: A fault can never happen. The message has one sentence per fault, and no fault is
+                planned.
         """
         self._buses, self._start_ns = tuple(buses), start_ns
         self._plan(self._faults, start_ns if now_ns is None else now_ns)
 
     def add(self, fault: Fault, now_ns: int) -> None:
-        """Plan one more fault on the attached buses, by hand; without a time it happens at `now_ns`.
+        """Plan one more fault on the attached buses.
 
-        Raises InputError with one sentence when it could never happen.
+        Args:
+            fault: The fault.
+            now_ns: Time of a fault without a time.
+
+        Raises:
+            InputError: The fault can never happen; the message is one sentence.
         """
         self._plan((fault,), now_ns)
 
@@ -68,14 +79,14 @@ class FaultScript:
 
     @property
     def waiting(self) -> tuple[Fault, ...]:
-        """Faults that have not happened, so far or for ever: a servo that is not read loses no reply."""
+        """Faults that have not happened, possibly never: a servo that is not read loses no reply."""
         return tuple(fault for fault, happening in self._planned if not happening.happened)
 
     def _placed(self, fault: Fault, index: int, since_ns: int) -> list[tuple[Fault, Happening]]:
-        """Return what happens, on which bus; of a storm each of its faults, in the order of their times.
+        """Return a fault with its bus, or all faults of a storm in the order of their times.
 
-        Each of those names its bus where there are several, its servo, and its time: its text alone repeats
-        it. Without `at=` a storm starts at `since_ns`.
+        Each fault of a storm names its bus (if there are several), its servo and its time, so that its text
+        alone reproduces it. Without `at=` a storm starts at `since_ns`.
         """
         buses = _chosen(fault, self._buses)
         if fault.at_ns is not None and fault.at_ns < since_ns:
@@ -103,7 +114,7 @@ class FaultScript:
 
 
 def _action(fault: Fault, first: object, **others: object) -> Callable[[], None]:
-    """Return what lets a fault happen: the function of its kind with the values of its line."""
+    """Return a call of a kind's function with the values of a fault's line."""
     named = {f"{key}_" if iskeyword(key) else key: value for key, value in fault.given.items()}
     return partial(
         KINDS[fault.kind].act, first, **{key: named[key] for key in named if key not in WHEN}, **others
@@ -111,7 +122,9 @@ def _action(fault: Fault, first: object, **others: object) -> Callable[[], None]
 
 
 def _chosen(fault: Fault, buses: Sequence[SimulatedBus]) -> Sequence[SimulatedBus]:
-    """Return the bus that is meant, for a storm without one all; raises InputError when nothing is there."""
+    """Return the bus of a fault, or all buses for a storm without one. Raises InputError for a missing
+    target.
+    """
     names = " or ".join(f"bus={bus.name}" for bus in buses)
     chosen = [bus for bus in buses if fault.bus in (None, bus.name)]
     if not chosen:

@@ -1,4 +1,4 @@
-"""How the values of a fault's line are read and written: `3`, `500ms`, `-30deg`, `ff00fd`."""
+"""Values of a fault's line: parsing and formatting of `3`, `500ms`, `-30deg`, `ff00fd`."""
 
 from __future__ import annotations
 
@@ -11,21 +11,23 @@ from dxlsim.texts.duration import parse_duration
 
 Value = int | float | str | bytes | tuple[str, ...]
 
-SHORTEST_PAUSE_NS = 100_000  # A babbling servo without pauses would leave the simulation no time
+SHORTEST_PAUSE_NS = 100_000  # A babbling servo without pauses would stall the simulation
 _MOST_BYTES = 256
 _MOST_DEGREES = 36_000.0
 
 
 class Reader(NamedTuple):
-    """Reads a value from its text, and writes it back; `example` stands for it in the help."""
+    """Parser and formatter of a value; `example` represents the value in the help."""
 
     example: str
-    read: Callable[[str], Value]  # Raises ValueError with what to write
+    read: Callable[[str], Value]  # Raises ValueError with the expected form
     show: Callable[..., str] = str
 
 
 def _read(read: Callable[[str], Value], may_be: Callable[..., bool], asked: str) -> Callable[[str], Value]:
-    """Return a reader of what `read` makes of a text, where it `may_be`; else it raises what was asked."""
+    """Return a parser that accepts the values of `read` for which `may_be` holds. It raises ValueError with
+    `asked`.
+    """
 
     def checked(text: str) -> Value:
         with suppress(ValueError):
@@ -87,7 +89,7 @@ def _show_angle(value: float) -> str:
 
 _time_of = Reader("TIME", _time(1, "longer than 0, such as 500ms"), _show_time)
 _angle_of = Reader("ANGLE", _angle, _show_angle)
-TURN = Reader("ANGLE", _turn, _show_angle)  # Of `by` where it is an angle
+TURN = Reader("ANGLE", _turn, _show_angle)  # Reader of `by` if it is an angle
 READERS: Mapping[str, Reader] = {
     "bus": Reader("NAME", _read(str, bool, "the name of a bus")),
     "servo": Reader("ID", _whole(0, 253)),
@@ -117,4 +119,4 @@ READERS: Mapping[str, Reader] = {
     "packet": Reader("NUMBER", _whole(1, 10**9)),
     "for": _time_of,
 }
-"""By key, in the order in which a fault is written."""
+"""Readers by key, in the order of the keys in a formatted fault."""

@@ -1,1 +1,1 @@
-"""Geometry: rigid transforms, and the reader of URDF files. No other module of dxlsim is imported here."""
+"""Geometry: rigid transforms, and the reader of URDF files. It imports no other module of dxlsim."""

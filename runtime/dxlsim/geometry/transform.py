@@ -1,7 +1,7 @@
-"""Transforms: where one frame lies in another one, as a translation and a unit quaternion.
+"""Transforms: pose of one frame in another one, as a translation and a unit quaternion.
 
-Plain Python: the client of a running robot needs no library, and a robot has some twenty frames. Quaternions
-are (x, y, z, w), as in ROS 2's messages; rotations are active and right-handed.
+Plain Python, so that the client of a running robot needs no library; a robot has some twenty frames.
+Quaternions are (x, y, z, w), as in ROS 2 messages; rotations are active and right-handed.
 """
 
 from __future__ import annotations
@@ -18,32 +18,32 @@ NO_TURN: Quaternion = (0.0, 0.0, 0.0, 1.0)
 
 
 class Transform(msgspec.Struct, frozen=True):
-    """A frame in another one: p_there = rotation * p_here + translation."""
+    """Pose of a frame in another one: p_there = rotation * p_here + translation."""
 
     translation: Vector = (0.0, 0.0, 0.0)  # m
-    rotation: Quaternion = NO_TURN  # Of length 1
+    rotation: Quaternion = NO_TURN  # Unit quaternion
 
     def __matmul__(self, inner: Transform) -> Transform:
-        """Return a frame that lies in this one, seen from where this one lies."""
+        """Return the pose of an inner frame in the outer frame."""
         moved = self.apply(inner.translation)
         return Transform(moved, product(self.rotation, inner.rotation))
 
     def apply(self, point: Vector) -> Vector:
-        """Return a point of this frame, m, seen from where the frame lies."""
+        """Transform a point of this frame, m, into the outer frame."""
         x, y, z = rotated(self.rotation, point)
         a, b, c = self.translation
         return x + a, y + b, z + c
 
     @property
     def inverse(self) -> Transform:
-        """Where the outer frame lies in this one."""
+        """Pose of the outer frame in this frame."""
         back = conjugate(self.rotation)
         x, y, z = rotated(back, self.translation)
         return Transform((-x, -y, -z), back)
 
     @property
     def matrix(self) -> Matrix:
-        """The homogeneous matrix, 4 x 4, row by row."""
+        """Homogeneous matrix, 4 x 4, in row order."""
         columns = [
             rotated(self.rotation, axis) for axis in ((1.0, 0.0, 0.0), (0.0, 1.0, 0.0), (0.0, 0.0, 1.0))
         ]
@@ -52,17 +52,17 @@ class Transform(msgspec.Struct, frozen=True):
 
     @property
     def rpy(self) -> Vector:
-        """Roll, pitch and yaw, rad, as in a URDF: about the fixed x, y and z, one after the other."""
+        """Roll, pitch and yaw, rad, as in a URDF: about the fixed x, y and z axes, in this order."""
         (a, _, _, _), (b, _, _, _), (c, d, e, _), _ = self.matrix
         level = math.hypot(a, b)
-        if level < 1e-12:  # straight up or down: roll and yaw turn about the same axis
+        if level < 1e-12:  # Gimbal lock: roll and yaw rotate about the same axis
             (_, f, *_), (_, h, *_), *_ = self.matrix
             return 0.0, math.atan2(-c, level), math.atan2(-f, h)
         return math.atan2(d, e), math.atan2(-c, level), math.atan2(b, a)
 
 
 def product(left: Quaternion, right: Quaternion) -> Quaternion:
-    """Return the rotation that turns by `right` and then by `left`."""
+    """Return the rotation by `right` followed by `left`."""
     x1, y1, z1, w1 = left
     x2, y2, z2, w2 = right
     return (
@@ -74,13 +74,13 @@ def product(left: Quaternion, right: Quaternion) -> Quaternion:
 
 
 def conjugate(rotation: Quaternion) -> Quaternion:
-    """Return the rotation back."""
+    """Return the inverse rotation."""
     x, y, z, w = rotation
     return -x, -y, -z, w
 
 
 def rotated(rotation: Quaternion, vector: Vector) -> Vector:
-    """Return a vector turned: v + 2 w (u x v) + 2 u x (u x v), with the quaternion (u, w)."""
+    """Return the rotated vector: v + 2 w (u x v) + 2 u x (u x v), with the quaternion (u, w)."""
     x, y, z, w = rotation
     a, b, c = vector
     d, e, f = 2 * (y * c - z * b), 2 * (z * a - x * c), 2 * (x * b - y * a)
@@ -88,21 +88,21 @@ def rotated(rotation: Quaternion, vector: Vector) -> Vector:
 
 
 def turn(axis: Vector, angle: float) -> Quaternion:
-    """Return a rotation by an angle, rad, about an axis of length 1; it is continuous in the angle."""
+    """Return the rotation by an angle, rad, about a unit axis. It is continuous in the angle."""
     x, y, z = axis
     sine = math.sin(angle / 2)
     return x * sine, y * sine, z * sine, math.cos(angle / 2)
 
 
 def from_rpy(rpy: Vector) -> Quaternion:
-    """Return the rotation of roll, pitch and yaw, rad, about the fixed x, y and z, one after the other."""
+    """Return the rotation by roll, pitch and yaw, rad, about the fixed x, y and z axes, in this order."""
     roll, pitch, yaw = rpy
     about_x, about_y = turn((1.0, 0.0, 0.0), roll), turn((0.0, 1.0, 0.0), pitch)
     return product(turn((0.0, 0.0, 1.0), yaw), product(about_y, about_x))
 
 
 def unit(rotation: Quaternion) -> Quaternion | None:
-    """Return a quaternion of length 1; None for one that is no rotation: NaN, infinite or of no length."""
+    """Return the normalized quaternion, or None for an invalid one: NaN, infinite or of length 0."""
     length = math.sqrt(sum(value * value for value in rotation))
     if not math.isfinite(length) or length < 1e-9:
         return None
@@ -111,9 +111,10 @@ def unit(rotation: Quaternion) -> Quaternion | None:
 
 
 def near(rotation: Quaternion, last: Quaternion) -> Quaternion:
-    """Return the one of the two quaternions of a rotation that is nearer to another quaternion.
+    """Return the one of a rotation's two quaternions that is nearer to the last one.
 
-    Values between two messages are interpolated, which would turn the long way round otherwise.
+    Values between two messages are interpolated; with the other quaternion the interpolation would take the
+    long way.
     """
     x, y, z, w = rotation
     together = x * last[0] + y * last[1] + z * last[2] + w * last[3]

@@ -1,7 +1,8 @@
-"""A robot's URDF: links, joints, origins, axes, limits and mimic joints, with every mistake at its place.
+"""URDF of a robot: links, joints, origins, axes, limits and mimic joints; each error has its position.
 
-Source: the pages "urdf/XML" of ROS (robot, link, joint) for elements, defaults and units: m, rad, and for a
-slide m; `rpy` turns about the parent's fixed x, then y, then z. Shapes and masses are not read here.
+Source: the pages "urdf/XML" of ROS (robot, link, joint) for elements, defaults and units: rad, and m for
+prismatic joints. `rpy` rotates about the parent's fixed x, then y, then z axis. Shapes and masses are not
+read here.
 """
 
 from __future__ import annotations
@@ -18,14 +19,14 @@ from dxlwire.errors import InputError, Mark, Problem, suggestion
 Vector: TypeAlias = "tuple[float, float, float]"
 JointType = Literal["revolute", "continuous", "prismatic", "fixed"]
 _TYPES: tuple[str, ...] = get_args(JointType)
-_FREE = ("floating", "planar")  # Types of a URDF that no single servo moves
+_FREE = ("floating", "planar")  # Joint types that a single servo cannot move
 TURNING = ("revolute", "continuous")
 SLIDING = "prismatic"
 _NOWHERE: Vector = (0.0, 0.0, 0.0)
 
 
 class UrdfLimits(msgspec.Struct, frozen=True):
-    """Limits of a joint: rad, rad/s and Nm, of a slide m, m/s and N; None: not given."""
+    """Limits of a joint: rad, rad/s and Nm; for a prismatic joint m, m/s and N. None: not given."""
 
     lower: float | None = None
     upper: float | None = None
@@ -34,7 +35,7 @@ class UrdfLimits(msgspec.Struct, frozen=True):
 
 
 class Mimic(msgspec.Struct, frozen=True):
-    """How a joint follows another one: q = multiplier * q_of_that + offset."""
+    """Coupling of a joint to another one: q = multiplier * q_of_that + offset."""
 
     joint: str
     multiplier: float = 1.0
@@ -42,43 +43,47 @@ class Mimic(msgspec.Struct, frozen=True):
 
 
 class UrdfJoint(msgspec.Struct, frozen=True):
-    """A joint: how its child link lies in its parent link."""
+    """Joint, with the pose of its child link in its parent link."""
 
     name: str
     type: JointType
     parent: str
     child: str
-    xyz: Vector = _NOWHERE  # m, in the parent
+    xyz: Vector = _NOWHERE  # m, in the parent's frame
     rpy: Vector = _NOWHERE  # rad, roll, pitch and yaw about the parent's axes
-    axis: Vector = (1.0, 0.0, 0.0)  # In the joint's own frame; of length 1
+    axis: Vector = (1.0, 0.0, 0.0)  # Unit vector in the joint's own frame
     limits: UrdfLimits = UrdfLimits()
     mimic: Mimic | None = None
     mark: Mark = Mark("")
 
     @property
     def moves(self) -> bool:
-        """True when it has a coordinate."""
+        """True unless the joint is fixed."""
         return self.type != "fixed"
 
 
 class Urdf(msgspec.Struct, frozen=True):
-    """A robot's tree of links."""
+    """Tree of a robot's links."""
 
     name: str
-    root: str  # The link without a parent
+    root: str  # Link without a parent
     links: tuple[str, ...]
-    """From the root downwards, each behind its parent; otherwise in the order of the file."""
-    joints: tuple[UrdfJoint, ...]  # As the links: the joint of each but the root
+    """Links from the root downwards, each after its parent; otherwise in the order of the file."""
+    joints: tuple[UrdfJoint, ...]  # In the order of `links`: the joint above each link except the root
 
     def joint(self, name: str) -> UrdfJoint | None:
-        """Return a joint by its name; None: there is none."""
+        """Return a joint by its name, or None."""
         return next((joint for joint in self.joints if joint.name == name), None)
 
 
 def leader(
     joints: Mapping[str, UrdfJoint], joint: UrdfJoint, known: Container[str]
 ) -> tuple[UrdfJoint, float, float]:
-    """Return the joint that one follows, itself where known or mimicking none: q = scale * its q + offset."""
+    """Return the joint that a joint follows, with q = scale * q_of_that + offset.
+
+    The search along `mimic` ends at the first joint that is in `known` or mimics no joint, possibly the joint
+    itself.
+    """
     scale, offset = 1.0, 0.0
     while joint.name not in known and joint.mimic is not None:
         offset += scale * joint.mimic.offset
@@ -88,9 +93,13 @@ def leader(
 
 
 def read_urdf(text: str, file: str = "the URDF") -> Urdf:
-    """Return what a URDF describes. Raises InputError with all mistakes that can be seen at once.
+    """Return the tree of a URDF.
 
-    No DTD is read: entities can be files of this machine, or grow without end, and a URDF needs none.
+    DTDs are rejected: entities can refer to files of this machine or expand without limit, and a URDF needs
+    none.
+
+    Raises:
+        InputError: The URDF is invalid; `problems` has all errors that can be detected at once.
     """
     return _Reading(_parsed(text, file)).result()
 
@@ -146,7 +155,7 @@ def _parsed(text: str, file: str) -> _Element:
 
 
 class _Reading:
-    """Reads the elements of a URDF, and collects what is wrong with them."""
+    """Reader of a URDF's elements; collects their errors."""
 
     def __init__(self, robot: _Element) -> None:
         self._robot = robot
@@ -166,7 +175,7 @@ class _Reading:
                 self._joints[joint.name] = joint
         self._check_mimics()
         root = ""
-        if not self._problems:  # else links would seem to have no parents
+        if not self._problems:  # After an error links might seem to have no parents
             root = self._root()
         if self._problems:
             raise InputError(sorted(self._problems, key=lambda problem: problem.mark))
@@ -214,7 +223,7 @@ class _Reading:
         return "fixed"
 
     def _end(self, element: _Element, name: str, tag: str) -> str:
-        """Return the link at one end of a joint."""
+        """Return the parent or child link of a joint."""
         found = element.first(tag)
         link = "" if found is None else found.attributes.get("link", "")
         mark = element.mark if found is None else found.mark
@@ -238,7 +247,7 @@ class _Reading:
         return default
 
     def _axis(self, element: _Element, name: str) -> Vector:
-        """Return the axis, brought to length 1."""
+        """Return the normalized axis."""
         x, y, z = self._vector(element, name, "axis", "xyz", (1.0, 0.0, 0.0))
         length = math.hypot(x, y, z)
         if not length:
@@ -303,13 +312,13 @@ class _Reading:
                 seen.add(following.name)
                 way[following.name] = None
                 following = None if following.mimic is None else self._joints.get(following.mimic.joint)
-            if following is not None and following.name in way:  # else that circle was found before
+            if following is not None and following.name in way:  # Otherwise this circle was already reported
                 circle = [*way][[*way].index(following.name) :]
                 what = f"joint {circle[0]} mimics itself: {' -> '.join((*circle, circle[0]))}"
                 self._add(following.mark, what, "let one of them move by itself")
 
     def _root(self) -> str:
-        """Return the link without a parent; add a problem unless the links are one tree."""
+        """Return the link without a parent; add a problem unless the links form one tree."""
         above: dict[str, UrdfJoint] = {}
         for joint in self._joints.values():
             other = above.setdefault(joint.child, joint)
@@ -338,7 +347,7 @@ class _Reading:
 
 
 def _downwards(root: str, joints: Sequence[UrdfJoint]) -> tuple[UrdfJoint, ...]:
-    """Return the joints below a link, each behind the one above it."""
+    """Return the joints below a link, each after the joint above it."""
     below: dict[str, list[UrdfJoint]] = {}
     for joint in joints:
         below.setdefault(joint.parent, []).append(joint)

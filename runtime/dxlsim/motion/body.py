@@ -1,9 +1,9 @@
-"""Body: how the links of a URDF move when simulated servos turn its joints.
+"""Body: motion of the links of a URDF, computed from the shafts of simulated servos.
 
-Pose, velocity and acceleration are passed on from link to link along the tree (R. Featherstone, "Rigid Body
-Dynamics Algorithms", 2008, chapter 5: the outward half of the recursive Newton-Euler algorithm), from the
-angles of the shafts alone: so it is the same with independent joints and with MuJoCo, whose own sensors a
-test compares. The URDF's first link stands still at the world's origin, z up.
+Pose, velocity and acceleration are propagated from link to link along the tree (R. Featherstone, "Rigid Body
+Dynamics Algorithms", 2008, chapter 5: the outward half of the recursive Newton-Euler algorithm). The input is
+only the shafts' motion, so the result is the same with independent joints and with MuJoCo; a test compares it
+with MuJoCo's own sensors. The URDF's first link is fixed at the world's origin, z up.
 """
 
 from __future__ import annotations
@@ -33,19 +33,20 @@ from dxlsim.simulation_plan import UrdfBodies
 
 
 class _Step(msgspec.Struct, frozen=True):
-    offset: Vector  # m, of the joint in the link before
-    rotation: Quaternion  # Of the joint's frame in the link before, at 0
+    offset: Vector  # m, position of the joint in the previous link
+    rotation: Quaternion  # Orientation of the joint's frame in the previous link, at q = 0
     axis: Vector  # Unit vector in the joint's frame
     slides: bool
-    joint: int  # Which of the joints that shafts move, or that it follows; -1: none
+    joint: int  # Index of the joint that shafts move, directly or by `mimic`; -1: fixed
     scale: float  # Coordinate = scale * that joint's + at
     at: float
 
 
 class SimulatedBody:
-    """The links of a URDF at the time of the shafts that it was last given.
+    """Links of a URDF at the time of the last `move`.
 
-    Raises InputError for a URDF that is wrong.
+    Raises:
+        InputError: The URDF is invalid.
     """
 
     def __init__(self, bodies: UrdfBodies) -> None:
@@ -59,13 +60,17 @@ class SimulatedBody:
         self.move(Shafts(0, *(np.zeros(bodies.servos) for _ in range(3))))
 
     def move(self, shafts: Shafts) -> None:
-        """Take the state of the shafts, in the order in which the servos were added."""
+        """Set the state of the shafts, in the order in which the servos were added."""
         self._place = self._matrix @ shafts.angle + self._offset
         self._speed = self._matrix @ shafts.velocity
         self._gain = self._matrix @ shafts.acceleration
 
     def motion(self, link: str) -> LinkMotion:
-        """Return how a link moves. Raises KeyError for one that the URDF does not have."""
+        """Return the motion of a link.
+
+        Raises:
+            KeyError: The URDF does not have the link.
+        """
         facing, position = NO_TURN, np.zeros(3)
         speed, rate, gain, spin = np.zeros(3), np.zeros(3), np.zeros(3), np.zeros(3)
         for step in self._chain(link):
@@ -140,17 +145,17 @@ def _moved(bodies: UrdfBodies) -> tuple[tuple[str, ...], Floats, Floats]:
 
 
 class ShaftSink(Protocol):
-    """Takes the newest state of all shafts."""
+    """Receiver of the newest state of all shafts."""
 
     values: int
-    """Length of the arrays that it takes: angle, velocity and acceleration of each shaft."""
+    """Length of the arrays: angle, velocity and acceleration of each shaft."""
 
     def write(self, t_ns: int, values: Floats) -> None:
-        """Take the angles, rad, then the velocities, rad/s, then the accelerations, rad/s^2; never waits."""
+        """Write the angles, rad, then the velocities, rad/s, then the accelerations, rad/s^2; never waits."""
 
 
 class ShaftsShown:
-    """Gives a sink how the shafts move, for processes of sensors, after each step of the mechanics."""
+    """Publishes the motion of the shafts after each step of the mechanics, for processes of sensors."""
 
     def __init__(self, mechanics: Mechanics, sink: ShaftSink) -> None:
         self._mechanics, self._sink = mechanics, sink
@@ -159,7 +164,7 @@ class ShaftsShown:
         mechanics.sense()
 
     def show(self) -> None:
-        """Write the sink if the mechanics are further than the last time."""
+        """Write to the sink if the mechanics have advanced since the last call."""
         mechanics, values = self._mechanics, self._values
         if mechanics.grid_ns == self._shown_ns:
             return
@@ -171,22 +176,26 @@ class ShaftsShown:
 
 
 class SensedBody:
-    """The body of a simulation in this process, as it is now."""
+    """Current body of a simulation in this process."""
 
     def __init__(self, bodies: UrdfBodies, mechanics: Mechanics, now_ns: Callable[[], int]) -> None:
-        """Raises InputError for a URDF that is wrong."""
+        """Raises:     InputError: The URDF is invalid."""
         self._body, self._mechanics, self._now_ns = SimulatedBody(bodies), mechanics, now_ns
         self._count = bodies.servos
         mechanics.sense()
 
     def motion(self, link: str) -> LinkMotion:
-        """Return how a link moves now. Raises KeyError for one that the URDF does not have."""
+        """Return the current motion of a link.
+
+        Raises:
+            KeyError: The URDF does not have the link.
+        """
         self._body.move(self._mechanics.shafts(self._now_ns(), self._count))
         return self._body.motion(link)
 
 
 def _cross(a: Floats, b: Floats) -> Floats:
-    # numpy's own takes 20 us for three numbers
+    # numpy's cross product takes 20 us for three numbers
     ax, ay, az = a.tolist()
     bx, by, bz = b.tolist()
     return np.array((ay * bz - az * by, az * bx - ax * bz, ax * by - ay * bx))

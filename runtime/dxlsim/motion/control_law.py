@@ -1,12 +1,12 @@
-"""The controllers inside simulated servos: commands, the trajectories to their goals, and one control law.
+"""Control law: controllers inside simulated servos, with their commands and the trajectories to their goals.
 
-All families share the law; each uses a part of it:
+All families share the law; each one uses some of its terms:
 
     duty = p * error beyond the margin + punch + i * its integral + d * its speed + feed-forward + bias
 
-limited to `limit`; and where a current is controlled, the torque limited to `torque_limit`. A velocity
-controller is the same law on the integrated speed: its I gain takes the place of P, its P gain that of D.
-The motor gives `duty * stall torque - damping * velocity`.
+clamped to `limit`; with current control the torque is also clamped to `torque_limit`. A velocity controller
+is the same law on the integrated speed: its I gain takes the place of P, its P gain that of D. The motor's
+torque is `duty * stall torque - damping * velocity`.
 """
 
 from __future__ import annotations
@@ -17,51 +17,51 @@ import numpy as np
 
 from dxlsim.motion.plant import Floats
 
-FREE = 1e6  # A limit that nothing reaches: rad/s, rad/s^2, Nm. Finite, so that no step makes 0 * infinity.
+FREE = 1e6  # Unreachable limit: rad/s, rad/s^2, Nm. It is finite to avoid 0 * infinity.
 
-_ARRIVED = 1e-9  # rad; nearer to the goal a trajectory is there
+_ARRIVED = 1e-9  # rad; distance to the goal at which a trajectory ends
 
-_UNWOUND = 1e-6  # duty/s; an integral that changes the duty more slowly is as good as constant
+_UNWOUND = 1e-6  # duty/s; an integral that changes the duty more slowly counts as constant
 
 
 class ServoCommand(NamedTuple):
-    """The inside of one servo for the time until the next command; what is left out is switched off.
+    """Parameters of one servo's controller until the next command; every default switches its term off.
 
-    `duty` is a part of the supply's voltage at the motor, -1 to 1. Angles are those of the shaft.
+    `duty` is a fraction of the supply voltage at the motor, -1 to 1. Angles are those of the shaft.
     """
 
-    goal: float = 0.0  # rad; where the trajectory ends
+    goal: float = 0.0  # rad; end of the trajectory
     speed: float = FREE
-    """rad/s, the most that the trajectory has; where it is `turning`: the speed with its sign"""
+    """rad/s, speed limit of the trajectory; with `turning` its signed speed"""
     acceleration: float = FREE  # rad/s^2 of the trajectory
-    turning: float = 0.0  # 1: the trajectory continues for ever at `speed`
-    p_ccw: float = 0.0  # duty per rad of error, where the goal is counter-clockwise of the shaft
+    turning: float = 0.0  # 1: the trajectory continues indefinitely at `speed`
+    p_ccw: float = 0.0  # duty per rad of error, if the goal is counter-clockwise of the shaft
     p_cw: float = 0.0
-    margin_ccw: float = 0.0  # rad of error that are left alone
+    margin_ccw: float = 0.0  # rad of error without a reaction
     margin_cw: float = 0.0
     punch: float = 0.0  # duty at the edge of the margin
     i: float = 0.0  # duty per rad s
     d: float = 0.0  # duty per rad/s of the error's speed
-    feed_velocity: float = 0.0  # duty per rad/s of the trajectory, beside `d`
+    feed_velocity: float = 0.0  # duty per rad/s of the trajectory, in addition to `d`
     feed_acceleration: float = 0.0  # duty per rad/s^2 of the trajectory
-    bias: float = 0.0  # duty, whatever the position
-    limit: float = 0.0  # most duty; 0: the servo is limp
-    torque_limit: float = FREE  # Nm, most torque where the motor's current is controlled
+    bias: float = 0.0  # duty, independent of the position
+    limit: float = 0.0  # largest duty; 0: the servo is limp
+    torque_limit: float = FREE  # Nm, torque limit if the motor's current is controlled
 
 
 LIMP = ServoCommand()
-"""No torque: the shaft follows what turns it, and the motor brakes it as with closed terminals [i]."""
+"""No torque: the shaft moves freely, and the motor brakes it as with shorted terminals [i]."""
 
 ROWS = {name: row for row, name in enumerate(ServoCommand._fields)}
 """Row of each number in an array of all servos."""
 
 
 class Profiles:
-    """Position and velocity that the servos' controllers follow.
+    """Position and velocity setpoints of the servos' controllers.
 
-    At most the profile's speed, reached and left with the profile's acceleration (e-Manual, X series,
-    Profile Velocity (112)). The manual's jerk control is not modelled. A new goal begins with the velocity
-    that the trajectory has ("Velocity Override").
+    The speed is limited by the profile's speed, and changes with the profile's acceleration (e-Manual, X
+    series, Profile Velocity (112)). The manual's jerk control is not modelled. A new goal starts with the
+    current velocity of the trajectory ("Velocity Override").
     """
 
     def __init__(self, commands: Floats, angle: Floats, dt_s: float) -> None:
@@ -71,13 +71,13 @@ class Profiles:
         self.position: Floats = angle.copy()  # rad
         self.velocity: Floats = np.zeros(len(angle))  # rad/s
         self.change: Floats = np.zeros(len(angle))
-        """rad/s that the velocity changed by in the last step"""
+        """Change of the velocity in the last step, rad/s."""
         self.arrived = False  # True while no trajectory moves
         self._dt_s = dt_s
         self.commanded()
 
     def commanded(self) -> None:
-        """Prepare for changed commands."""
+        """Update cached values after a change of commands."""
         self._turning = self._turn != 0.0
         self._accelerate()
         self.arrived = False
@@ -91,7 +91,7 @@ class Profiles:
         self.arrived = False
 
     def at_goal(self, index: int) -> bool:
-        """Return whether a servo's trajectory has come to its end."""
+        """Return True if a servo's trajectory has ended."""
         if self._turning[index]:
             return bool(self.velocity[index] == self._speed[index])
         return bool(abs(self._goal[index] - self.position[index]) < _ARRIVED)
@@ -102,8 +102,8 @@ class Profiles:
             return
         error = self._goal - self.position
         way = np.abs(error)
-        # Braking by a dt in each of n steps from v on takes n v - n (n - 1) / 2 a dt in steps of dt: for the
-        # rest of the way the least n with which it can end at rest, and the v that ends exactly there.
+        # Braking by a dt in each of n steps from v takes n v - n (n - 1) / 2 a dt, in steps of dt. Choose the
+        # least n with which the rest of the way can end at rest, and the v that ends exactly there.
         steps = np.maximum(np.ceil((np.sqrt(way * self._per_braking + 1.0) - 1.0) * 0.5), 1.0)
         speed = (steps - 1.0) * (self._ramp / 2) + way * (1.0 / self._dt_s) / steps
         speed = np.copysign(np.minimum(speed, self._speed), error)
@@ -113,7 +113,7 @@ class Profiles:
         self.position += self.velocity * self._dt_s
 
     def look(self) -> None:
-        """Find out whether all trajectories have come to their ends: then they are there exactly."""
+        """Check whether all trajectories have ended, and then set them exactly to their goals."""
         if self.arrived or self._turning.any():
             return
         left = np.abs(self._goal - self.position).max(initial=0.0)
@@ -129,19 +129,19 @@ class Profiles:
 
 
 class ControlLaw:
-    """All servos' controllers and motors; `step` works out `drive` and `damping` for the plant."""
+    """Controllers and motors of all servos; `step` computes `drive` and `damping` for the plant."""
 
     def __init__(self, commands: Floats, motor_damping: Floats, dt_s: float) -> None:
         size = len(motor_damping)
         self._rows = {name: commands[row] for name, row in ROWS.items()}
         self._dt_s = dt_s
         self.stall: Floats = np.zeros(size)
-        """Torque at standstill and full duty, at the supply's voltage, Nm; `commanded` when it changes."""
+        """Torque at standstill and full duty, at the supply voltage, Nm. Call `commanded` after a change."""
         self._motor_damping = motor_damping
         self.drive: Floats = np.zeros(size)  # Nm at standstill
         self.damping: Floats = motor_damping  # Nm s/rad
-        self.torque: Floats = np.zeros(size)  # Nm of the motor at the speed of the last step
-        self.duty: Floats = np.zeros(size)  # Part of the supply's voltage at the motor, signed
+        self.torque: Floats = np.zeros(size)  # Nm of the motor at the speed before the last step
+        self.duty: Floats = np.zeros(size)  # Signed fraction of the supply voltage at the motor
         self.integral: Floats = np.zeros(size)  # rad s
         self._error: Floats = np.zeros(size)
         self._within = np.zeros(size, dtype=bool)
@@ -149,23 +149,23 @@ class ControlLaw:
 
     @property
     def winding(self) -> bool:
-        """True while an integral changes, which may yet move a shaft that friction holds."""
+        """True while an integral changes, which may still move a shaft that friction holds."""
         if not self._integrates:
             return False
         return bool((np.abs(self._rows["i"] * self._error) * self._within > _UNWOUND).any())
 
     def commanded(self) -> None:
-        """Prepare for changed commands."""
+        """Update cached values after a change of commands."""
         rows = self._rows
         self._feed = rows["d"] + rows["feed_velocity"]
         self._integrates = bool(rows["i"].any())
         self._turning = rows["turning"] != 0.0
-        # an integrated speed that would need more than the limit is held there: no windup
+        # Anti-windup: the integrated speed error stops at the value that requires the full limit.
         held = self._turning & (rows["p_ccw"] > 0.0)
         self._longest = np.where(held, rows["limit"] / np.maximum(rows["p_ccw"], 1e-9), FREE)
 
     def step(self, profiles: Profiles, angle: Floats, velocity: Floats) -> None:
-        """Work out drive and damping for shafts at some angles, rad, and velocities, rad/s."""
+        """Compute drive and damping for shafts at some angles, rad, and velocities, rad/s."""
         rows = self._rows
         error = np.maximum(np.minimum(profiles.position - angle, self._longest), -self._longest)
         np.copyto(profiles.position, angle + error, where=self._turning)
@@ -182,13 +182,13 @@ class ControlLaw:
         wanted = undamped - d * velocity
         self.duty = duty = np.maximum(np.minimum(wanted, limit), -limit)
         self._error, self._within = error, wanted == duty
-        # at the limit the controller's own damping does nothing; elsewhere it is the plant's to apply
+        # At the limit the controller's own damping has no effect. Elsewhere the plant applies it.
         drive = np.where(self._within, undamped, duty) * self.stall
         damping = d * self.stall * self._within + self._motor_damping
         if self._integrates:
             self.integral += error * self._within * self._dt_s
         torque = drive - damping * velocity
-        over = np.abs(torque) > most  # of a motor whose current is controlled
+        over = np.abs(torque) > most  # Only for a motor whose current is controlled
         self.torque = np.clip(torque, -most, most)
         self.drive = np.where(over, self.torque, drive)
         self.damping = np.where(over, 0.0, damping)

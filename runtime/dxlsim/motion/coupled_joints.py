@@ -5,8 +5,8 @@ loads' J_q, and torques t, all in these coordinates:
 
     (J_s + M' J_q M) s'' = t_s - M' t_q(q) - N' K N s,    N = 1 - pinv(M) M
 
-N s is what the servos are apart where more of them than joints are coupled; K is the give of horns and
-brackets. Friction holds at most its torque, at each servo and each joint.
+N s is the disagreement between servos, if more servos than joints are coupled; K is the stiffness of horns
+and brackets. Friction holds at most its torque, at each servo and each joint.
 """
 
 from __future__ import annotations
@@ -27,20 +27,21 @@ from dxlsim.motion.plant import (
 )
 from dxlsim.simulation_plan import Mechanism
 
-GIVE_RAD = 0.05  # rad by which horn and bracket of one servo give way to its stall torque [i]
+GIVE_RAD = 0.05  # rad of deflection of one servo's horn and bracket at its stall torque [i]
 
-_ROUNDED = 1e-9  # Less is a rounding error of a pseudoinverse
+_ROUNDED = 1e-9  # A smaller entry of a pseudoinverse is a rounding error
 
 _MOST_ROUNDS = 30
-_SETTLED = 1e-10  # rad/s or m/s that a further round of friction would change
+_SETTLED = 1e-10  # rad/s or m/s; the iteration ends when a round of friction changes less
 
 
 class CoupledJoints:
-    """A mechanism of several servos.
+    """Mechanism of several servos.
 
-    A step takes damping and the give of brackets at its end: it is stable at any stiffness. As with
-    `IndependentJoints`, half a step of the motors' damping is taken off their inertia, and friction is that
-    of `Motor` and of `Load`. Which frictions hold is found by turns (projected Gauss and Seidel).
+    Damping and the elasticity of brackets are implicit (backward Euler), so a step is stable at any
+    stiffness. As in `IndependentJoints`, half a step of the motors' damping is subtracted from their inertia,
+    and friction is that of `Motor` and of `Load`. The holding frictions are found by iteration (projected
+    Gauss-Seidel).
     """
 
     def __init__(self, mechanism: Mechanism, joints: Sequence[PlantJoint]) -> None:
@@ -69,12 +70,12 @@ class CoupledJoints:
         self._load_friction = np.array([motor.load_friction for motor in motors])
         self._stribeck = Stribecks(joints) if any(motor.stribeck for motor in motors) else None
         self._joint_friction = [load.friction for load in loads]
-        # rows along which friction acts: each servo's own, and each joint's
+        # Directions of friction: each servo's own, and each joint's.
         self._rows: Floats = np.vstack([np.eye(len(joints)), self._matrix])
         self._take_braking(np.zeros(len(joints)), 0.0)
 
     def step(self, drive: Floats, damping: Floats, dt_s: float) -> None:
-        """Let a time pass in which each servo drives with `drive - damping * velocity`; Nm and Nm s/rad."""
+        """Advance by `dt_s` with servo torque `drive - damping * velocity` (Nm, Nm s/rad)."""
         scale = self._per_rad
         place, speed = scale * (self.angle - self._reference), scale * self.velocity
         torque, braking = drive / scale, damping / scale**2
@@ -93,18 +94,18 @@ class CoupledJoints:
         self.angle += self.velocity * dt_s
 
     def jam(self, index: int, on: bool) -> None:
-        """Block a servo's shaft where it is, or free it."""
+        """Block a servo's shaft at its angle, or release it."""
         self._jammed[index] = JAMMED_NM if on else 0.0
 
     def place(self, index: int, angle: float) -> None:
-        """Put a shaft somewhere, rad, at rest, and with it those that are on the same axis."""
+        """Move a resting shaft to an angle, rad, together with the shafts on the same axis."""
         moved = coupled_motion(self._together, index)
         by = self._per_rad[index] * (angle - self.angle[index])
         self.angle += moved * by / self._per_rad
         self.velocity[moved != 0.0] = 0.0
 
     def recount(self, index: int, by: float) -> None:
-        """Let a shaft that does not move count its angle from elsewhere."""
+        """Shift the angle count of a resting shaft by an angle, rad."""
         self.angle[index] += by
         self._reference[index] += by
 
@@ -121,7 +122,13 @@ class CoupledJoints:
         self._gains: list[list[float]] = compliance.tolist()
 
     def _rubbed(self, free: Floats, most: Sequence[float], dt_s: float) -> Floats:
-        """Return the speeds that friction leaves of those without it; `most`: Nm or N, along each row."""
+        """Return the speeds after friction.
+
+        Args:
+            free: Speeds without friction.
+            most: Friction limit along each row, Nm or N.
+            dt_s: Step, s.
+        """
         speeds, gains = (self._rows @ free).tolist(), self._gains
         held = [0.0] * len(most)
         rubbing = [row for row, torque in enumerate(most) if torque > 0.0]
@@ -148,22 +155,22 @@ def coupled_projection(matrix: Floats) -> Floats:
 
 
 def coupled_motion(projection: Floats, index: int) -> Floats:
-    """Return how far each servo of a mechanism moves when one of them moves by 1."""
+    """Return the movement of each servo of a mechanism per unit of one servo's movement."""
     moved: Floats = projection[:, index] / projection[index, index]
     return moved
 
 
 def joints_without_bodies(mechanisms: Sequence[Mechanism], joints: Sequence[PlantJoint]) -> Plant:
-    """Return the plant of servos that move no body, by their mechanisms."""
+    """Return the plant of servos without bodies, grouped by their mechanisms."""
     return combine_plants(joints, parts_without_bodies(mechanisms, joints, range(len(joints))))
 
 
 def parts_without_bodies(
     mechanisms: Sequence[Mechanism], joints: Sequence[PlantJoint], rows: Sequence[int]
 ) -> list[Part]:
-    """Return the plants of some servos: of each mechanism, and of all that move by themselves.
+    """Return the plants of some servos: one per coupled mechanism, and one for all independent servos.
 
-    A mechanism whose servos have not all been added yet is omitted.
+    A mechanism is omitted until all its servos have been added.
     """
     whole = [
         one for one in mechanisms if not one.is_single and all(servo.index in rows for servo in one.servos)

@@ -1,4 +1,4 @@
-"""The shaft of servos with angle limits and a moving speed: Protocol 1.0, and the XL-320."""
+"""Shaft of servos with angle limits and a moving speed: Protocol 1.0, and the XL-320."""
 
 from __future__ import annotations
 
@@ -21,19 +21,20 @@ SLOPE_TIMES_P = 1024
 P gain (`Motor.p_gain_duty`) has priority."""
 
 _MID_OF_CURRENT = {"current": 2048, "sensed_current": 512}
-"""Tick of no current: MX-64, Current (68), 4.5 mA a tick; EX-106+, Sensed Current (56), 10 mA a tick."""
+"""Tick of zero current: MX-64, Current (68), 4.5 mA a tick; EX-106+, Sensed Current (56), 10 mA a tick."""
 
 _WHEEL_P, _WHEEL_I = 4.0, 40.0
-"""Duty per part of the no-load speed that is missing, and per s of it: 0.12 s until a speed is there [i]."""
+"""Duty per speed error, as a fraction of the no-load speed, and per its integral, 1/s. A speed is reached in
+0.12 s [i]."""
 
 
 class JointShaft(Shaft):
-    """Joint, wheel and multi-turn mode, and where there is Goal Torque, torque control mode.
+    """Joint, wheel and multi-turn mode; torque control mode on models with Goal Torque.
 
-    In joint mode the trajectory goes at Moving Speed, with Goal Acceleration where there is one; 0 is no
-    limit. AX and RX models turn the error into torque by compliance margin, slope and punch, the MX and
-    the XL-320 by PID gains. In wheel mode Moving Speed is a duty without control of the speed on the AX and
-    RX (unit 0.1 %), and a controlled speed on the MX.
+    In joint mode the trajectory has Moving Speed, and Goal Acceleration on models with this item; 0 means
+    no limit. AX and RX models convert the error into torque by compliance margin, slope and punch, MX models
+    and the XL-320 by PID gains. In wheel mode Moving Speed is an open-loop duty on AX and RX models (unit
+    0.1 %), and a controlled speed on MX models.
     """
 
     items = ACCESS.joint_shaft
@@ -41,20 +42,20 @@ class JointShaft(Shaft):
     def __init__(self, memory: Memory, mechanics: Mechanics, motor: Motor, load: Load, angle: float) -> None:
         super().__init__(memory, mechanics, motor, load, angle)
         self._turns_apart = 0.0
-        """rad of whole turns between the shaft and the turn in which joint mode counts"""
+        """Whole turns between the shaft and the turn in which joint mode counts, rad."""
         self._aimed: tuple[int, int, int] = (0, 0, 0)
         self._reach = memory.table.max_tick * memory.table.rad_per_tick
 
     def within_a_turn(self, angle: float) -> float:
-        """Return the angle: such a servo counts no turns."""
+        """Return the angle unchanged: these servos count no turns."""
         return angle
 
     def position_tick(self, angle: float) -> int:
-        """Return what Present Position shows; beyond the reach the nearest end [i]."""
+        """Return Present Position; beyond the range the nearest end [i]."""
         table = self.memory.table
         if multi_turn_mode(self.memory):
             tick = round(angle / table.rad_per_tick / self.memory["resolution_divider"])
-            return tick + self.memory.ticks("multi_turn_offset") & 0xFFFF  # in two's complement
+            return tick + self.memory.ticks("multi_turn_offset") & 0xFFFF  # In two's complement
         if wheel_mode(self.memory):
             angle = in_turn(angle)
         else:
@@ -66,9 +67,10 @@ class JointShaft(Shaft):
         return max(0, min(table.max_tick, tick))
 
     def live(self) -> Mapping[str, Callable[[], int]]:
-        """Return the items that show the motion, each with what it shows now, in ticks."""
+        """Return the items of the motion, each with a function for its current value in ticks."""
         return {
-            "present_position": lambda: self.position_tick(self.angle) & 0xFFFF,  # turns below 0: as goals
+            # Negative turns, as in goals
+            "present_position": lambda: self.position_tick(self.angle) & 0xFFFF,
             "present_speed": self._present_speed,
             "present_load": self._present_load,
             "moving": lambda: int(self.moving),
@@ -104,7 +106,7 @@ class JointShaft(Shaft):
         return self.memory.table.rad_s_per_tick / 2
 
     def _whole_turns(self, angle: float) -> float:
-        """Return the whole turns to an angle, rad; what lies a little outside the reach is within it."""
+        """Return the whole turns of an angle, rad; an angle slightly outside the range counts as inside."""
         outside = max(math.tau - self._reach, 0.1) / 2
         return math.tau * math.floor((angle + outside) / math.tau)
 
@@ -124,7 +126,7 @@ class JointShaft(Shaft):
             goal = aimed[0] * table.rad_per_tick + self._turns_apart
         speed = (
             abs(memory.ticks("moving_speed")) * table.rad_s_per_tick or FREE
-        )  # a direction does not count [i]
+        )  # The direction bit has no effect [i]
         ramp = aimed[2] * table.items["goal_acceleration"].scale if aimed[2] else FREE
         return goal, speed, ramp
 
@@ -151,7 +153,7 @@ class JointShaft(Shaft):
         memory = self.memory
         punch = memory["punch"] / 1023
         unit = memory.table.rad_per_tick
-        seen = unit / 2 if punch else 0.0  # less than half a tick of error is none
+        seen = unit / 2 if punch else 0.0  # An error below half a tick is not observable
         return ServoCommand(
             p_ccw=(1.0 - punch) / (_slope(memory["ccw_compliance_slope"]) * SLOPE_TICK),
             p_cw=(1.0 - punch) / (_slope(memory["cw_compliance_slope"]) * SLOPE_TICK),
@@ -162,9 +164,11 @@ class JointShaft(Shaft):
         )
 
     def _pid(self, limit: float) -> ServoCommand:
-        """Kp = P / 8, Ki = I * 1000 / 2048, Kd = D * 4 / 1000, in one unit (e-Manual, MX-28, PID Gains).
+        """Return the PID gains: Kp = P / 8, Ki = I * 1000 / 2048, Kd = D * 4 / 1000 (e-Manual, MX-28, PID
+        Gains).
 
-        What Punch does beside PID gains is in no manual: nothing here [?].
+        All are in one unit. No manual describes an effect of Punch together with PID gains, so it has none
+        here [?].
         """
         memory = self.memory
         unit = 8 * (self.motor.p_gain_duty or 1 / (SLOPE_TIMES_P * SLOPE_TICK))
@@ -179,7 +183,7 @@ class JointShaft(Shaft):
 
 
 def _slope(value: int) -> int:
-    """Return the slope that counts: the power of two up to the value, 2 to 128.
+    """Return the effective slope: the largest power of two up to the value, 2 to 128.
 
     e-Manual, AX-12A, Compliance Slope (28): "7 steps".
     """

@@ -1,8 +1,8 @@
-"""All servos of one simulation as mechanics: stepped together on one grid of time.
+"""Mechanics: all servos of one simulation, stepped together on one time grid.
 
-In each step the profiles give where the servos' controllers want to be, the control law which torque their
-motors give, and the plant what it moves. Commands act at the next point of the grid; between its points
-angles go on with their velocity. While nothing moves, nothing is computed.
+In each step the profiles give the setpoints of the servos' controllers, the control law gives the torque of
+the motors, and the plant gives the motion. Commands take effect at the next point of the grid; between grid
+points angles are extrapolated with their velocity. Nothing is computed while all servos rest.
 """
 
 from __future__ import annotations
@@ -25,45 +25,46 @@ from dxlsim.motion.plant import Floats, IndependentJoints, Plant, PlantJoint, Pl
 from dxlsim.simulation_plan import Load, SimulationConfig
 
 STEP_NS = 2_000_000
-"""Step of the grid. The fastest thing in a servo here is its motor's time constant: 13.6 ms and more."""
+"""Step of the grid. The shortest time constant in a servo is that of its motor: 13.6 ms or more."""
 
 EAGER_NS, EASY_NS = 4_000_000, 1_000_000_000
-"""In real time it is advanced so often while servos move and while they only cool: to catch up with a long
+"""Intervals of `advance` in real time, while servos move and while they only cool. Catching up after a long
 pause of the host would delay the next reply."""
 
-STRAIN_NS = 100_000_000  # So often servos feel heat and load; a whole number of steps
+STRAIN_NS = 100_000_000  # Interval at which heat and load are updated; a whole number of steps
 
-_STEPS_A_LOOK = 16  # So often it is looked whether all rest
+_STEPS_A_LOOK = 16  # Steps between two checks for rest
 
-_STILL, _UNDRIVEN = 1e-6, 1e-8  # rad/s, and its change in a step: below both a servo rests
+_STILL, _UNDRIVEN = 1e-6, 1e-8  # rad/s, and its change in a step: a servo rests below both
 
 
-AMBIENT_C = 30.0  # degrees C of a servo at rest [i]
+AMBIENT_C = 30.0  # Temperature of a servo at rest, degrees C [i]
 
 STALLED_RISE_C = 300.0
-"""degrees C above ambient where a servo at stall would end: with 400 s it is at 80 after a minute [i]."""
+"""Steady-state temperature rise of a stalled servo, degrees C: with 400 s the servo reaches 80 after a minute
+[i]."""
 
-COOLING_S = 400.0  # Time constant of housing and winding as one body [i]
+COOLING_S = 400.0  # Time constant of housing and winding, modelled as one body [i]
 
 OVERLOAD_PART = 0.8
-"""Part of the torque that the limit allows, beyond which the servo counts as overloaded [i]"""
+"""Fraction of the torque allowed by the limit, above which the servo counts as overloaded [i]."""
 
-OVERLOAD_TICKS = 10  # Ticks of `Strain` that it may last: a second [i]
+OVERLOAD_TICKS = 10  # Tolerated duration in ticks of `Strain`: a second [i]
 
-_STEADY_C = 1e-7  # degrees C in a tick; a smaller change shows nowhere in years
+_STEADY_C = 1e-7  # degrees C in a tick; a smaller change has no visible effect in years
 
-SUPPLY_OHM = 0.1  # Resistance of cable and plugs between supply and servo [i]
+SUPPLY_OHM = 0.1  # Resistance of cable and connectors between supply and servo [i]
 
 
 class _Hand(msgspec.Struct):
     speed: float  # rad/s
-    steps: int  # of the grid that are left
+    steps: int  # remaining steps of the grid
     gives_way: Callable[[float], None]
     turned: float = 0.0  # rad so far
 
 
 class Mechanics:
-    """Servos that are stepped together; time comes from the callers, and going back is ignored."""
+    """Servos that are stepped together; time comes from the callers, and an earlier time is ignored."""
 
     def __init__(self, start_ns: int, plant: PlantMaker | None = None) -> None:
         self._make_plant: PlantMaker = plant or IndependentJoints
@@ -79,15 +80,15 @@ class Mechanics:
         self._hands: dict[int, _Hand] = {}
         self._busy = False
         self._commanded = False
-        self.still = False  # True while all servos rest, uncommanded
+        self.still = False  # True while all servos rest without new commands
         self._before: Floats | None = None
-        """Velocities before the last step, if accelerations are sensed"""
+        """Velocities before the last step; None unless accelerations are sensed."""
         self._build(np.zeros(0), np.zeros(0))
 
     # Servos
 
     def add(self, motor: Motor, load: Load, angle: float) -> int:
-        """Add a servo with its shaft at an angle, rad from its raw 0, at rest and limp; return its index."""
+        """Add a servo at rest and limp, with its shaft at an angle, rad from its raw 0; return its index."""
         plant, profiles, law, strain = self.plant, self.profiles, self.law, self.strain
         commands, count = self._commands, len(self._motors)
         self._motors.append(motor)
@@ -104,7 +105,7 @@ class Mechanics:
         return count
 
     def jam(self, index: int, on: bool) -> None:
-        """Block a shaft where it is, or free it."""
+        """Block a shaft at its angle, or release it."""
         self.plant.jam(index, on)
         self._wake()
 
@@ -117,13 +118,13 @@ class Mechanics:
         self._watchers[index] = act
 
     def supply(self, index: int, volts: float) -> None:
-        """Give a servo another voltage: its stall torque and no-load speed go with it."""
+        """Change a servo's supply voltage; its stall torque and no-load speed change in proportion."""
         motor = self._motors[index]
         self.law.stall[index] = motor.stall_torque * (volts / motor.voltage if motor.voltage else 1.0)
         self._wake()
 
     def command(self, index: int, command: ServoCommand) -> None:
-        """Command a servo; its trajectory continues from where it is, that of a limp one from the shaft."""
+        """Command a servo. Its trajectory continues from its setpoint, or from the shaft if it was limp."""
         was_limp = self._commands[ROWS["limit"], index] == 0.0
         was_turning = self._commands[ROWS["turning"], index] != 0.0
         self._commands[:, index] = command
@@ -136,13 +137,13 @@ class Mechanics:
         self._wake()
 
     def aim(self, index: int, goal: float, speed: float, acceleration: float) -> None:
-        """Change the goal of a servo and its profile, and nothing else; as in `ServoCommand`."""
+        """Change only the goal of a servo and its profile; units as in `ServoCommand`."""
         self.profiles.aim(index, goal, speed, acceleration)
         self.strain.calm = False
         self.still = False
 
     def place(self, index: int, angle: float) -> None:
-        """Put a shaft somewhere, rad, at rest; its trajectory begins there."""
+        """Move a resting shaft to an angle, rad; its trajectory begins there."""
         self.plant.place(index, angle)
         self.profiles.position[index], self.profiles.velocity[index] = angle, 0.0
         if self._commands[ROWS["limit"], index] == 0.0:
@@ -151,7 +152,7 @@ class Mechanics:
         self.still = False
 
     def recount(self, index: int, angle: float) -> None:
-        """Put a shaft to rest and count its angle, rad, in another turn; its trajectory begins there."""
+        """Stop a shaft and count its angle, rad, in another turn; its trajectory begins there."""
         turns = math.tau * round((angle - self.plant.angle.item(index)) / math.tau)
         if turns:
             self._recounted[index] += turns
@@ -159,38 +160,44 @@ class Mechanics:
         self.place(index, angle)
 
     def turn(self, index: int, by: float, duration_ns: int, gives_way: Callable[[float], None]) -> None:
-        """Let a hand turn a shaft evenly by an angle, rad, from now on.
+        """Turn a shaft by hand, evenly by an angle, starting now.
 
-        It gives way to a servo that drives or holds its shaft; `gives_way` is then called with its way, rad.
+        The hand lets go of a servo that drives or holds its shaft.
+
+        Args:
+            index: The servo.
+            by: Angle, rad.
+            duration_ns: Duration, ns.
+            gives_way: Called when the hand lets go, with the angle turned until then, rad.
         """
         steps = max(1, round(duration_ns / STEP_NS))
         self._hands[index] = _Hand(by / (steps * STEP_NS * 1e-9), steps, gives_way)
         self.still = False
 
     def heat(self, index: int, celsius: float) -> None:
-        """Bring a servo to a temperature, degrees C; it returns to that of its load."""
+        """Set a servo's temperature, degrees C; it then approaches that of its load."""
         self.strain.temperature[index] = celsius
         self.strain.calm = False
 
     def overloaded(self, index: int) -> bool:
-        """Return whether a servo has been overloaded for too long."""
+        """Return True if a servo has been overloaded for too long."""
         return bool(self.strain.overloaded[index] >= OVERLOAD_TICKS)
 
-    # What sensors on the bodies see
+    # For sensors on the bodies
 
     def sense(self) -> None:
-        """Keep what `acceleration` needs, from the next step on."""
+        """Record the data for `acceleration` from the next step on."""
         self._before = self.plant.velocity.copy()
 
     @property
     def acceleration(self) -> Floats:
-        """Accelerations of the shafts in the last step, rad/s^2; `sense` was called before."""
+        """Accelerations of the shafts in the last step, rad/s^2; requires an earlier call of `sense`."""
         if self.still or self._before is None or len(self._before) != len(self._motors):
             return np.zeros(len(self._motors))
         return (self.plant.velocity - self._before) / (STEP_NS * 1e-9)
 
     def shafts(self, now_ns: int, count: int) -> Shafts:
-        """Return the first shafts at a time; between points of the grid they go on with their velocity."""
+        """Return the first `count` shafts at a time, extrapolated with their velocity between grid points."""
         self.advance(now_ns)
         velocity = self.plant.velocity[:count].copy()
         angle = self.plant.angle[:count] + velocity * (max(0, now_ns - self.grid_ns) * 1e-9)
@@ -199,11 +206,13 @@ class Mechanics:
     # Time
 
     def call_at(self, t_ns: int, action: Callable[[], None]) -> None:
-        """Let something happen at the first point of the grid that is not before a time."""
+        """Call `action` at the first grid point at or after a time."""
         heapq.heappush(self._agenda, (t_ns, next(self._order), action))
 
     def due_ns(self) -> int | None:
-        """Return when it should be advanced in real time, whatever hosts do; None: it has nothing to do."""
+        """Return the time of the next `advance` in real time, even without requests of hosts; None without
+        need.
+        """
         if not self._motors:
             return None
         if not self.still:
@@ -215,10 +224,10 @@ class Mechanics:
         return easy_ns if agenda_ns is None else min(easy_ns, agenda_ns)
 
     def advance(self, now_ns: int) -> None:
-        """Step up to the last point of the grid before a time."""
+        """Step up to the last grid point at or before a time."""
         if self._busy or self.grid_ns + STEP_NS > now_ns:
             return
-        self._busy = True  # what is called on the way may look at the time, not change it
+        self._busy = True  # Callbacks may read the time, but must not advance it
         try:
             while self.grid_ns + STEP_NS <= now_ns:
                 self._advance_once(now_ns)
@@ -226,7 +235,7 @@ class Mechanics:
             self._busy = False
 
     def _advance_once(self, now_ns: int) -> None:
-        """Take one step, or as many as nothing happens in."""
+        """Take one step, or skip the steps in which nothing happens."""
         while self._agenda and self._agenda[0][0] <= self.grid_ns:
             heapq.heappop(self._agenda)[2]()
         if self.still or not self._motors:
@@ -242,7 +251,7 @@ class Mechanics:
             self._feel()
 
     def _skip(self, now_ns: int) -> None:
-        """Let the time pass in which nothing moves, and nothing gets warmer or colder."""
+        """Skip steps without motion, due actions or changes of temperature."""
         until_ns = now_ns if self.strain.calm else min(now_ns, self._next_strain_ns)
         if self._agenda:
             until_ns = min(until_ns, self._agenda[0][0])
@@ -273,7 +282,7 @@ class Mechanics:
             self.still = True
 
     def _step_with_hands(self) -> None:
-        """Take one step; what a hand turns is where the hand is."""
+        """Take one step; a shaft that is turned by hand follows the hand."""
         angles = {index: self.plant.angle.item(index) for index in self._hands}
         self._step()
         for index, angle in angles.items():
@@ -290,7 +299,7 @@ class Mechanics:
                 del self._hands[index]
 
     def _drives(self, index: int) -> bool:
-        """Return whether a servo is commanded to a position, a speed, or a torque that is not 0."""
+        """Return True if a servo is commanded to a position, a speed, or a torque other than 0."""
         command = ServoCommand(*self._commands[:, index].tolist())
         able = command.limit > 0.0 and command.torque_limit > 0.0
         return able and any((command.bias, command.turning, command.p_ccw, command.p_cw))
@@ -329,20 +338,22 @@ class Mechanics:
 
 
 class Strain:
-    """Temperature by the copper's loss (current squared, [i]: one body), and time under too much load."""
+    """Temperature from the copper loss (current squared, [i]: one body), and duration of overload."""
 
     def __init__(self, nominal_stall: Floats, dt_s: float) -> None:
         size = len(nominal_stall)
         self._nominal_stall = nominal_stall
         self._part = dt_s / COOLING_S
         self.temperature: Floats = np.full(size, AMBIENT_C)  # degrees C
-        self.overloaded = np.zeros(size, dtype=np.int64)  # Ticks since the load became too much
-        self.calm = False  # True when the same load would change nothing any more
+        self.overloaded = np.zeros(size, dtype=np.int64)  # Ticks since the beginning of the overload
+        self.calm = False  # True if the same load would change nothing any more
 
     def tick(self, torque: Floats, most: Floats) -> list[int]:
-        """Let a time pass under torques, Nm; return the servos that have something new to notice.
+        """Update for one tick under torques, Nm; return the servos with a new temperature or overload.
 
-        `most`: the torque that duty limit and supply allow at standstill, Nm.
+        Args:
+            torque: Torque of each motor, Nm.
+            most: Torque at standstill that duty limit and supply allow, Nm.
         """
         shown = np.rint(self.temperature)
         load = torque / self._nominal_stall
@@ -356,12 +367,13 @@ class Strain:
 
 
 def plant_of(config: SimulationConfig) -> PlantMaker:
-    """Return what makes the plant of a simulation: of its bodies, or of joints that move without them.
+    """Return the maker of a simulation's plant: of its bodies, or of joints without bodies.
 
-    Raises InputError when MuJoCo is not installed, cannot take the URDF, or would move nothing.
+    Raises:
+        InputError: MuJoCo is not installed, cannot load the URDF, or would move nothing.
     """
     if config.bodies is not None:
-        (found,) = entry_points(group="dxlrun.physics", name="mujoco")  # of a package, and slow to import
+        (found,) = entry_points(group="dxlrun.physics", name="mujoco")  # In a package that is slow to import
         maker: PlantMaker = found.load()(config.bodies)
         return maker
     if all(one.is_single for one in config.mechanisms):

@@ -1,4 +1,4 @@
-"""The shaft of servos with an operating mode: Protocol 2.0 but the XL-320."""
+"""Shaft of servos with an operating mode: Protocol 2.0 except the XL-320."""
 
 from __future__ import annotations
 
@@ -24,17 +24,19 @@ _OF_POSITION = (
 
 _RECTANGULAR, _TRIANGULAR, _TRAPEZOIDAL = 0x10, 0x20, 0x30
 _ARRIVED, _ON_THE_WAY = 0x01, 0x02
-"""Bits of Moving Status (123): the profile's kind, in position, a profile is under way."""
+"""Bits of Moving Status (123): kind of the profile; in position; profile in progress."""
 
-_IN_POSITION_TICKS = 10  # So near is "in position"; the manual of the X series names no number [i]
+# Distance that counts as "in position"; the manual of the X series gives no value [i]
+_IN_POSITION_TICKS = 10
 
 
 SAMPLING_S = 1e-3
-"""What the e-Manual's conversions of gains include, as it says without a figure (X series, Velocity PI Gain
-(76, 78) and Position PID Gain (80 to 84)): they count in PWM units, ticks and velocity units [i]."""
+"""Sampling period in the e-Manual's conversions of gains, which mention it without a value (X series,
+Velocity PI Gain (76, 78) and Position PID Gain (80 to 84)). Gains refer to PWM units, ticks and velocity
+units [i]."""
 
 UNKNOWN_P = 150.0
-"""Duty per rad where the manual gives no initial gain: the PRO, P and Y lines, and the grippers [i].
+"""Duty per rad if the manual gives no initial gain: the PRO, P and Y lines, and the grippers [i].
 
 ROBOTIS' own examples for the PRO line wait until at most 20 ticks are left (DynamixelSDK,
 c++/example/protocol2.0, DXL_MOVING_STATUS_THRESHOLD); friction takes 1.3 % of the duty, and 20 ticks of the
@@ -42,14 +44,15 @@ finest model are 0.000125 rad.
 """
 
 UNKNOWN_VELOCITY_P, UNKNOWN_VELOCITY_I = 4.0, 40.0
-"""There, per part of the no-load speed that is missing, and per s of it [i]"""
+"""The same for velocity control: duty per speed error, as a fraction of the no-load speed, and per its
+integral, 1/s [i]."""
 
 
 class ModeShaft(Shaft):
-    """Moves by the goal of its mode, with the profile beside it.
+    """Follows the goal of its mode, with the profile for the way to it.
 
-    Where Profile Velocity is 0 there is no profile (a step), where Profile Acceleration is 0 it is
-    rectangular (e-Manual, X series, Profile Velocity (112)); velocity control uses the acceleration only.
+    Profile Velocity 0 disables the profile (a step); Profile Acceleration 0 makes it rectangular (e-Manual, X
+    series, Profile Velocity (112)). Velocity control uses only the acceleration.
     """
 
     items = ACCESS.mode_shaft
@@ -60,7 +63,7 @@ class ModeShaft(Shaft):
         self._profile_kind = 0
         items = memory.table.items
         self._speed_item = memory.table.goal_speed_item
-        """What the profile's speed is: on PRO Goal Velocity (600), with Goal Acceleration (606)."""
+        """Item of the profile's speed: on PRO Goal Velocity (600), with Goal Acceleration (606)."""
         of_pro = self._speed_item == "goal_velocity"
         self._ramp_item = "goal_acceleration" if of_pro else "profile_acceleration"
         item = items.get(self._ramp_item)
@@ -74,27 +77,27 @@ class ModeShaft(Shaft):
         memory.watch(("drive_mode", "homing_offset"), self._orient)
 
     def within_a_turn(self, angle: float) -> float:
-        """Return the angle within the turn that the encoder knows: 0 to 4095 ticks, or around 0."""
+        """Return the angle within the encoder's turn: 0 to 4095 ticks, or centered at 0."""
         shown = self._sign * angle
         if self.memory.table.items["min_position_limit"].minimum < 0:
             return self._sign * (shown - math.tau * round(shown / math.tau))
-        # less than half a tick below 0 is still 0
+        # Less than half a tick below 0 still counts as 0.
         half = self.memory.table.rad_per_tick / 2
         return self._sign * (shown - math.tau * math.floor((shown + half) / math.tau))
 
     def position_tick(self, angle: float) -> int:
-        """Return what Present Position shows."""
+        """Return Present Position."""
         tick = round(self._sign * angle / self._rad_per_tick)
         return tick + self._offset
 
     def live(self) -> Mapping[str, Callable[[], int]]:
-        """Return the items that show the motion, each with what it shows now, in ticks."""
+        """Return the items of the motion, each with a function for its current value in ticks."""
         return {
             "present_position": lambda: self.position_tick(self.angle),
             "present_velocity": lambda: self._velocity_tick("present_velocity", self.velocity),
             "position_trajectory": lambda: self.position_tick(self._trajectory_angle),
             "velocity_trajectory": lambda: self._velocity_tick("velocity_trajectory", self._trajectory_speed),
-            "present_load": lambda: round(self._sign * self.duty * 1000),  # unit 0.1 %, as the output is
+            "present_load": lambda: round(self._sign * self.duty * 1000),  # Unit 0.1 %, like the output
             "present_current": lambda: round(self._sign * self.current / self._current_unit),
             "present_pwm": lambda: round(self._sign * self.duty / self._pwm_unit),
             "moving": lambda: int(self.moving),
@@ -153,7 +156,7 @@ class ModeShaft(Shaft):
         if mode == OperatingMode.VELOCITY:
             return self._turn(limit)._replace(torque_limit=self._most_torque(torque))
         if not self._controls_position:
-            return LIMP  # a value that the model's manual does not name
+            return LIMP  # A value that the model's manual does not list
         most = (
             abs(torque)
             if mode == OperatingMode.CURRENT_BASED_POSITION and "goal_current" in memory
@@ -162,10 +165,10 @@ class ModeShaft(Shaft):
         return _position_gains(memory, self.motor)._replace(limit=limit, torque_limit=most)
 
     def _most_torque(self, torque: float) -> float:
-        """Return what limits the torque beside a position or a speed, Nm.
+        """Return the torque limit of position or velocity control, Nm.
 
-        Of PRO it is Goal Torque (604), where that is 0 Torque Limit (30) (e-Manual, Goal Torque (604)); of
-        the RH-P12-RN the latter is inferred [i].
+        On PRO it is Goal Torque (604), or Torque Limit (30) if that is 0 (e-Manual, Goal Torque (604)). For
+        the RH-P12-RN the use of Torque Limit is inferred [i].
         """
         if self._torque_item is None or self._torque_item.name != "goal_torque":
             return FREE
@@ -190,7 +193,7 @@ class ModeShaft(Shaft):
 
     @property
     def _torque_unit(self) -> float:
-        """Nm per tick of the goal: it counts current, or parts of the stall torque (L42-10-S300-R)."""
+        """Nm per tick of the goal, which counts current, or fractions of the stall torque (L42-10-S300-R)."""
         if self._torque_item is None:
             return 0.0
         parts = self._torque_item.unit == "1"
@@ -217,7 +220,7 @@ class ModeShaft(Shaft):
         return goal, speed, acceleration
 
     def _timed(self, goal: float, distance: float, duration: float, ramp: float) -> Trajectory:
-        """Return the move that takes a duration, s, and a time to come to speed, s, at most half of it."""
+        """Return a move with a duration and an acceleration time, s; the latter is at most half as long."""
         if distance == 0.0:
             return goal, FREE, FREE
         ramp = min(ramp, duration / 2)
@@ -239,7 +242,7 @@ def _kind(ramp: float, distance: float, speed: float, acceleration: float) -> in
 def _position_gains(memory: Memory, motor: Motor) -> ServoCommand:
     """Return the gains of position control: KP / 128, KI / 65536, KD / 16, KFF1 / 4 and KFF2 / 4.
 
-    Where the P gain was identified as another one, the others go with it [i].
+    If the P gain was identified with another value, the others are scaled with it [i].
     """
     table = memory.table
     if table.items["position_p_gain"].initial is None or "goal_pwm" not in table.items:

@@ -1,4 +1,4 @@
-"""The motor of a simulated servo with its gear, from the manual's figures and published identifications."""
+"""Motor of a simulated servo with its gear, from the manual's data and published identifications."""
 
 from __future__ import annotations
 
@@ -14,44 +14,44 @@ from dxlsim.motor_model import MotorModel, Stribeck
 from dxlwire.control_table import ControlTable
 
 STALL_POWER_W = 20.0
-"""Stall torque times no-load speed where the manual gives no stall torque: as an XM430-W350 [i]."""
+"""Stall torque times no-load speed if the manual gives no stall torque: as an XM430-W350 [i]."""
 
-STALL_CURRENT_A = 1.5  # Where the manual gives none and the model measures none: as an AX-12A [i]
+STALL_CURRENT_A = 1.5  # Used if the manual gives none and the model measures none: as an AX-12A [i]
 
 _FILE = Path(__file__).parent / "motors.toml"
 
 
 class Motor(msgspec.Struct, frozen=True):
-    """A direct-current motor with its gear, as felt at the horn: torque falls with speed in a line.
+    """Direct-current motor with its gear, as seen at the horn: torque decreases linearly with speed.
 
-    Friction is at most `friction + load_friction * |motor's torque - load's torque|`, and in motion
-    `viscous_friction` times the speed beside it: model M3 of M. Duclusaud et al., "Extended Friction Models
+    Friction is at most `friction + load_friction * |motor's torque - load's torque|`. In motion
+    `viscous_friction` times the speed is added: model M3 of M. Duclusaud et al., "Extended Friction Models
     for the Physics Simulation of Servo Actuators" (arXiv 2410.08650).
     """
 
-    stall_torque: float  # Nm of the motor at `voltage` and standstill; friction is not taken off
+    stall_torque: float  # Nm of the motor at `voltage` and standstill, without subtracting friction
     damping: float
-    """Nm s/rad that the motor loses to its own voltage: torque constant squared over resistance"""
+    """Damping by the motor's own voltage, Nm s/rad: torque constant squared over resistance."""
     torque_per_ampere: float  # Nm/A
-    voltage: float  # V at which `stall_torque` holds; 0: whatever it is supplied with
+    voltage: float  # V at which `stall_torque` holds; 0: at any supply voltage
     inertia: float  # kg m^2 of rotor and gear
     friction: float = 0.0  # Nm (Coulomb)
-    load_friction: float = 0.0  # Nm of friction for each Nm between the motor's torque and the load's
+    load_friction: float = 0.0  # Nm of friction per Nm between the motor's torque and the load's
     viscous_friction: float = 0.0  # Nm s/rad
     p_gain_duty: float = 0.0
-    """Duty for each rad of error and each unit of the P gain; 0: not identified, the manual's holds"""
-    source: str = ""  # Where the figures are from that no manual gives
-    gain_source: str = ""  # Where `p_gain_duty` is from
-    stribeck: Stribeck | None = None  # More friction near standstill
+    """Duty per rad of error and unit of the P gain; 0: not identified, the manual's value holds."""
+    source: str = ""  # Source of the data that no manual gives
+    gain_source: str = ""  # Source of `p_gain_duty`
+    stribeck: Stribeck | None = None  # Additional friction near standstill
 
     @property
     def time_constant(self) -> float:
-        """How fast the motor takes up speed without load and friction, s: J R / kt^2."""
+        """Time constant of the motor's speed without load and friction, s: J R / kt^2."""
         return self.inertia / self.damping
 
     @property
     def no_load_speed(self) -> float:
-        """rad/s at `voltage` and full duty: where motor and friction are in balance."""
+        """Speed at `voltage` and full duty, rad/s, at which motor and friction are in balance."""
         driving = 1.0 - self.load_friction
         return (driving * self.stall_torque - self.friction) / (
             driving * self.damping + self.viscous_friction
@@ -78,9 +78,9 @@ class _Motors(msgspec.Struct, frozen=True):
 
 
 def motor_of(table: ControlTable, model: MotorModel | None = None) -> Motor:
-    """Return a model's motor: that of a motor file, or else an identified one.
+    """Return a model's motor: that of a motor file, or an identified one.
 
-    Where there is neither it is the manual's, with inertia and friction of one like it.
+    Without either, its data are the manual's, with inertia and friction of a similar motor.
     """
     known = _known(table)
     if model is None:
@@ -124,10 +124,10 @@ def identified_motor(model: MotorModel) -> Motor:
 
 
 def _scaled(table: ControlTable, like: MotorModel) -> Motor:
-    """Return a motor of the manual's stall torque and no-load speed, the rest in proportion to another one's.
+    """Return a motor with the manual's stall torque and no-load speed, otherwise scaled from another motor.
 
-    Damping is what leaves just that speed with friction f, load friction l and viscous friction v:
-    (1 - l) * (stall torque - damping * speed) = f + v * speed.
+    The damping gives exactly that speed with friction f, load friction l and viscous friction v: (1 - l) *
+    (stall torque - damping * speed) = f + v * speed.
     """
     model = identified_motor(like)
     torque = table.stall_torque or STALL_POWER_W / table.max_speed
@@ -135,7 +135,7 @@ def _scaled(table: ControlTable, like: MotorModel) -> Motor:
     viscous = model.viscous_friction / model.damping
     driving = 1.0 - model.load_friction
     damping = torque * (driving - friction) / (table.max_speed * (driving + viscous))
-    limit = table.items.get("current_limit") or table.items.get("torque_limit")  # PRO has the latter, in A
+    limit = table.items.get("current_limit") or table.items.get("torque_limit")  # On PRO the latter, in A
     measured = STALL_CURRENT_A
     if limit is not None and limit.unit == "A":
         measured = limit.maximum * limit.scale

@@ -1,7 +1,7 @@
-"""What simulated servos move: joints with inertia, friction and gravity, all of them in one step.
+"""Plant: joints that simulated servos move, with inertia, friction and gravity, all in one step.
 
-The servos give the torque with which they drive at standstill and how much of it each rad/s takes away; a
-plant turns that into motion. `IndependentJoints` is the plant of joints that do not feel one another.
+Each servo provides its torque at standstill and the reduction of this torque per rad/s; a plant converts that
+into motion. `IndependentJoints` is the plant of joints without coupling.
 """
 
 from __future__ import annotations
@@ -21,16 +21,16 @@ Floats = NDArray[np.float64]
 Rows = NDArray[np.intp]
 
 
-JAMMED_NM = 1e6  # Friction of a blocked joint: more than any motor has
+JAMMED_NM = 1e6  # Friction of a blocked joint: more than the torque of any motor
 
 
 class PlantJoint(msgspec.Struct, frozen=True):
-    """One servo's shaft as a plant takes it over."""
+    """Shaft of one servo, as the input of a plant."""
 
-    motor: Motor  # Its inertia and friction are the plant's to apply
+    motor: Motor  # The plant applies its inertia and friction
     load: Load
     angle: float  # rad from the servo's raw 0, at the start
-    recounted: float = 0.0  # rad that its count has shifted by since it was mounted
+    recounted: float = 0.0  # Shift of its count since it was mounted, rad
 
 
 class Plant(Protocol):
@@ -38,37 +38,37 @@ class Plant(Protocol):
 
     @property
     def angle(self) -> Floats:
-        """Angles, rad; the same array for ever."""
+        """Angles, rad; always the same array."""
 
     @property
     def velocity(self) -> Floats:
-        """Speeds, rad/s, counter-clockwise positive; the same array for ever."""
+        """Speeds, rad/s, counter-clockwise positive; always the same array."""
 
     def step(self, drive: Floats, damping: Floats, dt_s: float) -> None:
-        """Let a time pass in which each servo drives with `drive - damping * velocity`; Nm and Nm s/rad."""
+        """Advance by `dt_s` with servo torque `drive - damping * velocity` (Nm, Nm s/rad)."""
 
     def place(self, index: int, angle: float) -> None:
-        """Put a shaft somewhere, rad, at rest."""
+        """Move a resting shaft to an angle, rad."""
 
     def recount(self, index: int, by: float) -> None:
-        """Let a shaft that does not move count its angle from elsewhere, as after a power cycle: rad."""
+        """Shift the angle count of a resting shaft by an angle, rad, as after a power cycle."""
 
     def jam(self, index: int, on: bool) -> None:
-        """Block a shaft where it is, or free it."""
+        """Block a shaft at its angle, or release it."""
 
 
-Part = tuple[Sequence[int], Plant]  # Some of the servos, by index, and what moves them
+Part = tuple[Sequence[int], Plant]  # Indices of some servos, and their plant
 
 PlantMaker = Callable[[Sequence[PlantJoint]], Plant]
-"""Makes the plant of some joints; called again when a servo is added later, with the joints as they are."""
+"""Makes the plant of some joints. It is called again with the current joints when a servo is added later."""
 
 
 class IndependentJoints:
-    """Joints that do not feel one another.
+    """Joints without coupling.
 
-    Velocity first, damping taken at the end of the step: stable at any damping and any step. That alone would
-    brake less than the motor does, as if dt / 2 of its damping were inertia (7 % of an MX-64's); the inertia
-    of the step is less by it, which makes it Crank and Nicolson's. Friction is that of `Motor` and of `Load`.
+    The velocity is updated first, with implicit damping: stable at any damping and any step. That alone would
+    brake less than the motor does, as if dt / 2 of its damping were inertia (7 % for an MX-64). Subtracting
+    this from the inertia turns the step into Crank-Nicolson's. Friction is that of `Motor` and of `Load`.
     """
 
     def __init__(self, joints: Sequence[PlantJoint]) -> None:
@@ -88,46 +88,46 @@ class IndependentJoints:
         self._dt_s = 0.0
 
     def step(self, drive: Floats, damping: Floats, dt_s: float) -> None:
-        """Let a time pass in which each servo drives with `drive - damping * velocity`; Nm and Nm s/rad."""
+        """Advance by `dt_s` with servo torque `drive - damping * velocity` (Nm, Nm s/rad)."""
         if dt_s != self._dt_s:
             self._set_step(dt_s)
         velocity, per_torque = self.velocity, self._per_torque
         pull = np.sin((self.angle - self._down) * self._turns) * self._gravity + self._steady
-        # the motor's torque, which gravity's is added to
+        # The torque between motor and load, which load friction depends on.
         most = np.abs(drive - damping * velocity + pull) * (self._load_friction * per_torque)
         most += self._friction * per_torque
         if self._stribeck is not None:
             most += self._stribeck.friction(velocity) * per_torque
-        free = velocity + (drive - pull) * per_torque  # as it would be without friction and damping
-        # what friction takes in a step, and no more: a joint that it stops stays at rest
+        free = velocity + (drive - pull) * per_torque  # Velocity without friction and damping
+        # Friction removes at most the whole velocity: a joint that it stops stays at rest.
         rubbed = free - np.maximum(np.minimum(free, most), -most)
         velocity[:] = rubbed / (per_torque * damping + self._undamped)
         self.angle += velocity * dt_s
 
     def jam(self, index: int, on: bool) -> None:
-        """Block a joint where it is, or free it."""
+        """Block a joint at its angle, or release it."""
         self._friction[index] = JAMMED_NM if on else self._free_friction[index]
 
     def place(self, index: int, angle: float) -> None:
-        """Put a joint somewhere, rad, at rest."""
+        """Move a resting joint to an angle, rad."""
         self.angle[index] = angle
         self.velocity[index] = 0.0
 
     def recount(self, index: int, by: float) -> None:
-        """Let a shaft that does not move count its angle from elsewhere."""
+        """Shift the angle count of a resting shaft by an angle, rad."""
         self.angle[index] += by
         self._down[index] += by
 
     def _set_step(self, dt_s: float) -> None:
         self._dt_s = dt_s
-        # not less than half: a step as long as the motor's time constant is no more exact by it
+        # At least half: the correction does not improve a step as long as the motor's time constant.
         inertia = np.maximum(self._inertia - self._own_damping * dt_s / 2, self._inertia / 2)
         self._per_torque: Floats = dt_s / inertia
         self._undamped: Floats = 1.0 + self._viscous_friction * self._per_torque
 
 
 class SeveralPlants:
-    """Plants that do not feel one another, each with some of the servos."""
+    """Plants without coupling, each with some of the servos."""
 
     def __init__(self, joints: Sequence[PlantJoint], parts: Sequence[Part]) -> None:
         self.angle: Floats = np.array([joint.angle for joint in joints], dtype=np.float64)
@@ -140,33 +140,33 @@ class SeveralPlants:
         }
 
     def step(self, drive: Floats, damping: Floats, dt_s: float) -> None:
-        """Let a time pass in which each servo drives with `drive - damping * velocity`; Nm and Nm s/rad."""
+        """Advance by `dt_s` with servo torque `drive - damping * velocity` (Nm, Nm s/rad)."""
         for rows, plant in self._parts:
             self._hand(rows, plant)
             plant.step(drive[rows], damping[rows], dt_s)
             self._take(rows, plant)
 
     def place(self, index: int, angle: float) -> None:
-        """Put a shaft somewhere, rad, at rest."""
+        """Move a resting shaft to an angle, rad."""
         rows, plant, place = self._place_of[index]
         self._hand(rows, plant)
         plant.place(place, angle)
         self._take(rows, plant)
 
     def recount(self, index: int, by: float) -> None:
-        """Let a shaft that does not move count its angle from elsewhere."""
+        """Shift the angle count of a resting shaft by an angle, rad."""
         rows, plant, place = self._place_of[index]
         self._hand(rows, plant)
         plant.recount(place, by)
         self._take(rows, plant)
 
     def jam(self, index: int, on: bool) -> None:
-        """Block a shaft where it is, or free it."""
+        """Block a shaft at its angle, or release it."""
         _, plant, place = self._place_of[index]
         plant.jam(place, on)
 
     def _hand(self, rows: Rows, plant: Plant) -> None:
-        """Hand a plant the shafts as they are: they may have been changed in the arrays of all."""
+        """Copy the shafts to a plant, because they may have been changed in the common arrays."""
         plant.angle[:] = self.angle[rows]
         plant.velocity[:] = self.velocity[rows]
 
@@ -176,13 +176,13 @@ class SeveralPlants:
 
 
 def combine_plants(joints: Sequence[PlantJoint], parts: Sequence[Part]) -> Plant:
-    """Return the plant that these parts are together; rows are in the order of the joints."""
+    """Return the common plant of these parts; rows are in the order of the joints."""
     rows, plant = parts[0]
     return plant if [*rows] == [*range(len(joints))] else SeveralPlants(joints, parts)
 
 
 class Stribecks:
-    """The friction of joints that is there near standstill only."""
+    """Additional friction of joints near standstill."""
 
     def __init__(self, joints: Sequence[PlantJoint]) -> None:
         parts = [joint.motor.stribeck or Stribeck(0.0, 1.0) for joint in joints]
@@ -191,6 +191,6 @@ class Stribecks:
         self._exponent = np.array([part.exponent for part in parts])
 
     def friction(self, velocity: Floats) -> Floats:
-        """Return it at some velocities, rad/s, in Nm."""
+        """Return the additional friction at some velocities, rad/s, in Nm."""
         friction: Floats = self._most * np.exp(-((np.abs(velocity) / self._speed) ** self._exponent))
         return friction

@@ -1,4 +1,4 @@
-"""The shaft of a simulated servo: what the registers command, and what they show of how it moves."""
+"""Shaft of a simulated servo: commands from its registers, and its motion in registers."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ Trajectory = tuple[float, float, float]
 
 
 class Shaft(ABC):
-    """Follows what is written, and is looked at; a subclass for each family of registers."""
+    """Follows written registers and reports the motion; a subclass for each family of registers."""
 
     items: ClassVar[ShaftItems]
 
@@ -33,12 +33,12 @@ class Shaft(ABC):
         self.now_ns = mechanics.grid_ns
         self._last: ServoCommand | None = None
         self._goes_to_goal = False
-        self.response_delay_ns = 0  # Until what is commanded acts; torque off acts at once
-        self._withdrawn = 0  # How often what had not acted yet was withdrawn
+        self.response_delay_ns = 0  # Delay until a command takes effect; torque off has none
+        self._withdrawn = 0  # Number of times that pending commands were withdrawn
 
     @property
     def angle(self) -> float:
-        """Angle, rad from raw 0, of the shaft itself: turns count, Homing Offset and reversal do not."""
+        """Angle of the shaft itself, rad from raw 0, including turns, without Homing Offset and reversal."""
         plant, ahead_ns = self.mechanics.plant, self.now_ns - self.mechanics.grid_ns
         angle: float = plant.angle.item(self.index)
         return angle + plant.velocity.item(self.index) * ahead_ns * 1e-9 if ahead_ns > 0 else angle
@@ -55,21 +55,21 @@ class Shaft(ABC):
 
     @property
     def duty(self) -> float:
-        """Part of the supply's voltage that the motor gets, -1 to 1."""
+        """Fraction of the supply voltage at the motor, -1 to 1."""
         return self.mechanics.law.duty.item(self.index)
 
     @property
     def moving(self) -> bool:
-        """True while its trajectory moves, or it is faster than its threshold."""
+        """True while its trajectory moves, or while its speed exceeds the threshold."""
         return self._under_way or abs(self.velocity) > self._noticed_speed
 
     @property
     def torque_on(self) -> bool:
-        """True when the motor holds or moves the shaft: torque enabled and its limit not 0."""
+        """True if the motor holds or moves the shaft: torque is enabled and its limit is not 0."""
         return self.memory.get("torque_enable") == 1 and self.memory.get("torque_limit", 1) > 0
 
     def recount(self, angle: float) -> None:
-        """Put the shaft to rest where it is, its angle counted in another turn."""
+        """Stop the shaft at its position, and count its angle in another turn."""
         self.mechanics.recount(self.index, angle)
         self._forget()
 
@@ -79,14 +79,14 @@ class Shaft(ABC):
         self._goes_to_goal = False
 
     def advance(self, now_ns: int) -> None:
-        """Let time pass; going back is ignored."""
+        """Advance to a time; an earlier time is ignored."""
         if now_ns > self.now_ns:
             self.now_ns = now_ns
             if now_ns - self.mechanics.grid_ns >= STEP_NS:
                 self.mechanics.advance(now_ns)
 
     def plan(self, written: Iterable[str]) -> None:
-        """Command what was written, if that is something else."""
+        """Command the written registers, if they differ from the last command."""
         if self.items.aims.isdisjoint(written) and self.items.others.isdisjoint(written):
             return
         if self._goes_to_goal and self.items.aims.issuperset(written):
@@ -107,9 +107,10 @@ class Shaft(ABC):
                 self._act(partial(self.mechanics.command, self.index, command))
 
     def _act(self, action: Callable[[], None]) -> None:
-        """Do something to the mechanics after the response delay, at the next point of its grid.
+        """Schedule an action on the mechanics after the response delay, at the next grid point.
 
-        Up to a step late, a half on average: as much as a plant is ahead, whose velocity comes first.
+        It is up to a step late, half a step on average. That compensates the lead of a plant, which updates
+        its velocity first.
         """
         withdrawn = self._withdrawn
 
@@ -120,25 +121,25 @@ class Shaft(ABC):
         self.mechanics.call_at(self.now_ns + self.response_delay_ns, act)
 
     def power_up(self) -> None:
-        """Come to rest within one turn, and take the angle as the goal [i]."""
+        """Come to rest within one turn, with the angle as the goal [i]."""
         self.recount(self.within_a_turn(self.angle))
         self.memory["goal_position"] = self.position_tick(self.angle)
 
     @abstractmethod
     def within_a_turn(self, angle: float) -> float:
-        """Return an angle as the servo finds it when it is switched on."""
+        """Return the angle that the servo detects at power-up."""
 
     @abstractmethod
     def position_tick(self, angle: float) -> int:
-        """Return what Present Position shows."""
+        """Return Present Position."""
 
     @abstractmethod
     def live(self) -> Mapping[str, Callable[[], int]]:
-        """Return the items that show the motion, each with what it shows now, in ticks."""
+        """Return the items of the motion, each with a function for its current value in ticks."""
 
     @abstractmethod
     def _command(self) -> ServoCommand:
-        """Return what the registers command while torque is on, the trajectory to a goal left out."""
+        """Return the command of the registers while torque is on, without the trajectory to a goal."""
 
     @property
     @abstractmethod
@@ -150,7 +151,7 @@ class Shaft(ABC):
 
     @abstractmethod
     def _new_trajectory(self, *, afresh: bool = False) -> Trajectory | None:
-        """Return the trajectory that the registers command; None: it is the current one."""
+        """Return the trajectory of the registers, or None if it has not changed."""
 
     @property
     def _under_way(self) -> bool:
@@ -165,8 +166,8 @@ def in_turn(angle: float) -> float:
 def critical_d(p: float, motor: Motor) -> float:
     """Return the D gain, duty per rad/s, with which a P gain, duty per rad, does not overshoot.
 
-    With the motor's time constant T, and w its stall torque over damping, the loop is
-    T x'' + (1 + D w) x' + P w x = 0.
+    With the motor's time constant T, and w its stall torque over damping, the loop is T x'' + (1 + D w) x' +
+    P w x = 0.
     """
     speed = motor.stall_torque / motor.damping
     return max(0.0, 2 * math.sqrt(p * speed * motor.time_constant) - 1.0) / speed
