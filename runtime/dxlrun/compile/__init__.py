@@ -1,5 +1,5 @@
-"""Compiler: a robot file, motions, control tables and plug-ins become a plan.
+"""Compiler: converts a robot file, motions, control tables and plug-ins into a plan.
 
-All checks that need more than one section are here. The form of one section belongs in `description`, and
-nothing here opens a port.
+All checks that need more than one section are here; `description` checks the form of one section. No module
+here opens a port.
 """

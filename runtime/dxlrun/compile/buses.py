@@ -26,12 +26,12 @@ from dxlwire.modes import Mode
 from dxlwire.plan.planning import Wiring, bus_plan
 from dxlwire.plan.reads import slow_items
 
-FAST_LATENCY_NS = 1_000_000  # The shortest latency timer of an FTDI adapter (protocol.md, Time budget)
+FAST_LATENCY_NS = 1_000_000  # shortest latency timer of an FTDI adapter (protocol.md, Time budget)
 _COMFORTABLE = 0.9
-"""Share of the period above which controllers and the operating system have too little left."""
+"""Share of the period above which too little time is left for controllers and the operating system."""
 _LEAST_DEVICE_MARGIN_NS, _MOST_DEVICE_MARGIN_NS = 100_000, 5_000_000
-"""A stock kernel wakes some 50-100 us late."""
-WATCHDOG_NS = 200_000_000  # Bus Watchdog of a servo of Protocol 2.0 where the file gives none (failures.md)
+"""Bounds of the timeout margin for devices: a stock kernel wakes about 50-100 us late."""
+WATCHDOG_NS = 200_000_000  # default Bus Watchdog of servos of Protocol 2.0 (failures.md)
 
 
 def compile_buses(
@@ -40,9 +40,13 @@ def compile_buses(
     contributions: Collection[Contribution],
     modes: Mapping[str, Mode],
 ) -> list[BusPlan]:
-    """Return the plans of the buses that have joints or devices, in the order of the file.
+    """Return the plans of the buses with joints or devices, in the order of the file.
 
-    `modes`: in which mode each joint begins a run, by its name.
+    Args:
+        file: Robot file; collects the problems.
+        joints: Compiled joints, by name.
+        contributions: Contributions of the features.
+        modes: Start mode of each joint, by name.
     """
     _own_ports(file)
     plans: list[BusPlan] = []
@@ -85,9 +89,9 @@ def compile_buses(
 
 
 def _check_baud_rate(file: RobotFile, name: str, tables: Sequence[ControlTable | DeviceTable]) -> None:
-    """Refuse a rate that nothing on the bus can have; what of it cannot have it is a warning.
+    """Refuse a baud rate that no node on the bus supports, and warn if some nodes do not support it.
 
-    A rate beyond those of all lines stands for a bus without a wire, as a measurement of hosts makes one.
+    A rate above those of all servos is accepted: it describes a bus without a wire, used to measure hosts.
     """
     rate, mark = file.robot.buses[name].baud_rate, file.at("buses", name, "baud_rate")
     if rate > HIGHEST_BAUD_RATE:
@@ -141,7 +145,7 @@ def _wiring(
 
 
 def _servo_range(servo: CompiledServo, joints: Sequence[CompiledJoint]) -> Interval:
-    """Return how far a servo goes while the joints that it moves are within their limits."""
+    """Return the range of a servo while the joints that it moves are within their limits."""
     ranges = [
         limits_of(joint.plan).scaled(joint.drive.levers[joint.servos.index(servo)], joint.plan.unit)
         for joint in joints
@@ -185,7 +189,7 @@ def _check_budget(file: RobotFile, plan: BusPlan) -> None:
 
 
 def _improvements(plan: BusPlan) -> list[str]:
-    """Return the rate that each change alone would allow."""
+    """Return the rate that each single change would allow."""
     budget = plan.budget
     now = _floor(budget.highest_rate_hz)
     found: list[str] = []
@@ -213,12 +217,12 @@ def _rate(budget: Budget, *, latency_ns: int | None = None, return_delay_ns: int
 
 
 def _floor(rate: float) -> str:
-    """Write a rate that is certainly possible, Hz, with two digits at least."""
+    """Return a rate that is certainly possible, Hz, rounded down to at least two digits."""
     return str(math.floor(rate)) if rate >= 10 else f"{math.floor(rate * 10) / 10:g}"
 
 
 def _with_monitoring(file: RobotFile, plan: BusPlan) -> BusPlan:
-    """Return a bus' plan with Bus Watchdog, slow registers, and which servos get torque after a reboot."""
+    """Return the plan of a bus with Bus Watchdog, slow registers, and torque at start and after a reboot."""
     bus, joints = file.robot.buses[plan.name], first_joints(file.description)
     policies = file.robot.policies
     items = bus.slow_registers.items
@@ -242,15 +246,14 @@ def _with_monitoring(file: RobotFile, plan: BusPlan) -> BusPlan:
 
 
 def _device_margin_ns(description: Description, plan: BusPlan) -> int:
-    """Return how long a device that is late is awaited: half of what the cycle leaves, so that one that is
-    lost makes no cycle late.
-    """
+    """Return the timeout margin of a device: half of the idle time, so a lost device does not make a cycle
+    late."""
     left_ns = round(1e9 / description.robot.loop.rate) - plan.budget.total_ns
     return max(min(_MOST_DEVICE_MARGIN_NS, left_ns // 2), _LEAST_DEVICE_MARGIN_NS)
 
 
 def slowest_period_ns(buses: Sequence[BusPlan]) -> int:
-    """Return the longest period in which no Bus Watchdog stops its servos, ns; 0: any."""
+    """Return the longest period at which no Bus Watchdog trips, ns; 0: no limit."""
     armed = [bus.watchdog_ticks for bus in buses if any(has_one(bus, servo) for servo in bus.servos)]
     return min(armed) * UNIT_NS // LEAST_PERIODS if armed else 0
 

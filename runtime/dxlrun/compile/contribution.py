@@ -1,4 +1,4 @@
-"""Contribution: the share of a feature in a plan, and the stage that asks for it."""
+"""Contribution: the share of a feature in a plan, and the stage that creates it."""
 
 from __future__ import annotations
 
@@ -22,25 +22,25 @@ from dxlwire.control_table.device_table import DeviceTable
 
 
 class Compilation(msgspec.Struct, frozen=True):
-    """A robot file whose joints are compiled, as features see it."""
+    """A robot file with compiled joints, as input for features."""
 
     file: RobotFile
-    """Problems are added to it."""
+    """The robot file; it collects problems."""
     plugins: PlugIns
     joints: Mapping[str, CompiledJoint]
-    """Joints without mistakes: one with a mistake is reported already."""
+    """Joints without mistakes; mistakes in other joints have been reported."""
     body: CompiledUrdf | None
     """The robot's URDF; None if it has none."""
 
 
 class BusDevice(msgspec.Struct, frozen=True):
-    """Something on a bus that is not a servo."""
+    """A node on a bus that is not a servo."""
 
     bus: str
     plan: DevicePlan
     table: DeviceTable
     simulated: Shown
-    """Its states when the bus is simulated."""
+    """Its states if the bus is simulated."""
 
 
 class PolicyEntry(msgspec.Struct, frozen=True):
@@ -49,43 +49,43 @@ class PolicyEntry(msgspec.Struct, frozen=True):
     name: str
     """Its key, or the key and a group: `on_lost_servo of wheels`."""
     does: str
-    """Its action while the run continues, as `dxlrun check` shows it."""
+    """Its action while the run continues, for `dxlrun check`."""
     steps: WrittenPolicy | None = None
-    """Steps by which it ends the run, as the file has them, where they are not `hold`; None: it has none."""
+    """Steps with which it ends the run, in the notation of the file; None for `hold`, or without steps."""
 
 
 class Contribution(msgspec.Struct, frozen=True):
     """The share of one feature in a plan."""
 
     names: tuple[str, ...] = ()
-    """Names of all its sources, also of those that a mistake leaves out: no controller is blamed for naming
-    one."""
+    """Names of all sources of the feature. Sources with mistakes are included, so that no controller that
+    names one of them gets an error."""
     buses: frozenset[str] = frozenset()
-    """Buses that the entries of its section name."""
+    """Buses that the entries of the section name."""
     sources: tuple[SourcePlan, ...] = ()
-    """Its states and commands in the cycle's record."""
+    """States and commands of the feature in the cycle's record."""
     devices: tuple[BusDevice, ...] = ()
-    """Devices that its buses exchange data with in each cycle."""
+    """Devices that the buses read and write in each cycle."""
     links: Mapping[str, str] = {}
-    """Links of the URDF whose orientation its sources have, by source."""
+    """Links of the URDF whose orientation the sources measure, by source."""
     texts: Mapping[str, str] = {}
-    """Contents of the files that its section names, by path."""
+    """Contents of the files that the section names, by path."""
     plan: bytes = b""
-    """Whatever its part in the run needs beside that, encoded; `BusContext.plan` has it."""
+    """Further encoded data for the feature's part in the run; see `BusContext.plan`."""
     packages: Mapping[str, str] = {}
-    """Packages of plug-ins whose code runs for it, with their distributions."""
+    """Packages of plug-ins whose code runs for the feature, with their distributions."""
     mechanics: MechanicsPlan | None = None
-    """Which servos move which joints, of the feature that knows."""
+    """Assignment of servos to joints, set by one feature only."""
     recording: RecordingPlan | None = None
-    """Where the log is written, of the feature that knows."""
+    """Destination of the log, set by one feature only."""
     policies: tuple[PolicyEntry, ...] = ()
-    """Its policies, as `dxlrun check` shows them."""
+    """Policies of the feature, for `dxlrun check`."""
     group_policies: tuple[GroupPolicy, ...] = ()
-    """Groups of joints with a policy of their own for lost servos."""
+    """Groups of joints with their own policy for lost servos."""
 
 
 class CompileStage(msgspec.Struct, frozen=True):
-    """`STAGE` of `compile.py`: called once, when the joints are compiled and before the controllers are.
+    """`STAGE` of `compile.py`: called once, after the joints and before the controllers are compiled.
 
     It checks the feature's section against the rest of the file, and adds every problem to the file.
     """
@@ -103,7 +103,7 @@ def check_source_names(
     """Check that joints, controllers with states, and the sources of features have different names.
 
     Args:
-        file: Robot file.
+        file: Robot file; collects the problems.
         contributions: Contribution of each feature, by the name of its section.
         controllers: All controllers of the file.
     """

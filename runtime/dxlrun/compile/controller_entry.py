@@ -1,7 +1,7 @@
 """Entry of a plug-in's class, such as a controller: its checks, for a robot file, a client and a replay.
 
-Each mistake has the path in the robot file that it is about. The compiler shows where that path is, the
-gateway and a replay refuse with the sentences.
+Each mistake has its path in the robot file. The compiler converts the path into line and column; the gateway
+and a replay use only the sentences.
 """
 
 from __future__ import annotations
@@ -34,12 +34,12 @@ _OFFERED = (
 _REMOVED = {
     "joint_limiter": "take it out: the gate keeps all goals within `limits` of their joints",
 }
-"""Types of earlier versions, and what to do instead."""
+"""Types of earlier versions, each with the fix."""
 Parameters = TypeVar("Parameters", bound=ParametersModel)
 
 
 class WrongEntry(Exception):
-    """An entry that cannot be used, with all mistakes that a check found."""
+    """An unusable entry, with all mistakes that a check found."""
 
     def __init__(self, *mistakes: Mistake) -> None:
         super().__init__("; ".join(f"{one.what}; {one.fix}" for one in mistakes))
@@ -47,26 +47,31 @@ class WrongEntry(Exception):
 
 
 class CompiledController(msgspec.Struct, frozen=True):
-    """A controller whose type is known and whose parameters are valid."""
+    """A controller with a known type and valid parameters."""
 
     plan: ControllerPlan
     offer: Offer
     parameters: ParametersModel
-    motors: tuple[str, ...] = ()  # Figures of its joints' motors that it needs
+    motors: tuple[str, ...] = ()  # figures of its joints' motors that it needs
     asked_by: Mapping[CommandName, KeyPath] = {}
-    """The key of its parameters for which it claims a command interface, see `Interfaces`."""
+    """The parameter for which it claims a command interface, see `Interfaces`."""
 
 
 class PlugInCode(NamedTuple):
     """The class of an entry, whose code may raise anything."""
 
     kind: str
-    """Word in messages, with which the section is named: `sensor`."""
+    """Name of the section in the singular, for messages: `sensor`."""
     name: str
     distribution: str
 
     def parameters(self, written: Mapping[str, object], model: type[Parameters]) -> Parameters:
-        """Return the parameters of an entry. Raises ValidationError, and WrongEntry for other errors."""
+        """Return the parameters of an entry.
+
+        Raises:
+            ValidationError: The parameters are invalid.
+            WrongEntry: The plug-in's code raised another error.
+        """
         try:
             return model.model_validate(written)
         except ValidationError:
@@ -76,14 +81,14 @@ class PlugInCode(NamedTuple):
 
     @contextmanager
     def asked_to(self, task: str) -> Iterator[None]:
-        """Run code of the plug-in. Raises WrongEntry for whatever it raises."""
+        """Run code of the plug-in; raise WrongEntry for any exception."""
         try:
             yield
         except (Exception, SystemExit) as error:
             raise self._failed(task, error) from error
 
     def broken(self, breach: Breach) -> WrongEntry:
-        """Return the error for a class that does not keep the contract."""
+        """Return the error for a class that breaks its contract."""
         what, fix = breach
         return self._at_fault(what, f"report it to its author: {fix}")
 
@@ -97,7 +102,7 @@ class PlugInCode(NamedTuple):
 
 
 def find_offer(name: str, type_name: str, plugins: PlugIns) -> Offer:
-    """Return the offer of a controller's type. Raises WrongEntry where there is none."""
+    """Return the offer of a controller's type; raise WrongEntry if there is none."""
     offer = plugins.controllers.get(type_name)
     if offer is not None:
         return offer
@@ -112,11 +117,15 @@ def find_offer(name: str, type_name: str, plugins: PlugIns) -> Offer:
 
 
 def where_to_get(type_name: str, known: Sequence[str], broken: Mapping[str, str]) -> str:
-    """Return how to get a type of plug-ins: another spelling, another package, or the repair of a broken one.
+    """Return the fix for an unknown type: another spelling, another package, or the repair of a broken
+    plug-in.
 
-    `known` are the types that there are, `broken` the plug-ins that cannot be used.
+    Args:
+        type_name: The type.
+        known: Available types.
+        broken: Problems of plug-ins that cannot be used, by type or plug-in.
     """
-    if type_name in broken:  # two plug-ins offer it
+    if type_name in broken:  # e.g. two plug-ins offer it
         return broken[type_name]
     if type_name in _REMOVED:
         return _REMOVED[type_name]
@@ -128,12 +137,12 @@ def where_to_get(type_name: str, known: Sequence[str], broken: Mapping[str, str]
 
 
 def plan_entry(name: str, entry: ControllerEntry, every: int) -> ControllerPlan:
-    """Return the plan of a controller with what its entry says, without what its class asks for."""
+    """Return the plan of a controller from its entry, without the requests of its class."""
     return ControllerPlan(
         name=name,
         type=entry.type,
         distribution="",
-        parameters=json.dumps(entry.parameters),  # as written: `60 deg` is what the model accepts
+        parameters=json.dumps(entry.parameters),  # as written, because the model accepts `60 deg`
         joints=(),
         command=(),
         publishes=(),
@@ -153,17 +162,17 @@ def compile_entry(
     wrapping: Collection[str] = (),
     groups: Collection[str] = (),
 ) -> CompiledController:
-    """Return a controller with what its class asks for.
+    """Return a controller with the interfaces that its class requests.
 
     Args:
-        plan: What the entry says, see `plan_entry`.
+        plan: Plan of the entry, see `plan_entry`.
         offer: Offer of its type.
         joints: All joints of the robot.
-        wrapping: Those that go the shorter way round.
-        groups: Names of groups, which are proposed for an unknown joint.
+        wrapping: Joints that take the shorter way round.
+        groups: Names of groups, as suggestions for an unknown joint.
 
     Raises:
-        ValidationError: Its parameters are wrong.
+        ValidationError: Its parameters are invalid.
         WrongEntry: Its class fails, breaks the contract, or claims joints that it cannot have.
     """
     cls, code = offer.controller, PlugInCode("controller", plan.name, offer.distribution)
@@ -198,9 +207,9 @@ def compile_entry(
 
 
 def require_fit(controller: CompiledController, joints: Sequence[JointPlan], urdf: str | None) -> None:
-    """Raise WrongEntry where the robot does not fit a controller: motors, servos, the URDF.
+    """Raise WrongEntry if the robot does not fit a controller: motors, servos, the URDF.
 
-    `joints` are its own.
+    `joints` are the controller's joints.
     """
     plan, offer = controller.plan, controller.offer
     with PlugInCode("controller", plan.name, offer.distribution).asked_to("compare itself with the robot"):
@@ -215,9 +224,9 @@ def require_fit(controller: CompiledController, joints: Sequence[JointPlan], urd
 def wrapped(
     parameters: dict[str, object], model: type[ParametersModel], wrapping: Collection[str]
 ) -> dict[str, object]:
-    """Return the parameters of a controller with `wrap`, where they leave it out and some joints wrap.
+    """Return the parameters of a controller with `wrap`, if they have no `wrap` and some of its joints wrap.
 
-    A controller that cannot wrap them, such as one of velocities, keeps its own.
+    A controller that cannot wrap them, such as a velocity controller, keeps its parameters.
     """
     joints = parameters.get("joints")
     if "wrap" not in model.model_fields or "wrap" in parameters or not isinstance(joints, list | tuple):
@@ -227,7 +236,7 @@ def wrapped(
     found = {**parameters, "wrap": own}
     try:
         model.model_validate(found)
-    except Exception:  # a plug-in's code; the parameters as written are checked by themselves
+    except Exception:  # a plug-in's code; the caller checks the parameters as written
         return parameters
     return found
 

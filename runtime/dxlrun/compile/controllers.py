@@ -1,4 +1,4 @@
-"""Controllers of the robot file against plug-ins, joints, each other, modes and the loop's rate."""
+"""Controllers of the robot file, checked against plug-ins, joints, each other, modes and the loop's rate."""
 
 from __future__ import annotations
 
@@ -48,7 +48,7 @@ _INTERFACE: Mapping[Mode, str] = {
 
 
 def read_controller_files(file: RobotFile) -> dict[str, str]:
-    """Return the texts of the files beside the robot file whose classes are controllers, by name."""
+    """Return the texts of the Python files with controllers next to the robot file, by name."""
     folder = file.description.path.parent
     texts: dict[str, str] = {}
     for controller, entry in file.robot.controllers.items():
@@ -74,7 +74,7 @@ def compile_controllers(
 ) -> dict[str, CompiledController]:
     """Return the controllers that could be compiled, by name, in the order of the file.
 
-    They may read the sources of `contributions`, and command them.
+    They can read and command the sources in `contributions`.
     """
     compiled: dict[str, CompiledController] = {}
     plans: list[ControllerPlan] = []
@@ -100,7 +100,7 @@ def compile_controllers(
 
 
 def _compiled(file: RobotFile, plan: ControllerPlan, plugins: PlugIns) -> CompiledController | None:
-    """Return a controller with what its class asks for; None where a mistake keeps that from being known."""
+    """Return a compiled controller; None if a mistake prevents that."""
     name, robot = plan.name, file.robot
     offer = _offer(file, name, plan.type, plugins)
     if offer is None:
@@ -127,11 +127,11 @@ def report_entry(  # noqa: PLR0917  an entry, and what is made of it
     model: type[ParametersModel],
     make: Callable[[], Made],
 ) -> Made | None:
-    """Return what is made of an entry; None where it has mistakes, which become problems of the file.
+    """Return the result of `make` for an entry; None if it has mistakes, which become problems of the file.
 
     Args:
-        file: Robot file.
-        kind: Word for the class in messages, with which its section is named: `sensor`.
+        file: Robot file; collects the problems.
+        kind: Name of the section in the singular, for messages: `sensor`.
         name: Name of the entry.
         entry: Entry of the section.
         model: Form of its parameters.
@@ -160,7 +160,7 @@ def _report(file: RobotFile, wrong: WrongEntry) -> None:
 
 
 def _entry_mark(description: Description, at: KeyPath) -> Mark:
-    """Return the place of an entry, of one of its keys, or of a joint that its parameters name."""
+    """Return the place of an entry, of one of its keys, or of a joint in its parameters."""
     if not at[2:]:
         return description.marks.key(*at)
     if description.marks.has(at):
@@ -187,7 +187,7 @@ def _check_graph(
 
 
 def _graph_mark(description: Description, plans: Mapping[str, ControllerPlan], at: KeyPath) -> Mark:
-    """Return the place of a part of a controller: what only its class names is where its parameters do."""
+    """Return the place of a part of a controller; for names from its class, the place of its parameters."""
     marks, plan = description.marks, plans[str(at[1])]
     match at[2:]:
         case ("joints", int(index)):
@@ -209,7 +209,7 @@ def _graph_mark(description: Description, plans: Mapping[str, ControllerPlan], a
 
 
 def _every(file: RobotFile, name: str, rate: float | None) -> int:
-    """Return of how many cycles the controller is updated in one; 0 where its rate is wrong."""
+    """Return the number of cycles per update of a controller; 0 if its rate is invalid."""
     loop = file.robot.loop.rate
     period_ns = round(1e9 / loop)
     every = rate_divider(rate, period_ns)
@@ -225,12 +225,13 @@ def _offer(file: RobotFile, name: str, type_name: str, plugins: PlugIns) -> Offe
     ros = ros_type(type_name, plugins.controllers)
     offer = plugins.controllers.get(type_name)
     if offer is None and is_of_file(type_name) and not ros and type_name not in plugins.broken:
-        return None  # its file could not be read, which is reported
+        return None  # the unreadable file has been reported
     try:
         return find_offer(name, type_name, plugins)
     except WrongEntry as wrong:
         _report(file, wrong)
-    return plugins.controllers.get(ros[2]) if ros else None  # so that its parameters are checked, too
+    # return dxlrun's type, so that the parameters are checked, too
+    return plugins.controllers.get(ros[2]) if ros else None
 
 
 def check_robot(
@@ -244,7 +245,7 @@ def check_robot(
     plans = {name: joint.plan for name, joint in joints.items()}
     for controller in controllers.values():
         own = [plans[joint] for joint in controller.plan.joints if joint in plans]
-        # what is named and could not be used has its own problems
+        # An unusable motor file, joint or URDF has been reported.
         unread = [one for one in own if one.motor is None and _names_motor(joints[one.name])]
         if unread or len(own) < len(controller.plan.joints) or (urdf is None and robot.model is not None):
             continue
@@ -257,16 +258,16 @@ def check_robot(
 def check_motions(
     file: RobotFile, joints: Mapping[str, CompiledJoint], controllers: Mapping[str, CompiledController]
 ) -> None:
-    """Compare the motions of the file, which controllers play by their names, with the joints' speeds."""
+    """Compare the speeds of the file's motions, which controllers play by name, with those of the joints."""
     for name, controller in controllers.items():
         cls, parameters = controller.offer.controller, controller.parameters
-        seen: set[SpeedPeak] = set()  # a motion that follows others is a part of each of them
+        seen: set[SpeedPeak] = set()  # a motion that follows others is contained in each of them
         try:
             for motion in cls.motions(parameters):
                 command = cls.Commands["play"].model_validate({"motion": motion})
                 data = np.ascontiguousarray(cls.prepare("play", command, parameters), dtype="<f8")
                 seen.update(cls.speed_peaks("play", data, parameters))
-        except Exception as error:  # of foreign code: nothing else of the file depends on these speeds
+        except Exception as error:  # foreign code; nothing else depends on these speeds
             what = f"the speeds of its motions are not checked: {type(error).__name__}: {error}"
             text = f"controller {name} ({controller.offer.distribution}): {' '.join(what.split())}"
             file.warning(file.key("controllers", name), text, "correct its parameters, or its plug-in")
@@ -287,10 +288,9 @@ def _names_motor(joint: CompiledJoint) -> bool:
 def compile_modes(
     file: RobotFile, joints: Mapping[str, CompiledJoint], controllers: Mapping[str, CompiledController]
 ) -> dict[str, Mode]:
-    """Return the mode in which each joint begins a run, by its name; it is one that its model has.
+    """Return the start mode of each joint, by name; the joint's model has the mode.
 
-    Every controller's joints must have the mode that the controller needs, and every joint one in which it
-    rests.
+    Each joint must have the mode that its controllers need, and a mode in which it rests.
     """
     able = {name: joint.modes for name, joint in joints.items()}
     for name, joint in joints.items():
@@ -315,7 +315,7 @@ def compile_modes(
 def _warn_of_slow_takeovers(
     file: RobotFile, plans: Sequence[ControllerPlan], modes: Mapping[str, Mode]
 ) -> None:
-    """Warn of takeovers that change the mode in which joints begin: that takes more than one cycle."""
+    """Warn of takeovers that change the joints' start mode: the change takes more than one cycle."""
     named = {plan.name: plan for plan in plans}
     for plan in plans:
         for index, name in enumerate(plan.takeovers):

@@ -1,7 +1,7 @@
-"""The controller graph: controllers, what they read, claim and command, and every mistake in it.
+"""Controller graph: the controllers, their reads, claims and commands, and every mistake in them.
 
-For the controllers of a robot file and for one that is loaded into a run. Each mistake has the path in the
-file that it is about.
+It is used for the controllers of a robot file and for a controller that is loaded into a run. Each mistake
+has its path in the file.
 """
 
 from __future__ import annotations
@@ -20,15 +20,15 @@ from dxlrun.output.graph import Edge, Graph, Node, listed
 from dxlrun.plan.loop_plan import ControllerPlan, SourcePlan
 
 STATES = ("position", "velocity", "effort", "temperature", "voltage", "age")
-"""Interfaces of every joint that may be read without a claim; `age` is that of the state, s."""
-_LONGEST = 6  # Names of joints in one message
+"""Interfaces of every joint that can be read without a claim; `age` is the age of the state, s."""
+_LONGEST = 6  # names of joints in one message
 
 
 class GraphEdge(msgspec.Struct, frozen=True):
-    """What passes from one node to another: commands toward the servos, values toward a reader."""
+    """Data flow between two nodes: commands toward the servos, or values toward a reader."""
 
     kind: Literal["command", "reference", "read"]
-    """To the servo of a joint; to another controller; without a claim."""
+    """`command`: to the servo of a joint; `reference`: to another controller; `read`: without a claim."""
     source: str
     target: str
     joint: str
@@ -36,7 +36,7 @@ class GraphEdge(msgspec.Struct, frozen=True):
 
 
 class Mistake(NamedTuple):
-    """What is wrong with the graph, and the path in the file."""
+    """One mistake in the graph, with its path in the file."""
 
     at: KeyPath
     what: str
@@ -47,10 +47,13 @@ Check: TypeAlias = Callable[[ControllerPlan], Iterable[Mistake]]
 
 
 class ControllerGraph:
-    """Controllers of a robot and the joints that they work on.
+    """Controllers of a robot and their joints.
 
-    `sources`: devices and sensors; `incomplete`: those that have mistakes of their own, so that their joints
-    and interfaces are not known.
+    Args:
+        joints: All joints of the robot.
+        controllers: All controllers, in the order of the file.
+        sources: Devices and sensors.
+        incomplete: Controllers and sources with mistakes, whose joints and interfaces are not known.
     """
 
     def __init__(
@@ -68,12 +71,12 @@ class ControllerGraph:
 
     @property
     def order(self) -> tuple[str, ...]:
-        """Names in the order of updates."""
+        """Names of the controllers in the order of updates."""
         return update_order(self.controllers)
 
     @property
     def edges(self) -> tuple[GraphEdge, ...]:
-        """All edges of a valid graph: those of each controller together, in the order of the file."""
+        """All edges of a valid graph, grouped by controller, in the order of the file."""
         return tuple(edge for plan in self.controllers for edge in self._edges_of(plan))
 
     def mistakes(self) -> Iterator[Mistake]:
@@ -96,7 +99,7 @@ class ControllerGraph:
         yield from self._active_claims()
 
     def warnings(self) -> Iterator[Mistake]:
-        """Yield each interface by which a controller reads its own values back."""
+        """Yield a mistake for each interface by which a controller reads its own values back."""
         for plan in self.controllers:
             for index, interface in enumerate(plan.reads):
                 if found := self._read_back(plan, interface):
@@ -105,7 +108,7 @@ class ControllerGraph:
                     yield Mistake(at, f"{plan.name} reads {interface}, {what}", fix)
 
     def _read_back(self, plan: ControllerPlan, interface: str) -> tuple[str, str] | None:
-        """Return how a controller reads itself by an interface, and how to avoid that; None: it does not."""
+        """Return problem and fix if an interface reads the controller's own values; None: it does not."""
         source, _, name = interface.rpartition("/")
         owner, _, joint = source.partition("/")
         if source == plan.name and name in plan.provides:
@@ -124,10 +127,10 @@ class ControllerGraph:
         return None
 
     def drawing(self, title: str, rate: float) -> Graph:
-        """Return what is drawn of it, for a loop at this rate, Hz.
+        """Return the drawing of the graph for a loop at a rate, Hz.
 
-        Joints of the same controllers are one node. That controllers read the states of their own joints is
-        drawn only for those that command nothing.
+        Joints with the same controllers are one node. Reads of a controller's own joints are drawn only for
+        controllers without commands.
         """
         commanding: dict[str, list[str]] = {}
         reads: dict[tuple[str, str, str], list[str]] = {}
@@ -169,15 +172,15 @@ class ControllerGraph:
         return Graph(title, tuple(nodes.values()), tuple(edges))
 
     def _together(self, joints: Sequence[str]) -> Sequence[str]:
-        """Return names of joints, or that they are all."""
+        """Return names of joints, or one text if they are all joints."""
         return [f"all {len(joints)} joints"] if 2 < len(joints) == len(self.joints) else joints
 
     # Edges
 
     @cached_property
     def _readable(self) -> Mapping[str, tuple[str, ...]]:
-        """What can be read without a claim: interfaces of `JOINT` and of `CONTROLLER/JOINT`, states of
-        devices, sensors, and controllers that provide some."""
+        """Interfaces that can be read without a claim, by `JOINT`, `CONTROLLER/JOINT`, device, sensor, and
+        controller with states."""
         states = dict.fromkeys(self.joints, STATES)
         references = {
             f"{plan.name}/{joint}": plan.reference
@@ -190,7 +193,7 @@ class ControllerGraph:
         return {**states, **references, **others, **provided}
 
     def _edges_of(self, plan: ControllerPlan) -> Iterator[GraphEdge]:
-        """Yield the edges that one controller has in a valid graph: what it reads, then what it commands."""
+        """Yield the edges of one controller in a valid graph: first its reads, then its commands."""
         for interface in plan.reads:
             source, _, name = interface.rpartition("/")
             owner, _, joint = source.rpartition("/")
@@ -202,7 +205,7 @@ class ControllerGraph:
                 yield GraphEdge("reference", plan.name, lower.name, joint, plan.command)
 
     def _lowers(self, plan: ControllerPlan) -> list[ControllerPlan]:
-        """Return the controllers that it is into, without itself and without unknown ones."""
+        """Return the known controllers in `into`, without the controller itself."""
         return [
             self._named[name]
             for name in dict.fromkeys(plan.into)
@@ -210,7 +213,7 @@ class ControllerGraph:
         ]
 
     def _exporters(self, plan: ControllerPlan, joint: str) -> list[ControllerPlan]:
-        """Return the controllers that it is into and that export all that it commands of a joint."""
+        """Return the controllers in `into` that export all commanded interfaces of a joint."""
         return [
             lower
             for lower in self._lowers(plan)
@@ -220,7 +223,7 @@ class ControllerGraph:
     # Rules
 
     def _targets(self, plan: ControllerPlan) -> Iterator[Mistake]:
-        """Each name of `into` is another controller of the file, once."""
+        """Check that each name in `into` is another controller of the file and occurs once."""
         name = plan.name
         for index, target in enumerate(plan.into):
             at = (*_path(name), "into", index)
@@ -236,7 +239,7 @@ class ControllerGraph:
                 yield Mistake(at, f"{name} is into {target} twice", "name it once")
 
     def _exports(self, plan: ControllerPlan) -> Iterator[Mistake]:
-        """Each joint is exported, with all that is commanded of it, by exactly one of `into`."""
+        """Check that exactly one controller in `into` exports each joint with all commanded interfaces."""
         name, lowers = plan.name, self._lowers(plan)
         if not plan.into or name in self._incomplete:
             return
@@ -296,7 +299,7 @@ class ControllerGraph:
             yield Mistake(self._at_into(plan, idle), what, f"take {idle.name} out of `into`")
 
     def _activity(self, plan: ControllerPlan) -> Iterator[Mistake]:
-        """What is active from the start has its lower end active too."""
+        """Check that a controller that is active from the start commands only active controllers."""
         for lower in self._lowers(plan):
             if plan.active and not lower.active:
                 what = f"{plan.name} is active from the start, but {lower.name}, which it commands, is not"
@@ -304,7 +307,8 @@ class ControllerGraph:
                 yield Mistake(self._at_into(plan, lower), what, fix)
 
     def _rates(self, plan: ControllerPlan) -> Iterator[Mistake]:
-        """The upper end's rate divides that of the lower one: no command of it is missed."""
+        """Check that a controller's rate divides the rate of the controllers that it commands, so they miss
+        no command."""
         for lower in self._lowers(plan):
             if plan.every and lower.every and plan.every % lower.every:
                 what = (
@@ -320,7 +324,7 @@ class ControllerGraph:
                 )
 
     def _reads(self, plan: ControllerPlan) -> Iterator[Mistake]:
-        """Each of `reads` is an interface that there is; those that a source lacks are one mistake."""
+        """Check that each interface in `reads` exists; missing interfaces of one source are one mistake."""
         missing: dict[str, list[int]] = {}
         for index, interface in enumerate(plan.reads):
             source, _, name = interface.rpartition("/")
@@ -335,7 +339,7 @@ class ControllerGraph:
             yield Mistake(at, f"{plan.name} reads {interface}{more}, but {what}", fix)
 
     def _unreadable(self, interface: str, source: str, name: str) -> tuple[str, str]:
-        """Return why there is no such interface, and what to write."""
+        """Return problem and fix for an interface that does not exist."""
         owner, _, joint = source.partition("/")
         plan = self._named.get(owner)
         if interface.count("/") not in {1, 2} or "" in interface.split("/"):
@@ -355,7 +359,7 @@ class ControllerGraph:
         return _unexported(plan, joint)
 
     def _source_commands(self, plan: ControllerPlan) -> Iterator[Mistake]:
-        """Check that each of `source_commands` is a command of a source."""
+        """Check that each name in `source_commands` is a command of a source."""
         known = [f"{one.name}/{command}" for one in self.sources for command in one.commands]
         for index, name in enumerate(plan.source_commands):
             if name not in known and name.partition("/")[0] not in self._incomplete:
@@ -364,7 +368,7 @@ class ControllerGraph:
                 yield Mistake((*_path(plan.name), "source_commands", index), what, fix)
 
     def _takeovers(self, plan: ControllerPlan) -> Iterator[Mistake]:
-        """Each of `takeovers` is another controller, and they can be active together."""
+        """Check that each name in `takeovers` is another controller, and that they can be active together."""
         names = plan.takeovers
         for index, name in enumerate(names):
             at = (*_path(plan.name), "takeovers", index)
@@ -381,7 +385,7 @@ class ControllerGraph:
             yield Mistake((*_path(plan.name), "takeovers", 0), what, "take one of them out")
 
     def _needed_together(self, plan: ControllerPlan) -> Iterator[Mistake]:
-        """The controllers below one another can be active together."""
+        """Check that the controllers below a controller can be active together."""
         found = self._clashes_below(plan)
         for lower in self._lowers(plan):
             found = {pair: clash for pair, clash in found.items() if pair not in self._clashes_below(lower)}
@@ -392,7 +396,7 @@ class ControllerGraph:
             yield Mistake((*_path(plan.name), "into"), what, fix)
 
     def _clashes_below(self, plan: ControllerPlan) -> dict[tuple[str, str], list[Conflict]]:
-        """Return which controllers claim the same among one and all below it."""
+        """Return the conflicting claims in a controller and all controllers below it, by pair."""
         names = {plan.name, *below(self.controllers, plan.name)} - self._incomplete if plan.into else set()
         return _by_pairs(conflicts(one for one in self.controllers if one.name in names))
 
@@ -411,7 +415,7 @@ class ControllerGraph:
     def _circles(self) -> Iterator[Mistake]:
         for circle in circles(self.controllers):
             if len(circle) == 1:
-                continue  # into itself: said before
+                continue  # `_targets` reports a controller that is into itself
             following = dict(zip(circle, (*circle[1:], circle[0]), strict=True))
             begin = next((one for one in circle if following[one] in self._named[one].into), circle[0])
             into = self._named[begin].into
@@ -426,7 +430,7 @@ class ControllerGraph:
             yield Mistake(at, what, "take one of these steps out")
 
     def _active_claims(self) -> Iterator[Mistake]:
-        """What is active from the start claims each servo, and each reference, once."""
+        """Check that controllers that are active from the start claim each servo and reference only once."""
         active = [plan for plan in self.controllers if plan.active and plan.name not in self._incomplete]
         reported = {pair for plan in self.controllers for pair in self._clashes_below(plan)}
         for (holder, other), clashes in _by_pairs(conflicts(active)).items():
@@ -444,7 +448,7 @@ class ControllerGraph:
             yield Mistake(_path(other) if at is None else _joint(other, at), what, fix)
 
     def _from_above(self, name: str) -> str:
-        """Return the chain that ends in a controller, from its upper end."""
+        """Return the chain of active controllers that ends in a controller."""
         way = [name]
         while upper := next(
             (p for p in self.controllers if way[0] in p.into and p.name not in way and p.active), None
@@ -453,7 +457,7 @@ class ControllerGraph:
         return " -> ".join(way)
 
     def _fallback(self, plan: ControllerPlan) -> Iterator[Mistake]:
-        """A fallback can take over when it is needed."""
+        """Check that a fallback can take over when it is needed."""
         name, at = plan.name, (*_path(plan.name), "fallback")
         if not plan.fallback:
             return
@@ -474,7 +478,7 @@ class ControllerGraph:
             yield from self._taking_over(plan, other, at)
 
     def _taking_over(self, plan: ControllerPlan, fallback: ControllerPlan, at: KeyPath) -> Iterator[Mistake]:
-        """Let it take over as in a run, from what is active at the start; name the claims that prevent it."""
+        """Simulate the takeover from the controllers active at the start; yield claims that prevent it."""
         known = {one.name: one for one in self.controllers if one.name not in self._incomplete}
         taken = [name for name in (plan.name, *above(self.controllers, plan.name)) if name in known]
         active = {name: one for name, one in known.items() if one.active and name not in taken}
@@ -482,7 +486,7 @@ class ControllerGraph:
         if standing.fall_back(fallback.name, taken, {plan.name}):
             return
         entering = {fallback.name, *below(self.controllers, fallback.name)}
-        free = standing.only_under(taken) - entering  # they would leave
+        free = standing.only_under(taken) - entering  # these controllers would be deactivated
         kept = [one for name, one in active.items() if name not in free | entering]
         after = [*kept, *(one for name, one in known.items() if name in entering)]
         clashes = [one for one in conflicts(after) if one.other in entering and one.holder not in entering]
@@ -507,7 +511,7 @@ class ControllerGraph:
 
 
 def _unexported(plan: ControllerPlan, joint: str) -> tuple[str, str]:
-    """Return why a controller has no such reference, and what to write."""
+    """Return problem and fix for a reference that a controller does not export."""
     if not (plan.reference and plan.joints):
         return f"{plan.name} exports no reference", "read a joint: JOINT/position"
     if not joint:

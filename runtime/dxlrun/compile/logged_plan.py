@@ -1,4 +1,4 @@
-"""Logged plan: what a log holds of a robot, compiled again with changes."""
+"""Logged plan: the robot of a log, compiled again with changes."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ _MOST_SENTENCES = 20
 
 
 def compile_texts(files: Mapping[str, str], arguments: Mapping[str, str], urdf: str | None) -> Compiled:
-    """Compile a robot from texts, in a directory of their own.
+    """Compile a robot from texts, in a temporary directory.
 
     Args:
         files: Texts by their paths relative to the robot file; the robot file is the first.
@@ -29,12 +29,12 @@ def compile_texts(files: Mapping[str, str], arguments: Mapping[str, str], urdf: 
         urdf: Text of the URDF that the robot file names, or None.
 
     Raises:
-        InputError: The files do not compile, or one of them leads out of the directory.
+        InputError: The files do not compile, or one of them is outside the directory.
     """
     name = next(iter(files))
     with tempfile.TemporaryDirectory(prefix="dxlrun-replay-") as directory:
         root = Path(directory).resolve()
-        home = root.joinpath(*["up"] * 8)  # a file may include one beside or above its own directory
+        home = root.joinpath(*["up"] * 8)  # A file may include files next to its own directory or above it.
         for relative, text in files.items():
             _write(root, home / relative, text)
         try:
@@ -48,7 +48,7 @@ def compile_texts(files: Mapping[str, str], arguments: Mapping[str, str], urdf: 
 
 
 def _write(root: Path, path: Path, text: str) -> None:
-    """Write one file of the log. Raises InputError for a name that leads out of the directory."""
+    """Write one file of the log; raise InputError for a path outside the directory."""
     place = Path(path).resolve()
     if not place.is_relative_to(root):
         raise InputError(
@@ -61,21 +61,21 @@ def _write(root: Path, path: Path, text: str) -> None:
 def replan_controller(
     change: str, plan: ControllerPlan, joints: Mapping[str, JointPlan], plugins: PlugIns, urdf: str | None
 ) -> ControllerPlan:
-    """Return the plan of a controller whose parameters or code have changed, with what it claims now.
+    """Return the plan of a controller whose parameters or code have changed, with its new claims.
 
     Args:
-        change: The change, as messages begin.
+        change: Start of the messages, which names the change.
         plan: The controller with its new parameters.
         joints: Plans of all joints by name.
         plugins: The types of controllers.
         urdf: Text of the robot's URDF, or None.
 
     Raises:
-        InputError: The parameters are wrong, or the controller does not fit the robot of the log.
+        InputError: The parameters are invalid, or the controller does not fit the robot of the log.
     """
     offer = plugins.controllers.get(plan.type)
     if offer is None:
-        return plan  # the manager reports it
+        return plan  # the manager reports the missing type
     wrapping = {name for name, joint in joints.items() if joint.wrap}
     try:
         found = compile_entry(plan, offer, tuple(joints), wrapping=wrapping)

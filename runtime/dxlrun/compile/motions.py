@@ -1,14 +1,15 @@
-"""Motions: the parts of a motion file become prepared commands for controllers, by time.
+"""Motions: converts the parts of a motion file into prepared commands for controllers, by time.
 
-A part's `start` is the time since the loop's first deadline at which its controller gets the first command.
-A controller can be played when it takes a command `trajectory` (points: time s, positions, velocities,
-accelerations; start_in s) or one whose fields are `positions`, `velocities` or both: values in rad and rad/s
-in the order of its joints. The standard controllers do; those of any plug-in may.
+The `start` of a part is the time since the loop's first deadline at which its controller gets the first
+command. A controller can play motions if it has one of two commands. The first is `trajectory` (points: time
+s, positions, velocities, accelerations; start_in s). The second has the fields `positions`, `velocities` or
+both: values in rad and rad/s in the order of the joints. The standard controllers have such commands, and
+those of plug-ins may have them.
 
-A controller that takes trajectories gets one; a group controller gets one command for each point, in which a
-joint that the point does not name keeps the target of the point before. A trajectory whose first point lies
-at t = 0 would be a jump, so it begins 1 s after it was handed over, as in the thesis: meanwhile the
-controller leads the joints to the first point.
+A controller with trajectories gets one trajectory. A group controller gets one command for each point; joints
+that the point does not name keep their previous targets. A trajectory whose first point is at t = 0 would be
+a jump. It therefore begins 1 s after its handover, as in the thesis, and the controller leads the joints to
+the first point until then.
 """
 
 from __future__ import annotations
@@ -55,10 +56,12 @@ _EXAMPLES: Mapping[JointUnit, Mapping[Quantity, str]] = {
     LINEAR: {"position": "20 mm", "velocity": "50 mm/s", "acceleration": "200 mm/s^2"},
 }
 LEAD_NS = 1_000_000_000
-"""From handing over a trajectory that begins at t = 0 to its first point, as in the thesis."""
+"""Time between the handover of a trajectory that begins at t = 0 and its first point, as in the thesis."""
 MOST_TARGETS = 200_000
-"""Of all formulas of a motion file: 20 joints for 100 s at 100 Hz. One takes some 300 bytes and 5 us."""
-MOST_CHARACTERS = 20_000_000  # Of formulas, as often as they are evaluated: up to 0.5 us each, so 10 s
+"""Targets in all formulas of a motion file: 20 joints for 100 s at 100 Hz. A target takes about 300 bytes and
+5 us."""
+# Characters of formulas times evaluations; each takes up to 0.5 us, so 10 s in total.
+MOST_CHARACTERS = 20_000_000
 
 
 def compile_motion(
@@ -106,7 +109,7 @@ def compile_motion(
 
 
 def check_times(parts: Sequence[MotionPart], duration_ns: int | None, problems: Problems) -> None:
-    """Refuse a part that replaces another one on its way; warn of a run that ends before a part does."""
+    """Refuse a part that replaces a part still playing; warn of a run that ends before a part does."""
     by_start = sorted(parts, key=lambda part: part.start_ns)
     for index, part in enumerate(by_start):
         replaced = [
@@ -137,7 +140,7 @@ def _seconds(time_ns: int) -> str:
 
 
 def affordable(motion: MotionDescription, problems: Problems) -> bool:
-    """Return whether the formulas of a motion file can be sampled in a few seconds and some 100 MB."""
+    """Return True if the formulas of a motion file can be sampled in a few seconds and about 100 MB."""
     values: dict[int, int] = {}
     characters: dict[int, int] = {}
     for index, part in enumerate(motion.motion.motions):
@@ -178,7 +181,7 @@ def _controller(
     names: tuple[str, ...],
     problems: Problems,
 ) -> CompiledController | None:
-    """Return the active controller of a part; None when there is none, or the robot file has it wrong."""
+    """Return the active controller of a part; None if it does not exist or has mistakes in the robot file."""
     name = motion.motion.motions[index].controller
     mark = motion.marks.value("motions", index, "controller")
     if name not in names:
@@ -202,7 +205,7 @@ def playable(
     joints: Mapping[str, JointPlan],
     problems: Problems,
 ) -> tuple[str, tuple[Sample, ...]]:
-    """Return the kind of command by which a part is played, and its samples; none where a part is wrong."""
+    """Return the kind of command that plays a part, and its samples; empty if the part has mistakes."""
     samples = samples_of(motion, index, problems)
     if controller is None or not _names_own_joints(motion, index, controller, problems):
         return "", ()
@@ -221,7 +224,7 @@ def playable(
 def _names_own_joints(
     motion: MotionDescription, index: int, controller: CompiledController, problems: Problems
 ) -> bool:
-    """Return whether every joint that the part names belongs to its controller."""
+    """Return True if every joint that the part names belongs to its controller."""
     part = motion.motion.motions[index]
     paths: list[tuple[str | int, ...]]
     if isinstance(part, PointsPart):
@@ -247,7 +250,7 @@ def _names_own_joints(
 def _right_units(
     motion: MotionDescription, index: int, joints: Mapping[str, JointPlan], problems: Problems
 ) -> bool:
-    """Return whether the units of the listed targets are those of their joints."""
+    """Return True if the units of the listed targets match their joints."""
     part, good = motion.motion.motions[index], True
     for number, point in enumerate(part.points if isinstance(part, PointsPart) else ()):
         for joint, target in point.joints.items():
@@ -266,7 +269,7 @@ def _right_units(
 
 
 def _settle_ns(controller: CompiledController, joints: Mapping[str, JointPlan]) -> int:
-    """Return how long a part lasts after its last target: until its goal must be reached."""
+    """Return the timeout after the last target for reaching the goal."""
     tolerances = getattr(controller.parameters, "tolerances", controller.parameters)
     goal_time = getattr(tolerances, "goal_time", None)
     if isinstance(goal_time, int) and goal_time > 0:
@@ -281,7 +284,7 @@ def warn_of_turns(
     wrap: Collection[str],
     problems: Problems,
 ) -> None:
-    """Warn of the longest step of each continuous joint by which it turns the longer way."""
+    """Warn of each continuous joint that turns the longer way, at its longest step."""
     longest: dict[str, tuple[float, Mark]] = {}
     before: dict[str, float] = {}
     for sample in samples:
@@ -307,7 +310,7 @@ def warn_of_turns(
 
 
 def warn_of_last_velocities(samples: Sequence[Sample], problems: Problems) -> None:
-    """Warn of joints without a position that a motion leaves turning."""
+    """Warn of joints without a position that still move when the motion ends."""
     last: dict[str, SampledTarget] = {}
     for sample in samples:
         last.update(sample.targets)
@@ -321,7 +324,8 @@ def warn_of_last_velocities(samples: Sequence[Sample], problems: Problems) -> No
 
 
 def last_positions(joints: Sequence[str], samples: Sequence[Sample]) -> tuple[float | None, ...]:
-    """Return where joints are left, rad or m; None where they name no position, but have to come to rest."""
+    """Return the last positions of joints, rad or m; None for joints without a position, which must come to
+    rest."""
     held: dict[str, float] = {}
     for sample in samples:
         for joint, target in sample.targets.items():
@@ -331,9 +335,10 @@ def last_positions(joints: Sequence[str], samples: Sequence[Sample]) -> tuple[fl
 
 
 def last_arrival_ns(samples: Sequence[Sample], joints: Mapping[str, JointPlan]) -> int:
-    """Return when the joints of single commands can be at their last positions, ns since the part's start.
+    """Return the earliest arrival of the joints of single commands at their last positions, ns since the
+    part's start.
 
-    A joint goes to a position at the speed that is commanded with it, else at its highest speed.
+    A joint moves to a position at the speed commanded with it, else at its highest speed.
     """
     arrival_ns = samples[-1].t_ns
     held: dict[str, float] = {}
@@ -353,7 +358,7 @@ def last_arrival_ns(samples: Sequence[Sample], joints: Mapping[str, JointPlan]) 
 def commands_of(
     controller: CompiledController, kind: str, samples: tuple[Sample, ...], start_ns: int, lead_ns: int
 ) -> tuple[ScheduledCommand, ...]:
-    """Return the commands of a part; raises InputError with the first that cannot be given."""
+    """Return the commands of a part; raise InputError with the first invalid one."""
     joints = controller.plan.joints
     if kind == TRAJECTORY:
         payload = trajectory_command(joints, samples, lead_ns)
@@ -370,7 +375,7 @@ def commands_of(
 def prepared(
     controller: CompiledController, kind: str, payload: dict[str, object], at_ns: int, mark: Mark
 ) -> ScheduledCommand:
-    """Validate and prepare a command by the controller's own code, which may raise anything."""
+    """Validate and prepare a command with the controller's own code, which may raise anything."""
     cls = controller.offer.controller
     try:
         data = cls.prepare(kind, cls.Commands[kind].model_validate(payload), controller.parameters)
@@ -394,9 +399,9 @@ def prepared(
 def speed_peaks(
     controller: CompiledController, commands: Sequence[ScheduledCommand], mark: Mark
 ) -> list[SpeedPeak]:
-    """Return the highest speeds of joints on the way of a trajectory, by the controller's own code.
+    """Return the highest speeds of the joints in a trajectory, computed by the controller's own code.
 
-    A group controller has no way between its targets. Raises InputError.
+    A group controller has no path between its targets. Raises InputError.
     """
     if len(commands) != 1 or commands[0].kind != TRAJECTORY:
         return []
@@ -411,7 +416,7 @@ def speed_peaks(
 
 
 def command_kind(controller: type[Controller[Any]]) -> str | None:
-    """Return the name of the command by which motions are played; None when the controller takes none."""
+    """Return the name of the command that plays motions; None if the controller has none."""
     if TRAJECTORY in controller.Commands:
         return TRAJECTORY
     for kind, model in controller.Commands.items():
@@ -423,7 +428,7 @@ def command_kind(controller: type[Controller[Any]]) -> str | None:
 def group_command(
     controller: type[Controller[Any]], kind: str, joints: Sequence[str], sample: Sample
 ) -> dict[str, object]:
-    """Return one command with a value for each joint; raises InputError."""
+    """Return one command with a value for each joint; raise InputError for a quantity that it lacks."""
     fields = controller.Commands[kind].model_fields
     quantities = [quantity for quantity, name in _FIELDS.items() if name in fields]
     for joint, target in sample.targets.items():
@@ -440,7 +445,7 @@ def group_command(
 
 
 def trajectory_command(joints: Sequence[str], samples: Sequence[Sample], lead_ns: int) -> dict[str, object]:
-    """Return a trajectory through all samples, starting `lead_ns` after it was taken; raises InputError."""
+    """Return a trajectory through all samples, starting `lead_ns` after its handover; raise InputError."""
     quantities: list[Quantity] = ["position"]
     derivatives: tuple[Quantity, ...] = ("velocity", "acceleration")
     for quantity in derivatives:
@@ -460,7 +465,7 @@ def trajectory_command(joints: Sequence[str], samples: Sequence[Sample], lead_ns
 
 
 def _value(sample: Sample, joint: str, quantity: Quantity) -> float:
-    """Return one value; raises InputError where the point does not give it."""
+    """Return one value; raise InputError if the point does not have it."""
     target = sample.targets.get(joint)
     value = None if target is None else target.get(quantity)
     if value is None:

@@ -1,4 +1,4 @@
-"""Orientations: of which link of the URDF each is, by its sensor, its messages and those that use it."""
+"""Orientations: the link of the URDF to which each belongs, by its sensor, its messages and its users."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ from dxlrun.errors import suggestion
 from dxlsim.geometry.transform import NO_TURN, Quaternion, Transform, conjugate, from_rpy, product
 from dxlsim.geometry.urdf import Urdf
 
-_ALIKE_RAD = math.radians(1.0)  # Between two orientations that are meant to be one. [i]
+_ALIKE_RAD = math.radians(1.0)  # orientations this close are meant to be equal [i]
 
 
 def check_orientations(
@@ -23,7 +23,7 @@ def check_orientations(
     contributions: Iterable[Contribution],
     controllers: Mapping[str, CompiledController],
 ) -> None:
-    """Warn where sensor, frame of the messages, `model.imu_link` and users of an orientation disagree."""
+    """Warn if sensor, frame of the messages, `model.imu_link` and users of an orientation disagree."""
     links = {name: link for each in contributions for name, link in each.links.items()}
     for name, controller in controllers.items():
         if (frame := _text(controller, "frame")) and _text(controller, "sensor"):
@@ -54,7 +54,7 @@ def check_orientations(
 def _check_frame(
     file: RobotFile, urdf: Urdf, name: str, controller: CompiledController, links: Mapping[str, str]
 ) -> None:
-    """Compare the frame of a controller's messages with the link of its sensor, and with its mounting."""
+    """Compare the frame of a controller's messages with the link of its sensor and with its mounting."""
     frame, sensor = _text(controller, "frame"), _text(controller, "sensor")
     mark = file.at("controllers", name, "frame")
     if frame not in urdf.links:
@@ -71,13 +71,13 @@ def _check_frame(
 
 
 def _text(controller: CompiledController, key: str) -> str:
-    """Return a parameter that is a text; empty: there is none."""
+    """Return a parameter that is a text; empty: it is missing."""
     value = getattr(controller.parameters, key, "")
     return value if isinstance(value, str) else ""
 
 
 def _turn(urdf: Urdf, link: str, other: str, expected: Quaternion = NO_TURN) -> str:
-    """Return how a link is turned in another one unlike expected, in words; empty: it is as expected."""
+    """Return the unexpected rotation of a link relative to another one, in words; empty: as expected."""
     if link not in urdf.links or other not in urdf.links:
         return ""
     (above, place), (other_above, other_place) = _fixed(urdf, link), _fixed(urdf, other)
@@ -92,7 +92,7 @@ def _turn(urdf: Urdf, link: str, other: str, expected: Quaternion = NO_TURN) -> 
 
 
 def _fixed(urdf: Urdf, link: str) -> tuple[str, Transform]:
-    """Return the highest link to which one is fixed, and where it lies in that."""
+    """Return the highest link to which a link is fixed, and the pose of the link in it."""
     above = {joint.child: joint for joint in urdf.joints}
     place = Transform()
     while link in above and not above[link].moves:

@@ -1,4 +1,4 @@
-"""Policies and poses of the robot file against joints, limits, servos, and the time that the end may take."""
+"""Policies and poses of the robot file, checked against joints, limits, servos and the exit timeout."""
 
 from __future__ import annotations
 
@@ -26,7 +26,7 @@ from dxlwire.joint_unit import LINEAR, ROTARY, JointUnit
 from dxlwire.plan.planning import torque_off_ns
 
 MARGIN_NS = 100_000_000
-"""For the processor, and for servos that answer only the second time, while torque is switched off."""
+"""Reserve for torque off: for the processor, and for servos that answer only the second request."""
 
 _EXAMPLES: Mapping[JointUnit, str] = {ROTARY: "60 deg", LINEAR: "20 mm"}
 
@@ -37,7 +37,7 @@ def compile_policies(
     buses: Sequence[BusPlan],
     contributions: Sequence[Contribution],
 ) -> PolicyPlan:
-    """Return the policies of a file; add problems where they do not fit the robot or `exit_timeout`."""
+    """Return the policies of a file; add problems if they do not fit the robot or `exit_timeout`."""
     _check_poses(file, joints)
     robot = file.robot
     limit_ns = robot.policies.exit_timeout - _reserve_ns(buses, robot.loop.rate)
@@ -147,7 +147,7 @@ def _check_torque(file: RobotFile, name: str, steps: WrittenPolicy, buses: Seque
 
 
 def _check_stopping(file: RobotFile, name: str, joints: Mapping[str, CompiledJoint], left_ns: int) -> None:
-    """Refuse joints that brake longer than a policy lasts that leaves them holding."""
+    """Refuse joints that need longer to brake than the time left for a policy that keeps torque on."""
     for joint in (joint.plan for joint in joints.values()):
         stop_s = 0.0 if joint.acceleration is None else joint.highest_speed / joint.acceleration
         if stop_s * 1e9 > left_ns:
@@ -160,7 +160,7 @@ def _check_stopping(file: RobotFile, name: str, joints: Mapping[str, CompiledJoi
 
 
 def _check_groups(file: RobotFile, joints: Mapping[str, CompiledJoint]) -> None:
-    """Check that each joint is in one group at most, with all joints that the same servos move."""
+    """Check that each joint is in one group at most, together with all joints that the same servos move."""
     known = tuple(file.robot.joints)
     owner: dict[str, str] = {}
     for name, group in file.robot.policies.groups.items():
@@ -193,7 +193,7 @@ def _check_groups(file: RobotFile, joints: Mapping[str, CompiledJoint]) -> None:
 
 
 def _reserve_ns(buses: Sequence[BusPlan], rate: float) -> int:
-    """Return the part of the exit timeout that is no step's: two periods, and torque off on every line."""
+    """Return the part of the exit timeout that steps cannot use: two periods, and torque off on all lines."""
     return max(map(torque_off_ns, buses), default=0) + round(2e9 / rate) + MARGIN_NS
 
 

@@ -1,4 +1,4 @@
-"""Problems of a robot file whose form is right: collected by all checks, each at its place in the file."""
+"""Problems of a robot file of valid form: collected by all checks, each at its place in the file."""
 
 from __future__ import annotations
 
@@ -10,12 +10,16 @@ from dxlrun.errors import InputError, Mark, Problem, told_once
 
 
 class Problems:
-    """All problems of one compilation: a check adds to it and continues."""
+    """All problems of one compilation. A check adds its problems and continues."""
 
     __slots__ = ("_found", "_joints")
 
     def __init__(self, joints: Collection[str] = ()) -> None:
-        """`joints` may share a mistake: it stands in their defaults, and is told once."""
+        """Start without problems.
+
+        Args:
+            joints: Joints that can share a mistake in their defaults, which is reported once.
+        """
         self._found: list[Problem] = []
         self._joints = joints
 
@@ -33,12 +37,12 @@ class Problems:
 
     @property
     def errors(self) -> tuple[Problem, ...]:
-        """The errors in file order."""
+        """Errors in file order."""
         return self._of("error")
 
     @property
     def warnings(self) -> tuple[Problem, ...]:
-        """The warnings in file order."""
+        """Warnings in file order."""
         return self._of("warning")
 
     def _of(self, severity: str) -> tuple[Problem, ...]:
@@ -46,13 +50,13 @@ class Problems:
         return tuple(sorted(found, key=lambda problem: problem.mark))
 
     def refuse(self) -> None:
-        """Raise InputError with the errors, and after them the warnings, if there is any error."""
+        """Raise InputError with the errors, followed by the warnings, if there is any error."""
         if self.errors:
             raise InputError(self.errors + self.warnings)
 
 
 class RobotFile(Problems):
-    """A robot file under compilation: what it says, where it says it, and what is wrong with it."""
+    """A robot file under compilation: its values, their places, and the problems."""
 
     __slots__ = ("description", "marks", "robot")
 
@@ -63,16 +67,16 @@ class RobotFile(Problems):
         self.marks = description.marks
 
     def at(self, *path: str | int) -> Mark:
-        """Return the place of a value, or of the nearest parent that the file has."""
+        """Return the place of a value, or of its nearest parent in the file."""
         return self.marks.value(*path)
 
     def key(self, *path: str | int) -> Mark:
-        """Return the place of a key, of a list's item, or of the nearest parent."""
+        """Return the place of a key, of a list item, or of the nearest parent."""
         return self.marks.key(*path)
 
 
 def joint_mark(description: Description, controller: str, joint: str) -> Mark:
-    """Return where a controller of the file names a joint last; the controller's own place if nowhere."""
+    """Return the last place where a controller of the file names a joint, else the controller's own place."""
     start = ("controllers", controller)
     parameters = description.robot.controllers[controller].parameters
     named = [path for path, text in _texts(parameters, start) if text == joint]
@@ -80,7 +84,7 @@ def joint_mark(description: Description, controller: str, joint: str) -> Mark:
 
 
 def into_mark(description: Description, controller: str, index: int) -> Mark:
-    """Return where a controller names one of those that it is into: a list, or one name without it."""
+    """Return the place where a controller names an entry of `into`, which can be a list or one name."""
     at: KeyPath = ("controllers", controller, "into")
     return (
         description.marks.value(*at, index)

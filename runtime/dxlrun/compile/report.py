@@ -1,6 +1,6 @@
-"""What `dxlrun check` shows of a compiled robot, as its JSON has it; its tables have columns of these rows.
+"""Report of `dxlrun check` about a compiled robot, for JSON; the columns of its tables come from these rows.
 
-Angles in rad, of servos from their raw 0; lengths in m, times in s, rates in Hz.
+Angles in rad, those of servos from their raw 0; lengths in m, times in s, rates in Hz.
 """
 
 from __future__ import annotations
@@ -27,17 +27,17 @@ from dxlwire.bus_plan import BusPlan, ServoPlan
 from dxlwire.joint_unit import LINEAR, ROTARY
 
 Source = Literal["file", "servo", "none"]
-"""Where a limit is from: `servo`: its reach, top speed or highest goal; `none`: a wheel, or not known."""
-Row = dict[str, Any]  # What JSON has of one thing
+"""Origin of a limit. `servo`: its reach, top speed or highest goal; `none`: a wheel, or not known."""
+Row = dict[str, Any]  # JSON object of one row
 
 
 class TableStage(msgspec.Struct, frozen=True):
-    """`STAGE` of `table.py`: what `dxlrun check` shows of a feature."""
+    """`STAGE` of `table.py`: the table of a feature in `dxlrun check`."""
 
     FILE: ClassVar[str] = "table"
 
     rows: Callable[[Plan], Iterable[Row]]
-    """Rows of the feature in a plan. JSON has them under the feature's name."""
+    """Returns the rows of the feature in a plan; in JSON they are under the feature's name."""
     table: Callable[[Sequence[Row]], Table]
     """Returns the table of these rows."""
 
@@ -49,7 +49,7 @@ def check_report(
     parts: Sequence[MotionPart],
     policies: Sequence[PolicyEntry],
 ) -> Row:
-    """Return everything that was decided for a robot before a port opens, as JSON has it."""
+    """Return all results of the compilation of a robot, for JSON."""
     loop, buses = plan.loop, plan.buses
     servos = {servo.own_name: servo for bus in buses for servo in bus.servos}
     return {
@@ -68,7 +68,7 @@ def check_report(
 
 
 def graph_of(loop: LoopPlan) -> ControllerGraph:
-    """Return the controller graph of a plan, which was found valid when the plan was made."""
+    """Return the controller graph of a plan, which was checked when the plan was made."""
     return ControllerGraph([joint.name for joint in loop.joints], loop.controllers, loop.sources)
 
 
@@ -107,7 +107,7 @@ def _joint(joint: CompiledJoint, servos: Mapping[str, ServoPlan]) -> Row:
 
 
 def _properties(plan: JointPlan, limits: Limits) -> Row:
-    """Return the numbers of a joint that have a column, with the source of limits."""
+    """Return the numeric properties of a joint with a column, and the origin of its limits."""
     row: Row = {}
     for one in shown_properties():
         row[one.name] = value = one.value(plan)
@@ -117,7 +117,7 @@ def _properties(plan: JointPlan, limits: Limits) -> Row:
 
 
 def shown_properties() -> list[JointProperty]:
-    """Return the properties of joints that have a column: the keys of features are the last."""
+    """Return the properties of joints with a column; the keys of features come last."""
     own = [one for one in JOINT_PROPERTIES if one.column is not None]
     return own + [_property_of(key) for key in joint_keys()]
 
@@ -198,16 +198,17 @@ def _motion(part: MotionPart) -> Row:
 
 
 class PolicyRow(msgspec.Struct, frozen=True):
-    """What happens when something does not go on as planned."""
+    """Actions of one policy for a deviation from the plan."""
 
     name: str
-    does: str  # Its steps and how the robot is left; or which joints are held while the run continues
-    longest: float  # s, that the steps take at the most
-    without_loop: str  # What of it is left when the loop is gone: what the guardian does
+    does: str
+    """Its steps and the state in which it leaves the robot; or the joints held while the run continues."""
+    longest: float  # longest duration of the steps, s
+    without_loop: str  # action taken by the guardian when the loop process has exited
 
 
 def policy_rows(plan: Plan, entries: Sequence[PolicyEntry]) -> list[PolicyRow]:
-    """Return what happens when something does not go on as planned: policies with steps are the first."""
+    """Return the rows of all policies: those with steps come first."""
     policies = plan.loop.policies.by_name
     found = {name: (policy.text, policy.longest_ns * 1e-9) for name, policy in policies.items()}
     for entry in entries:
@@ -219,7 +220,7 @@ def policy_rows(plan: Plan, entries: Sequence[PolicyEntry]) -> list[PolicyRow]:
 
 
 def _on_returned_servo(buses: Sequence[BusPlan]) -> str:
-    """Return which servos get torque after a reboot."""
+    """Return the servos that get torque after a reboot, in words."""
     servos = [servo for bus in buses for servo in bus.servos]
     held = [servo.joint for servo in servos if servo.torque_on_return]
     if len(held) in {0, len(servos)}:

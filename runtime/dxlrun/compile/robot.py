@@ -1,4 +1,4 @@
-"""The compiler: every check in turn, all problems at once, then the plan."""
+"""Compiler: runs every check, reports all problems at once, then makes the plan."""
 
 from __future__ import annotations
 
@@ -54,30 +54,30 @@ if TYPE_CHECKING:
     from dxlrun.output.graph import Graph
 
 Ask: TypeAlias = Callable[[Sequence[BusPlan], Sequence[str]], Mapping[str, str]]
-"""Read the models of the servos of joints: takes the buses and the joints, returns models by joint."""
-_HIGHEST = 98  # The guardian needs one priority above the loop, and 99 is the highest there is (sched(7))
+"""Reads the models of servos: takes the buses and the joints, returns models by joint."""
+_HIGHEST = 98  # the guardian needs a higher priority, and 99 is the highest one (sched(7))
 
 
 class Compiled(msgspec.Struct, frozen=True):
-    """A plan that can be run, what it was compiled from, and what should be looked at."""
+    """A plan that can be run, its sources, and the warnings."""
 
     plan: Plan
     warnings: tuple[Problem, ...]
-    rate: float  # Of the loop, Hz, as the file has it
+    rate: float  # rate of the loop in the file, Hz
     joints: tuple[CompiledJoint, ...]
     parts: tuple[MotionPart, ...]
     policies: tuple[PolicyEntry, ...]
 
     @property
     def report(self) -> Row:
-        """Everything that was decided, as JSON has it."""
-        from dxlrun.compile.report import check_report  # not above: only `dxlrun check` shows it
+        """All results of the compilation, for JSON."""
+        from dxlrun.compile.report import check_report  # imported here, because only `dxlrun check` needs it
 
         return check_report(self.plan, self.rate, self.joints, self.parts, self.policies)
 
     @property
     def drawing(self) -> Graph:
-        """The controller graph, as it is drawn."""
+        """Drawing of the controller graph."""
         from dxlrun.compile.report import graph_of  # as above
 
         return graph_of(self.plan.loop).drawing(f"{self.plan.robot}: controllers", self.rate)
@@ -92,10 +92,15 @@ def compile_files(
     *,
     replacements: Sequence[Replacement] = (),
 ) -> Compiled:
-    """Read robot file and motion files and compile them.
+    """Read a robot file and motion files and compile them.
 
-    `replacements` stand in for values of the robot file. Only when nothing is wrong, the models of servos on
-    real ports with `model: auto` are read by `ask`, if it is given.
+    Args:
+        robot: Robot file.
+        arguments: Arguments of the robot file.
+        motions: Motion files.
+        duration_ns: Duration of the run; None: until the last motion ends.
+        ask: Reads the models of servos on real ports with `model: auto`; called only after all checks passed.
+        replacements: Values that replace those of the robot file.
 
     Raises:
         InputError: All problems of form of all files; if there are none, all problems that the checks find.
@@ -110,7 +115,8 @@ def compile_files(
     except InputError as error:
         problems += error.problems
     for path in motions:
-        from dxlrun.description.motion import read_motion  # not above: most checks and runs play none
+        # imported here, because most checks and runs play no motion
+        from dxlrun.description.motion import read_motion
 
         try:
             read.append(read_motion(path, groups))
@@ -126,7 +132,7 @@ def compile_files(
 
 
 def _unknown(description: Description) -> list[str]:
-    """Return the joints whose models can be read from their servos, and must be."""
+    """Return the joints whose models must be read from their servos."""
     robot = description.robot
     return [
         name
@@ -141,15 +147,21 @@ def compile_robot(
     duration_ns: int | None = None,
     models: Mapping[str, str] | None = None,
 ) -> Compiled:
-    """Turn a description and motions into a plan.
+    """Convert a description and motions into a plan.
 
-    The run ends by itself after `duration_ns`, else when the last motion has ended, else when it is stopped.
-    `models` are those that were read from the servos of joints with `model: auto`, by joint.
-    Raises InputError with every problem of the robot file and the motions.
+    Args:
+        description: The robot.
+        motions: The motions.
+        duration_ns: Duration of the run. None: it ends after the last motion; without motions it runs until
+            it is stopped.
+        models: Models that were read from the servos of joints with `model: auto`, by joint.
+
+    Raises:
+        InputError: All problems of the robot file and the motions.
     """
     file = RobotFile(description)
     code = read_controller_files(file)
-    plugins = load_plugins(files=code)  # first, as they may bring the servo models of joints along
+    plugins = load_plugins(files=code)  # Load plug-ins first, because they may provide servo models.
     motors = read_motors(file)
     joints = compile_joints(file, models or {}, motors)
     _check_scheduler(file)
@@ -254,7 +266,7 @@ def _packages(features: Iterable[Feature]) -> dict[str, str]:
 
 
 def _physics(simulation: SimulationPlan, buses: Iterable[BusPlan]) -> dict[str, str]:
-    """Return the package that moves the bodies of simulated servos, with its distribution; {} without."""
+    """Return the package that simulates the bodies, with its distribution; empty without simulated servos."""
     if not any(bus.port == SIMULATED for bus in buses):
         return {}
     return {
@@ -265,7 +277,7 @@ def _physics(simulation: SimulationPlan, buses: Iterable[BusPlan]) -> dict[str, 
 
 
 def _check_scheduler(file: RobotFile) -> None:
-    """Check the scheduler's settings; whether this machine grants them is checked at the start."""
+    """Check the scheduler's settings; the start checks whether this machine grants them."""
     loop = file.robot.loop
     scheduler, timeout_ns = loop.scheduler, file.robot.policies.exit_timeout
     if 1e9 / loop.rate >= timeout_ns:
@@ -290,7 +302,7 @@ def _check_scheduler(file: RobotFile) -> None:
 
 
 def _scheduler_plan(loop: Loop) -> SchedulerPlan:
-    """Return the scheduler's settings as the loop's process reads them."""
+    """Return the scheduler's settings for the loop's process."""
     scheduler = loop.scheduler
     return SchedulerPlan(
         policy=scheduler.policy,
@@ -304,9 +316,9 @@ def _scheduler_plan(loop: Loop) -> SchedulerPlan:
 
 
 def _least_period_ns(loop: Loop, buses: Sequence[BusPlan]) -> int:
-    """Return the shortest period that the slowest bus allows, ns: the buses work at the same time.
+    """Return the shortest period that the slowest bus allows, ns; the buses work in parallel.
 
-    Never more than the file's own period, which was checked by the same budget.
+    Not more than the file's own period, which was checked against the same budget.
     """
     slowest = max((bus.budget.total_ns for bus in buses), default=0)
     return min(slowest, round(1e9 / loop.rate))

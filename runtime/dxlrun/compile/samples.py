@@ -1,6 +1,6 @@
-"""Samples: the points of one part of a motion, listed or computed by formulas of time.
+"""Samples: the points of one part of a motion, listed or computed from formulas of time.
 
-Formulas are evaluated by simpleeval within narrow bounds.
+simpleeval evaluates the formulas, within narrow bounds.
 """
 
 from __future__ import annotations
@@ -24,9 +24,9 @@ from dxlrun.errors import Mark
 
 Quantity = Literal["position", "velocity", "acceleration"]
 QUANTITIES: tuple[Quantity, ...] = ("position", "velocity", "acceleration")
-LONGEST_FORMULA = 1000  # Characters; bounds parsing and evaluation together with the list of operations
+LONGEST_FORMULA = 1000  # characters; bounds parsing and evaluation, together with the list of operations
 DEEPEST_FORMULA = 100
-"""Levels of operations; a sum of n terms has n. Keeps the evaluator away from Python's recursion limit."""
+"""Levels of operations; a sum of n terms has n. Keeps the evaluator below Python's recursion limit."""
 
 FUNCTIONS: Mapping[str, Callable[..., float]] = {
     "sin": math.sin,
@@ -51,7 +51,7 @@ _NODES = (ast.BinOp, ast.UnaryOp, ast.Constant, ast.Name, ast.Load, ast.Call)
 
 
 def _power(base: float, exponent: float) -> float:
-    # floats overflow at once, where integers would grow for minutes: 9**9**9
+    # Floats overflow at once; integers would grow for minutes: 9**9**9.
     return math.pow(base, exponent)
 
 
@@ -68,7 +68,7 @@ _OPERATORS: Mapping[type[ast.AST], Callable[..., float]] = {
 
 
 class SampledTarget(msgspec.Struct, frozen=True):
-    """Position, rad, velocity, rad/s, and acceleration, rad/s^2, of a joint; None = not given."""
+    """Position, rad, velocity, rad/s, and acceleration, rad/s^2, of a joint; None: not given."""
 
     position: float | None
     velocity: float | None
@@ -82,9 +82,9 @@ class SampledTarget(msgspec.Struct, frozen=True):
 
 
 class Sample(msgspec.Struct, frozen=True):
-    """The targets of one moment."""
+    """Targets of all joints at one time."""
 
-    t_ns: int  # Since the part's start
+    t_ns: int  # since the part's start
     targets: dict[str, SampledTarget]
     mark: Mark
 
@@ -125,7 +125,7 @@ def formula_texts(part: FormulaPart) -> tuple[str, ...]:
 def formula_samples(
     motion: MotionDescription, index: int, part: FormulaPart, problems: Problems
 ) -> tuple[Sample, ...]:
-    """Return the formulas' values at `samples` moments over `duration`, both ends included."""
+    """Return the values of the formulas at `samples` times over `duration`, both ends included."""
     count = part.samples
     times = [round(part.duration * i / max(1, count - 1)) for i in range(count)]
     columns: dict[str, dict[Quantity, list[float]]] = {}
@@ -161,7 +161,7 @@ def _text(formula: Formula, quantity: Quantity) -> str | None:
 
 
 def _values(mark: Mark, text: str, times: Sequence[int], problems: Problems) -> list[float] | None:
-    """Return a formula's values at the times; None when it is wrong."""
+    """Return the values of a formula at the times; None if it is invalid."""
     try:
         formula = Expression(text)
     except ValueError as error:
@@ -182,9 +182,10 @@ def _values(mark: Mark, text: str, times: Sequence[int], problems: Problems) -> 
 
 
 class Expression:
-    """An expression of `t`, s; knows pi, sin, cos, tan, sqrt, exp, abs and a few more, and nothing else.
+    """An expression of `t`, s, with pi, sin, cos, tan, sqrt, exp, abs and a few other functions.
 
-    Raises ValueError with one sentence when the text is not such an expression.
+    Raises:
+        ValueError: The text is not a valid expression; one sentence.
     """
 
     __slots__ = ("_evaluator", "_tree", "text")
@@ -195,7 +196,7 @@ class Expression:
         self._evaluator = SimpleEval(operators=dict(_OPERATORS), functions=dict(FUNCTIONS), names={})
 
     def at(self, t: float) -> float:
-        """Return the value at `t` s; raises ValueError with one sentence where there is none."""
+        """Return the value at `t` s; raise ValueError with one sentence if it is undefined."""
         self._evaluator.names = {"t": t, "pi": math.pi}
         try:
             value = float(self._evaluator.eval(self.text, previously_parsed=self._tree))

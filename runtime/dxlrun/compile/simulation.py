@@ -1,6 +1,6 @@
-"""Simulation: the `simulation` keys of the robot file, checked and put into the plan; what simulates a plan.
+"""Simulation: the `simulation` keys of the robot file, and the simulator's configuration for a plan.
 
-On a real port none of these keys is used, so one that could not be simulated is then a warning at most.
+A real port ignores these keys, so an impossible value is only a warning there.
 """
 
 from __future__ import annotations
@@ -78,12 +78,12 @@ def compile_simulation(
 
 
 def _motor(joint: CompiledJoint, motors: Motors) -> MotorDescription | None:
-    """Return the motor file of a joint's simulated servo, or of its first one."""
+    """Return the motor file of a joint's simulated servo, or of its first servo."""
     return motors.simulated(joint.servos[0].described.name)
 
 
 def _times(joint: CompiledJoint, motor: MotorDescription | None) -> ServoTimes:
-    """Return how slow a simulated servo is: the keys, or the delay of its motor file."""
+    """Return the delays of a simulated servo: from the keys, else from its motor file."""
     keys = joint.described.simulation
     known_ns = 0 if motor is None else motor.motor.delay_ns
     return ServoTimes(keys.response_delay or known_ns, keys.write_time)
@@ -95,13 +95,13 @@ def _adapter(bus: Bus) -> AdapterConfig:
 
 
 def _load(joint: CompiledJoint, motor: MotorDescription | None) -> Load:
-    """Return what simulated servos move: the keys, and where there is none that of the servo's motor file."""
+    """Return the load of simulated servos: from the keys, else from the servo's motor file."""
     keys = joint.described.simulation
     friction = float(keys.friction or 0.0)
     if joint.plan.unit is LINEAR:
         return Load(keys.mass or 0.0, friction, steady=float(keys.gravity or 0.0))
     known = MotorLoad() if motor is None or not joint.drive.own else motor.motor.load
-    ratio = joint.servos[0].described.ratio  # the file's load is felt at the horn
+    ratio = joint.servos[0].described.ratio  # the file's load is at the horn
     inertia = known.inertia / ratio**2 if keys.inertia is None else keys.inertia
     gravity = known.gravity / ratio if keys.gravity is None else float(keys.gravity)
     if not gravity:
@@ -145,7 +145,7 @@ def _check_load(file: RobotFile, name: str, joint: CompiledJoint, motor: MotorDe
 
 
 def _stall(joint: CompiledJoint) -> float:
-    """Return what all servos of a joint exert there at stall, Nm or N; 0: not known of one of them."""
+    """Return the stall torque of all servos of a joint at the joint, Nm or N; 0: not known."""
     torques = [servo.table.stall_torque / servo.described.ratio for servo in joint.servos]
     if not all(torques):
         return 0.0
@@ -181,14 +181,15 @@ def _check_physics(file: RobotFile) -> None:
         add(mark, NEEDS_MUJOCO, INSTALL_MUJOCO)
 
 
-# What simulates a plan
+# Simulation of a plan
 
 
 def simulation_of(plan: Plan) -> SimulationConfig:
-    """Return the simulated lines of a plan, each servo at its reference (q = 0), and what they move together.
+    """Return the simulated lines of a plan, with each servo at its reference (q = 0), and their loads.
 
-    Raises InputError when the robot file asks for bodies that cannot be moved: here, where the
-    user sees it, and not in the process of the simulated buses.
+    Raises:
+        InputError: The robot file requires bodies that cannot be simulated. This is raised here, where the
+            user sees it, and not in the process of the simulated buses.
     """
     bodies, physics = _bodies(plan), plan.simulation.physics != "independent"
     if physics and bodies is None:
@@ -200,28 +201,28 @@ def simulation_of(plan: Plan) -> SimulationConfig:
         sensed=bodies if any(one.link for one in plan.simulation.devices.values()) else None,
     )
     if physics:
-        from dxlsim.motion.mechanics import plant_of  # not above: no check needs it
+        from dxlsim.motion.mechanics import plant_of  # imported here, because no check needs it
 
         try:
             plant_of(config)
-        except ImportError as error:  # MuJoCo may be installed and yet not load
+        except ImportError as error:  # MuJoCo may be installed but fail to load
             raise InputError(f"{NEEDS_MUJOCO}; {INSTALL_MUJOCO}") from error
     return config
 
 
 def sensed_bodies(plan: Plan) -> UrdfBodies | None:
-    """Return the bodies that processes beside the loop sense, whatever moves them; None: none does."""
+    """Return the bodies that processes next to the loop sense, simulated or not; None: none are sensed."""
     sensed = any(one.process.has_body for one in planned_processes(plan.loop))
     return _bodies(plan) if sensed else None
 
 
 def _bodies(plan: Plan) -> UrdfBodies | None:
-    """Return the bodies of the robot's URDF, and how simulated servos move them; None: it has none."""
+    """Return the bodies of the robot's URDF, and the mechanisms that move them; None: no URDF."""
     return None if plan.urdf is None else UrdfBodies(plan.urdf, _mechanisms(plan))
 
 
 def _mechanisms(plan: Plan) -> tuple[Mechanism, ...]:
-    """Return what the simulated servos move, first those with a joint of their own."""
+    """Return the mechanisms of the simulated servos; servos with a joint of their own come first."""
     by_row = {servo.row: (index, servo) for index, servo in enumerate(_simulated_servos(plan))}
     found: list[Mechanism] = []
     for one in plan.mechanics.mechanisms(len(plan.loop.joints)):
@@ -229,7 +230,8 @@ def _mechanisms(plan: Plan) -> tuple[Mechanism, ...]:
         names = tuple(plan.loop.joints[row].name for row in one.joints)
         loads = tuple(plan.simulation.loads.get(name, NO_LOAD) for name in names)
         if len(servos) < len(one.servos):
-            # what a servo on a real port does cannot be simulated: the others move by themselves
+            # A servo on a real port cannot be simulated, so the other servos of the mechanism move
+            # independently.
             found += (_mechanism([each], (each[1].joint,)) for each in servos)
         else:
             found.append(_mechanism(servos, names, one.matrix, () if one.own else loads))
@@ -263,7 +265,7 @@ def _simulated_bus(plan: Plan, bus: BusPlan) -> BusConfig:
                 servo.model,
                 servo.reference,
                 bus.return_delay_ns,
-                # the load of what several servos move is that of their mechanism
+                # The load on several servos belongs to their mechanism.
                 load=_felt(servo, described.loads.get(servo.joint)) if servo.row in own else NO_LOAD,
                 times=described.times.get(servo.own_name, ServoTimes()),
                 motor=described.motors.get(servo.own_name),
@@ -281,7 +283,7 @@ def _simulated_bus(plan: Plan, bus: BusPlan) -> BusConfig:
 
 
 def _felt(servo: ServoPlan, load: Load | None) -> Load:
-    """Return a joint's load as its one servo feels it, through the ratio."""
+    """Return the load of a joint at its single servo, through the ratio."""
     if load is None:
         return NO_LOAD
     inertia, friction = load.inertia * servo.ratio**2, load.friction * servo.ratio

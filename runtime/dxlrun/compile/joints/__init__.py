@@ -1,4 +1,4 @@
-"""Compilation of joints: bus, model, limits, registers and motor of each.
+"""Compilation of joints: their buses, models, limits, registers and motors.
 
-What joints are used for (controllers, motions, policies) is compiled in the package above.
+The parent package compiles the users of joints: controllers, motions and policies.
 """

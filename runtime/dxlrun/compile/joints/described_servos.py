@@ -1,6 +1,7 @@
-"""Servos as the robot file has them: those of joints, with what a joint has for all, and of features.
+"""Servos in the notation of the robot file: those of joints, with the joints' shared keys, and those of
+features.
 
-The file's servos decide which features it uses, as a key may be that of a servo.
+The servos of a file also decide which features it uses, because a feature's key can be a servo's key.
 """
 
 from __future__ import annotations
@@ -19,36 +20,36 @@ from dxlrun.features import installed_features, stages
 from dxlrun.features.feature import Feature, JointKey, PolicyKey, Section, ServoKey, Stage
 from dxlwire.joint_unit import JointUnit
 
-AUTO = "auto"  # In place of a model: it is read from the servo
+AUTO = "auto"  # in place of a model, which is then read from the servo
 
 
 class DescribedServo(msgspec.Struct, frozen=True):
-    """One servo as the robot file has it, with what its joint has for it."""
+    """One servo of the robot file, with the shared keys of its joint."""
 
-    title: str  # What it moves, as sentences name it: `head`, `hip`, `wrist/left`
-    name: str  # Its own: `head`, `hip/1`, `wrist/left`
-    joints: tuple[str, ...]  # The joints that it moves
-    place: KeyPath  # Of its keys in the file
-    defaults: KeyPath  # Where what it does not have itself is; the same place for the only servo of a joint
+    title: str  # name of its load in messages: `head`, `hip`, `wrist/left`
+    name: str  # its own name: `head`, `hip/1`, `wrist/left`
+    joints: tuple[str, ...]  # joints that it moves
+    place: KeyPath  # path of its keys in the file
+    defaults: KeyPath  # path of its default keys; equal to `place` for the only servo of a joint
     bus: str
     id: int
     model: str
     reference: float  # rad from the servo's raw 0
     direction: int
-    ratio: float  # What it moves while it turns by 1 rad: rad or m
-    unit: JointUnit  # Of the positions of what it moves
+    ratio: float  # travel of its load per rad of the servo: rad or m
+    unit: JointUnit  # unit of its load's positions
     continuous: bool
     torque: bool
-    keys: Mapping[str, object]  # Of features; `ServoKey.of` returns one with its type
+    keys: Mapping[str, object]  # keys of features; `ServoKey.of` returns one with its type
     motor: str | None
 
     @property
     def servo(self) -> str:
-        """ID and bus, as sentences name it."""
+        """ID and bus, for messages."""
         return f"ID {self.id} on bus {self.bus}"
 
     def mark(self, marks: Marks, *path: str | int) -> Mark:
-        """Return the place of one of its values, which may be its joint's."""
+        """Return the place of one of its values, which may be in its joint."""
         own = (*self.place, *path)
         return (
             marks.value(*own) if marks.has(own[: len(self.place) + 1]) else marks.value(*self.defaults, *path)
@@ -57,7 +58,7 @@ class DescribedServo(msgspec.Struct, frozen=True):
 
 @dataclass(frozen=True)
 class ServoStage:
-    """`STAGE` of `servos.py`: called for the servos that a feature's section has, before models are known."""
+    """`STAGE` of `servos.py`: called for the servos in a feature's section, before their models are known."""
 
     FILE: ClassVar[str] = "servos"
 
@@ -76,7 +77,7 @@ def described_servos(description: Description) -> list[DescribedServo]:
 
 
 def used_features(description: Description) -> tuple[Feature, ...]:
-    """Return our features, and those of plug-ins whose sections or keys the file has."""
+    """Return the built-in features, and those of plug-ins whose sections or keys are in the file."""
     robot, marks = description.robot, description.marks
     servos = described_servos(description)
     parents: dict[type[Stage], list[KeyPath]] = {
@@ -94,12 +95,12 @@ def used_features(description: Description) -> tuple[Feature, ...]:
 
 
 def find_unknown_servos(description: Description) -> frozenset[str]:
-    """Return the names of the servos with `model: auto`, whose models are read from them."""
+    """Return the names of the servos with `model: auto`, whose models must be read."""
     return frozenset(servo.name for servo in described_servos(description) if servo.model == AUTO)
 
 
 def first_joints(description: Description) -> dict[str, str]:
-    """Return the joint that each servo moves, or the first one, by the name of the servo."""
+    """Return the first joint that each servo moves, by the name of the servo."""
     return {servo.name: servo.joints[0] for servo in described_servos(description)}
 
 

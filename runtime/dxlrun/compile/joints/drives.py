@@ -1,4 +1,4 @@
-"""Drives: how the servos of each joint move it, in figures at the joint, as features compile them."""
+"""Drives: relation between a joint and its servos, in figures at the joint; features compile them."""
 
 from __future__ import annotations
 
@@ -15,30 +15,30 @@ from dxlwire.modes import Mode
 
 
 class JointDrive(msgspec.Struct, frozen=True):
-    """How its servos move a joint; positions and speeds in rad, or m of a linear joint."""
+    """Drive of a joint by its servos; positions and speeds in rad, or m for a linear joint."""
 
     servos: tuple[CompiledServo, ...]
     together: tuple[str, ...]
-    """The joints that these servos move, itself among them"""
+    """Joints that these servos move, including this one."""
     levers: tuple[float, ...]
-    """Travel of each servo, after its gear, while the joint moves by 1 and the others of `together` rest"""
+    """Travel of each servo, after its gear, per unit of the joint; the other joints of `together` rest."""
     reach: Interval
-    """Positions that the servos reach, with the others of `together` where it is widest"""
+    """Positions that the servos reach, with the other joints of `together` where the range is widest."""
     allowed: Interval | None
-    """Positions that the gate allows; None: a mistake in the file, which was reported"""
+    """Positions that the gate allows; None: a mistake in the file, which has been reported."""
     modes: tuple[Mode, ...]
     top_speed: float | None
-    """Highest speed while the others of `together` rest; None: not known"""
+    """Highest speed while the other joints of `together` rest; None: not known."""
     shared_speed: float | None
-    """Highest speed while all of `together` move as fast; None: not known"""
+    """Highest speed while all joints of `together` move equally fast; None: not known."""
     top_effort: float | None
-    """Highest effort while the others of `together` have none; None: a servo follows no effort"""
+    """Highest effort while the other joints of `together` have none; None: a servo has no effort goal."""
     excluded: Mapping[Mode, str] = {}
-    """Modes of the servos in which they do not move the joint, each with the reason"""
+    """Modes of the servos that do not move the joint, each with the reason."""
 
     @property
     def own(self) -> bool:
-        """True when the joint has one servo, which the file describes with the keys of the joint."""
+        """True if the joint has one servo, described by the keys of the joint."""
         return self.servos[0].described.name in self.together
 
 
@@ -46,8 +46,8 @@ class JointDrive(msgspec.Struct, frozen=True):
 class DriveStage:
     """`STAGE` of `drives.py`: called when the models of all servos are known, before joints are compiled.
 
-    Takes the servos by name and returns the drive of each joint that they move. A joint without a drive has a
-    mistake, which the stage adds to the file.
+    Receives the servos by name and returns the drive of each joint that they move. A joint without a drive
+    has a mistake, which the stage adds to the file.
     """
 
     FILE: ClassVar[str] = "drives"

@@ -35,12 +35,12 @@ _EXAMPLES: Mapping[str, str] = {
     "1": "40 %",
 }
 MOST_STARTING_S = 10.0
-"""A joint that needs longer to its highest speed, and to stop from it, is one with a mistaken unit. [i]"""
-_SAME = math.radians(1.0)  # References nearer than this are taken as equal: a horn has teeth, a trim has not
+"""Longest plausible time from rest to the highest speed; above it the limit has a wrong unit. [i]"""
+_SAME = math.radians(1.0)  # references closer than this are equal: a horn has teeth, a trim does not
 
 
 _BY_ERROR = (("position",), ("position", "velocity"))
-"""Claims of controllers whose servos get nothing but where to go."""
+"""Claims of controllers that send only positions, so the servo's position error alone holds a load."""
 _I_GAIN = "position_i_gain"
 
 
@@ -53,12 +53,12 @@ class CompiledJoint(msgspec.Struct, frozen=True):
 
     @property
     def servos(self) -> tuple[CompiledServo, ...]:
-        """The servos that move it."""
+        """Servos that move the joint."""
         return self.drive.servos
 
     @property
     def table(self) -> ControlTable:
-        """Of its first servo."""
+        """Control table of its first servo."""
         return self.servos[0].table
 
     @property
@@ -68,14 +68,17 @@ class CompiledJoint(msgspec.Struct, frozen=True):
 
     @property
     def modes(self) -> tuple[Mode, ...]:
-        """The modes in which it can be."""
+        """Possible modes of the joint."""
         return self.drive.modes
 
 
 def compile_joints(file: RobotFile, models: Mapping[str, str], motors: Motors) -> dict[str, CompiledJoint]:
     """Return the joints that could be compiled, by name, in the order of the file.
 
-    `models`: those that were read from the servos of joints with `model: auto`, by joint.
+    Args:
+        file: Robot file; collects the problems.
+        models: Models that were read from the servos of joints with `model: auto`, by joint.
+        motors: Motor files.
     """
     servos = compile_servos(file, models, motors)
     drives: dict[str, JointDrive] = {}
@@ -97,7 +100,8 @@ def compile_joints(file: RobotFile, models: Mapping[str, str], motors: Motors) -
 
 
 def moving_servos(joints: Iterable[CompiledJoint]) -> tuple[CompiledServo, ...]:
-    """Return the servos of joints, each once, in the order of the joints: that of their arrays' rows."""
+    """Return the servos of joints, each once, in the order of the joints, which is the order of the arrays'
+    rows."""
     return tuple({servo.described.name: servo for joint in joints for servo in joint.servos}.values())
 
 
@@ -112,7 +116,8 @@ def _joint_plan(
         name,
         allowed.lower,
         allowed.upper,
-        # the servo cannot go faster: a goal that does not run ahead of it is one that can be stopped
+        # Without a limit use the servo's speed: a goal that runs ahead of its servo could not be stopped in
+        # time.
         plain(joint.limits.velocity) or drive.shared_speed,
         effort,
         joint.continuous,
@@ -134,12 +139,12 @@ def _joint_plan(
 
 
 def _limited(tolerance: float | None) -> float | None:
-    """Return a tolerance as plans have it: JSON has no infinity."""
+    """Return a tolerance for a plan: JSON has no infinity."""
     return None if tolerance is None else min(float(tolerance), UNLIMITED)
 
 
 def _servo_label(servos: Sequence[CompiledServo]) -> str:
-    """Return IDs and bus of a joint's servos, for sentences: `ID 1 and 2 on bus main`."""
+    """Return IDs and bus of a joint's servos, for messages: `ID 1 and 2 on bus main`."""
     described = [servo.described for servo in servos]
     if len({one.bus for one in described}) == 1:
         return f"ID {' and '.join(str(one.id) for one in described)} on bus {described[0].bus}"
@@ -147,10 +152,14 @@ def _servo_label(servos: Sequence[CompiledServo]) -> str:
 
 
 def _at_joint(servo: CompiledServo, levers: Sequence[float]) -> MotorModel | None:
-    """Return one motor in place of those of a joint's servos, which are equal, as the joint counts.
+    """Return one motor at the joint that is equivalent to the equal motors of its servos.
 
-    `levers`: by how much each servo moves, behind its gear, while the joint moves by 1. A gear multiplies
-    torque and back-EMF, servos side by side divide the resistance. The load is the joint's already.
+    A gear multiplies torque and back-EMF; servos in parallel divide the resistance. The load is already that
+    of the joint.
+
+    Args:
+        servo: One of the servos.
+        levers: Travel of each servo, after its gear, per unit of the joint.
     """
     motor, ratio = servo.motor, servo.described.ratio
     lever = max(map(abs, levers))
@@ -169,7 +178,7 @@ def _at_joint(servo: CompiledServo, levers: Sequence[float]) -> MotorModel | Non
         stribeck=stribeck
         and replace(stribeck, friction=stribeck.friction * count * turns, velocity=stribeck.velocity / turns),
         position_gain=None if gain is None else gain * turns,
-        # efforts of coupled servos are added up with their levers; those in A or % do not grow by the gear
+        # Efforts of coupled servos add up with their levers; those in A or % do not grow with the gear.
         torque_per_effort=effort if effort is None or servo.table.effort_unit == "Nm" else effort / ratio,
     )
 
@@ -192,10 +201,10 @@ def check_limp_joints(file: RobotFile, controllers: Iterable[ControllerPlan]) ->
 def check_tolerances(
     file: RobotFile, joints: Mapping[str, CompiledJoint], controllers: Iterable[ControllerPlan]
 ) -> None:
-    """Warn of joints that a weight keeps beyond their tolerance, where their motor's model says so.
+    """Warn of joints that a weight moves beyond their tolerance, according to the model of their motor.
 
-    A servo in position control holds a weight by its error alone, unless a controller adds what holds it or
-    its I gain is not 0.
+    In position control only the position error holds a weight, unless the I gain is not 0 or a controller
+    adds an effort.
     """
     plans = [plan for plan in controllers if plan.commands_servos]
     by_error = {name for plan in plans if plan.command in _BY_ERROR for name in plan.joints}
@@ -216,8 +225,10 @@ def check_tolerances(
 
 
 def _static_error(joint: CompiledJoint) -> float | None:
-    """Return the error by which a servo holds its weight at the worst pose within the limits, rad; None: the
-    model of its motor, or the weight, is not known; infinite: it cannot hold it."""
+    """Return the position error that holds the weight at the worst pose within the limits, rad.
+
+    None: the motor's model or the weight is not known. Infinite: the servo cannot hold the weight.
+    """
     plan, given = joint.plan, joint.described.simulation
     motor = plan.motor
     if motor is None or not motor.stiffness:
@@ -225,7 +236,7 @@ def _static_error(joint: CompiledJoint) -> float | None:
     gravity, hangs_at = motor.load.gravity, motor.load.gravity_angle
     if given.gravity is not None:
         gravity, hangs_at = float(given.gravity), given.gravity_angle or 0.0
-    # the weight pulls most where it sticks out horizontally, or at the limit that is nearest to that
+    # The weight pulls most where it sticks out horizontally, or at the limit nearest to that.
     first = math.ceil((plan.lower - hangs_at - math.pi / 2) / math.pi)
     sticks_out = first * math.pi + math.pi / 2 + hangs_at <= plan.upper
     ends = max(abs(math.sin(end - hangs_at)) for end in (plan.lower, plan.upper))
@@ -236,7 +247,7 @@ def _static_error(joint: CompiledJoint) -> float | None:
 
 
 def _effort(file: RobotFile, name: str, joint: JointEntry, servo: CompiledServo) -> float | None:
-    """Return the limit of the effort in the unit in which the joint has it."""
+    """Return the effort limit in the joint's unit; None without a limit."""
     if joint.limits.effort is None:
         return None
     value, unit = float(joint.limits.effort), joint.limits.effort.unit
@@ -253,7 +264,7 @@ def _effort(file: RobotFile, name: str, joint: JointEntry, servo: CompiledServo)
 
 
 def _check_acceleration(file: RobotFile, plan: JointPlan) -> None:
-    """Compare an acceleration limit with the highest speed of its joint, and with the cycle."""
+    """Check an acceleration limit against the highest speed of its joint, and against the cycle."""
     speed, acceleration, rate = plan.highest_speed, plan.acceleration, file.robot.loop.rate
     if acceleration is None or not math.isfinite(speed):
         return
@@ -280,8 +291,8 @@ def _check_acceleration(file: RobotFile, plan: JointPlan) -> None:
 def check_twins(file: RobotFile, tables: dict[str, ControlTable]) -> None:
     """Warn of each pair of joints that are not mirror images of each other.
 
-    Mirrored, the right servo counts from the other end and turns the other way:
-    reference_right = lowest + highest angle of the servo - reference_left, direction_right = -direction_left.
+    In a mirror image the right servo counts from the other end and turns the other way: reference_right =
+    lowest + highest angle of the servo - reference_left, direction_right = -direction_left.
     """
     joints = file.robot.joints
     for name, left in joints.items():

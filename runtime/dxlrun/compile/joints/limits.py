@@ -1,4 +1,4 @@
-"""Limits of joints: intervals of positions, and what motions and commands ask of a joint beyond them."""
+"""Limits of joints: intervals of positions, and checks of motions and commands against them."""
 
 from __future__ import annotations
 
@@ -16,35 +16,35 @@ from dxlrun.plan.loop_plan import JointPlan, LimitedInterface
 from dxlwire.joint_unit import ROTARY, JointUnit
 
 if TYPE_CHECKING:
-    from dxlrun.compile.samples import Sample  # not at run time: formulas are parsed for motions alone
+    from dxlrun.compile.samples import Sample  # not at run time: only motions need the parser of formulas
 
 _TOLERANCE = 1e-6  # rad; far below a tick (5e-3 rad on an AX-12), far above the rounding of degrees
 
 
-_ROUNDING = 1e-9  # Part of a speed that differences of positions and times may be off
-_MOST_LONGER = 1000  # Times as long; more is a mistake in a number, not in a time
+_ROUNDING = 1e-9  # relative rounding error of speeds from differences of positions and times
+_MOST_LONGER = 1000  # largest suggested extension of the time; beyond it a number is wrong
 PEAK_OVER_MEAN = 15 / 8
-"""Highest speed of a quintic from rest to rest over its mean speed; that of a cubic is lower."""
+"""Ratio of the highest to the mean speed of a quintic from rest to rest; a cubic has a lower one."""
 
 
 class Interval(msgspec.Struct, frozen=True):
-    """Closed interval of joint positions, rad, or m of a linear joint."""
+    """Closed interval of joint positions, rad, or m for a linear joint."""
 
     lower: float
     upper: float
     unit: JointUnit = ROTARY
 
     def contains(self, other: Interval) -> bool:
-        """Return whether `other` lies inside, but for rounding."""
+        """Return True if `other` is inside this interval, up to rounding."""
         return other.lower >= self.lower - _TOLERANCE and other.upper <= self.upper + _TOLERANCE
 
     def meet(self, other: Interval) -> Interval | None:
-        """Return what both have in common; None when that is not more than a point."""
+        """Return the intersection; None if it is not more than a point."""
         lower, upper = max(self.lower, other.lower), min(self.upper, other.upper)
         return Interval(lower, upper, self.unit) if lower < upper else None
 
     def scaled(self, ratio: float, unit: JointUnit) -> Interval:
-        """Return the interval of what moves by `ratio` while this moves by 1."""
+        """Return the interval of a part that moves by `ratio` per unit of this one."""
         lower, upper = sorted((self.lower * ratio, self.upper * ratio))
         return Interval(lower, upper, unit)
 
@@ -58,12 +58,12 @@ class Interval(msgspec.Struct, frozen=True):
 
 
 def limits_of(joint: JointPlan) -> Interval:
-    """Return where the gate lets a joint go."""
+    """Return the position limits that the gate enforces for a joint."""
     return Interval(joint.lower, joint.upper, joint.unit)
 
 
 def degrees(angle: float) -> str:
-    """Write an angle of `angle` rad in degrees, with as many digits as it needs, at most two."""
+    """Format an angle in rad as degrees, with at most two decimals."""
     return ROTARY.number(angle)
 
 
@@ -74,10 +74,10 @@ def check_samples(
     problems: Problems,
     peaks: Iterable[SpeedPeak] = (),
 ) -> None:
-    """Check the targets of joints against their limits: once for each joint, with the worst of them.
+    """Check the targets of joints against their limits, and report the worst target of each joint.
 
-    Warn of positions beyond the limits, and of speeds beyond the file's; refuse speeds above the top speed of
-    a servo. The speeds are the targets' and the `peaks` of the way between them.
+    Positions beyond the limits and speeds beyond the file's limit are warnings. Speeds above the servo's top
+    speed are errors. The speeds are those of the targets and the `peaks` between them.
     """
     farthest, fastest = _worst(samples, joints, peaks)
     for joint, (_, sample, position) in farthest.items():
@@ -93,9 +93,9 @@ def check_samples(
 
 
 def report_speed(joint: JointPlan, speed: float, where: str, mark: Mark, problems: Problems) -> None:
-    """Report a speed of a file that its joint cannot reach: an error, or a warning where the servo can.
+    """Report a speed of a file that its joint cannot reach: an error, or a warning if the servo can reach it.
 
-    There the gate holds the joint at the limit of the file, and its goal is late or missed.
+    In the second case the gate limits the speed, and the joint reaches its goal late or not at all.
     """
     excess = excess_speed(joint, speed, where)
     if excess is None:
@@ -108,18 +108,18 @@ def report_speed(joint: JointPlan, speed: float, where: str, mark: Mark, problem
 
 
 class ExcessSpeed(NamedTuple):
-    """A speed above the limit of a joint, and what to do about it."""
+    """A speed above the limit of a joint, with the fix."""
 
     text: str
     fix: str
     beyond_servo: bool
-    """True: above the top speed of its servo"""
+    """True: above the top speed of the servo."""
 
 
 def excess_speed(joint: JointPlan, speed: float, where: str) -> ExcessSpeed | None:
-    """Compare a speed, rad/s or m/s, with the highest one of a joint; None: the joint can reach it.
+    """Compare a speed, rad/s or m/s, with the highest speed of a joint; None: the joint can reach it.
 
-    Every speed that a file or a client asks for is compared here.
+    All speeds in files and in clients' requests are compared here.
     """
     most, top = joint.highest_speed, joint.top_speed
     if abs(speed) <= most * (1 + _ROUNDING):
@@ -140,7 +140,7 @@ def excess_speed(joint: JointPlan, speed: float, where: str) -> ExcessSpeed | No
 def _worst(
     samples: Sequence[Sample], joints: Mapping[str, JointPlan], peaks: Iterable[SpeedPeak]
 ) -> tuple[dict[str, tuple[float, Sample, float]], dict[str, tuple[float, int, Mark]]]:
-    """Return by joint the position that is farthest beyond its limits, and the highest speed, with places."""
+    """Return, by joint, the position farthest beyond the limits and the highest speed, with their places."""
     farthest: dict[str, tuple[float, Sample, float]] = {}
     fastest: dict[str, tuple[float, int, Mark]] = {}
 
@@ -180,10 +180,14 @@ def beyond_limits(
 ) -> list[BeyondLimit]:
     """Return each value of a command that its joint cannot follow.
 
-    `joints`: those of the controller, in its order. Positions (rad) are compared with the position limits,
-    velocities (rad/s), the `peaks` of the way and efforts with the lower one of the file's limit and the
-    servo's own. Of a command that names its `joints`, the values are theirs. A field that has not one number
-    a joint is for the controller's `prepare` to judge.
+    Positions (rad) are compared with the position limits. Velocities (rad/s), the `peaks` and efforts are
+    compared with the lower one of the file's limit and the servo's own. In a command that names its `joints`,
+    the values belong to these. A field without one number per joint is left to the controller's `prepare`.
+
+    Args:
+        joints: Joints of the controller, in its order.
+        command: The command.
+        peaks: Highest speeds between its points.
     """
     values = command.model_dump()
     known = {joint.name: joint for joint in joints}
@@ -231,13 +235,13 @@ def _beyond(joints: Sequence[JointPlan], values: Mapping[str, object], where: st
 
 
 def _register_limit(joint: JointPlan, interface: LimitedInterface) -> str:
-    """Return the register of a joint's servo that is its limit, as sentences name it; empty: none is."""
+    """Return the register that limits a joint's servo, for messages; empty: no register does."""
     own = joint.find_servo_limit(interface)
     return "" if own is None else f"{own.text}, a register of its servo"
 
 
 def _row(joints: Sequence[JointPlan], values: Mapping[str, object], name: str) -> Sequence[float]:
-    """Return a field with one number a joint, else nothing."""
+    """Return a field with one number per joint; otherwise an empty sequence."""
     row = values.get(name)
     if not isinstance(row, list | tuple) or len(row) != len(joints):
         return ()

@@ -1,4 +1,4 @@
-"""Motors: the motor files that joints name, read and compared with the joints' models and registers."""
+"""Motors: the motor files of joints, read and compared with the joints' models and registers."""
 
 from __future__ import annotations
 
@@ -19,26 +19,26 @@ if TYPE_CHECKING:
     from dxlrun.description.joints.motor_file import MotorDescription
 
 P_GAINS = ("p_gain", "position_p_gain")
-"""Names of the P gain of position control: Protocol 1.0 and the XL-320, and all others."""
+"""Names of the P gain of position control: in Protocol 1.0 and the XL-320, and in all other models."""
 
 
 class Motors(msgspec.Struct, frozen=True):
-    """The motor files of a robot that could be read."""
+    """The readable motor files of a robot."""
 
-    servos: Mapping[str, MotorDescription] = {}  # By the servo that it describes
-    simulations: Mapping[str, MotorDescription] = {}  # By the servo that is to be simulated as another one
+    servos: Mapping[str, MotorDescription] = {}  # by the servo that the file describes
+    simulations: Mapping[str, MotorDescription] = {}  # by the servo that is simulated with another motor
 
     def of_servo(self, name: str) -> MotorDescription | None:
         """Return the file that describes a servo, by the servo's own name."""
         return self.servos.get(name)
 
     def simulated(self, name: str) -> MotorDescription | None:
-        """Return the file that describes a simulated servo, by the servo's own name."""
+        """Return the file for the simulation of a servo, by the servo's own name."""
         return self.simulations.get(name) or self.servos.get(name)
 
     @property
     def texts(self) -> dict[str, str]:
-        """The files' texts, by path."""
+        """Texts of the files, by path."""
         return {str(each.path): each.text for each in (*self.servos.values(), *self.simulations.values())}
 
 
@@ -70,7 +70,8 @@ def read_motors(file: RobotFile) -> Motors:
 
 
 def _read(path: Path, written: str, mark: Mark, problems: Problems) -> MotorDescription | None:
-    from dxlrun.description.joints.motor_file import read_motor  # not above: most robots name none
+    # imported here, because most robots have no motor file
+    from dxlrun.description.joints.motor_file import read_motor
 
     if not path.exists():
         problems.error(
@@ -93,7 +94,7 @@ def compile_motor(
     declared: Mapping[str, int],
     found: MotorDescription | None,
 ) -> MotorModel | None:
-    """Return a servo's motor, with the P gain that it will have."""
+    """Return a servo's motor model, with the P gain that the servo will have."""
     if found is None:
         return None
     name, mark = servo.title, servo.mark(file.marks, "motor")

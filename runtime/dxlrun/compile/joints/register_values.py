@@ -1,4 +1,5 @@
-"""Values of registers: items that a robot file, a client or a tool may write, and those of dxlrun alone."""
+"""Values of registers: the items that a robot file, a client or a tool may write, and those reserved for
+dxlrun."""
 
 from __future__ import annotations
 
@@ -48,14 +49,14 @@ _OWN: Mapping[str, tuple[str, str]] = MappingProxyType(
         "electronic_gearratio_denominator": _TICK,
     }
 )
-"""Items that dxlrun writes itself or relies on: why, and what to do instead."""
+"""Items that dxlrun writes itself or relies on, with the reason and the fix."""
 _RESTORED = ("profile_velocity", "torque_limit")
-"""Items that a start writes, but not on all models; on the others they are reported."""
+"""Items that start-up writes on some models only; on the other models they are reported."""
 _ANGLE_LIMITS = ("cw_angle_limit", "ccw_angle_limit")
 
 
 class UnfitRegister(ValueError):
-    """A register that may not be written so: `what` is wrong, and how to `fix` it."""
+    """A register value that may not be written: `what` is the problem, `fix` the remedy."""
 
     def __init__(self, what: str, fix: str) -> None:
         super().__init__(f"{what}; {fix}")
@@ -64,10 +65,16 @@ class UnfitRegister(ValueError):
 
 
 def register_value(table: ControlTable, name: str, value: int | str) -> RegisterValue:
-    """Return what is written for a declared register; raises UnfitRegister.
+    """Return the value to write for a declared register.
 
-    `value` is the integer on the wire, signed where the item is, or text with a unit of the item's kind; that
-    becomes the nearest tick.
+    Args:
+        table: Control table of the servo.
+        name: Name of the item.
+        value: Integer on the wire, signed if the item is; or text with a unit of the item's kind, rounded to
+            the nearest tick.
+
+    Raises:
+        UnfitRegister: The register or the value cannot be declared.
     """
     item = table.items.get(name)
     if item is None:
@@ -80,9 +87,9 @@ def register_value(table: ControlTable, name: str, value: int | str) -> Register
 
 
 def any_value(table: Table, name: str, value: int | str) -> RegisterValue:
-    """Return what a tool writes into any item that can be written; raises UnfitRegister.
+    """Return the value that a tool writes into any writable item; raise UnfitRegister.
 
-    `value` is what `register_value` takes.
+    `value` is as in `register_value`.
     """
     item = table.items.get(name)
     if item is None:
@@ -100,7 +107,7 @@ def any_value(table: Table, name: str, value: int | str) -> RegisterValue:
 
 
 def steered_value(table: ControlTable, name: str, value: int | str) -> RegisterValue:
-    """Return what is written for a register that a client changes in the run; raises UnfitRegister."""
+    """Return the value to write for a register that a client changes in a run; raise UnfitRegister."""
     item = table.items.get(name)
     if item is not None and item.access == "R":
         raise UnfitRegister(f"{item.title} can only be read", "write another item")
@@ -121,13 +128,13 @@ def steered_value(table: ControlTable, name: str, value: int | str) -> RegisterV
 
 
 def declarable(table: ControlTable) -> tuple[str, ...]:
-    """Return the items of a model that may be declared, in the order of their addresses."""
+    """Return the items of a model that can be declared, in the order of their addresses."""
     items = table.items.values()
     return tuple(item.name for item in items if item.access == "RW" and not own_reason(table, item))
 
 
 def own_reason(table: ControlTable, item: ControlItem) -> tuple[str, str] | None:
-    """Return why an item belongs to dxlrun and what to do instead; None where it does not."""
+    """Return the reason why an item is reserved for dxlrun, and the fix; None if it is not."""
     if item.name.startswith("indirect_"):
         return "a reboot resets it", "take it out"
     if item.name in _ANGLE_LIMITS and table.protocol == 1.0:
@@ -137,7 +144,7 @@ def own_reason(table: ControlTable, item: ControlItem) -> tuple[str, str] | None
         )
     rule = item.deviation
     if rule is not None and item.name in _RESTORED and rule.judgement == "report":
-        return None  # no start writes it on this model
+        return None  # start-up does not write it on this model
     return _OWN.get(item.name)
 
 
@@ -171,7 +178,7 @@ def _shown(value: int | str, raw: int) -> str:
 
 
 def _check_meaning(item: ControlItem, raw: int) -> None:
-    """Refuse values that a servo accepts but with which no run starts."""
+    """Refuse values that a servo accepts but that prevent every start."""
     rule, factory = item.deviation, item.initial
     if rule is None or rule.planned or factory is None or rule.judge(raw, factory) != "refuse":
         return

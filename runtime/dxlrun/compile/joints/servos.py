@@ -22,13 +22,15 @@ from dxlwire.bus_plan import BusPlan, RegisterValue
 from dxlwire.control_table import ControlTable, find_table, perhaps_meant, protocols_of
 from dxlwire.plan.mode_plan import mode_plans
 
-_USUAL = {1.0: "AX-12A", 2.0: "XM430-W350"}  # The model that is assumed where none is known, by protocol
+_USUAL = {1.0: "AX-12A", 2.0: "XM430-W350"}  # assumed model if none is known, by protocol
 MANY_TURNS = {1.0: 7, 2.0: 256}
 """Turns that a goal position can be away from raw 0, by protocol: Multi-turn Mode of MX (e-Manual MX-64, Goal
 Position (30): -28,672..28,672), Extended Position Control Mode (e-Manual XM430-W350, Goal Position (116):
--1,048,575..1,048,575)."""
+-1,048,575..1,048,575).
+"""
 _TEMPERATURE_LIMITS = ("motor_temperature_limit", "temperature_limit")
-"""The item of the Y series whose motor and inverter have one each, and that of all others."""
+"""Items with the temperature limit: that of the motor in the Y series, which also has one for the inverter,
+and that of all other models."""
 
 
 class CompiledServo(msgspec.Struct, frozen=True):
@@ -36,19 +38,19 @@ class CompiledServo(msgspec.Struct, frozen=True):
 
     described: DescribedServo
     table: ControlTable
-    settings: tuple[RegisterValue, ...]  # Of features, in the order in which they are written
+    settings: tuple[RegisterValue, ...]  # settings of features, in the order of writing
     motor: MotorModel | None
     known_bus: bool
-    certain: bool  # False while its model is still to be read, so that what does not fit it is no error yet
+    certain: bool  # False while its model is not read yet; its mistakes are not errors yet
 
     @property
     def declared(self) -> dict[str, int]:
-        """The integer on the wire that the robot file gives an item, by item."""
+        """Declared integers on the wire, by item."""
         return {setting.name: setting.value for setting in self.settings}
 
     @property
     def reach(self) -> Interval:
-        """Where its goal positions bring its joint, or its transmission's input, rad or m."""
+        """Positions of its joint, or of its transmission's input, that its goal positions reach, rad or m."""
         described = self.described
         if described.continuous:
             reach = many_turns(self.table.protocol, described.reference, described.direction)
@@ -58,12 +60,12 @@ class CompiledServo(msgspec.Struct, frozen=True):
 
     @property
     def top_speed(self) -> float:
-        """Its own highest speed as its joint counts, rad/s or m/s; 0: not known."""
+        """Highest speed of the servo in joint units, rad/s or m/s; 0: not known."""
         return self.table.top_speed * self.described.ratio
 
     @property
     def top_effort(self) -> float | None:
-        """The highest effort that it can be sent, as its joint counts; None where it follows none."""
+        """Highest effort goal of the servo in joint units; None if it has no effort goal."""
         table, continuous = self.table, self.described.continuous
         scales = [plan.effort for plan in mode_plans(table, table.min_tick, table.max_tick, continuous)]
         most = max((scale.per_tick * scale.most for scale in scales if scale is not None), default=None)
@@ -71,7 +73,7 @@ class CompiledServo(msgspec.Struct, frozen=True):
 
     @property
     def servo_model(self) -> ServoModel:
-        """What the manual says of it, as its joint counts."""
+        """Figures of the servo from its manual, in joint units."""
         table, ratio = self.table, self.described.ratio
         limit = next((table.items[name] for name in _TEMPERATURE_LIMITS if name in table.items), None)
         raw = None if limit is None else self.declared.get(limit.name, limit.initial)
@@ -89,24 +91,28 @@ class CompiledServo(msgspec.Struct, frozen=True):
 
 @dataclass(frozen=True)
 class SettingsStage:
-    """`STAGE` of `settings.py`: items of a control table that get a value before their servo gets torque.
+    """`STAGE` of `settings.py`: items of a control table that are written before their servo gets torque.
 
-    The plan of the servo has them. A start writes those that differ, and so does a return of the servo.
+    They are part of the servo's plan. Start-up writes those that differ, and so does the recovery of the
+    servo.
     """
 
     FILE: ClassVar[str] = "settings"
 
     compile: Callable[[RobotFile, DescribedServo, ControlTable], Iterable[RegisterValue]]
-    """Returns the values for one servo in the order in which they are written, EEPROM first. Where two
-    features give an item, the later one counts."""
+    """Returns the values for one servo in the order of writing, EEPROM first. If two features set an item,
+    the later feature takes precedence."""
     check: Callable[[RobotFile, BusPlan], None] = lambda file, plan: None
-    """Compares the values with the plan of a bus."""
+    """Checks the values against the plan of a bus."""
 
 
 def compile_servos(file: RobotFile, models: Mapping[str, str], motors: Motors) -> dict[str, CompiledServo]:
     """Return the servos whose model is known, by their names.
 
-    `models`: those that were read from the servos of joints with `model: auto`, by joint.
+    Args:
+        file: Robot file; collects the problems.
+        models: Models that were read from the servos of joints with `model: auto`, by joint.
+        motors: Motor files.
     """
     described, features = described_servos(file.description), used_features(file.description)
     _unique_ids(file, described)
@@ -121,8 +127,8 @@ def compile_servos(file: RobotFile, models: Mapping[str, str], motors: Motors) -
             continue
         if not servo.continuous:
             _check_reference(file, servo, table)
-        # the registers of a servo whose model is still to be read are unknown: those that fit the assumed
-        # model are kept, as a simulated servo has exactly these; what does not fit is no error yet
+        # The registers of a servo whose model is not read yet are unknown. Those that fit the assumed model
+        # are kept, because a simulated servo has exactly these; mistakes are not errors yet.
         certain = (servo.model != AUTO or servo.name in models) and (known_bus or _one_table(model))
         found = file if certain else RobotFile(file.description)
         settings = {
@@ -143,7 +149,7 @@ def _unique_ids(file: RobotFile, servos: list[DescribedServo]) -> None:
         owner = owners.setdefault((servo.bus, servo.id), servo.name)
         if owner != servo.name:
             other = next(one.title for one in servos if one.name == owner)
-            if other == servo.title:  # two of one joint, which has no other name for them
+            if other == servo.title:  # two servos of one joint, which share its name
                 other = f"servo {owner.rpartition('/')[2]} of the same joint"
             file.error(
                 servo.mark(file.marks, "id"),
@@ -165,7 +171,7 @@ class OnBus(Protocol):
 
 
 def check_bus(file: RobotFile, one: OnBus, name: str, at: Callable[[str], Mark], called: str) -> bool:
-    """Check bus and ID of an entry; return whether the bus is defined. `at`: places of keys."""
+    """Check bus and ID of an entry; return True if the bus is defined. `at` returns the places of keys."""
     bus = file.robot.buses.get(one.bus)
     if bus is None:
         what = f"{name} is on bus {one.bus}, which is not defined"
@@ -177,7 +183,7 @@ def check_bus(file: RobotFile, one: OnBus, name: str, at: Callable[[str], Mark],
 
 
 def _assumed_model(file: RobotFile, servo: DescribedServo, others: list[DescribedServo]) -> str:
-    """Return the model to assume until it is read: that of the neighbours, else the usual one."""
+    """Return the model to assume until it is read: that of another servo on the bus, else the usual one."""
     neighbours = [each.model for each in others if each.bus == servo.bus]
     known = [model for model in neighbours if model != AUTO]
     bus = file.robot.buses.get(servo.bus)
@@ -219,7 +225,7 @@ def _table(file: RobotFile, servo: DescribedServo, model: str) -> ControlTable |
 
 
 def _one_table(model: str) -> bool:
-    """Return whether a model has one protocol alone; MX servos have one name for two firmwares."""
+    """Return True if a model has a single protocol; MX servos have one name for two firmwares."""
     return len(protocols_of(model)) == 1
 
 
@@ -236,7 +242,7 @@ def _check_reference(file: RobotFile, servo: DescribedServo, table: ControlTable
 
 
 def many_turns(protocol: float, reference: float, direction: int) -> Interval:
-    """Return the reach of a servo that counts turns, rad: how far its goal positions go."""
+    """Return the reach of a servo that counts turns, rad: the range of its goal positions."""
     turns = 2 * math.pi * MANY_TURNS[protocol]
     middle = -direction * reference
     return Interval(middle - turns, middle + turns)
@@ -245,13 +251,14 @@ def many_turns(protocol: float, reference: float, direction: int) -> Interval:
 def servo_travel(table: ControlTable) -> Interval:
     """Return the angles that a servo's goal positions reach, rad from raw 0.
 
-    From 0 on in Protocol 1.0 and on X and MX, to both sides of 0 on P, PRO and Y (e-Manual, Goal Position).
+    From 0 upwards in Protocol 1.0 and on X and MX, to both sides of 0 on P, PRO and Y (e-Manual, Goal
+    Position).
     """
     return Interval(table.min_tick * table.rad_per_tick, table.max_tick * table.rad_per_tick)
 
 
 def joint_reach(travel: Interval, reference: float, direction: int) -> Interval:
-    """Return the reach of a servo that turns within `travel`, rad from raw 0, from its reference.
+    """Return the reach of a servo relative to its reference, from its `travel` in rad from raw 0.
 
     s = direction * (theta - reference), theta in `travel` (thesis of M. Amarante Araujo, 2017, JointID).
     """

@@ -1,7 +1,7 @@
-"""The robot's URDF against the joints of the robot file.
+"""The robot's URDF, checked against the joints of the robot file.
 
-The robot file alone says which joints there are and how far they go; the URDF shows the body, in the log and
-in frames, and gives the simulation its masses. So most of what differs is a warning.
+Joints and their limits come from the robot file alone. The URDF shows the body, in the log and in frames, and
+provides the simulation's masses. Most differences are therefore warnings.
 """
 
 from __future__ import annotations
@@ -21,7 +21,7 @@ from dxlsim.geometry.urdf import SLIDING, TURNING, Urdf, UrdfJoint, read_urdf
 from dxlwire.joint_unit import LINEAR, ROTARY, JointUnit
 
 TYPES: Mapping[JointUnit, tuple[str, ...]] = {ROTARY: TURNING, LINEAR: (SLIDING,)}
-"""Types of joints of a URDF whose positions have this unit."""
+"""Types of URDF joints whose positions have this unit."""
 _UNLIKE: Mapping[JointUnit, tuple[str, str, str]] = {
     ROTARY: (
         "slides",
@@ -30,7 +30,8 @@ _UNLIKE: Mapping[JointUnit, tuple[str, str, str]] = {
     ),
     LINEAR: ("turns", "lengths", "make it prismatic there"),
 }
-"""Of a joint with this unit that the URDF moves in the other way: what it does there, positions, and fix."""
+"""For joints with this unit and a URDF joint of the other kind: its motion in the URDF, the unit of
+positions, the fix."""
 
 
 class CompiledUrdf(msgspec.Struct, frozen=True):
@@ -38,11 +39,11 @@ class CompiledUrdf(msgspec.Struct, frozen=True):
 
     text: str
     urdf: Urdf
-    moved: tuple[str, ...]  # Joints of the robot file that move a joint of the URDF
+    moved: tuple[str, ...]  # joints of the robot file that move a joint of the URDF
 
 
 def compile_urdf(file: RobotFile, joints: Mapping[str, CompiledJoint]) -> CompiledUrdf | None:
-    """Return the robot's URDF; None when the file names none, or it cannot be read."""
+    """Return the robot's URDF; None if the file names none, or it cannot be read."""
     model = file.robot.model
     if model is None:
         return None
@@ -73,9 +74,12 @@ def compile_urdf(file: RobotFile, joints: Mapping[str, CompiledJoint]) -> Compil
 def compile_frames(
     file: RobotFile, body: CompiledUrdf | None, states: Mapping[str, Collection[str]]
 ) -> FramesPlan | None:
-    """Return what moves the robot's frames, and how they are logged; None: it has no URDF.
+    """Return the plan for the robot's frames and their log; None without a URDF.
 
-    `states`: names of the states of devices, sensors and controllers, by their names.
+    Args:
+        file: Robot file; collects the problems.
+        body: The robot's URDF.
+        states: Names of the states of devices, sensors and controllers, by source.
     """
     model = file.robot.model
     if model is None or body is None:
@@ -109,7 +113,7 @@ def compile_frames(
 
 
 def _alike(joint: CompiledJoint, drawn: UrdfJoint) -> bool:
-    """Return whether a position of a joint is one of the joint in the URDF: an angle, or a length."""
+    """Return True if joint and URDF joint have positions of the same kind: angles, or lengths."""
     return drawn.type in TYPES[joint.plan.unit]
 
 
@@ -145,7 +149,7 @@ def _check_names(
 
 
 def _check_limits(file: RobotFile, joint: CompiledJoint, drawn: UrdfJoint) -> None:
-    """Compare limits, rad and rad/s, or m and m/s of a linear joint."""
+    """Compare limits, rad and rad/s, or m and m/s for a linear joint."""
     if not _alike(joint, drawn):
         return
     name, marks = joint.plan.name, file.marks
