@@ -1,4 +1,4 @@
 """Log: topics and messages, the recorder's process, the writer, the reader.
 
-What a log means belongs in `dxlrun_analysis`.
+The interpretation of a log belongs in `dxlrun_analysis`.
 """

@@ -1,4 +1,4 @@
-"""Packets of a log as columns: one numpy array a field, and the bytes of all of them one behind the other."""
+"""Columns: packets of a log as one NumPy array per field, and one array with the bytes of all packets."""
 
 from __future__ import annotations
 
@@ -16,30 +16,30 @@ from dxlwire.packets import PacketKind
 
 @dataclass(frozen=True, slots=True, eq=False)
 class PacketColumns(Sequence[LoggedPacket]):
-    """Packets, one row each; as a sequence, the packets one by one. Times: ns of the run's clock."""
+    """Packets, one row each; as a sequence, single packets. Times are ns of the run's clock."""
 
     cycle: NDArray[np.int64]
-    """Number of the cycle in whose period it was; BEFORE_FIRST_CYCLE: none yet. One that a process died in
-    has no record."""
+    """Number of the cycle in whose period the packet was; BEFORE_FIRST_CYCLE before the first. The cycle
+    in which a process died has no record."""
     bus: NDArray[np.uint8]
-    """Index in the log's buses."""
+    """Index into the log's buses."""
     kind: NDArray[np.uint8]
-    """A PacketKind."""
+    """Number of a PacketKind."""
     servo_id: NDArray[np.uint8]
     first_ns: NDArray[np.int64]
     last_ns: NDArray[np.int64]
     start: NDArray[np.int64]
-    """Index in `data` of its first byte."""
+    """Index of the packet's first byte in `data`."""
     length: NDArray[np.int64]
     data: NDArray[np.uint8]
-    """Bytes of all packets, and possibly of others."""
+    """Bytes of all packets, possibly with bytes of other packets."""
 
     @overload
     def __getitem__(self, index: int) -> LoggedPacket: ...
     @overload
     def __getitem__(self, index: slice) -> PacketColumns: ...
     def __getitem__(self, index: int | slice) -> LoggedPacket | PacketColumns:
-        """Return one packet, or columns of some."""
+        """Return one packet, or the columns of a slice."""
         if isinstance(index, slice):
             return self.take(np.arange(len(self))[index])
         start = int(self.start[index])
@@ -53,11 +53,11 @@ class PacketColumns(Sequence[LoggedPacket]):
         )
 
     def __len__(self) -> int:
-        """Return how many packets there are."""
+        """Return the number of packets."""
         return len(self.bus)
 
     def __iter__(self) -> Iterator[LoggedPacket]:
-        """Yield the packets one by one; what is to be quick works on the columns."""
+        """Yield the packets one by one; working on the columns is faster."""
         data = self.data.tobytes()
         columns = (self.bus, self.kind, self.servo_id, self.first_ns, self.last_ns, self.start, self.length)
         for bus, kind, servo_id, first_ns, last_ns, start, length in zip(
@@ -67,16 +67,16 @@ class PacketColumns(Sequence[LoggedPacket]):
             yield LoggedPacket(bus, PacketKind(kind), servo_id, first_ns, last_ns, body)
 
     def take(self, rows: NDArray[np.int64] | NDArray[np.bool_]) -> PacketColumns:
-        """Return some of the packets, by their indices or by a mask of shape (packets,); bytes are shared."""
+        """Return some packets, by indices or by a mask of shape (packets,); the bytes are shared."""
         return replace(self, **{name: getattr(self, name)[rows] for name in _OF_EACH})
 
     def compact(self) -> PacketColumns:
-        """Return the same packets with no bytes but their own."""
+        """Return the same packets with a copy of only their own bytes."""
         start = np.cumsum(self.length) - self.length
         return replace(self, start=start, data=pieces(self.data, self.start, self.length))
 
     def byte(self, index: int) -> NDArray[np.uint8]:
-        """Return the byte at an index of each packet, shape (packets,); 0 where a packet is shorter."""
+        """Return the byte at an index of each packet, shape (packets,); 0 in shorter packets."""
         found = np.zeros(len(self), np.uint8)
         there = index < self.length
         found[there] = self.data[self.start[there] + index]
@@ -84,7 +84,7 @@ class PacketColumns(Sequence[LoggedPacket]):
 
     @classmethod
     def joined(cls, parts: Sequence[PacketColumns]) -> PacketColumns:
-        """Return the packets of several, one behind the other."""
+        """Return the concatenated packets of several columns."""
         if len(parts) == 1:
             return parts[0]
         if not parts:
@@ -98,7 +98,7 @@ class PacketColumns(Sequence[LoggedPacket]):
 
     @classmethod
     def of(cls, packets: Iterable[LoggedPacket], cycle: NDArray[np.int64] | None = None) -> PacketColumns:
-        """Return packets as columns; `cycle`: shape (packets,), without it they are before the first."""
+        """Return packets as columns; `cycle` has shape (packets,); None: all are before the first cycle."""
         rows = list(packets)
         length = np.array([len(packet.data) for packet in rows], np.int64)
         return cls(
@@ -115,11 +115,11 @@ class PacketColumns(Sequence[LoggedPacket]):
 
 
 _OF_EACH = ("cycle", "bus", "kind", "servo_id", "first_ns", "last_ns", "start", "length")
-"""Columns with one element a packet."""
+"""Columns with one element per packet."""
 
 
 def numbers(data: NDArray[np.uint8], at: NDArray[np.int64], kind: str) -> NDArray[np.int64]:
-    """Return little-endian integers at any indices of `data`; there must be bytes for them."""
+    """Return little-endian integers at arbitrary indices of `data`; each must lie within `data`."""
     dtype = np.dtype(kind)
     count = max(len(data) - dtype.itemsize + 1, 0)
     found: NDArray[np.int64] = np.ndarray((count,), dtype, data, 0, (1,))[at].astype(np.int64)

@@ -1,6 +1,7 @@
-"""Identity: hashes of the files that a run is made of, the git revision of their folder, and the machine.
+"""Identity: hashes of a run's input files and code, the git revision of their folder, and the machine.
 
-Kept in a log, so that two runs, or a run and its replay, can be compared: same inputs, same record.
+The log keeps the identity, so that two runs, or a run and its replay, can be compared: same inputs, same
+record.
 """
 
 from __future__ import annotations
@@ -18,26 +19,27 @@ from pathlib import Path
 from dxlrun.installed_plugins import distribution_name
 
 IDENTITY_NAME = "identity"
-"""The metadata record; docs/how-to/logs.md has its keys."""
+"""Name of the metadata record; docs/how-to/logs.md has its keys."""
 ROBOT, INCLUDED, MOTION, URDF, PLUGIN, RUNTIME = "robot", "included", "motion", "urdf", "plugin", "runtime"
-"""What a hash is of: the first word of its key; all but URDF and RUNTIME are followed by the file's name."""
+"""First word of a hash's key: the kind of the file. All but URDF and RUNTIME are followed by the file's
+name."""
 HOST, KERNEL, REVISION, CHANGED = "host", "kernel", "git revision", "git changed"
-"""Keys of what is no hash."""
+"""Keys of values that are not hashes."""
 _GIT_TIMEOUT_S = 2.0
-"""For all questions to git together: a folder of a network may answer late, and the run waits for it."""
+"""Timeout of all git commands together: a network folder may respond slowly, and the run waits."""
 _MOST_FILES = 2_000
-"""Of one package: a bound on the time before a run, not on packages."""
+"""Upper limit of the hashed files of a package, which bounds the delay before a run."""
 _BUILT = (".pyc", ".so")
-"""Suffixes of what each machine makes of sources by itself."""
+"""Suffixes of files that each machine builds from sources."""
 
 
 def identity(source_file: str, files: Mapping[str, str], packages: Mapping[str, str]) -> dict[str, str]:
-    """Return the record of a run.
+    """Return the identity of a run.
 
     Args:
         source_file: Path of the robot file.
-        files: Texts by their keys, as `file_key` makes them.
-        packages: The packages of plug-ins that run, with their distributions (`Plan.packages`).
+        files: Texts by key, see `file_key`.
+        packages: Packages of the used plug-ins, with their distributions (`Plan.packages`).
     """
     folder = Path(source_file).parent
     return {
@@ -55,10 +57,10 @@ def file_key(what: str, name: str) -> str:
 
 
 def code_hashes(packages: Iterable[tuple[str, str]] = ()) -> dict[str, str]:
-    """Return the hash of each file of some packages, and one of dxlrun's own code.
+    """Return the hash of each file of some packages, and one hash of dxlrun's own code.
 
-    `plugin DISTRIBUTION PACKAGE/FILE.py` -> SHA-256; a package counts from its top. Of a package with more
-    than 2000 files only the first, by name.
+    Keys are `plugin DISTRIBUTION PACKAGE/FILE.py`, values SHA-256. Package paths begin at the top package.
+    Only the first 2000 files of a package, by name, are hashed.
 
     Args:
         packages: Top packages or modules with their distributions.
@@ -77,17 +79,17 @@ def code_hashes(packages: Iterable[tuple[str, str]] = ()) -> dict[str, str]:
 
 
 def package_of(key: str) -> tuple[str, str]:
-    """Return package and distribution of a key of a plug-in's file."""
+    """Return package and distribution from the key of a plug-in's file."""
     distribution, _, name = key.removeprefix(file_key(PLUGIN, "")).rpartition(" ")
     return name.partition("/")[0].removesuffix(".py"), distribution
 
 
 def changed_code(then: Mapping[str, str], publishers: Iterable[str]) -> tuple[str, ...]:
-    """Return a sentence for each plug-in whose files differ from those of a run, and one for dxlrun itself.
+    """Return a sentence for each plug-in whose files have changed since a run, and one for dxlrun itself.
 
     Args:
-        then: The identity in the log of the run; empty in logs from before it was kept.
-        publishers: The distributions of the plug-ins that the run used, with their versions.
+        then: Identity in the log of the run; empty in logs of earlier versions.
+        publishers: Distributions of the plug-ins in the run, with their versions.
     """
     if not then:
         return ()
@@ -113,14 +115,15 @@ def runtime_hash() -> str:
 
 
 _imported = cache(code_hashes)
-"""The code of this process, which imports it once."""
+"""Cached hashes of the code of this process, which imports it once."""
 
 
 def module_files(module: str) -> list[tuple[str, Path]]:
-    """Return the files of a top package or module, by their names from there; none where it has no place."""
+    """Return the files of a top package or module by relative name; empty without a location."""
     try:
         spec = find_spec(module)
-    except (ImportError, ValueError):  # ValueError: it was put together in memory
+    # ValueError: the module was created in memory.
+    except (ImportError, ValueError):
         return []
     if spec is None:
         return []
@@ -142,7 +145,7 @@ def _named(places: Iterable[Path]) -> Iterator[tuple[str, Path]]:
 
 
 def _hash_of(path: Path) -> str:
-    """Return the hash of a file, or why there is none."""
+    """Return the hash of a file, or the reason why it cannot be read."""
     try:
         return sha256(path.read_bytes()).hexdigest()
     except OSError as error:
@@ -150,13 +153,14 @@ def _hash_of(path: Path) -> str:
 
 
 def git_state(folder: Path, file: str) -> dict[str, str]:
-    """Return the git revision of a folder, and whether what lies there differs from it; {} without git.
+    """Return the git revision of a folder, and whether its files differ from the revision; {} without git.
 
-    `yes` also where git does not have the file itself. What git does not have beside it does not count: logs
+    `yes` also means that git does not track the file itself. Other untracked files are ignored, because logs
     are written there.
     """
     if not any((place / ".git").exists() for place in (folder.absolute(), *folder.absolute().parents)):
-        return {}  # the usual case of a robot's computer: no process is started
+        # The usual case on a robot's computer: git is not started.
+        return {}
     give_up = time.monotonic() + _GIT_TIMEOUT_S
     status = _git(
         folder,
@@ -168,7 +172,8 @@ def git_state(folder: Path, file: str) -> dict[str, str]:
     oid = "# branch.oid "
     lines = status.splitlines()
     revision = next((line.removeprefix(oid) for line in lines if line.startswith(oid)), "(initial)")
-    if revision == "(initial)":  # a repository without a commit
+    # The repository has no commit.
+    if revision == "(initial)":
         return {}
     changed = any(not line.startswith("#") for line in lines)
     known = changed or _git(folder, ("ls-files", "--error-unmatch", "--", file), give_up) is not None
@@ -176,8 +181,8 @@ def git_state(folder: Path, file: str) -> dict[str, str]:
 
 
 def _git(folder: Path, arguments: tuple[str, ...], give_up: float) -> str | None:
-    """Return what git prints; None when it is missing, fails or is too slow."""
-    # no index is written and no program of the repository started: a run only looks
+    """Return the output of git; None when git is missing, fails or is too slow."""
+    # Neither write the index nor start a program that the repository configures: a run only reads.
     command = ["git", "--no-optional-locks", "-c", "core.fsmonitor=false", *arguments]
     surroundings = {key: value for key, value in os.environ.items() if not key.startswith("GIT_")}
     try:

@@ -1,4 +1,4 @@
-"""The file of the simulated buses' ledger."""
+"""Ledger file: the file of the simulated buses' ledger."""
 
 from __future__ import annotations
 
@@ -7,12 +7,14 @@ from pathlib import Path
 from dxlrun.output.target import open_empty
 from dxlsim.bus.ledger import Ledger
 
-_MODE = 0o640  # Of a new file: it can be read by its user and group only
-_BUFFER = 1 << 16  # Bytes that are written out together
+# Mode of a new file, which only its user and group can read.
+_MODE = 0o640
+# Buffer size, bytes.
+_BUFFER = 1 << 16
 
 
 def open_ledger(path: Path | None) -> Ledger:
-    """Return a ledger that keeps nothing in memory, and writes a file where one is named.
+    """Return a ledger that writes to a file, if one is given, and keeps nothing in memory.
 
     Raises OSError for a file that cannot be written, or is not empty.
     """

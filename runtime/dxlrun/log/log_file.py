@@ -1,4 +1,4 @@
-"""The file of a log: bytes that are on the disk, or an error; who writes it holds a lock on it."""
+"""Log file: unbuffered output with errors for all lost bytes; the writer holds a lock on the file."""
 
 from __future__ import annotations
 
@@ -13,19 +13,21 @@ from dxlrun.output.target import open_empty
 
 try:
     import fcntl
-except ImportError:  # Windows, where logs are read
+# Windows, where logs are only read.
+except ImportError:
     fcntl = None  # type: ignore[assignment]  # a module, or none
 
 LOG_MODE = 0o640
-"""Of a new log: commands and the names of clients are for its user and group."""
-_LATELY_S = 10.0  # Without locks, a file counts as being written for so long after its last change
+"""Mode of a new log: commands and names of clients are only for its user and group."""
+# Without locks, a file counts as being written for this time after its last change.
+_LATELY_S = 10.0
 _HELD = (errno.EWOULDBLOCK, errno.EACCES)
 
 
 def has_writer(path: Path) -> bool:
     """Return whether a process has this file of a log open for writing.
 
-    The writer holds a lock (flock(2)), which ends with the process however that ends. On a file system
+    The writer holds a lock (flock(2)), which Linux releases at any end of the process. On a file system
     without locks, a file that changed within 10 s counts as being written.
     """
     try:
@@ -47,20 +49,22 @@ def has_writer(path: Path) -> bool:
 
 
 class LogFile:
-    """Unbuffered bytes on a disk; every method raises OSError when the disk does not take or keep them."""
+    """Unbuffered file; every method raises OSError when the disk does not accept or keep the bytes."""
 
     __slots__ = ("_descriptor", "_path", "_size")
 
     def __init__(self, path: Path) -> None:
-        self._descriptor = open_empty(path, LOG_MODE)  # empty is how a name is taken before a log begins
+        # An empty file reserves the name before the log begins.
+        self._descriptor = open_empty(path, LOG_MODE)
         if fcntl is not None:
-            with suppress(OSError):  # A file system without locks
+            # The file system may not support locks.
+            with suppress(OSError):
                 fcntl.flock(self._descriptor, fcntl.LOCK_EX | fcntl.LOCK_NB)
         self._path = path
         self._size = 0
 
     def write(self, data: bytes | bytearray | memoryview) -> int:
-        """Write all of `data`; Linux may take it in pieces, and the last piece shows a full disk."""
+        """Write all of `data`. Linux may write less than requested; only the rest then shows a full disk."""
         if os.fstat(self._descriptor).st_size < self._size:
             raise OSError(errno.EIO, "the file was cut by another program")
         rest = memoryview(data)
@@ -70,18 +74,18 @@ class LogFile:
         return len(data)
 
     def tell(self) -> int:
-        """Return how many bytes were written whole."""
+        """Return the number of bytes that were written."""
         return self._size
 
     def flush(self) -> None:
-        """Nothing is held back here."""
+        """Do nothing: output is not buffered."""
 
     def sync(self) -> None:
-        """Wait until the disk has what was written."""
+        """Wait until the disk has all written bytes."""
         (os.fdatasync if sys.platform == "linux" else os.fsync)(self._descriptor)
 
     def truncate(self, size: int) -> None:
-        """Cut what lies behind `size`; a file that is shorter stays so."""
+        """Truncate the file to `size`; a shorter file keeps its length."""
         size = min(size, os.fstat(self._descriptor).st_size)
         os.ftruncate(self._descriptor, size)
         os.lseek(self._descriptor, size, os.SEEK_SET)
@@ -89,7 +93,7 @@ class LogFile:
 
     @property
     def gone(self) -> bool:
-        """Whether another program deleted, moved or replaced the file."""
+        """True when another program deleted, moved or replaced the file."""
         ours = os.fstat(self._descriptor)
         try:
             there = self._path.stat()
@@ -98,7 +102,7 @@ class LogFile:
         return (there.st_dev, there.st_ino) != (ours.st_dev, ours.st_ino)
 
     def close(self) -> None:
-        """Release the lock and close the file. A forked child that still has the descriptor keeps no lock."""
+        """Release the lock and close the file, even if a forked child still has the file descriptor."""
         if fcntl is not None:
             with suppress(OSError):
                 fcntl.flock(self._descriptor, fcntl.LOCK_UN)

@@ -1,4 +1,4 @@
-"""The log: records of the rings become MCAP messages; two runs on virtual time give the same bytes."""
+"""Log writer: writes records of the rings as MCAP messages; two virtual runs give the same bytes."""
 
 from __future__ import annotations
 
@@ -27,9 +27,9 @@ from dxlrun.messages.definition import MessageType
 
 Written = TypeVar("Written")
 CHUNK_BYTES = 512 * 1024
-"""A chunk with so many bytes of messages is written."""
+"""Size of a chunk's messages, bytes, above which the chunk is written."""
 _COMPRESSED_FROM = 16 * 1024
-"""Bytes: an attachment of so many is compressed, as the plan is; shorter ones stay as text to read."""
+"""Bytes; an attachment of this size or more is compressed. Shorter ones remain readable as text."""
 _LIBRARY = "dxlrun"
 _PACKAGE = "dxlrun_msgs"
 _LIBRARIES = ("dxlrun", "mcap", "numpy")
@@ -37,23 +37,24 @@ _MEDIA_TYPES = {".json": "application/json", ".yaml": "application/yaml", ".txt"
 
 
 class LogWriter(RunMessages):
-    """Writes one log; takes the records of the rings as they come.
+    """Writer of one log file from records of the rings.
 
-    A disk that takes no more (OSError while writing) stops the writing, not the caller: the file is cut back
-    to its last whole chunk, `error` says why, later records are counted. Only a file that cannot be created
-    or begun raises OSError.
+    A disk that accepts no more bytes (OSError) stops the writing, but not the caller. The file is then
+    truncated to its last whole chunk, `error` has the reason, and later records are counted. Only a file that
+    cannot be created or begun raises OSError.
     """
 
     def __init__(self, path: Path, header: LogHeader, span: CycleSpan | None = None) -> None:
-        """`span`: of the earlier parts of the same log, which is extended."""
+        """`span`: cycles in the earlier parts of the same log; it is extended."""
         super().__init__(header)
         self.span = span or self.span
         self.error: str | None = None
         self.late_metadata: dict[str, dict[str, str]] = {}
-        """Written at the end, beside the header's: what became known in the run."""
+        """Metadata that become known during the run, written at the end of the file."""
         self._file = LogFile(path)
         self._messages = self._lost = self._unwritten = 0
-        self.first_ns = self.last_ns = 0  # Of the messages so far
+        # Times of the first and the last message so far.
+        self.first_ns = self.last_ns = 0
         self._whole_bytes = self._whole_messages = 0
         self._whole_last_ns: int | None = None
         self._summary: LogSummary | None = None
@@ -63,7 +64,7 @@ class LogWriter(RunMessages):
         self._chunk_bytes = 0
         self._sequences: dict[int, int] = {}
         self._known: dict[str, int] = {}
-        """Schemas by the names of their messages."""
+        """Schemas by message name."""
         try:
             self._begin()
         except BaseException:
@@ -72,7 +73,7 @@ class LogWriter(RunMessages):
 
     @property
     def size(self) -> int:
-        """Bytes of the file so far; a chunk that is not finished does not count."""
+        """Size of the file without the unfinished chunk, bytes."""
         return self._file.tell()
 
     def _begin(self) -> None:
@@ -115,7 +116,7 @@ class LogWriter(RunMessages):
         self.last_ns = max(self.last_ns, t_ns)
 
     def _end_chunk(self) -> None:
-        """Write the chunk, with the packets that belong to its cycles: what is behind it may be lost."""
+        """Write the chunk with the packets of its cycles; later messages may be lost in a failure."""
         self._write_packets()
         self._writer.flush()
         self._whole_bytes, self._whole_messages = self._file.tell(), self._messages
@@ -123,7 +124,7 @@ class LogWriter(RunMessages):
         self._chunk_bytes = 0
 
     def _guarded(self, write: Callable[[Written], None], what: Written) -> None:
-        """Write something, or count it when nothing can be written any more."""
+        """Write a record, or count it after the writing has stopped."""
         if self.error is None:
             write(what)
         else:
@@ -136,13 +137,14 @@ class LogWriter(RunMessages):
         try:
             self._file.truncate(self._whole_bytes)
         except OSError:
-            return  # what lies behind the last whole chunk stays; a reader stops there
+            # Bytes after the last whole chunk remain; a reader stops there.
+            return
         self.span.last_ns = self._whole_last_ns
         if self.span.last_ns is not None and self._file.tell() == self._whole_bytes:
             self.error += f"; {self.span.last_cycle_text}"
 
     def take(self, kind: int, payload: Payload) -> None:
-        """Write one record of a ring. Raises ValueError when it is none that the log can hold."""
+        """Write one record of a ring. Raises ValueError for a record that does not fit into a log."""
         if kind not in self._takers:
             raise ValueError(f"a record of kind {kind} does not belong into a log")
         self._guarded(self._takers[kind], payload)
@@ -150,11 +152,11 @@ class LogWriter(RunMessages):
             self.flush()
 
     def machine(self, t_ns: int, data: bytes) -> None:
-        """Write a message about the machine; the first one opens its topic, which virtual time has not."""
+        """Write a message about the machine; the first one opens the topic, which virtual runs lack."""
         self._guarded(lambda message: self._machine(t_ns, message), data)
 
     def gap(self, source: str, lost: int) -> None:
-        """Declare that `lost` records of `source` did not reach the log; it becomes an event."""
+        """Add an event for `lost` records of `source` that did not reach the log."""
         self._lost += lost
         what = counted(lost, f"record of {source} was", f"records of {source} were")
         them = "it" if lost == 1 else "them"
@@ -164,7 +166,7 @@ class LogWriter(RunMessages):
         self._guarded(self.event, event)
 
     def flush(self) -> None:
-        """Finish the chunk in progress: a reader finds it, also when this process is killed."""
+        """Finish the present chunk, so that a reader finds it even after this process was killed."""
         if self.error is None:
             try:
                 self._end_chunk()
@@ -172,7 +174,7 @@ class LogWriter(RunMessages):
                 self._give_up(error)
 
     def sync(self) -> None:
-        """Wait until the disk has what was flushed: a reader finds it also after a loss of power."""
+        """Wait until the disk has all flushed chunks, so that a reader finds them after a power failure."""
         if self.error is None:
             try:
                 self._file.sync()
@@ -180,9 +182,9 @@ class LogWriter(RunMessages):
                 self._give_up(error)
 
     def close(self) -> LogSummary:
-        """Finish the file and return what is in it; a second call returns the same.
+        """Finish the file and return its summary; a second call returns the same summary.
 
-        Its error is set too when the file is not there any more.
+        The summary also has an error when the file no longer exists.
         """
         if self._summary is not None:
             return self._summary
@@ -210,7 +212,7 @@ class LogWriter(RunMessages):
 
 
 class TopicWriter:
-    """Writes a log of topics into a new or empty file.
+    """Writer of topics into a new or empty log file.
 
         log = TopicWriter(Path("heat.mcap"), "heat", 1_000_000_000, {"setup": {"room": "lab"}})
         heat = log.open_topic("/heat", Heat)  # a dataclass
@@ -248,15 +250,15 @@ class TopicWriter:
         self._codecs: list[Codec] = []
 
     def open_topic(self, name: str, message: type) -> int:
-        """Return the number of a new topic; `message` is a dataclass or msgspec struct."""
+        """Open a topic and return its number; `message` is a dataclass or msgspec struct."""
         codec = Codec(declared_message(message, _PACKAGE).type)
         self._codecs.append(codec)
         return self._ring.announce(PublishedTopic(name, codec.message))
 
     def append(self, topic: int, t_ns: int, values: Sequence[Value]) -> None:
-        """Append a message; `values` are its fields in order, `t_ns` a time of the monotonic clock."""
+        """Append a message; `values` are its fields in sequence, `t_ns` is a time of the monotonic clock."""
         self._ring.message(topic, t_ns, self._codecs[topic].pack_row(values))
 
     def close(self) -> LogSummary:
-        """Finish the file; a full disk is in the summary."""
+        """Finish the file and return its summary, which has the error of a full disk."""
         return self._log.close()

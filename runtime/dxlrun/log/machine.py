@@ -1,7 +1,7 @@
-"""The machine beside the cycles: what its cores did, how warm they are, and what the loop got of them.
+"""Machine: load and temperature of the cores, and the loop's share of the processor, once a second.
 
-Taken once a second in the recorder's process, from /proc and /sys (proc(5), cpufreq and thermal of the
-kernel's documentation). What a system does not tell is NaN, never an error: virtual machines have no
+The recorder's process samples them from /proc and /sys (proc(5); cpufreq and thermal of the kernel's
+documentation). Values that a system does not provide are NaN, never an error: virtual machines have no
 frequency, some kernels no schedstat.
 """
 
@@ -22,26 +22,26 @@ from dxlrun.messages.cdr import Codec
 from dxlrun.plan.machine_load import LoadSample
 
 _SHARES = ("user", "nice", "system", "idle", "iowait", "irq", "softirq", "steal")
-"""Columns of a core in /proc/stat; guests are in `user` already."""
+"""Columns of a core in /proc/stat; `user` already contains guests."""
 _LAST_CORE = 38
-"""Which core a process ran on last, in /proc/PID/stat, counted from 0."""
+"""Index of the field of the last used core in /proc/PID/stat, counted from 0."""
 _UNREADABLE = (OSError, ValueError, IndexError, KeyError)
 Floats = NDArray[np.float64]
 
 
 class _Counters(msgspec.Struct, frozen=True, eq=False):
-    """What only grows; rows: one a core."""
+    """Monotonic counters, with one row per core."""
 
     t_ns: int
     ticks: Floats
     """Shape (cores, columns of /proc/stat)."""
     pressure_s: float
-    """In which some process waited for memory."""
+    """Time during which some process waited for memory, s."""
     process: dict[str, float]
 
 
 class MachineSampler:
-    """Samples the machine and one of its processes; `root`: of the file system, for tests."""
+    """Sampler of the machine and one process; `root`: root of the file system, for tests."""
 
     def __init__(self, pid: int, root: Path = Path("/")) -> None:
         self._root = root
@@ -59,7 +59,10 @@ class MachineSampler:
         self._codec = Codec(MACHINE)
 
     def sample(self, t_ns: int) -> bytes | None:
-        """Return a message about the time since the last call, None at the first; `t_ns`: the run's clock."""
+        """Return a message about the time since the last call; None at the first call.
+
+        `t_ns`: time of the run's clock.
+        """
         now, before = _Counters(t_ns, self._ticks(), self._pressure_s(), self._of_process()), self._before
         self._before = now
         if before is None:
@@ -102,11 +105,12 @@ class MachineSampler:
         return math.nan
 
     def _of_process(self) -> dict[str, float]:
-        """Return the counters of the process by the names of the message's fields."""
+        """Return the counters of the process by field name of the message."""
         found: dict[str, float] = {}
         with suppress(*_UNREADABLE):
             running, waiting, _ = (float(word) for word in self._text("schedstat").split())
-            if running:  # else the kernel does not count
+            # A zero means that the kernel does not count.
+            if running:
                 found |= {"loop_running": running / 1e9, "loop_waiting": waiting / 1e9}
         with suppress(*_UNREADABLE):
             lines = (line.partition(":") for line in self._text("status").splitlines())
@@ -124,7 +128,7 @@ class MachineSampler:
         return -1
 
     def _stat(self) -> list[str]:
-        """Return the fields of /proc/PID/stat; the name of the program, which may have blanks, is cut out."""
+        """Return the fields of /proc/PID/stat without the program's name, which may contain spaces."""
         text = self._text("stat")
         return ["", "", *text[text.rindex(")") + 1 :].split()]
 
@@ -165,7 +169,7 @@ def _readable(paths: Iterable[Path]) -> Iterable[float]:
 
 
 def load_sample(message: Mapping[str, object]) -> LoadSample:
-    """Return the part of a message of /machine that the load of the machine is judged by."""
+    """Return the values of a message of /machine from which the machine's load is judged."""
     end_ns, interval_ns = cast("int", message["t_ns"]), cast("int", message["interval_ns"])
     idle, steal = (cast("Floats", message[name]) for name in ("idle", "steal"))
     return LoadSample(

@@ -1,4 +1,4 @@
-"""Parts: a log in several files, each a whole log; with `keep`, the oldest are deleted."""
+"""Part writer: a log in several files, each a complete log; with `keep`, the oldest are deleted."""
 
 from __future__ import annotations
 
@@ -20,19 +20,19 @@ from dxlrun.plan.recording_plan import (
 )
 
 FOLDER_MODE = 0o750
-"""Of a directory of parts: as the logs in it."""
+"""Mode of a directory of parts, with the same rights as a log's file."""
 
 
 def open_writer(path: Path, header: LogHeader, recording: RecordingPlan) -> LogWriter | PartWriter:
-    """Open a log: a file, or a directory of parts. Raises OSError when it cannot be begun."""
+    """Open a log, a file or a directory of parts, for writing. Raises OSError when it cannot be begun."""
     return PartWriter(path, header, recording) if recording.in_parts else LogWriter(path, header)
 
 
 class PartWriter:
-    """Writes a log in parts, as LogWriter writes one file.
+    """Writer of a log in parts, with the interface of LogWriter.
 
-    `settle` ends a part that is full or old, and deletes those that the plan keeps no longer; the newest
-    stays, however old it is.
+    `settle` ends a part that is full or old, and deletes expired parts according to the plan; the newest part
+    is never deleted.
     """
 
     def __init__(self, path: Path, header: LogHeader, recording: RecordingPlan) -> None:
@@ -41,26 +41,26 @@ class PartWriter:
         self._header = header
         self._plan = recording
         self.late_metadata: dict[str, dict[str, str]] = {}
-        """Of the run: written at the end of each part that ends from now on."""
+        """Metadata of the run, written at the end of each part that ends from now on."""
         self.span = CycleSpan()
-        """Of the cycles that were taken, in all parts."""
+        """Time span of the cycles in all parts."""
         self._error: str | None = None
         self._unwritten = 0
-        """Records that came when the last part that could be written was closed."""
+        """Number of records after the last writable part was closed."""
         self._closed: list[LogSummary] = []
         self._kept: deque[tuple[Path, int]] = deque()
-        """Closed parts that were not deleted, and the time of the newest record of each."""
+        """Closed parts that were not deleted, with the time of each part's newest record."""
         self._summary: LogSummary | None = None
         self._path = path / part_name(0)
         self._log = self._open(0, "start", ())
 
     @property
     def error(self) -> str | None:
-        """Why the log is not whole; nothing is written any more."""
+        """Reason why the log is incomplete; then nothing more is written."""
         return self._error or self._log.error
 
     def _open(self, index: int, began: str, topics: Iterable[bytes]) -> LogWriter:
-        """Begin a part, which opens these topics; it says why it begins, and what of earlier ones is kept."""
+        """Open a new part with these topics, and metadata about its reason and the retention."""
         part = {"index": str(index), "began": began, "keep_ns": str(self._plan.keep_ns or "")}
         self._path = self._folder / part_name(index)
         try:
@@ -69,14 +69,15 @@ class PartWriter:
         except FileExistsError:
             raise
         except OSError:
-            self._path.unlink(missing_ok=True)  # it has nothing, and would look like a part
+            # The file is empty and would look like a part.
+            self._path.unlink(missing_ok=True)
             raise
         for topic in topics:
             log.take(RecordKind.TAGGED, topic)
         return log
 
     def _next(self, began: str) -> None:
-        """End the part and begin another; when that cannot be, the log ends with this part."""
+        """End the part and begin another one; when that fails, the log ends with this part."""
         if self.error is not None:
             return
         summary = self._end(last=False)
@@ -100,7 +101,7 @@ class PartWriter:
         return self._log.close()
 
     def take(self, kind: int, payload: Payload) -> None:
-        """Write one record of a ring. Raises ValueError when it is none that the log can hold."""
+        """Write one record of a ring. Raises ValueError for a record that does not fit into a log."""
         if self._error is None:
             self._log.take(kind, payload)
         else:
@@ -114,36 +115,38 @@ class PartWriter:
             self._unwritten += 1
 
     def settle(self) -> None:
-        """End the part if it is full or old, and delete the oldest; call it behind a whole cycle."""
+        """End the part if it is full or old, and delete expired parts; call this after a complete cycle."""
         size, age_ns, keep_ns = self._plan.split_bytes, self._plan.split_ns, self._plan.keep_ns
         now_ns = self._log.last_ns
         if size is not None and self._log.size >= size:
             self._next("size")
         elif age_ns is not None and now_ns - self._log.first_ns >= age_ns:
             self._next("time")
-        if keep_ns is None or self.error is not None:  # a log that has ended loses nothing more
+        # A log that has ended must not lose more parts.
+        if keep_ns is None or self.error is not None:
             return
         while self._kept and self._kept[0][1] < now_ns - keep_ns:
-            with suppress(OSError):  # then it stays
+            # A part that cannot be deleted remains.
+            with suppress(OSError):
                 self._kept.popleft()[0].unlink()
 
     def gap(self, source: str, lost: int) -> None:
-        """Declare that `lost` records of `source` did not reach the log; it becomes an event."""
+        """Add an event for `lost` records of `source` that did not reach the log."""
         if self._error is None:
             self._log.gap(source, lost)
 
     def flush(self) -> None:
-        """Finish the chunk in progress: a reader finds it, also when this process is killed."""
+        """Finish the present chunk, so that a reader finds it even after this process was killed."""
         if self._error is None:
             self._log.flush()
 
     def sync(self) -> None:
-        """Wait until the disk has what was flushed."""
+        """Wait until the disk has all flushed chunks."""
         if self._error is None:
             self._log.sync()
 
     def close(self) -> LogSummary:
-        """Finish the last part, and return what was in all of them; a second call returns the same."""
+        """Finish the last part and return the summary of all parts; a second call returns it again."""
         if self._summary is None:
             last = self._end(last=True)
             every = [*self._closed, last]

@@ -1,4 +1,4 @@
-"""Parts: the files of a log that lies in a directory, in order, and what is missing among them."""
+"""Parts: the files of a log in a directory, in sequence, and the missing ones."""
 
 from __future__ import annotations
 
@@ -15,19 +15,19 @@ _PART = re.compile(r"part_(\d{4,9})\.mcap")
 
 
 class LogFiles(msgspec.Struct, frozen=True):
-    """The files of one log."""
+    """Files of one log."""
 
     files: tuple[Path, ...]
-    """In the order in which they were written."""
+    """Files in the sequence of writing."""
     damage: tuple[str, ...] = ()
-    """A sentence for the parts that are missing between two of them."""
+    """Sentences about missing parts between existing ones."""
 
 
 def log_files(path: Path) -> LogFiles:
     """Return the file at a path, or the parts in a directory; other files in it are ignored.
 
-    Raises LogError when a directory has no part, or cannot be read, and for a pipe or a device, which could
-    be waited for without an end.
+    Raises LogError for a directory without parts or one that cannot be read, and for a pipe or a device, on
+    which a read could block forever.
     """
     if not path.is_dir():
         if path.exists() and not path.is_file():
@@ -49,7 +49,7 @@ def log_files(path: Path) -> LogFiles:
 
 
 def is_log_directory(path: Path) -> bool:
-    """Return whether a directory holds the parts of a log."""
+    """Return whether a directory contains the parts of a log."""
     try:
         return path.is_dir() and any(_PART.fullmatch(each.name) and each.is_file() for each in path.iterdir())
     except OSError:
@@ -57,7 +57,7 @@ def is_log_directory(path: Path) -> bool:
 
 
 def missing_parts(first: int, end: int) -> str:
-    """Return the sentence for parts that are missing, from `first` to the one before `end`."""
+    """Return the sentence about missing parts, from `first` to `end` - 1."""
     if end == first + 1:
         return f"{part_name(first)} is missing"
     return f"{part_name(first)} to {part_name(end - 1)} are missing"

@@ -1,4 +1,4 @@
-"""Reading a log: whole, unfinished, damaged, or of another program; the unreadable is reported."""
+"""Reader: reads logs that are complete, unfinished, damaged, or of another program, and reports damage."""
 
 from __future__ import annotations
 
@@ -25,25 +25,26 @@ if TYPE_CHECKING:
 __all__ = ["UNREADABLE", "Log", "LogFollower", "LogReader", "Topic", "open_log", "read_log"]
 
 UNREADABLE = (msgspec.MsgspecError, ValueError, RecursionError)
-"""What msgspec raises for JSON in a log (the plan, data of a command) that is damaged or too deep."""
+"""Exceptions of msgspec for damaged or too deep JSON in a log, such as the plan or data of a command."""
 SLICE_BYTES = 8 << 20
-"""Chunks are taken together until they are so long: what is done with a slice costs by calls of numpy."""
+"""Size of a slice, bytes: chunks are joined up to this size, because each slice costs a number of NumPy
+calls."""
 
 
 class Topic(msgspec.Struct, frozen=True):
-    """What a log says about one of its topics."""
+    """Description of a topic in a log."""
 
     type: str
-    """Name of its messages: `sensor_msgs/msg/JointState`."""
+    """Name of the message type: `sensor_msgs/msg/JointState`."""
     count: int | None
-    """Messages; None where the file has no statistics: it was not finished."""
+    """Number of messages; None for an unfinished file, which has no statistics."""
 
 
 class LogReader:
-    """A log that is open: what it says about itself, and its records one after the other in flat memory.
+    """An open log: its metadata, and its records slice by slice in bounded memory.
 
-    Any MCAP file can be opened; one of another program has no header, no slices, and columns only. Nothing is
-    held open between the calls.
+    Any MCAP file can be opened. A file of another program has no header and no slices, only columns. No file
+    stays open between calls.
     """
 
     def __init__(self, path: Path) -> None:
@@ -54,30 +55,30 @@ class LogReader:
         self._about: Log | None = None
         self._searched = False
         self.share = 0.0
-        """Of the file, how much the slices that were yielded have gone through."""
+        """Share of the file that the yielded slices cover, 0 to 1."""
         self.header = _header(path, self._file)
-        """Of a log of dxlrun; None: another program wrote the file."""
+        """Header of a log of dxlrun; None for a file of another program."""
 
     def __enter__(self) -> LogReader:
         """Return the reader."""
         return self
 
     def __exit__(self, *_: object) -> None:
-        """Nothing is left open."""
+        """Do nothing, because no file stays open."""
 
     @property
     def metadata(self) -> dict[str, dict[str, str]]:
-        """Records of text by name: versions, kernel, scheduler."""
+        """Metadata records by name: versions, kernel, scheduler."""
         return self._file.metadata
 
     @property
     def attachments(self) -> dict[str, bytes]:
-        """Robot file, plan: by name."""
+        """Attachments by name: robot file, plan."""
         return self._file.attachments
 
     @property
     def topics(self) -> dict[str, Topic]:
-        """The topics of the file; of one that has no end its messages are gone through for that."""
+        """Topics of the file. An unfinished file is read completely for its topics."""
         if not self._file.finished:
             self._file_of_all()
         topics: dict[str, Topic] = {}
@@ -91,13 +92,15 @@ class LogReader:
 
     @property
     def damage(self) -> tuple[str, ...]:
-        """A sentence for each thing that is missing or could not be read, by going through all of it once."""
+        """Sentences about missing or unreadable data. The first access reads the whole file."""
         return self.about.damage if self.header else tuple(self._file_of_all().damage)
 
     @property
     def about(self) -> Log:
-        """All that the file says about itself, as a log without records; the file is gone through for its
-        damage, unless it was. Raises LogError for a file of another program."""
+        """The log without its records. The first access reads the whole file to find damage.
+
+        Raises LogError for a file of another program.
+        """
         if self._about is None:
             for _ in self.slices():
                 pass
@@ -106,11 +109,11 @@ class LogReader:
         return self._about
 
     def slices(self, *, packets: bool = True) -> Iterator[Log]:
-        """Yield cycles, packets, events, commands and topics as logs of their own, in the order of the file.
+        """Yield the log in slices: cycles, packets, events, commands and topics, in the order of the file.
 
-        Each has whole cycles with all their packets, also those of the idle time after them; what belongs to
-        no slice (attachments, damage) is in `about`. Without `packets` these are not looked at. Raises
-        LogError for a file of another program.
+        Each slice has complete cycles with all their packets, including those of the idle time after a cycle.
+        `about` has all that belongs to no slice (attachments, damage). Without `packets`, packets are not
+        read. Raises LogError for a file of another program.
         """
         if self.header is None:
             raise LogError(_foreign(self.path))
@@ -121,16 +124,17 @@ class LogReader:
             for messages in gathered(walk.messages(), SLICE_BYTES):
                 self.share = walk.share
                 part = slicer.take(messages)
-                del messages  # what looks at the part does not need their memory
+                # Free the memory of the messages while the caller uses the slice.
+                del messages
                 yield part
             yield slicer.rest()
         if packets or self._about is None:
             self._about = slicer.about()
 
     def columns(self, topic: str, *fields: str) -> dict[str, NDArray[np.generic]]:
-        """Return fields of all messages of a topic, without `fields` all, one row each: `batches`, joined.
+        """Return fields of all messages of a topic, one row each: the joined `batches`. Default: all fields.
 
-        A field that is not an array of the same length everywhere becomes an array of objects.
+        A field that is not an array of constant length becomes an array of objects.
         """
         parts = list(self._trees(topic, fields or None))
         chosen = fields or self._column_reader(topic).leaves
@@ -143,19 +147,22 @@ class LogReader:
         return found
 
     def batches(self, topic: str, *fields: str) -> Iterator[dict[str, NDArray[np.generic]]]:
-        """Yield fields of the messages of a topic, without `fields` all, chunk by chunk in flat memory.
+        """Yield fields of the messages of a topic, chunk by chunk in bounded memory. Default: all fields.
 
-        Beside them `t_ns`: ns of the run's clock, in files of other programs the time in the file. Fields of
-        nested messages have dots: `pose.pose.position.x`; of a sequence of messages, `status.name`, each row
-        is an array. Raises LogError for a topic or a field that the log does not have, and for messages that
-        are not CDR with a definition of ROS 2; messages that do not fit their definition are left out.
+        `t_ns` is added: ns of the run's clock; in files of other programs, the time in the file. Fields of
+        nested messages have dots: `pose.pose.position.x`. Rows of a sequence of messages, `status.name`, are
+        arrays. Messages that do not fit their definition are skipped.
+
+        Raises:
+            LogError: The log does not have the topic or a field, or its messages are not CDR with a ROS 2
+                definition.
         """
         for times, tree in self._trees(topic, fields or None):
             chosen = fields or tree.leaves
             yield {"t_ns": times, **{name: tree.leaf(name).array() for name in chosen}}
 
     def arrow(self, topic: str, *fields: str) -> pa.RecordBatchReader:
-        """Return the messages of a topic for Arrow, chunk by chunk; nested as they are. Raises as `batches`.
+        """Return the messages of a topic for Arrow, chunk by chunk, with nested fields. Raises as `batches`.
 
         Raises InputError without pyarrow, which the extra `logs` has.
         """
@@ -196,7 +203,7 @@ class LogReader:
                 yield messages.t_ns[rows[whole]] - offset_ns, tree
 
     def _column_reader(self, topic: str) -> ColumnReader:
-        """Return how messages of a topic are read. Raises LogError."""
+        """Return the column reader of a topic. Raises LogError."""
         channels = self._file.channels.values()
         if not any(known.topic == topic for known in channels):
             self._file_of_all()
@@ -215,7 +222,7 @@ class LogReader:
             raise LogError(f"{self.path}: messages of {topic} cannot be read: {error}") from error
 
     def _file_of_all(self) -> McapFile:
-        """Return what is in the file, channels and damage beside the messages included."""
+        """Return the contents of the whole file, including channels and damage that only messages show."""
         if not self._searched:
             self._searched = True
             walk = LogWalk(self.path)
@@ -226,22 +233,25 @@ class LogReader:
 
 
 def open_log(path: str | Path) -> LogReader:
-    """Open an MCAP file. Raises LogError with one sentence when it is none, is missing or empty, or a log of
-    dxlrun that this version cannot read."""
+    """Open an MCAP file.
+
+    Raises:
+        LogError: The file is missing, empty or not MCAP, or is a log of dxlrun that this version cannot read.
+    """
     return LogReader(Path(path))
 
 
 def read_log(path: str | Path) -> Log:
-    """Read a log of dxlrun at once. Raises LogError with one sentence when the file is none, or cannot be."""
+    """Read a whole log of dxlrun. Raises LogError for any other file, or a log that cannot be read."""
     reader = LogReader(Path(path))
     slices = list(reader.slices())
     return joined(reader.about, slices)
 
 
 class LogFollower:
-    """A log that is being written: what came since the last look. Packets are left out.
+    """Follower of a log that is being written: yields new records without packets.
 
-    Raises LogError as read_log, at each look.
+    Raises LogError as read_log, at each call.
     """
 
     def __init__(self, path: str | Path) -> None:
@@ -250,7 +260,7 @@ class LogFollower:
         self._slicer: Slicer | None = None
 
     def new(self) -> Log:
-        """Return what the file has in addition, as a log of its own."""
+        """Return the records since the last call, as a log."""
         self._walk.file.damage.clear()
         with _readable(self._path):
             slices = [self._made().take(messages) for messages in self._walk.messages()]
@@ -276,7 +286,7 @@ def _readable(path: Path) -> Iterator[None]:
 
 
 def _header(path: Path, file: McapFile) -> LogHeader | None:
-    """Return the header of a log of dxlrun; where its metadata are damaged, that of the attachment."""
+    """Return the header of a log of dxlrun; the attachment replaces damaged metadata."""
     text = file.metadata.get(schemas.METADATA_NAME)
     attached = file.attachments.get(schemas.HEADER_ATTACHMENT)
     if text is None and attached is None:

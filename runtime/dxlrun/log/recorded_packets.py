@@ -1,4 +1,4 @@
-"""The packets of one bus of a log, for a simulated bus that answers with them."""
+"""Recorded packets: the packets of one bus of a log, from which a simulated bus answers."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ from dxlwire.packets import PacketKind
 
 
 def read_recorded_packets(path: Path, bus: str) -> RecordedPackets:
-    """Return what passed a bus. Raises LogError for a log that cannot be read, or has no such bus."""
+    """Return the packets of a bus. Raises LogError for an unreadable log, or one without this bus."""
     pieces = []
     for piece in open_log(path).slices():
         if bus not in piece.buses:

@@ -1,7 +1,7 @@
-"""The recorder: a process that reads the rings and writes the log, at its own pace beside the loop.
+"""Recorder: the process that reads the rings and writes the log, independently of the loop.
 
-A record is in the file FLUSH_S after the recorder has read it, plus the time that the disk takes. A recorder
-that gets too little of the processor falls behind: records then wait in the rings, which hold RING_SECONDS.
+A record is in the file FLUSH_S after the recorder has read it, plus the disk's write time. A recorder with
+too little processor time falls behind; records then wait in the rings, which hold RING_SECONDS.
 """
 
 from __future__ import annotations
@@ -36,7 +36,8 @@ from dxlrun.plan.machine_load import SAMPLE_PERIOD_NS, LoadMeter, MachineLoad
 POLL_S = 0.005
 FLUSH_S = 0.5
 SYNC_S = 2.0
-_MOST_PER_TURN = 100  # Of one ring, so that no ring waits long for another
+# Records of one ring per turn, so that no ring waits long for another one.
+_MOST_PER_TURN = 100
 
 
 Request = LateMetadata | LoopRuns | Finish
@@ -44,7 +45,7 @@ REQUESTS: Decoder[Request] = Decoder(Request)
 
 
 class Recorder:
-    """Drains rings into a log, flushing every 0.5 s and syncing every 2 s of the machine's time."""
+    """Recorder of the rings into a log. It flushes every 0.5 s and syncs every 2 s of the machine's time."""
 
     def __init__(self, job: RecorderJob, supervisor: MessageChannel[Request]) -> None:
         self._supervisor = supervisor
@@ -55,13 +56,15 @@ class Recorder:
         self._layout = job.header.layout
         self._codec = Codec(MACHINE)
         self._machine: MachineSampler | None = None
-        self._start_up: LoadMeter | None = None  # from the begin of the loop's process to its first cycle
-        self._run: LoadMeter | None = None  # from the first cycle on
+        # Load from the start of the loop's process to its first cycle.
+        self._start_up: LoadMeter | None = None
+        # Load from the first cycle on.
+        self._run: LoadMeter | None = None
         self._next_sample_ns = 0
         self._next_flush = self._next_sync = time.monotonic() + FLUSH_S
 
     def run(self, asked_to_stop: Callable[[], bool]) -> LogClosed:
-        """Record until the supervisor or a signal ends it; then drain every ring and finish the file."""
+        """Record until the supervisor or a signal ends it, then drain the rings and finish the file."""
         self._supervisor.send(Ready())
         while True:
             more = self._turn()
@@ -77,7 +80,7 @@ class Recorder:
         return LogClosed(summary, *loads)
 
     def _requested_to_finish(self, seconds: float) -> bool:
-        """Wait so long for requests and do them; True for Finish, and when the supervisor is gone."""
+        """Wait up to `seconds` for requests and execute them; return True for Finish or a closed channel."""
         if not select.select([self._supervisor], [], [], seconds)[0]:
             return False
         finish = False
@@ -93,7 +96,7 @@ class Recorder:
         return finish or self._supervisor.closed
 
     def _turn(self) -> bool:
-        """Drain each ring, at most _MOST_PER_TURN records; then split, flush and sample where that is due.
+        """Drain each ring, at most _MOST_PER_TURN records, then split, flush and sample when due.
 
         Returns:
             True when there may be more records.
@@ -107,9 +110,9 @@ class Recorder:
         return any(full)
 
     def _flush_when_due(self) -> None:
-        """Finish the chunk in progress FLUSH_S after the last flush ended.
+        """Finish the present chunk FLUSH_S after the end of the last flush.
 
-        Counted from its begin, a disk that takes longer would leave no time for the rings.
+        Counted from its start, a slow disk would leave no time for the rings.
         """
         if time.monotonic() < self._next_flush:
             return
@@ -122,7 +125,7 @@ class Recorder:
         self._next_flush = time.monotonic() + FLUSH_S
 
     def _sample_machine(self) -> None:
-        """Write what the machine did since the last sample; a run with processes has the monotonic clock."""
+        """Write a sample of the machine when due. A run with processes uses the monotonic clock."""
         now_ns = time.monotonic_ns()
         if self._machine is None or now_ns < self._next_sample_ns:
             return
@@ -138,8 +141,8 @@ class Recorder:
     def _drain(self, name: str, ring: RingReader) -> bool:
         """Write the records of a ring, at most _MOST_PER_TURN; return whether there may be more.
 
-        A flush that becomes due does not wait for the other records: a recorder that is short of processor
-        time may need seconds for them.
+        A due flush does not wait for the remaining records, which may take a recorder without processor time
+        seconds.
         """
         lost, record = 0, None
         for _ in range(_MOST_PER_TURN):
@@ -155,13 +158,14 @@ class Recorder:
             try:
                 self._log.take(record.kind, record.payload)
             except (ValueError, IndexError, OverflowError):
-                lost += 1  # whole, but not what the log can hold: declared like any other loss
+                # An intact record that does not fit into a log is reported as lost.
+                lost += 1
         if lost:
             self._log.gap(name, lost)
         return record is not None
 
     def _begin_run(self, payload: Payload) -> None:
-        """Begin to measure the load of the run at its first deadline; activation is part of start-up."""
+        """Start to measure the load of the run at its first deadline; activation is part of start-up."""
         if len(payload) != self._layout.dtype.itemsize:
             return
         cycle = np.frombuffer(payload, self._layout.dtype)[0]
@@ -178,7 +182,7 @@ class Recorder:
 
 
 def main() -> int:
-    """Run the recorder's process: `--job-fd N --control-fd M`; return 1 when the log is not whole."""
+    """Run the recorder's process: `--job-fd N --control-fd M`; return 1 for an incomplete log."""
     stop: list[int] = []
     signal.signal(signal.SIGTERM, lambda number, frame: stop.append(number))
     job, supervisor = process.begun(RecorderJob, REQUESTS)

@@ -1,4 +1,4 @@
-"""Messages of a run: the log's topics, made of the records of the rings, for a file or a live viewer."""
+"""Run messages: makes messages of the log's topics from records of the rings, for a file or a live viewer."""
 
 from __future__ import annotations
 
@@ -23,25 +23,26 @@ from dxlrun.messages.cdr import ENCAPSULATION, Codec
 from dxlrun.messages.definition import MessageType
 
 _MOST_PACKETS, _MOST_CYCLES = 1000, 250
-"""In one message. The index has 16 bytes a message, and arrays of many cycles compress better."""
+"""Upper limits of one message: packets, and cycles whose packets it has. The index needs 16 bytes per
+message, and arrays of many cycles compress better."""
 JOINT_COMMANDS_NS = 10_000_000
-"""In so much time there is one message of /joint_commands; /cycle has the goals of each cycle."""
+"""Interval of /joint_commands; /cycle has the goals of each cycle."""
 
 
 class RunMessages(ABC):
-    """Makes the messages of all topics; what is done with them is a subclass' matter."""
+    """Maker of the messages of all topics; subclasses store or send them."""
 
     def __init__(self, header: LogHeader) -> None:
         self.header = header
         self.span = CycleSpan()
-        """Of the cycles that were taken."""
+        """Time span of the processed cycles."""
         self._layout = header.layout
         self._firsts: list[tuple[int, Callable[[Stamp], bytes]]] = []
-        """Channels with one message, and what makes it of the time of the first record."""
+        """Channels with a single message, and a function that makes it from the time of the first record."""
         self.topics: dict[bytes, None] = {}
-        """Records of the topics that were opened."""
+        """Records of opened topics."""
         self._topic_channels: dict[int, int] = {}
-        """Channels of topics by their numbers."""
+        """Channels by topic number."""
         self._machine_channel: int | None = None
         self._takers: dict[int, Callable[[Payload], None]] = {
             RecordKind.CYCLE: self.cycle,
@@ -54,21 +55,22 @@ class RunMessages(ABC):
 
     @abstractmethod
     def _channel(self, topic: str, message: MessageType, *, latched: bool = False) -> int:
-        """Return a new channel; `latched`: its one message is for late readers too."""
+        """Open a channel and return its number; `latched`: late readers also get its one message."""
 
     @abstractmethod
     def _put(self, channel: int, t_ns: int, wall_ns: int, data: bytes) -> None:
-        """Take a message: its time on the run's clock and as ns since 1970, and CDR."""
+        """Store or send a message, with its time on the run's clock and in ns since 1970."""
 
     def _add(self, channel: int, t_ns: int, data: bytes) -> None:
-        if self._firsts:  # the run begins with its first record, not when the log is opened
+        # The run begins with its first record, not with the opening of the log.
+        if self._firsts:
             firsts, self._firsts = self._firsts, []
             for first, message in firsts:
                 self._add(first, t_ns, message(self._stamp(t_ns)))
         self._put(channel, t_ns, max(0, t_ns + self.header.epoch_offset_ns), data)
 
     def _open_channels(self) -> None:
-        """Open the channels that every run has."""
+        """Open the channels of every run."""
         header = self.header
         self._cycle_channel = self._channel(schemas.LogTopic.CYCLE, schemas.CYCLE)
         self._activation_channel = self._channel(schemas.LogTopic.ACTIVATION, schemas.CYCLE)
@@ -82,9 +84,9 @@ class RunMessages(ABC):
             self._channel(schemas.bus_topic(bus), schemas.BUS_PACKETS) for bus in header.buses
         ]
         self._waiting: list[list[BatchedPacket]] = [[] for _ in header.buses]
-        """Packets that are not in a message yet, for each bus."""
+        """Packets of each bus that are not in a message yet."""
         self._oldest: int | None = None
-        """Cycle of the first of them."""
+        """Cycle of the first waiting packet."""
         self._commands_slot: int | None = None
         self._publishers = [
             (
@@ -109,7 +111,7 @@ class RunMessages(ABC):
     def cycle(self, payload: Payload) -> None:
         """Make the messages of a cycle: /cycle, its goals and frames, and the states that controllers marked.
 
-        Of the record before the first cycle /activation.
+        The record before the first cycle becomes /activation.
         """
         data = bytes(payload)
         record = np.frombuffer(data, dtype=self._layout.dtype)[0]
@@ -155,7 +157,7 @@ class RunMessages(ABC):
         return divmod(max(0, t_ns + self.header.epoch_offset_ns), 1_000_000_000)
 
     def _packets(self, payload: Payload) -> None:
-        """Take one batch of packets; those of many cycles become one message, for a small index."""
+        """Add a batch of packets; packets of many cycles become one message, for a small index."""
         for packet in split_packets(payload):
             if self._oldest is None:
                 self._oldest = packet[0]
@@ -165,7 +167,7 @@ class RunMessages(ABC):
                 self._write_packets()
 
     def _write_packets(self) -> None:
-        """Write the packets that wait, one message a bus, each at the time of its last packet."""
+        """Write the waiting packets, one message per bus, with the time of its last packet."""
         self._oldest = None
         for channel, packets in zip(self._bus_channels, self._waiting, strict=True):
             if packets:

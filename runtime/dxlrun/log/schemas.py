@@ -1,8 +1,7 @@
-"""Topics, messages and metadata of the log: the one place that declares them.
+"""Schemas: the declarations of topics, messages and metadata of the log.
 
 Messages are ROS 2 definitions (`ros2msg`), encoded as CDR little-endian, so that rosbag2, Foxglove,
-PlotJuggler and Rerun open a log without conversion. Every channel carries the RIHS01 hash of its type (REP
-2016).
+PlotJuggler and Rerun open a log without conversion. Every channel has the RIHS01 hash of its type (REP 2016).
 """
 
 from __future__ import annotations
@@ -35,11 +34,11 @@ SCHEMA_ENCODING = "ros2msg"
 
 
 class LogTopic(StrEnum):
-    """Topics of every log. A bus has a topic that begins with `BUS_PREFIX`; controllers add their own."""
+    """Topics of every log. The topic of a bus begins with `BUS_PREFIX`; controllers add their own topics."""
 
     CYCLE = "/cycle"
     ACTIVATION = "/activation"
-    """One message of the type of /cycle: states and goals with which the controllers were activated."""
+    """One message of the type of /cycle: states and goals at the activation of the controllers."""
     COMMANDS = "/commands"
     EVENT = "/events"
     ROSOUT = "/rosout"
@@ -55,20 +54,21 @@ class LogTopic(StrEnum):
 BUS_PREFIX = "/bus/"
 
 METADATA_NAME = "dxlrun"
-"""The metadata record that makes an MCAP file a log of dxlrun."""
+"""Name of the metadata record that identifies a log of dxlrun."""
 SUMMARY_NAME = "dxlrun_summary"
-"""The metadata record that a finished log ends with."""
+"""Name of the last metadata record of a finished log."""
 FAILURES_NAME = "failures"
-"""The metadata record with what failed in the run outside of the loop, one sentence each."""
+"""Name of the metadata record with failures outside the loop, one sentence each."""
 HEADER_ATTACHMENT = "header.json"
 COMPRESSED_SUFFIX, COMPRESSED_TYPE = ".zst", "application/zstd"
-"""Of an attachment that is compressed: its name has this at its end."""
+"""Suffix and media type of a compressed attachment."""
 KEPT_ATTACHMENT = "kept.json"
-"""What controllers kept in earlier runs, and began with."""
+"""Attachment with the states that controllers kept in earlier runs and began with."""
 FORMAT = "9"
-"""Grows when a reader of the version before would misread a log."""
+"""Log format; increased when readers of the previous version would misread a log."""
 READ_FORMATS = ("8", FORMAT)
-"""Format 8 has another word for the unit of a joint: see `plan.robot_plan.decode_plan`."""
+"""Readable log formats. Format 8 has another name for the unit of a joint: see
+`plan.robot_plan.decode_plan`."""
 
 
 def bus_topic(bus: str) -> str:
@@ -146,8 +146,9 @@ LATCHED = f"""- history: 1
   liveliness_lease_duration:
     {_FOREVER}
   avoid_ros_namespace_conventions: false"""
-"""Quality of service as rosbag2 writes it: keep last, reliable, transient local, so that late subscribers get
-the message too. The integers are those of rmw/types.h; older rosbag2 reads no words here."""
+"""Quality of service in the format of rosbag2: keep last, reliable, transient local, so that late
+subscribers also get the message. The integers are those of rmw/types.h, because older versions of rosbag2
+read no words here."""
 
 
 def _cycle_text() -> str:
@@ -259,21 +260,21 @@ float64 loop_major_faults
 
 
 class LoggedController(msgspec.Struct, frozen=True):
-    """One controller of the run; its index is its bit in the masks of a cycle."""
+    """A controller of the run; its index is its bit in the masks of a cycle."""
 
     name: str
     joints: tuple[str, ...]
     publishes: tuple[str, ...]
-    """Topics that it writes in the cycles it marks."""
+    """Topics that the controller publishes in the cycles that it marks."""
 
 
 def epoch_offset_ns() -> int:
-    """Return wall time minus monotonic time, ns: read once, so that a clock step cannot bend the log."""
+    """Return wall time minus monotonic time, ns. Read once, so that a clock step does not distort the log."""
     return time.time_ns() - time.monotonic_ns()
 
 
 class LogHeader(msgspec.Struct, frozen=True):
-    """Everything that is known before the first record; JSON on its way to the recorder."""
+    """Description of a run that is known before the first record; sent to the recorder as JSON."""
 
     robot: str
     joints: tuple[str, ...]
@@ -281,27 +282,27 @@ class LogHeader(msgspec.Struct, frozen=True):
     controllers: tuple[LoggedController, ...]
     period_ns: int
     epoch_offset_ns: int
-    """Wall time (ns since 1970) = time of the run's clock + this."""
+    """Wall time (ns since 1970) minus the run's clock."""
     references: tuple[str, ...] = ()
-    """Names of the cycles' references: `arm_pid/shoulder/position`."""
+    """Names of the references in a cycle: `arm_pid/shoulder/position`."""
     sources: dict[str, tuple[str, ...]] = {}
-    """Devices, sensors and controllers that provide states, each with the names of its states."""
+    """Devices, sensors and controllers that provide states, with the names of these states."""
     source_commands: tuple[str, ...] = msgspec.field(default=(), name=SOURCE_COMMANDS)
-    """Names of the cycles' commands of sources: `light/led`."""
+    """Names of the source commands in a cycle: `light/led`."""
     source_units: dict[str, str] = {}
-    """SI units of the states of sources, by `imu/angular_velocity.x`; logs of earlier versions have none."""
+    """SI units of source states by `imu/angular_velocity.x`; empty in logs of earlier versions."""
     attachments: dict[str, bytes] = {}
-    """Robot file, plan: by name."""
+    """Attachments by name: robot file, plan."""
     metadata: dict[str, dict[str, str]] = {}
-    """Versions, kernel, scheduler: records of text by name."""
+    """Metadata records by name: versions, kernel, scheduler."""
     robot_description: str | None = None
     """The robot's URDF."""
     frames: FramesPlan | None = None
-    """What moves its frames, and how they are logged; None: it has no URDF."""
+    """Plan of the moved frames and their logging; None without a URDF."""
 
     @classmethod
     def of(cls, plan: Plan, epoch_offset_ns: int) -> LogHeader:
-        """Return what the messages of a run are made with; attachments and metadata are left out."""
+        """Return the header of a run, without attachments and metadata."""
         loop = plan.loop
         return cls(
             robot=plan.robot,
@@ -323,7 +324,7 @@ class LogHeader(msgspec.Struct, frozen=True):
 
     @property
     def layout(self) -> CycleLayout:
-        """Of the cycles' records."""
+        """Layout of the cycles' records."""
         names = [controller.name for controller in self.controllers]
         return CycleLayout(self.joints, names, self.references, self.sources, self.source_commands)
 
@@ -332,7 +333,7 @@ _SPAN = struct.Struct("=qq")
 
 
 class CycleSpan:
-    """Time of a run that the cycles in a log cover: from the first deadline to the last cycle."""
+    """Time span of a run that the cycles in a log cover, from the first deadline to the last cycle."""
 
     __slots__ = ("begin_ns", "last_ns")
 
@@ -341,19 +342,19 @@ class CycleSpan:
 
     @classmethod
     def load(cls, descriptor: int) -> CycleSpan:
-        """Return the span that a recorder has stored in a nameless file; an empty one before that."""
+        """Return the span that a recorder has stored in a memory file; an empty span before that."""
         data = os.pread(descriptor, _SPAN.size, 0)
         return cls(*_SPAN.unpack(data)) if len(data) == _SPAN.size else cls()
 
     def store(self, descriptor: int) -> None:
-        """Store the span in a nameless file, where it outlives this process."""
+        """Store the span in a memory file, where it survives this process."""
         if self.begin_ns is not None and self.last_ns is not None:
             os.pwrite(descriptor, _SPAN.pack(self.begin_ns, self.last_ns), 0)
 
     def add(self, record: np.void, period_ns: int) -> None:
         """Extend the span by a record of /cycle or /activation, which has number -1 and the first deadline.
 
-        The first cycle may not be the first of the run, in a later part: its number gives the deadline.
+        In a later part, the first record is not the first of the run; its number gives the first deadline.
         """
         number = int(record["cycle"])
         if self.begin_ns is None:
@@ -363,36 +364,36 @@ class CycleSpan:
 
     @property
     def last_cycle_text(self) -> str:
-        """A clause about the last cycle of a log that is not whole."""
+        """Clause about the last cycle of an incomplete log."""
         if self.begin_ns is None or self.last_ns is None:
             return "it has no cycle"
         return f"its last cycle is at {(self.last_ns - self.begin_ns) / 1e9:.1f} s of the run"
 
 
 class RecorderJob(msgspec.Struct, frozen=True):
-    """What a recorder works on, as JSON through a descriptor."""
+    """Job of a recorder, sent as JSON through a file descriptor."""
 
     path: str
     header: LogHeader
     rings: dict[str, int]
-    """Descriptors of the rings that it reads, by their names."""
+    """File descriptors of the rings, by name."""
     recording: RecordingPlan = RecordingPlan()
     span: int = -1
-    """Descriptor of the nameless file for the CycleSpan of what was flushed; -1: none."""
+    """File descriptor of the memory file for the CycleSpan of flushed cycles; -1: none."""
 
 
 class LogSummary(msgspec.Struct, frozen=True):
-    """What was written, and what was not."""
+    """Numbers of written and lost records of a log."""
 
     messages: int
     bytes: int
     """Size of the file."""
     gaps: int
-    """Records that the recorder did not get from the rings."""
+    """Number of records that the recorder did not receive from the rings."""
     error: str | None = None
-    """Why the log is not whole: a full disk, a file that was deleted."""
+    """Reason why the log is incomplete: a full disk, a deleted file."""
     unwritten: int = 0
-    """Messages that were lost with the unfinished chunk when writing stopped, and records that came later."""
+    """Number of messages in the unfinished chunk when writing stopped, and of later records."""
 
 
 class LogClosed(msgspec.Struct, frozen=True, tag=True):
@@ -400,9 +401,9 @@ class LogClosed(msgspec.Struct, frozen=True, tag=True):
 
     summary: LogSummary
     start_up_load: MachineLoad = MachineLoad()
-    """Of the machine, from the begin of the loop's process to its first cycle."""
+    """Load of the machine from the start of the loop's process to its first cycle."""
     run_load: MachineLoad = MachineLoad()
-    """Of the machine, from the first cycle on."""
+    """Load of the machine from the first cycle on."""
 
 
 _TEXTS = {
@@ -410,9 +411,9 @@ _TEXTS = {
     for one in msgspec.structs.fields(LogHeader)
     if one.name not in {"attachments", "metadata", "robot_description", "frames"}
 }
-"""Fields of the header in the metadata, by the metadata's names: JSON, but texts as they are."""
+"""Fields of the header by name in the metadata: strings unchanged, others as JSON."""
 _ADDED = frozenset({"source_units"})
-"""Names that logs of the same format did not always have."""
+"""Names that early logs of the same format do not have."""
 
 
 def to_metadata(header: LogHeader) -> dict[str, str]:

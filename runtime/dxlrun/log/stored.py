@@ -1,4 +1,4 @@
-"""Stored logs: which are being written, how much disk the logs of runs take, and which are the oldest."""
+"""Stored logs: size and age of the logs of runs, and whether they are being written."""
 
 from __future__ import annotations
 
@@ -14,20 +14,20 @@ from dxlrun.log.log_file import has_writer
 from dxlrun.log.parts import is_log_directory, log_files
 
 MUCH_BYTES = 10 * 10**9
-"""From here on the end of a run says how much its folder has."""
+"""Size of a folder of logs above which the end of a run reports it."""
 _NAME = re.compile(r"\w+_\d{8}_\d{6}(_\d+)?")
 
 
 class StoredLog(msgspec.Struct, frozen=True):
-    """A log that a run has left in a folder."""
+    """A log of a run in a folder."""
 
     path: Path
     bytes: int
     changed_s: float
-    """When it was written last, s since 1970."""
+    """Time of the last write, s since 1970."""
 
     def delete(self) -> None:
-        """Delete the log; raises OSError. Other files in the directory of a log in parts stay."""
+        """Delete the log; raises OSError. Other files in the directory of a log in parts are kept."""
         if not self.path.is_dir():
             self.path.unlink(missing_ok=True)
             return
@@ -38,16 +38,17 @@ class StoredLog(msgspec.Struct, frozen=True):
 
 
 def is_being_written(log: Path) -> bool:
-    """Return whether a run is writing a log, a file or a directory of parts; False where there is none."""
+    """Return whether a run is writing a log, a file or a directory of parts; False without a log."""
     with suppress(LogError):
         return has_writer(log_files(log).files[-1])
     return False
 
 
 def stored_logs(folder: Path) -> tuple[StoredLog, ...]:
-    """Return the logs in a folder whose names runs have given, the oldest first."""
+    """Return the logs in a folder that have names of runs, oldest first."""
     found: list[StoredLog] = []
-    with suppress(OSError):  # gone, or not to be read: it has none for this user
+    # A missing or unreadable folder has no logs for this user.
+    with suppress(OSError):
         found = [
             one
             for path in folder.iterdir()
@@ -59,15 +60,15 @@ def stored_logs(folder: Path) -> tuple[StoredLog, ...]:
 
 
 def bytes_of(log: Path) -> int:
-    """Return the size of a log, 0 where there is none."""
+    """Return the size of a log, bytes; 0 without a log."""
     stored = _stored(log)
     return 0 if stored is None else stored.bytes
 
 
 def oldest_beyond(folder: Path, keep_bytes: int, but: Iterable[Path] = ()) -> tuple[StoredLog, ...]:
-    """Return the oldest logs without which the others fit into `keep_bytes`.
+    """Return the oldest logs to delete so that the others fit into `keep_bytes`.
 
-    `but` and logs that are being written are not among them.
+    Logs in `but` and logs that are being written are not returned.
     """
     logs, spared = stored_logs(folder), set(but)
     left = sum(one.bytes for one in logs)
@@ -82,7 +83,7 @@ def oldest_beyond(folder: Path, keep_bytes: int, but: Iterable[Path] = ()) -> tu
 
 
 def _stored(path: Path) -> StoredLog | None:
-    """Return what lies at a path; None: no log."""
+    """Return the log at a path; None without one."""
     in_parts = is_log_directory(path)
     if not in_parts and (path.suffix != ".mcap" or not path.is_file()):
         return None

@@ -1,4 +1,4 @@
-"""Packing of a run's records as messages of the log, field by field.
+"""Packing: conversion of a run's records to messages of the log, field by field.
 
 The schemas of these messages are in `log/schemas.py`.
 """

@@ -1,4 +1,4 @@
-"""Messages of `/bus/NAME`: packets of a bus as arrays; packing, and reading as columns."""
+"""Bus messages: messages of `/bus/NAME`, with the packets of a bus as arrays; packing and reading."""
 
 from __future__ import annotations
 
@@ -16,16 +16,16 @@ from dxlwire.packets import PacketKind
 
 _CODEC, _READER = Codec(BUS_PACKETS), ColumnReader(BUS_PACKETS)
 _FIELDS = ("cycle_delta", "first_ns_delta", "duration_ns", "kind", "servo_id", "length", "data")
-"""Sequences; but for the last one with an element a packet."""
+"""Sequences with one element per packet, except for the last one."""
 
 
 def pack_packets(packets: Sequence[BatchedPacket]) -> bytes:
-    """Return the message of packets on one bus, at least one."""
+    """Return the message of one or more packets on one bus."""
     cycle, _, kind, servo_id, first_ns, last_ns, data = zip(*packets, strict=True)
     first = np.array(first_ns, np.int64)
     took = np.array(last_ns, np.int64) - first
     length = np.array([len(one) for one in data], np.uint16)
-    # differences repeat: compressed, they take a fifth of what times and cycles do
+    # Differences repeat, so they compress to a fifth of the size of absolute times and cycles.
     steps = (np.diff(np.array(each, np.int64), prepend=np.int64(0)) for each in (cycle, first))
     return _CODEC.pack(*steps, took, bytes(kind), bytes(servo_id), length, b"".join(data))
 
@@ -36,13 +36,18 @@ def read_packets(
     start: NDArray[np.int64],
     size: NDArray[np.int64],
 ) -> tuple[PacketColumns, int]:
-    """Return the packets of the messages in `data`, and the number of messages that contradict themselves.
+    """Return the packets of the messages in `data`, and the number of inconsistent messages.
 
-    `bus`: index in the log's buses; `start`: of each message's encapsulation header; `size`: its bytes.
+    Args:
+        data: Bytes that contain the messages.
+        bus: Index into the log's buses, for each message.
+        start: Index of each message's encapsulation header.
+        size: Length of each message, bytes.
     """
     try:
         whole, tree = _READER.read(data, start, size)
-    except ValueError:  # none of them is a message
+    # None of them is a valid message.
+    except ValueError:
         return PacketColumns.of(()), len(start)
     good = _consistent(tree)
     if not good.all():
@@ -65,7 +70,7 @@ def read_packets(
 
 
 def _consistent(tree: Column) -> NDArray[np.bool_]:
-    """Return which messages have an element a packet, only kinds that there are, and the bytes they say."""
+    """Return a mask of consistent messages: equal lengths, known packet kinds, as many bytes as stated."""
     *counts, bytes_each = (tree.leaf(name).flat[0] for name in _FIELDS)
     good = np.all([one == counts[0] for one in counts], axis=0)
     kinds, lengths = (tree.leaf(name).flat for name in ("kind", "length"))
@@ -75,7 +80,7 @@ def _consistent(tree: Column) -> NDArray[np.bool_]:
 
 
 def _summed_up(count: NDArray[np.int64], deltas: NDArray[np.generic]) -> NDArray[np.int64]:
-    """Return the sums of differences, of which each message has `count`, from its first one on."""
+    """Return the cumulative sums of differences for each message; `count`: differences per message."""
     sums = np.cumsum(deltas.astype(np.int64, copy=False))
     before = np.concatenate([[0], sums])[np.cumsum(count) - count]
     found: NDArray[np.int64] = sums - np.repeat(before, count)
@@ -83,5 +88,5 @@ def _summed_up(count: NDArray[np.int64], deltas: NDArray[np.generic]) -> NDArray
 
 
 def _sums(count: NDArray[np.int64], values: NDArray[np.generic]) -> NDArray[np.number]:
-    """Return the sum of the values of each message, of which each has `count`."""
+    """Return the sum of the values of each message; `count`: values per message."""
     return np.bincount(np.repeat(np.arange(len(count)), count), values, len(count))

@@ -1,4 +1,4 @@
-"""Messages of /diagnostics: temperature, voltage, hardware error and mode of each servo, once a second."""
+"""Diagnostics: messages of /diagnostics with temperature, voltage, hardware error and mode, once a second."""
 
 from __future__ import annotations
 
@@ -12,14 +12,14 @@ from dxlrun.messages.cdr import Codec
 from dxlwire.modes import Mode
 
 DIAGNOSTICS_NS = 1_000_000_000
-"""The least time between two messages."""
+"""Shortest interval between two messages."""
 _OK, _ERROR, _STALE = 0, 2, 3
 """Levels of diagnostic_msgs/msg/DiagnosticStatus."""
 _Status = tuple[int, str, str, str, tuple[tuple[str, str], ...]]
 
 
 class Diagnostics:
-    """Makes a message of a cycle when the last one is old enough; rows are in the order of the joints."""
+    """Diagnostics messages made from cycles, limited in rate; rows are in the order of the joints."""
 
     def __init__(self, joints: Sequence[str]) -> None:
         self._joints = tuple(joints)
@@ -27,7 +27,7 @@ class Diagnostics:
         self._due_ns: int | None = None
 
     def of(self, record: np.void, t_ns: int, stamp: tuple[int, int]) -> bytes | None:
-        """Return the message of a cycle at `t_ns`, None while the one before is new."""
+        """Return the message of a cycle at `t_ns`; None within DIAGNOSTICS_NS after the previous one."""
         if self._due_ns is not None and t_ns < self._due_ns:
             return None
         self._due_ns = t_ns + DIAGNOSTICS_NS

@@ -1,7 +1,7 @@
-"""Messages of /tf and /tf_static: where the frames of a robot lie, from its URDF and the record of a cycle.
+"""Frame messages: messages of /tf and /tf_static, with the poses of a robot's frames from URDF and cycles.
 
-A frame whose joint was never read is in no message until it was. A joint that is not read any more stays
-where it was read last, as the record has it.
+A frame is omitted until its joint was read once. A joint that is no longer read keeps its last position, as
+in the record.
 """
 
 from __future__ import annotations
@@ -16,13 +16,13 @@ from dxlrun.messages.cdr import Codec
 from dxlsim.geometry.transform import Quaternion, Transform, near
 
 Stamp = tuple[int, int]
-"""Seconds since 1970 and the nanoseconds behind them."""
+"""Seconds since 1970 and the remaining nanoseconds."""
 
 
 class FrameMessages:
-    """Makes a message of /tf of a cycle when the last one is old enough, and that of /tf_static.
+    """Messages of /tf made from cycles, limited in rate, and the message of /tf_static.
 
-    Raises InputError where the URDF is wrong, or does not fit the plan: the compiler has checked both.
+    Raises InputError when the URDF is wrong or does not fit the plan; the compiler has checked both.
     """
 
     def __init__(self, urdf: str, plan: FramesPlan, header: LogHeader) -> None:
@@ -41,16 +41,16 @@ class FrameMessages:
 
     @property
     def any_still(self) -> bool:
-        """Whether there is something for /tf_static."""
+        """True when /tf_static has frames."""
         return bool(self._still)
 
     def still(self, stamp: Stamp) -> bytes:
-        """Return the message of the frames that never move in their parents."""
+        """Return the message of the frames that do not move in their parents."""
         found = [(frame, self._tree.local(frame, {})) for frame in self._still]
         return _packed(stamp, [(frame, local) for frame, local in found if local is not None])
 
     def of(self, record: np.void, stamp: Stamp) -> bytes | None:
-        """Return the message of a cycle; None while the one before is new, or nothing is known yet."""
+        """Return the message of a cycle; None within the interval of the last one, or without any pose."""
         slot = int(record["scheduled_ns"]) // self._interval_ns
         if slot == self._slot:
             return None
@@ -67,7 +67,7 @@ class FrameMessages:
         return _packed(stamp, found) if found else None
 
     def _continued(self, name: str, local: Transform) -> Transform:
-        """Return a transform whose quaternion has the sign of the one before."""
+        """Return a transform with the quaternion's sign chosen to continue the previous one."""
         rotation = near(local.rotation, self._last.get(name, local.rotation))
         self._last[name] = rotation
         return Transform(local.translation, rotation)
@@ -83,7 +83,7 @@ def _packed(stamp: Stamp, found: Sequence[tuple[Frame, Transform]]) -> bytes:
 
 
 def frame_messages(header: LogHeader) -> FrameMessages | None:
-    """Return what makes the messages of a log; None: its robot has no URDF, or asks for none."""
+    """Return the frame messages of a log; None without a URDF, or with rate 0."""
     if header.frames is None or not header.frames.rate or header.robot_description is None:
         return None
     return FrameMessages(header.robot_description, header.frames, header)

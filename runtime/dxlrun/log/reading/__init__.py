@@ -1,4 +1,4 @@
-"""Reading of a log below its reader: chunks, topics, slices of a run, columns.
+"""Parts of the reader: chunks, topics, slices of a run, columns.
 
-Files are opened by `log/reader.py`. What is computed from columns belongs to its caller.
+Files are opened by `log/reader.py`. Computations on columns belong to their callers.
 """

@@ -1,4 +1,4 @@
-"""Columns of a topic as Arrow: messages inside messages are structs, sequences are lists."""
+"""Arrow: columns of a topic as Arrow data; nested messages are structs, sequences are lists."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ from dxlrun.messages.definition import (
 
 
 def schema_of(reader: ColumnReader, fields: Sequence[str] | None) -> pa.Schema:
-    """Return the columns of a topic: `t_ns`, and the chosen places, or the fields of the message."""
+    """Return the schema of a topic: `t_ns`, and the chosen fields or all fields of the message."""
     top, definitions = short_name(reader.message.name), reader.definitions
     if fields is None:
         fields = [one.name for one in definitions[top]]
@@ -29,13 +29,13 @@ def schema_of(reader: ColumnReader, fields: Sequence[str] | None) -> pa.Schema:
 
 
 def batch_of(schema: pa.Schema, t_ns: NDArray[np.int64], tree: Column) -> pa.RecordBatch:
-    """Return some messages as a batch."""
+    """Return messages as a record batch."""
     columns = [_array(tree.leaf(name), schema.field(name).type) for name in schema.names[1:]]
     return pa.record_batch([pa.array(t_ns), *columns], schema=schema)
 
 
 def type_of(one: MessageField, definitions: Definitions) -> pa.DataType:
-    """Return the type of a field; that of a message is a struct."""
+    """Return the Arrow type of a field; nested messages are structs."""
     if one.kind in definitions:
         inside: pa.DataType = struct_of(one.kind, definitions)
     elif one.kind == "string":
@@ -51,7 +51,7 @@ def message_struct(message: MessageType) -> pa.DataType:
 
 
 def struct_of(message: str, definitions: Definitions) -> pa.DataType:
-    """Return the type of a message, by its short name."""
+    """Return the Arrow type of a message, given by its short name."""
     return pa.struct([(field.name, type_of(field, definitions)) for field in definitions[message]])
 
 

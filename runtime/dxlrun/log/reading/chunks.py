@@ -1,6 +1,6 @@
-"""The records of an MCAP file, of any writer: its messages chunk by chunk, also of a damaged file.
+"""Chunks: the messages of an MCAP file of any writer, chunk by chunk, even from a damaged file.
 
-Source: mcap.dev/spec. Memory is bounded whatever the file says: by _LARGEST for a record and for a chunk.
+Source: mcap.dev/spec. Memory is bounded for any content: by _LARGEST for each record and each chunk.
 """
 
 from __future__ import annotations
@@ -30,7 +30,7 @@ from dxlrun.messages.definition import MessageType
 MAGIC = b"\x89MCAP0\r\n"
 _RECORD = struct.Struct("<BQ")
 _MESSAGE_HEAD = 22
-"""Bytes of a message before its data: channel, sequence, log time, publish time."""
+"""Bytes of a message's header: channel, sequence, log time, publish time."""
 _TIME_AT = 6
 _DAMAGE = (
     McapError,
@@ -42,37 +42,38 @@ _DAMAGE = (
     MemoryError,
 )
 _LARGEST = 64 << 20
-"""Bytes of a record, and of a chunk when decompressed; ours have 512 KiB and one message."""
+"""Upper limit of a record, and of a decompressed chunk, bytes; dxlrun's chunks have 512 KiB and one
+message."""
 _MOST_EXPANDED = 256
-"""Bytes that a file may become for each of its own: logs of ours become 8 to 50 times as long."""
+"""Upper limit of the decompression ratio of a file; logs of dxlrun have 8 to 50."""
 _LOOSE_BYTES = 1 << 20
-"""Messages that are in no chunk are taken together in so many bytes."""
+"""Size to which messages outside chunks are joined, bytes."""
 _COMPRESSIONS = (b"\4\0\0\0zstd", b"\3\0\0\0lz4")
-"""What a chunk's header has in it, by which one is found behind damage."""
+"""Compression fields of chunk headers, by which the next chunk after damage is found."""
 _COMPRESSION_AT = _RECORD.size + 28
 _BLOCK = 1 << 20
 
 
 class OpenChannel(msgspec.Struct, frozen=True):
-    """One channel of a file."""
+    """A channel of a file."""
 
     topic: str
     encoding: str
-    """Of its messages: `cdr`."""
+    """Encoding of its messages: `cdr`."""
     type_name: str
     schema_encoding: str
-    """`ros2msg`, or another that is not read here."""
+    """`ros2msg`; other encodings are not read here."""
     text: str
-    """The definition of its messages."""
+    """Definition of its messages."""
 
     @property
     def type(self) -> MessageType:
-        """Of its messages."""
+        """Type of its messages."""
         return MessageType(self.type_name, self.text)
 
 
 class Messages(msgspec.Struct, frozen=True, eq=False):
-    """The messages of one chunk, an element each, in the order of the file."""
+    """Messages of one chunk, one element each, in the order of the file."""
 
     data: NDArray[np.uint8]
     """Bytes of the chunk."""
@@ -92,7 +93,7 @@ class Messages(msgspec.Struct, frozen=True, eq=False):
 
 
 def gathered(chunks: Iterable[Messages], least: int) -> Iterator[Messages]:
-    """Yield the messages of several chunks as one: at least so many bytes, as long as there are as many."""
+    """Yield the joined messages of several chunks, at least `least` bytes each except for the last."""
     parts: list[Messages] = []
     size = 0
     for messages in chunks:
@@ -106,7 +107,7 @@ def gathered(chunks: Iterable[Messages], least: int) -> Iterator[Messages]:
 
 
 def _joined(parts: list[Messages]) -> Messages:
-    """Return messages as one, and forget the parts: they need not be in memory twice."""
+    """Return joined messages, and clear `parts`, so that they are not in memory twice."""
     if len(parts) == 1:
         return parts.pop()
     sizes = [len(part.data) for part in parts]
@@ -124,44 +125,45 @@ def _joined(parts: list[Messages]) -> Messages:
 
 @dataclass(slots=True)
 class McapFile:
-    """What a walk through a file has found; it goes on where the last one ended, as a file may grow.
+    """Contents of a file, found by a walk. As a file may grow, the next walk continues at the end of the
+    last.
 
-    The files of one log are walked one after the other: `begin` goes to the next.
+    The files of one log are walked in sequence: `begin` starts the next file.
     """
 
     channels: dict[int, OpenChannel] = field(default_factory=dict)
     attachments: dict[str, bytes] = field(default_factory=dict)
     metadata: dict[str, dict[str, str]] = field(default_factory=dict)
     counts: dict[int, int] = field(default_factory=dict)
-    """Messages of each channel, by the file's own statistics; empty without them."""
+    """Messages of each channel according to the file's statistics; empty without them."""
     damage: list[str] = field(default_factory=list)
     finished: bool = False
     end: int = len(MAGIC)
-    """The byte behind the last whole record."""
+    """Offset after the last complete record."""
     name: str = ""
-    """What sentences call the file; empty: there is only one."""
+    """Name of the file in sentences; empty for a single file."""
     on_metadata: Callable[[str, dict[str, str]], None] = lambda name, record: None
-    """Called with each metadata record; what it raises ends the walk."""
+    """Called with each metadata record; an exception ends the walk."""
     _base: int = 0
-    """Added to the numbers of channels, which each file has for itself."""
+    """Offset of channel numbers, which each file counts separately."""
     _anchor: int = len(MAGIC)
-    """Behind the last chunk that is whole: from here the next one is looked for when a record is none."""
+    """Offset after the last complete chunk, from which the next chunk is searched after an invalid record."""
     _read: Counter[int] = field(default_factory=Counter)
-    """Messages of each channel that were there."""
+    """Messages of each channel that were read."""
     _schemas: dict[int, Schema] = field(default_factory=dict)
     _room: int = 0
-    """Bytes that the chunks which follow may have when they are decompressed."""
+    """Remaining bytes for decompressed chunks."""
 
     def begin(self, number: int) -> None:
-        """Go on with another file, with channels of its own."""
+        """Start another file, with its own channels."""
         self._base, self.end, self.finished = number << 16, len(MAGIC), False
         self._anchor = self.end
         self._schemas.clear()
 
     def walk(self, stream: IO[bytes], size: int, *, chunks: bool = True) -> Iterator[Messages]:
-        """Yield the messages chunk by chunk, to the end of the file; what cannot be read is in `damage`.
+        """Yield the messages chunk by chunk, to the end of the file; `damage` gets what cannot be read.
 
-        Without `chunks` there are none, and channels that are only beside messages are not found.
+        `chunks=False` skips messages, and the channels that only chunks have.
         """
         self._room = _LARGEST + _MOST_EXPANDED * size
         loose = bytearray()
@@ -196,7 +198,7 @@ class McapFile:
                 return
 
     def _head(self, stream: IO[bytes], size: int) -> tuple[int, int]:
-        """Return opcode and length of the next record; 0 where there is none that is whole."""
+        """Return opcode and length of the next record; 0 without a complete record."""
         stream.seek(self.end)
         head = stream.read(_RECORD.size)
         if len(head) < _RECORD.size:
@@ -207,13 +209,14 @@ class McapFile:
             return 0, 0
         if opcode == Opcode.FOOTER:
             stream.seek(end)
-            if stream.read(len(MAGIC)) != MAGIC:  # another record, of which a bit is wrong
+            # Another record with a wrong bit.
+            if stream.read(len(MAGIC)) != MAGIC:
                 return 0, 0
             stream.seek(self.end + _RECORD.size)
         return opcode, length
 
     def _finish(self, *, counted: bool) -> None:
-        """End the file; with `counted`, report what its statistics have and was not there unexplained."""
+        """Mark the file as finished; with `counted`, report missing messages that no damage explains."""
         self.finished = True
         if counted and not self.damage:
             self.damage += [
@@ -223,11 +226,12 @@ class McapFile:
             ]
 
     def _go_on(self, stream: IO[bytes], size: int) -> bool:
-        """Find the next chunk behind what is no record; return whether there is one."""
+        """Find the next chunk after an invalid record; return False without one."""
         begin = self.end
         found = _next_chunk(stream, self._anchor, size)
         if found is not None:
-            begin = min(begin, self._anchor)  # a wrong length may have led past it
+            # A wrong length may have skipped the next chunk.
+            begin = min(begin, self._anchor)
             self.end, self._anchor = found, found + 1
             self.damage.append(f"what lies between byte {begin} and byte {found}{self._of} cannot be read")
             return True
@@ -241,7 +245,7 @@ class McapFile:
         return f" of {self.name}" if self.name else ""
 
     def _chunk(self, body: bytes) -> bytes | None:
-        """Return the records of a chunk; None, and a sentence, when it is damaged."""
+        """Return the records of a chunk; None for a damaged chunk, which is reported."""
         try:
             return self._decompressed(Chunk.read(ReadDataStream(BytesIO(body))))
         except _DAMAGE as error:
@@ -254,7 +258,7 @@ class McapFile:
             self.damage.append(damage)
 
     def _messages(self, data: bytes) -> Iterator[Messages]:
-        """Cut a chunk into its messages; what lies behind the first that is damaged is left out."""
+        """Split a chunk into its messages; all after the first damaged record is skipped."""
         starts: list[int] = []
         keep, unpack, at, end = starts.append, _RECORD.unpack_from, 0, len(data)
         message = int(Opcode.MESSAGE)
@@ -291,7 +295,7 @@ class McapFile:
         )
 
     def _decompressed(self, chunk: Chunk) -> bytes:
-        """Return the records of a chunk; EOFError when it contradicts its header, or is more than allowed."""
+        """Return the records of a chunk; raises EOFError if it contradicts its header, or exceeds a limit."""
         size = chunk.uncompressed_size
         self._take_room(size)
         if chunk.compression == "zstd":
@@ -312,7 +316,7 @@ class McapFile:
         return data
 
     def _take_room(self, size: int) -> None:
-        """Allow bytes that are to be decompressed. Raises EOFError where they are too many."""
+        """Reserve bytes for a decompression. Raises EOFError above the limits."""
         if size > _LARGEST:
             raise EOFError(f"it is {size} bytes long when decompressed, and {_LARGEST} are read at most")
         if size > self._room:
@@ -334,7 +338,8 @@ class McapFile:
             schema.data.decode(errors="replace") if schema else "",
         )
         known = self.channels.setdefault(self._base + channel.id, found)
-        if known != found:  # the summary at the end repeats all of them, and has no CRC of its own here
+        # The summary at the end repeats all channels, without a CRC.
+        if known != found:
             self.damage.append(
                 f"the topic {known.topic} is described in two ways{self._of}; the first counts"
             )
@@ -371,12 +376,12 @@ _OPENS = frozenset((int(Opcode.SCHEMA), int(Opcode.CHANNEL)))
 
 
 def _of_zstd(data: bytes, most: int) -> bytes:
-    # not decompress(): it believes the length in the frame
+    # decompress() would trust the length in the frame, and allocate it.
     return zstandard.ZstdDecompressor().stream_reader(data).read(most)
 
 
 def _next_chunk(stream: IO[bytes], begin: int, size: int) -> int | None:
-    """Return where the next chunk begins; None when there is none."""
+    """Return the offset of the next chunk; None without one."""
     at = begin
     while at < size:
         stream.seek(at)
@@ -398,7 +403,7 @@ def _places(block: bytes, mark: bytes) -> Iterator[int]:
 
 
 def _is_chunk(stream: IO[bytes], start: int, size: int) -> bool:
-    """Return whether the lengths that the head of a chunk has agree with each other."""
+    """Return whether the lengths in a chunk's header are consistent."""
     stream.seek(start)
     head = stream.read(_COMPRESSION_AT + 16)
     if len(head) < _COMPRESSION_AT + 16:

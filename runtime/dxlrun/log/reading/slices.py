@@ -1,4 +1,4 @@
-"""A run as its log has it, whole or in slices: messages become cycles, packets, events and topics."""
+"""Slices: converts messages of a log to cycles, packets, events and topics, whole or in slices."""
 
 from __future__ import annotations
 
@@ -39,7 +39,7 @@ _FOR_OTHERS = frozenset(
         schemas.LogTopic.STILL_FRAMES,
     )
 )
-"""What other tools read; the same is in the other topics."""
+"""Topics for other tools; other topics have the same data."""
 _OWN = frozenset(
     (
         schemas.LogTopic.CYCLE,
@@ -48,16 +48,17 @@ _OWN = frozenset(
         schemas.LogTopic.EVENT,
     )
 )
-"""What this module reads by itself."""
+"""Topics that this module decodes."""
 _MOST_HELD = 4096
-"""Cycles that wait for their packets, or the other way round: recorders took up to 2000 of a ring in turn."""
+"""Upper limit of cycles that wait for their packets, or packets for their cycles: recorders took up to
+2000 records of one ring in turn."""
 _MOST_PACKETS_HELD = 1 << 18
 _NO_PACKETS = PacketColumns.of(())
 
 
 @dataclass(frozen=True)
 class Log:
-    """One run, as its log has it. Times: ns of the run's clock; wall time = that + `epoch_offset_ns`."""
+    """One run from its log. Times are ns of the run's clock; wall time = that + `epoch_offset_ns`."""
 
     path: Path
     header: LogHeader
@@ -69,34 +70,35 @@ class Log:
     complete: bool
     """True when the recorder finished the file and nothing in it is damaged."""
     damage: tuple[str, ...]
-    """A sentence for each thing that is missing or could not be read."""
+    """Sentences about missing or unreadable data."""
     being_written: bool = False
     """True when a run was writing the file as it was read."""
     packets: PacketColumns = field(default_factory=lambda: PacketColumns.of(()))
-    """Every packet of every bus, bus by bus as recorded."""
+    """All packets, bus by bus, each in the order of recording."""
     activation: NDArray[np.void] | None = None
-    """Shape (1,), as `cycles`: states and goals when the controllers were activated; None: not in the log."""
+    """Shape (1,), as `cycles`: states and goals at the activation of the controllers; None: not in the
+    log."""
     commands: tuple[TakenCommand, ...] = ()
-    """What cycles took for controllers and for the loop, in order."""
+    """Commands that cycles took for controllers and for the loop, in sequence."""
     topics: Mapping[str, LoggedTopic] = field(default_factory=dict)
-    """Own topics of controllers, and `/goals` of the runtime, by name."""
+    """Topics of controllers, and `/goals` of the runtime, by name."""
 
     part: int = 0
-    """Index of the part that it begins with; above 0 it lacks the run's beginning."""
+    """Index of the log's first part; above 0, the beginning of the run is missing."""
 
     def slices(self, *, packets: bool = True) -> Iterator[Log]:
-        """Yield the log itself: one that was read whole is its own only slice."""
+        """Yield the log itself, as its only slice."""
         yield self
 
     @property
     def about(self) -> Log:
-        """The log itself, as LogReader has one without its records."""
+        """The log itself, for the interface of LogReader."""
         return self
 
     def messages(self, topic: str) -> list[Mapping[str, Value]]:
-        """Return the messages of a controller's own topic by their fields; `topics` has times and columns.
+        """Return the messages of a controller's topic by field; `topics` has times and columns.
 
-        Raises LogError when the log does not have it.
+        Raises LogError when the log does not have the topic.
         """
         if topic not in self.topics:
             raise LogError(f"{self.path}: no topic {topic}; {suggestion(topic, tuple(self.topics))}")
@@ -109,28 +111,29 @@ class Log:
 
     @property
     def buses(self) -> tuple[str, ...]:
-        """Names of the buses; a packet's `bus` is an index here."""
+        """Names of the buses; a packet's `bus` is an index into this tuple."""
         return self.header.buses
 
     @property
     def controllers(self) -> tuple[LoggedController, ...]:
-        """The controllers, in the order of the masks' bits."""
+        """Controllers, in the order of the masks' bits."""
         return self.header.controllers
 
     @property
     def period_ns(self) -> int:
-        """The nominal period of the loop, ns."""
+        """Nominal period of the loop, ns."""
         return self.header.period_ns
 
 
 class Slicer:
-    """Makes slices of a run from the messages of its log; each has whole cycles, with all their packets.
+    """Converter from messages of a log to slices of a run, which have complete cycles with all packets.
 
-    Cycles and packets reach the recorder on two ways: what has no counterpart yet waits for the next slice.
+    Cycles and packets reach the recorder through different rings. Those without a counterpart wait for the
+    next slice.
     """
 
     def __init__(self, header: LogHeader, walk: LogWalk, *, packets: bool = True) -> None:
-        """`walk`: whose channels are known when their messages come; without `packets` nothing waits."""
+        """`walk`: source of the channels of messages; without `packets`, no cycle waits."""
         self._header, self._walk, self._file = header, walk, walk.file
         self._layout = header.layout
         self._buses = {schemas.bus_topic(bus): index for index, bus in enumerate(header.buses)}
@@ -141,10 +144,10 @@ class Slicer:
         self._names: dict[int, str] = {}
         self._span = CycleSpan()
         self.wrong = 0
-        """Messages of packets that are not what their definition says."""
+        """Number of inconsistent packet messages."""
 
     def take(self, messages: Messages) -> Log:
-        """Return what is whole with the next messages. Raises ValueError where they cannot be read."""
+        """Return the slice that is complete after more messages. Raises ValueError for unreadable ones."""
         bodies: dict[str, list[bytes]] = {}
         cycle_rows = np.zeros(0, np.int64)
         topics: dict[str, LoggedTopic] = {}
@@ -189,11 +192,11 @@ class Slicer:
         )
 
     def rest(self) -> Log:
-        """Return what still waits when there are no more messages."""
+        """Return the remaining cycles and packets after the last message."""
         return self._slice(self._cycles, _NO_PACKETS, last=True)
 
     def about(self) -> Log:
-        """Return a log without records, with all that the file says about itself until now."""
+        """Return a log without records, with the metadata and damage found so far."""
         damage = list(self._file.damage)
         if self.wrong:
             them = counted(self.wrong, "message of packets is", "messages of packets are")
@@ -228,7 +231,7 @@ class Slicer:
         )
 
     def _slice(self, cycles: NDArray[np.void], packets: PacketColumns, *, last: bool) -> Log:
-        """Return the cycles and packets that are whole, and keep the others; `cycles`: with those kept."""
+        """Return complete cycles and packets, and store the rest; `cycles` includes the stored ones."""
         found = [part for part in (self._packets, packets) if len(part)]
         joined = PacketColumns.joined(found)
         if len(found) > 1:
@@ -239,7 +242,7 @@ class Slicer:
         return self._log(_chosen(cycles, whole), joined if ready.all() else joined.take(ready))
 
     def _bound(self, cycles: NDArray[np.void], packets: PacketColumns) -> int:
-        """Return the number below which cycles have all their packets, and packets their cycle."""
+        """Return the first cycle number whose cycles or packets may be incomplete."""
         if len(cycles) > _MOST_HELD or len(packets) > _MOST_PACKETS_HELD:
             return _FOREVER
         newest = int(cycles["cycle"][-1]) if len(cycles) else 0
@@ -248,7 +251,7 @@ class Slicer:
         return newest
 
     def _read_packets(self, messages: Messages, buses: Mapping[int, int]) -> PacketColumns:
-        """Return the packets of channels; `buses`: the bus of each."""
+        """Return the packets of channels; `buses`: channel -> bus index."""
         rows = [np.flatnonzero(messages.channel == channel) for channel in buses]
         if not rows:
             return _NO_PACKETS
@@ -264,7 +267,7 @@ class Slicer:
         if not known.text and not known.type_name:
             raise ValueError(f"the topic {known.topic} has no definition")
         if channel not in self._names:
-            # of a controller that was unloaded and loaded again, maybe with another message
+            # A controller that was loaded again may publish another message type on the same topic.
             others = [one for at, one in self._file.channels.items() if at < channel]
             same = [one for one in others if one.topic == known.topic]
             other = same and (same[0].type_name, same[0].text) != (known.type_name, known.text)
@@ -277,7 +280,7 @@ _FOREVER = int(np.iinfo(np.int64).max)
 
 
 def joined_topic(parts: Sequence[LoggedTopic]) -> LoggedTopic:
-    """Return the messages of several slices of one topic as one."""
+    """Return the joined messages of several slices of one topic."""
     t_ns = np.concatenate([part.t_ns for part in parts])
     return structs.replace(
         parts[0], t_ns=t_ns, data=tuple(message for part in parts for message in part.data)
@@ -285,7 +288,7 @@ def joined_topic(parts: Sequence[LoggedTopic]) -> LoggedTopic:
 
 
 def joined_cycles(parts: Sequence[NDArray[np.void]]) -> NDArray[np.void]:
-    """Return cycles one behind the other, to the byte: numpy leaves out what lies between the fields."""
+    """Return concatenated cycles, including padding, which NumPy would not copy."""
     some = [part for part in parts if len(part)]
     if len(some) < 2:
         return some[0] if some else parts[0]
@@ -308,7 +311,7 @@ def _bytes(dtype: np.dtype[np.void]) -> np.dtype[np.void]:
 
 
 def joined(about: Log, slices: Sequence[Log]) -> Log:
-    """Return the slices of a log as one; `about`: what the file says about itself."""
+    """Return the joined slices of a log; `about`: the log without records."""
     packets = PacketColumns.joined([part.packets.compact() for part in slices if len(part.packets)])
     if len(about.buses) > 1:
         packets = packets.take(np.argsort(packets.bus, kind="stable"))
@@ -329,7 +332,7 @@ def joined(about: Log, slices: Sequence[Log]) -> Log:
 def _cycles(
     layout: CycleLayout, data: NDArray[np.uint8], start: NDArray[np.int64], size: NDArray[np.int64]
 ) -> NDArray[np.void]:
-    """Return the cycles of messages that lie in `data`."""
+    """Return the cycles of messages in `data`."""
     if (size != len(ENCAPSULATION) + layout.size).any():
         raise ValueError("the messages of /cycle are not as long as joints and controllers ask")
     bodies = pieces(data, start + len(ENCAPSULATION), size - len(ENCAPSULATION))

@@ -1,4 +1,4 @@
-"""Topics in a log: messages of controllers and of the runtime, decoded by the definitions that it has."""
+"""Topics: messages of controllers and the runtime in a log, decoded by the log's definitions."""
 
 from __future__ import annotations
 
@@ -14,19 +14,19 @@ from dxlrun.messages.definition import MessageType
 
 
 class LoggedTopic(msgspec.Struct, frozen=True, eq=False):
-    """One topic: its messages, in order."""
+    """One topic with its messages in sequence."""
 
     name: str
     """`/CONTROLLER/TOPIC`, or `/goals`."""
     type: MessageType
-    """As in the log."""
+    """Type as in the log."""
     t_ns: NDArray[np.int64]
-    """When each was published, ns of the run's clock: the wake-up of its cycle."""
+    """Time of publication of each message, ns of the run's clock: the wake-up of its cycle."""
     data: tuple[bytes, ...]
-    """CDR, as it was published."""
+    """CDR, as published."""
 
     def messages(self) -> list[Mapping[str, Value]]:
-        """Return the fields of each message; nested ones as mappings. Raises LogError."""
+        """Return the fields of each message, with nested messages as mappings. Raises LogError."""
         try:
             codec = Codec(self.type)
             return [codec.unpack(data) for data in self.data]
@@ -34,9 +34,9 @@ class LoggedTopic(msgspec.Struct, frozen=True, eq=False):
             raise LogError(f"a message of {self.name} cannot be read: {error}") from error
 
     def column(self, field: str) -> NDArray[np.generic]:
-        """Return a field of all messages, one row each: `error`, `pose.pose.position.x`. Raises LogError.
+        """Return a field of all messages, one row each: `error`, `pose.pose.position.x`.
 
-        Raises it also where the field is an array whose length is not always the same.
+        Raises LogError for an unknown field, and for an array whose length varies.
         """
         values: list[Value] = list(self.messages())
         for name in field.split("."):

@@ -1,4 +1,4 @@
-"""The files of a log, one part after the other, as one; it goes on where it ended when they have grown."""
+"""Walk: the files of a log, part after part, as one log; a later walk continues in files that have grown."""
 
 from __future__ import annotations
 
@@ -18,38 +18,39 @@ from dxlrun.log.schemas import METADATA_NAME
 from dxlrun.plan.recording_plan import PART_END_NAME, PART_NAME
 
 _BUFFER = 1 << 18
-"""Bytes: most of what a chunk has behind it is gone past without a call of the operating system."""
+"""Buffer size, bytes: most records after a chunk are skipped without a system call."""
 
 
 class _OtherRunError(Exception):
-    """A part is of another run than the first."""
+    """A part belongs to another run than the first part."""
 
 
 @dataclass(slots=True)
 class LogWalk:
-    """What was found in the files of a log; a file alone, of whatever program, is a log too."""
+    """Contents of a log's files; a single MCAP file of any program is a log too."""
 
     path: Path
     file: McapFile = field(default_factory=McapFile)
-    """What all of them have; `finished`: the last one."""
+    """Contents of all files; `finished` refers to the last one."""
     first_part: int = 0
-    """Index of the part that comes first, as it says itself."""
+    """Index of the first existing part, according to its metadata."""
     share: float = 0.0
-    """Of the files, how much was gone through."""
+    """Share of the files that was read, 0 to 1."""
     _file: Path | None = None
-    """Where it goes on: by its name, as older parts may be deleted meanwhile."""
+    """File at which the next walk continues; by name, because older parts may be deleted between two
+    walks."""
     _part: int = 0
-    """How many files came before this one."""
+    """Number of files before this one."""
 
     def survey(self) -> None:
-        """Read all but the messages. Raises LogError as `messages`."""
+        """Read everything except for messages. Raises LogError as `messages`."""
         for _ in self.messages(chunks=False):
             pass
 
     def messages(self, *, chunks: bool = True) -> Iterator[Messages]:
-        """Yield the messages chunk by chunk; channels have numbers of their own in each part.
+        """Yield the messages chunk by chunk; each part has its own channel numbers.
 
-        Raises LogError with one sentence when there is no MCAP file, or an empty one.
+        Raises LogError without a readable MCAP file, or for an empty one.
         """
         log, found = log_files(self.path), self.file
         found.damage += log.damage
@@ -90,7 +91,7 @@ class LogWalk:
 
     @property
     def no_end(self) -> str:
-        """The sentence for a file without an end."""
+        """Sentence about a file without an end."""
         name = self.file.name or "the file"
         if self.is_being_written:
             return f"{name} has no end yet: a run is writing it"
@@ -107,13 +108,13 @@ class LogWalk:
 
 
 def _order(part: Path) -> tuple[int, str]:
-    """Parts are in this order: their numbers have four digits, or more."""
+    """Return the sort key of a part: numbers have four or more digits."""
     return len(part.name), part.name
 
 
 @contextmanager
 def _opened(path: Path) -> Iterator[tuple[IO[bytes], int]]:
-    """Give an MCAP file and its size; raises LogError with one sentence when it is none, missing or empty."""
+    """Yield an open MCAP file and its size; raises LogError for a missing, empty or other file."""
     try:
         with path.open("rb", buffering=_BUFFER) as stream:
             size = os.fstat(stream.fileno()).st_size
