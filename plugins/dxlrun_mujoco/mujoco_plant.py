@@ -1,13 +1,12 @@
-"""Bodies of a URDF that servos move together: each of its joints is moved by the servos' torques, in MuJoCo.
+"""MuJoCo plant: bodies of a URDF whose joints are moved by the servos' torques, in MuJoCo.
 
-What is taken of the URDF: its tree, masses and inertias (of a link without `inertial`: those of its collision
-shapes at the density of water), `dynamics` and `mimic` of its joints, gravity along -z of its first link,
-which does not move. What is not: meshes, contacts, limits of joints. Joints that no servo moves, neither
-itself nor by one that they mimic, do not move. Servos turn hinges; they move slides where the robot file has
-how far a turn moves them.
+Used from the URDF: the tree, masses and inertias (for a link without `inertial`: those of its collision
+shapes at the density of water), `dynamics` and `mimic` of joints. Gravity is along -z of the first link,
+which is fixed. Not used: meshes, contacts, limits of joints. A joint is fixed if no servo moves it, directly
+or by `mimic`. Servos turn hinges; they move slides if the robot file has the travel per turn.
 
-A servo that moves one joint is that joint's rotor: its inertia, damping and friction are the joint's. Where
-several servos share joints, each has a rotor of its own, and constraints hold them to s = pinv(M) q.
+A servo that moves one joint is that joint's rotor: its inertia, damping and friction are added to the joint.
+Where several servos share joints, each has its own rotor, and constraints keep the rotors at s = pinv(M) q.
 """
 
 from __future__ import annotations
@@ -45,25 +44,30 @@ Floats = NDArray[np.float64]
 Rows = NDArray[np.intp]
 
 _LEAST_MASS = 1e-6
-"""kg. A link with neither `inertial` nor a shape: MuJoCo refuses a moving body without mass."""
-_LEAST_INERTIA = 1e-9  # kg m^2, as above
+"""Mass of a link with neither `inertial` nor a shape, kg: MuJoCo rejects a moving body without mass."""
+_LEAST_INERTIA = 1e-9  # kg m^2, for the same reason
 _HELD_SOLREF = (0.004, 1.0)
-"""How stiff gears hold rotors and joints together: two steps, the stiffest that MuJoCo allows."""
+"""Time constant (s) and damping ratio of the constraint between rotors and joints: two steps, the stiffest
+that MuJoCo allows."""
 _FRICTION_SOLREF = (0.004, 1.0)
 _FRICTION_SOLIMP = (0.9999, 0.9999, 0.001, 0.5, 2.0)
-"""Friction that holds: with MuJoCo's own values a joint creeps although its friction could hold it."""
+"""Stiff friction: with MuJoCo's defaults a joint creeps although its friction could hold it."""
 
 
 def mujoco_plant(bodies: UrdfBodies) -> PlantMaker:
-    """Return what makes the plant of these bodies.
+    """Return the maker of a plant with these bodies.
 
-    Joints that the URDF lacks, or does not draw as hinges (those in m: as slides), move without it. Raises
-    ImportError when MuJoCo cannot be loaded, InputError when it cannot take the URDF, or would move nothing.
+    A mechanism moves without bodies if the URDF lacks one of its joints, or has it with an unsuitable type
+    (hinges for rad, slides for m).
+
+    Raises:
+        ImportError: MuJoCo cannot be loaded.
+        InputError: MuJoCo cannot load the URDF, or would move nothing.
     """
-    from xml.etree import ElementTree  # only robots with a URDF need it
+    from xml.etree import ElementTree  # Only robots with a URDF need it
 
     try:
-        # no DTD can be in it: the robot file's compiler refuses one
+        # The text has no DTD: the robot file's compiler rejects one.
         root = ElementTree.fromstring(bodies.urdf)  # noqa: S314  it was checked when the robot was compiled
         kinds = {each.get("name", ""): each.get("type", "") for each in root.findall("joint")}
         here = [one for one in bodies.mechanisms if all(kinds.get(name) in one.types for name in one.joints)]
@@ -73,7 +77,7 @@ def mujoco_plant(bodies: UrdfBodies) -> PlantMaker:
         _make_movable(root, moved.names)
         text = ElementTree.tostring(root, encoding="unicode")
         _compiled(text, _NOTHING_MOVED, ())
-    except (ValueError, SyntaxError) as error:  # a ParseError of XML is a SyntaxError
+    except (ValueError, SyntaxError) as error:  # A ParseError of XML is a SyntaxError
         reason = " ".join(str(error).split())
         raise InputError(f"MuJoCo cannot take the URDF: {reason}; correct it") from error
     if not moved.names:
@@ -104,7 +108,7 @@ class _Moved(msgspec.Struct, frozen=True):
 
     @property
     def servos(self) -> list[MechanismServo]:
-        """All servos, first those that are rotors of their joints."""
+        """All servos, with the rotors of single joints first."""
         return [servo for one in (*self.single, *self.shared) for servo in one.servos]
 
     @property
@@ -113,7 +117,7 @@ class _Moved(msgspec.Struct, frozen=True):
         return [servo.index for servo in self.servos]
 
     def of(self, count: int) -> _Moved:
-        """Return what so many servos move; a mechanism waits for its last one."""
+        """Return the mechanisms whose servos are all among the first `count` ones."""
         parts = (
             tuple(one for one in part if all(servo.index < count for servo in one.servos))
             for part in (self.single, self.shared)
@@ -125,7 +129,7 @@ _NOTHING_MOVED = _Moved((), ())
 
 
 class MujocoBodies:
-    """Servos that feel one another through the bodies that they move."""
+    """Servos that are coupled through the bodies that they move."""
 
     def __init__(self, urdf: str, moved: _Moved, servos: Sequence[PlantJoint]) -> None:
         import mujoco
@@ -139,7 +143,8 @@ class MujocoBodies:
         model = _compiled(urdf, moved, servos)
         data = mujoco.MjData(model)
         self._model, self._data, self._step = model, data, mujoco.mj_step
-        # views that stay; all joints are hinges or slides: coordinate and speed have a joint's own number
+        # Persistent views. All joints are hinges or slides, so the indices of coordinate and speed equal that
+        # of the joint.
         self._damping, self._force = model.dof_damping, data.qfrc_applied
         self._turn, self._speed = data.qpos, data.qvel
         names = [name for one in moved.single for name in one.joints]
@@ -165,14 +170,14 @@ class MujocoBodies:
         self._dt_s = 0.0
 
     def step(self, drive: Floats, damping: Floats, dt_s: float) -> None:
-        """Let a time pass in which each servo drives with `drive - damping * velocity`; Nm and Nm s/rad."""
+        """Advance by `dt_s` with servo torque `drive - damping * velocity` (Nm, Nm s/rad)."""
         numbers, scale = self._numbers, self._per_rad
         if dt_s != self._dt_s:
             self._set_step(dt_s)
-        # MuJoCo's own integrator takes damping at the end of the step, as independent joints do
+        # MuJoCo's integrator treats damping implicitly, like `IndependentJoints`.
         self._damping[numbers] = self._own_damping + damping / scale**2
         torque = (drive - damping * self.velocity) / scale
-        # what pulls at the joint is the bodies' as it was a step ago
+        # The bodies' pull on the joint is that of the previous step.
         pull = self._bias[numbers]
         for one in self._shared:
             pull[one.rows] = one.matrix.T @ self._bias[one.numbers]
@@ -185,7 +190,7 @@ class MujocoBodies:
         self.velocity[:] = self._speed[numbers] / scale
 
     def place(self, index: int, angle: float) -> None:
-        """Put a shaft somewhere, rad, at rest, and the joints that it moves with it."""
+        """Move a resting shaft to an angle, rad, together with the joints that it moves."""
         by = self._per_rad[index] * (angle - self.angle[index])
         self.angle[index] = angle
         self.velocity[index] = 0.0
@@ -197,22 +202,22 @@ class MujocoBodies:
         self._put_bodies()
 
     def recount(self, index: int, by: float) -> None:
-        """Let a shaft that does not move count its angle from elsewhere."""
+        """Shift the angle count of a resting shaft by an angle, rad."""
         self.angle[index] += by
         self._reference[index] += by
 
     def jam(self, index: int, on: bool) -> None:
-        """Block a shaft where it is, or free it."""
+        """Block a shaft at its angle, or release it."""
         self._own_friction[index] = JAMMED_NM if on else self._free_friction[index]
 
     def _put_bodies(self) -> None:
-        """Put all bodies where the shafts are; those that servos share, and those that mimic, at rest."""
+        """Move all bodies according to the shafts; bodies of shared and mimic joints come to rest."""
         turned = self._per_rad * (self.angle - self._reference)
         self._turn[self._numbers] = turned
         for one in self._shared:
             self._turn[one.numbers] = one.matrix @ turned[one.rows]
             self._speed[one.numbers] = 0.0
-        for _ in self._mimics:  # one may mimic another
+        for _ in self._mimics:  # A mimic joint may follow another one, so repeat until the chain is resolved
             for follower, leader, (offset, multiplier, *_) in self._mimics:
                 self._turn[follower] = offset + multiplier * self._turn[leader]
                 self._speed[follower] = 0.0
@@ -226,14 +231,14 @@ class MujocoBodies:
 class _SharedBodies:
     def __init__(self, mechanism: Mechanism, indices: Sequence[int], numbers: Rows) -> None:
         self.rows: Rows = np.array([indices.index(servo.index) for servo in mechanism.servos], dtype=np.intp)
-        """Of its servos"""
-        self.numbers = numbers  # Of its joints in MuJoCo
+        """Indices of its servos."""
+        self.numbers = numbers  # Indices of its joints in MuJoCo
         self.matrix: Floats = np.array(mechanism.matrix, dtype=np.float64)
         self.together = coupled_projection(self.matrix)
 
 
 def _make_movable(root: Element, moved: Set[str]) -> None:
-    """Leave of a URDF what servos move, and what mimics it: other joints are fixed, meshes are not there."""
+    """Fix the joints of a URDF that servos move neither directly nor by `mimic`, and remove meshes."""
     joints = {joint.get("name", ""): joint for joint in root.findall("joint")}
     followed = {
         name: mimic.get("joint", "")
@@ -258,7 +263,8 @@ def _make_movable(root: Element, moved: Set[str]) -> None:
 def _compiled(urdf: str, moved: _Moved, servos: Sequence[PlantJoint]) -> MjModel:
     """Return the model with the rotors and frictions of servos.
 
-    Raises ValueError when MuJoCo cannot take the URDF.
+    Raises:
+        ValueError: MuJoCo cannot load the URDF.
     """
     import mujoco
 
@@ -270,7 +276,7 @@ def _compiled(urdf: str, moved: _Moved, servos: Sequence[PlantJoint]) -> MjModel
     joints = {joint.name: joint for joint in spec.joints}
     for one in moved.single:
         (name,), (servo,) = one.joints, one.servos
-        # the load's friction is the shaft's already, as that of a servo that moves no body
+        # The load's friction already belongs to the shaft, as for a servo that moves no body.
         _drive(joints[name], servos[servo.index].motor, servo.per_rad, servos[servo.index].load.friction)
     for one in moved.shared:
         for name, load in zip(one.joints, one.loads, strict=True):
@@ -291,7 +297,7 @@ def _compiled(urdf: str, moved: _Moved, servos: Sequence[PlantJoint]) -> MjModel
 
 
 def _drive(joint: MjsJoint, motor: Motor, per_rad: float, friction: float) -> None:
-    """Give a joint the rotor of a servo that turns with it; `friction`: Nm at the servo."""
+    """Add the rotor of a servo to a joint; `friction` is that of the load at the servo, Nm."""
     joint.armature = motor.inertia / per_rad**2
     joint.damping[0] += motor.viscous_friction / per_rad**2
     _rub(joint, (motor.friction + friction) / abs(per_rad))

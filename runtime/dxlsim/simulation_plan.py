@@ -1,6 +1,7 @@
-"""What is simulated: servos with their loads on buses with their adapters; plain data, as JSON too.
+"""Simulation plan: servos with their loads on buses with their adapters; plain data, convertible to JSON.
 
-Nothing of the simulation itself is imported here, so that the rest of the runtime can describe one cheaply.
+This module imports nothing of the simulation itself, so that the rest of the runtime can describe one
+cheaply.
 """
 
 from __future__ import annotations
@@ -13,87 +14,88 @@ from dxlsim.motor_model import MotorModel
 
 
 class Load(msgspec.Struct, frozen=True):
-    """What hangs on the shaft of a servo, or on a joint, of a linear one in N and kg; nothing by default."""
+    """Load on the shaft of a servo, or on a joint (N and kg for a linear one); none by default."""
 
-    inertia: float = 0.0  # kg m^2, beside that of the servo's own rotor and gear
+    inertia: float = 0.0  # kg m^2, in addition to the servo's own rotor and gear
     friction: float = 0.0
-    """Nm, Coulomb, beside the servo's own: the same at every speed, and the most that holds at rest"""
-    gravity: float = 0.0  # Nm with which gravity turns the link where it is horizontal
-    gravity_angle: float = 0.0  # rad from the servo's raw 0, where the link hangs straight down
+    """Coulomb friction in addition to the servo's own, Nm: constant in motion, the maximum at rest."""
+    gravity: float = 0.0  # Torque by gravity with the link in horizontal position, Nm
+    gravity_angle: float = 0.0  # rad from the servo's raw 0, with the link straight down
     turns: float = 1.0
-    """rad of the link for each rad of the shaft, when a gear lies between them; torques are the shaft's"""
-    steady: float = 0.0  # Nm that turn the shaft back at every angle: of a weight on a slide
+    """rad of the link per rad of the shaft, with a gear between them; torques are at the shaft."""
+    steady: float = 0.0  # Constant torque that turns the shaft back, Nm: of a weight on a slide
 
 
 NO_LOAD = Load()
 
 
 class ServoTimes(msgspec.Struct, frozen=True):
-    """How slow a servo is, beside its return delay."""
+    """Delays of a servo, in addition to its return delay."""
 
     response_delay_ns: int = 0
-    """Between the end of an instruction and its effect on the motor; torque off takes none.
+    """Delay between the end of an instruction and its effect on the motor; torque off has none.
 
-    An AX-12+ was measured to need 17 to 50 ms from a goal to its first motion, its inertia included
-    (J. A. Smith, J. Jivraj, "Analysis of Robotis Dynamixel AX-12+ Actuator Latencies").
+    An AX-12+ was measured to need 17 to 50 ms from a goal to its first motion, including its inertia (J. A.
+    Smith, J. Jivraj, "Analysis of Robotis Dynamixel AX-12+ Actuator Latencies").
     """
     write_time_ns: int = 0
-    """After the end of an instruction that writes, in which the servo receives nothing.
+    """Time without reception after the end of an instruction that writes.
 
-    An AX-12 needs 24 us and 6 us a byte, several ms where it writes its EEPROM (Xevel, "Dynamixel protocol
-    notes").
+    An AX-12 needs 24 us plus 6 us per byte, and several ms for a write to its EEPROM (Xevel, "Dynamixel
+    protocol notes").
     """
 
 
 class ServoConfig(msgspec.Struct, frozen=True):
-    """A servo as it is connected to a bus when the simulation starts."""
+    """Servo that is connected to a bus at the start of the simulation."""
 
     servo_id: int
     model: str
     position: float  # rad, from the servo's raw 0
     return_delay_ns: int = 500_000  # Initial value of Return Delay Time, rounded to its unit of 2 us
-    load: Load = NO_LOAD  # What its shaft moves
+    load: Load = NO_LOAD  # Load on its shaft
     firmware: int | None = None
-    """Firmware Version: it decides the control table where a model has two, and the fast reads.
+    """Firmware Version: selects the control table if a model has two, and the support of fast reads.
 
-    None: one that has all that the model's table names.
+    None: a version with all items of the model's table.
     """
     times: ServoTimes = ServoTimes()
     motor: MotorModel | None = None
-    """Its motor, of a motor file; None: the one that the simulation has for the model."""
+    """Model of its motor from a motor file; None: the simulation's default for the servo model."""
 
 
 class Shown(msgspec.Struct, frozen=True):
-    """What a device shows, and where it is."""
+    """Measurements and location of a device."""
 
     states: dict[str, str] = {}
-    """By item: name of the state that a robot makes of it, which says what it measures; else the table's."""
-    values: dict[str, float] = {}  # By item: what it shows, SI units
-    noise: dict[str, float] = {}  # By item: standard deviation of what it shows, SI units
-    link: str = ""  # Link of the robot's URDF that it is fixed to; empty: it stands upright and still
-    table: str = ""  # Text of its control table, where that is none of dxlrun's own
+    """State name by item, which selects the measured quantity; default: the state in the control table."""
+    values: dict[str, float] = {}  # Constant value by item, SI units
+    noise: dict[str, float] = {}  # Standard deviation by item, SI units
+    link: str = ""  # Link of the robot's URDF that carries the device; empty: it is upright and at rest
+    table: str = ""  # Text of its control table, unless it is shipped with dxlrun
 
 
 class DeviceConfig(msgspec.Struct, frozen=True):
-    """A device as it is connected to a bus when the simulation starts."""
+    """Device that is connected to a bus at the start of the simulation."""
 
     servo_id: int  # Its ID
     model: str
-    return_delay_ns: int = 0  # Initial value of its return delay time, where it has one
+    return_delay_ns: int = 0  # Initial value of its return delay time, if it has this item
     shown: Shown = Shown()
 
 
 class AdapterConfig(msgspec.Struct, frozen=True):
-    """How a line behaves, and its adapter: the default hands each reply over whole, at its last byte."""
+    """Behaviour of a line's adapter; by default each reply is delivered as a whole with its last byte."""
 
     latency_timer_ns: int = 0
-    """FTDI: bytes are handed over when this timer runs out or 62 are there; 0: at once."""
+    """FTDI latency timer: bytes are delivered when it expires or when 62 bytes are waiting; 0: at once."""
     split: Literal["whole", "byte", "random"] = "whole"
-    """Pieces in which bytes are handed over; `random`: 1 to 8 bytes."""
-    seed: int = 0  # Of `random`
-    echo: bool = False  # True: the host receives its own bytes back
+    """Size of the delivered pieces; `random`: 1 to 8 bytes."""
+    seed: int = 0  # Seed of `random`
+    echo: bool = False  # True: the host receives its own bytes
     absent: Literal["silent", "slot"] = "silent"
-    """Protocol 2.0, a listed servo does not reply: those after it never reply, or after its time [?]."""
+    """Protocol 2.0, effect of an absent servo in a group read: the servos after it never reply, or reply
+    after its slot [?]."""
 
 
 WHOLE_REPLIES = AdapterConfig()
@@ -105,51 +107,52 @@ class BusConfig(msgspec.Struct, frozen=True):
     name: str
     baud_rate: int  # bit/s, of the host and, at the start, of every servo
     servos: tuple[ServoConfig, ...]
-    protocol: float = 1.0  # 1.0 or 2.0: one bus speaks one protocol
+    protocol: float = 1.0  # 1.0 or 2.0; a bus has one protocol
     control_tables: tuple[str, ...] = ()
-    """Texts of the control tables of plug-ins: the process of the simulated buses loads no plug-ins."""
-    adapter: AdapterConfig = WHOLE_REPLIES  # What is between the line and the host
-    devices: tuple[DeviceConfig, ...] = ()  # What is on the line beside the servos
-    recorded: str = ""  # Path of the log whose bus of this name answers instead of servos; empty: none does
+    """Texts of plug-ins' control tables: the process of the simulated buses loads no plug-ins."""
+    adapter: AdapterConfig = WHOLE_REPLIES  # Adapter between the line and the host
+    devices: tuple[DeviceConfig, ...] = ()  # Units on the line that are not servos
+    # Path of a log whose bus of this name answers instead of servos; empty: simulated servos
+    recorded: str = ""
 
 
 class MechanismServo(msgspec.Struct, frozen=True):
-    """A servo of a mechanism, by its coordinate s = per_rad * (theta - reference)."""
+    """Servo of a mechanism, with its coordinate s = per_rad * (theta - reference)."""
 
-    index: int  # By the order in which the servos are added
-    reference: float  # rad, of the servo from its raw 0
-    per_rad: float  # rad or m for each rad of the shaft, with the sign of its direction
+    index: int  # Index in the order in which the servos are added
+    reference: float  # rad from the servo's raw 0
+    per_rad: float  # rad or m per rad of the shaft, with the sign of its direction
 
 
-HINGES = ("revolute", "continuous")  # Types of the joints of a URDF that turn
+HINGES = ("revolute", "continuous")  # Rotary joint types of a URDF
 
 
 class Mechanism(msgspec.Struct, frozen=True):
-    """Servos, and the joints that they move: q = matrix @ s.
+    """Servos and the joints that they move: q = matrix @ s.
 
-    One servo with a joint of its own, several servos on one joint, whose q is the mean of theirs, a
-    differential, any matrix of full rank.
+    One servo with its own joint, several servos on one joint (q is the mean of theirs), a differential, or
+    any other matrix of full rank.
     """
 
     servos: tuple[MechanismServo, ...]
     joints: tuple[str, ...]
-    matrix: tuple[tuple[float, ...], ...] = ((1.0,),)  # A row for each joint, a column for each servo
+    matrix: tuple[tuple[float, ...], ...] = ((1.0,),)  # One row per joint, one column per servo
     loads: tuple[Load, ...] = ()
-    """Of the joints, at the joints: Nm and kg m^2, or N and kg; `gravity_angle` is the joint's. Empty: one
-    servo with a joint of its own, which has the load itself (`ServoConfig`)."""
-    types: tuple[str, ...] = HINGES  # Of the URDF's joints that it can move
+    """Loads at the joints: Nm and kg m^2, or N and kg; `gravity_angle` is the joint's. Empty for one servo
+    with its own joint, whose load is in `ServoConfig`."""
+    types: tuple[str, ...] = HINGES  # Joint types of a URDF that it can move
 
     @property
     def is_single(self) -> bool:
-        """True when it is one servo that moves as if there were no other joint."""
+        """True for one servo that moves independently of all other joints."""
         return not self.loads
 
 
 class UrdfBodies(msgspec.Struct, frozen=True):
-    """A URDF, and how servos move its joints, whichever plant moves the servos."""
+    """URDF with the mechanisms that move its joints, for any plant."""
 
     urdf: str
-    mechanisms: tuple[Mechanism, ...]  # Servos that are in none of them are added after all others
+    mechanisms: tuple[Mechanism, ...]  # Servos without a mechanism are added after all others
 
     @property
     def servos(self) -> int:
@@ -158,13 +161,14 @@ class UrdfBodies(msgspec.Struct, frozen=True):
 
 
 class SimulationConfig(msgspec.Struct, frozen=True):
-    """What the process of the simulated buses serves."""
+    """Configuration of the process of the simulated buses."""
 
     buses: tuple[BusConfig, ...]
     faults: tuple[str, ...] = ()  # Lines of faults; their times count from the start
-    seed: int = 0  # Of what the faults leave to chance
+    seed: int = 0  # Seed of the random values of faults
     links: dict[str, str] = {}
-    """By bus: path of a symbolic link that always leads to its terminal, as udev's do."""
-    bodies: UrdfBodies | None = None  # What the servos move together; None: each joint moves by itself
-    mechanisms: tuple[Mechanism, ...] = ()  # A servo that is in none of them moves by itself
-    sensed: UrdfBodies | None = None  # The bodies with which devices move that are on a link; None: none is
+    """Path of a symbolic link to each bus's terminal, by bus; it is updated like links by udev."""
+    # Bodies that the servos move together; None: each joint moves independently
+    bodies: UrdfBodies | None = None
+    mechanisms: tuple[Mechanism, ...] = ()  # Servos without a mechanism move independently
+    sensed: UrdfBodies | None = None  # Bodies whose links carry devices; None: no device is on a link

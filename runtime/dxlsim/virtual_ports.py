@@ -1,4 +1,4 @@
-"""Ports of simulated buses on virtual time: no process, no terminal, no waiting."""
+"""Virtual ports: ports of simulated buses on virtual time, without process, terminal or real waiting."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ from dxlwire.errors import PortError
 
 
 class VirtualPort:
-    """The host's end of one simulated bus; a Port of the dynamixel package by its form."""
+    """Host's end of one simulated bus; implements `dxlwire`'s Port."""
 
     def __init__(self, clock: VirtualClock, bus: SimulatedBus) -> None:
         self._clock = clock
@@ -19,12 +19,14 @@ class VirtualPort:
         self._unplugged = bus.times_unplugged
 
     def write(self, data: bytes | bytearray | memoryview) -> None:
-        """Hand bytes to the line now; raises PortError when the adapter was unplugged."""
+        """Write bytes to the line now. Raises PortError if the adapter was unplugged."""
         self._check()
         self._bus.receive(data, self._clock.now_ns())
 
     def read_into(self, buffer: memoryview) -> int:
-        """Copy what has arrived by now; return the number of bytes; raises PortError when unplugged."""
+        """Copy the bytes that have arrived; return their number. Raises PortError if the adapter was
+        unplugged.
+        """
         self._check()
         self.collect()
         size = min(len(buffer), len(self._arrived))
@@ -33,7 +35,7 @@ class VirtualPort:
         return size
 
     def failure(self, code: int) -> PortError:
-        """Return why a write failed: the adapter was unplugged, there is no other reason."""
+        """Return the error for a failed write; the only cause is an unplugged adapter."""
         return PortError(f"the adapter of bus {self._bus.name} is gone")
 
     def extend_deadline(self, deadline_ns: int, off_wire_ns: int, heard_ns: int, now_ns: int) -> int:
@@ -41,25 +43,27 @@ class VirtualPort:
         return deadline_ns
 
     def stalled_ns(self, since_ns: int, until_ns: int) -> int:
-        """Return 0, for the same reason."""
+        """Return 0: virtual time waits for the servos."""
         return 0
 
     def late_ns(self, off_wire_ns: int, heard_ns: int) -> int:
-        """Return 0, for the same reason."""
+        """Return 0: virtual time waits for the servos."""
         return 0
 
     def collect(self) -> bool:
-        """Take what has passed the wire by now; return whether something waits, or the adapter is gone."""
+        """Receive the bytes that have passed the wire; return True if bytes are waiting or the adapter is
+        gone.
+        """
         self._arrived += self._bus.take(self._clock.now_ns())
         return bool(self._arrived) or self._gone
 
     def unplug(self) -> None:
-        """Pull the adapter: every later use raises PortError."""
+        """Unplug the adapter: every later use raises PortError."""
         self._bus.unplug()
 
     @property
     def _gone(self) -> bool:
-        """True after the adapter was pulled, also when it is back: a port does not outlive that."""
+        """True after the adapter was unplugged, even if it is back: a port is not reusable after that."""
         return self._bus.times_unplugged != self._unplugged
 
     def _check(self) -> None:
@@ -68,11 +72,11 @@ class VirtualPort:
 
 
 class VirtualPorts:
-    """All simulated lines of a robot, waited for together; a Ports of the dynamixel package by its form."""
+    """All simulated lines of a robot with a common wait; implements `dxlwire`'s Ports."""
 
     def __init__(self, clock: VirtualClock, buses: Sequence[SimulatedBus]) -> None:
         self.polling = self.descriptors = None
-        """As on a SerialPorts: on virtual time no wake-up is late, and there are no files."""
+        """Properties as in SerialPorts. Virtual time needs neither polling nor descriptors."""
         self._clock = clock
         self._buses = tuple(buses)
         self._ports = [VirtualPort(clock, bus) for bus in buses]
@@ -84,9 +88,9 @@ class VirtualPorts:
         return self._ports
 
     def wait(self, deadline_ns: int) -> Sequence[int]:
-        """Let virtual time pass until bytes arrive or `deadline_ns`; return the lines with bytes."""
+        """Advance virtual time until bytes arrive or `deadline_ns`; return the indices of readable lines."""
         while True:
-            # time passes for the servos of a lost line, too
+            # Time passes for the servos of a lost line, too.
             received = [index for index, port in enumerate(self._ports) if port.collect()]
             ready = [index for index in received if index not in self._lost]
             now_ns = self._clock.now_ns()
@@ -96,7 +100,7 @@ class VirtualPorts:
             self._clock.wait_until(min([deadline_ns, *due]))
 
     def reopen(self, index: int) -> bool:
-        """Request a lost line again: it is back as soon as its adapter is plugged in."""
+        """Request a lost line again; return True once its adapter is plugged in."""
         self._lost.add(index)
         bus = self._buses[index]
         bus.advance(self._clock.now_ns())

@@ -1,6 +1,7 @@
-"""Which writes a simulated servo or device refuses, and with which error; `[i]` marks what no manual has.
+"""Access rules: writes that a simulated servo or device rejects, and their errors; `[i]` marks inferred
+rules.
 
-A write is refused as a whole [i]. What items mean to a servo is a table, `access.toml`.
+A write is rejected as a whole [i]. The table `access.toml` has the special items of servos.
 """
 
 from __future__ import annotations
@@ -19,18 +20,20 @@ from dxlsim.wire.protocol2 import ErrorNumber
 from dxlwire.control_table import SIGN_BIT, ControlItem, ControlTable
 
 ErrorOf = Callable[[Memory, ControlItem, int], int]
-"""The error of a value of an item, with its sign where it has one; 0: it is taken."""
+"""Returns the error for a value of an item (signed if the item is); 0: the value is accepted."""
 
 _TURNS = 256
-"""Reach of extended position control to either side (e-Manual, X series, Goal Position (116): 1,048,575)."""
-_MULTI_TURN_GOAL = 28_672  # Reach of multi-turn mode to either side (e-Manual, MX series, Goal Position (30))
+"""Range of extended position control in either direction, revolutions (e-Manual, X series, Goal Position
+(116): 1,048,575 ticks)."""
+# Range of multi-turn mode in either direction, ticks (e-Manual, MX series, Goal Position (30))
+_MULTI_TURN_GOAL = 28_672
 _MULTI_TURN_LIMIT = 4095
 _MAGNITUDE = (1 << SIGN_BIT) - 1
 TORQUE_ENABLE_OF_P = 512  # Address of Torque Enable on P, PRO(A), RH-P12-RN(A) and Y
 
 
 class ShaftItems(msgspec.Struct, frozen=True):
-    """Items whose writing may change the motion of one kind of shaft."""
+    """Items whose writes may change the motion of one kind of shaft."""
 
     aims: frozenset[str]
     others: frozenset[str]
@@ -51,7 +54,7 @@ class _Values(msgspec.Struct, frozen=True):
 
 
 class AccessTable(msgspec.Struct, frozen=True):
-    """`access.toml`, which explains its keys."""
+    """Content of `access.toml`, which explains its keys."""
 
     identity: tuple[str, ...]
     goals: frozenset[str]
@@ -69,7 +72,7 @@ ACCESS = msgspec.convert(tomllib.loads(Path(__file__).with_suffix(".toml").read_
 
 @unique
 class OperatingMode(IntEnum):
-    """Operating Mode (11); the position limits hold in POSITION."""
+    """Operating Mode (11); the position limits apply in POSITION."""
 
     CURRENT = 0
     VELOCITY = 1
@@ -80,11 +83,11 @@ class OperatingMode(IntEnum):
 
 
 def refusal(memory: Memory, run: Run, error_of: ErrorOf) -> int:
-    """Return the error with which a write would be refused; 0 when it would not.
+    """Return the error for a write, or 0 if it is accepted.
 
-    Protocol 1.0: the error bits of all its items; a cell that no item owns is a range error [i].
-    Protocol 2.0: the first error; the EEPROM is closed while the torque is on, and part of an item is a
-    length error (e-Manual, Protocol 2.0, "Error": Data Length Error).
+    Protocol 1.0: the error bits of all its items; a cell without an item is a range error [i]. Protocol 2.0:
+    the first error; the EEPROM is locked while torque is on, and a write of an incomplete item is a length
+    error (e-Manual, Protocol 2.0, "Error": Data Length Error).
     """
     cells = run.cells
     errors = (error_of(memory, item, signed(item, run.after[item.name])) for item in cells.items)
@@ -99,24 +102,24 @@ def refusal(memory: Memory, run: Run, error_of: ErrorOf) -> int:
 
 
 def device_error(memory: Memory, item: ControlItem, value: int) -> int:
-    """Return the error of a value of a device's item: of one outside its range."""
+    """Return the error for a value of a device's item: a range error outside its range."""
     taken = item.access == "RW" and item.minimum <= value <= item.maximum
     return 0 if taken else ErrorBit.RANGE if memory.table.protocol == 1.0 else ErrorNumber.DATA_RANGE
 
 
 def lock_error(memory: Memory, item: ControlItem, value: int) -> int:
-    """Return the error of a value in Protocol 1.0, where Lock (47) closes the EEPROM until the power is cut.
+    """Return the error for a value in Protocol 1.0, where Lock (47) locks the EEPROM until a power cycle.
 
-    A read-only item, a locked one and a value out of its range are range errors [i]; a goal outside the angle
+    A read-only item, a locked item and a value out of range are range errors [i]; a goal outside the angle
     limits is an angle limit error (e-Manual, Goal Position (30)).
 
-    A Moving Speed with a direction bit is taken in joint mode too [i]: the manual has only "0 ~ 1,023 can be
-    used", but pypot writes the bit to every motor with `orientation: indirect`, and Poppy moves.
+    A Moving Speed with a direction bit is accepted in joint mode too [i]. The manual only has "0 ~ 1,023 can
+    be used", but pypot writes the bit to every motor with `orientation: indirect`, and Poppy moves.
     """
-    if item.name == "goal_position" and multi_turn_mode(memory):  # it counts turns, in two's complement
+    if item.name == "goal_position" and multi_turn_mode(memory):  # Counts turns, in two's complement
         return ErrorBit.RANGE if abs(value - (value >> 15 << 16)) > _MULTI_TURN_GOAL else 0
     locked = memory.get("lock") == 1 and (not value if item.name == "lock" else item.area == "EEPROM")
-    # e-Manual, Goal Torque (71): it cannot be bigger than Torque Limit
+    # e-Manual, Goal Torque (71): the value must not exceed Torque Limit.
     strong = item.name == "goal_torque" and value & _MAGNITUDE > memory["torque_limit"]
     if locked or strong:
         return ErrorBit.RANGE
@@ -125,11 +128,11 @@ def lock_error(memory: Memory, item: ControlItem, value: int) -> int:
 
 
 def torque_error(memory: Memory, item: ControlItem, value: int) -> int:
-    """Return the error of a value in Protocol 2.0."""
+    """Return the error for a value in Protocol 2.0."""
     name, table = item.name, memory.table
     one_turn = name == "goal_position" and _one_turn(memory)
     lowest, highest = item.minimum, item.maximum
-    if one_turn:  # or a goal that only the position limits bound: those of Y reach over turns
+    if one_turn:  # Also for a goal that only the position limits bound: those of Y span several turns
         limit = table.items.get("max_position_limit", item)
         lowest, highest = min(lowest, limit.minimum), max(highest, limit.maximum)
     elif name == "goal_position":
@@ -159,22 +162,22 @@ def _outside_angle_limits(memory: Memory, item: ControlItem, value: int) -> bool
 
 
 def _one_turn(memory: Memory) -> bool:
-    """Return whether the goal stays within a turn: by the operating mode, or as a gripper has no more."""
+    """Return True if the goal stays within a turn, because of the operating mode or of a gripper's travel."""
     goal = memory.table.items["goal_position"]
     has_one = (goal.maximum - goal.minimum + 1) * memory.table.rad_per_tick < 0.99 * math.tau
     return has_one or memory.get("operating_mode", OperatingMode.POSITION) == OperatingMode.POSITION
 
 
 def watchdog_expired(memory: Memory) -> bool:
-    """Return whether Bus Watchdog (98) shows that its time ran out: -1, which no host can write."""
+    """Return True if Bus Watchdog (98) has expired: its value is then -1, which a host cannot write."""
     item = memory.table.items.get("bus_watchdog")
     return item is not None and memory["bus_watchdog"] > item.maximum
 
 
 def wheel_mode(memory: Memory) -> bool:
-    """Return whether a servo with angle limits turns without end (e-Manual, CW/CCW Angle Limit (6, 8)).
+    """Return True if a servo with angle limits is in wheel mode (e-Manual, CW/CCW Angle Limit (6, 8)).
 
-    Both limits are 0, or, where the model has it, Control Mode (11) is 1 (XL-320).
+    Both limits are 0; on the XL-320, Control Mode (11) is 1.
     """
     if "control_mode" in memory:
         return memory["control_mode"] == 1
@@ -182,7 +185,7 @@ def wheel_mode(memory: Memory) -> bool:
 
 
 def multi_turn_mode(memory: Memory) -> bool:
-    """Return whether a servo of Protocol 1.0 counts turns: both angle limits are 4095 (e-Manual, MX)."""
+    """Return True if a servo of Protocol 1.0 counts turns: both angle limits are 4095 (e-Manual, MX)."""
     if "multi_turn_offset" not in memory:
         return False
     return memory["cw_angle_limit"] == memory["ccw_angle_limit"] == _MULTI_TURN_LIMIT

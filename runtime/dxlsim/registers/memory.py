@@ -1,4 +1,4 @@
-"""The memory of a simulated servo: the control items of its table as bytes and as integers of the wire."""
+"""Memory of a simulated servo: the control items of its table as bytes and as integers on the wire."""
 
 from __future__ import annotations
 
@@ -11,47 +11,49 @@ from dxlwire.control_table import ControlItem, ControlTable
 _INDIRECT = re.compile(r"indirect_address_(\d+)")
 
 _CELLS_KEPT = 1024
-"""So many places of a table are looked up only once: a host writes few of them, rubbish goes everywhere."""
+"""Size of the cache of address ranges. A host accesses only a few, but corrupted packets may address any
+range."""
 
 
 class Cells(NamedTuple):
-    """What is in a row of cells."""
+    """Properties of a range of cells."""
 
-    items: tuple[ControlItem, ...]  # Their items; none when a cell belongs to no item
+    items: tuple[ControlItem, ...]  # Their items; empty if a cell belongs to no item
     names: frozenset[str]
-    whole: bool  # True when they are those items from the first byte to the last
-    touched: bool  # True when one of them belongs to an item
-    direct: bool  # True when none of them is Indirect Data
-    read_only: bool  # True when one of the items is
-    eeprom: bool  # True when one of the items is in the EEPROM area
+    whole: bool  # True if they consist of complete items
+    touched: bool  # True if at least one belongs to an item
+    direct: bool  # True if none is Indirect Data
+    read_only: bool  # True if at least one item is read-only
+    eeprom: bool  # True if at least one item is in the EEPROM area
     live: tuple[tuple[str, Callable[[], int]], ...]
-    """What shows something else whenever it is looked at, and what it shows now."""
+    """Names of the live items, with the functions that return their current values."""
 
 
 class Run(NamedTuple):
-    """Bytes for a row of cells."""
+    """Bytes for a range of cells."""
 
     address: int
     data: bytes
     cells: Cells
-    after: dict[str, int]  # The integers of the items that a write touches, as they would be after it
+    after: dict[str, int]  # Integers of the written items as they would be after the write
 
 
 class Memory:
-    """Bytes of a control table; `memory[name]` is the integer of the wire, never negative.
+    """Bytes of a control table; `memory[name]` is the integer on the wire, never negative.
 
-    Cells of Indirect Data are those cells whose addresses the Indirect Addresses hold.
+    Cells of Indirect Data are aliases of the cells at the addresses in the Indirect Addresses.
     """
 
     def __init__(self, table: ControlTable, firmware: int) -> None:
         self.table = table = table.with_firmware(firmware)
         self.firmware = firmware
         self.has_gaps = True
-        """False: where no cell belongs to an item there is nothing to read."""
+        """False if cells without any item are unreadable."""
         self.size = table.size  # Bytes from address 0 to the end of the last item
         self._memory = bytearray(self.size)
-        self._values: dict[str, int] = {}  # the same as in the bytes: looked up far more often than written
-        self._cells_at: dict[tuple[int, int], Cells] = {}  # hosts access the same again and again
+        # Same content as the bytes, for speed: reads are far more frequent than writes
+        self._values: dict[str, int] = {}
+        self._cells_at: dict[tuple[int, int], Cells] = {}  # Cache, because hosts repeat the same accesses
         self._item_at: dict[int, ControlItem] = {
             address: item
             for item in table.items.values()
@@ -64,17 +66,17 @@ class Memory:
         self.restore_factory_values()
 
     def restore_factory_values(self, keep: tuple[str, ...] = ()) -> None:
-        """Set every item but those of `keep` to its initial value, and those without one to 0."""
+        """Reset every item except `keep` to its initial value, or to 0 without one."""
         self.reset(name for name in self.table.items if name not in keep)
         self["model_number"] = self.table.model_number
         self["firmware_version"] = self.firmware
 
     def restore_ram(self) -> None:
-        """Set the items of the RAM area to what they are at power-up; the EEPROM area stays."""
+        """Reset the items of the RAM area to their values at power-up; the EEPROM area is kept."""
         self.reset(name for name, item in self.table.items.items() if item.area == "RAM")
 
     def reset(self, names: Iterable[str]) -> None:
-        """Set some items to their initial values, those of them that the model has."""
+        """Reset items to their initial values; names that the model lacks are ignored."""
         for name in names:
             if (item := self.table.items.get(name)) is not None:
                 initial = max(0, item.minimum) if item.access == "RW" else 0
@@ -97,7 +99,7 @@ class Memory:
             self._notify((name,))
 
     def watch(self, names: Iterable[str], act: Callable[[], None]) -> None:
-        """Let something be done now, and whenever one of some items changes; others may stay the same."""
+        """Call `act` now, and after each change of one of the items, possibly also without a change."""
         for name in names:
             self._watchers.setdefault(name, []).append(act)
         act()
@@ -107,27 +109,27 @@ class Memory:
             act()
 
     def get(self, name: str, otherwise: int = 0) -> int:
-        """Return the integer of an item, or another one when the model has no such item."""
+        """Return the integer of an item, or `otherwise` if the model lacks the item."""
         return self._values.get(name, otherwise)
 
     def show(self, name: str, wire: int) -> None:
-        """Set an item if the model has it; what does not fit ends at its highest or lowest value."""
+        """Set an item if the model has it; the value is clamped to the range of its bytes."""
         if name in self._places:
             *_, lowest, highest = self._places[name]
             self[name] = lowest if wire < lowest else min(wire, highest)
 
     def show_live(self, live: Mapping[str, Callable[[], int]]) -> None:
-        """Let items of the model show what functions return: worked out when they are read, not before."""
+        """Let functions provide the values of items; they are called only when the items are read."""
         self._live = {name: show for name, show in live.items() if name in self}
         self._cells_at.clear()
 
     def show_no_more(self, name: str) -> None:
-        """Let an item keep what it has."""
+        """Make a live item keep its current value."""
         self._live.pop(name, None)
         self._cells_at.clear()
 
     def refresh(self) -> None:
-        """Set all live items to what they show now."""
+        """Update all live items."""
         for name, show in self._live.items():
             self.show(name, show())
 
@@ -142,9 +144,9 @@ class Memory:
         return bytes(self._memory[item.address : item.address + item.size])
 
     def read(self, address: int, length: int) -> bytes | None:
-        """Return bytes of the table as they are now, None where it has none.
+        """Return the current bytes of a range, or None if it is unreadable.
 
-        Cells between items are 0, and so is what Indirect Addresses beyond the table lead to [i].
+        Cells between items are 0, and so are targets of Indirect Addresses beyond the table [i].
         """
         if length < 1 or address + length > self.size:
             return None
@@ -166,7 +168,7 @@ class Memory:
         return bytes(self._memory[address : address + length]).ljust(length, b"\0")
 
     def runs(self, address: int, data: bytes) -> tuple[Run, ...]:
-        """Return where bytes really go: as they are, or to the cells behind Indirect Data."""
+        """Return the actual targets of a write: the given cells, or the targets of Indirect Data."""
         cells = self.cells(address, len(data))
         if cells.direct:
             return (self._run(address, data, cells),)
@@ -176,7 +178,7 @@ class Memory:
         )
 
     def places(self, address: int, length: int) -> list[tuple[int, int, int]]:
-        """Return where some cells really are: address, and the first and last of them that begin there."""
+        """Return the actual location of cells as runs: target address, first index, end index."""
         places: list[tuple[int, int, int]] = []
         for index in range(length):
             name = self._indirect.get(address + index)
@@ -188,7 +190,7 @@ class Memory:
         return places
 
     def cells(self, address: int, length: int) -> Cells:
-        """Return what some cells are; looked up once."""
+        """Return the properties of a range of cells; cached."""
         cells = self._cells_at.get((address, length))
         if cells is None:
             spanned = range(address, address + length)
@@ -213,13 +215,13 @@ class Memory:
         return cells
 
     def reaches_eeprom(self, address: int, data: bytes) -> bool:
-        """Return whether a write would change the EEPROM area, also through Indirect Data."""
+        """Return True if a write would change the EEPROM area, directly or through Indirect Data."""
         return any(run.cells.eeprom for run in self.runs(address, data))
 
     def _run(self, address: int, data: bytes, cells: Cells) -> Run:
         items = cells.items
         start, all_of_them = address, data
-        if items and not cells.whole:  # parts of items stay as they are
+        if items and not cells.whole:  # A partial write leaves the other bytes of an item unchanged
             start, end = items[0].address, items[-1].address + items[-1].size
             before, behind = self._memory[start:address], self._memory[address + len(data) : end]
             all_of_them = bytes(before) + data + bytes(behind)
@@ -232,7 +234,7 @@ class Memory:
         return Run(address, data, cells, after)
 
     def write(self, run: Run) -> None:
-        """Write bytes that were not refused."""
+        """Write bytes that have been accepted."""
         start, end = run.address, run.address + len(run.data)
         if self._memory[start:end] != run.data:
             self._memory[start:end] = run.data
@@ -242,12 +244,12 @@ class Memory:
 
 
 def signed(item: ControlItem, wire: int) -> int:
-    """Return the integer of an item with its sign, where that is two's complement."""
+    """Return the integer of an item with its sign, if it is in two's complement."""
     return wire - (wire >> 8 * item.size - 1 << 8 * item.size) if item.signed else wire
 
 
 def _place(item: ControlItem) -> tuple[int, int, int, int, int]:
-    """Return where an item begins and ends, the mask of its bits, and the range that its bytes hold."""
+    """Return start and end of an item, its bit mask, and the range of its bytes."""
     bits = 8 * item.size - item.signed
     lowest = -1 << bits if item.signed else 0
     return item.address, item.address + item.size, (1 << 8 * item.size) - 1, lowest, (1 << bits) - 1

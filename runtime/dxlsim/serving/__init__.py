@@ -1,4 +1,5 @@
-"""Simulated buses on pseudo-terminals in real time, one thread for all lines, and what asks for it.
+"""Simulated buses on pseudo-terminals in real time, one thread for all lines, with the interface to its
+starter.
 
-What passes on a line is decided in `bus`; ports on virtual time are in `virtual_ports`.
+The behaviour of a line belongs in `bus`; ports on virtual time are in `virtual_ports`.
 """

@@ -1,4 +1,4 @@
-"""Protocols of the objects through which a server is asked, and tells how far it has come."""
+"""Host protocols: objects that send requests to a server, and that receive its progress."""
 
 from __future__ import annotations
 
@@ -8,43 +8,43 @@ from typing import Protocol
 from dxlsim.messages import Request, SimulationMessage
 
 ENDLESS_NS = 1 << 62
-"""`LineProgress.serve` takes it where nothing is due to the host."""
+"""Argument of `LineProgress.serve` while nothing is due to the host."""
 
 
 class Starter(Protocol):
-    """The program that started a server, which can be another thread or process."""
+    """Program that started a server, possibly in another thread or process."""
 
     closed: bool
-    """True after its last request was received: the server ends."""
+    """True after its last request: the server ends."""
 
     def fileno(self) -> int:
-        """Return a descriptor: readable when a request arrived, writable while messages are taken."""
+        """Return a descriptor that is readable after a request, and writable while messages are accepted."""
 
     def receive(self) -> Sequence[Request]:
-        """Return the requests that arrived; called when the descriptor is readable."""
+        """Return the new requests; called when the descriptor is readable."""
 
     def send(self, message: SimulationMessage) -> None:
-        """Take a message; never raises."""
+        """Send a message to the program; never raises."""
 
 
 class LineProgress(Protocol):
-    """Takes how far one line was served. Times are CLOCK_MONOTONIC, ns."""
+    """Receiver of the progress on one line. Times are CLOCK_MONOTONIC, ns."""
 
     def serve(self, until_ns: int) -> None:
-        """Publish that all bytes that reach the host before `until_ns` were handed over."""
+        """Publish that all bytes due to the host before `until_ns` have been delivered."""
 
     def take(self, off_wire_ns: int) -> None:
-        """Publish when the last byte is off the wire that was taken from the host, and executed."""
+        """Publish the time at which the newest byte received from the host is off the wire."""
 
     def give(self, due_ns: int, now_ns: int) -> None:
-        """Publish when the newest bytes for the host were due, and that they are handed over now."""
+        """Publish that bytes are delivered at `now_ns` that were due at `due_ns`."""
 
 
 class Progress(Protocol):
-    """Takes how far the server has come, for hosts that distinguish a late server from a silent servo."""
+    """Receiver of the server's progress, for hosts that distinguish a late server from a silent servo."""
 
     def note_stall(self, begin_ns: int, end_ns: int) -> None:
-        """Publish a time in which the server did not run although it had to."""
+        """Publish an interval in which the server was runnable but had no core."""
 
     def line(self, index: int) -> LineProgress:
         """Return the progress on one line."""

@@ -1,4 +1,4 @@
-"""A pseudo-terminal before a simulated bus, so that a host opens it as it would open an adapter."""
+"""Pseudo-terminal of a simulated bus: a host opens it like the port of an adapter."""
 
 from __future__ import annotations
 
@@ -14,40 +14,41 @@ from pathlib import Path
 from dxlsim.bus.simulated_bus import SimulatedBus
 
 _TCGETS2, _TCSETS2 = 0x802C542A, 0x402C542B
-"""Terminal settings with the rate as a number (Linux, asm-generic/ioctls.h): they know every rate."""
+"""Terminal settings with a numeric rate (Linux, asm-generic/ioctls.h): they support every rate."""
 _SETTINGS = struct.Struct("4I20s2I")
 """struct termios2 (asm-generic/termbits.h): flags of input, output, control, local; line; both rates."""
 _ROOM = bytes(_SETTINGS.size)
 _CBAUD, _BOTHER = 0o010017, 0o010000
 _CHUNK = 4096
-"""Bytes of one read; fewer are all that there are."""
+"""Size of one read, bytes; a shorter result means that no more bytes are waiting."""
 
 
 class PseudoTerminal:
-    """The master's end. Hosts may come and go; no slave is open here, as programs look for who else has it.
+    """Master's end of a terminal that hosts open and close. No slave is open here, because programs check for
+    other users of a port.
 
-    A terminal without a rate of its own has that of the bus; a host that sets another one sends at that rate,
-    and servos at the old one receive nothing.
+    A terminal starts with the rate of the bus. A host that sets another rate sends at that rate, and servos
+    at the old rate receive nothing.
 
-    What a USB adapter would not do [i]: a host that throws its output away (`tcflush(TCOFLUSH)`, pyserial's
-    `reset_output_buffer`) right after writing loses what the kernel has not handed over yet; pypot 5.0 does
-    so before each packet.
+    Difference from a USB adapter [i]: a host that flushes its output right after writing
+    (`tcflush(TCOFLUSH)`, pyserial's `reset_output_buffer`) loses the bytes that the kernel has not delivered
+    yet. pypot 5.0 does so before each packet.
     """
 
     def __init__(self, bus: SimulatedBus, link: DeviceLink | None = None) -> None:
         self.bus = bus
         self._link = link
         self._master, self._name = self._new_pair()
-        self._settings = b""  # Settings of the terminal when the host last wrote
-        self._taken = b""  # What the host wrote and the bus was not handed yet
-        self.may_have_more = False  # The newest chunk was full
+        self._settings = b""  # Settings of the terminal at the host's last write
+        self._taken = b""  # Bytes of the host that the bus has not received yet
+        self.may_have_more = False  # True if the last read returned a full chunk
         self._times_unplugged = bus.times_unplugged
-        self.plugged = True  # False: the host saw it go, and no device is there
+        self.plugged = True  # False: the adapter is unplugged and no device exists
         self._publish()
 
     @property
     def path(self) -> str:
-        """Path of the device that a host opens, empty while the adapter is unplugged."""
+        """Path of the device for hosts; empty while the adapter is unplugged."""
         return self._name if self.plugged else ""
 
     def fileno(self) -> int:
@@ -55,10 +56,10 @@ class PseudoTerminal:
         return self._master
 
     def follow_adapter(self) -> bool:
-        """Go and come back with the adapter of the bus; return whether the device is another one now.
+        """Close and reopen the terminal with the adapter of the bus; return True if the device has changed.
 
-        It comes back under another name, because a host may still hold the old one, as udev would have it;
-        the link follows. What the host wrote meanwhile is lost.
+        The new device has another name, as with udev, because a host may still hold the old one; the link is
+        updated. Bytes that the host wrote in between are lost.
         """
         if self._times_unplugged == self.bus.times_unplugged and self.plugged == self.bus.plugged:
             return False
@@ -66,7 +67,8 @@ class PseudoTerminal:
         if self._times_unplugged != self.bus.times_unplugged:
             self._times_unplugged = self.bus.times_unplugged
             old = self._master
-            self._master, self._name = self._new_pair()  # while the old name is still taken
+            # Opened before the old one is closed, to get another name
+            self._master, self._name = self._new_pair()
             os.close(old)
             self._unpublish()
         self.plugged = self.bus.plugged
@@ -78,23 +80,24 @@ class PseudoTerminal:
         return True
 
     def read(self) -> None:
-        """Take what the host has written, a chunk at most."""
+        """Read one chunk of the host's bytes."""
         data = b""
-        with suppress(OSError):  # there is nothing, or no host
+        with suppress(OSError):  # No data, or no host
             data = os.read(self._master, _CHUNK)
         self._taken += data
         self.may_have_more = len(data) == _CHUNK
 
     def receive(self, now_ns: int) -> int:
-        """Hand what was taken to the bus, as if it had been written at `now_ns`, which is no earlier.
+        """Pass the bytes that were read to the bus, with the write time `now_ns`.
 
-        Return the number of bytes.
+        Returns:
+            The number of bytes.
         """
         data, self._taken = self._taken, b""
         if not data:
             return 0
         settings = _settings(self._master)
-        if settings != self._settings:  # the host's rate can only be another one then
+        if settings != self._settings:  # Cheap check: the rate changes only with the settings
             self._settings = settings
             rate = _rate(settings)
             if rate not in (0, self.bus.baud_rate):
@@ -103,9 +106,11 @@ class PseudoTerminal:
         return len(data)
 
     def deliver(self, now_ns: int, announce: Callable[[int], None] | None = None) -> None:
-        """Give the host what has reached it by `now_ns`; what does not fit into the terminal is lost.
+        """Write the due bytes to the host; bytes that do not fit into the terminal are lost.
 
-        `announce` is called before, with the time, where there are any bytes.
+        Args:
+            now_ns: Time up to which bytes are due.
+            announce: Called with the time before bytes are written.
         """
         handed_ns = time.monotonic_ns()
         data = self.bus.take(now_ns, handed_ns=handed_ns)
@@ -121,12 +126,12 @@ class PseudoTerminal:
             self.bus.note(f"{len(data) - written} bytes to the host are lost: it does not read")
 
     def close(self) -> None:
-        """Take the terminal and its link away."""
+        """Close the terminal and remove its link."""
         os.close(self._master)
         self._unpublish()
 
     def _new_pair(self) -> tuple[int, str]:
-        """Return the descriptor of the master and the path of the slave, whose settings stay."""
+        """Return the descriptor of the master and the path of the slave, which keeps its settings."""
         master, slave = os.openpty()
         tty.setraw(slave)
         _set_rate(slave, self.bus.baud_rate)
@@ -145,14 +150,19 @@ class PseudoTerminal:
 
 
 class DeviceLink:
-    """Points at one path after the other; never replaces anything that is not a link."""
+    """Symbolic link with a changing target; never replaces anything but a link."""
 
     def __init__(self, path: Path) -> None:
         self._path = path
         self._target: str | None = None
 
     def point(self, target: str) -> None:
-        """Lead to `target`, in one step; raises OSError when it cannot, FileExistsError for another file."""
+        """Point the link at `target` atomically.
+
+        Raises:
+            FileExistsError: The path is not a link.
+            OSError: The link cannot be created.
+        """
         if os.path.lexists(self._path) and not self._path.is_symlink():
             raise FileExistsError(f"{self._path} is no link; it is not replaced")
         new = self._path.with_name(f"{self._path.name}.{os.getpid()}")
@@ -165,7 +175,7 @@ class DeviceLink:
         self._target = target
 
     def remove(self) -> None:
-        """Take the link away, if it still leads where it was pointed."""
+        """Remove the link if it still has the last target."""
         with suppress(OSError):
             if self._target is not None and os.readlink(self._path) == self._target:
                 self._path.unlink()

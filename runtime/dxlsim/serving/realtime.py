@@ -1,4 +1,4 @@
-"""Real time for the process of the simulated buses: priority, a core of its own, and punctual waking."""
+"""Real time for the process of the simulated buses: priority, a dedicated core, and punctual wake-ups."""
 
 from __future__ import annotations
 
@@ -9,18 +9,22 @@ import os
 _PR_SET_TIMERSLACK = 29  # linux/prctl.h
 
 LONGEST_POLL_NS = 50_000
-"""A sleep wakes some 30 us late on a stock kernel: so long before a reply is due the clock is polled."""
+"""Polling time before a reply is due: a sleep wakes some 30 us late on a stock kernel."""
 _POLL_SHARE = 6
-"""One part in so many of the time may be polled by which the process waits longer than it works."""
+"""Polling is limited to one part in this many of the time by which the process waits longer than it works."""
 _BUDGET_NS = 20_000_000
 _PAUSE_NS = 100_000
-"""So long the process at least sleeps when it may not poll: what becomes due meanwhile goes out together."""
+"""Shortest sleep while polling is not allowed; everything that becomes due during it is sent together."""
 
 
 def prepare(priority: int, core: int) -> str:
-    """Ask for a real-time priority (SCHED_FIFO; 0: none) and a core (-1: any); return what was granted.
+    """Request a real-time priority and a core; return a description of the result.
 
-    Never raises: a simulation without real time is a simulation, and its ledger shows how late it was.
+    Never raises: a simulation without real time still works, and its ledger shows the lateness.
+
+    Args:
+        priority: Priority for SCHED_FIFO, 1 to 99; 0: none.
+        core: Core to run on; -1: any.
     """
     gc.collect()
     gc.freeze()
@@ -55,11 +59,11 @@ def _take_priority(priority: int) -> str:
 
 
 class PollBudget:
-    """Decides how long to sleep before something is due, and when to poll the clock instead.
+    """Decides how long to sleep before an event, and when to poll the clock instead.
 
-    Polling is punctual and costs the processor; it is bounded to a sixth of the time, and a process that
-    works half of the time does not poll at all. Beyond that, replies are handed over a little late, several
-    at once.
+    Polling is punctual but uses the processor. It is limited to a sixth of the time, and a process that works
+    half of the time does not poll at all. Without polling, replies are delivered slightly late, several at
+    once.
     """
 
     def __init__(self, now_ns: int) -> None:
@@ -68,7 +72,13 @@ class PollBudget:
         self._polls = False
 
     def sleep_s(self, due_ns: int | None, now_ns: int, easy_ns: int | None = None) -> float | None:
-        """Return for how long to sleep, s; 0: poll; None: for ever. `easy_ns`: what need not be punctual."""
+        """Return the time to sleep, s; 0: poll; None: indefinitely.
+
+        Args:
+            due_ns: Time of the next punctual event; None: no event.
+            now_ns: Current time.
+            easy_ns: Time of the next event that need not be punctual.
+        """
         self._asked_ns = now_ns
         worked_ns = now_ns - self._woken_ns
         self._budget_ns = max(-_BUDGET_NS, self._budget_ns - worked_ns // _POLL_SHARE)
@@ -84,7 +94,7 @@ class PollBudget:
         return 0.0 if self._polls or left_ns <= 0 else _PAUSE_NS * 1e-9
 
     def woke(self, now_ns: int) -> None:
-        """Account for how long it has really waited."""
+        """Account for the actual waiting time."""
         self._woken_ns = now_ns
         waited_ns = now_ns - self._asked_ns
         spent_ns = waited_ns if self._polls else 0

@@ -1,4 +1,4 @@
-"""A simulated bus that a thread of this process serves on a pseudo-terminal, for tests and scripts."""
+"""Simulated bus that a thread of this process serves on a pseudo-terminal, for tests and scripts."""
 
 from __future__ import annotations
 
@@ -18,11 +18,11 @@ from dxlsim.texts.servo_words import bus_of_servos
 from dxlwire.errors import InputError
 
 ANSWER_TIMEOUT_S = 10.0
-"""For an answer of the thread, which waits for the interpreter lock as any other."""
+"""Timeout for the server thread, which has to wait for the interpreter lock."""
 
 
 class LocalStarter:
-    """The starter of a server in this process: requests come from any thread, messages go to a function."""
+    """Starter of a server in this process: requests come from any thread, messages go to a function."""
 
     def __init__(self, take: Callable[[SimulationMessage], None]) -> None:
         self.closed = False
@@ -36,52 +36,57 @@ class LocalStarter:
         return self._wake
 
     def ask(self, request: Request) -> None:
-        """Hand the server a request."""
+        """Send a request to the server."""
         self._requests.append(request)
         os.eventfd_write(self._wake, 1)
 
     def end(self) -> None:
-        """Let the server end after the requests that it has."""
+        """End the server after its pending requests."""
         self._ending = True
         os.eventfd_write(self._wake, 1)
 
     def send(self, message: SimulationMessage) -> None:
-        """Pass a message on."""
+        """Pass a message to the function."""
         self._take(message)
 
     def receive(self) -> Sequence[Request]:
-        """Return the requests that arrived."""
+        """Return the new requests."""
         with suppress(BlockingIOError):
             os.eventfd_read(self._wake)
         self.closed = self._ending
         return [self._requests.popleft() for _ in range(len(self._requests))]
 
     def close(self) -> None:
-        """Close the descriptor; the server has ended."""
+        """Close the descriptor after the server has ended."""
         os.close(self._wake)
 
 
 class ServedBus:
-    """A simulated bus on a pseudo-terminal, which any program opens as it opens a USB adapter.
+    """Simulated bus on a pseudo-terminal, which any program opens like a USB adapter.
 
-    A thread serves it: its replies are as punctual as the interpreter lock allows. Where a test measures
-    reply times, `python -m dxlsim` serves the same bus from a process of its own.
+    A thread serves the bus, so its replies are as punctual as the interpreter lock allows. For tests that
+    measure reply times, `python -m dxlsim` serves the same bus in a process of its own.
 
     Attributes:
         path: The device to open, such as `/dev/pts/3`; empty while the adapter is unplugged.
-        baud_rate: bit/s, of the servos.
+        baud_rate: Baud rate of the servos, bit/s.
         protocol: 1.0 or 2.0.
         ledger: Every byte that passed the line, with its time, and a note for each fault.
     """
 
     def __init__(self, config: SimulationConfig) -> None:
-        """Serve the one bus of a configuration. Raises InputError and OSError."""
+        """Serve the single bus of a configuration.
+
+        Raises:
+            InputError: The configuration is invalid.
+            OSError: The terminal or the link cannot be created.
+        """
         (bus,) = config.buses
         self.baud_rate, self.protocol, self._name = bus.baud_rate, bus.protocol, bus.name
         self.ledger = Ledger()
         self.path = ""
         self._answers: queue.Queue[SimulationMessage] = queue.Queue()
-        self._ready = threading.Event()  # The terminal is open, or the thread has failed
+        self._ready = threading.Event()  # Set when the terminal is open or the thread has failed
         self._failure: Exception | None = None
         self._closed = False
         self._starter = LocalStarter(self._take)
@@ -107,7 +112,7 @@ class ServedBus:
         if message.ports is not None:
             self.path = message.ports[self._name]
             self._ready.set()
-        elif message.happened is None:  # the ledger has what happened
+        elif message.happened is None:  # The ledger already has a note of the fault
             self._answers.put(message)
 
     def _ask(self, request: Request) -> SimulationMessage:
@@ -121,21 +126,21 @@ class ServedBus:
             raise RuntimeError(f"the simulated bus has ended: {self._failure}") from self._failure
 
     def inject(self, fault: str) -> None:
-        """Let a fault happen, now or at its time: `silence servo=1 for=500ms`.
+        """Inject a fault, now or at its time: `silence servo=1 for=500ms`.
 
         Raises:
-            InputError: There is no such fault, or it can never happen; `dxlsim.fault_help` lists them.
+            InputError: The fault is unknown or can never happen; `dxlsim.fault_help` lists all faults.
         """
         message = self._ask(Request(fault=fault))
         if message.error is not None:
             raise InputError(message.error)
 
     def look(self) -> tuple[ServoLook, ...]:
-        """Return each servo as it is now: position, torque, temperature, error, counts of packets."""
+        """Return the current state of each servo: position, torque, temperature, error, counts of packets."""
         return self._ask(Request(look=True)).servos or ()
 
     def close(self) -> None:
-        """Take the pseudo-terminal away; the ledger stays. A second call does nothing."""
+        """Close the pseudo-terminal; the ledger is kept. A second call does nothing."""
         if self._closed:
             return
         self._closed = True
@@ -163,15 +168,15 @@ def serve_bus(
 
     Args:
         servos: Models with their IDs, such as `XL430-W250:1-3`.
-        baud_rate: bit/s; None: the one that the servos are shipped with.
-        protocol: 1.0 or 2.0; needed only by models that exist with both.
+        baud_rate: bit/s; None: the factory setting of the servos.
+        protocol: 1.0 or 2.0; needed only for models that exist with both.
         faults: Lines such as `lose servo=3 at=2s`; their times count from now.
-        seed: What the faults leave to chance is drawn from this number.
-        link: A symbolic link to make, which leads to the pseudo-terminal.
+        seed: Seed of the random values of faults.
+        link: Path of a symbolic link to the pseudo-terminal, which is created.
 
     Raises:
         InputError: A model, an ID, a rate or a fault does not fit.
-        OSError: The terminal or the link cannot be made.
+        OSError: The terminal or the link cannot be created.
 
     Example:
         >>> with serve_bus("XL430-W250:1,2") as bus:

@@ -1,4 +1,4 @@
-"""Serving simulated buses in real time: one thread that waits for all lines together."""
+"""Server: serves simulated buses in real time, in one thread that waits for all lines together."""
 
 from __future__ import annotations
 
@@ -29,35 +29,38 @@ from dxlsim.simulation_plan import SimulationConfig
 from dxlwire.errors import InputError
 
 MOST_BACKLOG_NS = 20_000_000
-"""A host that hands over bytes faster than they pass the wire is not read while so much of them waits.
+"""Limit of the host's bytes that wait for the wire; beyond it the host is not read.
 
-So it feels the rate of its line, as with an adapter."""
+The host is thus slowed down to the rate of its line, as with an adapter.
+"""
 
 GATHER_NS = 250_000
-"""Replies that follow one so closely are handed over together with it, as in two microframes of USB: each
-hand-over costs the processor, and the host's, more than a reply."""
+"""Replies within this time are delivered together, as in two microframes of USB. Each delivery costs more
+processor time here and in the host than a reply."""
 
 _WRITTEN = select.EPOLLIN | select.EPOLLET
-"""Reports once what a host has written; without a host a terminal is at its end all the time."""
+"""Edge-triggered, to report each write of a host once. A terminal without a host is at end of file all the
+time."""
 
 LONGEST_SLEEP_NS = 10_000_000
-"""Where the host watches the progress: no sleep is longer, so that a longer pause is known for a stall."""
+"""Longest sleep while the host watches the progress, so that a longer pause is recognized as a stall."""
 STALL_NS = 20_000_000
-"""A longer pause between two looks at the clock counts as a stall, in which the process had no core."""
+"""A longer pause between two readings of the clock counts as a stall, in which the process had no core."""
 
-IDLE_NS = 300_000  # So long the mechanics of a few steps may take
+IDLE_NS = 300_000  # Time reserved for a few steps of the mechanics
 
 _BITS_PER_BYTE = 10  # 8N1
 
 _GOAL_MODES = (3, 4, 5)
-"""Operating Mode (11): position, extended position, current-based position (e-Manual, X series)."""
+"""Values of Operating Mode (11): position, extended position, current-based position (e-Manual, X series)."""
 
 
 class Server:
-    """Pumps pseudo-terminals and buses until its starter closes, or the `stop` of `run` is readable.
+    """Serves pseudo-terminals and buses until its starter closes, or until the `stop` of `run` is readable.
 
-    Raises InputError when a fault of the configuration could never happen, or its bodies cannot be moved,
-    OSError when a terminal or a link cannot be made.
+    Raises:
+        InputError: A fault of the configuration can never happen, or its bodies cannot be moved.
+        OSError: A terminal or a link cannot be created.
     """
 
     def __init__(
@@ -70,15 +73,16 @@ class Server:
         progress: Progress | None = None,
         recordings: Mapping[str, RecordedPackets] = MappingProxyType({}),
     ) -> None:
-        """Make the buses and their terminals.
+        """Create the buses and their terminals.
 
         Args:
             config: Buses, faults, links and bodies.
-            ledger: Takes every byte that passes the wire.
-            starter: Sends requests, and takes ports, faults that happen, and answers.
-            shafts: Takes how the shafts move, for sensors in other processes.
-            progress: Takes up to which time each line was served, for a host that waits for this process.
-            recordings: The packets of each bus that is `recorded`, by the name of the bus.
+            ledger: Records every byte that passes the wire.
+            starter: Sends requests; receives ports, faults that happen, and answers.
+            shafts: Receives the motion of the shafts, for sensors in other processes.
+            progress: Receives the time up to which each line was served, for a host that waits for this
+                process.
+            recordings: Packets of each bus that is `recorded`, by the name of the bus.
         """
         self.start_ns = time.monotonic_ns()
         self._ledger = ledger
@@ -109,12 +113,14 @@ class Server:
         self._waiting = select.epoll()
         self._by_descriptor: dict[int, PseudoTerminal] = {}
         self._held: dict[int, int] = {}
-        """Terminals that are not read before a time, by descriptor."""
+        """Terminals that are not read until a time, by descriptor."""
 
     def run(self, granted: str = "", stop: int = -1) -> None:
-        """Report the ports and what real time was granted, then serve.
+        """Report the ports and the granted real-time properties, then serve.
 
-        `stop`: a descriptor that ends it when it becomes readable; -1: none does.
+        Args:
+            granted: Description of the granted real-time properties.
+            stop: Descriptor that ends the server when it becomes readable; -1: none.
         """
         self._ledger.on_note = self._report_fault
         with self._waiting as waiting:
@@ -131,7 +137,7 @@ class Server:
             terminal.close()
 
     def _look_at_clock(self) -> int:
-        """Return the time, ns; publish a stall before it, which no servo counts as silence of the host."""
+        """Return the time, ns. Publish a preceding stall and exclude it from the servos' watchdogs."""
         now_ns = time.monotonic_ns()
         if self._progress is not None:
             since_ns, self._looked_ns = self._looked_ns, now_ns
@@ -145,13 +151,13 @@ class Server:
         now_ns = self._look_at_clock()
         soonest_ns = self._find_next_delivery()
         easy_ns = None
-        if soonest_ns is None or soonest_ns - now_ns > IDLE_NS:  # no reply is about to leave
+        if soonest_ns is None or soonest_ns - now_ns > IDLE_NS:  # No reply is about to be sent
             easy_ns = self._work_in_idle_time(now_ns)
             now_ns = self._look_at_clock()
         if self._lines:
             easy_ns = min(easy_ns or ENDLESS_NS, now_ns + LONGEST_SLEEP_NS)
         ready = self._wait(soonest_ns, easy_ns, now_ns)
-        # What was due before the host wrote goes out first: the host could have read it.
+        # Replies that were due before the host wrote go out first, because the host could have read them.
         now_ns = self._look_at_clock()
         self._polling.woke(now_ns)
         if soonest_ns is not None and soonest_ns <= now_ns:
@@ -159,22 +165,25 @@ class Server:
                 due_ns = terminal.bus.next_delivery_ns(GATHER_NS)
                 if due_ns is not None and due_ns <= now_ns:
                     self._deliver(terminal, now_ns)
-        rounds = len(self._terminals)  # a host that drives all buses writes to them in one go
+        rounds = len(self._terminals)  # A host that drives all buses writes to them in one go
         while ready:
             for number, _ in ready:
                 if number in self._by_descriptor:
                     self._by_descriptor[number].read()
             now_ns = (
                 self._look_at_clock()
-            )  # no host gets a reply before it wrote, though other lines take long
+                # Read after the bytes, so that no host gets a reply before it wrote, even if other lines take
+                # long
+            )
             for number, _ in ready:
                 self._read_ready(number, stop, now_ns)
             rounds -= 1
-            ready = self._waiting.poll(0) if rounds else []  # what is reported is reported once
+            # Edge-triggered: each event is reported only once
+            ready = self._waiting.poll(0) if rounds else []
         self._ledger.flush_if_due(now_ns)
 
     def _find_next_delivery(self) -> int | None:
-        """Return when bytes are due to a host next; publish it for each line."""
+        """Return the time of the next delivery to any host; publish it for each line."""
         soonest_ns = None
         for terminal in self._terminals:
             due_ns = terminal.bus.next_delivery_ns(GATHER_NS)
@@ -185,7 +194,7 @@ class Server:
         return soonest_ns
 
     def _work_in_idle_time(self, now_ns: int) -> int | None:
-        """Do what is not urgent; return when there is more of it."""
+        """Do the work that is not urgent; return the time at which more is due."""
         self._mechanics.advance(now_ns)
         times = [self._ledger.flush_due_ns(), self._mechanics.due_ns()]
         if self._held:
@@ -199,7 +208,7 @@ class Server:
         poll, polling = self._waiting.poll, self._polling
         sleep_s = polling.sleep_s(due_ns, now_ns, easy_ns)
         if sleep_s is None or sleep_s > 0.0:
-            # select keeps to the microsecond, an epoll by itself counts milliseconds
+            # select has microsecond resolution, epoll alone only milliseconds
             select.select((self._waiting,), (), (), sleep_s)
             if (ready := poll(0)) or due_ns is None:
                 return ready
@@ -241,12 +250,13 @@ class Server:
             self._held[number] = bus.host_free_ns - MOST_BACKLOG_NS
             self._waiting.unregister(number)
         elif terminal.may_have_more:
-            self._waiting.modify(number, _WRITTEN)  # reports what is there once more
+            self._waiting.modify(number, _WRITTEN)  # Makes epoll report the waiting bytes once more
 
     def _plug(self) -> None:
-        """Wait for the terminals that are there now."""
+        """Register the terminals that exist now."""
         for number in self._by_descriptor:
-            with contextlib.suppress(OSError):  # of a terminal that was unplugged, or is not read for a while
+            # Terminals that were unplugged or are on hold are not registered
+            with contextlib.suppress(OSError):
                 self._waiting.unregister(number)
         self._held.clear()
         self._by_descriptor = {each.fileno(): each for each in self._terminals if each.plugged}
@@ -261,12 +271,12 @@ class Server:
             self._tell(SimulationMessage(happened=note.removeprefix(FAULT)))
 
     def _tell(self, message: SimulationMessage) -> None:
-        """Send a message; where the starter does not read it is dropped, never a reason to wait."""
-        if select.select((), (self._starter,), (), 0)[1]:  # there is room for 100 KB and more then
+        """Send a message; drop it if the starter does not read. Never blocks."""
+        if select.select((), (self._starter,), (), 0)[1]:  # Writable means room for 100 KB or more
             self._starter.send(message)
 
     def _answer_requests(self, now_ns: int) -> None:
-        """Answer the requests of the process that started the simulation."""
+        """Answer the requests of the starter."""
         for request in self._starter.receive():
             if request.look:
                 looks = tuple(look for bus in self._buses for look in servo_looks(bus, now_ns))
@@ -285,7 +295,7 @@ class Server:
 
 
 class _ServedLine:
-    """Publishes the progress on one line."""
+    """Publisher of the progress on one line."""
 
     __slots__ = ("_bus", "_progress", "_served_ns", "_taken_ns")
 
@@ -296,28 +306,28 @@ class _ServedLine:
         self._served_ns = -1
 
     def serve(self, due_ns: int | None) -> None:
-        """Publish when something is due to the host next; None: nothing is."""
+        """Publish the time of the next delivery to the host; None: nothing is due."""
         until_ns = ENDLESS_NS if due_ns is None else due_ns
         if until_ns != self._served_ns:
             self._progress.serve(until_ns)
             self._served_ns = until_ns
 
     def take(self, count: int, now_ns: int) -> None:
-        """Publish that bytes of the host were taken, though a fault may keep them from the servos.
+        """Publish that bytes of the host were received, even if a fault keeps them from the servos.
 
-        To be called after `serve`: a host that sees the bytes as taken relies on when the reply is due.
+        Call this after `serve`: a host that sees the bytes as received relies on the due time of the reply.
         """
         duration_ns = count * _BITS_PER_BYTE * 1_000_000_000 // self._bus.baud_rate
         self._taken_ns = max(self._taken_ns, now_ns) + duration_ns
         self._progress.take(self._taken_ns)
 
     def give(self, now_ns: int) -> None:
-        """Publish that bytes are handed over to the host now."""
+        """Publish a delivery to the host."""
         self._progress.give(now_ns - self._bus.lateness_ns[-1], now_ns)
 
 
 def wake_on_signals(*numbers: signal.Signals) -> socket.socket:
-    """Return a socket that becomes readable when one of these signals comes, which does nothing else then."""
+    """Return a socket that becomes readable after one of these signals, and disable their other effects."""
     wake, signalled = socket.socketpair()
     signalled.setblocking(False)
     for number in numbers:
@@ -327,7 +337,7 @@ def wake_on_signals(*numbers: signal.Signals) -> socket.socket:
 
 
 def servo_looks(bus: SimulatedBus, now_ns: int) -> list[ServoLook]:
-    """Return each servo of a bus as it is now."""
+    """Return the current state of each servo of a bus."""
     bus.advance(now_ns)
     return [
         ServoLook(
@@ -356,7 +366,7 @@ def _goal(registers: Memory) -> float | None:
 
 
 def lateness_us(buses: Sequence[SimulatedBus]) -> dict[str, float]:
-    """Return how late hosts got their last bytes, us: median, p99, maximum; nothing before the first.
+    """Return the lateness of deliveries to hosts, us: median, p99, maximum; empty before the first delivery.
 
     Quantiles by nearest rank: the smallest value that at least this share does not exceed.
     """

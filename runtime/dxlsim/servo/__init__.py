@@ -1,4 +1,4 @@
 """Servo: instructions and protection of a simulated servo.
 
-How its shaft moves belongs in `motion`.
+The motion of its shaft belongs in `motion`.
 """

@@ -1,4 +1,4 @@
-"""Making the simulated servo of a model: which table, shaft and protocol it has."""
+"""Construction of a model's simulated servo, with its table, shaft and protocol."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ from dxlsim.simulation_plan import ServoConfig
 from dxlwire.control_table import ControlTable, find_table, models_by_number
 
 FIRMWARE = {1.0: 24, 2.0: 45}
-"""Firmware version of a simulated servo where its table asks for nothing newer; the manual gives none."""
+"""Firmware version of a simulated servo, unless its table requires a newer one; the manual gives none."""
 
 
 def make_servo(
@@ -28,9 +28,11 @@ def make_servo(
     *,
     mechanics: Mechanics | None = None,
 ) -> SimulatedServo:
-    """Return a servo that was just switched on, and listens at a rate, bit/s.
+    """Return a servo that was just switched on at a baud rate, bit/s.
 
-    Raises LookupError for a model without a control table, ValueError for a rate that it does not have.
+    Raises:
+        LookupError: The model has no control table.
+        ValueError: The model does not support the baud rate.
     """
     table = _table(config, protocol)
     firmware = config.firmware

@@ -1,7 +1,7 @@
-"""A node of a simulated line, a servo or another device: what the bus asks of it, and what cuts it off.
+"""Node of a simulated line, a servo or another device: its interface to the bus, and its disconnection.
 
-What is behind its registers is a subclass' matter: `simulated_servo` has a shaft, `device` shows what a board
-measures.
+Subclasses implement the meaning of the registers: `simulated_servo` has a shaft, `simulated_device` shows the
+measurements of a board.
 """
 
 from __future__ import annotations
@@ -30,11 +30,11 @@ Answer = tuple[int, bytes]  # Error and parameters of a reply
 
 
 class ServoCounts(msgspec.Struct):
-    """What a servo did on the line since the start."""
+    """Packet counters of a servo since the start."""
 
-    received: int = 0  # Intact instructions to it, those to all servos among them
+    received: int = 0  # Intact instructions to it, including broadcasts
     replied: int = 0
-    last_error: int = 0  # Of its last reply, as in the packet
+    last_error: int = 0  # Error of its last reply, as in the packet
 
     def reply(self, error: int) -> None:
         """Count a reply."""
@@ -43,40 +43,41 @@ class ServoCounts(msgspec.Struct):
 
 
 class SimulatedNode(ABC):
-    """One node: the bus calls `execute` and `reply_to_group_read`; faults and tests do the rest.
+    """One node. The bus calls `execute` and `reply_to_group_read`; faults and tests call the rest.
 
     `note` is called with each refusal and each fault.
     """
 
-    kind: ClassVar[str]  # As notes call it
+    kind: ClassVar[str]  # Word for the node in notes
     answers_damaged = False
-    """True: a packet with a wrong checksum is answered by the manual's error; False: never [?]."""
+    """True: a packet with a wrong checksum is answered by the manual's error; False: it is never answered
+    [?]."""
 
     def __init__(self, memory: Memory, error_of: ErrorOf, note: Callable[[str], None], now_ns: int) -> None:
         self._codec = protocol1.CODEC if memory.table.protocol == 1.0 else protocol2.CODEC
         self._error_of = error_of
-        self.registers = memory  # Its control items, by name, as integers of the wire
+        self.registers = memory  # Control items by name, as integers on the wire
         self.note = note
         self.counts = ServoCounts()
         self.servo_id = 0  # ID (3 or 7)
         self.secondary_id: int | None = None
-        """Secondary ID (12), to which it never replies; None: it has none, or it is off.
+        """Secondary ID (12), to which it never replies; None: it has none, or the feature is off.
 
-        253 to 255 switch it off, and the ID goes first (e-Manual, X series).
+        253 to 255 switch it off, and the ID has priority (e-Manual, X series).
         """
         self._silent = False
         self._contacts: list[Callable[[], bool]] = []
-        """Each says, when an instruction arrives, whether its cable has contact."""
-        self._later_ns = 0  # How much later than its Return Delay Time it replies
+        """Callbacks that return True if the cable has contact when an instruction arrives."""
+        self._later_ns = 0  # Additional delay of its replies
         self._deaf_until_ns = now_ns
-        """Until then it boots, or works on a write, and receives nothing."""
+        """Time until which it boots or processes a write, and receives nothing."""
         self._delay_ns = 0  # Return Delay Time (5, 9)
         memory.show_live(self._live_items())
         memory.watch(("return_delay_time",), self._set_delay)
 
     @property
     def called(self) -> str:
-        """How notes call it: `servo 3`."""
+        """Name in notes: `servo 3`."""
         return f"{self.kind} {self.servo_id}"
 
     def _set_delay(self) -> None:
@@ -85,19 +86,19 @@ class SimulatedNode(ABC):
     # What the bus asks
 
     def listens_to(self, servo_id: int) -> bool:
-        """Return whether an instruction to an ID, or to all, is for this servo."""
+        """Return True if an instruction to an ID, or a broadcast, is for this node."""
         return servo_id == BROADCAST or servo_id in (self.servo_id, self.secondary_id)
 
     @property
     def baud_rate(self) -> int:
-        """The rate at which it listens, bit/s; in Protocol 1.0 also by the formula 2e6 / (value + 1)."""
+        """Baud rate of the node, bit/s; in Protocol 1.0 also by the formula 2e6 / (value + 1)."""
         registers = self.registers
         value, rates = registers[baud_item(registers)], registers.table.baud_rates
         return rates.get(value, 2_000_000 // (value + 1) if registers.table.protocol == 1.0 else 0)
 
     def execute(self, packet: InstructionPacket, now_ns: int) -> ServoReply | None:
-        """Obey an instruction whose last byte arrived at `now_ns`; return the reply, None for silence."""
-        servo_id = self.servo_id  # a write of ID is still answered under the old one [i]
+        """Execute an instruction whose last byte arrived at `now_ns`; return the reply, if any."""
+        servo_id = self.servo_id  # A write of ID is still answered with the old ID [i]
         own = packet.servo_id == servo_id
         if not (own or self.listens_to(packet.servo_id)) or not self.receives(now_ns):
             return None
@@ -111,16 +112,16 @@ class SimulatedNode(ABC):
         return ServoReply(servo_id, error | self._state(), parameters, delay_ns) if replies else None
 
     def reply_to_group_read(self, read: GroupRead, entry: ReadEntry, now_ns: int) -> ServoReply | None:
-        """Return its part of the reply to an instruction that ended at `now_ns`; None for silence."""
+        """Return the node's reply to a group read that ended at `now_ns`, or None for no reply."""
         if not self.receives(now_ns) or not self._takes_part(read):
             return None
         if self.registers.get("status_return_level", 2) < 1:
             return None
         error, data = self._answer_read(entry.address, entry.length)
-        if read.fast and error:  # its form has no room for an error without data [i]
+        if read.fast and error:  # Its format has no room for an error without data [i]
             self._stays_out(read)
             return None
-        # of a status packet that servos share only the first one waits its Return Delay Time
+        # In a shared status packet only the first servo waits its Return Delay Time.
         delay_ns = self._later_ns if read.fast and entry is not read.entries[0] else self._delay_ns
         return ServoReply(self.servo_id, error | self._state(), data, delay_ns)
 
@@ -128,54 +129,58 @@ class SimulatedNode(ABC):
 
     @abstractmethod
     def advance(self, now_ns: int) -> None:
-        """Bring what it shows to a time; going back is ignored."""
+        """Advance the live values to a time; an earlier time is ignored."""
 
     @abstractmethod
     def receives(self, now_ns: int) -> bool:
-        """Take an instruction on the line at a time; return whether it reaches the node."""
+        """Return True if the node receives an instruction at a time."""
 
     @abstractmethod
     def _live_items(self) -> Mapping[str, Callable[[], int]]:
-        """Return the items that change by themselves: worked out when they are read, not before."""
+        """Return the items with live values, and the functions that return them."""
 
     @abstractmethod
     def _state(self) -> int: ...
 
     @abstractmethod
     def protect(self, refused: int = 0) -> None:
-        """Do what it does against what may harm it."""
+        """Apply the node's protection against harmful conditions."""
 
     @abstractmethod
     def reset(self) -> None:
-        """Cut and give back its power: RAM is lost."""
+        """Power-cycle the node: RAM is lost."""
 
     @property
     @abstractmethod
     def voltage(self) -> float:
-        """Voltage of its supply, V."""
+        """Supply voltage, V."""
 
     @abstractmethod
     def set_voltage(self, volts: float) -> None:
-        """Supply it with another voltage, V."""
+        """Change the supply voltage, V."""
 
     @abstractmethod
     def _set(self, name: str, wire: int) -> None: ...
 
     @abstractmethod
     def _takes_part(self, read: GroupRead) -> bool:
-        """Return whether it knows a group read."""
+        """Return True if the node supports a group read."""
 
     @abstractmethod
     def _written(self, names: frozenset[str]) -> None:
-        """Do what the writing of some items does beside changing them."""
+        """Apply the side effects of a write to some items."""
 
     # Instructions
 
     def _replies_to(self, packet: InstructionPacket, own: bool) -> bool:
-        """Return whether a status packet follows (Status Return Level); of broadcasts only to a ping.
+        """Return True if a status packet follows (Status Return Level). Of the broadcasts only a ping is
+        answered.
 
-        `own`: the instruction is to the servo's ID; those to the Secondary ID get none. A packet with a wrong
-        checksum gets none, unless `answers_damaged` asks for the manual's error.
+        A packet with a wrong checksum is not answered, unless `answers_damaged` asks for the manual's error.
+
+        Args:
+            packet: The instruction.
+            own: The instruction is to the node's ID; instructions to the Secondary ID are not answered.
         """
         level = self.registers.get("status_return_level", 2)
         if not packet.intact:
@@ -190,7 +195,7 @@ class SimulatedNode(ABC):
         return self._delay_ns + self.servo_id * self._codec.ping_slot_ns(self.baud_rate)
 
     def _obey(self, packet: InstructionPacket) -> Answer:
-        """Return the answer to an instruction; of a packet with a wrong checksum nothing is obeyed."""
+        """Return the answer to an instruction; a packet with a wrong checksum is not executed."""
         codec, parameters = self._codec, packet.parameters
         if not packet.intact:
             return codec.damaged, b""
@@ -208,7 +213,7 @@ class SimulatedNode(ABC):
         return (self._manage(packet), b"") if answer is None else answer
 
     def _manage(self, packet: InstructionPacket) -> int:
-        """Obey what is not reading or writing; return the error, also for what it does not know."""
+        """Execute an instruction other than reads and writes; return the error, also for an unknown one."""
         return self._codec.unknown
 
     def _stays_out(self, read: GroupRead) -> None:
@@ -223,17 +228,18 @@ class SimulatedNode(ABC):
         return self._beyond_shadow(servo_id, address, data) or self._write(address, data)
 
     def _beyond_shadow(self, servo_id: int, address: int, data: bytes) -> int:
-        """Return the error of a write to the EEPROM through the Secondary ID, 0 of any other."""
+        """Return the error for a write to the EEPROM through the Secondary ID, 0 for any other write."""
         shadow = servo_id == self.secondary_id and self.registers.reaches_eeprom(address, data)
         return protocol2.ErrorNumber.ACCESS if shadow else 0
 
     def _write_listed(self, writes: ListedWrites | None) -> int:
-        """Do the writes of a list to this servo, in its order; a listed Secondary ID counts as well [i].
+        """Execute the writes of a list for this node, in list order; its Secondary ID counts as well [i].
 
-        Return the last error; of Protocol 1.0 all error bits.
+        Returns:
+            The last error; in Protocol 1.0 all error bits.
         """
         if writes is None:
-            return self._codec.unknown  # and nothing of it is done [i]
+            return self._codec.unknown  # None of the list is executed [i]
         error, secondary = 0, self.secondary_id
         listed = writes.get(self.servo_id, ())
         if secondary is not None and secondary in writes:
@@ -244,7 +250,7 @@ class SimulatedNode(ABC):
         return error
 
     def _write(self, address: int, data: bytes) -> int:
-        """Write, or return the error with which it is refused; 0 when it is not."""
+        """Execute a write; return 0, or its error if it is rejected."""
         runs = self.registers.runs(address, data)
         if error := self._refused(runs):
             return error
@@ -262,28 +268,28 @@ class SimulatedNode(ABC):
     # What faults do
 
     def silence(self, on: bool = True) -> None:
-        """Cut its data line, or restore it: it receives and sends nothing, and keeps moving."""
+        """Cut its data line, or restore it. A cut node receives and sends nothing, but keeps moving."""
         self._silent = on
         self.note(f"{self.called}: data line {'cut' if on else 'restored'}")
 
     def interrupt(self, contact: Callable[[], bool]) -> None:
-        """Let instructions and replies of this servo through only where `contact` says so."""
+        """Pass instructions and replies of this node only while `contact` returns True."""
         self._contacts.append(contact)
         self.note(f"{self.called}: cable loose")
 
     def connect(self, contact: Callable[[], bool]) -> None:
-        """End what `interrupt` began."""
+        """Undo `interrupt`."""
         self._contacts.remove(contact)
         self.note(f"{self.called}: cable has contact")
 
     def reply_later(self, by_ns: int) -> None:
-        """Start each reply later than Return Delay Time; 0: no longer."""
+        """Delay each reply by an additional time, ns; 0: no longer."""
         self._later_ns = by_ns
         self._set_delay()
         self.note(f"{self.called}: replies {by_ns} ns later")
 
     def cut_power(self, until_ns: int) -> None:
-        """Cut its power until a time: RAM is lost, and it does and receives nothing before."""
+        """Cut its power until a time: RAM is lost, and the node does nothing before."""
         self.reset()
         self._receive_nothing_until(max(self._deaf_until_ns, until_ns))
 
@@ -291,7 +297,7 @@ class SimulatedNode(ABC):
         self._deaf_until_ns = t_ns
 
     def poke(self, name: str, wire: int) -> None:
-        """Set a control item as if it had been so before; the integer of the wire, no refusal."""
+        """Set a control item to an integer on the wire, without checks, as if it had been set before."""
         self.note(f"{self.called}: {name} set to {wire}")
         self._set(name, wire)
 
@@ -300,7 +306,11 @@ Node = TypeVar("Node", bound=SimulatedNode)
 
 
 def baud_value(table: ControlTable, baud_rate: int) -> int:
-    """Return the value of that item for a rate, bit/s. Raises ValueError for one that the model lacks."""
+    """Return the value of the baud rate item for a rate, bit/s.
+
+    Raises:
+        ValueError: The model does not support the rate.
+    """
     for value, rate in table.baud_rates.items():
         if rate == baud_rate:
             return value
@@ -311,5 +321,5 @@ def baud_value(table: ControlTable, baud_rate: int) -> int:
 
 
 def baud_item(memory: Memory) -> str:
-    """Return the item that decides the rate: the Y series has two."""
+    """Return the name of the baud rate item; the Y series has two rates."""
     return "baud_rate" if "baud_rate" in memory else "baud_rate_bus"

@@ -1,7 +1,7 @@
-"""A simulated servo of Protocol 2.0: its instructions, Hardware Error Status with its latch, Bus Watchdog.
+"""Simulated servo of Protocol 2.0: its instructions, Hardware Error Status with its latch, Bus Watchdog.
 
-The Y series reports errors in Error Code instead, each of which takes the torque away. Not modelled of it:
-the time that switching its torque takes, its brake, and Controller State but for off, running and fault.
+The Y series reports errors in Error Code instead, and each of them switches torque off. Not modelled for the
+Y series: the time to switch torque, the brake, and Controller State except off, running and fault.
 """
 
 from __future__ import annotations
@@ -19,35 +19,35 @@ from dxlwire.control_table import ControlItem
 
 WATCHDOG_UNIT_NS = 20_000_000
 TORQUE_ON_AT_START, RAM_FROM_BACKUP = 0x01, 0x02  # Bits of Startup Configuration (60)
-TORQUE_ON_BY_GOAL = 0x08  # Bit of Drive Mode (10): a goal switches the torque on
+TORQUE_ON_BY_GOAL = 0x08  # Bit of Drive Mode (10): a goal enables torque
 
 
 _LIMITS = frozenset(("pwm_limit", "current_limit"))
 _SPEAKS = (2, 20, 21, 22)
-"""Values of Protocol Type (13) with which a servo obeys Protocol 2.0: without a remote control on the line it
-falls back from S.BUS, iBUS and RC-PWM (e-Manual, X330, Protocol Type (13))."""
+"""Values of Protocol Type (13) with which a servo executes Protocol 2.0. Without a remote control on the line
+the servo falls back from S.BUS, iBUS and RC-PWM (e-Manual, X330, Protocol Type (13))."""
 
 _HISTORY = 16
-_INVERTER_OFF, _RUNNING, _FAULT = 2, 5, 8  # Controller State (152) of the Y series
+_INVERTER_OFF, _RUNNING, _FAULT = 2, 5, 8  # Values of Controller State (152) of the Y series
 _CLEAR_TURNS = bytes.fromhex("01 44 58 4c 22")
 _CLEAR_ERROR = bytes.fromhex("02 45 52 43 4c")
 _BACK_UP = bytes.fromhex("01 43 54 52 4c")
 _RESTORE = bytes.fromhex("02 43 54 52 4c")
 _CLEARS_SINCE = 42
-"""Firmware of MX (2.0) and X from which on Clear is known, and a reset of everything is not for all."""
+"""First firmware of MX (2.0) and X that supports Clear, and that rejects a broadcast reset of everything."""
 _KEPT_BY_RESET = {0xFF: (), 0x01: ("id",), 0x02: ("id", "baud_rate", "baud_rate_bus")}
 
 
 class Protocol2Servo(SimulatedServo):
-    """X, P, PRO and Y, the XL-320, grippers, and MX with firmware for Protocol 2.0."""
+    """Servo of Protocol 2.0: X, P, PRO and Y, the XL-320, grippers, and MX with firmware for Protocol 2.0."""
 
     def __init__(self, memory: Memory, shaft: Shaft, note: Callable[[str], None]) -> None:
         self._errors = memory.table.errors
         self._has_error_code = self._errors.has_codes
-        """True for the Y series, which keeps its turns without power, too."""
+        """True for the Y series, which also keeps its turn count without power."""
         self._backup: dict[str, int] = {}
         self._shut_down = False
-        self._check_ns: int | None = None  # When the Bus Watchdog is checked next; None: never
+        self._check_ns: int | None = None  # Time of the next Bus Watchdog check; None: no check
         super().__init__(memory, torque_error, shaft, note)
         memory.has_gaps = False
         memory.watch(("bus_watchdog", "torque_enable"), self._plan_watchdog)
@@ -66,9 +66,9 @@ class Protocol2Servo(SimulatedServo):
         return known
 
     def _manage(self, packet: InstructionPacket) -> int:
-        """Obey what is not reading or writing; an instruction error for what it does not know.
+        """Execute an instruction other than reads and writes; return an instruction error for an unknown one.
 
-        To its Secondary ID a servo does nothing of it that would change the EEPROM [i].
+        An instruction to the Secondary ID must not change the EEPROM [i].
         """
         error: int | None = None
         match packet.instruction, packet.parameters:
@@ -90,7 +90,7 @@ class Protocol2Servo(SimulatedServo):
 
     @property
     def _clears(self) -> bool:
-        """True when it knows Clear: MX (2.0) and X since firmware 42; P and Y [i], not the XL-320."""
+        """True if the servo supports Clear: MX (2.0) and X since firmware 42; P and Y [i], not the XL-320."""
         registers = self.registers
         of_x = registers.table.items["torque_enable"].address == 64
         old = of_x and registers["firmware_version"] < _CLEARS_SINCE
@@ -100,15 +100,15 @@ class Protocol2Servo(SimulatedServo):
         if servo_id == self.secondary_id:
             return ErrorNumber.ACCESS
         kept = _KEPT_BY_RESET.get(option)
-        # e-Manual, Factory Reset: a reset of everything "will NOT be activated" for all
+        # e-Manual, Factory Reset: a broadcast reset of everything "will NOT be activated".
         if kept is None or (option == 0xFF and servo_id == BROADCAST and self._clears):
             return ErrorNumber.INSTRUCTION
         self.registers.restore_factory_values(keep=kept)
         self.reboot()
         return 0
 
-    # Bus Watchdog: its time begins again with each instruction to the servo; whether those to others count
-    # the manual does not mention [?]
+    # Bus Watchdog: its time restarts with each instruction to the servo. The manual does not mention whether
+    # instructions to other servos restart it as well [?].
 
     def _plan_watchdog(self) -> None:
         units = self._watchdog_units()
@@ -118,22 +118,22 @@ class Protocol2Servo(SimulatedServo):
             self.shaft.mechanics.call_at(end_ns, lambda: self._check_watchdog(end_ns))
 
     def _watchdog_units(self) -> int:
-        """Return for how long the Bus Watchdog waits, in its unit; 0 while it does not."""
+        """Return the timeout of the Bus Watchdog, in its unit; 0 while it is not running."""
         registers = self.registers
         units = registers.get("bus_watchdog")
         return units if units and registers.get("torque_enable") and not watchdog_expired(registers) else 0
 
     def _check_watchdog(self, at_ns: int) -> None:
-        """Stop where the Bus Watchdog's time has run out; else check again when it does."""
+        """Stop the servo if the Bus Watchdog has expired; otherwise schedule the next check."""
         if at_ns != self._check_ns:
-            return  # its time was made shorter since
+            return  # A shorter timeout was set in the meantime
         self._check_ns = None
         units = self._watchdog_units()
         if not units or self.shaft.mechanics.grid_ns < self._received_ns + units * WATCHDOG_UNIT_NS:
             self._plan_watchdog()
             return
         self.note(f"servo {self.servo_id}: bus watchdog after {units * 20} ms")
-        for name in ACCESS.profile:  # e-Manual, X series, Bus Watchdog (98), step 4 of the example
+        for name in ACCESS.profile:  # e-Manual, X series, Bus Watchdog (98), step 4 of the example.
             if name in self.registers:
                 self._set(name, 0)
         self._set("bus_watchdog", -1)
@@ -141,19 +141,19 @@ class Protocol2Servo(SimulatedServo):
     # Protection
 
     def _refusal(self, run: Run) -> int:
-        """Return the error number of a write, 0 when it is allowed.
+        """Return the error number of a write, 0 if it is accepted.
 
-        After a shutdown the torque stays off until a reboot: a result fail [i].
+        After a shutdown torque stays off until a reboot: a result fail [i].
         """
         torque = self._shut_down and run.after.get("torque_enable")
         return super()._refusal(run) or (ErrorNumber.RESULT_FAIL if torque else 0)
 
     def _state(self) -> int:
-        """Return the alert bit while Hardware Error Status or Error Code shows something."""
+        """Return the alert bit while Hardware Error Status or Error Code reports an error."""
         return ALERT if self.registers.get(self._errors.item) else 0
 
     def protect(self, refused: int = 0) -> None:
-        """Show what is wrong, and switch the torque off until a reboot when Shutdown lists it."""
+        """Report active errors, and switch torque off until a reboot if Shutdown lists one of them."""
         registers = self.registers
         wrong = self._wrong()
         if self._has_error_code:
@@ -171,22 +171,22 @@ class Protocol2Servo(SimulatedServo):
         self._show_controller_state()
 
     def reboot(self) -> None:
-        """Start again; the servo is deaf until it has."""
+        """Restart; the servo receives nothing until the restart is complete."""
         self.note(f"servo {self.servo_id}: reboot")
         self.power_up()
         self._receive_nothing_until(self.shaft.now_ns + self.boot_ns)
 
     def power_up(self) -> None:
-        """Start: RAM is as it is at power-up, and so is the angle, but for the turns of the Y series."""
+        """Start with RAM and angle as at power-up; only the Y series keeps its turn count."""
         angle = self.shaft.angle
         super().power_up()
         if self._has_error_code:
             self._recount(angle)
 
     def clear_turns(self) -> int:
-        """Bring Present Position back into one turn; return the error: it must not move.
+        """Reset Present Position into one turn; return an error while the servo moves.
 
-        The Y series needs the torque off as well, and reboots. The goal is then the position [i].
+        On the Y series torque must be off as well, and the servo reboots. The position becomes the goal [i].
         """
         if self.shaft.moving or (self._has_error_code and self.registers.get("torque_enable")):
             return ErrorNumber.RESULT_FAIL
@@ -196,7 +196,7 @@ class Protocol2Servo(SimulatedServo):
         return 0
 
     def clear_error(self) -> int:
-        """Forget Error Code; return the error: its causes must be over (e-Manual, Y series)."""
+        """Clear Error Code; return an error while a cause is active (e-Manual, Y series)."""
         if self._wrong():
             return ErrorNumber.RESULT_FAIL
         self.registers["error_code"] = 0
@@ -207,16 +207,16 @@ class Protocol2Servo(SimulatedServo):
 
     @property
     def keeps_backup(self) -> bool:
-        """True when it knows Control Table Backup: it then has Backup Ready.
+        """True if the servo supports Control Table Backup; it then has the item Backup Ready.
 
         e-Manual, Protocol 2.0, Control Table Backup (0x20), and the models' pages, Backup Ready.
         """
         return "backup_ready" in self.registers
 
     def back_up(self) -> int:
-        """Keep EEPROM, gains, profile and indirect addresses; return the error: the torque must be off.
+        """Store EEPROM, gains, profile and indirect addresses; return an error while torque is on.
 
-        P keeps no indirect addresses; so does Y [i].
+        P does not store indirect addresses; neither does Y [i].
         """
         registers = self.registers
         if registers.get("torque_enable"):
@@ -228,7 +228,9 @@ class Protocol2Servo(SimulatedServo):
         return 0
 
     def restore_backup(self) -> int:
-        """Take back the EEPROM that was kept, and reboot; return the error: torque off, and a backup."""
+        """Restore the EEPROM from the backup, and reboot; return an error while torque is on, or without a
+        backup.
+        """
         registers = self.registers
         if registers.get("torque_enable") or not self._backup:
             return ErrorNumber.RESULT_FAIL
@@ -244,7 +246,7 @@ class Protocol2Servo(SimulatedServo):
         self.shaft.plan(("goal_position",))
 
     def _wrong(self) -> tuple[int, ...]:
-        """Return the bits or codes of the errors whose cause is there now."""
+        """Return the bits or codes of the errors with an active cause."""
         registers, errors = self.registers, self._errors
         wrong = [errors.value_of("overload")] if self.overload else []
         if "max_voltage_limit" in registers:
@@ -259,7 +261,7 @@ class Protocol2Servo(SimulatedServo):
         return tuple(wrong)
 
     def _show_error_code(self, codes: tuple[int, ...]) -> None:
-        """Show the newest error; the same one does not count twice, and the history holds the last 16."""
+        """Report the newest error. The same error does not count twice, and the history holds the last 16."""
         registers = self.registers
         names = [f"error_code_history_{number}" for number in range(1, _HISTORY + 1)]
         history = [registers[name] for name in names if registers[name]]
@@ -315,9 +317,9 @@ class Protocol2Servo(SimulatedServo):
         super()._written(names)
 
     def _change_mode(self) -> None:
-        """Begin with another operating mode as in the manual (e-Manual, X series, Operating Mode (11)).
+        """Apply the effects of a new operating mode (e-Manual, X series, Operating Mode (11)).
 
-        Gains, profile and the goals that limit are reset; position control knows one turn only.
+        Gains, profile and the limiting goals are reset; position control has only one turn.
         """
         registers = self.registers
         registers.reset((*ACCESS.gains, *ACCESS.profile))
@@ -327,9 +329,9 @@ class Protocol2Servo(SimulatedServo):
         self._reset_goals()
 
     def _find_turn(self) -> None:
-        """Bring Present Position into the turn that position control knows.
+        """Reset Present Position into the turn of position control.
 
-        e-Manual, X series, Torque Enable (64): it is reset when mode or torque change.
+        e-Manual, X series, Torque Enable (64): it is reset after a change of mode or torque.
         """
         shaft = self.shaft
         if self.registers.get("operating_mode") != OperatingMode.POSITION or self._has_error_code:
@@ -339,7 +341,7 @@ class Protocol2Servo(SimulatedServo):
             shaft.recount(inside)
 
     def _reset_goals(self) -> None:
-        """Set Goal PWM and Goal Current to their limits; to 0 in the mode that obeys them [i]."""
+        """Set Goal PWM and Goal Current to their limits, or to 0 in the mode that follows them [i]."""
         registers = self.registers
         mode = registers.get("operating_mode")
         for goal, limit, obeyed in (
@@ -351,7 +353,7 @@ class Protocol2Servo(SimulatedServo):
 
 
 def _is_kept(name: str, item: ControlItem) -> bool:
-    """Return whether a backup holds an item (e-Manual, Protocol 2.0, Control Table Backup (0x20))."""
+    """Return True if a backup includes an item (e-Manual, Protocol 2.0, Control Table Backup (0x20))."""
     if name.startswith("indirect_address_"):
         return item.area == "RAM"
     return item.access == "RW" and (item.area == "EEPROM" or name in (*ACCESS.gains, *ACCESS.profile))

@@ -1,12 +1,12 @@
-"""A simulated servo: it receives instructions, replies, moves its shaft, and can be broken.
+"""Simulated servo: receives instructions, replies, moves its shaft, and can be damaged by faults.
 
-What both protocols share is here, and the servo of Protocol 1.0; `protocol2_servo` has the instructions of
-the others, and how they protect themselves. Where the e-Manual has no answer, `[i]` marks what was inferred;
-nothing was compared with a real servo yet.
+This module has the common part of both protocols, and the servo of Protocol 1.0. `protocol2_servo` has the
+instructions and the protection of the other servos. `[i]` marks behaviour that was inferred where the
+e-Manual has no answer; nothing was compared with a real servo yet.
 
-Not modelled: other protocols than 1.0 and 2.0 on one line (a servo that is set to another one falls silent),
-what the two shafts of a 2XL or 2XC share, servos that Drive Mode couples, and what firmware decides beyond
-the control table, the fast reads, Clear and Control Table Backup.
+Not modelled: other protocols than 1.0 and 2.0 on one line (a servo set to another protocol is silent), the
+shared properties of the two shafts of a 2XL or 2XC, servos that are coupled by Drive Mode, and effects of the
+firmware version beyond the control table, the fast reads, Clear and Control Table Backup.
 """
 
 from __future__ import annotations
@@ -23,25 +23,25 @@ from dxlsim.servo.node import SimulatedNode
 from dxlsim.wire.packets import GroupRead, Instruction, InstructionPacket
 from dxlsim.wire.protocol1 import ErrorBit
 
-BOOT_NS = 100_000_000  # How long a servo receives nothing after a reboot; no manual names it [i]
+BOOT_NS = 100_000_000  # Time without reception after a reboot; the manuals give no value [i]
 
 _SECONDARY_IDS = ("secondary_shadow_id", "secondary_id")
 
 
 class SimulatedServo(SimulatedNode):
-    """One servo: registers that command a shaft, and show how it moves."""
+    """One servo: its registers command a shaft and report the motion."""
 
     kind = "servo"
 
     def __init__(self, memory: Memory, error_of: ErrorOf, shaft: Shaft, note: Callable[[str], None]) -> None:
         self.shaft = shaft
-        self.overload = False  # True while the shaft is loaded beyond the torque
+        self.overload = False  # True while the load exceeds the torque of the shaft
         self.wakes_on_goal = True
         """Protocol 1.0: writing Goal Position (30) while Torque Enable (24) is 0 sets it to 1 [i]."""
         self.boot_ns = BOOT_NS
-        """How long a reboot or a factory reset by an instruction takes: Protocol 2.0."""
-        self.write_time_ns = 0  # How long it receives nothing after an instruction that writes
-        self._speaks = True  # False when it is set to another protocol
+        """Duration of a reboot or a factory reset by an instruction: Protocol 2.0."""
+        self.write_time_ns = 0  # Time without reception after an instruction that writes
+        self._speaks = True  # False if another protocol is set
         self._started_ns = self._received_ns = shaft.now_ns
         self._registered: tuple[int, bytes] | None = None
         super().__init__(memory, error_of, note, shaft.now_ns)
@@ -61,12 +61,12 @@ class SimulatedServo(SimulatedNode):
     # What the bus asks
 
     def advance(self, now_ns: int) -> None:
-        """Bring the shaft and the present registers to a time; going back is ignored."""
+        """Advance the shaft and the live registers to a time; an earlier time is ignored."""
         self.shaft.advance(now_ns)
         self.registers.refresh()
 
     def receives(self, now_ns: int) -> bool:
-        """Take an instruction on the line at a time; return whether it reaches the servo."""
+        """Return True if the servo receives an instruction at a time."""
         if self._silent or now_ns < self._deaf_until_ns or not self._speaks:
             return False
         self.shaft.advance(now_ns)
@@ -76,14 +76,14 @@ class SimulatedServo(SimulatedNode):
         return True
 
     def excuse(self, duration_ns: int) -> None:
-        """Leave out of the Bus Watchdog's time for how long this process did not run, ns."""
+        """Exclude a stall of this process, ns, from the time of the Bus Watchdog."""
         self._received_ns += duration_ns
 
     # What the protocols do differently
 
     @abstractmethod
     def protect(self, refused: int = 0) -> None:
-        """Take the torque away when something is wrong for which Shutdown asks."""
+        """Switch torque off if an error is active that Shutdown lists."""
 
     @abstractmethod
     def _start_up(self) -> None: ...
@@ -147,14 +147,14 @@ class SimulatedServo(SimulatedNode):
         return round((self._voltage - SUPPLY_OHM * drawn) / self.registers.table.items[name].scale)
 
     def _strained(self) -> None:
-        """It became warmer or colder by a degree, or was overloaded for too long."""
+        """Handle a new temperature, in whole degrees, or an overload."""
         if not self.overload and self.shaft.mechanics.overloaded(self.shaft.index):
             self.overload = True
             self.note(f"servo {self.servo_id}: overload, it does not hold its load")
         self.protect()
 
     def power_up(self) -> None:
-        """Start: RAM is as it is at power-up, the shaft stays where it is."""
+        """Start with RAM at its values for power-up; the shaft stays at its angle."""
         self._registered = None
         self.overload = False
         self.registers.restore_ram()
@@ -177,12 +177,12 @@ class SimulatedServo(SimulatedNode):
 
     @property
     def torque_on(self) -> bool:
-        """True when the motor holds or moves the shaft: torque enabled and its limit not 0."""
+        """True if the motor holds or moves the shaft: torque is enabled and its limit is not 0."""
         return self.shaft.torque_on
 
     @property
     def voltage(self) -> float:
-        """Voltage of the supply, V; the servo sees less while it draws current."""
+        """Supply voltage, V; the servo measures less while it draws current."""
         return self._voltage
 
     @voltage.setter
@@ -192,7 +192,7 @@ class SimulatedServo(SimulatedNode):
 
     @property
     def temperature(self) -> float:
-        """degrees C."""
+        """Temperature, degrees C."""
         return float(self.shaft.mechanics.strain.temperature[self.shaft.index])
 
     @temperature.setter
@@ -200,38 +200,41 @@ class SimulatedServo(SimulatedNode):
         self.shaft.mechanics.heat(self.shaft.index, celsius)
 
     def jam(self, on: bool) -> None:
-        """Block the shaft, or free it."""
+        """Block the shaft, or release it."""
         self.shaft.mechanics.jam(self.shaft.index, on)
         self.note(f"servo {self.servo_id}: shaft {'blocked' if on else 'free'}")
 
     def reset(self) -> None:
-        """Cut and give back its power: RAM is lost, the shaft stays where it is."""
+        """Power-cycle the servo: RAM is lost, the shaft stays at its angle."""
         self.note(f"servo {self.servo_id}: power cycle")
         self.power_up()
 
     def trigger_overload(self) -> None:
-        """Load the shaft beyond the torque.
+        """Load the shaft beyond its torque.
 
-        It ends with a power cycle, a reboot (Protocol 2.0), a write of Torque Limit (34, Protocol 1.0).
+        The overload ends with a power cycle, a reboot (Protocol 2.0), or a write of Torque Limit (34,
+        Protocol 1.0).
         """
         self.overload = True
         self.note(f"servo {self.servo_id}: overload")
         self.protect()
 
     def set_voltage(self, volts: float) -> None:
-        """Supply it with another voltage, V."""
+        """Change the supply voltage, V."""
         self.voltage = volts
         self.note(f"servo {self.servo_id}: voltage {volts} V")
         self.protect()
 
     def set_temperature(self, celsius: float) -> None:
-        """Heat it, degrees C."""
+        """Set the temperature, degrees C."""
         self.temperature = celsius
         self.note(f"servo {self.servo_id}: temperature {celsius} degC")
         self.protect()
 
     def turn(self, by: float, duration_ns: int) -> None:
-        """Let a hand turn the shaft by an angle, rad, in a time; it gives way to a servo that has torque."""
+        """Turn the shaft by hand by an angle, rad, within a time. The hand lets go of a servo that has
+        torque.
+        """
 
         def gives_way(turned: float) -> None:
             came = f"gives way after {math.degrees(turned):.1f} of {math.degrees(by):g} deg"
@@ -241,13 +244,16 @@ class SimulatedServo(SimulatedNode):
 
 
 class Protocol1Servo(SimulatedServo):
-    """AX, DX, EX, RX, and MX with their first firmware: error bits, Torque Limit 0, and the EEPROM's lock."""
+    """Servo of Protocol 1.0: AX, DX, EX, RX, and MX with their first firmware.
+
+    It has error bits, Torque Limit 0 after a shutdown, and the lock of the EEPROM.
+    """
 
     def __init__(self, memory: Memory, shaft: Shaft, note: Callable[[str], None]) -> None:
         super().__init__(memory, lock_error, shaft, note)
 
     def _manage(self, packet: InstructionPacket) -> int:
-        """Return an instruction error also of a bulk read that an AX does not know [i]."""
+        """Execute an instruction other than reads and writes; an AX rejects a bulk read as unknown [i]."""
         if packet.instruction != Instruction.FACTORY_RESET:
             return super()._manage(packet)
         self.registers.restore_factory_values()
@@ -255,7 +261,7 @@ class Protocol1Servo(SimulatedServo):
         return 0
 
     def _takes_part(self, read: GroupRead) -> bool:
-        """Return whether it knows a bulk read: only the MX do, and only for two servos or more."""
+        """Return True for a supported bulk read: MX models only, with two servos or more."""
         known = "bulk_read" in self.registers.table.capabilities and len(read.entries) >= 2
         if not known:
             self.note(f"servo {self.servo_id} refuses a bulk read of {len(read.entries)}")
@@ -264,7 +270,7 @@ class Protocol1Servo(SimulatedServo):
     # Protection
 
     def _state(self) -> int:
-        """Return the error bits that last as long as their cause."""
+        """Return the error bits, which persist as long as their cause."""
         registers, errors = self.registers, self.registers.table.errors
         error = errors.value_of("overload") if self.overload else 0
         if not registers["min_voltage_limit"] <= round(self.voltage * 10) <= registers["max_voltage_limit"]:
@@ -274,7 +280,7 @@ class Protocol1Servo(SimulatedServo):
         return error
 
     def protect(self, refused: int = 0) -> None:
-        """Set Torque Limit to 0 when Shutdown (18) lists an error; Torque Enable (24) stays as it is."""
+        """Set Torque Limit to 0 if Shutdown (18) lists an error; Torque Enable (24) does not change."""
         error = self._state() | refused
         if error & self.registers["shutdown"] and self.registers["torque_limit"]:
             self.note(f"servo {self.servo_id}: shutdown, torque limit 0: {ErrorBit(error)!r}")
@@ -294,9 +300,9 @@ class Protocol1Servo(SimulatedServo):
 
 
 def _supply(memory: Memory) -> float:
-    """Return the voltage at which a servo is tried, V.
+    """Return the supply voltage of a servo, V.
 
-    The one that the manual's figures are for; else 12 V, or the middle of its limits.
+    It is the voltage of the manual's data; otherwise 12 V, or the middle of the servo's limits.
     """
     if memory.table.nominal_voltage:
         return memory.table.nominal_voltage

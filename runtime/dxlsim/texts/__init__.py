@@ -1,4 +1,4 @@
-"""What a person writes about simulated servos: `XL430-W250:1-3`, and durations such as `500 ms`.
+"""Texts by users about simulated servos: `XL430-W250:1-3`, and durations such as `500 ms`.
 
-The lines of faults are read in `faults`; units of a robot file are read in `dxlrun.description`.
+Lines of faults are parsed in `faults`, units of a robot file in `dxlrun.description`.
 """

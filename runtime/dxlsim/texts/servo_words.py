@@ -1,4 +1,4 @@
-"""Servos on one bus, in the words of a command line: `XL430-W250:1-3`."""
+"""Servos of one bus in the syntax of a command line: `XL430-W250:1-3`."""
 
 from __future__ import annotations
 
@@ -25,16 +25,16 @@ _MOST_DIGITS = 9
 def bus_of_servos(
     words: Sequence[str], baud_rate: int | None = None, protocol: float | None = None
 ) -> BusConfig:
-    """Return the bus of servos that are written `MODEL:IDS`, each in the middle of its travel.
+    """Return the bus of servos in the form `MODEL:IDS`, each in the middle of its travel.
 
     Args:
         words: Models with their IDs, such as `XL430-W250:1-3` or `AX-12A:1,4`.
-        baud_rate: bit/s; None: the one that all models are shipped with.
-        protocol: 1.0 or 2.0; None: the one that all models speak.
+        baud_rate: bit/s; None: the common factory setting of all models.
+        protocol: 1.0 or 2.0; None: the common protocol of all models.
 
     Raises:
-        InputError: A model, an ID, the protocol or the baud rate does not fit. It has a sentence for each
-            mistake, in the words of a command line: `--servo`, `--baud`, `--protocol`.
+        InputError: A model, an ID, the protocol or the baud rate does not fit. The message has a sentence
+            for each error, with the options of a command line: `--servo`, `--baud`, `--protocol`.
 
     Example:
         >>> bus = bus_of_servos(["XL430-W250:1-3"])
@@ -101,7 +101,7 @@ def _unknown(models: Sequence[str]) -> list[str]:
 
 
 def _protocol(models: Sequence[str], chosen: float | None) -> float:
-    """Return the protocol that was chosen, or the one that all models have in common."""
+    """Return the chosen protocol, or the common protocol of all models."""
     if chosen not in (None, 1.0, 2.0):
         raise InputError(f"there is no Protocol {chosen:g}; --protocol is 1.0 or 2.0")
     spoken = {model: protocols_of(model) for model in models}

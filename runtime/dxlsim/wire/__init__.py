@@ -1,4 +1,4 @@
-"""Wire: packets of both protocols as servos read and write them.
+"""Wire: packets of both protocols from the perspective of servos.
 
-It shares no code with the packets of the host, on purpose.
+It deliberately shares no code with the packets of the host.
 """

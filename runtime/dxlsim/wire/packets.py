@@ -1,7 +1,7 @@
-"""What the two protocols have in common for a servo: instruction packets, replies, group reads, framing.
+"""Common packet code of both protocols for servos: instruction packets, replies, group reads, framing.
 
 Written from the protocols alone (ROBOTIS e-Manual, "Protocol 1.0", "Protocol 2.0"), without the host's packet
-code: one codec for both sides would agree with its own mistakes.
+code: a common codec would hide its own errors.
 """
 
 from __future__ import annotations
@@ -17,7 +17,7 @@ BROADCAST = 0xFE
 
 @unique
 class Instruction(IntEnum):
-    """Instruction byte (e-Manual, "Instruction"); Protocol 1.0 has some of them."""
+    """Instruction byte (e-Manual, "Instruction"); Protocol 1.0 has only some of them."""
 
     PING = 0x01
     READ = 0x02
@@ -42,13 +42,13 @@ class InstructionPacket(NamedTuple):
     servo_id: int
     instruction: int
     parameters: bytes
-    intact: bool  # False when the checksum is wrong: then nothing else of it can be trusted
-    end: int  # Index behind its last byte, in the bytes that completed it
+    intact: bool  # False if the checksum is wrong; the other fields are then unreliable
+    end: int  # Index after its last byte, in the bytes that completed it
     raw: bytes = b""  # All of its bytes, as they were on the line
 
 
 class ServoReply(NamedTuple):
-    """What a servo sends back, and how long after the instruction's last byte it starts to."""
+    """Reply of a servo, with its delay after the instruction's last byte."""
 
     servo_id: int
     error: int
@@ -57,7 +57,7 @@ class ServoReply(NamedTuple):
 
 
 class ReadEntry(NamedTuple):
-    """What is read of one servo of a list."""
+    """Address range to read from one servo of a list."""
 
     servo_id: int
     address: int
@@ -65,13 +65,14 @@ class ReadEntry(NamedTuple):
 
 
 class GroupRead(msgspec.Struct, frozen=True):
-    """An instruction that several servos answer one after the other, in the order of its list."""
+    """Instruction that several servos answer one after the other, in the order of its list."""
 
     instruction: int
     entries: tuple[ReadEntry, ...]
     fast: bool = False  # True: the servos share one status packet
     has_slots: bool = False
-    """True: a servo may wait for the time of an absent one before it [?]; False: it waits for its reply."""
+    """True: a servo may wait for the slot of an absent servo before it [?]; False: it waits for the actual
+    reply."""
 
     @property
     def lengths(self) -> tuple[int, ...]:
@@ -80,11 +81,11 @@ class GroupRead(msgspec.Struct, frozen=True):
 
 
 ListedWrites = Mapping[int, Sequence[tuple[int, int, int, bytes]]]
-"""The writes of a list for each ID: place in the list, ID, address, data."""
+"""Writes of a list by ID: place in the list, ID, address, data."""
 
 
 def sync_writes(listed: bytes, address: int, length: int) -> ListedWrites | None:
-    """Return the writes of a sync write, whose list has ID and data of each; None: it has another form."""
+    """Return the writes of a sync write's list of IDs and data, or None if its length is wrong."""
     if length == 0 or len(listed) % (length + 1):
         return None
     writes: dict[int, list[tuple[int, int, int, bytes]]] = {}
@@ -95,29 +96,31 @@ def sync_writes(listed: bytes, address: int, length: int) -> ListedWrites | None
 
 
 class Codec(NamedTuple):
-    """A protocol's bytes: `protocol1.CODEC` and `protocol2.CODEC`; functions return None for a wrong form."""
+    """Codec of a protocol: `protocol1.CODEC` and `protocol2.CODEC`. Functions return None for malformed
+    input.
+    """
 
-    header: bytes  # The ID follows it
+    header: bytes  # The ID follows the header
     no_id: frozenset[int]  # Bytes that cannot be an ID
-    length_bytes: int  # Of the length, which follows the ID
-    shortest: int  # The least length
+    length_bytes: int  # Size of the length field, which follows the ID
+    shortest: int  # Smallest valid length
     longest_pause_ns: int  # Longest gap inside an instruction
-    packet: Callable[[bytes, int], InstructionPacket]  # The packet that some bytes are, and its `end`
-    status_packet: Callable[[int, int, bytes], bytes]  # Of ID, error and parameters
-    read: Callable[[bytes], tuple[int, int] | None]  # Address and length of a read's parameters
-    write: Callable[[bytes], tuple[int, bytes] | None]  # Address and data of a write's
-    listed_writes: Callable[[InstructionPacket], ListedWrites | None]  # Those of a sync or bulk write
-    group_read: Callable[[InstructionPacket], GroupRead | None]  # None also: it is none
+    packet: Callable[[bytes, int], InstructionPacket]  # Parses the bytes of a packet, given its `end`
+    status_packet: Callable[[int, int, bytes], bytes]  # From ID, error and parameters
+    read: Callable[[bytes], tuple[int, int] | None]  # Address and length from the parameters of a read
+    write: Callable[[bytes], tuple[int, bytes] | None]  # Address and data from the parameters of a write
+    listed_writes: Callable[[InstructionPacket], ListedWrites | None]  # From a sync write or bulk write
+    group_read: Callable[[InstructionPacket], GroupRead | None]  # None also for other instructions
     ping_slot_ns: Callable[[int], int]
-    """How much later than the ID before it a servo answers a ping to all, at a baud rate."""
-    error: Callable[[int], IntEnum | IntFlag]  # What an error is
-    damaged: int  # Its errors: a wrong checksum
-    unknown: int  # an instruction that it does not know, or wrong parameters
-    no_cells: int  # no such address
+    """Delay between the answers of two successive IDs to a broadcast ping, at a baud rate."""
+    error: Callable[[int], IntEnum | IntFlag]  # Enum member of an error
+    damaged: int  # Error for a wrong checksum
+    unknown: int  # Error for an unknown instruction, or wrong parameters
+    no_cells: int  # Error for an invalid address
 
 
 class InstructionReceiver:
-    """Finds instruction packets in the bytes of a line, noise or not; holds at most one packet."""
+    """Extracts instruction packets from the bytes of a line, despite noise; holds at most one packet."""
 
     def __init__(self, codec: Codec) -> None:
         self._codec = codec
@@ -125,18 +128,18 @@ class InstructionReceiver:
 
     @property
     def pending(self) -> int:
-        """Number of bytes of a packet that is not complete."""
+        """Number of bytes of an incomplete packet."""
         return len(self._held)
 
     def forget(self) -> None:
-        """Drop a packet that was not completed in time."""
+        """Discard a packet that was not completed in time."""
         self._held = b""
 
     def feed(self, data: bytes | bytearray, start: int = 0) -> InstructionPacket | None:
-        """Take bytes of `data` from `start` on until a packet is complete, and return it.
+        """Process `data` from `start` until a packet is complete, and return the packet.
 
-        None: all were taken, and no packet is complete. One with a wrong checksum is a packet too. Go on at
-        `packet.end`.
+        None means that all bytes were processed without completing a packet. A packet with a wrong checksum
+        is returned, too. Continue at `packet.end`.
         """
         held = len(self._held)
         seen = self._held + data[start:]
@@ -152,14 +155,14 @@ class InstructionReceiver:
         return self._codec.packet(bytes(seen[at:end]), start + end - held)
 
     def _size(self, head: bytes) -> int | None:
-        """Return the bytes of a packet that begins so; None: too little of it is there."""
+        """Return the size of a packet with this beginning, or None if the beginning is too short."""
         codec = self._codec
         begin = len(codec.header) + 1
         end = begin + codec.length_bytes
         return None if len(head) < end else end + int.from_bytes(head[begin:end], "little")
 
     def _may_begin(self, head: bytes) -> bool:
-        """Return whether a packet can begin so: the header, an ID that can be, a length that can be."""
+        """Return True if a packet can begin with these bytes: header, valid ID, valid length."""
         header, no_id = self._codec.header, self._codec.no_id
         if not head.startswith(header[: len(head)]):
             return False

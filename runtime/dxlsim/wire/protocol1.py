@@ -1,4 +1,4 @@
-"""Protocol 1.0 as a servo sees it: bytes of the line -> instructions, replies -> bytes."""
+"""Protocol 1.0 from the servo's perspective: bytes of the line -> instructions, replies -> bytes."""
 
 from __future__ import annotations
 
@@ -16,7 +16,8 @@ from dxlsim.wire.packets import (
 )
 
 HEADER = b"\xff\xff"
-LONGEST = 4 + 255  # Bytes of the longest packet: header, ID, a length byte of 255 and what it counts
+# Size of the longest packet, bytes: header, ID, a length byte of 255 and the bytes that it counts
+LONGEST = 4 + 255
 
 
 @unique
@@ -44,7 +45,7 @@ def status_packet(servo_id: int, error: int, parameters: bytes = b"") -> bytes:
 
 
 def group_read(packet: InstructionPacket) -> GroupRead | None:
-    """Return the group read that a packet is; None: it is none, or its parameters are wrong."""
+    """Return the group read of a packet, or None for another or a malformed instruction."""
     if not packet.intact or packet.servo_id != BROADCAST or packet.instruction != Instruction.BULK_READ:
         return None
     listed = packet.parameters[1:]
@@ -52,7 +53,8 @@ def group_read(packet: InstructionPacket) -> GroupRead | None:
         return None
     entries: dict[int, ReadEntry] = {}
     for length, servo_id, address in zip(listed[::3], listed[1::3], listed[2::3], strict=True):
-        entries.setdefault(servo_id, ReadEntry(servo_id, address, length))  # of an ID listed twice the first
+        # For an ID that is listed twice the first entry counts
+        entries.setdefault(servo_id, ReadEntry(servo_id, address, length))
     return GroupRead(packet.instruction, tuple(entries.values()))
 
 

@@ -1,6 +1,6 @@
-"""Protocol 2.0 as a servo sees it: bytes of the line -> instructions, replies -> bytes.
+"""Protocol 2.0 from the servo's perspective: bytes of the line -> instructions, replies -> bytes.
 
-Only the CRC is a library's; the tests have another.
+Only the CRC comes from a library; the tests use another implementation.
 """
 
 from __future__ import annotations
@@ -26,17 +26,18 @@ HEADER = b"\xff\xff\xfd"
 RESERVED = 0x00
 STATUS = 0x55
 ALERT = 0x80
-"""Bit of a status packet's error: look at Hardware Error Status. It does not mean that anything failed."""
+"""Bit of a status packet's error: Hardware Error Status is set. The instruction may have succeeded."""
 
-LONGEST = 0xFFFF  # The greatest length of a packet
+LONGEST = 0xFFFF  # Largest value of the length field
 
 _OVERHEAD = 7  # Bytes that the length does not count: header, reserved byte, ID, length
 _STUFFED = HEADER + b"\xfd"
 
 
-_LONGEST_KNOWN = 1265  # Bytes that list all servos of a line once: longer lists are rubbish, and not kept
+# Size of a list of all servos of a line, bytes; longer lists are corrupted and not cached
+_LONGEST_KNOWN = 1265
 
-SLOT_NS = 1_000_000  # What a servo's slot after a broadcast ping is longer than its reply [i]
+SLOT_NS = 1_000_000  # Time by which a servo's slot after a broadcast ping exceeds its reply [i]
 _PING_REPLY = 14
 
 _FAST_READS = frozenset((Instruction.FAST_SYNC_READ, Instruction.FAST_BULK_READ))
@@ -58,22 +59,22 @@ class ErrorNumber(IntEnum):
 
 
 def crc16(data: bytes | bytearray, crc: int = 0) -> int:
-    """Return the CRC-16 of some bytes: polynomial 8005 (hex), not reflected; `crc` is that so far."""
+    """Return the CRC-16 of bytes: polynomial 8005 (hex), not reflected; `crc` is that of the bytes before."""
     return umts(data, crc)
 
 
 def ping_slot_ns(baud_rate: int) -> int:
-    """Return how much later than the ID before it a servo answers a ping to all."""
+    """Return the delay between the answers of two successive IDs to a broadcast ping."""
     return _PING_REPLY * (10_000_000_000 // baud_rate) + SLOT_NS
 
 
 def stuffed(body: bytes) -> bytes:
-    """Return instruction and parameters as they are on the line: no header is in them."""
+    """Return instruction and parameters with byte stuffing, so that they contain no header."""
     return body.replace(HEADER, _STUFFED)
 
 
 def unstuffed(body: bytes) -> bytes:
-    """Return instruction and parameters as they were meant."""
+    """Return instruction and parameters without byte stuffing."""
     return body.replace(_STUFFED, HEADER)
 
 
@@ -87,18 +88,18 @@ def status_packet(servo_id: int, error: int, parameters: bytes = b"") -> bytes:
 
 
 class FastStatusPacket:
-    """The one status packet of a fast sync or bulk read: each servo adds error, ID, data and CRC.
+    """Shared status packet of a fast sync or bulk read: each servo adds error, ID, data and CRC.
 
-    Nothing in it is stuffed. Each CRC is over everything before it, earlier CRCs included.
+    It has no byte stuffing. Each CRC covers everything before it, including earlier CRCs.
     """
 
     def __init__(self, lengths: tuple[int, ...]) -> None:
         self._head = _head(BROADCAST, _fast_length(lengths)) + bytes((STATUS,))
         self._crc = 0
-        self._sent_crc = b""  # The CRC so far as it was sent: it counts for the next one
+        self._sent_crc = b""  # Previous CRC as sent; the next CRC covers it
 
     def part(self, reply: ServoReply) -> bytes:
-        """Return the bytes that the next servo adds; the first one also sends the header."""
+        """Return the bytes that the next servo adds; the first servo also sends the header."""
         servo_id, error, parameters, _ = reply
         data = b"%b%c%c%b" % (self._head, error, servo_id, parameters)
         self._head = b""
@@ -108,21 +109,21 @@ class FastStatusPacket:
 
 
 def group_read(packet: InstructionPacket) -> GroupRead | None:
-    """Return the group read that a packet is; None: it is none, or its parameters are wrong."""
+    """Return the group read of a packet, or None for another or a malformed instruction."""
     if packet.instruction not in _GROUP_READS or not packet.intact or packet.servo_id != BROADCAST:
         return None
     known = _group_read if len(packet.parameters) <= _LONGEST_KNOWN else _group_read.__wrapped__
     return known(packet.instruction, packet.parameters)
 
 
-@lru_cache(maxsize=16)  # hosts read the same again and again
+@lru_cache(maxsize=16)  # Hosts repeat the same reads
 def _group_read(instruction: int, parameters: bytes) -> GroupRead | None:
     fast = instruction in _FAST_READS
     if instruction in (Instruction.SYNC_READ, Instruction.FAST_SYNC_READ):
         entries = _sync_entries(parameters)
     else:
         entries = _bulk_entries(parameters)
-    # A fast status is one packet [i]: with an absent servo in it, it stays short.
+    # A fast status is one packet [i]: with an absent servo it stays incomplete.
     read = GroupRead(instruction, entries, fast=fast, has_slots=not fast)
     if not entries or (fast and _fast_length(read.lengths) > LONGEST):
         return None
@@ -147,7 +148,7 @@ def _listed_writes(packet: InstructionPacket) -> ListedWrites | None:
     return (_sync_writes if packet.instruction == Instruction.SYNC_WRITE else _bulk_writes)(packet.parameters)
 
 
-@lru_cache(maxsize=1)  # each servo of a line looks itself up
+@lru_cache(maxsize=1)  # Each servo of a line looks itself up
 def _sync_writes(parameters: bytes) -> ListedWrites | None:
     listed = parameters[4:]
     return sync_writes(listed, _word(parameters, 0), _word(parameters, 2)) if listed else None
@@ -184,7 +185,7 @@ def _packet(data: bytes, end: int) -> InstructionPacket:
     return known(data, end)
 
 
-@lru_cache(maxsize=16)  # hosts send the same again and again
+@lru_cache(maxsize=16)  # Hosts repeat the same packets
 def _packet_of(data: bytes, end: int) -> InstructionPacket:
     body = unstuffed(data[_OVERHEAD:-2])
     intact = int.from_bytes(data[-2:], "little") == umts(data[:-2])
