@@ -1,7 +1,7 @@
 """Standard controllers of dxlrun, and its standard sensors.
 
-They import the public package `dxlrun` alone, like the plug-in of any author. Limits of joints are not theirs
-to keep: the gate of the loop does that.
+They import only the public package `dxlrun`, like a third-party plug-in. The gate of the loop enforces joint
+limits, so a controller does not have to.
 
-Other packages may import the modules of `laws`. All else is private.
+Other packages may import the modules of `laws`. The other modules are private.
 """

@@ -1,8 +1,8 @@
-"""diff_drive_controller: drives a base on a left and a right side of wheels by a twist, and keeps odometry.
+"""diff_drive_controller: drive a base with left and right wheels by a twist, and compute its odometry.
 
-Kinematics, limits, time-out and names follow ROS 2's diff_drive_controller (control.ros.org, its user
-documentation): the rims of a base that moves at v and turns at w have the speeds v -+ w * separation / 2.
-Other than there, the speeds of the wheels keep their ratio at the wheels' own limits, so that the base slows
+Kinematics, limits, timeout and names follow ROS 2's diff_drive_controller (control.ros.org, user
+documentation). The rims of a base that moves at v and turns at w have the speeds v -+ w * separation / 2.
+There are two differences: the wheels keep the ratio of their speeds at their own limits, so the base slows
 down on its curve instead of leaving it; and jerk limits are kept without overshoot.
 """
 
@@ -37,33 +37,33 @@ from dxlrun_controllers.laws.odometry import Pose, WheelAngles
 
 
 class LinearLimits(ParametersModel):
-    """Limits forward and backward; what is left out is not limited."""
+    """Limits of the forward and backward motion. A limit that is not given is not applied."""
 
     velocity: Annotated[LinearVelocity, Field(gt=0)] | None = None
-    """Greatest speed."""
+    """Highest speed, m/s."""
     acceleration: Annotated[LinearAcceleration, Field(gt=0)] | None = None
-    """By how much the speed may grow."""
+    """Highest acceleration, m/s^2."""
     deceleration: Annotated[LinearAcceleration, Field(gt=0)] | None = None
-    """Toward a standstill; as `acceleration` where it is left out."""
+    """Highest deceleration, m/s^2; by default the same as `acceleration`."""
     jerk: Annotated[LinearJerk, Field(gt=0)] | None = None
-    """By how much the acceleration may change."""
+    """Highest rate of change of the acceleration, m/s^3."""
 
 
 class AngularLimits(ParametersModel):
-    """Limits to the left and to the right; what is left out is not limited."""
+    """Limits of the rotation to the left and to the right. A limit that is not given is not applied."""
 
     velocity: Annotated[AngularVelocity, Field(gt=0)] | None = None
-    """Greatest rate of turn."""
+    """Highest rate of turn, rad/s."""
     acceleration: Annotated[AngularAcceleration, Field(gt=0)] | None = None
-    """By how much the rate may grow."""
+    """Highest angular acceleration, rad/s^2."""
     deceleration: Annotated[AngularAcceleration, Field(gt=0)] | None = None
-    """Toward a standstill; as `acceleration` where it is left out."""
+    """Highest angular deceleration, rad/s^2; by default the same as `acceleration`."""
     jerk: Annotated[AngularJerk, Field(gt=0)] | None = None
-    """By how much the acceleration may change."""
+    """Highest rate of change of the angular acceleration, rad/s^3."""
 
 
 _SAME = 1e-9
-"""m/s and rad/s: what dividing by a radius and multiplying by it again changes."""
+"""Tolerance, m/s and rad/s, for the rounding errors of a division by a radius and a multiplication by it"""
 
 Multiplier = Annotated[float, Field(gt=0)]
 
@@ -72,35 +72,35 @@ class DiffDriveParameters(ParametersModel):
     """Keys of a diff_drive_controller in the robot file."""
 
     left: JointNames
-    """Wheels on the left: positive velocities drive the base forward."""
+    """Wheels on the left. Their positive velocities must drive the base forward."""
     right: JointNames
-    """Wheels on the right, likewise."""
+    """Wheels on the right. Their positive velocities must drive the base forward."""
     separation: Annotated[Length, Field(gt=0)]
-    """m, between the wheels of the two sides, where they touch the ground"""
+    """Distance between the ground contacts of the left and the right wheels, m."""
     radius: Annotated[Length, Field(gt=0)]
-    """m, of a wheel"""
+    """Radius of a wheel, m."""
     separation_multiplier: Annotated[Multiplier, LIVE] = 1.0
-    """Calibration: what the separation is multiplied by."""
+    """Calibration factor of the separation."""
     left_radius_multiplier: Annotated[Multiplier, LIVE] = 1.0
-    """Calibration: what the radius of the left wheels is multiplied by."""
+    """Calibration factor of the radius of the left wheels."""
     right_radius_multiplier: Annotated[Multiplier, LIVE] = 1.0
-    """Calibration: what the radius of the right wheels is multiplied by."""
+    """Calibration factor of the radius of the right wheels."""
     linear: LinearLimits = LinearLimits()
     angular: AngularLimits = AngularLimits()
     timeout: Annotated[Duration, Field(gt=0)] = 500_000_000
-    """ns; without a new command for so long the base decelerates to a standstill"""
+    """Time without a new command after which the base decelerates to a standstill."""
     odometry: Literal["position", "velocity", "command"] = "position"
-    """What it is made of: the angles of the wheels, their measured velocities, or what was commanded."""
+    """Source of the odometry: measured wheel positions, measured wheel velocities, or the commanded twist."""
     odometry_rate: Annotated[float, Field(gt=0)] = 50.0
-    """Hz, of the topic; at most one message an update"""
+    """Rate of the topic, Hz, but at most one message per update."""
     frame: str = "odom"
-    """Name of the frame in which the pose is."""
+    """Frame of the pose."""
     child_frame: str = "base_link"
-    """Name of the frame of the base, in which the twist is."""
+    """Frame of the base, in which the twist is expressed."""
 
 
 class VelocityCommand(CommandModel):
-    """A twist of the base in the plane, until the next one, at most for the time-out."""
+    """Twist of the base in the plane. It is valid until the next command, at most for the timeout."""
 
     linear: Annotated[float, or_number(TypeAdapter(LinearVelocity))] = 0.0
     """m/s, forward"""
@@ -109,12 +109,12 @@ class VelocityCommand(CommandModel):
 
 
 class Ramp:
-    """A velocity that goes to its target within limits of acceleration, deceleration and jerk (SI units).
+    """Velocity ramp with limits of velocity, acceleration, deceleration and jerk (SI units).
 
     With a jerk limit the acceleration is the largest one from which n steps of `jerk` end exactly at the
     target: a = gap / (n dt) + (n - 1) / 2 * jerk * dt. This is the time-optimal law of a double integrator in
-    discrete time, as in Han, From PID to Active Disturbance Rejection Control, IEEE Trans. Industrial
-    Electronics 56 (2009), without its boundary layer.
+    discrete time of Han, From PID to Active Disturbance Rejection Control, IEEE Trans. Industrial
+    Electronics 56 (2009), without the boundary layer.
     """
 
     def __init__(self, limits: LinearLimits | AngularLimits) -> None:
@@ -125,11 +125,11 @@ class Ramp:
         self.velocity = self.acceleration = 0.0
 
     def within(self, target: float) -> float:
-        """Return a target within the limit of velocity."""
+        """Return the target, clamped to the velocity limit."""
         return min(max(target, -self._top), self._top)
 
     def next(self, target: float, dt: float) -> float:
-        """Return the velocity after `dt` s on the way to `target`; `set` makes it the present one."""
+        """Return the velocity after `dt` s on the way to `target`. The state only changes by `set`."""
         gap = target - self.velocity
         falling = self.velocity * gap < 0
         if math.isinf(self._jerk):
@@ -142,7 +142,8 @@ class Ramp:
         return self.velocity + (self.acceleration + change) * dt
 
     def _by_acceleration(self, target: float, gap: float, falling: bool, dt: float) -> float:
-        if falling and abs(gap) > abs(self.velocity):  # to the other side: through zero
+        # A reversal decelerates to zero first, and accelerates for the rest of the period.
+        if falling and abs(gap) > abs(self.velocity):
             stop_s = abs(self.velocity) / self._sink
             if stop_s >= dt:
                 return self.velocity + math.copysign(self._sink * dt, gap)
@@ -151,21 +152,22 @@ class Ramp:
         return target if abs(gap) <= most else self.velocity + math.copysign(most, gap)
 
     def set(self, velocity: float, dt: float) -> None:
-        """Make a velocity, reached in `dt` s, the present one."""
+        """Set the present velocity, reached in `dt` s, and the acceleration that follows from it."""
         self.acceleration = (velocity - self.velocity) / dt
         self.velocity = velocity
 
     def stop(self) -> None:
-        """Stand still."""
+        """Set velocity and acceleration to 0."""
         self.velocity = self.acceleration = 0.0
 
 
 class DiffDriveController(Controller[DiffDriveParameters]):
-    """Turns a twist into velocities of wheels, within limits, and the wheels' angles into a pose.
+    """Controller of a base with differential drive: wheel velocities from a twist, pose from wheel angles.
 
-    The pose begins at 0 with the run, and is kept while the controller is inactive. While a wheel is lost the
-    base is held, and the pose stands still; the way of the wheels in a short silence is made up for with the
-    next reply; that of a longer one, in which a servo may have lost its turns, is left out and reported.
+    The pose starts at 0 with the run, and is kept while the controller is inactive. While a wheel is lost,
+    the base is held and the pose is frozen. After a short gap in the replies, the next reply updates the pose
+    by the travel in the gap. After a longer gap, in which a servo may have lost its turn count, the travel is
+    discarded and an event reports that.
     """
 
     Parameters = DiffDriveParameters
@@ -174,11 +176,11 @@ class DiffDriveController(Controller[DiffDriveParameters]):
 
     @classmethod
     def interfaces(cls, parameters: DiffDriveParameters, joints: tuple[str, ...]) -> Interfaces:
-        """Claim the velocity of all wheels: those on the left first."""
+        """Claim the velocity of all wheels, those on the left first."""
         return Interfaces((*parameters.left, *parameters.right), ("velocity",))
 
     def on_configure(self, context: Context) -> None:
-        """Make room for everything that the loop needs."""
+        """Allocate all memory that the loop needs."""
         super().on_configure(context)
         parameters, left = self.parameters, len(self.parameters.left)
         speeds = context.limits.velocity[np.isfinite(context.limits.velocity)]
@@ -198,7 +200,7 @@ class DiffDriveController(Controller[DiffDriveParameters]):
         self.on_parameters(0)
 
     def on_parameters(self, time_ns: int) -> None:
-        """Take over a changed calibration."""
+        """Apply a changed calibration."""
         parameters = self.parameters
         self._half = parameters.separation * parameters.separation_multiplier / 2
         self._radii = (
@@ -218,7 +220,7 @@ class DiffDriveController(Controller[DiffDriveParameters]):
         self.context.commands.velocity.fill(0.0)
 
     def on_command(self, kind: str, data: NDArray[np.float64], time_ns: int) -> None:
-        """Take a new twist."""
+        """Set a new twist."""
         self._command = float(data[0]), float(data[1])
         self._commanded_ns = time_ns
         self._aim()
@@ -228,14 +230,14 @@ class DiffDriveController(Controller[DiffDriveParameters]):
         self._command = self._target = (0.0, 0.0)
 
     def _aim(self) -> None:
-        """Make the command the target, slowed down along its curve to what base and wheels may do."""
+        """Set the target to the command, scaled down on the same curve to the limits of base and wheels."""
         linear, angular = self._linear.within(self._command[0]), self._angular.within(self._command[1])
         rim = abs(linear) + abs(angular) * self._half
         share = self._rim_limit / rim if rim > self._rim_limit else 1.0
         self._target = linear * share, angular * share
 
     def update(self, time_ns: int, period_ns: int) -> None:
-        """Go on toward the target; a target without a new command for the time-out is a standstill."""
+        """Ramp towards the target. After the timeout the target is a standstill."""
         dt = period_ns * 1e-9
         linear, angular = self._linear, self._angular
         self._start_from_goals()
@@ -252,7 +254,7 @@ class DiffDriveController(Controller[DiffDriveParameters]):
         velocity[right] = (forward + across) / self._radii[1]
 
     def _start_from_goals(self) -> None:
-        """Go on from what was sent: the gate may have slowed the wheels down, or stopped them meanwhile."""
+        """Restart the ramps from the goals that were sent, if the gate has slowed or stopped the wheels."""
         forward, turn = self._rims(self.context.goals.velocity)
         if abs(forward - self._linear.velocity) > _SAME or abs(turn - self._angular.velocity) > _SAME:
             self._linear.stop()
@@ -260,7 +262,10 @@ class DiffDriveController(Controller[DiffDriveParameters]):
             self._linear.velocity, self._angular.velocity = forward, turn
 
     def _within_wheels(self, forward: float, turn: float) -> tuple[float, float]:
-        """Hold back what grows, so that no wheel is faster than its limit, and no ramp steeper."""
+        """Reduce the increase of the twist so that each wheel keeps its speed limit.
+
+        Only the increase is reduced, so that neither ramp becomes steeper than its limits.
+        """
         excess = abs(forward) + abs(turn) * self._half - self._rim_limit
         if excess > 0.0:
             less = min(excess, max(0.0, abs(forward) - abs(self._linear.velocity)))
@@ -270,7 +275,7 @@ class DiffDriveController(Controller[DiffDriveParameters]):
         return forward, turn
 
     def _rims(self, turned: NDArray[np.float64]) -> tuple[float, float]:
-        """Return the way and the angle of the base, or its twist, of angles or velocities of its wheels."""
+        """Convert wheel angles into distance and angle of the base, or wheel velocities into its twist."""
         (left, right), (left_radius, right_radius) = self._sides, self._radii
         on_left = float(np.add.reduce(turned[left])) / len(self.parameters.left) * left_radius
         on_right = float(np.add.reduce(turned[right])) / len(self.parameters.right) * right_radius
@@ -279,7 +284,7 @@ class DiffDriveController(Controller[DiffDriveParameters]):
     # Odometry
 
     def _follow(self, time_ns: int, dt: float) -> None:
-        """Move the pose by what happened since the update before."""
+        """Update the pose by the motion since the last update."""
         states = self.context.states
         if self.parameters.odometry == "command":
             self._twist = self._linear.velocity, self._angular.velocity
@@ -296,7 +301,7 @@ class DiffDriveController(Controller[DiffDriveParameters]):
             self._publish()
 
     def _measure(self, time_ns: int) -> None:
-        """Move the pose by the wheels' way since their last replies."""
+        """Update the pose by the travel of the wheels since the last complete set of replies."""
         states = self.context.states
         age_ns = self._angles.age_ns(time_ns)
         elapsed_ns = self._angles.take(states, time_ns)
@@ -310,7 +315,7 @@ class DiffDriveController(Controller[DiffDriveParameters]):
         self._holding = False
 
     def _hold(self, time_ns: int) -> None:
-        """Report, once, that wheels are silent for so long that their way is lost."""
+        """Report once that wheels have not answered for so long that their travel is lost."""
         if self._holding or self._angles.age_ns(time_ns) <= self._angles.longest_ns:
             return
         self._holding = True

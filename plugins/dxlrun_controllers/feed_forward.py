@@ -1,4 +1,4 @@
-"""feed_forward: adds to a motion what its servos need for it, by the models of their motors."""
+"""feed_forward: add to a motion the feed-forward that its servos need, from the models of their motors."""
 
 from __future__ import annotations
 
@@ -32,30 +32,33 @@ from dxlrun_controllers.joints import (
 from dxlrun_controllers.laws.feed_forward import NEEDED_FIGURES, InverseServo, MotionAhead, output_per_need
 
 STATE_NS: Final = 20_000_000
-"""Between two messages of the state, ns."""
+"""Time between two messages of the state, ns"""
 
 
 class FeedForwardParameters(JointsParameters):
     """Keys of a feed_forward in the robot file."""
 
     command_interface: Literal["position", "effort", "pwm"] = "position"
-    """`position`: the reference, and as much beside it that the servo's own control gives the duty that is
-    needed; `effort`, `pwm`: the torque in the unit of the servo's effort, or the duty, and nothing else."""
+    """`position` commands the reference plus an offset, at which the servo's own control outputs the needed
+    duty. `effort` and `pwm` command only the torque, in the unit of the servo's effort, or the duty."""
     pass_on: bool = False
-    """With `effort` and `pwm` command the reference's position and velocity, too, of a pid_controller."""
+    """With `effort` and `pwm`: also command position and velocity of the reference, for a pid_controller
+    below."""
     scale: Annotated[PerJoint[Annotated[float, Field(ge=0, le=1)]], LIVE] = 1.0
-    """Part of the feed-forward that is commanded; 0: `position` is the reference as it is."""
+    """Factor on the feed-forward, 0..1. With 0, `position` commands the unchanged reference."""
     most: PerJoint[Positive] | None = None
-    """Largest magnitude of what is added (rad) or commanded (unit of the effort, part of full voltage)."""
+    """Largest magnitude of the offset (rad) or of the command (unit of the effort, fraction of full
+    voltage).."""
     friction_speed: Annotated[AngularVelocity, Field(gt=0)] = 0.1
-    """At this desired speed 3/4 of the friction is compensated, at rest nothing of it."""
+    """Desired speed at which 3/4 of the friction is compensated, rad/s. At rest, none is."""
     lead: Duration = 0
-    """From the begin of a cycle to its goals' arrival at the servos: what `dxlrun check` shows as `waits`."""
+    """Time from the start of a cycle until its goals arrive at the servos; `dxlrun check` shows it as
+    `waits`."""
     voltage_filter: Duration = 2_000_000_000
-    """Time constant of the filter on the measured supply; 0: none."""
+    """Time constant of the filter on the measured supply voltage; 0 disables the filter."""
 
     def mistakes(self) -> Iterator[Mistake]:
-        """Yield references that are passed on although they are commanded."""
+        """Yield `pass_on` if the positions are commanded anyway."""
         yield from super().mistakes()
         if self.pass_on and self.command_interface == "position":
             yield (
@@ -66,35 +69,37 @@ class FeedForwardParameters(JointsParameters):
 
 @dataclass(slots=True)
 class FeedForwardState:
-    """What the motion needs; rows in the order of the controller's joints."""
+    """Feed-forward of the motion, one row per joint in the order of the controller's joints"""
 
     header: Header
     velocity: Floats
-    """rad/s, desired, as far ahead as goals take to act; so is what follows"""
+    """Desired velocity, rad/s. Like all fields that follow, it is predicted for the time when the goal acts.
+    """
     acceleration: Floats
     """rad/s^2"""
     torque: Floats
     """Nm of the motor"""
     duty: Floats
-    """Part of the supply's voltage"""
+    """Fraction of the supply voltage"""
     supply: Floats
     """V"""
     output: Floats
-    """What is added (rad) or commanded"""
+    """Offset of the position (rad), or command"""
 
 
 class FeedForward(Controller[FeedForwardParameters]):
-    """Commands what a motion needs by the inverse of the servos' models (`laws.feed_forward`).
+    """Controller that adds feed-forward to a motion by inverse models of the servos (`laws.feed_forward`).
 
-    - References: `position`, and `velocity` with its sign. Where none is commanded, the joints are at rest
-      where the last reference was, or where they were when it became active.
-    - It looks ahead by what a goal takes to act: `lead`, the motor's `delay`, and half a period for which the
-      goal stays. Acceleration and look-ahead follow from the references' own differences: the one above
-      should command the velocity too, and have the same rate.
-    - The voltage is the measured one, filtered, or the motor file's until there is one.
+    - References are `position` and the signed `velocity`. Without a reference, the joints rest at the last
+      one, or where they were when the controller became active.
+    - The motion is predicted for the time when a goal acts: after `lead`, the motor's `delay`, and half a
+      period, because a goal is held for one. Acceleration and prediction are computed from differences of the
+      references. The controller above should therefore also command the velocity, and run at the same rate.
+    - The voltage is the filtered measurement, or that of the motor file until there is one.
 
-    After M. Schwarz, S. Behnke, "Compliant Robot Behavior using Servo Actuator Models identified by Iterative
-    Learning Control", RoboCup 2013: the servo's own position control is made to give the torque.
+    The method, in which the servo's own position control produces the torque, is from M. Schwarz, S. Behnke,
+    "Compliant Robot Behavior using Servo Actuator Models identified by Iterative Learning Control",
+    RoboCup 2013.
     """
 
     Parameters = FeedForwardParameters
@@ -102,7 +107,7 @@ class FeedForward(Controller[FeedForwardParameters]):
 
     @classmethod
     def interfaces(cls, parameters: FeedForwardParameters, joints: tuple[str, ...]) -> Interfaces:
-        """Command one interface, perhaps the references beside it; export position and velocity."""
+        """Command one interface, with `pass_on` also the references. Export position and velocity."""
         passed = ("position", "velocity") if parameters.pass_on else ()
         return Interfaces(
             parameters.joints,
@@ -112,7 +117,7 @@ class FeedForward(Controller[FeedForwardParameters]):
         )
 
     def on_configure(self, context: Context) -> None:
-        """Make room for everything that the loop needs."""
+        """Allocate all memory that the loop needs."""
         super().on_configure(context)
         parameters, joints, limits = self.parameters, context.joints, context.limits
         motors = [motor for motor in context.motors if motor is not None]
@@ -151,7 +156,7 @@ class FeedForward(Controller[FeedForwardParameters]):
         self.on_parameters(0)
 
     def on_parameters(self, time_ns: int) -> None:
-        """Take the scale."""
+        """Set the scale."""
         self._scale = row_of(self.parameters.scale, self.context.joints)
 
     def on_activate(self, time_ns: int) -> None:
@@ -162,7 +167,7 @@ class FeedForward(Controller[FeedForwardParameters]):
         self._state_ns = time_ns
 
     def update(self, time_ns: int, period_ns: int) -> None:
-        """Command what the reference needs."""
+        """Command the feed-forward of the reference."""
         context, ahead, inverse, output = self.context, self._ahead, self._inverse, self._output
         period_s = period_ns * 1e-9
         refer(self._reference, context)
@@ -177,11 +182,11 @@ class FeedForward(Controller[FeedForwardParameters]):
         np.copyto(output, clamped(added * self._scale, -self._most, self._most))
         if self._position_mode:
             np.copyto(self._command, clamped(self._reference + output, self._lower, self._upper))
-        else:  # without any position that was read there is nothing to hold
+        else:  # 0 until the first position was read
             np.copyto(self._command, finite_or(output, 0.0))
         if self.parameters.pass_on:
             np.copyto(context.commands.position, self._reference)
-            np.copyto(context.commands.velocity, finite_or(velocity, 0.0))  # below it counts as at rest
+            np.copyto(context.commands.velocity, finite_or(velocity, 0.0))  # 0: at rest
         if time_ns >= self._state_ns:
             self._state_ns = time_ns + STATE_NS
             context.publish("state", self._state)

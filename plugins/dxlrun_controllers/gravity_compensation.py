@@ -1,4 +1,4 @@
-"""gravity_compensation: adds to references what holds the weight of the robot's bodies, by its URDF."""
+"""gravity_compensation: add to references the torque that holds the weight of the links, from the URDF."""
 
 from __future__ import annotations
 
@@ -41,57 +41,59 @@ from dxlrun_controllers.laws.feed_forward import NEEDED_FIGURES, Supply, output_
 from dxlrun_controllers.laws.gravity import MOVABLE, TYPES, Bodies, bodies_of, gravity_law, up_of
 
 STATE_NS: Final = 20_000_000
-"""Between two messages of the state, ns."""
+"""Time between two messages of the state, ns"""
 _MOVE: Final[Mapping[JointUnit, str]] = {ROTARY: "turn", LINEAR: "slide"}
 
 
 class PayloadParameters(ParametersModel):
-    """What the robot carries and the URDF does not have."""
+    """Load that the robot carries and that the URDF does not include"""
 
     link: str
-    """That carries it"""
+    """Link that carries the payload."""
     mass: Annotated[Mass, Field(ge=0), LIVE]
-    """Of the payload, kg."""
+    """Mass of the payload, kg."""
     position: Annotated[tuple[Length, ...], Field(min_length=3, max_length=3)] = (0.0, 0.0, 0.0)
-    """Of its centre of mass, in the axes of the link."""
+    """Centre of mass of the payload in the axes of the link, m."""
 
 
 class GravityParameters(JointsParameters):
     """Keys of a gravity_compensation in the robot file."""
 
     command_interface: Literal["position", "posvel", "effort", "pwm"] = "position"
-    """`position`: the reference, and as much beside it that the servo's own control holds the weight;
-    `posvel` passes the velocity on; `effort`, `pwm`: the reference, or 0, and what holds the weight."""
+    """`position` commands the reference plus an offset at which the servo's own control holds the weight;
+    `posvel` also passes the velocity on. `effort` and `pwm` add the weight to the reference, or to 0."""
     scale: Annotated[PerJoint[Annotated[float, Field(ge=0, le=1)]], LIVE] = 1.0
-    """Part of the weight that is held."""
+    """Fraction of the weight that is compensated, 0..1."""
     most: PerJoint[Positive] | None = None
-    """Largest magnitude of what is added: rad, unit of the effort, part of full voltage."""
+    """Largest magnitude that is added: rad, unit of the effort, or fraction of full voltage."""
     payload: PayloadParameters | None = None
-    """What the robot carries."""
+    """Payload of the robot."""
     orientation: str | None = None
-    """That of the URDF's first link, a state: `imu/orientation`; without it that link is level."""
+    """State with the orientation of the URDF's first link, such as `imu/orientation`. Without it, the link is
+    assumed to be level."""
     voltage_filter: Duration = 2_000_000_000
-    """Time constant of the filter on the measured supply; 0: none."""
+    """Time constant of the filter on the measured supply voltage; 0 disables the filter."""
 
 
 @dataclass(slots=True)
 class GravityState:
-    """What holds the weight; rows in the order of the controller's joints."""
+    """Compensation of the weight, one row per joint in the order of the controller's joints"""
 
     header: Header
     torque: Floats
     """Nm"""
     output: Floats
-    """What is added: rad, unit of the effort, part of full voltage"""
+    """Value that is added: rad, unit of the effort, or fraction of full voltage"""
 
 
 class GravityCompensation(Controller[GravityParameters]):
-    """Holds the weight of the bodies that its joints move (`laws.gravity`), so that no error has to.
+    """Controller that compensates the weight of the links that its joints move (`laws.gravity`).
 
-    Positions are shifted by as much as a feed_forward shifts them for the same torque, and the weight is that
-    at the desired positions; efforts and PWM are for that at the measured ones. Without a reference positions
-    hold, efforts and PWM carry the weight alone: the arm floats. Other joints of the robot count where they
-    are.
+    Without it, a servo needs a position error to hold a weight. For `position`, the weight is computed at the
+    desired positions, and a torque causes the same offset as in a feed_forward. For `effort` and `pwm`, the
+    weight is computed at the measured positions. Without a reference, `position` holds the joints, while
+    `effort` and `pwm` only carry the weight, so the arm floats. All other joints of the robot are taken into
+    account at their measured positions.
     """
 
     Parameters = GravityParameters
@@ -99,7 +101,7 @@ class GravityCompensation(Controller[GravityParameters]):
 
     @classmethod
     def interfaces(cls, parameters: GravityParameters, joints: tuple[str, ...]) -> Interfaces:
-        """Command and export the same; read where the other joints are, and the base's orientation."""
+        """Command and export the same interfaces. Read all other joints and the orientation of the base."""
         interfaces = commanded_by(parameters.command_interface)
         source = parameters.orientation
         others = (f"{joint}/position" for joint in joints if joint not in parameters.joints)
@@ -113,7 +115,7 @@ class GravityCompensation(Controller[GravityParameters]):
 
     @classmethod
     def mismatches(cls, parameters: GravityParameters, robot: RobotModel) -> Iterator[Mismatch]:
-        """Yield what is missing: MuJoCo, the URDF, a joint or a mass in it, the payload's link."""
+        """Yield a missing requirement: MuJoCo, the URDF, a joint or a mass in it, the link of the payload."""
         if importlib.util.find_spec("mujoco") is None:
             yield Mismatch(
                 "needs MuJoCo, which is not installed", "`pip install 'dxlrun[physics]'` installs it"
@@ -140,7 +142,7 @@ class GravityCompensation(Controller[GravityParameters]):
         yield from found
 
     def on_configure(self, context: Context) -> None:
-        """Make the law, and room for everything that the loop needs."""
+        """Build the gravity law, and allocate all memory that the loop needs."""
         super().on_configure(context)
         parameters, joints, limits = self.parameters, context.joints, context.limits
         if context.urdf is None:
@@ -160,16 +162,16 @@ class GravityCompensation(Controller[GravityParameters]):
         self._command: Floats = getattr(context.commands, self._first)
         self._commanded: Floats = getattr(context.references, self._first)
         self._at = np.full(len(names), np.nan)
-        """rad, of its own joints and then of the others, where the weight is taken"""
+        """Positions at which the weight is computed, rad: the controller's joints, then all other joints"""
         self._up = np.array([0.0, 0.0, 1.0])
         self._reference, self._torque, self._output = np.zeros((3, count))
-        # a velocity beside a position: for a servo one above 0, with which it goes there
+        # Velocity of `posvel` without a reference. A servo needs one above 0 to reach its goal position.
         self._rest = np.zeros(count) if context.into else finite_or(limits.velocity, 1.0)
         self._state = GravityState(Header(), self._torque, self._output)
         self.on_parameters(0)
 
     def on_parameters(self, time_ns: int) -> None:
-        """Take the scale; the payload's mass counts from the next update."""
+        """Set the scale. A changed mass of the payload takes effect in the next update."""
         self._scale = row_of(self.parameters.scale, self.context.joints)
 
     def on_activate(self, time_ns: int) -> None:
@@ -180,7 +182,7 @@ class GravityCompensation(Controller[GravityParameters]):
         self._state_ns = time_ns
 
     def update(self, time_ns: int, period_ns: int) -> None:
-        """Command the reference, and what holds the weight."""
+        """Command the references plus the compensation of the weight."""
         context, parameters, count = self.context, self.parameters, len(self._output)
         period_s = period_ns * 1e-9
         self._supply.take(context.states.voltage, period_s / (self._filter_s + period_s))
@@ -216,7 +218,7 @@ class GravityCompensation(Controller[GravityParameters]):
             np.copyto(context.commands.velocity, velocity if context.into else np.abs(velocity))
 
     def _command_torques(self) -> None:
-        self._output[np.isnan(self.context.states.position)] = 0.0  # where it is is not known yet
+        self._output[np.isnan(self.context.states.position)] = 0.0  # no torque at an unknown position
         np.add(finite_or(self._commanded, 0.0), self._output, out=self._command)
 
 
@@ -226,7 +228,7 @@ def _hung(parameters: GravityParameters) -> tuple[str, tuple[float, ...]] | None
 
 
 def _of_joint(bodies: Bodies, joint: str, unit: JointUnit) -> Iterator[Mismatch]:
-    """Yield what the URDF lacks of a joint."""
+    """Yield the first problem of the URDF with a joint."""
     if joint not in bodies.joints:
         yield Mismatch(
             f"needs {joint} in the URDF, which does not have it",

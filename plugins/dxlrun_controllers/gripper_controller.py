@@ -1,6 +1,6 @@
-"""gripper_controller: closes and opens a gripper by goals, with a limited effort, and reports what it holds.
+"""gripper_controller: close and open a gripper by goals with a limited effort, and detect a grip.
 
-A gripper that stands still short of its goal holds something: as in ROS 2's gripper controllers
+A gripper that stalls before its goal is assumed to hold something, as in ROS 2's gripper controllers
 (control.ros.org, gripper_controllers: stall_velocity_threshold, stall_timeout, allow_stalling).
 """
 
@@ -48,19 +48,19 @@ from dxlrun_controllers.group import PositionsCommand
 from dxlrun_controllers.joints import hold, or_number, take_shorter_way_from_goals
 
 STATE_NS = 50_000_000
-"""Between two messages of the topic, ns."""
+"""Time between two messages of the topic, ns"""
 REST_NS = 1_000_000_000
-"""After a cancel, how long the gripper may take to come to rest, ns."""
+"""Timeout for the gripper to come to rest after a cancel, ns"""
 
 
 Way = Angle | Length
-"""A position of the joint: of a linear one a length"""
+"""Position of the joint: an angle, or a length for a linear joint"""
 Speed = AngularVelocity | LinearVelocity
 _OF_LENGTHS: TypeAdapter[float] = TypeAdapter(Length | LinearVelocity)
 
 
 def _is_length(value: object) -> bool:
-    """Return whether a quantity is written with a unit of length, or of length a second."""
+    """Return True if a quantity is written with a unit of length or of linear velocity."""
     try:
         return isinstance(value, str) and _OF_LENGTHS.validate_python(value) is not None
     except ValidationError:
@@ -68,36 +68,37 @@ def _is_length(value: object) -> bool:
 
 
 class Width(ParametersModel):
-    """How far the gripper is open at a position of its joint."""
+    """Opening of the gripper at a position of its joint"""
 
     angle: Way
     """Position of the joint."""
     width: Length
-    """How far the gripper is open there."""
+    """Opening at this position."""
 
 
 class GripperParameters(ParametersModel):
     """Keys of a gripper_controller in the robot file."""
 
     _units: Mapping[str, JointUnit] = PrivateAttr({})
-    """The joints that each key about the joint fits, as it is written"""
+    """Unit of the joint that each key was written for"""
     joint: str
-    """The joint that opens and closes it."""
+    """Joint that opens and closes the gripper."""
     effort: Annotated[float, Field(gt=0)] | None = None
-    """The most that the servo may exert, in the unit that the model measures (Nm, A or the fraction of its
-    maximum), unless a goal has its own. Left out: the servo is in position mode, without such a limit."""
+    """Effort limit of the servo, in the unit that the model measures (Nm, A or the fraction of its maximum).
+    A goal can have its own. Without this key the servo is in position mode, which has no effort limit."""
     speed: Annotated[Speed, Field(gt=0), LIVE] = 2.0
-    """rad/s, of a linear joint m/s, at which it closes and opens"""
+    """Speed of the joint, rad/s, or m/s for a linear joint."""
     tolerance: Annotated[Way, Field(gt=0)] = 0.02
-    """rad, of a linear joint m; nearer to its goal, and at rest, it has reached it"""
+    """Distance within which a goal is reached once the joint is at rest, rad, or m for a linear joint."""
     stall_speed: Annotated[Speed, Field(gt=0)] = 0.05
-    """rad/s, of a linear joint m/s; slower ..."""
+    """Speed below which the joint may be stalled, rad/s, or m/s for a linear joint."""
     stall_time: Annotated[Duration, Field(gt=0)] = 200_000_000
-    """... for so long, ns, and short of its goal, it is stalled"""
+    """Time below `stall_speed`, short of the goal, after which the joint is stalled."""
     timeout: Annotated[Duration, Field(gt=0)] = 5_000_000_000
-    """ns; a goal that has neither been reached nor stalled then is missed"""
+    """Time after which a goal that is neither reached nor stalled is missed."""
     widths: tuple[Width, ...] = ()
-    """At least two, in between linear; without them goals and results are angles."""
+    """Table of at least two openings, with linear interpolation. Without it, goals and results are positions
+    of the joint."""
 
     @model_validator(mode="wrap")
     @classmethod
@@ -111,11 +112,11 @@ class GripperParameters(ParametersModel):
         return found
 
     def unit_of(self, key: str) -> JointUnit:
-        """Return the unit of the joints that a key fits, as it is written or by its default."""
+        """Return the unit of the joint that a key, or its default, was written for."""
         return self._units.get(key, ROTARY)
 
     def mistakes(self) -> Iterator[Mistake]:
-        """Yield what keeps the widths from following from the angle."""
+        """Yield `widths` if they do not define a monotonic function of the angle."""
         yield from super().mistakes()
         if len(self.widths) == 1:
             yield ("widths",), "one width makes no line; write at least two, such as open and closed"
@@ -129,7 +130,7 @@ class GripperParameters(ParametersModel):
 
 
 _OF_THE_WAY = ("speed", "tolerance", "stall_speed")
-"""Keys whose defaults are of a joint that turns"""
+"""Keys whose defaults are for a joint that turns"""
 _FIXES: Mapping[JointUnit, Mapping[str, str]] = {
     ROTARY: {},
     LINEAR: {
@@ -146,16 +147,16 @@ _POSITIONS: Mapping[JointUnit, str] = {
 
 
 class GripCommand(CommandModel):
-    """A goal: a position of the joint or a width, and perhaps the most effort on the way and at it."""
+    """Goal of the gripper: a position of the joint or an opening, and optionally an effort limit."""
 
     _unit: JointUnit | None = PrivateAttr(None)
-    """The joints that the position fits, as it is written; None: it is a number"""
+    """Unit of the joint that the position was written for; None for a bare number"""
     position: Annotated[float, or_number(TypeAdapter(Way))] | None = None
-    """rad, of a linear joint m"""
+    """rad, or m for a linear joint"""
     width: Annotated[float, or_number(TypeAdapter(Length))] | None = None
     """m"""
     effort: Annotated[float, Field(gt=0)] | None = None
-    """In the unit that the model measures"""
+    """Effort limit on the way and at the goal, in the unit that the model measures"""
 
     @model_validator(mode="wrap")
     @classmethod
@@ -174,25 +175,26 @@ class GripCommand(CommandModel):
 
 @dataclass(frozen=True, slots=True)
 class GripperState:
-    """What the gripper does."""
+    """State of the gripper"""
 
     position: float
-    """rad, of a linear joint m"""
+    """rad, or m for a linear joint"""
     width: float
     """m; NaN without a table of widths"""
     effort: float
     """In the unit that the model measures"""
     moving: bool
-    """True while it works on a goal"""
+    """True while a goal is active"""
     stalled: bool
-    """True from a stall until the next goal: it holds something"""
+    """True from a stall until the next goal: the gripper holds something"""
 
 
 class GripperController(Controller[GripperParameters]):
-    """Moves one joint to goals; a stall ends a goal as reached, and the gripper keeps its grip.
+    """Controller of a gripper with one joint. A stall ends a goal as reached, and the gripper keeps its grip.
 
-    With a limit of effort it goes on pressing with it; without one, it holds the angle at which it stalled.
-    The command `positions`, of streams and motion files, moves it without a result.
+    With an effort limit the gripper continues to press with that effort. Without one, it holds the position
+    at which it stalled. The command `positions` of streams and motion files moves the gripper without a
+    result.
     """
 
     Parameters = GripperParameters
@@ -205,7 +207,7 @@ class GripperController(Controller[GripperParameters]):
 
     @classmethod
     def mismatches(cls, parameters: GripperParameters, robot: RobotModel) -> Iterator[Mismatch]:
-        """Yield each key whose unit is not that of the joint; the defaults are of one that turns."""
+        """Yield each key whose unit does not fit the joint. The defaults are for a joint that turns."""
         needed = (*_OF_THE_WAY, *(["widths"] if parameters.widths else []))
         for key in needed:
             unit, written = robot.units[0], parameters.unit_of(key)
@@ -215,7 +217,7 @@ class GripperController(Controller[GripperParameters]):
 
     @classmethod
     def interfaces(cls, parameters: GripperParameters, joints: tuple[str, ...]) -> Interfaces:
-        """Claim position and velocity of the joint, and its effort where that is limited."""
+        """Claim position and velocity of the joint, and the effort if it is limited."""
         if parameters.effort is None:
             return Interfaces((parameters.joint,), ("position", "velocity"))
         return Interfaces(
@@ -224,7 +226,11 @@ class GripperController(Controller[GripperParameters]):
 
     @classmethod
     def prepare(cls, kind: str, command: CommandModel, parameters: GripperParameters) -> NDArray[np.float64]:
-        """Return angle, rad, and effort. Raises ValueError for a width, or an effort, that it cannot have."""
+        """Return the position of the joint (rad or m) and the effort limit.
+
+        Raises:
+            ValueError: The width is out of range, or the parameters do not allow a width or an effort.
+        """
         if not isinstance(command, GripCommand):
             return super().prepare(kind, command, parameters)
         if command.effort is not None and parameters.effort is None:
@@ -246,7 +252,7 @@ class GripperController(Controller[GripperParameters]):
         return np.array([np.interp(command.width, widths[order], angles[order]), effort])
 
     def on_configure(self, context: Context) -> None:
-        """Make room for everything that the loop needs."""
+        """Allocate all memory that the loop needs."""
         super().on_configure(context)
         self._angles, self._widths = _table(self.parameters)
         self._lower, self._upper = context.limits.lower.item(0), context.limits.upper.item(0)
@@ -254,7 +260,7 @@ class GripperController(Controller[GripperParameters]):
         self._target = self._way = 0.0
         self._began_ns = self._published_ns = 0
         self._still, self._still_ns, self._heard_ns = np.nan, 0, 0
-        """Where the gripper has been since, nearer than it may go in `stall_time`; and the last reply."""
+        """Position near which the gripper has stayed, the time since then, and the time of the last reply"""
         self._cancelled = self._stalled = False
         self._unit = self.parameters.unit_of("speed").value
 
@@ -269,11 +275,11 @@ class GripperController(Controller[GripperParameters]):
         self._published_ns = time_ns - STATE_NS
 
     def on_parameters(self, time_ns: int) -> None:
-        """Take another speed; beside a reference of another controller it would be a velocity, so 0."""
+        """Set the speed. For a controller below it would be a signed velocity, so it gets 0."""
         self.context.commands.velocity.fill(0.0 if self.context.into else self.parameters.speed)
 
     def on_goal(self, goal: Goal, data: NDArray[np.float64], time_ns: int) -> None:
-        """Begin to close or open; an angle beyond the joint's limits is refused."""
+        """Start to close or open. A position beyond the joint's limits aborts the goal."""
         self._goal, self._cancelled, self._stalled = None, False, False
         angle, effort = float(take_shorter_way_from_goals(data[:1], self.context)[0]), float(data[1])
         if not self._lower <= angle <= self._upper:
@@ -289,23 +295,23 @@ class GripperController(Controller[GripperParameters]):
         self._way = abs(angle - float(self.context.states.position[0]))
 
     def on_command(self, kind: str, data: NDArray[np.float64], time_ns: int) -> None:
-        """Go to another angle; a goal that is pursued ends."""
+        """Set another position. An active goal ends."""
         self._end(Outcome.PREEMPTED, "positions came")
         self._cancelled, self._stalled = False, False
         self.on_parameters(time_ns)
         np.copyto(self.context.commands.position, take_shorter_way_from_goals(data, self.context))
 
     def on_cancel(self, goal: Goal, time_ns: int) -> None:
-        """Hold where the gripper is now; the goal has ended when it is at rest."""
+        """Hold the gripper at its present position. The goal ends when it is at rest."""
         self._cancelled, self._began_ns = True, time_ns
         self._stay()
 
     def on_deactivate(self, time_ns: int) -> None:
-        """Leave the goal: the runtime ends it."""
+        """Drop the goal, which the runtime ends."""
         self._goal = None
 
     def update(self, time_ns: int, period_ns: int) -> None:
-        """Watch the gripper until it has reached its goal, stands still short of it, or takes too long."""
+        """Monitor the goal until it is reached, stalled or timed out, and publish the state."""
         states = self.context.states
         if self._goal is not None:
             if self._cancelled:
@@ -322,7 +328,7 @@ class GripperController(Controller[GripperParameters]):
             self.context.publish("state", message)
 
     def _watch(self, goal: Goal, time_ns: int) -> None:
-        """Look at a goal that is pursued; without a reply nothing is known but the time."""
+        """Check an active goal. Without a reply, only the timeout is checked."""
         if not self.context.states.valid[0]:
             if time_ns - self._began_ns >= self.parameters.timeout:
                 self._end(Outcome.MISSED, "no reply of its servo")
@@ -345,10 +351,10 @@ class GripperController(Controller[GripperParameters]):
         goal.feedback(max(0.0, 1.0 - error / self._way) if self._way else 0.0, error)
 
     def _stands_still(self, position: float, time_ns: int) -> bool:
-        """Check whether it was slower than `stall_speed` for `stall_time`, by its way.
+        """Return True if the gripper was slower than `stall_speed` for `stall_time`.
 
-        A measured velocity is noisy near 0, and a lost reply must not begin the time anew; a silence as long
-        does.
+        The check compares positions, because a measured velocity is noisy near 0. A lost reply does not
+        restart the time, but a gap longer than `stall_time` does.
         """
         parameters = self.parameters
         silent_ns, self._heard_ns = time_ns - self._heard_ns, time_ns
@@ -358,7 +364,7 @@ class GripperController(Controller[GripperParameters]):
         return time_ns - self._still_ns >= parameters.stall_time
 
     def _stay(self) -> None:
-        """Command the angle that was measured, within the limits; without one, the goal of before counts."""
+        """Command the measured position, clamped to the limits. Without one, keep the last command."""
         position = float(self.context.states.position[0])
         if not np.isnan(position):
             self.context.commands.position.fill(min(max(position, self._lower), self._upper))
@@ -372,14 +378,14 @@ class GripperController(Controller[GripperParameters]):
         goal.end(outcome, f"{text} at {self._place(position)}", self.parameters.joint, error)
 
     def _hand_over(self, text: str, tolerance: float, rest_speed: float, settle_ns: int) -> None:
-        """Let the goal be judged: by its position as it was asked, or as a stall."""
+        """Pass the goal to the runtime for judgement. A stall has an infinite tolerance."""
         goal, self._goal = self._goal, None
         if goal is not None:
             tolerances = GoalTolerances(np.array([tolerance]), np.array([rest_speed]), settle_ns)
             goal.judge(np.array([self._target]), tolerances=tolerances, text=text)
 
     def _place(self, position: float) -> str:
-        """Return a position of the joint, and how far the gripper is open there."""
+        """Format a position of the joint and the opening there."""
         width = self._width(position)
         place = f"{position:.4g} {self._unit}"
         return place if np.isnan(width) else f"{place}, {width * 1e3:.4g} mm"
@@ -389,6 +395,6 @@ class GripperController(Controller[GripperParameters]):
 
 
 def _table(parameters: GripperParameters) -> tuple[Floats, Floats]:
-    """Return angles, rad, growing, and their widths, m."""
+    """Return the positions of the joint in increasing order (rad or m), and their widths (m)."""
     ordered = sorted(parameters.widths, key=lambda point: point.angle)
     return np.array([point.angle for point in ordered]), np.array([point.width for point in ordered])

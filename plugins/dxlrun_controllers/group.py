@@ -1,4 +1,4 @@
-"""Group controllers: forward one command a joint, of one or two interfaces, until the next one comes."""
+"""Group controllers: forward the newest command of one or two interfaces to a group of joints."""
 
 from __future__ import annotations
 
@@ -17,53 +17,53 @@ class GroupParameters(JointsParameters):
 
 
 class PositionsCommand(CommandModel):
-    """One goal a joint."""
+    """One goal position per joint"""
 
     positions: tuple[float, ...]
     """rad, shape (joints,)"""
 
 
 class PosVelCommand(CommandModel):
-    """One goal and one speed a joint."""
+    """One goal position and one speed per joint"""
 
     positions: tuple[float, ...]
     """rad, shape (joints,)"""
     velocities: tuple[float, ...]
-    """rad/s, shape (joints,); the magnitude counts"""
+    """rad/s, shape (joints,); signs are ignored"""
 
 
 class PosEffortCommand(CommandModel):
-    """One goal and the highest effort on the way there and at it, a joint."""
+    """One goal position and one effort limit per joint"""
 
     positions: tuple[float, ...]
     """rad, shape (joints,)"""
     efforts: tuple[float, ...]
-    """Nm, A or the fraction of maximum, as the model measures it; shape (joints,); the magnitude counts"""
+    """Nm, A or the fraction of maximum, as the model measures it; shape (joints,); signs are ignored"""
 
 
 class VelocitiesCommand(CommandModel):
-    """One velocity a joint."""
+    """One velocity per joint"""
 
     velocities: tuple[float, ...]
-    """rad/s, shape (joints,), with their signs"""
+    """rad/s, signed, shape (joints,)"""
 
 
 class EffortsCommand(CommandModel):
-    """One effort a joint."""
+    """One effort per joint"""
 
     efforts: tuple[float, ...]
-    """Nm, A or the fraction of maximum, as the model measures it; shape (joints,), with their signs"""
+    """Nm, A or the fraction of maximum, as the model measures it; signed, shape (joints,)"""
 
 
 class PwmCommand(CommandModel):
-    """One PWM a joint."""
+    """One PWM duty per joint"""
 
     pwm: tuple[Annotated[float, Field(ge=-1, le=1)], ...]
-    """Fraction of the full voltage, -1..1, shape (joints,): 20 for 20 % is refused"""
+    """Fraction of the full voltage, -1..1, shape (joints,); 20 for 20 % is rejected"""
 
 
 class _GroupController(Controller[GroupParameters]):
-    """Forwards the newest command; each field of it is for one interface, in the order of `claimed`."""
+    """Controller that forwards the newest command. Its fields are in the order of `claimed`."""
 
     Parameters = GroupParameters
     claimed: ClassVar[tuple[Literal["position", "velocity", "effort", "pwm"], ...]]
@@ -74,47 +74,47 @@ class _GroupController(Controller[GroupParameters]):
         return Interfaces(parameters.joints, cls.claimed)
 
     def on_activate(self, time_ns: int) -> None:
-        """Hold positions where the joints are; velocities, efforts and PWM begin with 0."""
+        """Hold the joints where they are. Velocities, efforts and PWM start at 0."""
         if "position" in self.claimed:
             hold(self.context)
         else:
             getattr(self.context.commands, self.claimed[0]).fill(0.0)
 
     def on_restart(self, time_ns: int) -> None:
-        """Keep the efforts or PWM of the other joints, which may carry a load; else as an activation."""
+        """Activate again, but keep the efforts or PWM that were sent, because joints may carry a load."""
         self.on_activate(time_ns)
         if self.claimed[0] in ("effort", "pwm"):
             sent = getattr(self.context.goals, self.claimed[0])
             np.copyto(getattr(self.context.commands, self.claimed[0]), sent, where=np.isfinite(sent))
 
     def on_command(self, kind: str, data: NDArray[np.float64], time_ns: int) -> None:
-        """Take new values."""
+        """Set new values."""
         for name, values in zip(self.claimed, data.reshape(len(self.claimed), -1), strict=True):
             wanted = take_shorter_way_from_goals(values, self.context) if name == "position" else values
             np.copyto(getattr(self.context.commands, name), wanted)
 
     def update(self, time_ns: int, period_ns: int) -> None:
-        """Keep the last command: the manager takes the arrays as they are."""
+        """Do nothing: the manager sends the command arrays as they are."""
 
 
 class JointGroupPositionController(_GroupController):
-    """Forwards positions; the servos go there as fast as they can."""
+    """Controller that forwards positions. The servos move there as fast as they can."""
 
     claimed = ("position",)
     Commands: ClassVar = {"positions": PositionsCommand}
 
 
 class JointGroupPosVelController(_GroupController):
-    """Forwards positions, and the speeds at which the servos go there."""
+    """Controller that forwards positions and the speeds at which the servos move there"""
 
     claimed = ("position", "velocity")
     Commands: ClassVar = {"posvel": PosVelCommand}
 
 
 class JointGroupPosEffortController(_GroupController):
-    """Forwards positions, and the highest effort of the servos there: a gripper holds gently.
+    """Controller that forwards positions and effort limits, for example for a gripper that holds gently.
 
-    Until the first command a servo may take as much as its own limit lets it.
+    Until the first command, the effort is only limited by the servo's own limit.
     """
 
     claimed = ("position", "effort")
@@ -122,21 +122,22 @@ class JointGroupPosEffortController(_GroupController):
 
 
 class JointGroupVelocityController(_GroupController):
-    """Forwards velocities: wheels, and joints that turn at a speed."""
+    """Controller that forwards velocities, for wheels and other joints that turn at a speed"""
 
     claimed = ("velocity",)
     Commands: ClassVar = {"velocities": VelocitiesCommand}
 
 
 class JointGroupEffortController(_GroupController):
-    """Forwards efforts: torques or currents. Without a command joints have none, so they give way."""
+    """Controller that forwards efforts: torques or currents. Without a command the effort is 0, so joints are
+    compliant."""
 
     claimed = ("effort",)
     Commands: ClassVar = {"efforts": EffortsCommand}
 
 
 class JointGroupPwmController(_GroupController):
-    """Forwards PWM: a voltage, without any control behind it."""
+    """Controller that forwards PWM duties: a voltage without closed-loop control"""
 
     claimed = ("pwm",)
     Commands: ClassVar = {"pwm": PwmCommand}

@@ -1,4 +1,4 @@
-"""joint_state_broadcaster: writes the states of all joints into the log, at its own rate."""
+"""joint_state_broadcaster: write the states of all joints into the log, at its own rate."""
 
 from __future__ import annotations
 
@@ -6,15 +6,15 @@ from dxlrun import Controller, Interfaces, ParametersModel
 
 
 class JointStateBroadcaster(Controller[ParametersModel]):
-    """Marks the cycles whose states go to /joint_states; claims nothing, commands nothing."""
+    """Controller that publishes the joint states to /joint_states at its own rate. It commands nothing."""
 
     publishes = ("/joint_states",)
 
     @classmethod
     def interfaces(cls, parameters: ParametersModel, joints: tuple[str, ...]) -> Interfaces:
-        """Return all joints of the robot, none of them claimed."""
+        """Read all joints of the robot and claim none."""
         return Interfaces(joints)
 
     def update(self, time_ns: int, period_ns: int) -> None:
-        """Mark this cycle."""
+        """Publish the states of this cycle."""
         self.context.publish()

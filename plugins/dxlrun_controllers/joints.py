@@ -1,4 +1,4 @@
-"""Joints: the names of a controller's joints, parameters with one value for all of them or one for each."""
+"""Joints: names of a controller's joints, and parameters with one value for all joints or one per joint."""
 
 from __future__ import annotations
 
@@ -23,7 +23,7 @@ CommandInterface = Literal["position", "posvel", "poseffort", "velocity", "effor
 def commanded_by(
     interface: CommandInterface,
 ) -> tuple[Literal["position", "velocity", "effort", "pwm"], ...]:
-    """Return what is commanded of each joint."""
+    """Return the interfaces that a value of `command_interface` commands on each joint."""
     match interface:
         case "posvel":
             return "position", "velocity"
@@ -34,7 +34,7 @@ def commanded_by(
 
 
 def or_number(adapter: TypeAdapter[float]) -> BeforeValidator:
-    """Let a field of a command accept text with a unit beside a bare number, which is in SI units."""
+    """Return a validator that accepts a bare number in SI units or a text with a unit."""
     return BeforeValidator(lambda value: adapter.validate_python(value) if isinstance(value, str) else value)
 
 
@@ -49,13 +49,13 @@ PerJoint = Annotated[
 
 
 class JointsParameters(ParametersModel):
-    """Base of parameters with `joints`; mappings by joint name only these joints."""
+    """Base class of parameters with `joints`. Mappings by joint may only name these joints."""
 
     joints: JointNames
-    """The joints, in the order in which commands name them."""
+    """Joints of the controller. Commands list their values in this order."""
 
     def mistakes(self) -> Iterator[Mistake]:
-        """Yield the keys of mappings, and the joints that wrap, that are not among the joints."""
+        """Yield each mapping key and each entry of `wrap` that does not name a joint of the controller."""
         yield from super().mistakes()
         for path, names in _names_of_joints(self, ()):
             for step, joint in names:
@@ -64,14 +64,14 @@ class JointsParameters(ParametersModel):
 
 
 def not_one_of(joints: Sequence[str]) -> str:
-    """Return the end of a sentence about a joint that a controller does not have, and the remedy."""
+    """Return the second half of an error message: the controller lacks the joint; it has these."""
     return f"not one of its joints; they are {', '.join(joints)}"
 
 
 def _names_of_joints(
     model: BaseModel, path: tuple[str, ...]
 ) -> Iterator[tuple[tuple[str, ...], Iterable[tuple[str | int, str]]]]:
-    """Yield the paths of the keys that name joints, and the names with their steps below these."""
+    """Yield the path of each key that names joints, with the names and their position below that key."""
     for name, value in model:
         if isinstance(value, BaseModel):
             yield from _names_of_joints(value, (*path, name))
@@ -84,36 +84,36 @@ def _names_of_joints(
 def row_of(
     value: float | Mapping[str, float] | None, joints: tuple[str, ...], default: float = np.inf
 ) -> Floats:
-    """Return a PerJoint parameter as an array, shape (joints,); `default` where it is left out."""
+    """Return a PerJoint parameter as an array, shape (joints,). Joints without a value get `default`."""
     if isinstance(value, Mapping):
         return np.array([value.get(joint, default) for joint in joints])
     return np.full(len(joints), default if value is None else value)
 
 
 def value_for(value: T | Mapping[str, T] | None, joint: str) -> T | None:
-    """Return a PerJoint parameter's value for a joint; None where it is left out."""
+    """Return the value of a PerJoint parameter for a joint, or None if it has none."""
     return value.get(joint) if isinstance(value, Mapping) else value
 
 
 def finite_or(values: Floats, default: Floats | float) -> Floats:
-    """Return a copy with `default` in place of NaN: a limit that there is not, a value that is not known."""
+    """Return a copy in which `default` replaces NaN, which marks a missing limit or an unknown value."""
     return np.where(np.isnan(values), default, values)
 
 
 def clamped(values: Floats, lower: Floats | float, upper: Floats | float) -> Floats:
-    """Return values within bounds: in a third of the time of np.clip, which is written in Python."""
+    """Return the values clamped to bounds, in a third of the time that np.clip takes."""
     bounded: Floats = np.minimum(np.maximum(values, lower), upper)
     return bounded
 
 
 def check_size(what: str, found: int, joints: tuple[str, ...]) -> None:
-    """Raise ValueError when a command does not have one value a joint."""
+    """Raise ValueError if a command does not have exactly one value per joint."""
     if found != len(joints):
         raise ValueError(f"{found} {what} for {len(joints)} joints ({', '.join(joints)})")
 
 
 def ends_unheard(goal: Goal, position: Floats, joints: tuple[str, ...]) -> bool:
-    """Abort a goal that cannot begin, as the position of a joint is not known yet (NaN)."""
+    """Abort a goal if the position of a joint is still unknown (NaN). Return True if it was aborted."""
     unknown = np.isnan(position)
     if unknown.any():
         joint = joints[int(unknown.argmax())]
@@ -122,21 +122,24 @@ def ends_unheard(goal: Goal, position: Floats, joints: tuple[str, ...]) -> bool:
 
 
 def take_shorter_way(positions: Floats, near: Floats, wrap: NDArray[np.bool_]) -> Floats:
-    """Return positions with those of the joints of `wrap` at most half a turn from `near`, rad.
+    """Shift positions of wrapping joints by whole turns, to within half a turn of `near`.
 
-    They stay as they are where `near` is not known (NaN).
+    Args:
+        positions: rad, shape (joints,).
+        near: rad, shape (joints,). A joint with NaN keeps its position.
+        wrap: True for each joint that may be shifted.
     """
     return np.where(wrap & np.isfinite(near), nearest_turn(positions, near), positions)
 
 
 def take_shorter_way_from_goals(positions: Floats, context: Context) -> Floats:
-    """Return positions by the shorter way from what was last sent, or from where the joints were read."""
+    """Shift positions of wrapping joints to the turn nearest to the last goal, or to the last reading."""
     near = finite_or(context.goals.position, context.states.position)
     return take_shorter_way(positions, near, np.array(context.wrap))
 
 
 def hold(context: Context) -> None:
-    """Command what was last sent, or the position that was read where nothing was sent: nothing moves."""
+    """Command the last goals, so that no joint moves. Joints without a goal get their measured position."""
     commands, goals = context.commands, context.goals
     np.copyto(commands.position, goals.position)
     np.copyto(commands.position, context.states.position, where=np.isnan(goals.position))
@@ -145,9 +148,10 @@ def hold(context: Context) -> None:
 
 
 def refer(reference: Floats, context: Context) -> None:
-    """Take the positions that are commanded; where none is, the last one stays, or where the joint was heard.
+    """Update `reference` with the positions that other controllers command.
 
-    `reference` is NaN where there was none yet.
+    A joint without a command keeps its last reference. A joint that has never had one (NaN) starts at its
+    measured position.
     """
     states, commanded = context.states, context.references.position
     np.copyto(reference, states.position, where=np.isnan(reference) & states.valid)
@@ -155,7 +159,6 @@ def refer(reference: Floats, context: Context) -> None:
 
 
 def take_where_heard(position: Floats, states: States) -> bool:
-    """Write the measured positions over NaN, of joints that had not answered; return whether some still have
-    not."""
+    """Replace NaN by measured positions. Return True while a joint has not answered yet."""
     np.copyto(position, states.position, where=np.isnan(position))
     return bool(np.isnan(position).any())

@@ -1,4 +1,4 @@
-"""leader_follower: joints follow other joints' states, or positions of another program, with a soft start."""
+"""leader_follower: make joints follow other joints, or positions from another program, with a soft start."""
 
 from __future__ import annotations
 
@@ -34,32 +34,33 @@ from dxlrun_controllers.laws.tracking import CLOSING_SPEED
 
 
 class Pair(ParametersModel):
-    """A joint and the joint that it follows: to scale * (leader's position) + offset."""
+    """Follower and leader. The follower moves to scale * (leader's position) + offset."""
 
     joint: str
-    """The follower."""
+    """Joint that follows."""
     leader: str = ""
-    """The joint whose position is followed; all pairs have one, or none: then `positions` are followed."""
+    """Joint that leads. Either all pairs have a leader, or none has: then the joints follow the command
+    `positions`."""
     scale: float = 1.0
-    """Negative: the follower turns the other way."""
+    """Factor on the leader's position. A negative scale reverses the direction."""
     offset: Angle = 0.0
-    """rad, added to the scaled position"""
+    """Offset added to the scaled position, rad."""
 
 
 class LeaderFollowerParameters(ParametersModel):
     """Keys of a leader_follower in the robot file."""
 
     pairs: Annotated[tuple[Pair, ...], Field(min_length=1)]
-    """In the order of the commands `positions`."""
+    """Pairs, in the order of the values of the command `positions`."""
     command_interface: Literal["position", "posvel"] = "position"
-    """`posvel` commands the speed of the leader beside the position."""
+    """`position` commands the position; `posvel` also commands the speed of the leader."""
     speed: Annotated[AngularVelocity, Field(gt=0), LIVE] = 1.0
-    """rad/s, of a follower on its way to where its leader is, until it is in step"""
+    """Speed limit of a follower until it has caught up with its leader, rad/s."""
     timeout: Annotated[Duration, Field(gt=0)] = 100_000_000
-    """ns; a leader's state, or a command, that is older is not followed: the joints hold"""
+    """Largest age of a leader's state, or of a command. The joints hold if it is older."""
 
     def mistakes(self) -> Iterator[Mistake]:
-        """Yield pairs without a leader beside others with one, and what is of leaders only."""
+        """Yield pairs with and without a leader in one controller, and keys that need a leader."""
         yield from super().mistakes()
         led = {pair.leader for pair in self.pairs if pair.leader}
         if not led and self.command_interface == "posvel":
@@ -80,11 +81,12 @@ class LeaderFollowerParameters(ParametersModel):
 
 
 class LeaderFollower(Controller[LeaderFollowerParameters]):
-    """Moves each joint to where its leader is: at first at a limited speed, then, in step, at once.
+    """Controller that makes joints follow leaders.
 
-    In step, a follower's command of a cycle is made of its leader's state of that cycle. All joints hold,
-    where they were last sent, as long as one leader's state, or the last command, is too old; then they start
-    softly again. Leaders may be joints without torque, moved by hand, or joints of any other controller.
+    A follower first approaches its leader at a limited speed. Once it has caught up, its command in a cycle
+    is computed from the leader's state of the same cycle. All joints hold their last goals while the state of
+    one leader, or the last command, is too old; then they start softly again. A leader can be a joint without
+    torque that is moved by hand, or a joint of another controller.
     """
 
     Parameters = LeaderFollowerParameters
@@ -92,7 +94,7 @@ class LeaderFollower(Controller[LeaderFollowerParameters]):
 
     @classmethod
     def interfaces(cls, parameters: LeaderFollowerParameters, joints: tuple[str, ...]) -> Interfaces:
-        """Claim the followers, and read position, velocity and age of their leaders."""
+        """Claim the followers, and read the position, velocity and age of the leaders."""
         followers = tuple(pair.joint for pair in parameters.pairs)
         leaders = [pair.leader for pair in parameters.pairs if pair.leader]
         reads = [f"{leader}/{state}" for state in ("position", "velocity", "age") for leader in leaders]
@@ -102,20 +104,24 @@ class LeaderFollower(Controller[LeaderFollowerParameters]):
     def prepare(
         cls, kind: str, command: CommandModel, parameters: LeaderFollowerParameters
     ) -> NDArray[np.float64]:
-        """Return the positions, rad, shape (pairs,). Raises ValueError for a wrong number of them."""
+        """Return the positions, rad, shape (pairs,).
+
+        Raises:
+            ValueError: The joints follow leaders, or the number of positions is wrong.
+        """
         if parameters.pairs[0].leader:
             raise ValueError("its joints follow leaders, so it takes no positions")
         return super().prepare(kind, command, parameters)
 
     def on_configure(self, context: Context) -> None:
-        """Make room for everything that the loop needs."""
+        """Allocate all memory that the loop needs."""
         super().on_configure(context)
         pairs, count = self.parameters.pairs, len(context.joints)
         self._led = bool(pairs[0].leader)
         self._scale = np.array([pair.scale for pair in pairs])
         self._offset = np.array([pair.offset for pair in pairs])
         self._lower, self._upper = context.limits.lower, context.limits.upper
-        # no rows where positions are commanded
+        # Without leaders, `reads` is empty and so are these rows.
         self._leader_position, self._leader_velocity, self._leader_age = context.reads.reshape(3, -1)
         self._wanted = np.zeros(count)
         self._wrap = np.array(context.wrap)
@@ -123,7 +129,7 @@ class LeaderFollower(Controller[LeaderFollowerParameters]):
         self._posvel = self.parameters.command_interface == "posvel"
 
     def on_activate(self, time_ns: int) -> None:
-        """Hold where the joints are."""
+        """Hold the joints."""
         hold(self.context)
         self._in_step.fill(False)
         self._unknown = True
@@ -131,12 +137,12 @@ class LeaderFollower(Controller[LeaderFollowerParameters]):
         self._following = self._reported = False
 
     def on_command(self, kind: str, data: NDArray[np.float64], time_ns: int) -> None:
-        """Take new positions to follow."""
+        """Set new positions to follow."""
         np.copyto(self._wanted, data)
         self._commanded_ns = time_ns
 
     def update(self, time_ns: int, period_ns: int) -> None:
-        """Command where the leaders are: of a joint that is not in step, a step on the way there."""
+        """Command the leaders' positions, with a limited step for each joint that has not caught up."""
         if self.context.states.has_lost:
             hold(self.context)
             self._in_step.fill(False)
@@ -160,13 +166,13 @@ class LeaderFollower(Controller[LeaderFollowerParameters]):
             self._command_speed(step)
 
     def _age_s(self, time_ns: int) -> float:
-        """Return the age of what is followed, s; NaN when there is none yet."""
+        """Return the age of the oldest leader's state, or of the last command, s; NaN before the first."""
         if self._led:
-            return float(np.maximum.reduce(self._leader_age))  # of NaN: NaN
+            return float(np.maximum.reduce(self._leader_age))  # NaN if one leader has not answered yet
         return (time_ns - self._commanded_ns) * 1e-9 if self._commanded_ns >= 0 else np.nan
 
     def _rest(self, age_s: float) -> None:
-        """Hold, and report why, once; before the first command there is nothing to report."""
+        """Hold, and report the reason once. Nothing is reported before the first command."""
         if self._following:
             self._in_step.fill(False)
             if self._posvel:
@@ -184,7 +190,7 @@ class LeaderFollower(Controller[LeaderFollowerParameters]):
         self.context.say(f"no reply of leader {leader} {since}, holding")
 
     def _command_speed(self, step: Floats) -> None:
-        """Command the leaders' speed to what is in step, the approach's to the others."""
+        """Command the leader's speed to joints that have caught up, and the approach speed to all others."""
         leading, approach = self._leader_velocity * self._scale, self.parameters.speed
         if self.context.into:  # a reference, with its sign
             velocity = np.where(self._in_step, leading, np.copysign(approach, step))

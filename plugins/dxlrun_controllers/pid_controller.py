@@ -1,4 +1,4 @@
-"""pid_controller: leads joints to positions or velocities by a PID law, alone or below another controller."""
+"""pid_controller: PID control of joint positions or velocities, alone or below another controller."""
 
 from __future__ import annotations
 
@@ -37,25 +37,26 @@ class PidParameters(JointsParameters):
     """Keys of a pid_controller in the robot file."""
 
     reference: Literal["position", "velocity"] = "position"
-    """What the joints are led to."""
+    """Controlled quantity."""
     command_interface: Literal["effort", "velocity", "pwm", "position"] = "effort"
-    """What is commanded. `position` adds the law to the reference: it removes what a servo's own control
-    leaves."""
+    """Commanded interface. `position` adds the output of the law to the reference, which removes the error
+    that the servo's own control leaves."""
     gains: Gains
     output_limit: PerJoint[Positive] | None = None
-    """Largest magnitude of the command, beside the joint's own limits; with `position` of the correction."""
+    """Largest magnitude of the command, in addition to the joint's own limits. With the interface `position`
+    it limits the correction."""
     integral_limit: PerJoint[NotNegative] | None = None
     """Largest magnitude of the integral term, in units of the command."""
     derivative_filter: Duration = 0
-    """Time constant of the filter on the error's rate."""
+    """Time constant of the low-pass filter on the rate of the error."""
     wrap: tuple[str, ...] = ()
-    """Joints whose position error is taken the shorter way round, -pi..pi: continuous joints that shall face
-    a direction. Without it one turn more is one turn more."""
+    """Continuous joints that take the shorter way: their position error is wrapped to -pi..pi. Positions of
+    all other joints count whole turns."""
 
     _own_velocity = model_validator(mode="before")(feed_velocities_forward)
 
     def mistakes(self) -> Iterator[Mistake]:
-        """Yield references that the command interface or `wrap` does not fit."""
+        """Yield a command interface or a `wrap` that does not fit the reference."""
         yield from super().mistakes()
         if self.reference == "velocity" and self.command_interface == "position":
             what = "a velocity reference cannot be commanded as positions"
@@ -68,48 +69,48 @@ _KIND: Final = {"position": "positions", "velocity": "velocities"}
 
 
 STATE_NS: Final = 20_000_000
-"""Between two messages of the state, ns."""
+"""Time between two messages of the state, ns"""
 
 
 @dataclass(slots=True)
 class PidState:
-    """What the law sees and does; rows in the order of the controller's joints."""
+    """Inputs and outputs of the law, one row per joint in the order of the controller's joints"""
 
     header: Header
     reference: Floats
-    """rad or rad/s, as the measurement and the error"""
+    """rad or rad/s, like `measurement` and `error`"""
     measurement: Floats
     error: Floats
     error_rate: Floats
-    """Filtered: rad/s or rad/s^2"""
+    """Filtered rate of the error, rad/s or rad/s^2"""
     proportional: Floats
-    """In units of the command, as all that follow"""
+    """In units of the command, like all fields that follow"""
     integral: Floats
     derivative: Floats
     feed_forward: Floats
     output: Floats
-    """What is commanded"""
+    """Command"""
 
 
 class PidController(Controller[PidParameters]):
-    """Commands by a PID law on the error of a reference (`pid.Pid`), once each period, with its true length.
+    """PID controller of joint positions or velocities. It runs once per period and uses its measured length.
 
-    - References: what controllers that are `into` this one command (`position` with `velocity` as its rate,
-      or `velocity`; `effort` and `pwm` are added to a commanded one), else the newest `positions` or
-      `velocities` command, else the positions at which the joints were when it became active or the last
-      reference ended, or the velocity 0.
-    - The derivative is that of the error: reference velocity minus measured velocity. A position reference
-      without a velocity counts as one at rest, so a step in it makes no kick. Of a velocity reference only
-      the measured rate counts: the difference of the measured velocities.
-    - The output stays inside the joint's own limit of what is commanded (effort, velocity, position, full
-      voltage), so the law knows when the last gate would cut it, and its integral does not wind up.
-    - A joint without a new measurement keeps its last command, see `Pid`, with `position` its last
-      correction of the reference; one that was never measured gets
-      none of its own (0; no position).
-    - While a joint is lost, the others are held where the last reference was, or at rest.
+    - The reference of a joint is, in this order: the command of a controller that is `into` this one; the
+      newest command `positions` or `velocities`; the position at which the joint was when the controller
+      became active or the last reference ended, or the velocity 0. A controller that is `into` this one
+      commands `position` and its rate `velocity`, or only `velocity`. Its `effort` or `pwm` is added to the
+      same interface.
+    - The derivative acts on the error: reference velocity minus measured velocity. A position reference
+      without a velocity counts as at rest, so a step in it causes no derivative kick. With a velocity
+      reference only the rate of the measured velocity counts.
+    - The output is clamped to the joint's limit of the commanded interface (effort, velocity, position, full
+      voltage). The gate therefore does not cut it, and the integral does not wind up.
+    - A joint without a new measurement keeps its last command, or its last correction with the interface
+      `position` (see `Pid`). A joint that was never measured gets the output 0, or no position.
+    - While a joint is lost, all other joints are held at their last reference, or at rest.
 
-    Behaves like pid_controller of ros2_controllers (control.ros.org, pid_controller) where that has the
-    same; it is also the joint_position_controller.
+    The controller follows pid_controller of ros2_controllers (control.ros.org, pid_controller) where both
+    have the same feature. It is also available as joint_position_controller.
     """
 
     Parameters = PidParameters
@@ -121,20 +122,24 @@ class PidController(Controller[PidParameters]):
 
     @classmethod
     def interfaces(cls, parameters: PidParameters, joints: tuple[str, ...]) -> Interfaces:
-        """Command one interface; export the reference, its rate, and an effort or PWM to add."""
+        """Command one interface. Export the reference, its rate, and an effort or PWM to add."""
         position = ("position", "velocity") if parameters.reference == "position" else ("velocity",)
         added = (parameters.command_interface,) if parameters.command_interface in {"effort", "pwm"} else ()
         return Interfaces(parameters.joints, (parameters.command_interface,), reference=(*position, *added))
 
     @classmethod
     def prepare(cls, kind: str, command: CommandModel, parameters: PidParameters) -> NDArray[np.float64]:
-        """Return the set-points, shape (joints,). Raises ValueError for the other kind or a wrong size."""
+        """Return the setpoints, shape (joints,).
+
+        Raises:
+            ValueError: The command does not fit the reference, or the number of values is wrong.
+        """
         if kind != (own := _KIND[parameters.reference]):
             raise ValueError(f"its reference is the {parameters.reference}, so it takes {own}, not {kind}")
         return super().prepare(kind, command, parameters)
 
     def on_configure(self, context: Context) -> None:
-        """Make room for everything that the loop needs."""
+        """Allocate all memory that the loop needs."""
         super().on_configure(context)
         count, limits, parameters = len(context.joints), context.limits, self.parameters
         self._pid = Pid(count)
@@ -175,13 +180,13 @@ class PidController(Controller[PidParameters]):
         self.on_parameters(0)
 
     def on_parameters(self, time_ns: int) -> None:
-        """Take the gains."""
+        """Set the gains."""
         gains, joints = self.parameters.gains, self.context.joints
         self._pid.take(gains, joints)
         self._feed_forward = row_of(gains.feed_forward, joints, 0.0)
 
     def on_activate(self, time_ns: int) -> None:
-        """Hold the joints where they are; what was commanded before stays the output, but for the mode."""
+        """Hold the joints where they are. The output continues from the last command of the interface."""
         goals, pid = self.context.goals, self._pid
         self._setpoint.fill(np.nan if self._by_position else 0.0)
         self._reference.fill(np.nan)
@@ -189,7 +194,7 @@ class PidController(Controller[PidParameters]):
         self._slope.reset()
         self._refer()
         if self.parameters.command_interface == "position":
-            # the servo's goal is above where its load lets it be: that much is the correction
+            # Under load, the last goal differs from the position. This offset becomes the first correction.
             before = goals.position - self._reference
             self._output.fill(np.nan)
         else:
@@ -202,11 +207,11 @@ class PidController(Controller[PidParameters]):
         self.on_activate(time_ns)
 
     def on_command(self, kind: str, data: NDArray[np.float64], time_ns: int) -> None:
-        """Take new set-points."""
+        """Set new setpoints."""
         np.copyto(self._setpoint, data)
 
     def update(self, time_ns: int, period_ns: int) -> None:
-        """Command by the law."""
+        """Compute the output of the law and command it."""
         period_s = period_ns * 1e-9
         self._refer()
         if not self._by_position:
@@ -222,18 +227,19 @@ class PidController(Controller[PidParameters]):
             self.context.publish("state", self._state)
 
     def _correct(self, period_s: float) -> None:
-        """Command the reference and its correction, which ends where the position limits do."""
+        """Command the sum of reference and correction, clamped to the position limits."""
         pid, reference = self._pid, self._reference
         pid.upper = np.minimum(self._upper - reference, self._most)
         pid.lower = np.maximum(self._lower - reference, -self._most)
         correction = pid.output
-        if not self.context.states.has_lost:  # its goals are held then: an integral would only wind up
+        # The goals are held while a joint is lost, so the integral would wind up.
+        if not self.context.states.has_lost:
             correction = pid.update(self._error, self._rate, self._bias, self._measured, period_s)
-        # a joint without a measurement keeps its correction, not the reference of then
+        # A joint without a measurement keeps its correction, but follows the present reference.
         np.add(reference, correction, out=self._output, where=np.isfinite(reference))
 
     def _refer(self) -> None:
-        """Set the reference, its error, the error's rate, and the feed-forward."""
+        """Compute the reference, the error and its rate, and the feed-forward."""
         setpoint, error = self._setpoint, self._error
         states, references = self.context.states, self.context.references
         free = np.isnan(self._commanded)
@@ -242,7 +248,7 @@ class PidController(Controller[PidParameters]):
         if self._by_position:
             np.copyto(setpoint, self._measurement, where=np.isnan(setpoint) & states.valid)
         wanted = np.where(free, setpoint, self._commanded)
-        if states.has_lost:  # the joints are held where the last reference was
+        if states.has_lost:  # hold the joints at their last reference
             held = self._reference if self._by_position else np.zeros_like(wanted)
             np.copyto(wanted, held, where=free & np.isfinite(held))
         np.copyto(self._reference, take_shorter_way(wanted, self._measurement, self._wrap))

@@ -1,4 +1,4 @@
-"""The standard controllers and sensors as a plug-in: the same hooks as any other package."""
+"""Plug-in of the standard controllers and sensors. It uses the same hooks as any other package."""
 
 from __future__ import annotations
 
@@ -12,13 +12,13 @@ _SENSING = "dxlrun_controllers.sensing"
 
 @hookimpl
 def dxlrun_contract() -> int:
-    """Return the contract that these controllers were written for: the one they are published with."""
+    """Return the plug-in contract version. These controllers are released together with it."""
     return CONTRACT_VERSION
 
 
 @hookimpl
 def dxlrun_controllers() -> Mapping[str, str]:
-    """Return where each standard controller is, by its type in the robot file."""
+    """Return the import path of each standard controller, by its type in the robot file."""
     return {
         "battery_state_broadcaster": f"{_SENSING}.battery_state_broadcaster:BatteryStateBroadcaster",
         "device_command_controller": f"{_SENSING}.device_command_controller:DeviceCommandController",
@@ -49,7 +49,7 @@ def dxlrun_controllers() -> Mapping[str, str]:
 
 @hookimpl
 def dxlrun_sensors() -> Mapping[str, str]:
-    """Return the standard sensors by their type in the robot file."""
+    """Return the import path of each standard sensor, by its type in the robot file."""
     return {
         "serial_imu": "dxlrun_controllers.sensors.serial_imu:SerialImu",
         "simulated_imu": "dxlrun_controllers.sensors.simulated_imu:SimulatedImu",

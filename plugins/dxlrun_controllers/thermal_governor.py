@@ -1,4 +1,4 @@
-"""thermal_governor: takes torque from servos before they become so hot that they trip."""
+"""thermal_governor: reduce the torque of hot servos before they shut down."""
 
 from __future__ import annotations
 
@@ -35,11 +35,11 @@ from dxlrun_controllers.joints import (
 )
 
 STATE_NS: Final = 100_000_000
-"""Between two messages of the state, ns."""
+"""Time between two messages of the state, ns"""
 WARN_BELOW, LIMIT_BELOW = 15.0, 5.0
-"""K below the servo's own temperature limit, where the file names no thresholds [i]"""
+"""Default thresholds, K below the servo's own temperature limit [i]"""
 SMOOTHING_S: Final = 2.0
-"""Time constant of the measured temperature, which comes about once a second in whole degrees [i]"""
+"""Time constant of the filter on the temperature, s. Servos report whole degrees about once a second [i]."""
 _FULL_DUTY: Final = 1.0
 
 
@@ -47,38 +47,40 @@ class ThermalParameters(JointsParameters):
     """Keys of a thermal_governor in the robot file."""
 
     command_interface: Literal["position", "poseffort", "effort", "pwm"] = "position"
-    """`position`: the goal is held back to where the servo's own control gives no more torque than it may;
-    `poseffort`: the reference, and the effort that it may exert; `effort`, `pwm`: the reference, limited."""
+    """`position` keeps the goal so close to the position that the servo's own control exceeds no torque
+    limit; `poseffort` commands the reference and the effort limit; `effort` and `pwm` command the clamped
+    reference."""
     warn: PerJoint[float] | None = None
-    """degrees C from which it gets less torque; 15 below the servo's own limit."""
+    """Temperature above which the torque is reduced, degrees C; by default 15 below the servo's own limit."""
     limit: PerJoint[float] | None = None
-    """degrees C from which it gets none; 5 below the servo's own limit."""
+    """Temperature from which the torque is 0, degrees C; by default 5 below the servo's own limit."""
     hysteresis: Annotated[float, Field(ge=0)] = 2.0
-    """K below a threshold at which it counts as cooled down."""
+    """Difference below a threshold at which a servo counts as cooled down, K."""
     most: PerJoint[Positive] | None = None
-    """Effort of a cool servo, in its unit; the joint's limit, else its stall."""
+    """Highest effort of a cool servo, in its unit; by default the joint's limit, else the stall effort."""
     reach: PerJoint[Annotated[Angle, Field(gt=0)]] | None = None
-    """Of `position`: at this error its control gives all its torque; by its motor file."""
+    """With `position`: error at which the servo's own control gives full torque; by default from the motor
+    file."""
 
 
 @dataclass(slots=True)
 class ThermalState:
-    """How warm the servos are; rows in the order of the controller's joints."""
+    """Thermal state of the servos, one row per joint in the order of the controller's joints"""
 
     header: Header
     temperature: Floats
-    """degrees C, as measured; NaN: not read yet"""
+    """Measured temperature, degrees C; NaN until first read"""
     scale: Floats
-    """Part of its torque that a servo may give"""
+    """Fraction of its torque that a servo may exert, 0..1"""
 
 
 class ThermalGovernor(Controller[ThermalParameters]):
-    """Passes references on, and takes torque from servos that become hot.
+    """Controller that passes references on and reduces the torque of hot servos.
 
-    Less than all between `warn` and `limit`, in proportion, none from `limit` on: a joint whose load is more
-    than its servo can carry for long sinks until it is not, instead of falling when the servo trips. It
-    stands at the lower end of a chain, as only what goes to the servos decides about their currents. Its
-    states are JOINT.scale, the part of the torque that is left.
+    The torque falls linearly from all at `warn` to none at `limit`. An overloaded joint therefore sinks
+    slowly instead of falling when its servo shuts down. The controller belongs at the lower end of a chain,
+    because only the commands that reach the servos determine their currents. It provides the states
+    JOINT.scale, the remaining fraction of the torque.
     """
 
     Parameters = ThermalParameters
@@ -86,7 +88,7 @@ class ThermalGovernor(Controller[ThermalParameters]):
 
     @classmethod
     def interfaces(cls, parameters: ThermalParameters, joints: tuple[str, ...]) -> Interfaces:
-        """Command and export the same; provide the scale of each joint."""
+        """Command and export the same interfaces, and provide the scale of each joint."""
         interfaces = commanded_by(parameters.command_interface)
         return Interfaces(
             parameters.joints,
@@ -97,7 +99,7 @@ class ThermalGovernor(Controller[ThermalParameters]):
 
     @classmethod
     def mismatches(cls, parameters: ThermalParameters, robot: RobotModel) -> Iterator[Mismatch]:
-        """Yield figures of servos that are not known, and thresholds at which a servo would have tripped."""
+        """Yield unknown figures of servos, and thresholds above a servo's own limit."""
         for joint, servo, motor in zip(robot.joints, robot.servos, robot.motors, strict=True):
             if servo is None:
                 yield Mismatch(
@@ -110,7 +112,7 @@ class ThermalGovernor(Controller[ThermalParameters]):
             yield from _of_figures(parameters, joint, servo, motor)
 
     def on_configure(self, context: Context) -> None:
-        """Make room for everything that the loop needs."""
+        """Allocate all memory that the loop needs."""
         super().on_configure(context)
         parameters, joints, limits = self.parameters, context.joints, context.limits
         count, interface = len(joints), parameters.command_interface
@@ -134,7 +136,7 @@ class ThermalGovernor(Controller[ThermalParameters]):
         self._state = ThermalState(Header(), context.states.temperature, self._scale)
 
     def on_activate(self, time_ns: int) -> None:
-        """Begin with the temperatures that were measured; hold the joints where they are."""
+        """Start from the measured temperatures, and hold the joints where they are."""
         self._reference.fill(np.nan)
         np.copyto(self._temperature, self.context.states.temperature)
         self._is_hot.fill(False)
@@ -142,7 +144,7 @@ class ThermalGovernor(Controller[ThermalParameters]):
         self._state_ns = time_ns
 
     def update(self, time_ns: int, period_ns: int) -> None:
-        """Command what servos may give at their temperatures."""
+        """Command the references, limited by the temperatures of the servos."""
         context = self.context
         self._smooth(context.states.temperature, period_ns * 1e-9)
         np.copyto(self._scale, torque_scale(self._temperature, self._warn, self._limit))
@@ -156,7 +158,7 @@ class ThermalGovernor(Controller[ThermalParameters]):
         match self.parameters.command_interface:
             case "position":
                 self._hold_back()
-            case "poseffort":  # NaN: not commanded
+            case "poseffort":  # fmin ignores NaN, which marks an effort that is not commanded
                 np.maximum(np.fmin(references.effort, most), 0.0, out=commands.effort)
             case "effort" | "pwm" as torque:
                 reference = finite_or(getattr(references, torque), 0.0)
@@ -166,15 +168,15 @@ class ThermalGovernor(Controller[ThermalParameters]):
             context.publish("state", self._state)
 
     def _smooth(self, measured: Floats, period_s: float) -> None:
-        """Follow the measured temperatures; a servo that is not heard keeps its last one."""
-        before = finite_or(self._temperature, measured)  # of a servo that was not heard before
+        """Low-pass filter the measured temperatures. A servo without a reading keeps its last value."""
+        before = finite_or(self._temperature, measured)  # start from the first reading
         step = (measured - before) * (period_s / (SMOOTHING_S + period_s))
         self._temperature = before + np.where(np.isfinite(step), step, 0.0)
 
     def _hold_back(self) -> None:
-        """Keep the goals of hot servos so near to where they are that their control gives no more torque.
+        """Clamp the goals of hot servos to a distance from their positions that keeps the torque limit.
 
-        A servo that was not read in this cycle is where it was read last: a lost packet lets no goal jump.
+        A servo that was not read in this cycle keeps its last position, so a lost packet causes no jump.
         """
         position, goal = self.context.states.position, self.context.commands.position
         reach = self._scale * self._reach
@@ -195,28 +197,29 @@ class ThermalGovernor(Controller[ThermalParameters]):
 
 
 def torque_scale(temperature: Floats, warn: Floats, limit: Floats) -> Floats:
-    """Return which part of its torque each servo may give: all below `warn` and while its temperature is not
-    known (NaN), none from `limit` on.
+    """Return the fraction of its torque that each servo may exert.
+
+    It is 1 below `warn` and while the temperature is unknown (NaN), and 0 from `limit` on.
     """
     scale: Floats = np.maximum(np.fmin((limit - temperature) / (limit - warn), 1.0), 0.0)
     return scale
 
 
 def _thresholds(parameters: ThermalParameters, joint: str, servo: ServoModel) -> tuple[float, float]:
-    """Return where it gets less torque and where none, degrees C; NaN where that is not known."""
+    """Return the thresholds of reduced and of no torque, degrees C; NaN if unknown."""
     own = np.nan if servo.temperature_limit is None else servo.temperature_limit
     warn, limit = value_for(parameters.warn, joint), value_for(parameters.limit, joint)
     return own - WARN_BELOW if warn is None else warn, own - LIMIT_BELOW if limit is None else limit
 
 
 def _reach(parameters: ThermalParameters, joint: str, motor: MotorModel | None) -> float | None:
-    """Return the error at which a servo's own control gives all its torque, rad."""
+    """Return the position error at which a servo's own control gives full torque, rad."""
     stiffness = None if motor is None else motor.stiffness
     return value_for(parameters.reach, joint) or (1.0 / stiffness if stiffness else None)
 
 
 def _stall(servo: ServoModel) -> float:
-    """Return the effort at its stall, in its unit; NaN: not known."""
+    """Return the stall effort of a servo in its unit; NaN if unknown."""
     stall = {"A": servo.stall_current, "Nm": servo.stall_torque, "1": 1.0}[servo.effort_unit]
     return np.nan if stall is None else stall
 

@@ -1,6 +1,6 @@
-"""Feed-forward: what a servo must be given for a motion, by the model of its motor and its load.
+"""Feed-forward: command that a servo needs for a motion, from the model of its motor and its load.
 
-The inverse of the model that `dxlrun.MotorModel` explains, for some joints at once; at the horn, in SI:
+Inverse of the model that `dxlrun.MotorModel` documents, vectorised over joints. At the horn, in SI units:
 
     torque = J a + g sin(q - down) + s f(|w|) + viscous w,   plus the friction of the torque itself
     duty   = (torque R / k + k w) / U,   position offset = duty / (position gain * P gain)
@@ -21,8 +21,10 @@ from dxlrun import Floats, MotorModel
 from dxlrun_controllers.joints import clamped, finite_or
 
 LEAST_SUPPLY = 0.5
-"""Part of the nominal voltage: a servo with less does not run, so such a measurement is a mistake [i]."""
+"""Lowest plausible fraction of the nominal voltage. A servo does not run below it, so a lower reading is an
+error of the measurement [i]."""
 MOST_SUPPLY = 1.5
+"""Highest plausible fraction of the nominal voltage"""
 NEEDED_FIGURES: Mapping[str, tuple[str, ...]] = {
     "position": ("resistance", "position_gain"),
     "effort": ("resistance", "torque_per_effort"),
@@ -32,11 +34,11 @@ NEEDED_FIGURES: Mapping[str, tuple[str, ...]] = {
 
 
 class MotionAhead:
-    """A desired motion some time ahead, by the differences of what was desired until now.
+    """Prediction of the desired motion, extrapolated from its finite differences.
 
-    `position` and `velocity`, shape (joints,), are those at `ahead_s` after the newest update; `acceleration`
-    is the mean of the last period. A velocity that is not known (NaN) is the difference of the positions, at
-    most `fastest`, rad/s; an acceleration above `most`, rad/s^2, counts as that.
+    `position` and `velocity`, shape (joints,), are predicted for `ahead_s` after the newest update.
+    `acceleration` is the mean over the last period, clamped to `most`, rad/s^2. An unknown velocity (NaN) is
+    replaced by the difference of the positions, clamped to `fastest`, rad/s.
     """
 
     def __init__(self, joints: int, fastest: float | Floats = np.inf, most: float | Floats = np.inf) -> None:
@@ -46,14 +48,14 @@ class MotionAhead:
         self._known, self._known_velocity = np.full((2, joints), np.nan)
 
     def reset(self) -> None:
-        """Forget the motion until now: the next position is one at rest, if it has no velocity."""
+        """Discard the past motion. The next position counts as at rest unless it has a velocity."""
         self._known.fill(np.nan)
         self._known_velocity.fill(np.nan)
 
     def update(self, position: Floats, velocity: Floats, period_s: float) -> None:
-        """Take what is desired now, rad and rad/s, a period after the update before; NaN: not known."""
+        """Add the desired position (rad) and velocity (rad/s or NaN), `period_s` after the last update."""
         slope = clamped((position - self._known) / period_s, -self._fastest, self._fastest)
-        now = finite_or(finite_or(velocity, slope), 0.0)  # 0: the first position
+        now = finite_or(finite_or(velocity, slope), 0.0)  # 0 after a reset, when no slope is known
         change = finite_or((now - self._known_velocity) / period_s, 0.0)
         np.copyto(self.acceleration, clamped(change, -self._most, self._most))
         gained = self.acceleration * self.ahead_s
@@ -64,10 +66,12 @@ class MotionAhead:
 
 
 def output_per_need(motors: Sequence[MotorModel], interface: str) -> Floats:
-    """Return what is commanded for each unit of torque (`effort`) or duty (`pwm`, `position`).
+    """Return the command per unit of torque (`effort`) or of duty (`pwm`, `position`).
 
-    For a position it is by how much it is shifted, rad, so that the servo's own control gives that duty.
-    Raises ValueError for a motor file that lacks the figure.
+    For `position` it is the offset, rad, at which the servo's own control outputs a duty of 1.
+
+    Raises:
+        ValueError: A motor file lacks the figure, or the P gain of a servo is declared as 0.
     """
     if interface == "position":
         per = [1.0 / (motor.stiffness or np.nan) for motor in motors]
@@ -81,7 +85,7 @@ def output_per_need(motors: Sequence[MotorModel], interface: str) -> Floats:
 
 
 class Supply:
-    """The voltage of motors, as it is measured, and the duty that gives them a torque."""
+    """Filtered supply voltage of motors, and the duty that produces a torque at that voltage."""
 
     def __init__(self, motors: Sequence[MotorModel]) -> None:
         self.voltage = np.array([motor.voltage for motor in motors], dtype=np.float64)
@@ -91,29 +95,34 @@ class Supply:
         self._per_torque = np.array([motor.resistance / motor.torque_constant for motor in motors])
 
     def take(self, measured: Floats, share: float) -> None:
-        """Let it come nearer to measured voltages, V, by a share of the way; NaN leaves it."""
+        """Low-pass filter the measured voltages, V, with the weight `share` (0..1). NaN is ignored."""
         step = (measured - self.voltage) * share
         np.add(self.voltage, step, out=self.voltage, where=np.isfinite(step))
         np.copyto(self.voltage, clamped(self.voltage, self._least, self._most))
 
     def duty(self, torque: Floats, velocity: Floats | float) -> Floats:
-        """Return the part of the voltage, not limited, that gives a torque, Nm, at a speed, rad/s."""
+        """Return the duty, not clamped, that produces a torque (Nm) at a velocity (rad/s)."""
         duty: Floats = (torque * self._per_torque + self._backward * velocity) / self.voltage
         return duty
 
 
 class InverseServo:
-    """What servos must be given for a motion; all arrays have the shape (joints,), `update` makes none."""
+    """Inverse model of servos. All arrays have the shape (joints,)."""
 
     def __init__(self, motors: Sequence[MotorModel], friction_speed: Floats) -> None:
-        """`friction_speed`, rad/s: at this desired speed 3/4 of the friction is compensated."""
+        """Read the figures of the motors.
+
+        Args:
+            motors: One motor per joint.
+            friction_speed: Desired speed at which 3/4 of the friction is compensated, rad/s.
+        """
 
         def row(values: list[float]) -> Floats:
             return np.array(values, dtype=np.float64)
 
         count = len(motors)
         self.torque, self.duty = np.zeros((2, count))
-        """Nm of the motor, and its part of the supply's voltage, not limited"""
+        """Torque of the motor, Nm, and its duty, not clamped"""
         self.supply = Supply(motors)
         self._inertia = row([motor.inertia + motor.load.inertia for motor in motors])
         self._gravity = row([motor.load.gravity for motor in motors])
@@ -129,7 +138,7 @@ class InverseServo:
         self._forward = 1.0 / friction_speed
 
     def update(self, position: Floats, velocity: Floats, acceleration: Floats) -> None:
-        """Work out torque and duty for a motion: rad, rad/s, rad/s^2."""
+        """Compute `torque` and `duty` for a motion (rad, rad/s, rad/s^2)."""
         hold = np.sin(position - self._down) * self._gravity
         friction = self._coulomb
         if self._has_stribeck:

@@ -1,10 +1,10 @@
 """Gravity: the torques that hold the bodies of a URDF at rest.
 
 g(q) of the equations of motion M(q) a + C(q, v) v + g(q) = torque, by MuJoCo's recursive Newton-Euler
-algorithm at rest (R. Featherstone, "Rigid Body Dynamics Algorithms", 2008, section 5.3). Of the URDF only
-joints and masses count: their origins, axes, and centres of mass. MuJoCo and not pinocchio, which gives
-the same: it is the extra `physics` already, takes half the memory in the loop's process, and a payload's mass
-can change in a run. Neither starts a thread.
+algorithm at rest (R. Featherstone, "Rigid Body Dynamics Algorithms", 2008, section 5.3). Only the origins and
+axes of the URDF's joints and the masses and centres of mass of its links matter. MuJoCo is preferred to
+pinocchio, which gives the same torques: the extra `physics` already installs it, it takes half the memory in
+the loop's process, and the mass of a payload can change in a run. Neither starts a thread.
 """
 
 from __future__ import annotations
@@ -25,30 +25,31 @@ if TYPE_CHECKING:
 GRAVITY = 9.80665
 """m/s^2, standard"""
 TYPES: Mapping[JointUnit, tuple[str, ...]] = {ROTARY: ("revolute", "continuous"), LINEAR: ("prismatic",)}
-"""Types of joints of a URDF whose positions have this unit."""
+"""URDF joint types by the unit of their positions"""
 MOVABLE = (*TYPES[ROTARY], *TYPES[LINEAR])
 _PAYLOAD = "payload of gravity_compensation"
 _LEAST_MASS = 1e-12
-"""kg of a link without mass: MuJoCo refuses a moving body without. Its weight is 1e-11 N."""
+"""Mass given to a massless link, kg. MuJoCo rejects a moving body without mass; the weight is 1e-11 N."""
 
 GravityLaw: TypeAlias = Callable[[Floats, Floats, float, Floats], None]
-"""Write the torques of some joints, Nm: positions of all joints, rad; up in the axes of the URDF's first
-link, a unit vector; mass of the payload, kg; the torques, to be written. No allocation that grows."""
+"""Function that writes the gravity torques of joints. Its arguments are the positions of all joints (rad),
+the unit vector that points up in the axes of the URDF's first link, the mass of the payload (kg), and the
+output array of torques (Nm). It allocates no memory that stays."""
 
 
 class Bodies(msgspec.Struct, frozen=True):
-    """Joints and masses of a URDF."""
+    """Kinematic tree and masses of a URDF"""
 
     joints: Mapping[str, Element]
     masses: Mapping[str, float | None]
-    """kg, by link; None: it has no `inertial`"""
+    """kg by link; None for a link without `inertial`"""
     children: Mapping[str, tuple[str, ...]] = msgspec.field(default_factory=dict)
-    """Joints by the link that they begin at"""
+    """Joints by their parent link"""
     shaped: frozenset[str] = frozenset()
-    """Links with a shape"""
+    """Links with a visual or a collision shape"""
 
     def moved(self, joint: str) -> list[str]:
-        """Return the links that a joint moves, those of mimic joints not among them."""
+        """Return all links below a joint in the tree. Links below joints that mimic it are not included."""
         links: list[str] = []
         left = [joint]
         while left:
@@ -59,12 +60,12 @@ class Bodies(msgspec.Struct, frozen=True):
         return links
 
     def mass(self, joint: str) -> float:
-        """Return the mass that a joint moves, kg."""
+        """Return the total mass of the links below a joint, kg."""
         return sum(self.masses.get(link) or 0.0 for link in self.moved(joint))
 
 
 def bodies_of(urdf: str) -> Bodies:
-    """Return joints and masses of a URDF. Raises ValueError for one that cannot be used."""
+    """Parse the joints and masses of a URDF. Raises ValueError for an invalid mass."""
     root = _root(urdf)
     joints = {_name(each): each for each in root.findall("joint")}
     masses = {_name(each): _mass(each) for each in root.findall("link")}
@@ -81,11 +82,19 @@ def bodies_of(urdf: str) -> Bodies:
 def gravity_law(
     urdf: str, names: Sequence[str], count: int, payload: tuple[str, Sequence[float]] | None = None
 ) -> GravityLaw:
-    """Return the law for the first `count` of the joints of these names; imports MuJoCo.
+    """Build the gravity law of a URDF. Imports MuJoCo.
 
-    Joints of the URDF that are none of them are at 0, those that mimic one of them move with it and count
-    for it; names that the URDF lacks have the torque 0. `payload`: the link that carries it, and where its
-    centre of mass is in the axes of that link, m. Raises ValueError for what MuJoCo cannot take.
+    Joints of the URDF that are not in `names` stay at 0. A joint that mimics a named one moves with that
+    joint, and its torque is added to that joint's. Names that the URDF lacks have the torque 0.
+
+    Args:
+        urdf: Text of the URDF.
+        names: Joints in the order of the positions that the law gets.
+        count: Number of joints, from the first on, whose torques the law writes.
+        payload: Link that carries the payload, and the centre of mass of the payload in its axes, m.
+
+    Raises:
+        ValueError: MuJoCo cannot compile the URDF.
     """
     import mujoco
 
@@ -107,7 +116,7 @@ def gravity_law(
     ratio = np.array([turned[name][1] for name in order])
     offset = np.array([turned[name][2] for name in order])
     share = np.zeros((count, len(order)))
-    """What each joint of the model counts for those whose torques are asked for"""
+    """Weight of each joint of the model (columns) in each requested torque (rows)"""
     for column, row in enumerate(source):
         if row < count:
             share[row, column] = ratio[column]
@@ -132,12 +141,12 @@ def gravity_law(
 def _root(urdf: str) -> Element:
     from xml.etree import ElementTree  # only robots with a URDF need it
 
-    # no DTD can be in it: the robot file's compiler refuses one
+    # The compiler of the robot file rejects a URDF with a DTD, so no entity can expand here.
     return ElementTree.fromstring(urdf)  # noqa: S314  as above
 
 
 def _turned(root: Element, names: Sequence[str]) -> dict[str, tuple[int, float, float]]:
-    """Return, by joint, which position it follows, by how much, and from where."""
+    """Return the index of the position that each joint follows, the ratio, and the offset, by joint."""
     known = {_name(each): each for each in root.findall("joint") if each.get("type") in MOVABLE}
     own = {name: (row, 1.0, 0.0) for row, name in enumerate(names) if name in known}
     turned = dict(own)
@@ -156,7 +165,7 @@ def _turned(root: Element, names: Sequence[str]) -> dict[str, tuple[int, float, 
 
 
 def _strip(root: Element, turned: Mapping[str, object]) -> None:
-    """Leave of a URDF the joints that move, and the masses of its links."""
+    """Reduce a URDF to its moving joints and the masses of its links."""
     for joint in root.findall("joint"):
         if _name(joint) not in turned:
             joint.set("type", "fixed")
@@ -164,9 +173,10 @@ def _strip(root: Element, turned: Mapping[str, object]) -> None:
             joint.remove(mimic)
     for link in root.findall("link"):
         for shape in (*link.findall("visual"), *link.findall("collision")):
-            link.remove(shape)  # of a link without `inertial` MuJoCo would weigh the shapes
+            link.remove(shape)  # MuJoCo would derive a mass from the shapes of a link without `inertial`
         inertia = link.find("inertial/inertia")
-        if inertia is not None:  # which does not count at rest, and MuJoCo refuses ones that cannot be
+        # The inertia has no effect at rest, but MuJoCo rejects one that is physically impossible.
+        if inertia is not None:
             for name in inertia.keys():  # noqa: SIM118  an element has no other iteration over its attributes
                 inertia.set(name, "1e-6" if name in {"ixx", "iyy", "izz"} else "0")
 
@@ -185,9 +195,14 @@ def _hang(root: Element, link: str, at: Sequence[float]) -> None:
 
 
 def up_of(quaternion: Floats, up: Floats) -> None:
-    """Write the direction up in the axes of a base with an orientation x, y, z, w; not finite: as it was.
+    """Write the unit vector that points up in the axes of a base.
 
-    The third row of its rotation matrix.
+    It is the third row of the rotation matrix. An orientation that is zero or not finite leaves `up`
+    unchanged.
+
+    Args:
+        quaternion: Orientation of the base x, y, z, w; of any length above 0.
+        up: Output, shape (3,).
     """
     x, y, z, w = quaternion
     norm = x * x + y * y + z * z + w * w

@@ -1,12 +1,12 @@
-"""Iterative learning: from how a motion was followed, the correction with which it is followed better.
+"""Iterative learning control: correction of a motion, learned from the errors of its repetitions.
 
 u[k+1](t) = Q(u[k](t) + L e[k](t + delay)), where u is added to the commanded positions, e is desired minus
-measured position, L the learning gain, and Q a low-pass without a phase (D. A. Bristow, M. Tharayil,
-A. G. Alleyne, "A survey of iterative learning control", IEEE Control Systems Magazine 26, 2006). With servos
-that control their position: M. Schwarz, S. Behnke, "Compliant Robot Behavior using Servo Actuator Models
+measured position, L the learning gain, and Q a zero-phase low-pass (D. A. Bristow, M. Tharayil,
+A. G. Alleyne, "A survey of iterative learning control", IEEE Control Systems Magazine 26, 2006). For
+position-controlled servos see M. Schwarz, S. Behnke, "Compliant Robot Behavior using Servo Actuator Models
 identified by Iterative Learning Control", RoboCup 2013.
 
-Q is a Gaussian: no weight is negative and their sum is 1, so no value of Q(x) is beyond the largest of x.
+Q is a Gaussian. Its weights are not negative and their sum is 1, so Q(x) never exceeds the largest |x|.
 """
 
 from __future__ import annotations
@@ -21,22 +21,21 @@ from numpy.typing import NDArray
 from dxlrun import Floats
 
 Table = NDArray[np.float32]
-"""A correction, shape (joints, rows), rad; one row a cycle."""
+"""Correction of a motion, rad, shape (joints, rows), with one row per cycle"""
 
 MOST_DELAY_S: Final = 0.25
-"""By so much a servo may lag behind."""
+"""Longest tracking delay of a servo that is compensated, s"""
 _TAPS: Final = 16384
-"""Products of a step; some 10 us."""
+"""Products of the convolution in one step of learning, which take some 10 us"""
 _LONGEST_STEP: Final = 256
 _WIDTH: Final = 4.0
-"""Standard deviations on each side; what lies beyond is 0.006 % of the whole."""
+"""Half-width of the filter in standard deviations. The tails that are cut off have 0.006 % of the weight."""
 
 
 def gaussian(cutoff_hz: float, period_s: float) -> Floats:
-    """Return the weights of a low-pass without a phase, shape (odd,); 0.71 of an amplitude is left at its
-    cut-off.
+    """Return the weights of a zero-phase low-pass, shape (odd,). Its gain at the cut-off is 0.71 (-3 dB).
 
-    A Gaussian of the deviation s passes exp(-(2 pi f s)^2 / 2).
+    A Gaussian with the standard deviation s has the gain exp(-(2 pi f s)^2 / 2).
     """
     deviation = math.sqrt(math.log(2.0)) / (2.0 * math.pi * cutoff_hz * period_s)
     side = np.arange(-math.ceil(_WIDTH * deviation), math.ceil(_WIDTH * deviation) + 1)
@@ -46,9 +45,9 @@ def gaussian(cutoff_hz: float, period_s: float) -> Floats:
 
 
 class Repetition:
-    """One repetition of a motion: what was commanded and how it was followed; learns from it in small steps.
+    """Record of one repetition of a motion, from which the next correction is computed in small steps.
 
-    All memory is made at once; `most_rows` is the longest repetition.
+    All memory is allocated by the constructor. `most_rows` is the length of the longest repetition, cycles.
     """
 
     def __init__(self, joints: int, most_rows: int, period_s: float, cutoff_hz: float) -> None:
@@ -62,19 +61,19 @@ class Repetition:
         self._part = np.zeros(self._step)
         self._desired, self._squares = np.zeros((2, joints))
         self._slow = np.zeros((2, joints))
-        """Sums of error times desired velocity, and of its square: their quotient is the delay."""
+        """Sums of error times desired step, and of the step's square. Their quotient is the delay."""
         self.most_rows = most_rows
         self.rows = 0
-        """So many were recorded."""
+        """Number of recorded rows"""
 
     def begin(self) -> None:
-        """Record anew."""
+        """Start a new recording."""
         self.rows = 0
         self._squares.fill(0.0)
         self._slow.fill(0.0)
 
     def record(self, desired: Floats, measured: Floats, applied: Floats, judged: bool) -> None:
-        """Record a row, shape (joints,) each, rad; `judged` ones count for `error` and `delay_s`."""
+        """Append a row (rad, shape (joints,)). Only `judged` rows count towards `error` and `delay_s`."""
         row, error = self.rows, desired - measured
         self._error[:, row] = error
         self._applied[:, row] = applied
@@ -88,11 +87,11 @@ class Repetition:
         self.rows = row + 1
 
     def error(self, judged_rows: int) -> float:
-        """Return the root of the mean square of the error, of all joints, rad."""
+        """Return the root mean square error over all joints, rad."""
         return math.sqrt(float(self._squares.sum()) / (judged_rows * len(self._squares)))
 
     def delay_s(self) -> Floats:
-        """Return by how much each joint lagged behind, s: of q(t) = d(t - T), the error is about T d'(t)."""
+        """Return the delay T of each joint, s. With q(t) = d(t - T), the error is about T d'(t)."""
         slow, fast = self._slow
         delay = np.divide(slow, fast, out=np.zeros_like(slow), where=fast > 0) * self._period_s
         return np.asarray(np.clip(delay, 0.0, MOST_DELAY_S), np.float64)
@@ -100,10 +99,14 @@ class Repetition:
     def learn(
         self, old: Table | None, new: Table, gain: float, delay_s: Floats, most: Floats
     ) -> Iterator[None]:
-        """Write the next correction into `new`, one small step after the other.
+        """Compute the next correction and yield after each small step.
 
-        `old` is the one that was played, for rows that were not recorded; None: none was.
-        `gain` without a unit, 0..1; `delay_s` and `most` (rad) have the shape (joints,).
+        Args:
+            old: Correction that was applied, used for rows that were not recorded; None if there was none.
+            new: Output, shape (joints, rows).
+            gain: Learning gain, 0..1.
+            delay_s: Delay of each joint, s, shape (joints,).
+            most: Largest correction of each joint, rad, shape (joints,).
         """
         rows, width = new.shape[1], len(self._weights)
         half, recorded = width // 2, min(self.rows, rows)

@@ -1,7 +1,7 @@
-"""Orientation of a body from its rates of turn, its accelerometer, and perhaps its magnetometer.
+"""Orientation of a body from its gyroscope, its accelerometer, and optionally its magnetometer.
 
 S. Madgwick, An efficient orientation filter for inertial and inertial/magnetic sensor arrays (report x-io and
-University of Bristol, 2010); numbers of equations are its own.
+University of Bristol, 2010). Equation numbers refer to this report.
 """
 
 from __future__ import annotations
@@ -12,12 +12,12 @@ Vector = tuple[float, float, float]
 
 
 class Madgwick:
-    """A unit quaternion that turns vectors of the body into a fixed frame with its z axis upwards.
+    """Unit quaternion that rotates vectors of the body into a fixed frame whose z axis points up.
 
-    `gain` is the report's beta, rad/s: how fast the accelerometer, which measures +g upwards at rest, and the
-    magnetometer correct what the integrated rates drift. With a magnetometer the x axis of the fixed frame is
-    the horizontal direction of the magnetic field (eq. 45, 46: no declination or inclination is needed).
-    Angles to it are found within some gain * dt.
+    `gain` is beta of the report, rad/s: the rate at which accelerometer and magnetometer correct the drift of
+    the integrated rates. The accelerometer measures +g upwards at rest. With a magnetometer, the x axis of
+    the fixed frame is the horizontal direction of the magnetic field (eq. 45 and 46; they need no declination
+    or inclination). Angles converge to within about gain * dt.
     """
 
     def __init__(self, gain: float) -> None:
@@ -26,15 +26,16 @@ class Madgwick:
 
     @property
     def heading(self) -> float:
-        """The angle about the vertical axis, rad."""
+        """Angle about the vertical axis, rad"""
         return math.atan2(
             2.0 * (self.w * self.z + self.x * self.y), 1.0 - 2.0 * (self.y * self.y + self.z * self.z)
         )
 
     def begin(self, acceleration: Vector, field: Vector | None, heading: float) -> None:
-        """Take roll and pitch from the accelerometer; heading from the field, or else the given one, rad.
+        """Set roll and pitch from the accelerometer, and the heading from the magnetic field.
 
-        An acceleration of zero says nothing: then both stay as they are.
+        Without a field, the heading is `heading`, rad. An acceleration of zero leaves the orientation
+        unchanged.
         """
         ax, ay, az = acceleration
         if ax == ay == az == 0.0:
@@ -53,9 +54,14 @@ class Madgwick:
         self.y, self.z = cr * sp * cy + sr * cp * sy, cr * cp * sy - sr * sp * cy
 
     def update(self, rate: Vector, acceleration: Vector, field: Vector | None, dt: float) -> None:
-        """Go on by `dt` s: rad/s, and directions of acceleration and magnetic field in any unit.
+        """Advance the orientation by `dt` s.
 
-        An acceleration of zero gives no direction: then the rates alone count, as without the field.
+        Args:
+            rate: Angular velocity in the axes of the body, rad/s.
+            acceleration: Direction of the measured acceleration, in any unit. With zero, only the rates
+                count.
+            field: Direction of the magnetic field, in any unit; None without a magnetometer.
+            dt: s.
         """
         w, x, y, z = self.w, self.x, self.y, self.z
         gx, gy, gz = rate

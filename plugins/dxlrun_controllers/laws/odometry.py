@@ -1,14 +1,14 @@
-"""Odometry of a base on two sides of wheels: from the ways of the wheels to a pose in the plane.
+"""Odometry of a base with differential drive: pose in the plane from the travel of the wheels.
 
-Between two samples both rims are taken to move at constant speeds, so that the base moves on an arc of a
-circle, or a straight line. Of the ways l and r of the left and right rims:
+Both rims are assumed to move at constant speeds between two samples, so the base moves on an arc of a circle
+or on a straight line. With l and r, the distances that the left and the right rim travel:
 
     s = (r + l) / 2,  a = (r - l) / separation
     chord = s * sin(a / 2) / (a / 2), in the direction heading + a / 2
 
-which is exact for every radius. Siegwart and Nourbakhsh, Introduction to Autonomous Mobile
-Robots, section 5.2.4, has the chord with sin(a / 2) / (a / 2) = 1; the exact arc is that of ROS 2's
-diff_drive_controller (`integrate_exact`), which divides by the angle.
+The formula is exact for every radius. Siegwart and Nourbakhsh, Introduction to Autonomous Mobile
+Robots, section 5.2.4, approximate sin(a / 2) / (a / 2) by 1. `integrate_exact` of ROS 2's
+diff_drive_controller computes the same arc, but divides by the angle.
 """
 
 from __future__ import annotations
@@ -20,20 +20,20 @@ import numpy as np
 from dxlrun import States
 
 _SMALL = 1e-4
-"""rad; below it the series of sin(x) / x is exact to the last bit: the next term is x^4 / 120."""
+"""rad; below it, two terms of the series of sin(x) / x are exact to the last bit (the next is x^4 / 120)."""
 HALF_TURN = math.pi
 FASTEST_WHEEL = 50.0
-"""rad/s; no servo turns faster: the MX-12W has 470 rpm at 12 V (e-Manual, MX-12W, Specifications)."""
+"""rad/s; the fastest servo is the MX-12W with 470 rpm at 12 V (e-Manual, MX-12W, Specifications)."""
 
 
 class Pose:
-    """Where a base is, in the frame of its start: x and y, m, and heading, rad, which counts turns."""
+    """Pose of a base in the frame of its start: x and y (m), and heading (rad, counts whole turns)."""
 
     def __init__(self) -> None:
         self.x = self.y = self.heading = 0.0
 
     def move(self, way: float, angle: float) -> None:
-        """Go on along an arc of `way` m, which turns by `angle` rad, to the left where it is positive."""
+        """Move along an arc of the length `way`, m, that turns by `angle`, rad (positive: to the left)."""
         half = angle / 2
         chord = way * (math.sin(half) / half if abs(half) > _SMALL else 1.0 - half * half / 6.0)
         direction = self.heading + half
@@ -43,32 +43,39 @@ class Pose:
 
 
 class WheelAngles:
-    """How far wheels have turned since they last all answered; shape (wheels,).
+    """Rotation of wheels between two samples in which all wheels answered, shape (wheels,).
 
-    The positions of most servos count turns in velocity mode. Those of Protocol 1.0 begin anew after each
-    turn: a step of more than half a turn, in so short a time that no wheel can have made it, is the step
-    over that end. After a longer time without a reply the turns are not known, so such a step is left out.
+    In velocity mode the positions of most servos count whole turns, but those of Protocol 1.0 wrap around.
+    A step of more than half a turn in a time too short for it is a wrap-around, and is corrected. After a
+    longer gap the number of turns is ambiguous, so the step is discarded.
     """
 
     def __init__(self, wheels: int, fastest: float, period_ns: int) -> None:
-        """`fastest` in rad/s, NaN where it is not known; `period_ns` is the time between two updates."""
+        """Set the longest gap that is still unambiguous.
+
+        Args:
+            wheels: Number of wheels.
+            fastest: Highest speed of a wheel, rad/s, or NaN if it is unknown.
+            period_ns: Time between two updates, ns.
+        """
         speed = fastest if math.isfinite(fastest) and fastest > 0 else FASTEST_WHEEL
         self.longest_ns = max(round(HALF_TURN / (2 * speed) * 1e9), 2 * period_ns)
-        """After a longer time the way since the sample before is not known, ns. Half of what half a turn
-        takes: a base that is pushed turns its wheels faster than it may."""
+        """Longest gap between two usable samples, ns. It is half the time of half a turn, because a base that
+        is pushed can turn its wheels faster than their limit."""
         self.turned = np.zeros(wheels)
-        """rad, of the last `take` that returned true"""
+        """rad; valid after a `take` that did not return None"""
         self._before = np.zeros(wheels)
         self._known_ns = -1
 
     def begin(self) -> None:
-        """Forget the sample before: the next one is a beginning."""
+        """Discard the last sample, so that the next one starts the odometry."""
         self._known_ns = -1
 
     def take(self, states: States, time_ns: int) -> int | None:
-        """Take a sample in which all wheels answered.
+        """Add a sample in which all wheels answered, and update `turned`.
 
-        Returns the time since the one before, ns, and `turned` has the way; None when that is not known.
+        Returns:
+            The time since the last sample, ns; None if the rotation since then is unknown.
         """
         known_ns, self._known_ns = self._known_ns, time_ns
         turned = self.turned
@@ -76,7 +83,7 @@ class WheelAngles:
         np.copyto(self._before, states.position)
         if known_ns < 0 or time_ns - known_ns > self.longest_ns:
             return None
-        # an end that begins anew is a whole turn away, whatever the unit of the servo's positions
+        # A wrap-around is always a whole turn, whatever the resolution of the servo.
         turned -= 2 * HALF_TURN * np.rint(turned / (2 * HALF_TURN))
         return time_ns - known_ns
 

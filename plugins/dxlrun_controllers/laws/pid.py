@@ -1,4 +1,4 @@
-"""PID: the law of proportional, integral and derivative feedback, for some joints at once.
+"""PID: proportional, integral and derivative feedback, vectorised over joints.
 
 Parallel form with a filtered derivative and a feed-forward w:
 
@@ -21,24 +21,24 @@ from dxlrun_controllers.joints import NotNegative, PerJoint, clamped, row_of
 
 
 class Gains(ParametersModel):
-    """Gains of a PID law, each one number for all joints or a mapping by joint; they can be changed in a run.
+    """Gains of a PID law. Each is one number for all joints or a mapping by joint, and can change in a run.
 
-    u is the unit of the command (Nm, A or fraction of maximum; rad/s; fraction of the full voltage; rad), e
-    that of the reference (rad or rad/s).
+    u is the unit of the command (Nm, A or fraction of maximum; rad/s; fraction of the full voltage; rad), and
+    e the unit of the reference (rad or rad/s).
     """
 
     p: Annotated[PerJoint[NotNegative], LIVE] = 0.0
-    """u/e"""
+    """Proportional gain, u/e."""
     i: Annotated[PerJoint[NotNegative], LIVE] = 0.0
-    """u/(e s)"""
+    """Integral gain, u/(e s)."""
     d: Annotated[PerJoint[NotNegative], LIVE] = 0.0
-    """u s/e"""
+    """Derivative gain, u s/e."""
     feed_forward: Annotated[PerJoint[NotNegative], LIVE] = 0.0
-    """u s/rad, times the reference's velocity; left out, it is 1 where velocities are commanded."""
+    """Factor on the velocity of the reference, u s/rad; by default 1 if velocities are commanded."""
 
 
 def feed_velocities_forward(data: object) -> object:
-    """Return parameters as written, with a feed_forward of 1 where velocities are commanded and it is not."""
+    """Set feed_forward to 1 in parameters that command velocities and do not set it."""
     if not isinstance(data, dict) or data.get("command_interface") != "velocity":
         return data
     gains = data.get("gains")
@@ -46,46 +46,50 @@ def feed_velocities_forward(data: object) -> object:
 
 
 class Pid:
-    """PID of some joints; all arrays have the shape (joints,), nothing is allocated in `update`.
+    """PID law of joints. All arrays have the shape (joints,).
 
-    - Integral and filter are backward Euler: with tau the filter's time constant and h the period, the filter
-      is D += h / (tau + h) * (de/dt - D). Its pole tau / (tau + h) lies in [0, 1) for every h, so tau = 0 is
-      no filter; the bilinear rule has its pole below 0 for tau < h / 2, and rings at tau = 0.
-    - `integral` is the term itself, in units of the command: a gain that is changed in a run changes only
-      what is added from then on, and the output does not jump by it.
-    - Anti-windup by clamping: where the output is at its limit, the integral takes only the part of its step
-      that leads away from the limit, so the output leaves the limit as soon as the rest of the law does. It
-      needs no time constant, as back-calculation does, and cannot make the integral overshoot.
-    - h is, for each joint, the time since its last measurement. A joint without one keeps its last output:
-      one lost packet must not let an arm fall. The runtime passes on none of a joint that stays silent
-      (lost: 3 replies and 50 ms).
+    - Integral and filter use backward Euler. With the filter's time constant tau and the period h, the filter
+      is D += h / (tau + h) * (de/dt - D). Its pole tau / (tau + h) is in [0, 1) for every h, and tau = 0
+      disables the filter. The bilinear rule would have its pole below 0 for tau < h / 2, and ring at tau = 0.
+    - `integral` is the integral term, in units of the command. A change of the gain in a run therefore only
+      affects later steps, and the output does not jump.
+    - Anti-windup is by clamping. While the output is at its limit, the integral only takes steps that lead
+      away from the limit, so the output leaves the limit as soon as the other terms do. Unlike
+      back-calculation, clamping needs no time constant and cannot make the integral overshoot.
+    - h is the time since the last measurement, for each joint. A joint without a new measurement keeps its
+      last output, because one lost packet must not let an arm fall. The runtime sends no command to a lost
+      joint (3 missing replies and 50 ms).
     """
 
     def __init__(self, joints: int) -> None:
         self.p, self.i, self.d = np.zeros((3, joints))
         self.filter_s = 0.0
-        """Time constant of the derivative's filter, s; 0: none."""
+        """Time constant of the derivative filter, s; 0 disables it."""
         self.lower, self.upper = np.full(joints, -np.inf), np.full(joints, np.inf)
         """Limits of the output."""
         self.integral_limit = np.full(joints, np.inf)
         """Largest magnitude of the integral term, in units of the command."""
         self._terms = np.zeros((5, joints))
         self.output, self.proportional, self.integral, self.derivative, self.rate = self._terms
-        """What the last update made; `rate` is the filtered rate of the error."""
+        """Results of the last update, in units of the command; `rate` is the filtered rate of the error."""
         self._elapsed_s = np.zeros(joints)
 
     def take(self, gains: Gains, joints: tuple[str, ...]) -> None:
-        """Take other gains; an integral that nothing would ever remove begins anew."""
+        """Set the gains. A joint with the integral gain 0 loses its integral, which would stay forever."""
         self.p, self.i, self.d = (row_of(gain, joints, 0.0) for gain in (gains.p, gains.i, gains.d))
         self.integral[self.i == 0.0] = 0.0
 
     def reset(self, output: Floats, error: Floats, bias: Floats) -> None:
-        """Begin so that the first output is `output` where there is an integral gain, without its rate.
+        """Preset the integral so that the first update continues from `output` (bumpless transfer).
 
-        `output` is what the joint has now, `error` and `bias` (the feed-forward) what the first update gets;
-        where one is not finite, the integral begins with 0. Without an integral gain nothing could remove
-        the bias again, so there the law begins as it is. The derivative brakes a moving joint from the first
-        update on.
+        The derivative term is not compensated, so it brakes a moving joint from the first update on. A joint
+        without an integral gain starts with an integral of 0, because nothing could remove a preset again.
+        The same holds where an argument is not finite.
+
+        Args:
+            output: Present command of the joints, in units of the command.
+            error: Error that the first update gets.
+            bias: Feed-forward that the first update gets.
         """
         np.copyto(self.output, output)
         self.proportional.fill(0.0)
@@ -99,10 +103,17 @@ class Pid:
     def update(
         self, error: Floats, rate: Floats, bias: Floats, measured: NDArray[np.bool_], period_s: float
     ) -> Floats:
-        """Return the output after `period_s`, one array that the next update overwrites.
+        """Compute the output.
 
-        `rate` is the rate of the error (reference rate minus measured rate), `bias` the feed-forward;
-        `measured` is False where the error is not new or not finite: there nothing changes.
+        Args:
+            error: Reference minus measurement.
+            rate: Rate of the error: rate of the reference minus measured rate.
+            bias: Feed-forward, in units of the command.
+            measured: False for a joint whose error is not new or not finite. Such joints keep their output.
+            period_s: Time since the last update, s.
+
+        Returns:
+            The output, in units of the command. The next update overwrites this array.
         """
         elapsed = self._elapsed_s
         elapsed += period_s
@@ -114,7 +125,7 @@ class Pid:
         step = clamped(step, -self.integral_limit, self.integral_limit) - self.integral
         output = proportional + derivative + bias + self.integral + step
         inside = clamped(output, self.lower, self.upper)
-        # what is beyond a limit is taken off the step, as far as the step led there
+        # Anti-windup: shorten the step by the excess over the limit, but never reverse the step.
         step -= clamped(output - inside, np.minimum(step, 0.0), np.maximum(step, 0.0))
         new = inside, proportional, step + self.integral, derivative, filtered
         np.copyto(self._terms, new, where=measured)
@@ -123,7 +134,7 @@ class Pid:
 
 
 class Slope:
-    """Rate of a measured value: its difference over the time between two measurements."""
+    """Rate of a measured value: difference of two measurements over the time between them."""
 
     def __init__(self, joints: int) -> None:
         self.rate, self._last = np.zeros((2, joints))
@@ -131,16 +142,16 @@ class Slope:
         self._seen = np.zeros(joints, dtype=np.bool_)
 
     def reset(self) -> None:
-        """Begin anew: the first measurement has the rate 0."""
+        """Discard the last measurement. The next one has the rate 0."""
         self._seen.fill(False)
         self.rate.fill(0.0)
         self._elapsed_s.fill(0.0)
 
     def update(self, value: Floats, measured: NDArray[np.bool_], period_s: float) -> Floats:
-        """Return the rates, 1/s; where `measured` is False the last one stays."""
+        """Return the rates, 1/s. A joint with `measured` False keeps its last rate."""
         elapsed = self._elapsed_s
         elapsed += period_s
-        # the first measurement has no one before it
+        # `_seen` makes the rate of the first measurement 0.
         np.copyto(self.rate, (value - self._last) / elapsed * self._seen, where=measured)
         np.copyto(self._last, value, where=measured)
         elapsed[measured] = 0.0

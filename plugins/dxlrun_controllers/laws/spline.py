@@ -1,8 +1,8 @@
 """Splines through the points of a trajectory: linear, cubic or quintic pieces, sampled by time; and stops.
 
-A piece is sum(c[k] * t**k), t from its start. Coefficients as in Biagiotti and Melchiorri, Trajectory
-Planning for Automatic Machines and Robots (2008), section 2.1. They are our own because the loop needs them
-without growing memory, and scipy takes two seconds to import; the tests compare the two.
+A piece is sum(c[k] * t**k) with t from its start. The coefficients are those of Biagiotti and Melchiorri,
+Trajectory Planning for Automatic Machines and Robots (2008), section 2.1. scipy is not used because the loop
+must not allocate memory that stays, and because its import takes two seconds. The tests compare the two.
 """
 
 from __future__ import annotations
@@ -17,35 +17,38 @@ from numpy.typing import NDArray
 from dxlrun import Floats, nearest_turn
 
 LINEAR, CUBIC, QUINTIC = 2, 4, 6
-"""Number of coefficients of a piece."""
+"""Number of coefficients of a piece"""
 DECELERATION: Final = 20.0
-"""rad/s^2, of joints that have no limit of their own: an XM430 is at rest from its top speed in 0.25 s."""
+"""Default deceleration of joints without an acceleration limit, rad/s^2. It stops an XM430 from its top speed
+in 0.25 s."""
 
 START_IN: Final = 3
-"""Where `start_in` is in the flat array of a trajectory, behind the numbers of points, joints and
-coefficients."""
+"""Index of `start_in` in the flat array of a trajectory, after the numbers of points, joints and
+coefficients"""
 _HEAD = 4
+"""Length of the header of the flat array"""
 _TRIES = 12
-"""In which a bridge becomes so long that it is not too fast."""
+"""Number of attempts to make a bridge long enough to keep the speed limits"""
 _SHORTER = 1.001
-"""By so much more than it is too fast a bridge is made longer: its speed does not fall in proportion."""
+"""Extra factor on the duration of a bridge that is too fast, because its speed does not fall in proportion"""
 _SHARES = np.linspace(1, 0, 17)
-"""Shares of a piece's time from which its peak is searched: its speed has at most three extremes. The end
-comes first, as a constant speed is that of the way to the end."""
+"""Normalised times at which the search for the peak speed of a piece starts. A speed has at most three
+extremes. The end is first, so that a constant speed is reported at the end."""
 _APART = 1 / 16
+"""Distance between two of these times"""
 _STEPS = 3
-"""Of Newton's method, which doubles the digits in each: that of a cubic's parabola is exact after one."""
+"""Iterations of Newton's method. Each doubles the correct digits; a cubic piece needs only one."""
 
 
 class SplineSample:
-    """The desired state of the joints at one time; shape (joints,) each: rad, rad/s, rad/s^2."""
+    """Desired state of the joints at one time: rad, rad/s and rad/s^2, each of the shape (joints,)."""
 
     def __init__(self, joints: int) -> None:
         self.rows = np.zeros((3, joints))
         self.position, self.velocity, self.acceleration = self.rows
 
     def rest_at(self, position: Floats) -> None:
-        """Be at rest at a position."""
+        """Set the state to rest at a position."""
         self.rows.fill(0.0)
         np.copyto(self.position, position)
 
@@ -57,10 +60,15 @@ def solve(
     end: Sequence[Floats] | Floats,
     out: Floats,
 ) -> None:
-    """Write the piece from `start` to `end` (position, velocity, acceleration) into `out`.
+    """Compute the coefficients of a piece.
 
-    `duration` in s, above 0, for all joints or of each; `out` has the shape (order, joints). A linear piece
-    looks only at positions, a cubic one not at accelerations.
+    Args:
+        order: LINEAR, CUBIC or QUINTIC. A linear piece ignores velocities, and only a quintic one uses
+            accelerations.
+        duration: s, above 0; one number or one per joint.
+        start: Position, velocity and acceleration at the start.
+        end: Position, velocity and acceleration at the end.
+        out: Output, shape (order, joints).
     """
     way, t = end[0] - start[0], duration
     out[0] = start[0]
@@ -95,15 +103,18 @@ def evaluate(piece: Sequence[Floats] | Floats, t: float, sample: SplineSample) -
 
 
 def peak_velocities(piece: Floats, duration: float | Floats) -> tuple[Floats, Floats]:
-    """Return the velocity of the largest magnitude on each piece, rad/s, and its time, s from its start.
+    """Return the peak velocity of each piece, rad/s, and its time from the start of the piece, s.
 
-    `piece` has the shape (order, pieces), `duration` is in s, of all pieces or of each. This is the one
-    place where the peak of a spline is found. The velocity of a cubic is a parabola, that of a quintic has
-    the extremes of a quartic: Newton's method finds the one next to the highest of some samples.
+    The velocity of a cubic piece is a parabola, and that of a quintic piece a quartic. Newton's method
+    refines the largest of some samples.
+
+    Args:
+        piece: Coefficients, shape (order, pieces).
+        duration: s; one number or one per piece.
     """
     order = len(piece)
     powers = np.asarray(duration, dtype=np.float64) ** np.arange(order - 1)[:, None]
-    speed = piece[1:] * np.arange(1, order)[:, None] * powers  # coefficients of the share of the time
+    speed = piece[1:] * np.arange(1, order)[:, None] * powers  # polynomial of the normalised time 0..1
     slope = speed[1:] * np.arange(1, order - 1)[:, None]
     bend = slope[1:] * np.arange(1, order - 2)[:, None]
     sampled = _SHARES[:, None] ** np.arange(order - 1) @ speed
@@ -128,9 +139,9 @@ def _horner(coefficients: Floats, at: Floats) -> Floats:
 
 
 def trajectory_peaks(data: Floats) -> list[tuple[float, float, int]]:
-    """Return for each joint of a flat trajectory its peak velocity, when, s, and on which piece, from 0.
+    """Return the peak velocity of each joint of a flat trajectory, its time (s), and its piece (from 0).
 
-    Nothing where the trajectory has one point: the way there is not known.
+    The list is empty for a trajectory of one point, because the start of the motion is unknown.
     """
     count, joints, order = map(int, data[:START_IN].tolist())
     if count < 2:
@@ -147,11 +158,15 @@ def trajectory_peaks(data: Floats) -> list[tuple[float, float, int]]:
 
 
 def smooth_velocities(times: Floats, positions: Floats) -> Floats:
-    """Return velocities at points with which cubic pieces overshoot none of them, shape (points, joints).
+    """Return velocities at the points, shape (points, joints), with which cubic pieces do not overshoot.
 
     F. N. Fritsch, J. Butland, "A method for constructing local monotone piecewise cubic interpolants", SIAM
-    Journal on Scientific and Statistical Computing 5, 1984; at both ends the three-point formula of C. Moler,
-    Numerical Computing with MATLAB (2004), section 3.6. `times` in s, growing, shape (points,).
+    Journal on Scientific and Statistical Computing 5, 1984. Both ends use the three-point formula of C.
+    Moler, Numerical Computing with MATLAB (2004), section 3.6.
+
+    Args:
+        times: s, increasing, shape (points,).
+        positions: rad, shape (points, joints).
     """
     gaps = np.diff(times)[:, None]
     slopes = np.diff(positions, axis=0) / gaps
@@ -176,11 +191,14 @@ def _end_velocity(gap: Floats, next_gap: Floats, slope: Floats, next_slope: Floa
 
 
 def flatten(orders: Sequence[int], times: Floats, points: Floats, start_in: float) -> Floats:
-    """Return a trajectory as the one flat array that `Trajectory.load` takes.
+    """Return a trajectory as the flat array that `Trajectory.load` expects.
 
-    `times` in s, shape (points,), growing; `points` has the shape (points, 3, joints): position, velocity,
-    acceleration; `start_in` in s. Each point has its order, by what is given of it; a piece has the lower one
-    of its two ends.
+    Args:
+        orders: Order of each point: LINEAR with a position only, CUBIC with a velocity, QUINTIC with an
+            acceleration. A piece has the lower order of its two ends.
+        times: s, increasing, shape (points,).
+        points: Position, velocity and acceleration, shape (points, 3, joints).
+        start_in: Time from loading to time 0 of the points, s.
     """
     count, _, joints = points.shape
     of_pieces = [min(pair) for pair in pairwise(orders)]
@@ -194,15 +212,20 @@ def flatten(orders: Sequence[int], times: Floats, points: Floats, start_in: floa
 
 
 def flat_size(data: Floats) -> int:
-    """Return how many numbers of a flat array are those of its trajectory."""
+    """Return the number of elements that the trajectory takes at the start of a flat array."""
     count, joints, order = map(int, data[:START_IN].tolist())
     return _HEAD + count + 6 * joints + (count - 1) * order * joints
 
 
 def whole_turns(data: Floats, now: Floats, wrap: NDArray[np.bool_]) -> Floats:
-    """Return a flat trajectory with the joints of `wrap` moved by whole turns.
+    """Shift the wrapping joints of a flat trajectory by whole turns.
 
-    Their first point is at most half a turn from `now`, rad, shape (joints,).
+    Their first point is then within half a turn of `now`.
+
+    Args:
+        data: Flat trajectory. It is returned as it is if no joint needs a shift.
+        now: Present position, rad, shape (joints,).
+        wrap: True for each joint that may be shifted.
     """
     count, joints, order = map(int, data[:START_IN].tolist())
     ends = _HEAD + count
@@ -218,34 +241,40 @@ def whole_turns(data: Floats, now: Floats, wrap: NDArray[np.bool_]) -> Floats:
 
 
 class Trajectory:
-    """A trajectory that is being played: a bridge from where the joints are to its first point, then pieces.
+    """Trajectory being played: a bridge from the present state to the first point, then the pieces.
 
-    `load` and `join` take views of the flat array, so that nothing grows in the loop.
+    `load` and `join` keep views of the flat array, so the loop allocates no memory that stays.
     """
 
     def __init__(self, joints: int) -> None:
         self._bridge = np.zeros((QUINTIC, joints))
         self.bridge_s = 0.0
-        """From `load` to the first point, s."""
+        """Time from `load` to the end of the bridge, s"""
         self._start_in = 0.0
         self._times = np.zeros(1)
         self._first = self._last = np.zeros((3, joints))
         self._pieces = np.zeros((0, LINEAR, joints))
         self._now: tuple[Floats, ...] = ()
-        """Coefficients of the piece that is played, from `_begin_s` to `_end_s`, in time of the points."""
+        """Coefficients of the current piece, which is valid from `_begin_s` to `_end_s` of the points' time
+        """
         self._begin_s = self._end_s = 0.0
         self._tail = Stop(joints)
         self._tail_s = 0.0
-        """When the joints begin to come to rest behind the last point."""
+        """Time from `load` to the start of the stop after the last point, s"""
         self._joined = SplineSample(joints)
         self.duration_s = 0.0
-        """From `load` until all are at rest, s."""
+        """Time from `load` until all joints are at rest, s"""
 
     def load(self, data: Floats, now: SplineSample, waited_s: float = 0.0) -> None:
-        """Begin a flat trajectory from the sample `now`; time counts from here.
+        """Start a flat trajectory from the present state.
 
-        From rest, the bridge is a piece as the others. From a motion it is quintic, whatever they are: it
-        keeps velocity and acceleration at both its ends. `waited_s` of the time until its start have passed.
+        From rest, the bridge has the same order as the pieces. From a motion it is quintic, so that velocity
+        and acceleration are continuous at both ends.
+
+        Args:
+            data: Flat trajectory.
+            now: Present desired state.
+            waited_s: Part of `start_in` that has already passed, s.
         """
         order = self._take(data, float(data[START_IN]) - waited_s)
         self.bridge_s = self._start_in + float(self._times[0])
@@ -258,10 +287,20 @@ class Trajectory:
                 solve(order, self.bridge_s, start, self._first, self._bridge[:order])
 
     def join(self, data: Floats, now: SplineSample, late_s: float, blend_s: float, limits: Limits) -> bool:
-        """Begin a flat trajectory from the sample `now`, in its middle: `late_s` of its points' time is over.
+        """Start a flat trajectory in its middle.
 
-        A quintic bridge passes into it in `blend_s`, or so much later that the way there is not too fast.
-        Behind the last point the joints come to rest. Returns False where all of its points are in the past.
+        A quintic bridge leads into it. The bridge takes `blend_s`, or longer to keep the speed limits. After
+        the last point the joints come to rest.
+
+        Args:
+            data: Flat trajectory.
+            now: Present desired state.
+            late_s: Part of the points' time that has already passed, s.
+            blend_s: Shortest duration of the bridge, s.
+            limits: Limits of the bridge's speed and of the stop.
+
+        Returns:
+            False if all points are in the past.
         """
         self._take(data, -late_s)
         joined, end_s = self._joined, float(self._times[-1]) - late_s
@@ -287,7 +326,7 @@ class Trajectory:
         return True
 
     def _take(self, data: Floats, start_in: float) -> int:
-        """Take the parts of a flat array; return the order of its pieces."""
+        """Set the views of a flat array. Return the order of its pieces."""
         count, joints, order = map(int, data[:START_IN].tolist())
         ends = _HEAD + count
         body, end = ends + 6 * joints, flat_size(data)
@@ -301,7 +340,7 @@ class Trajectory:
         return order
 
     def _beginning(self, order: int) -> tuple[Floats, Floats, Floats]:
-        """Return position, velocity and acceleration with which the first piece begins, or what it has."""
+        """Return position, velocity and acceleration at the first point."""
         if len(self._pieces):
             first = self._pieces[0]
             return first[0], first[1], first[2] * 2.0 if order > LINEAR else np.zeros_like(first[0])
@@ -310,7 +349,7 @@ class Trajectory:
 
     @property
     def end(self) -> Floats:
-        """Position of the last point, as it was asked, rad."""
+        """Position of the last point, rad"""
         position: Floats = self._last[0]
         return position
 
@@ -320,19 +359,22 @@ class Trajectory:
         return speeds
 
     def longest_steps(self, now: SplineSample, rows: NDArray[np.intp]) -> Floats:
-        """Return the longest way of each joint of `rows` from one point to the next, from `now` on, rad."""
+        """Return the largest step from one point to the next, rad, for each joint of `rows`.
+
+        The step from `now` to the first point counts as well.
+        """
         starts = self._pieces[:, 0, rows]
         points = np.concatenate([[now.position[rows], self._first[0, rows]], starts, [self._last[0, rows]]])
         steps: Floats = np.abs(np.diff(points, axis=0)).max(axis=0)
         return steps
 
     def first_way(self, now: SplineSample) -> Floats:
-        """Return the way from `now` to the first point, rad."""
+        """Return the displacement from `now` to the first point, rad."""
         way: Floats = self._first[0] - now.position
         return way
 
     def sample(self, t: float, sample: SplineSample) -> None:
-        """Write the desired state `t` s after `load`; after the end: at rest."""
+        """Write the desired state `t` s after `load`. After the end the joints are at rest."""
         if t < self.bridge_s:
             evaluate(self._bridge, max(t, 0.0), sample)
         elif t < self._tail_s:
@@ -356,7 +398,7 @@ class Trajectory:
 
 
 class Limits(NamedTuple):
-    """What joints keep when they pass into a trajectory and behind its end; shape (joints,) each."""
+    """Limits of joints on the bridge into a trajectory and in the stop after it, shape (joints,)"""
 
     speed: Floats
     """rad/s"""
@@ -368,26 +410,34 @@ class Limits(NamedTuple):
 
 
 class Stop:
-    """Joints that come to rest, each with a constant deceleration from its own velocity.
+    """Stop of joints. Each decelerates at a constant rate from its own velocity.
 
-    t_stop = |v| / a, and the way is |v| t_stop / 2, as joint_trajectory_controller of ros2_controllers does
-    on cancel (docs.ros.org, joint_trajectory_controller, "Decelerate on cancel"). Where a position limit is
-    nearer than that way, the deceleration is v**2 / (2 way to the limit): the limit goes before it.
+    The stop takes |v| / a and the distance |v|**2 / (2 a), as in joint_trajectory_controller of
+    ros2_controllers on cancel (docs.ros.org, joint_trajectory_controller, "Decelerate on cancel"). If a
+    position limit is closer than that, the deceleration rises to v**2 / (2 distance to the limit), because
+    the position limit has priority.
     """
 
     def __init__(self, joints: int) -> None:
         self._duration, self.end, self._pull = np.zeros((3, joints))
         self.duration_s = 0.0
-        """From `load` until all are at rest, s."""
+        """Time from `load` until all joints are at rest, s"""
 
     def load(self, now: SplineSample, deceleration: Floats, lower: Floats, upper: Floats) -> None:
-        """Begin to stop from position and velocity of `now`; limits shape (joints,), rad/s^2 and rad."""
+        """Start to stop from the position and velocity of `now`.
+
+        Args:
+            now: Present desired state.
+            deceleration: rad/s^2, shape (joints,).
+            lower: Lower position limit, rad, shape (joints,).
+            upper: Upper position limit, rad, shape (joints,).
+        """
         speed = np.abs(now.velocity)
         room = np.where(now.velocity > 0, upper - now.position, now.position - lower)
         needed = np.divide(speed * speed, 2.0 * room, out=np.full_like(room, np.inf), where=room > 0)
         needed = np.maximum(needed, deceleration)
         self._duration = speed / needed
-        # a joint that stops at once has none
+        # A joint that stops at once has no deceleration phase.
         self._pull = np.where(self._duration > 0, np.copysign(needed, now.velocity), 0.0)
         self.end = now.position + now.velocity * self._duration / 2.0
         self.duration_s = float(self._duration.max(initial=0.0))

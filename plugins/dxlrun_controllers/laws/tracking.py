@@ -1,4 +1,4 @@
-"""Tracking: velocities or efforts that make joints follow a desired motion: PID and feed-forward."""
+"""Tracking: PID and feed-forward that make joints follow a desired motion by velocities or efforts."""
 
 from __future__ import annotations
 
@@ -12,25 +12,25 @@ from dxlrun_controllers.laws.pid import Gains, Pid
 from dxlrun_controllers.laws.spline import SplineSample
 
 CLOSING_SPEED: Final = 0.5
-"""rad/s, posvel: the least speed for the rest of the way of a servo that lags; with the speed 0 of an end it
-would creep there at one tick (0.012 rad/s)."""
+"""Lowest profile velocity that `posvel` commands, rad/s. A lagging servo needs it for the rest of the
+distance: with the speed 0 at the end of a motion it would creep at one tick (0.012 rad/s)."""
 
 
 class TrackingGains(Gains):
-    """Gains of the law, and the effort that a motion needs by itself (Nm, A or fraction of maximum: u).
+    """Gains of PID law and feed-forward. u is the unit of the effort: Nm, A or fraction of maximum.
 
-    feed_forward is the viscous part, u s/rad. Sum as in L. Sciavicco, B. Siciliano, Modelling and Control of
-    Robot Manipulators (2000), section 7.2, for one joint without gravity.
+    `feed_forward` is the viscous term, u s/rad. The feed-forward is that of L. Sciavicco, B. Siciliano,
+    Modelling and Control of Robot Manipulators (2000), section 7.2, for one joint without gravity.
     """
 
     acceleration: Annotated[PerJoint[NotNegative], LIVE] = 0.0
-    """u s^2/rad, times the desired acceleration: the inertia."""
+    """Inertia, u s^2/rad. It is multiplied by the desired acceleration."""
     friction: Annotated[PerJoint[NotNegative], LIVE] = 0.0
-    """u, in the direction of the desired velocity: the dry friction."""
+    """Dry friction, u. It acts in the direction of the desired velocity."""
 
 
 class Tracking:
-    """Commands one interface of some joints so that they follow a desired state."""
+    """Tracking law that commands one interface so that joints follow a desired state"""
 
     def __init__(self, context: Context, interface: Literal["velocity", "effort"], filter_s: float) -> None:
         limits, commands = context.limits, context.commands
@@ -43,19 +43,19 @@ class Tracking:
         self._sent: Floats = context.goals.velocity if interface == "velocity" else context.goals.effort
 
     def take(self, gains: TrackingGains, joints: tuple[str, ...]) -> None:
-        """Take the gains."""
+        """Set the gains."""
         self._pid.take(gains, joints)
         self._velocity = row_of(gains.feed_forward, joints, 0.0)
         self._acceleration = row_of(gains.acceleration, joints, 0.0)
         self._friction = row_of(gains.friction, joints, 0.0)
 
     def begin(self, desired: SplineSample) -> None:
-        """Begin with the output that was last sent, or with 0."""
+        """Start from the command that was last sent, or from 0."""
         np.copyto(self._output, finite_or(self._sent, 0.0))
         self._pid.reset(self._output, desired.position - self._states.position, self._bias(desired))
 
     def update(self, desired: SplineSample, period_s: float) -> None:
-        """Command by the law, after `period_s`."""
+        """Update the commands, `period_s` after the last update."""
         states = self._states
         error, rate = desired.position - states.position, desired.velocity - states.velocity
         measured = np.isfinite(error) & states.valid

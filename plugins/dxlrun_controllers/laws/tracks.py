@@ -1,6 +1,7 @@
-"""Tracks: what each joint of a controller follows: one of several trajectories, a stop, or nothing.
+"""Tracks: trajectory or stop that each joint of a controller follows.
 
-A trajectory of some joints leaves the others on theirs: positions, velocities and accelerations go on.
+A new trajectory only moves its own joints. All other joints continue on their tracks without a jump in
+position, velocity or acceleration.
 """
 
 from __future__ import annotations
@@ -12,25 +13,26 @@ from dxlrun_controllers.laws.spline import Limits, SplineSample, Stop, Trajector
 
 
 class Track:
-    """A trajectory and the joints that follow it."""
+    """Trajectory and the joints that follow it"""
 
     def __init__(self, joints: int) -> None:
         self.trajectory = Trajectory(joints)
         self.joints = np.zeros(joints, dtype=np.bool_)
         self.ahead_s = 0.0
-        """By how much it began before the newest one."""
+        """Time by which this track started before the newest one, s"""
 
 
 class Tracks:
-    """The desired state of some joints, by the trajectories and the stop that they follow.
+    """Desired state of joints, from the trajectories and the stop that they follow.
 
-    All memory is made at once: each track that goes on has a joint, so one more is always free.
+    All memory is allocated by the constructor. Each playing track has a joint, so a pool of one track more
+    than joints always has a free one.
     """
 
     def __init__(self, joints: int) -> None:
         self.desired = SplineSample(joints)
         self.still = np.ones(joints, dtype=np.bool_)
-        """Joints that follow nothing: they are at rest."""
+        """True for each joint that follows neither a trajectory nor a stop, so is at rest"""
         self.stop = Stop(joints)
         self._stopping = np.zeros(joints, dtype=np.bool_)
         self._own = SplineSample(joints)
@@ -39,15 +41,21 @@ class Tracks:
 
     @property
     def playing(self) -> bool:
-        """True while a trajectory is followed."""
+        """True while a joint follows a trajectory"""
         return bool(self._playing)
 
     def free(self) -> Track:
-        """Return a track that no joint follows, for the next trajectory."""
+        """Return a free track for the next trajectory."""
         return next(track for track in self._pool if track not in self._playing)
 
     def follow(self, track: Track, moved: NDArray[np.bool_], clock_s: float) -> None:
-        """Let joints leave what they follow for a track that begins now, at `clock_s` of the one before."""
+        """Move joints to a track that starts now.
+
+        Args:
+            track: Free track with a loaded trajectory.
+            moved: True for each joint that moves to it.
+            clock_s: Time since the newest track started, s.
+        """
         for other in self._playing:
             other.joints &= ~moved
             other.ahead_s += clock_s
@@ -58,22 +66,26 @@ class Tracks:
         self.still &= ~moved
 
     def rest(self) -> None:
-        """Let the joints follow nothing any more."""
+        """End all tracks and the stop."""
         self._playing = ()
         self._stopping.fill(False)
         self.still.fill(True)
 
     def come_to_rest(self, limits: Limits) -> None:
-        """Let all joints come to rest from the desired state, from now on."""
+        """End all tracks and stop all joints from the desired state."""
         self.rest()
         self.stop.load(self.desired, limits.deceleration, limits.lower, limits.upper)
         self._stopping.fill(True)
         self.still.fill(False)
 
     def sample(self, clock_s: float, rate: float, slope: float, stop_s: float) -> None:
-        """Set the desired state: `clock_s` after the newest track began, `stop_s` after the stop did.
+        """Compute the desired state, and remove tracks that have ended.
 
-        The time of the tracks goes at `rate`, which changes by `slope`, 1/s. What has ended is left.
+        Args:
+            clock_s: Time since the newest track started, s.
+            rate: Speed of the tracks' clock relative to real time.
+            slope: Rate of change of `rate`, 1/s.
+            stop_s: Time since the stop started, s.
         """
         desired, own = self.desired, self._own
         if self._playing:

@@ -1,4 +1,4 @@
-"""ilc_controller: plays trajectories, and follows each of them better every time that it is repeated."""
+"""ilc_controller: play trajectories, and reduce the tracking error with each repetition."""
 
 from __future__ import annotations
 
@@ -25,69 +25,72 @@ from dxlrun_controllers.motions.learned_motions import LearnedMotion, LearnedMot
 from dxlrun_controllers.motions.trajectory_command import TrajectoryCommand
 
 TAIL_S: Final = 0.5
-"""After the end of a motion: the servos still arrive, and the correction that made them lead has to go."""
+"""Time after the end of a motion that is still recorded and corrected, s. The servos arrive in it, and the
+correction fades out."""
 WORSE: Final = 1.05
-"""An error that is larger than without a correction by this factor is one that the correction makes."""
+"""Factor on the error without a correction, above which the correction is to blame for the error"""
 LEAST: Final = math.radians(0.088)
-"""A tick of most servos: smaller errors are not compared."""
+"""Smallest error that is compared, rad: one tick of most servos"""
 FADE_S: Final = 0.2
-"""In which one correction passes into another where a motion gives no time for it."""
+"""Shortest time in which one correction fades into another, s"""
 STEP_NS: Final = 15_000
+"""Duration of one step of learning, ns, measured by tests/bench/controllers.py"""
 SHARE: Final = 0.05
-"""So much a step of learning takes (tests/bench/controllers.py), and so much of a period those of a cycle
-may."""
+"""Fraction of a period that the steps of learning in one cycle may take"""
 _SAME: Final = 1e-6
-"""rad, rad/s: goals so near to the commands were not clamped."""
+"""Largest difference of goal and command of a goal that was not clamped, rad and rad/s"""
 _NOT_LEARNED: Final = ("timeout", "goal_tolerance", "path_tolerance", "goal_time_tolerance")
-"""Fields of a trajectory that do not make it another motion."""
+"""Fields of a trajectory that do not change the identity of its motion"""
 _KEY_BYTES: Final = 6
-"""Of each of the two numbers of a motion's key: a float64 holds them exactly."""
+"""Bytes in each of the two numbers of a motion's key. A float64 represents them exactly."""
 
 
 class IlcParameters(TrajectoryParameters):
-    """Keys of an ilc_controller in the robot file: those of a joint_trajectory_controller, and these."""
+    """Keys of an ilc_controller in the robot file, in addition to those of a joint_trajectory_controller"""
 
     command_interface: Literal["position", "posvel"] = "position"
-    """The correction is added to the position; `posvel` commands the speed that belongs to it, too."""
+    """The correction is added to the position. `posvel` also commands the matching speed."""
     gain: Annotated[float, LIVE, Field(ge=0, le=1)] = 0.5
-    """L: the part of the error that a repetition corrects; 0 plays what was learned, and learns nothing."""
+    """Learning gain L: fraction of the error that a repetition corrects. With 0, the learned correction is
+    applied but does not change."""
     cutoff: Positive = 5.0
-    """Hz, of Q: what is faster is not learned. Lower it if a servo begins to shake."""
+    """Cut-off frequency of Q, Hz. Faster errors are not learned. Lower it if a servo begins to shake."""
     delay: Annotated[Duration, Field(ge=0, le=round(MOST_DELAY_S * 1e9))] | None = None
-    """By how much the servos lag behind; left out: as in the first repetition, each joint's own."""
+    """Tracking delay of the servos; by default it is measured in the first repetition, for each joint."""
     most: PerJoint[Annotated[Angle, Field(gt=0)]] = math.radians(10)
-    """The largest correction."""
+    """Largest correction, rad."""
     longest: Annotated[Duration, Field(gt=0)] = 40_000_000_000
-    """The longest motion that is learned."""
+    """Longest motion that is learned."""
     motions: Annotated[int, Field(ge=1, le=64)] = 4
-    """How many motions are remembered; of more, the one that was not played for longest is forgotten."""
+    """Number of motions that are remembered. A further one replaces the one that was played least recently..
+    """
     growth: Annotated[float, Field(gt=1)] = 2.0
-    """When the error is larger than the smallest one of this motion by more than this factor, or larger than
-    without a correction, twice in a row, what was learned is dropped."""
+    """Largest ratio of the error to the smallest error of the motion. The learned correction is dropped if
+    two repetitions in a row exceed it, or are worse than without a correction."""
 
 
 @dataclass(slots=True)
 class LearnedRepetition:
-    """Message of the topic `repetition`: how a motion was followed that can be learned from."""
+    """Message of the topic `repetition`: tracking error of a repetition that is usable for learning."""
 
     header: Header
     motion: str
-    """Which: the same for the same trajectory, joints and command interface."""
+    """Short name of the motion, which depends on trajectory, joints and command interface"""
     repetition: int
-    """How many were learned before this one."""
+    """Number of repetitions that were learned before this one"""
     error: float
-    """Root of the mean square of desired minus measured position, rad."""
+    """Root mean square of desired minus measured position, rad"""
     best: float
-    """The smallest one, rad."""
+    """Smallest error of this motion so far, rad"""
     correction: float
-    """The largest one that was added, rad."""
+    """Largest correction in this repetition, rad"""
 
 
 class IlcController(JointTrajectoryController):
-    """A joint_trajectory_controller that adds a learned correction, and learns after each repetition.
+    """joint_trajectory_controller that adds a learned correction, and updates it after each repetition.
 
-    Learning takes as many cycles as it needs, of each a bounded time, when the motion has ended. One that
-    begins meanwhile is corrected by what was learned before.
+    Learning starts when the motion has ended. It is spread over many cycles, and takes a bounded time in each
+    cycle. A motion that starts before learning has finished uses the previous correction.
     """
 
     Parameters = IlcParameters
@@ -100,13 +103,14 @@ class IlcController(JointTrajectoryController):
     def prepare(
         cls, kind: str, command: CommandModel, parameters: TrajectoryParameters
     ) -> NDArray[np.float64]:
-        """Return what a joint_trajectory_controller does, and the motion's key behind it: two numbers."""
+        """Return the array of a joint_trajectory_controller, followed by the motion's key (two numbers)."""
         data = super().prepare(kind, command, parameters)
         if not isinstance(command, TrajectoryCommand):
             return data
         if command.splice:
             raise ValueError("a motion that is learned begins by itself; take splice out")
-        # neither when it begins nor when it is given up is part of a motion: `dxlrun play` leads joints to it
+        # Start time, timeout and tolerances are not part of the motion: `dxlrun play` sets a start time so
+        # that the joints can move to the first point, and the key must not depend on it.
         motion = command.model_copy(update=dict.fromkeys(_NOT_LEARNED) | {"start_in": 0.0})
         digest = hashlib.sha256(super().prepare(kind, motion, parameters).tobytes())
         digest.update(repr((parameters.joints, parameters.command_interface)).encode())
@@ -115,9 +119,10 @@ class IlcController(JointTrajectoryController):
         return np.concatenate([data, np.array(key, np.float64)])
 
     def on_configure(self, context: Context) -> None:
-        """Make room for everything that is learned, and take what was kept.
+        """Allocate all memory for learning, and load the corrections that were kept.
 
-        Raises ValueError where that is more than can be kept.
+        Raises:
+            ValueError: The corrections would exceed the size that can be kept.
         """
         super().on_configure(context)
         parameters, count = self.parameters, len(context.joints)
@@ -129,40 +134,40 @@ class IlcController(JointTrajectoryController):
         self._known = LearnedMotions(parameters.motions, most_rows, context.period_ns, most)
         self._repetition = Repetition(count, most_rows, self._period_s, parameters.cutoff)
         self._correction, self._from, self._sent, self._sent_speed = np.zeros((4, count))
-        """What is added now; what it fades in from; what was commanded in the last cycle."""
+        """Present correction; correction at the start of the fade; last commanded position and speed"""
         self._fade_ns = self._faded_ns = 0
         self._playing: LearnedMotion | None = None
-        """Whose correction is played; None: none."""
+        """Motion whose correction is applied; None if there is none"""
         self._frozen = True
-        """The correction stays as it is."""
+        """True while the correction does not change"""
         self._key = (0.0, 0.0)
         self._judged = self._rows = 0
-        """Rows of the motion, and those with its tail."""
+        """Number of rows of the motion, without and with its tail"""
         self._row_ns = -1
-        """When row 0 was played."""
+        """Time of row 0, ns; -1 before it"""
         self._open = False
-        """This repetition can be learned from, until now."""
+        """True while the present repetition is usable for learning"""
         self._largest = 0.0
         self._pupil: LearnedMotion | None = None
-        """The motion that is being learned, by `_learning`."""
+        """Motion that `_learning` is updating"""
         self._learning: Iterator[None] = iter(())
         self._take_kept(context.kept)
 
     def on_activate(self, time_ns: int) -> None:
-        """Hold where the joints are, without a correction."""
+        """Hold the joints where they are, without a correction."""
         super().on_activate(time_ns)
         self._correction.fill(0.0)
         self._playing, self._frozen, self._open, self._row_ns = None, True, False, -1
 
     def on_deactivate(self, time_ns: int) -> None:
-        """Leave the goal and its repetition."""
+        """Drop the goal and end its repetition."""
         super().on_deactivate(time_ns)
         self._close()
 
     # A repetition
 
     def on_goal(self, goal: Goal, data: NDArray[np.float64], time_ns: int) -> None:
-        """Begin a trajectory with the correction of this motion, if it is known."""
+        """Start a trajectory, with the correction of this motion if there is one."""
         self._close()
         super().on_goal(goal, data, time_ns)
         if self._goal is not goal:
@@ -185,7 +190,7 @@ class IlcController(JointTrajectoryController):
             self._spoil("it is longer than `longest`")
 
     def _play(self, motion: LearnedMotion | None, time_ns: int) -> None:
-        """Let the correction pass into that of a motion, until its first point if there is a way to it."""
+        """Fade to the correction of a motion, until its first point or after FADE_S, whichever is later."""
         np.copyto(self._from, self._correction)
         self._playing, self._frozen = motion, False
         first_ns = self._start_ns + round(self._trajectory.bridge_s * 1e9)
@@ -193,7 +198,7 @@ class IlcController(JointTrajectoryController):
         self._faded_ns = max(first_ns, time_ns + round(FADE_S * 1e9))
 
     def _stop_from(self, time_ns: int) -> None:
-        """Let the correction stay as it is while the joints come to rest."""
+        """Freeze the correction while the joints come to rest."""
         super()._stop_from(time_ns)
         self._frozen = True
         self._spoil("it was not played to its end")
@@ -206,7 +211,7 @@ class IlcController(JointTrajectoryController):
             )
 
     def update(self, time_ns: int, period_ns: int) -> None:
-        """Command the trajectory's state with the correction; record how it is followed; learn."""
+        """Command the corrected state of the trajectory, record the tracking error, and learn."""
         row = -1 if self._frozen else self._row(time_ns)
         super().update(time_ns, period_ns)
         if self._open and row >= 0:
@@ -218,7 +223,7 @@ class IlcController(JointTrajectoryController):
             self._learn(time_ns)
 
     def _row(self, time_ns: int) -> int:
-        """Return which row of the motion this cycle is; -1 before the first one."""
+        """Return the row of the motion that belongs to this cycle, or -1 before the first."""
         if self._row_ns < 0:
             first_ns = self._start_ns + self._trajectory.bridge_s * 1e9
             if time_ns < first_ns - self.context.period_ns / 2:
@@ -231,7 +236,7 @@ class IlcController(JointTrajectoryController):
         return round((time_ns - self._row_ns) / self.context.period_ns)
 
     def _look(self, row: int, time_ns: int) -> None:
-        """Find what makes this repetition one that nothing can be learned from."""
+        """Discard the repetition if it is not usable for learning."""
         if self._rate != 1.0 or self._speed != 1.0:
             self._spoil("it is played at another speed")
             self._play(None, time_ns)
@@ -243,7 +248,7 @@ class IlcController(JointTrajectoryController):
             self._spoil("its goals were clamped")
 
     def _clamped(self) -> bool:
-        """Return whether the servos got other goals than those that were commanded in the last cycle."""
+        """Return True if the gate changed the commands of the last cycle."""
         goals = self.context.goals
         changed = np.abs(goals.position - self._sent)
         if self._interface == "posvel":
@@ -251,7 +256,7 @@ class IlcController(JointTrajectoryController):
         return bool(changed.max() > _SAME)
 
     def _correct(self, time_ns: int, row: int) -> None:
-        """Add the correction of this row to what is commanded, inside of the limits."""
+        """Add the correction of this row to the command, and clamp the sum to the position limits."""
         desired, before, correction = self._desired.position, self._correction, self._correction
         if not self._frozen:
             correction = np.zeros_like(before)
@@ -267,7 +272,7 @@ class IlcController(JointTrajectoryController):
             self._hurry((-before + self._correction) / self._period_s)
 
     def _hurry(self, added: Floats) -> None:
-        """Command the speed that belongs to the corrected position; `added` is the correction's, rad/s."""
+        """Command the speed of the corrected motion; `added` is the rate of the correction, rad/s."""
         speed = self.context.commands.velocity
         if not self._to_servos:
             np.add(self._desired.velocity, added, out=speed)
@@ -282,7 +287,7 @@ class IlcController(JointTrajectoryController):
     def _record(self) -> None:
         repetition, desired = self._repetition, self._desired.position
         judged = repetition.rows < self._judged
-        # joints that are not of this motion count as followed
+        # The error of joints that this motion does not move is 0.
         measured = np.where(self._unmoved, desired, self.context.states.position)
         repetition.record(desired, measured, self._correction, judged)
         if judged:
@@ -293,7 +298,7 @@ class IlcController(JointTrajectoryController):
     # Learning
 
     def _close(self) -> None:
-        """End the repetition, and begin to learn from it."""
+        """End the repetition, and start to learn from it."""
         if not self._open:
             return
         if self._row_ns < 0 or self._repetition.rows < self._judged:
@@ -328,8 +333,10 @@ class IlcController(JointTrajectoryController):
             )
 
     def _doubt(self, motion: LearnedMotion, error: float) -> None:
-        """Leave out a repetition that was followed much worse than another; at the second one in a row drop
-        what was learned: the servo is another one."""
+        """Ignore a repetition with a much larger error. Drop the correction at the second one in a row.
+
+        Two in a row mean that the servo or its load has changed.
+        """
         times = error / max(motion.best, LEAST)
         worse = f"its error, {math.degrees(error):.3f} deg, is {times:.1f} times the smallest one"
         if motion.grown == 1:
@@ -341,7 +348,7 @@ class IlcController(JointTrajectoryController):
         self.context.say(f"what was learned of motion {motion.name} is dropped: again {worse}")
 
     def _stay(self, motion: LearnedMotion) -> None:
-        """Let the correction stay as it is if it is that of a motion that was forgotten."""
+        """Freeze the correction if it belongs to a motion that was forgotten."""
         if motion is self._playing:
             self._frozen, self._playing = True, None
 

@@ -1,4 +1,4 @@
-"""joint_trajectory_controller: moves joints along a trajectory, sampled by time."""
+"""joint_trajectory_controller: move joints along a trajectory, sampled by time."""
 
 from __future__ import annotations
 
@@ -61,49 +61,51 @@ from dxlrun_controllers.motions.trajectory_command import (
 )
 
 SPEED_SLOPE: Final = 2.0
-"""1/s, how fast the speed of a trajectory changes: from 1 to 0 in 0.5 s, so no velocity ever jumps."""
+"""Rate of change of the speed factor, 1/s: from 1 to 0 in 0.5 s, so that no velocity jumps"""
 FEEDBACK_NS: Final = 100_000_000
+"""Time between two feedback messages of a goal, ns"""
 _STILL: Final = 1e-3
-"""A speed of the trajectory so near to 0 is none: its time stands still."""
+"""Speed factor below which the time of a trajectory counts as stopped"""
 
 
 class Tolerances(ParametersModel):
-    """How far a joint may be off, each one distance for all joints or a mapping by joint.
+    """Tolerances of joint positions, each one distance for all joints or a mapping by joint.
 
-    A goal may have its own in place of these.
+    A goal can override them.
     """
 
     path: PerJoint[Tolerance] | None = None
-    """On the way: beyond it the goal is aborted, and the joints come to rest; left out: not checked."""
+    """Tolerance on the way. Beyond it the goal is aborted, and the joints come to rest. By default the path
+    is not checked."""
     goal: PerJoint[Tolerance] | None = None
-    """At the end: the goal is reached when every joint is nearer than this; left out: the joint's own."""
+    """Tolerance at the end: the goal is reached when each joint is closer. The default is the joint's own."""
     goal_time: Duration | None = None
-    """How long after the end the goal may still be reached; left out: the joints' own."""
+    """Time after the end in which the goal may still be reached. The default is the joints' own."""
 
 
 class TrajectoryParameters(JointsParameters):
     """Keys of a joint_trajectory_controller in the robot file."""
 
     command_interface: Literal["position", "posvel", "velocity", "effort"] = "position"
-    """`posvel` commands the desired velocity beside the position: its magnitude to servos, with its sign to
-    another controller. `velocity` and `effort` follow it by a PID law with feed-forward."""
+    """`posvel` also commands the desired velocity: its magnitude to servos, and with its sign to another
+    controller. `velocity` and `effort` track the trajectory by a PID law with feed-forward."""
     tolerances: Tolerances = Tolerances()
     gains: TrackingGains | None = None
-    """Of `velocity` and `effort`."""
+    """Gains of `velocity` and `effort`."""
     derivative_filter: Duration = 0
-    """Time constant of the filter on the error's rate."""
+    """Time constant of the low-pass filter on the rate of the error."""
     deceleration: PerJoint[Annotated[AngularAcceleration, Field(gt=0)]] | None = None
-    """With which joints come to rest after a cancel or an abort; the joint's own limit if that is lower."""
+    """Deceleration after a cancel or an abort, rad/s^2; at most the joint's own acceleration limit."""
     wrap: tuple[str, ...] = ()
-    """Continuous joints that take the shorter way, as one turn more is the same place; left out: those with
-    `wrap: true`"""
+    """Continuous joints that take the shorter way, because whole turns do not matter. The default is all
+    joints with `wrap: true`."""
     speed: Annotated[float, LIVE, Field(ge=0, le=10)] = 1.0
-    """Factor of the trajectories' time: 0.5 is half as fast, 0 waits."""
+    """Speed factor of trajectories: 0.5 is half as fast, 0 pauses."""
 
     _own_velocity = model_validator(mode="before")(feed_velocities_forward)
 
     def mistakes(self) -> Iterator[Mistake]:
-        """Yield gains that are missing, or that count for nothing."""
+        """Yield missing gains, and gains that the command interface does not use."""
         yield from super().mistakes()
         tracks = self.command_interface in ("velocity", "effort")
         if tracks and self.gains is None:
@@ -120,11 +122,12 @@ class _Phase(Enum):
 
 
 class JointTrajectoryController(Controller[TrajectoryParameters]):
-    """Plays one goal at a time; a new one begins at the desired state of then, without a jump, and leaves the
-    joints that it does not name on their way.
+    """Controller that plays trajectories, one goal at a time.
 
-    Time decides the desired state, never the number of updates: a late cycle shortens nothing. Goals,
-    tolerances and partial joints as in joint_trajectory_controller of ros2_controllers (control.ros.org).
+    A new goal starts from the present desired state, without a jump. Joints that it does not name continue
+    their motion. The desired state depends on time and not on the number of updates, so late cycles do not
+    change the motion. Goals, tolerances and partial goals are those of joint_trajectory_controller of
+    ros2_controllers (control.ros.org).
     """
 
     Parameters = TrajectoryParameters
@@ -133,16 +136,17 @@ class JointTrajectoryController(Controller[TrajectoryParameters]):
 
     @classmethod
     def interfaces(cls, parameters: TrajectoryParameters, joints: tuple[str, ...]) -> Interfaces:
-        """Claim position, position and velocity, velocity, or effort of the parameters' joints."""
+        """Claim the interfaces of `command_interface` on the joints."""
         return Interfaces(parameters.joints, commanded_by(parameters.command_interface))
 
     @classmethod
     def prepare(
         cls, kind: str, command: CommandModel, parameters: TrajectoryParameters
     ) -> NDArray[np.float64]:
-        """Return the trajectory's splines as one flat array (spline.flatten), its joints and its time-out.
+        """Return the splines of the trajectory, its timeout, tolerances and joints as one flat array.
 
-        Raises ValueError for a wrong size, unknown joints, or times that do not grow.
+        Raises:
+            ValueError: The number of values is wrong, a joint is unknown, or the times do not increase.
         """
         if isinstance(command, ChunkCommand):
             return flat_chunk(command, parameters.joints, parameters.wrap)
@@ -154,11 +158,11 @@ class JointTrajectoryController(Controller[TrajectoryParameters]):
     def speed_peaks(
         cls, kind: str, data: NDArray[np.float64], parameters: TrajectoryParameters
     ) -> Iterator[SpeedPeak]:
-        """Yield the highest speed of each joint between the points, at the controller's factor of speed."""
+        """Yield the peak speed of each joint between the points, at the controller's speed factor."""
         return trajectory_speed_peaks(kind, data, parameters.joints, parameters.speed)
 
     def on_configure(self, context: Context) -> None:
-        """Make room for everything that the loop needs."""
+        """Allocate all memory that the loop needs."""
         super().on_configure(context)
         joints, limits, parameters = context.joints, context.limits, self.parameters
         count = len(joints)
@@ -166,14 +170,14 @@ class JointTrajectoryController(Controller[TrajectoryParameters]):
         self._still = self._tracks.still
         self._desired, self._path = self._tracks.desired, SplineSample(count)
         self._trajectory = self._tracks.free().trajectory
-        """What was begun last."""
+        """Trajectory that was started last"""
         self._error = np.zeros(count)
         self._moved, self._unmoved = np.ones(count, dtype=np.bool_), np.zeros(count, dtype=np.bool_)
-        """Joints of what was begun last, and all others."""
+        """Joints of the trajectory that was started last, and all other joints"""
         self._spliced: NDArray[np.float64] | None = None
-        """A trajectory whose start the joints wait for on the way of another one."""
+        """Trajectory that waits for its start while another one is played"""
         self._anchor_ns: int | None = None
-        """When the clock of a stream of chunks was 0; None: there is no stream."""
+        """Time at which the sender's clock of a stream of chunks was 0, ns; None without a stream"""
         self._moves = self._unknown = False
         self._phase = _Phase.RESTING
         self._goal: Goal | None = None
@@ -182,7 +186,7 @@ class JointTrajectoryController(Controller[TrajectoryParameters]):
         self._base_s = self._splice_s = 0.0
         self._speed = self._rate = parameters.speed
         self._slope = 0.0
-        """The speed that is wanted; that of now, and how fast it changes, 1/s."""
+        """Rate of change of the present speed factor `_rate` towards the requested one `_speed`, 1/s"""
         tolerances = parameters.tolerances
         self._own = GoalLimits(
             path=row_of(tolerances.path, joints),
@@ -192,11 +196,11 @@ class JointTrajectoryController(Controller[TrajectoryParameters]):
             settle_s=np.nan if tolerances.goal_time is None else tolerances.goal_time * 1e-9,
         )
         self._within = self._own
-        """Tolerances of the goal that is pursued."""
+        """Tolerances of the active goal"""
         self._lower, self._upper = limits.lower, limits.upper
         self._wrap = np.array([joint in parameters.wrap for joint in joints])
         self._turns = np.isinf(limits.upper) & np.isinf(limits.lower) & ~self._wrap
-        """Continuous joints to which a turn more is another place."""
+        """Continuous joints that count whole turns"""
         own = row_of(parameters.deceleration, joints, np.nan)
         deceleration = finite_or(np.fmin(own, limits.acceleration), DECELERATION)
         speed = self._speed_limit = finite_or(limits.velocity, np.inf)
@@ -205,7 +209,7 @@ class JointTrajectoryController(Controller[TrajectoryParameters]):
         self._interface = parameters.command_interface
         self._tracking: Tracking | None = None
         self._tracked = SplineSample(count)
-        """What it follows: the desired state, at rest while a joint is lost."""
+        """State that is tracked: the desired state, or at rest while a joint is lost"""
         if parameters.gains is not None:
             tracked: Literal["velocity", "effort"] = "velocity" if self._interface == "velocity" else "effort"
             self._tracking = Tracking(context, tracked, parameters.derivative_filter * 1e-9)
@@ -213,7 +217,7 @@ class JointTrajectoryController(Controller[TrajectoryParameters]):
         self._to_servos = not context.into
 
     def on_parameters(self, time_ns: int) -> None:
-        """Take the gains; the speed is reached with SPEED_SLOPE."""
+        """Set the gains and the speed factor, which is approached with SPEED_SLOPE."""
         if self._tracks.playing:
             self._base_s, self._base_ns = self._warped(time_ns), time_ns
         self._speed = self.parameters.speed
@@ -221,7 +225,7 @@ class JointTrajectoryController(Controller[TrajectoryParameters]):
             self._tracking.take(self.parameters.gains, self.context.joints)
 
     def on_activate(self, time_ns: int) -> None:
-        """Hold where the joints are."""
+        """Hold the joints where they are."""
         commands, states = self.context.commands, self.context.states
         self._phase, self._goal, self._spliced, self._anchor_ns = _Phase.RESTING, None, None, None
         self._tracks.rest()
@@ -237,13 +241,13 @@ class JointTrajectoryController(Controller[TrajectoryParameters]):
         self._unknown = True
 
     def on_deactivate(self, time_ns: int) -> None:
-        """Forget the goal: the runtime has ended it."""
+        """Drop the goal, which the runtime has ended."""
         self._goal = None
 
     # Goals
 
     def on_goal(self, goal: Goal, data: NDArray[np.float64], time_ns: int) -> None:
-        """Begin a trajectory from the desired state, or splice it into the one that is played."""
+        """Start a trajectory from the desired state, or splice it into the active one."""
         self._goal = self._spliced = None
         self._know_begin(time_ns)
         self._anchor_ns = None
@@ -260,7 +264,14 @@ class JointTrajectoryController(Controller[TrajectoryParameters]):
     def _begin(
         self, data: NDArray[np.float64], time_ns: int, clock_s: float, *, waited_s: float = 0.0
     ) -> None:
-        """Let the joints of a trajectory follow it, which begins `clock_s` after the one before did."""
+        """Start a trajectory on its joints.
+
+        Args:
+            data: Prepared trajectory.
+            time_ns: Time of the cycle, ns.
+            clock_s: Start, in the time of the trajectory before, s.
+            waited_s: Part of its `start_in` that has already passed, s.
+        """
         since_s, more = self._warped(time_ns) - clock_s, data[flat_size(data) :]
         count = len(self._moved)
         track, moved = self._tracks.free(), more[-count:] != 0
@@ -276,8 +287,8 @@ class JointTrajectoryController(Controller[TrajectoryParameters]):
             self._base_ns, self._base_s = time_ns, since_s
 
     def _warn_of_turns(self, trajectory: Trajectory, begin: SplineSample, rows: NDArray[np.intp]) -> None:
-        """Warn of steps by which a continuous joint, one of `rows`, turns the longer way."""
-        if not rows.size:  # the steps of thousands of points take milliseconds of the cycle
+        """Warn of steps in which a continuous joint, one of `rows`, turns by more than half a turn."""
+        if not rows.size:  # skip: the steps of thousands of points would take milliseconds of the cycle
             return
         for row, step in zip(rows.tolist(), trajectory.longest_steps(begin, rows).tolist(), strict=True):
             if step > np.pi * (1 + 1e-9):
@@ -287,7 +298,10 @@ class JointTrajectoryController(Controller[TrajectoryParameters]):
                 )
 
     def on_command(self, kind: str, data: NDArray[np.float64], time_ns: int) -> None:
-        """Pass into a chunk of positions; not where all of it is past, or a joint has not answered yet."""
+        """Blend into a chunk of positions.
+
+        The chunk is ignored if all of its points are in the past, or while a joint has not answered yet.
+        """
         self._know_begin(time_ns)
         if np.isnan(self._desired.position).any():
             return
@@ -309,11 +323,11 @@ class JointTrajectoryController(Controller[TrajectoryParameters]):
         self._trajectory, self._moved, self._unmoved = track.trajectory, moved, ~moved
 
     def on_cancel(self, goal: Goal, time_ns: int) -> None:
-        """Bring the joints to rest from their desired velocity; the goal ends when they are."""
+        """Stop the joints from their desired velocity. The goal ends when they are at rest."""
         self._stop_from(time_ns)
 
     def on_hold(self, time_ns: int) -> None:
-        """Bring the joints to rest from their desired velocity, and hold them there."""
+        """Stop the joints from their desired velocity, and hold them."""
         self._anchor_ns, self._moves = None, True
         if not self._still.all():
             self._stop_from(time_ns)
@@ -324,7 +338,7 @@ class JointTrajectoryController(Controller[TrajectoryParameters]):
         return self._phase is _Phase.MOVING
 
     def _know_begin(self, time_ns: int) -> None:
-        """Set the state from which something new begins now."""
+        """Update the desired state from which a new trajectory starts now."""
         if not self._tracks.playing:
             self._rate = 1.0 if not self._still.all() and self._speed <= _STILL else self._speed
             self._slope = 0.0 if self._rate == self._speed else -SPEED_SLOPE
@@ -332,21 +346,24 @@ class JointTrajectoryController(Controller[TrajectoryParameters]):
         self._know_where(time_ns)
 
     def _leave_stream(self) -> None:
-        """Forget the chunks that were streamed: the runtime holds the joints at their goals."""
+        """Drop the stream of chunks. The runtime holds the joints at their goals."""
         self._anchor_ns, self._phase = None, _Phase.RESTING
         self._tracks.rest()
         held = self.context.goals if self._tracking is None else self.context.states
         self._desired.rest_at(finite_or(held.position, self._desired.position))
 
     def _know_where(self, time_ns: int) -> None:
-        """Set the desired state of now."""
+        """Update the desired state."""
         if self._unknown:
             self._unknown = take_where_heard(self._desired.position, self.context.states)
         if not self._still.all():
             self._sample(time_ns)
 
     def _path_of(self, moved: NDArray[np.bool_]) -> SplineSample:
-        """Return the desired state with the derivatives of the path; zeros for joints that are not moved."""
+        """Return the desired state with derivatives by the path's own time, without the speed factor.
+
+        The derivatives are 0 for joints that are not moved.
+        """
         desired, path = self._desired, self._path
         path.rest_at(desired.position)
         if self._rate > _STILL:
@@ -357,9 +374,10 @@ class JointTrajectoryController(Controller[TrajectoryParameters]):
         return path
 
     def _refused_for_haste(self) -> bool:
-        """Abort a goal whose first point is too far away for its time: only now the way there is known.
+        """Abort a goal whose first point is too far away for its time. Return True if it was aborted.
 
-        A first point at time 0 is to be reached within a period.
+        The check needs the present position, so it is only possible when the goal starts. A first point at
+        time 0 must be reachable within one period.
         """
         trajectory, period_s = self._trajectory, self.context.period_ns * 1e-9
         way = np.abs(trajectory.first_way(self._path)) * self._moved * self._speed
@@ -383,7 +401,7 @@ class JointTrajectoryController(Controller[TrajectoryParameters]):
         return True
 
     def _end(self, outcome: Outcome, time_ns: int, text: str = "", row: int = -1) -> None:
-        """End the goal with the joint of `row`, or the one that is farthest off."""
+        """End the goal, and report the joint of `row`, or the one with the largest error if that is -1."""
         goal, self._goal = self._goal, None
         if goal is None:
             return
@@ -401,7 +419,7 @@ class JointTrajectoryController(Controller[TrajectoryParameters]):
     # In a cycle
 
     def update(self, time_ns: int, period_ns: int) -> None:
-        """Command the trajectory's state at `time_ns`; hold when there is none."""
+        """Command the desired state at `time_ns`. Hold without a trajectory."""
         if self._anchor_ns is not None and self.context.states.has_lost:
             self._leave_stream()
         if self._spliced is not None:
@@ -416,7 +434,7 @@ class JointTrajectoryController(Controller[TrajectoryParameters]):
         self._command(period_ns)
 
     def _splice(self, data: NDArray[np.float64], time_ns: int) -> None:
-        """Begin the trajectory that waits for its start, when that has come, from the state of then."""
+        """Start the waiting trajectory when its start time has come, from the desired state of that time."""
         if self._warped(time_ns) >= self._splice_s:
             self._spliced = None
             self._sample_at(self._splice_s, time_ns)
@@ -440,7 +458,7 @@ class JointTrajectoryController(Controller[TrajectoryParameters]):
             self._goal.feedback(elapsed / self._trajectory.duration_s, float(self._error.max()))
 
     def _sample(self, time_ns: int) -> float:
-        """Set the desired state of now; return how long the newest trajectory is played, s."""
+        """Update the desired state. Return the time of the newest trajectory, s."""
         elapsed = self._warped(time_ns) if self._tracks.playing else self._base_s
         self._sample_at(elapsed, time_ns)
         return elapsed
@@ -450,7 +468,7 @@ class JointTrajectoryController(Controller[TrajectoryParameters]):
         self._moves = True
 
     def _warped(self, time_ns: int) -> float:
-        """Return the trajectory's time, s: it goes at `speed`, toward which it changes with SPEED_SLOPE."""
+        """Return the time of the trajectory, s. Its rate approaches `speed` with SPEED_SLOPE."""
         since_s, wanted = (time_ns - self._base_ns) * 1e-9, self._speed
         if self._rate == wanted:
             self._slope = 0.0
@@ -466,7 +484,7 @@ class JointTrajectoryController(Controller[TrajectoryParameters]):
         return self._base_s
 
     def _hand_over(self, time_ns: int, text: str = "") -> None:
-        """Let the goal be judged by its last point, as it was asked."""
+        """Pass the goal to the runtime for judgement by its last point."""
         goal, self._goal = self._goal, None
         if goal is None:
             return
@@ -483,14 +501,14 @@ class JointTrajectoryController(Controller[TrajectoryParameters]):
     def _time_out(self, time_ns: int) -> None:
         text = f"after {(time_ns - self._start_ns) * 1e-9:.3f} s, its time-out"
         if self._spliced is not None and self._goal is not None:
-            # What is played is still the trajectory before: its end says nothing about this goal.
+            # The active trajectory is still the previous one, so its end must not decide this goal.
             joints = self._names_of(self._spliced[-len(self._moved) :] != 0)
             self._goal.end(Outcome.MISSED, f"{text}, before its start", joints=joints)
             self._goal = None
         self._hand_over(time_ns, text)
 
     def _stop_from(self, time_ns: int) -> None:
-        """Let all joints come to rest from their desired velocity."""
+        """Stop all joints from their desired velocity."""
         self._know_where(time_ns)
         self._brake(time_ns)
         self._sample(time_ns)
@@ -504,7 +522,7 @@ class JointTrajectoryController(Controller[TrajectoryParameters]):
     def _come_to_rest(self, time_ns: int) -> None:
         if self._still.all():
             self._phase = _Phase.RESTING
-            self._end(Outcome.CANCELLED, time_ns)  # any other end came before the stop
+            self._end(Outcome.CANCELLED, time_ns)  # other outcomes end the goal before the stop
 
     # Commands
 
@@ -512,7 +530,8 @@ class JointTrajectoryController(Controller[TrajectoryParameters]):
         commands, desired = self.context.commands, self._desired
         if self._tracking is not None:
             self._tracked.rows[1:] = 0.0
-            if not self.context.states.has_lost:  # else efforts carry the joints where they were
+            # While a joint is lost, the last position is tracked at rest, so that efforts carry the joints.
+            if not self.context.states.has_lost:
                 np.copyto(self._tracked.rows, desired.rows)
             self._tracking.update(self._tracked, period_ns * 1e-9)
             return
@@ -529,13 +548,13 @@ class JointTrajectoryController(Controller[TrajectoryParameters]):
     # How far off
 
     def _measure(self) -> None:
-        """Set the distance of the goal's joints from their desired positions, rad or m; 0 without a reply."""
+        """Compute the position errors of the goal's joints, rad or m. Joints without a reply have 0."""
         states = self.context.states
         self._error = np.where(states.valid, np.abs(states.position - self._desired.position), 0.0)
         np.copyto(self._error, 0.0, where=self._unmoved)
 
     def _find_off_path(self) -> int:
-        """Return the row of the joint that is farthest off its path, beyond a tolerance; -1: none is."""
+        """Return the row of the joint that violates its path tolerance with the largest error, or -1."""
         self._measure()
         states, within = self.context.states, self._within
         slip = np.abs(states.velocity - self._desired.velocity)

@@ -1,9 +1,8 @@
-"""keyframe_player: plays motions of poses, each with its time, a pause and torques, by their names.
+"""keyframe_player: play named motions of poses, each pose with a time, a pause and torque limits.
 
-The parts of a motion are those of ROBOTIS' motion pages (e-Manual, RoboPlus Motion): steps with a pose, a
-play time and a pause; of a page its repetitions, its speed and the next page. The way between two poses is a
-cubic here: Biagiotti and Melchiorri, Trajectory Planning for Automatic Machines and Robots (2008), section
-2.1.
+Motions are structured like ROBOTIS' motion pages (e-Manual, RoboPlus Motion). A step has a pose, a play time
+and a pause; a page has a number of repetitions, a speed and a next page. The way between two poses is a
+cubic: Biagiotti and Melchiorri, Trajectory Planning for Automatic Machines and Robots (2008), section 2.1.
 """
 
 from __future__ import annotations
@@ -57,41 +56,41 @@ from dxlrun_controllers.laws.spline import (
 from dxlrun_controllers.laws.tracking import CLOSING_SPEED
 
 HIGHEST_RATE = 10.0
-"""Of a motion's own time over the loop's: so few steps at most are passed in a period."""
+"""Highest ratio of a motion's time to the loop's time. It bounds the number of steps in one period."""
 PEAK = 1.5
-"""Highest speed of a cubic from rest to rest, over its mean speed."""
+"""Ratio of the peak speed to the mean speed of a cubic from rest to rest"""
 
 
 class Step(ParametersModel):
-    """A pose, how the joints go there, and how long they stay."""
+    """Pose with the motion that leads to it and the pause after it"""
 
     time: Annotated[Duration, Field(ge=10_000_000)]
-    """ns, of the way to the pose"""
+    """Time of the way to the pose."""
     pose: dict[str, Angle]
-    """Joints that it does not name stay where they were sent last."""
+    """Positions by joint, rad. A joint that is not named keeps its last goal."""
     pause: Duration = 0
-    """ns, at the pose"""
+    """Time at the pose."""
     torque: dict[str, Annotated[float, Field(gt=0)]] = Field(default_factory=dict)
-    """The most that a joint's servo may exert from this step on, in the unit that the model measures (Nm, A
-    or the fraction of its maximum)."""
+    """Effort limits by joint from this step on, in the unit that the model measures (Nm, A or the fraction of
+    its maximum)."""
     interpolation: Literal["smooth", "linear"] = "smooth"
-    """`smooth` begins and ends at rest; `linear` has one speed all the way."""
+    """`smooth` starts and ends at rest; `linear` has a constant speed."""
 
 
 class Motion(ParametersModel):
-    """A motion: its steps, one after the other, and perhaps another motion after it."""
+    """Sequence of steps, and optionally the motion that follows"""
 
     steps: Annotated[tuple[Step, ...], Field(min_length=1)]
-    """Poses, one after the other."""
+    """Steps of the motion."""
     repeat: Annotated[int, Field(ge=1, le=10_000)] = 1
-    """How often the steps are played."""
+    """Number of times that the steps are played."""
     speed: Annotated[float, Field(gt=0, le=10)] = 1.0
-    """What all times and pauses are divided by."""
+    """Divisor of all times and pauses."""
     next: str | None = None
-    """The motion that is played after it."""
+    """Name of the motion that follows."""
 
     def duration_s(self, repeat: int) -> float:
-        """Return how long it takes at speed 1 of the goal."""
+        """Return the duration with `repeat` repetitions, at the goal's speed 1, s."""
         return repeat * sum(step.time * 1e-9 + step.pause * 1e-9 for step in self.steps) / self.speed
 
 
@@ -99,29 +98,29 @@ class KeyframeParameters(ParametersModel):
     """Keys of a keyframe_player in the robot file."""
 
     joints: JointNames
-    """Its joints."""
+    """Joints of the controller."""
     motions: Annotated[dict[str, Motion], Field(min_length=1)]
-    """Motions by their names."""
+    """Motions by name."""
     command_interface: Literal["position", "posvel"] = "position"
-    """`posvel` commands the speed beside the position; where a step names torques, efforts are too."""
+    """`posvel` also commands the speed. Efforts are commanded as well if a step has torque limits."""
     approach: Annotated[AngularVelocity, Field(gt=0)] = 1.0
-    """rad/s; on the way to the first pose of a goal no joint is faster, the way takes longer instead"""
+    """Highest speed of a joint on the way to the first pose, rad/s. The way takes longer if necessary."""
     tolerance: Tolerance | None = None
-    """How far a joint may be off at the end; left out: its own tolerance."""
+    """Position tolerance at the end; by default the joint's own."""
     settle: Duration | None = None
-    """ns after the end in which the tolerance may still be reached; left out: the joints' own"""
+    """Time after the end in which the tolerance may still be reached; by default the joints' own."""
     wrap: tuple[str, ...] = ()
-    """Continuous joints that take the shorter way, as one turn more is the same place; left out: those with
-    `wrap: true`"""
+    """Continuous joints that take the shorter way, because whole turns do not matter. The default is all
+    joints with `wrap: true`."""
     speed: Annotated[float, Field(gt=0, le=10), LIVE] = 1.0
-    """What all motions are sped up by."""
+    """Speed factor of all motions."""
     partial: bool = False
-    """Joints without torque are left out; without it none may be without."""
+    """If true, joints without torque are skipped. If false, all joints must have torque."""
     start: str | None = None
-    """The motion that begins whenever the controller is activated, but not after a joint regained torque."""
+    """Motion that starts whenever the controller is activated, except after a joint has regained torque."""
 
     def mistakes(self) -> Iterator[Mistake]:
-        """Yield names of motions and joints that there are not, and circles of motions."""
+        """Yield unknown names of motions and joints, and motions that follow each other in a circle."""
         yield from super().mistakes()
         known = f"there are {', '.join(self.motions)}"
         for index, joint in enumerate(self.wrap):
@@ -143,7 +142,7 @@ class KeyframeParameters(ParametersModel):
             yield ("motions", circle[0], "next"), f"motions follow each other in a circle: {way}; end it"
 
     def _circles(self) -> Iterator[list[str]]:
-        """Yield the motions of each circle, from its first one in the file."""
+        """Yield the motions of each circle, starting with the first one in the file."""
         done: set[str] = set()
         for name in self.motions:
             way: list[str] = []
@@ -156,20 +155,20 @@ class KeyframeParameters(ParametersModel):
                 yield way[way.index(after) :]
 
     def chain(self, name: str | None) -> Iterator[str]:
-        """Yield a motion and those that follow it, by their names."""
+        """Yield the names of a motion and of all motions that follow it."""
         while name is not None:
             yield name
             name = self.motions[name].next
 
     def steps(self, first: str, repeat: int) -> Iterator[tuple[str, int, Step]]:
-        """Yield the steps that are played, with the name of their motion and their number in it."""
+        """Yield all steps as they are played, with the name of the motion and the step's number (from 1)."""
         for name in self.chain(first):
             for _ in range(repeat if name == first else self.motions[name].repeat):
                 for number, step in enumerate(self.motions[name].steps, 1):
                     yield name, number, step
 
     def first_torque(self) -> tuple[str | int, ...]:
-        """Return the key of the first step's torque that is limited; empty: none is."""
+        """Return the path of the first key `torque` with a limit, or an empty path."""
         steps = (
             ("motions", name, "steps", number, "torque")
             for name, motion in self.motions.items()
@@ -180,20 +179,20 @@ class KeyframeParameters(ParametersModel):
 
 
 class PlayCommand(CommandModel):
-    """A goal: a motion, by its name, and how."""
+    """Goal of a keyframe_player: a motion, its speed and its repetitions."""
 
     motion: str
     speed: Annotated[float, Field(gt=0, le=10)] = 1.0
-    """What all times and pauses are divided by, beside the motion's own speed."""
+    """Divisor of all times and pauses, in addition to the motion's own speed"""
     repeat: Annotated[int, Field(ge=1, le=10_000)] | None = None
-    """In place of the motion's own number; not of the motions that follow it."""
+    """Number of repetitions in place of the motion's own. Motions that follow keep theirs."""
 
 
 class KeyframePlayer(Controller[KeyframeParameters]):
-    """Plays one motion at a time; the last pose is held.
+    """Controller that plays one motion at a time and holds the last pose.
 
-    A motion begins where the joints were sent last, with their speed of then; a new goal takes over like
-    that, too. After a cancel each joint decelerates to a stop, by its limit of the acceleration.
+    A motion starts from the last goals of the joints and their present speed, also when a new goal replaces
+    an active one. After a cancel each joint decelerates to a stop, at its acceleration limit.
     """
 
     Parameters = KeyframeParameters
@@ -202,7 +201,7 @@ class KeyframePlayer(Controller[KeyframeParameters]):
 
     @classmethod
     def interfaces(cls, parameters: KeyframeParameters, joints: tuple[str, ...]) -> Interfaces:
-        """Claim position, perhaps velocity, and effort where a step limits a torque."""
+        """Claim position, velocity for `posvel`, and effort if a step has torque limits."""
         command = commanded_by(parameters.command_interface)
         key = parameters.first_torque()
         return Interfaces(
@@ -214,7 +213,7 @@ class KeyframePlayer(Controller[KeyframeParameters]):
 
     @classmethod
     def motions(cls, parameters: KeyframeParameters) -> Mapping[str, float]:
-        """Return the motions with their lengths at speed 1, those that follow them included, s."""
+        """Return the duration of each motion at speed 1, including the motions that follow, s."""
         known = parameters.motions
         lengths = {name: motion.duration_s(motion.repeat) for name, motion in known.items()}
         return {name: sum(map(lengths.__getitem__, parameters.chain(name))) for name in known}
@@ -223,9 +222,9 @@ class KeyframePlayer(Controller[KeyframeParameters]):
     def speed_peaks(
         cls, kind: str, data: NDArray[np.float64], parameters: KeyframeParameters
     ) -> Iterator[SpeedPeak]:
-        """Yield the highest speed of each joint on the ways between poses; the first pose is approached.
+        """Yield the peak speed of each joint between poses.
 
-        A joint that a motion does not name before a pose comes there from where it was: its way is not known.
+        The way of a joint to its first pose is not included, because its start is unknown.
         """
         names = list(parameters.motions)
         first, speed, repeat = names[int(data[0])], float(data[1]), int(data[2])
@@ -235,7 +234,7 @@ class KeyframePlayer(Controller[KeyframeParameters]):
         for name in parameters.chain(first):
             motion = parameters.motions[name]
             rate = min(speed * motion.speed * parameters.speed, HIGHEST_RATE)
-            # the third repetition goes the ways of the second one
+            # From the second repetition on, all repetitions are the same.
             rounds = min(repeat if name == first else motion.repeat, 2)
             for number, step in [*enumerate(motion.steps, 1)] * rounds:
                 moved = [joint for joint in step.pose if joint in at]
@@ -260,7 +259,7 @@ class KeyframePlayer(Controller[KeyframeParameters]):
 
     @classmethod
     def prepare(cls, kind: str, command: CommandModel, parameters: KeyframeParameters) -> NDArray[np.float64]:
-        """Return the motion's number, speed, and repetitions. Raises ValueError for an unknown motion."""
+        """Return index, speed and repetitions of the motion. Raises ValueError for an unknown motion."""
         if not isinstance(command, PlayCommand):
             return super().prepare(kind, command, parameters)
         names = list(parameters.motions)
@@ -270,7 +269,7 @@ class KeyframePlayer(Controller[KeyframeParameters]):
         return np.array([names.index(command.motion), command.speed, repeat])
 
     def on_configure(self, context: Context) -> None:
-        """Make room for everything that the loop needs."""
+        """Allocate all memory that the loop needs."""
         super().on_configure(context)
         parameters, count = self.parameters, len(context.joints)
         self._lower, self._upper = context.limits.lower, context.limits.upper
@@ -279,27 +278,27 @@ class KeyframePlayer(Controller[KeyframeParameters]):
         self._posvel = parameters.command_interface == "posvel"
         self._wrap = np.array([joint in parameters.wrap for joint in context.joints])
         self._now = SplineSample(count)
-        """Where the joints are sent, rad, and how fast, in rad a second of the motion's own time."""
+        """Present goals, rad, and velocities by the motion's own time, rad/s"""
         self._piece = np.zeros((CUBIC, count))
         self._ends = np.zeros((2, 2, count))
-        """Position and velocity at the beginning and at the end of a step."""
+        """Position and velocity at the start and at the end of a step"""
         self._stop = Stop(count)
         self._deceleration = finite_or(context.limits.acceleration, DECELERATION)
         self._order = CUBIC
         self._limp = np.zeros(count, dtype=np.bool_)
-        """Joints without torque now; none unless `partial`."""
+        """Joints that have no torque now; only used with `partial`"""
         self._out = np.zeros(count, dtype=np.bool_)
-        """Joints that are left out until the next step: they stay where they had no torque last."""
+        """Joints that are skipped until the next step. They hold where they last had no torque."""
         self._asked = np.full(count, np.nan)
-        """rad, the newest pose of each joint as it was asked, before its limits; NaN: none."""
+        """Newest requested pose of each joint before clamping, rad; NaN without one"""
         self._missed = np.zeros(count, dtype=np.bool_)
-        """Joints that were left out of the goal for a while."""
+        """Joints that were skipped in a part of the goal"""
         self._stand = np.zeros(count)
-        """rad, where joints without torque stand."""
+        """Last measured positions of joints without torque, rad"""
         self._rate = 1.0
 
     def on_activate(self, time_ns: int) -> None:
-        """Hold where the joints are."""
+        """Hold the joints where they are."""
         hold(self.context)
         self._now.rest_at(self.context.commands.position)
         self._limp.fill(False)
@@ -310,16 +309,16 @@ class KeyframePlayer(Controller[KeyframeParameters]):
         self._starting = self.parameters.start is not None
 
     def on_restart(self, time_ns: int) -> None:
-        """Hold where the joints are; a client may play the motion of the activation again."""
+        """Hold the joints where they are. The motion `start` does not start again; a client can play it."""
         self.on_activate(time_ns)
         self._starting = False
 
     def on_deactivate(self, time_ns: int) -> None:
-        """Leave the goal: the runtime ends it."""
+        """Drop the goal, which the runtime ends."""
         self._goal = None
 
     def on_goal(self, goal: Goal, data: NDArray[np.float64], time_ns: int) -> None:
-        """Begin a motion where the joints are sent, with their speed."""
+        """Start a motion from the present goals and velocities."""
         if self._unknown:
             self._hold_where_heard()
         if ends_unheard(goal, self._now.position, self.context.joints):
@@ -328,7 +327,7 @@ class KeyframePlayer(Controller[KeyframeParameters]):
         self._begin(list(self.parameters.motions)[int(data[0])], float(data[1]), int(data[2]))
 
     def _begin(self, motion: str, speed: float, repeat: int) -> None:
-        """Begin a motion where the joints are sent, with their speed."""
+        """Start a motion from the present goals and velocities."""
         self._now.velocity *= self._rate if self._playing or self._stopping else 0.0
         self._playing, self._stopping, self._starting = True, False, False
         self._asked.fill(np.nan)
@@ -344,10 +343,10 @@ class KeyframePlayer(Controller[KeyframeParameters]):
         self._next_step(softly=True)
 
     def on_cancel(self, goal: Goal, time_ns: int) -> None:
-        """Bring each joint to rest by its deceleration."""
+        """Decelerate each joint to rest."""
         if self._stopping:
             return
-        if not self._playing:  # at the end, where its goal is judged
+        if not self._playing:  # the motion is over, and the runtime is judging its goal
             return
         self._now.velocity *= self._rate
         self._rate = 1.0
@@ -355,7 +354,7 @@ class KeyframePlayer(Controller[KeyframeParameters]):
         self._playing, self._stopping, self._time_s = False, True, 0.0
 
     def update(self, time_ns: int, period_ns: int) -> None:
-        """Command the pose of this moment; the last one is held."""
+        """Command the present pose. Hold the last one after the end."""
         dt = period_ns * 1e-9
         if self.parameters.partial:
             self._leave_out()
@@ -369,9 +368,9 @@ class KeyframePlayer(Controller[KeyframeParameters]):
             self._hold_where_heard()
 
     def _leave_out(self) -> None:
-        """Let joints without torque be where they stand, and command them to stay there."""
+        """Skip joints without torque, and command their measured positions."""
         states = self.context.states
-        if states.has_lost:  # whether it has torque is known when it is back
+        if states.has_lost:  # the torque state of a lost servo is unknown until it returns
             return
         for row in range(self._limp.size):
             self._limp[row] = states.unable((row,)) is not None
@@ -387,14 +386,14 @@ class KeyframePlayer(Controller[KeyframeParameters]):
         self._now.velocity[self._out] = 0.0
 
     def _start(self) -> None:
-        """Begin the motion of the activation, as soon as all joints have answered."""
+        """Start the motion of the activation once all joints have answered."""
         if self._unknown:
             self._hold_where_heard()
         if not self._unknown and self.parameters.start is not None:
             self._begin(self.parameters.start, 1.0, self.parameters.motions[self.parameters.start].repeat)
 
     def _hold_where_heard(self) -> None:
-        """Hold joints that had not answered at the activation where they are heard first."""
+        """Hold joints that had not answered at the activation at their first measured positions."""
         self._unknown = take_where_heard(self._now.position, self.context.states)
         np.copyto(self.context.commands.position, self._now.position)
 
@@ -428,11 +427,18 @@ class KeyframePlayer(Controller[KeyframeParameters]):
             self._goal.feedback(min(self._done_s / self._total_s, 1.0), self._worst()[0])
 
     def _reach(self) -> None:
-        """Be at the end of the step, at rest."""
+        """Set the state to the end of the step, at rest."""
         self._now.rest_at(self._ends[1, 0])
 
     def _next_step(self, softly: bool = False) -> bool:
-        """Begin the next step from here; false: there is none. `softly`: not faster than the approach."""
+        """Start the next step from the present state.
+
+        Args:
+            softly: Limit the speed to `approach`.
+
+        Returns:
+            False if there are no more steps.
+        """
         following = next(self._steps, None)
         if following is None:
             return False
@@ -440,7 +446,7 @@ class KeyframePlayer(Controller[KeyframeParameters]):
         if name != self._name:
             before, self._name = self._rate, name
             self._rate = self._wanted_rate()
-            self._time_s *= self._rate / before  # what is left of the period
+            self._time_s *= self._rate / before  # the rest of the period passes at the new rate
         start, end = self._ends
         joints = self.context.joints
         pose, torque = row_of(step.pose, joints, np.nan), row_of(step.torque, joints, np.nan)
@@ -481,14 +487,14 @@ class KeyframePlayer(Controller[KeyframeParameters]):
         if not self._posvel:
             return
         velocity = now.velocity * self._rate
-        if not self.context.into:  # of a reference with its sign, of a servo the magnitude
+        if not self.context.into:  # a reference is signed, but a servo gets the magnitude
             velocity = np.maximum(np.abs(velocity), self._closing)
         np.copyto(commands.velocity, velocity)
 
     # The end
 
     def _hand_over(self) -> None:
-        """Let the goal be judged by the last pose of each joint, as it was asked."""
+        """Pass the goal to the runtime for judgement by the last requested pose of each joint."""
         moved, text = self._moved_joints(f"played {self._name}")
         if not moved:
             self._finish(Outcome.ABORTED, f"played {self._name}")
@@ -502,22 +508,21 @@ class KeyframePlayer(Controller[KeyframeParameters]):
         goal.judge(self._asked.copy(), joints=moved, tolerances=tolerances, text=text)
 
     def _worst(self) -> tuple[float, str]:
-        """Return the largest distance from what is commanded, rad, and of which joint; infinite where a servo
-        does not answer."""
+        """Return the largest position error, rad, and its joint; infinite for a servo without a reply."""
         states = self.context.states
         error = np.where(states.valid, np.abs(states.position - self.context.commands.position), np.inf)
         row = int(error.argmax())
         return float(error[row]), self.context.joints[row]
 
     def _finish(self, outcome: Outcome, text: str) -> None:
-        """End the goal without a judgement."""
+        """End the goal without judgement."""
         goal, self._goal = self._goal, None
         if goal is not None:
             (worst, joint), (_, text) = self._worst(), self._moved_joints(text)
             goal.end(outcome, text, joint, worst)
 
     def _moved_joints(self, text: str) -> tuple[list[str], str]:
-        """Return the joints that the goal moves now, and a text with those that were left out of it."""
+        """Return the joints that the goal moves now, and append the skipped joints to a text."""
         joints = self.context.joints
         named = {joint for motion in self._motions for step in motion.steps for joint in step.pose}
         moved = [each for each, out in zip(joints, self._out, strict=True) if each in named and not out]

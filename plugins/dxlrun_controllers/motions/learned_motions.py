@@ -1,4 +1,4 @@
-"""Learned motions: the corrections of the motions that an ilc_controller remembers, and how they are kept."""
+"""Learned motions: store of the corrections of an ilc_controller, and their binary format between runs."""
 
 from __future__ import annotations
 
@@ -13,54 +13,63 @@ from dxlrun import Floats
 from dxlrun_controllers.laws.learning import MOST_DELAY_S, Table
 
 Key = tuple[float, float]
-"""What a motion is known by."""
+"""Identity of a motion: two numbers from a hash of its trajectory"""
 
 _MOST_KEPT: Final = 1 << 20
-"""Bytes, of `Context.keep`."""
+"""Bytes; the limit of `Context.keep`"""
 _FORM: Final = 1
+"""Version of the binary format"""
 _HEAD: Final = struct.Struct("<IqII")
-"""Form, period (ns), joints, motions; of each motion:"""
+"""Header: version, period (ns), number of joints, number of motions"""
 _ENTRY: Final = struct.Struct("<ddIIdd")
-"""Key, rows, repetitions, first and smallest error; its delays as float64 and its table as float32 follow."""
+"""Motion: key, rows, repetitions, first and smallest error. Delays (float64) and table (float32) follow."""
 
 
 def motion_name(key: Key) -> str:
-    """Return a short name for people."""
+    """Return a short name of a motion for messages."""
     return f"{int(key[0]):012x}"[:8]
 
 
 class LearnedMotion(msgspec.Struct):
-    """A motion that is remembered."""
+    """Motion with a learned correction"""
 
     key: Key
     rows: int
     first: float
-    """Error without a correction, rad."""
+    """Error without a correction, rad"""
     best: float
-    """The smallest one, rad."""
+    """Smallest error, rad"""
     delay_s: Floats
+    """s, shape (joints,)"""
     repetitions: int = 0
     place: int = -1
-    """Of its table; -1: it has none yet."""
+    """Index of the table; -1 without one"""
     grown: int = 0
-    """How many times in a row the error was too large."""
+    """Number of consecutive repetitions with a too large error"""
 
     @property
     def name(self) -> str:
-        """A short name for people."""
+        """Short name for messages"""
         return motion_name(self.key)
 
 
 class LearnedMotions:
-    """A bounded number of motions with their tables; all memory is made at once.
+    """Bounded store of motions and their tables. All memory is allocated by the constructor.
 
-    There is one table more than motions: the next one is written while the one before is played.
+    There is one table more than motions, because the next table is written while the previous one is played.
     """
 
     def __init__(self, motions: int, rows: int, period_ns: int, most: Floats) -> None:
-        """`rows`: of the longest motion; `most`: largest correction, shape (joints,), rad.
+        """Allocate the tables.
 
-        Raises ValueError where that is more than can be kept.
+        Args:
+            motions: Largest number of motions.
+            rows: Rows of the longest motion.
+            period_ns: Time between two rows, ns.
+            most: Largest correction, rad, shape (joints,).
+
+        Raises:
+            ValueError: The motions would exceed the size that can be kept.
         """
         joints = len(most)
         size = _HEAD.size + motions * (_ENTRY.size + joints * (8 + 4 * rows))
@@ -75,38 +84,38 @@ class LearnedMotions:
         self._tables: NDArray[np.float32] = np.zeros((motions + 1, joints, rows), np.float32)
         self._free: list[int] = []
         self._known: list[LearnedMotion] = []
-        """The one that was played last is the last one."""
+        """Motions, the least recently played one first"""
         self.clear()
 
     def clear(self) -> None:
-        """Forget all of them."""
+        """Forget all motions."""
         self._known = []
         self._free = list(range(len(self._tables)))
 
     def found(self, key: Key) -> LearnedMotion | None:
-        """Return the motion with this key, if it is remembered."""
+        """Return the motion with this key, or None."""
         return next((motion for motion in self._known if motion.key == key), None)
 
     def touch(self, motion: LearnedMotion) -> None:
-        """Note that a motion is played: the one for which that is longest ago is forgotten first."""
+        """Mark a motion as played most recently. The least recently played one is forgotten first."""
         self._known.remove(motion)
         self._known.append(motion)
 
     def row(self, motion: LearnedMotion, row: int) -> Table:
-        """Return the correction of a row, shape (joints,), rad; before and behind all rows the nearest."""
+        """Return the correction of a row, rad, shape (joints,). The row is clamped to those of the motion."""
         correction: Table = self._tables[motion.place, :, min(max(row, 0), motion.rows - 1)]
         return correction
 
     def table(self, motion: LearnedMotion) -> Table | None:
-        """Return all its rows; None where it has none yet."""
+        """Return the correction of a motion, or None if it has none yet."""
         return None if motion.place < 0 else self._tables[motion.place, :, : motion.rows]
 
     def next_table(self, motion: LearnedMotion) -> Table:
-        """Return where its next table is written, before `learned` puts it in the place of the one before."""
+        """Return the free table for the next correction. `learned` makes it the current one."""
         return self._tables[self._free[0], :, : motion.rows]
 
     def learned(self, motion: LearnedMotion) -> LearnedMotion | None:
-        """Take the next table of a motion; return the motion that was forgotten for it, if one was."""
+        """Make the next table of a motion its current one. Return the motion that was replaced, or None."""
         forgotten = None
         if motion.place >= 0:
             self._free.append(motion.place)
@@ -125,7 +134,7 @@ class LearnedMotions:
         self._free.append(motion.place)
 
     def packed(self) -> bytes:
-        """Return all of them, to be kept."""
+        """Serialize all motions."""
         parts = [_HEAD.pack(_FORM, self._period_ns, len(self._most), len(self._known))]
         for one in self._known:
             parts.append(_ENTRY.pack(*one.key, one.rows, one.repetitions, one.first, one.best))
@@ -134,9 +143,13 @@ class LearnedMotions:
         return b"".join(parts)
 
     def unpack(self, data: bytes) -> None:
-        """Take what `packed` returned; what does not fit into `motions` and the longest one is left out.
+        """Load the motions from the bytes that `packed` returned. Motions that do not fit are omitted.
 
-        Raises ValueError and struct.error for what is not of this controller; then some are taken already.
+        On an error, some motions are loaded already.
+
+        Raises:
+            ValueError: Version, period, joints or values do not fit this controller.
+            struct.error: The data is truncated.
         """
         form, period_ns, joints, count = _HEAD.unpack_from(data)
         if form != _FORM:

@@ -1,6 +1,6 @@
-"""sample_player: plays a table of goals, one row a period, and gives up when a joint leaves its bounds.
+"""sample_player: play a table of goals, one row per period, and abort when a joint leaves its bounds.
 
-For measurements: what is commanded is the table and nothing else, whatever the joints answer.
+It is meant for measurements: the commands are exactly the rows of the table, without any feedback.
 """
 
 from __future__ import annotations
@@ -41,33 +41,33 @@ from dxlrun_controllers.laws.spline import DECELERATION, SplineSample, Stop
 from dxlrun_controllers.motions.trajectory_command import Near
 
 _HEAD: Final = 3
-"""Numbers in front of the rows of a goal."""
+"""Length of the header before the rows of a goal"""
 MOST_PIECES: Final = 256
-"""Of one table: the `rows` commands before its goal, and the goal's own rows."""
+"""Largest number of pieces of a table: the `rows` commands before its goal, and the goal's own rows"""
 
 
 class Bounds(ParametersModel):
-    """What ends a goal as aborted; what is left out is not checked."""
+    """Bounds whose violation aborts a goal. A bound that is not given is not checked."""
 
     range: dict[str, tuple[Angle, Angle]] = Field(default_factory=dict)
-    """Lowest and highest position by joint, rad; rows beyond it are refused."""
+    """Lowest and highest position by joint, rad. Rows beyond it are rejected."""
     temperature: Annotated[float, Field(gt=0)] | None = None
-    """The highest, deg C."""
+    """Highest temperature, deg C."""
     effort: PerJoint[Positive] | None = None
-    """The highest measured, Nm, A or the fraction of maximum; its magnitude counts."""
+    """Highest magnitude of the measured effort, Nm, A or the fraction of maximum."""
     age: Annotated[Duration, Field(gt=0)] | None = None
-    """The greatest age of a joint's state."""
+    """Largest age of a joint's state."""
 
 
 class SampleParameters(JointsParameters):
     """Keys of a sample_player in the robot file."""
 
     command_interface: Literal["position", "posvel", "velocity", "effort", "pwm"] = "position"
-    """What the rows command: one number a joint; of posvel the positions, and behind them the speeds."""
+    """Interface of the rows. A row has one number per joint; with posvel, the speeds follow the positions."""
     bounds: Bounds = Bounds()
 
     def mistakes(self) -> Iterator[Mistake]:
-        """Yield the ranges whose ends are not in order."""
+        """Yield the ranges whose lower end is not below the upper end."""
         yield from super().mistakes()
         for joint, (lower, upper) in self.bounds.range.items():
             if not lower < upper:
@@ -76,7 +76,7 @@ class SampleParameters(JointsParameters):
 
     @property
     def width(self) -> int:
-        """How many numbers a row has."""
+        """Number of values in a row"""
         return len(self.joints) * (2 if self.command_interface == "posvel" else 1)
 
 
@@ -84,24 +84,24 @@ Rows = tuple[tuple[float, ...], ...]
 
 
 class RowsCommand(CommandModel):
-    """The first rows of a long table: the next goal plays them, as they were sent in turn, before its own."""
+    """First rows of a long table. The next goal plays them before its own rows, in the order of sending."""
 
     rows: Rows
-    """Shape (rows, joints), of posvel (rows, 2 joints); in the unit of the command interface"""
+    """Shape (rows, joints), or (rows, 2 joints) with posvel; in the unit of the command interface"""
 
 
 class SamplesCommand(CommandModel):
-    """A goal: play rows, one a period."""
+    """Goal of a sample_player: rows that are played, one per period."""
 
     period: Annotated[float, Field(gt=0, le=3600)]
-    """s; the time decides which row is due: a late cycle leaves rows out, it delays none"""
+    """Time of a row, s. Late cycles skip rows, and do not delay those that follow."""
     rows: Rows
-    """As of `rows`; they follow those."""
+    """Rows that follow those of the `rows` commands, in the same format"""
     settle: Annotated[float, Field(ge=0, le=3600)] = 0.0
-    """s for which the last row is commanded still, after its period, before the goal is judged"""
+    """Time for which the last row is commanded after its period, before the goal is judged, s"""
     tolerance: Near | None = None
-    """rad or m, how near the joints must be to the last row's positions; left out: that of each joint; `inf`:
-    the goal is reached when its time is over and its joints have torque"""
+    """Position tolerance at the last row, rad or m; by default each joint's own. With `inf`, the goal is
+    reached when its time is over and its joints have torque."""
 
 
 @unique
@@ -112,11 +112,11 @@ class _Phase(Enum):
 
 
 class SamplePlayer(Controller[SampleParameters]):
-    """Plays one table at a time, from the cycle that takes the goal on.
+    """Controller that plays one table at a time, starting in the cycle that accepts the goal.
 
-    At its end the joints stay where the last row sends them; velocities decelerate to 0, efforts and PWM
-    become 0 at once. The same after a cancel and beyond a bound, but there joints that are commanded by
-    position come to rest from where they are and how fast they go.
+    After the end, position-controlled joints hold the last row, velocities decelerate to 0, and efforts and
+    PWM become 0 at once. A cancel or a violated bound has the same effect, except that position-controlled
+    joints decelerate from their measured position and velocity.
     """
 
     Parameters = SampleParameters
@@ -125,14 +125,15 @@ class SamplePlayer(Controller[SampleParameters]):
 
     @classmethod
     def interfaces(cls, parameters: SampleParameters, joints: tuple[str, ...]) -> Interfaces:
-        """Claim the command interface of the parameters' joints."""
+        """Claim the command interface of the joints."""
         return Interfaces(parameters.joints, commanded_by(parameters.command_interface))
 
     @classmethod
     def prepare(cls, kind: str, command: CommandModel, parameters: SampleParameters) -> NDArray[np.float64]:
-        """Return the rows one after the other; of `samples` behind period, settling time and tolerance.
+        """Return the rows as a flat array. For `samples`, period, settling time and tolerance come first.
 
-        Raises ValueError for a row of another size, or beyond the range of its joint.
+        Raises:
+            ValueError: A row has the wrong size, or exceeds the range of a joint.
         """
         if not isinstance(command, RowsCommand | SamplesCommand):
             return super().prepare(kind, command, parameters)
@@ -143,7 +144,7 @@ class SamplePlayer(Controller[SampleParameters]):
         return np.concatenate([[command.period, command.settle, tolerance], rows])
 
     def on_configure(self, context: Context) -> None:
-        """Make room for everything that the loop needs."""
+        """Allocate all memory that the loop needs."""
         super().on_configure(context)
         count, bounds, limits = len(context.joints), self.parameters.bounds, context.limits
         self._interface = self.parameters.command_interface
@@ -163,13 +164,13 @@ class SamplePlayer(Controller[SampleParameters]):
             self._rest_lower = np.maximum(self._lower, limits.lower)
             self._rest_upper = np.minimum(self._upper, limits.upper)
         self._primary: Floats = getattr(context.commands, commanded_by(self._interface)[0])
-        """What a row's first numbers command."""
+        """Command array for the first values of a row"""
         self._forget()
 
     # Life
 
     def on_activate(self, time_ns: int) -> None:
-        """Hold where the joints are; velocities, efforts and PWM begin with 0."""
+        """Hold the joints where they are. Velocities, efforts and PWM start at 0."""
         self._forget()
         if self._by_position:
             hold(self.context)
@@ -177,27 +178,27 @@ class SamplePlayer(Controller[SampleParameters]):
             self._primary.fill(0.0)
 
     def on_deactivate(self, time_ns: int) -> None:
-        """Forget the goal, which the runtime has ended, and rows that wait for one."""
+        """Drop the goal, which the runtime has ended, and all rows."""
         self._forget()
 
     def _forget(self) -> None:
         self._phase = _Phase.RESTING
         self._goal: Goal | None = None
         self._pieces: list[Floats] = []
-        """The table, piece after piece; those that came before their goal are for the next one."""
+        """Pieces of the table. Those that were received without a goal belong to the next goal."""
 
     # Commands
 
     def on_command(self, kind: str, data: NDArray[np.float64], time_ns: int) -> None:
-        """Keep rows for the next goal; a table that is played ends."""
+        """Store rows for the next goal. An active table is aborted."""
         if self._phase is _Phase.PLAYING:
             self._end(Outcome.ABORTED, "rows of another table came")
             self._begin_stop(time_ns)
         self._keep(data)
 
     def on_goal(self, goal: Goal, data: NDArray[np.float64], time_ns: int) -> None:
-        """Play the rows that were kept, and those of the goal."""
-        if self._phase is _Phase.PLAYING:  # that one has ended as preempted, its rows with it
+        """Play the stored rows and those of the goal."""
+        if self._phase is _Phase.PLAYING:  # drop the rows of the goal that was preempted
             self._pieces = []
         self._keep(data[_HEAD:])
         if len(self._pieces) > MOST_PIECES:
@@ -213,18 +214,18 @@ class SamplePlayer(Controller[SampleParameters]):
         self._settled_ns = time_ns + round(self._total * self._period_ns + float(data[1]) * 1e9)
 
     def on_cancel(self, goal: Goal, time_ns: int) -> None:
-        """Bring the joints to rest; the goal ends when they are."""
+        """Stop the joints. The goal ends when they are at rest."""
         self._begin_stop(time_ns)
 
     def _keep(self, rows: Floats) -> None:
-        """Keep rows behind the others; one piece too many aborts their goal."""
+        """Append rows. At most one piece too many is stored, so that `on_goal` can abort the goal."""
         if len(self._pieces) <= MOST_PIECES:
             self._pieces.append(rows)
 
     # In a cycle
 
     def update(self, time_ns: int, period_ns: int) -> None:
-        """Command the row that is due, what brings the joints to rest, or what was commanded last."""
+        """Command the present row or the stop. At rest, the last command stays."""
         if self._phase is _Phase.PLAYING:
             self._play(time_ns, period_ns)
         elif self._phase is _Phase.STOPPING:
@@ -238,7 +239,7 @@ class SamplePlayer(Controller[SampleParameters]):
             self._begin_stop(time_ns)
             return
         elapsed_ns = time_ns - self._start_ns
-        # wake-ups scatter around their deadlines: a row is due half a cycle before its time, at most
+        # Wake-ups have jitter, so a row counts as due up to half a cycle before its time.
         early_ns = min(self._period_ns, period_ns) / 2
         if time_ns + early_ns >= self._settled_ns:
             self._hand_over()
@@ -269,15 +270,16 @@ class SamplePlayer(Controller[SampleParameters]):
         )
         if elapsed >= self._stop.duration_s:
             self._phase = _Phase.RESTING
-            self._end(Outcome.CANCELLED)  # any other end came before the stop
+            self._end(Outcome.CANCELLED)  # other outcomes end the goal before the stop
 
     # The end
 
     def _breach(self) -> tuple[int, str] | None:
-        """Return the first joint that is beyond a bound, and how; None: none is."""
+        """Return the row of the first joint that violates a bound and a description, or None."""
         states, valid = self.context.states, self.context.states.valid
         lower, upper, most, effort = self._lower, self._upper, self._strongest, np.abs(states.effort)
-        if not self._by_position and states.has_lost:  # positions are held by the runtime
+        # The runtime holds positions while a joint is lost, but not the other interfaces.
+        if not self._by_position and states.has_lost:
             return states.unable(range(valid.size))
         if (beyond := ((states.position < lower) | (states.position > self._upper)) & valid).any():
             row = int(beyond.argmax())
@@ -295,7 +297,7 @@ class SamplePlayer(Controller[SampleParameters]):
         return None
 
     def _end(self, outcome: Outcome, text: str = "", row: int = -1) -> None:
-        """End the goal, if there is one; `row` is the joint that is the reason."""
+        """End the goal, if there is one, and name the joint of `row` as the reason."""
         goal, self._goal = self._goal, None
         if goal is None:
             return
@@ -303,7 +305,10 @@ class SamplePlayer(Controller[SampleParameters]):
         goal.end(outcome, f"joint {joint} {text}" if joint else text, joint)
 
     def _hand_over(self) -> None:
-        """Let the goal be judged by its last row; efforts and PWM lead to no position and no rest."""
+        """Pass the goal to the runtime for judgement by its last row.
+
+        Efforts and PWM are not judged by position or rest, because they define neither.
+        """
         goal, self._goal = self._goal, None
         if goal is None:
             return
@@ -319,7 +324,7 @@ class SamplePlayer(Controller[SampleParameters]):
         )
 
     def _begin_stop(self, time_ns: int, *, over: bool = False) -> None:
-        """Let the joints come to rest; `over`: those commanded by position are sent to rest already."""
+        """Start to stop the joints; `over`: the table is complete, so positions are at rest already."""
         if self._phase is _Phase.PLAYING:
             self._pieces = []
         self._phase, self._stop_ns = _Phase.STOPPING, time_ns
@@ -337,7 +342,7 @@ class SamplePlayer(Controller[SampleParameters]):
 
 
 def _checked(rows: Rows, parameters: SampleParameters) -> Floats:
-    """Return rows as an array, shape (rows, width). Raises ValueError for the first that is wrong."""
+    """Return rows as an array, shape (rows, width). Raises ValueError for the first invalid row."""
     width, joints = parameters.width, parameters.joints
     if not rows:
         raise ValueError("there is no row; give at least one")

@@ -1,4 +1,4 @@
-"""Trajectories and chunks of positions as they are commanded, and the flat arrays that the loop plays."""
+"""Commands of trajectories and chunks of positions, and their conversion to the flat arrays of the loop."""
 
 from __future__ import annotations
 
@@ -20,12 +20,13 @@ from dxlrun_controllers.laws.spline import (
 )
 
 SPLICED: Final = 2.0
-"""Behind a flat trajectory, of the joints that it moves when it is spliced; else 1, and 0 of all others."""
+"""Mark of a moved joint after a spliced flat trajectory. It is 1 without a splice, and 0 for all other
+joints."""
 _DURATION: TypeAdapter[int] = TypeAdapter(Duration)
 
 
 def _seconds(value: object) -> object:
-    """Accept `500 ms` beside a bare number, which counts seconds."""
+    """Convert a text with a unit, such as `500 ms`, to seconds. A bare number is in seconds already."""
     return _DURATION.validate_python(value) * 1e-9 if isinstance(value, str) else value
 
 
@@ -33,32 +34,32 @@ Seconds = Annotated[float, BeforeValidator(_seconds), Field(ge=0)]
 
 
 Near = Annotated[float, Field(gt=0, allow_inf_nan=True), or_number(TypeAdapter(Tolerance))]
-"""rad or m, or text with a unit, or `inf`."""
+"""Position tolerance: rad or m, text with a unit, or `inf`"""
 Slow = Annotated[float, Field(gt=0, allow_inf_nan=True), or_number(TypeAdapter(RestSpeed))]
-"""rad/s or m/s, or text with a unit, or `inf`."""
+"""Velocity tolerance: rad/s or m/s, text with a unit, or `inf`"""
 
 
 class JointTolerance(CommandModel):
-    """How far a joint may be off in one goal; what is left out is as in the robot file."""
+    """Tolerances of a joint in one goal. The robot file has the defaults."""
 
     position: Near | None = None
     """rad or m"""
     velocity: Slow | None = None
-    """rad/s or m/s: at the end the speed below which it is at rest, on the way its difference to the desired
-    speed"""
+    """rad/s or m/s. At the end it is the speed below which the joint is at rest; on the way it limits the
+    difference to the desired velocity."""
 
     @model_validator(mode="before")
     @classmethod
     def _from_position(cls, data: object) -> object:
-        """Accept a position alone."""
+        """Accept a bare position tolerance."""
         return data if isinstance(data, Mapping | JointTolerance) else {"position": data}
 
 
 class TrajectoryPoint(CommandModel):
-    """Where the joints are to be at a time."""
+    """Desired state of the joints at a time"""
 
     time: Seconds
-    """s since the trajectory's start"""
+    """Time since the start of the trajectory, s"""
     positions: tuple[float, ...]
     """rad, shape (joints,)"""
     velocities: tuple[float, ...] | None = None
@@ -68,65 +69,66 @@ class TrajectoryPoint(CommandModel):
 
 
 class TrajectoryCommand(CommandModel):
-    """A trajectory: from point to point linear where only positions are given, cubic where both have
-    velocities, quintic where both have accelerations too.
+    """Trajectory through points.
 
-    The joints go from where they are to the first point in `start_in` and the first point's time; when both
-    are 0, within a period. A goal for which that is too fast is aborted.
+    The piece between two points is linear if only positions are given, cubic if both points have velocities,
+    and quintic if both also have accelerations. The joints reach the first point after `start_in` plus the
+    time of that point, or within one period if both are 0. A goal that would exceed a speed limit on this way
+    is aborted.
     """
 
     points: Annotated[tuple[TrajectoryPoint, ...], Field(min_length=1)]
     start_in: Seconds = 0.0
-    """s until the trajectory's start, from the moment at which the command is taken"""
+    """Time from the acceptance of the command to the start of the trajectory, s"""
     joints: Annotated[tuple[str, ...], Field(min_length=1)] | None = None
-    """The joints that the points name, in their order; left out: all. The others go on with what they do."""
+    """Joints that the points list; by default all. All other joints continue their motion."""
     timeout: Annotated[Seconds, Field(gt=0)] | None = None
-    """s after which the goal is missed if it was not reached, however slow it was made; left out: none"""
+    """Time after which the goal is missed, whatever the speed factor, s; by default unlimited"""
     goal_tolerance: dict[str, JointTolerance] | None = None
-    """By joint, at the end, in place of the tolerances in the robot file"""
+    """Tolerances at the end, by joint. They override those of the robot file."""
     path_tolerance: dict[str, JointTolerance] | None = None
-    """By joint, on the way: beyond it the goal is aborted"""
+    """Tolerances on the way, by joint. Beyond them the goal is aborted."""
     goal_time_tolerance: Seconds | None = None
-    """s after the end in which the goal may still be reached"""
+    """Time after the end in which the goal may still be reached, s"""
     splice: bool = False
-    """For `start_in` the joints go on with the trajectory that they play, and leave it then with the
-    position, velocity and acceleration that they have."""
+    """Continue the active trajectory for `start_in`, and then leave it without a jump in position, velocity
+    and acceleration."""
 
 
 class ChunkCommand(CommandModel):
-    """The next positions of a stream, such as those of a policy: they replace all that was to come.
+    """Next positions of a stream, such as those of a policy, which replace the rest of the previous chunk.
 
-    Where points have no velocities, all get some with which the way between two points stays between them.
-    The joints pass into the chunk from the state in which they are, and behind its end they come to rest.
+    If a point has no velocity, velocities are chosen for all points so that no piece overshoots its points.
+    The joints blend into the chunk from their present state, and come to rest after its end.
     """
 
     points: Annotated[tuple[TrajectoryPoint, ...], Field(min_length=1)]
-    """Their times are those of the sender's clock, whichever it is, s; what is past is left out."""
+    """Points with times of the sender's clock, which may be any clock, s. Points in the past are ignored."""
     now: float
-    """What the sender's clock shows when this is sent, s"""
+    """Time of the sender's clock when the chunk is sent, s"""
     joints: Annotated[tuple[str, ...], Field(min_length=1)] | None = None
-    """As of a trajectory"""
+    """Joints that the points list; by default all"""
     blend: Annotated[Seconds, Field(le=10)] = 0.1
-    """s in which the joints pass into the chunk, at least"""
+    """Shortest time in which the joints blend into the chunk, s"""
 
 
 class GoalLimits(NamedTuple):
-    """Tolerances of a goal, shape (joints,); NaN in a command: those of the robot file."""
+    """Tolerances of a goal, shape (joints,). NaN in a command selects the tolerance of the robot file."""
 
     path: Floats
-    """rad or m on the way, infinite: not checked."""
+    """Position error on the way, rad or m; infinite if it is not checked"""
     path_velocity: Floats
-    """rad/s or m/s on the way, infinite: not checked."""
+    """Velocity error on the way, rad/s or m/s; infinite if it is not checked"""
     position: Floats
-    """rad or m at the end."""
+    """Position error at the end, rad or m"""
     velocity: Floats
-    """rad/s or m/s at the end."""
+    """Speed at the end, rad/s or m/s"""
     settle_s: float
-    """s after the end."""
+    """Time after the end in which the goal may still be reached, s"""
 
     @property
     def checks_path(self) -> bool:
-        """True when there is a tolerance on the way."""
+        """True if there is a tolerance on the way"""
         return bool(np.isfinite(self.path).any() or np.isfinite(self.path_velocity).any())
 
     def flatten(self) -> Floats:
@@ -134,7 +136,7 @@ class GoalLimits(NamedTuple):
         return np.concatenate([[self.settle_s], *self[:-1]])
 
     def replaced_by(self, flat: Floats, joints: int) -> Self:
-        """Return these tolerances with those of a flat array in their places, where it has some."""
+        """Return a copy in which the values of a flat array that are not NaN replace these tolerances."""
         settle_s, rows = float(flat[0]), flat[1 : 1 + 4 * joints].reshape(4, joints)
         own = [np.where(np.isnan(new), old, new) for old, new in zip(self[:-1], rows, strict=True)]
         return type(self)(
@@ -147,16 +149,17 @@ class GoalLimits(NamedTuple):
 
 
 class ChunkHead(NamedTuple):
-    """What stands before the flat array of a chunk."""
+    """Header before the flat array of a chunk, s"""
 
     now: float
     blend: float
 
 
 def flat_chunk(command: ChunkCommand, joints: tuple[str, ...], wrap: Collection[str] = ()) -> Floats:
-    """Return a chunk as a flat array: its head, and its trajectory with times from `now` on.
+    """Return a chunk as a flat array: its header, and its trajectory with times relative to `now`.
 
-    Raises ValueError as `flat_trajectory` does.
+    Raises:
+        ValueError: As in `flat_trajectory`.
     """
     points = tuple(point.model_copy(update={"time": point.time - command.now}) for point in command.points)
     whole = TrajectoryCommand.model_construct(points=points, start_in=0.0, joints=command.joints)
@@ -167,11 +170,17 @@ def flat_chunk(command: ChunkCommand, joints: tuple[str, ...], wrap: Collection[
 def flat_trajectory(
     command: TrajectoryCommand, joints: tuple[str, ...], wrap: Collection[str] = (), *, smooth: bool = False
 ) -> Floats:
-    """Return the command as a flat array: splines of all joints, time-out (s), tolerances, joints moved.
+    """Return a trajectory as a flat array: splines of all joints, timeout (s), tolerances, moved joints.
 
-    From point to point the joints of `wrap` take the shorter way, so that a position may be whole turns off.
-    `smooth`: velocities that not all points have are chosen. Raises ValueError for a wrong size, unknown
-    joints, or times that do not grow.
+    Args:
+        command: Trajectory.
+        joints: All joints of the controller.
+        wrap: Joints that take the shorter way between two points, so their positions may differ by whole
+            turns.
+        smooth: Choose velocities without overshoot if a point has none.
+
+    Raises:
+        ValueError: The number of values is wrong, a joint is unknown, or the times do not increase.
     """
     times = np.array([point.time for point in command.points])
     stalled = np.flatnonzero(np.diff(times) <= 0)
@@ -212,7 +221,7 @@ def flat_trajectory(
 
 
 def _goal_limits(command: TrajectoryCommand, named: tuple[str, ...], joints: tuple[str, ...]) -> GoalLimits:
-    """Return the tolerances of a command. Raises ValueError for one of a joint that it does not move."""
+    """Return the tolerances of a command. Raises ValueError if one names a joint that is not moved."""
     given = {"path_tolerance": command.path_tolerance or {}, "goal_tolerance": command.goal_tolerance or {}}
     for key, tolerances in given.items():
         if unknown := [joint for joint in tolerances if joint not in named]:
@@ -235,9 +244,9 @@ def _goal_limits(command: TrajectoryCommand, named: tuple[str, ...], joints: tup
 def trajectory_speed_peaks(
     kind: str, data: Floats, joints: tuple[str, ...], factor: float = 1.0
 ) -> Iterator[SpeedPeak]:
-    """Yield the highest speed of each joint between the points of a prepared trajectory or chunk.
+    """Yield the peak speed of each joint between the points of a prepared trajectory or chunk.
 
-    It is played `factor` times as fast; times are those of the points.
+    Speeds are multiplied by `factor`, but the reported times are those of the points.
     """
     flat = data[len(ChunkHead._fields) :] if kind == "chunk" else data
     for joint, (speed, time, piece) in zip(joints, trajectory_peaks(flat), strict=False):
@@ -245,7 +254,7 @@ def trajectory_speed_peaks(
 
 
 def _columns(named: tuple[str, ...], joints: tuple[str, ...]) -> list[int]:
-    """Return the places of named joints. Raises ValueError for one that is unknown or named twice."""
+    """Return the columns of named joints. Raises ValueError for a joint that is unknown or named twice."""
     for index, joint in enumerate(named):
         if joint not in joints:
             raise ValueError(f"{joint} is not one of its joints ({', '.join(joints)})")

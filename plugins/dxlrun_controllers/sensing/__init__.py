@@ -1,4 +1,4 @@
-"""Controllers that turn states of devices and sensors into messages, states and decisions.
+"""Controllers that compute messages, states and decisions from the states of devices and sensors.
 
-Drivers that produce these states belong in `sensors`.
+The drivers are in `sensors`.
 """

@@ -1,4 +1,4 @@
-"""battery_state_broadcaster: warns of a low battery, and ends the run or switches before it is empty."""
+"""battery_state_broadcaster: warn of a low battery, and end the run or switch controllers in time."""
 
 from __future__ import annotations
 
@@ -20,31 +20,31 @@ from dxlrun import (
 from dxlrun.messages import BatteryState, Header
 
 PUBLISH_NS = 1_000_000_000
-"""Between two messages."""
+"""Time between two messages, ns"""
 
 
 class BatteryParameters(ParametersModel):
     """Keys of a battery_state_broadcaster in the robot file."""
 
     voltages: Annotated[tuple[str, ...], Field(min_length=1)]
-    """Where the voltage is measured: `left_hip/voltage` of servos, `power/voltage` of a device; the median of
-    several counts."""
+    """States with the voltage of the battery: `left_hip/voltage` of a servo, `power/voltage` of a device. The
+    median of several states is used."""
     current: str | None = None
-    """State of a device that measures the battery's current, A."""
+    """State of a device that measures the current of the battery, A."""
     cells: Annotated[int, Field(ge=1, le=100)] | None = None
-    """In series; then the voltages below are those of one cell."""
+    """Number of cells in series. If it is given, the following voltages are per cell."""
     warn: Annotated[Voltage, Field(gt=0)]
-    """V; below it an event warns"""
+    """Voltage below which an event warns, V."""
     stop: Annotated[Voltage, Field(gt=0)]
-    """V; below it the run ends, or others take over"""
+    """Voltage below which the run ends, or the controllers of `activate` take over, V."""
     hysteresis: Annotated[Voltage, Field(ge=0)] = 0.1
-    """V; so far above `warn` the next warning counts again"""
+    """Difference above `warn` that re-arms the warning, V."""
     filter: Duration = 2_000_000_000
-    """ns; time constant of the low-pass on the voltage: a motor that starts is no empty battery"""
+    """Time constant of the low-pass filter on the voltage. It hides the voltage drop of a starting motor."""
     timeout: Annotated[Duration, Field(gt=0)] = 2_000_000_000
-    """ns; an older voltage does not count"""
+    """Age above which a voltage is ignored."""
     activate: tuple[str, ...] = ()
-    """Controllers that take over at `stop`; none: the run ends by the policy `on_fault`."""
+    """Controllers that take over at `stop`. Without any, the run ends by the policy `on_fault`."""
     frame: str = ""
     """Name of the frame in the messages."""
 
@@ -61,10 +61,11 @@ class BatteryParameters(ParametersModel):
 
 
 class BatteryStateBroadcaster(Controller[BatteryParameters]):
-    """Filters the voltage, provides it as `voltage`, publishes sensor_msgs/BatteryState once a second.
+    """Controller that monitors a battery, provides `voltage`, and publishes sensor_msgs/BatteryState at 1 Hz.
 
-    `warn` and `stop` are compared with the filtered voltage, which begins with the first measurement. `stop`
-    counts once. Without any fresh voltage nothing is decided, and an event says so.
+    `warn` and `stop` are compared with the filtered voltage. The filter starts with the first measurement.
+    `stop` only triggers once until the battery has recovered. Without a fresh voltage nothing triggers, and
+    an event reports that.
     """
 
     Parameters = BatteryParameters
@@ -72,7 +73,7 @@ class BatteryStateBroadcaster(Controller[BatteryParameters]):
 
     @classmethod
     def interfaces(cls, parameters: BatteryParameters, joints: tuple[str, ...]) -> Interfaces:
-        """Read the voltages, their ages, and perhaps the current."""
+        """Read the voltages, their ages, and optionally the current."""
         ages = (f"{name.rpartition('/')[0]}/age" for name in parameters.voltages)
         current = () if parameters.current is None else (parameters.current,)
         return Interfaces(
@@ -83,7 +84,7 @@ class BatteryStateBroadcaster(Controller[BatteryParameters]):
         )
 
     def on_configure(self, context: Context) -> None:
-        """Make the message."""
+        """Allocate the message."""
         super().on_configure(context)
         parameters, cells = self.parameters, self.parameters.cells or 1
         self._warn, self._stop = parameters.warn * cells, parameters.stop * cells
@@ -91,13 +92,13 @@ class BatteryStateBroadcaster(Controller[BatteryParameters]):
         self._message = BatteryState(header=Header(frame_id=parameters.frame))
 
     def on_activate(self, time_ns: int) -> None:
-        """Begin anew: another battery may be in."""
+        """Reset the filter and all warnings, because the battery may have been replaced."""
         self._voltage = math.nan
         self._warned = self._stopped = self._silent = False
         self._heard_ns = self._publish_ns = time_ns
 
     def update(self, time_ns: int, period_ns: int) -> None:
-        """Filter the voltage, and compare it."""
+        """Filter the voltage, compare it with the thresholds, and publish it."""
         parameters, count = self.parameters, len(self.parameters.voltages)
         values = self.context.reads.tolist()
         fresh = [

@@ -1,4 +1,4 @@
-"""device_command_controller: forwards values to commands of devices: lamps, buzzers, power switches."""
+"""device_command_controller: forward values to commands of devices: lamps, buzzers, power switches."""
 
 from __future__ import annotations
 
@@ -15,20 +15,21 @@ class DeviceCommandParameters(ParametersModel):
     """Keys of a device_command_controller in the robot file."""
 
     commands: Annotated[tuple[str, ...], Field(min_length=1)]
-    """Commands of devices: `board/led`."""
+    """Commands of devices, such as `board/led`."""
 
 
 class DeviceCommands(CommandModel):
-    """Values of some of the commands; the others keep theirs."""
+    """Values of commands. Commands that are not named keep their values."""
 
     values: Annotated[dict[str, float], Field(min_length=1)]
-    """By name, `board/led`, SI units"""
+    """Values by command, such as `board/led`, in SI units"""
 
 
 class DeviceCommandController(Controller[DeviceCommandParameters]):
-    """Forwards the newest value of each command; one that has had none is left as it is.
+    """Controller that forwards the newest value of each command. A command without a value stays unchanged.
 
-    When it leaves, fails, or its stream ends, the commands become their safe values.
+    The commands are set to their safe values when the controller is deactivated or fails, or when its stream
+    ends.
     """
 
     Parameters = DeviceCommandParameters
@@ -43,7 +44,11 @@ class DeviceCommandController(Controller[DeviceCommandParameters]):
     def prepare(
         cls, kind: str, command: CommandModel, parameters: DeviceCommandParameters
     ) -> NDArray[np.float64]:
-        """Return a value each, shape (commands,), NaN: as it is. Raises ValueError for an unknown command."""
+        """Return the values, shape (commands,); NaN leaves a command unchanged.
+
+        Raises:
+            ValueError: A command is unknown, or a value is not finite.
+        """
         if not isinstance(command, DeviceCommands):
             return super().prepare(kind, command, parameters)
         known = parameters.commands
@@ -54,8 +59,8 @@ class DeviceCommandController(Controller[DeviceCommandParameters]):
         return np.array([command.values.get(name, np.nan) for name in known])
 
     def on_command(self, kind: str, data: NDArray[np.float64], time_ns: int) -> None:
-        """Take new values."""
+        """Set new values."""
         np.copyto(self.context.device_commands, data, where=np.isfinite(data))
 
     def update(self, time_ns: int, period_ns: int) -> None:
-        """Keep the last values: the manager takes the array as it is."""
+        """Do nothing: the manager sends the array of values as it is."""

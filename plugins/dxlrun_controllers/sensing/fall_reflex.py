@@ -1,4 +1,4 @@
-"""fall_reflex: lets controllers take over, in one cycle, when the robot tips over."""
+"""fall_reflex: switch to other controllers, within one cycle, when the robot tips over."""
 
 from __future__ import annotations
 
@@ -19,31 +19,31 @@ from dxlrun import (
 from dxlrun_controllers.sensing.imu_sensor_broadcaster import ORIENTATION
 
 Bounds = Annotated[tuple[Angle, ...], Field(min_length=2, max_length=2)]
-"""The lowest and the highest angle, rad."""
+"""Lowest and highest angle, rad"""
 
 
 class FallParameters(ParametersModel):
     """Keys of a fall_reflex in the robot file."""
 
     imu: str
-    """Name of the controller, sensor or device that has the orientation."""
+    """Name of the controller, sensor or device that provides the orientation."""
     activate: Annotated[tuple[str, ...], Field(min_length=1)]
-    """Controllers that take over; those that command the same leave."""
+    """Controllers that take over. Controllers with the same claims are deactivated."""
     roll: Bounds = (-math.pi / 4, math.pi / 4)
-    """Lowest and highest angle; beyond it the robot tips over."""
+    """Lowest and highest roll of the link, rad. Beyond these the robot falls."""
     pitch: Bounds = (-math.pi / 4, math.pi / 4)
-    """rad; of the link, positive forward. Beyond these the robot falls."""
+    """Lowest and highest pitch of the link, rad, positive forward. Beyond these the robot falls."""
     time: Duration = 60_000_000
-    """ns; for so long before it counts"""
+    """Time beyond the bounds after which a fall is detected."""
     rearm: Duration = 1_000_000_000
-    """ns; so long within the bounds, and the next fall counts again"""
+    """Time within the bounds after which the next fall can be detected."""
     timeout: Annotated[Duration, Field(gt=0)] = 200_000_000
-    """ns; an older orientation says nothing"""
+    """Age above which an orientation is ignored."""
     on_silence: Literal["report", "activate"] = "report"
-    """What becomes of an orientation that stays out so long: an event, or the controllers take over too."""
+    """Reaction to a missing orientation after `timeout`: an event, or the controllers take over as well."""
 
     def mistakes(self) -> Iterator[Mistake]:
-        """Yield the angles that are not around 0."""
+        """Yield the bounds that do not include 0."""
         yield from super().mistakes()
         for name, (lower, upper) in (("roll", self.roll), ("pitch", self.pitch)):
             if not lower < 0 < upper:
@@ -52,10 +52,11 @@ class FallParameters(ParametersModel):
 
 
 class FallReflex(Controller[FallParameters]):
-    """Watches roll and pitch; claims nothing. Provides `fallen`: 1 from a fall on, until upright again.
+    """Controller that detects falls by roll and pitch, and switches to other controllers.
 
-    Takes over once for each fall: while the robot lies, other controllers may be activated to get it up.
-    Only a fresh orientation counts: an old one, or a quaternion of zeros, does not trigger it.
+    It claims nothing, and provides `fallen`: 1 from a fall until the robot is upright again. It switches
+    controllers once per fall, so other controllers can be activated to get the robot up. An old orientation
+    or a quaternion of zeros does not trigger it.
     """
 
     Parameters = FallParameters
@@ -71,7 +72,7 @@ class FallReflex(Controller[FallParameters]):
         )
 
     def on_activate(self, time_ns: int) -> None:
-        """Begin upright: a robot that lies falls anew."""
+        """Start as upright. A robot that is lying triggers again."""
         self._fallen = self._silent = False
         self._since_ns = -1
         self._heard_ns = time_ns
@@ -80,7 +81,7 @@ class FallReflex(Controller[FallParameters]):
         """Compare the orientation with the bounds."""
         x, y, z, w, age_s = self.context.reads.tolist()
         parameters = self.parameters
-        square = x * x + y * y + z * z + w * w  # a unit of its own may send zeros, or no unit quaternion
+        square = x * x + y * y + z * z + w * w  # a device may send zeros, or a quaternion of another length
         if 0.0 < square < math.inf and age_s * 1e9 <= parameters.timeout:
             self._heard_ns, self._silent = time_ns, False
             roll = math.atan2(2.0 * (w * x + y * z), w * w - x * x - y * y + z * z)
@@ -99,7 +100,7 @@ class FallReflex(Controller[FallParameters]):
             parameters.roll[0] <= roll <= parameters.roll[1]
             and parameters.pitch[0] <= pitch <= parameters.pitch[1]
         )
-        if within != self._fallen:  # as it was
+        if within != self._fallen:  # no change
             self._since_ns = -1
             return
         if self._since_ns < 0:

@@ -1,8 +1,8 @@
-"""imu_sensor_broadcaster: the orientation of an inertial measurement unit as states and as sensor_msgs/Imu.
+"""imu_sensor_broadcaster: orientation of an inertial measurement unit as states and as sensor_msgs/Imu.
 
-The filter is own code (`laws/madgwick.py`) and not the package imufusion: that one has Madgwick's revised
-algorithm in single precision, which is another filter than the published one. It would be one more compiled
-dependency for some 80 lines without a loop.
+The filter is implemented in `laws/madgwick.py` instead of using the package imufusion. imufusion has
+Madgwick's revised algorithm in single precision, which differs from the published filter, and it would be a
+compiled dependency in place of some 80 lines without a loop.
 """
 
 from __future__ import annotations
@@ -36,51 +36,51 @@ RATE = tuple(f"angular_velocity.{axis}" for axis in AXES)
 ACCELERATION = tuple(f"linear_acceleration.{axis}" for axis in AXES)
 _ZERO = (0.0, 0.0, 0.0)
 _BIAS_TIME_CONSTANT = 2.0
-"""s, of the low-pass that follows the rate of a body at rest."""
+"""Time constant of the low-pass filter that estimates the gyroscope bias at rest, s"""
 _BIAS_AFTER = 2.0
-"""s; a body is at rest when it turned so slowly for so long."""
+"""Time of slow rotation after which a body counts as at rest, s"""
 
 Diagonal = Annotated[tuple[Annotated[float, Field(ge=0)], ...], Field(min_length=3, max_length=3)]
-"""Variances about x, y and z."""
+"""Variances about x, y and z"""
 
 
 class ImuCovariance(ParametersModel):
-    """Variances as the data sheet has them; left out: not known, which ROS writes as zeros."""
+    """Variances from the data sheet. Unknown ones are omitted, and published as zeros, as ROS defines."""
 
     orientation: Diagonal | None = None
-    """rad^2"""
+    """rad^2."""
     angular_velocity: Diagonal | None = None
-    """(rad/s)^2"""
+    """(rad/s)^2."""
     linear_acceleration: Diagonal | None = None
-    """(m/s^2)^2"""
+    """(m/s^2)^2."""
 
 
 class ImuParameters(ParametersModel):
     """Keys of an imu_sensor_broadcaster in the robot file."""
 
     sensor: str
-    """Name of the sensor or device: it has angular_velocity and linear_acceleration."""
+    """Name of the sensor or device that provides angular_velocity and linear_acceleration."""
     orientation: Literal["madgwick", "sensor", "none"] = "madgwick"
-    """By the filter; the sensor's own one is passed on; or none is provided."""
+    """Source of the orientation: the Madgwick filter, the sensor itself, or none."""
     gain: Annotated[float, Field(ge=0, le=10), LIVE] = 0.1
-    """beta, rad/s"""
+    """Gain beta of the filter, rad/s."""
     magnetometer: str | None = None
-    """Name of the sensor or device with magnetic_field in the same axes; without it the heading drifts."""
+    """Name of the sensor or device with magnetic_field in the same axes. Without it the heading drifts."""
     declination: Annotated[Angle, Field(ge=-math.pi, le=math.pi)] = 0.0
-    """rad; of magnetic north from true north, positive to the east."""
+    """Angle from true north to magnetic north, rad, positive to the east."""
     mounting: Annotated[tuple[Angle, ...], Field(min_length=3, max_length=3)] = (0.0, 0.0, 0.0)
-    """rad; roll, pitch and yaw of the sensor in its link, as in a URDF's `rpy`."""
+    """Roll, pitch and yaw of the sensor in its link, rad, as `rpy` in a URDF."""
     rest: Annotated[AngularVelocity, Field(gt=0)] | None = None
-    """rad/s; slower than this for 2 s counts as standing still: what the gyroscope then measures is its bias.
-    Left out: the bias is not corrected."""
+    """Rate below which the body counts as at rest after 2 s, rad/s. The gyroscope bias is then estimated.
+    Without this key the bias is not corrected."""
     timeout: Annotated[Duration, Field(gt=0)] = 500_000_000
-    """ns; after so long without a sample the filter begins anew."""
+    """Time without a sample after which the filter restarts."""
     frame: str = "imu_link"
-    """Link of the URDF in whose axes the measurements are."""
+    """Link of the URDF in whose axes the measurements are expressed."""
     covariance: ImuCovariance = ImuCovariance()
 
     def mistakes(self) -> Iterator[Mistake]:
-        """Yield keys that count only beside another one."""
+        """Yield keys that have no effect without another key."""
         yield from super().mistakes()
         if self.orientation != "madgwick" and (self.magnetometer is not None or self.rest is not None):
             key = "rest" if self.magnetometer is None else "magnetometer"
@@ -91,17 +91,18 @@ class ImuParameters(ParametersModel):
 
 
 class ImuSensorBroadcaster(Controller[ImuParameters]):
-    """Provides orientation, angular velocity and linear acceleration of the link, and publishes them.
+    """Controller that provides and publishes orientation, angular velocity and linear acceleration of a link.
 
-    The orientation is that of the link in a frame whose z axis points upwards. With a magnetometer its x axis
-    points to the east (REP 103 and 145); without it the heading is 0 where the filter began.
+    The orientation is that of the link in a frame whose z axis points up. With a magnetometer, the x axis of
+    this frame points east (REP 103 and 145). Without one, the heading is 0 where the filter started.
 
-    - Each sample is taken once, by the true time since the one before, which its age tells. So a lost sample
-      makes a longer step. Without a new sample nothing is provided or published: the states keep their values
-      and become older.
-    - A sample with NaN or infinity counts as lost; one of the magnetometer leaves that step to the others.
-    - After `timeout` without a sample the filter begins anew: roll and pitch from the accelerometer, heading
-      as before or from the magnetometer. It is so too when the controller is activated.
+    - Each sample is used once, with the time since the last sample, which is computed from their ages. After
+      a lost sample the step is longer. Without a new sample nothing is provided or published: the states keep
+      their values, and their ages grow.
+    - A sample with NaN or infinity counts as lost. If only the magnetic field is not finite, the step uses
+      the gyroscope and the accelerometer alone.
+    - The filter restarts on activation and after `timeout` without a sample: roll and pitch come from the
+      accelerometer, and the heading from the magnetometer. Without a magnetometer the heading is kept.
     """
 
     Parameters = ImuParameters
@@ -109,7 +110,7 @@ class ImuSensorBroadcaster(Controller[ImuParameters]):
 
     @classmethod
     def interfaces(cls, parameters: ImuParameters, joints: tuple[str, ...]) -> Interfaces:
-        """Read the sensor's states, and perhaps the magnetometer's."""
+        """Read the states of the sensor, and optionally those of the magnetometer."""
         names = (*RATE, *ACCELERATION, *(ORIENTATION if parameters.orientation == "sensor" else ()), "age")
         reads = [f"{parameters.sensor}/{name}" for name in names]
         if parameters.magnetometer is not None:
@@ -119,14 +120,14 @@ class ImuSensorBroadcaster(Controller[ImuParameters]):
         return Interfaces((), reads=tuple(reads), provides=(*provided, *RATE, *ACCELERATION))
 
     def on_configure(self, context: Context) -> None:
-        """Make room for everything that the loop needs."""
+        """Allocate all memory that the loop needs."""
         super().on_configure(context)
         parameters = self.parameters
         self._filter = Madgwick(parameters.gain)
         self._times = SampleTimes(context.period_ns)
         self._axes = _matrix(*parameters.mounting) if any(parameters.mounting) else None
         self._mounting = _quaternion(*parameters.mounting)
-        # of the filter's frame, whose x axis is magnetic north, in one whose x axis is the true east
+        # Rotation from the filter's frame, whose x axis is magnetic north, to a frame with x to true east.
         north = 0.0 if parameters.magnetometer is None else math.pi / 2 - parameters.declination
         self._east = (0.0, 0.0, math.sin(north / 2), math.cos(north / 2))
         self._bias = _ZERO
@@ -140,21 +141,21 @@ class ImuSensorBroadcaster(Controller[ImuParameters]):
             message.orientation_covariance[0] = -1.0
 
     def on_activate(self, time_ns: int) -> None:
-        """Begin anew: what happened meanwhile is not known."""
+        """Restart the filter, because the motion since the last activation is unknown."""
         self._times.forget()
         self._silent = self._wrong = False
 
     def on_parameters(self, time_ns: int) -> None:
-        """Take over a changed gain."""
+        """Set the gain."""
         self._filter.gain = self.parameters.gain
 
     def update(self, time_ns: int, period_ns: int) -> None:
-        """Take a new sample, if there is one."""
+        """Process a new sample, if there is one."""
         provided = self.context.provided
-        provided.fill(np.nan)  # nothing new
+        provided.fill(np.nan)  # NaN: no new value
         values = self.context.reads.tolist()
         own = 10 if self.parameters.orientation == "sensor" else 6
-        # one that is left out takes no time: the next step is from the good one before
+        # A discarded sample does not advance the time, so the next step starts at the last valid sample.
         if not self._is_finite(values, own) or not self._times.take(time_ns, values[own]):
             self._look_for_silence(time_ns)
             return
@@ -184,13 +185,13 @@ class ImuSensorBroadcaster(Controller[ImuParameters]):
         return a * x + b * y + c * z, d * x + e * y + f * z, g * x + h * y + i * z
 
     def _orientation(self, rate: Vector, acceleration: Vector, values: list[float]) -> tuple[float, ...]:
-        """Return x, y, z, w of the link."""
+        """Return the orientation of the link, x, y, z, w."""
         if self.parameters.orientation == "sensor":
             x, y, z, w = self._mounting
             return _product((values[6], values[7], values[8], values[9]), (-x, -y, -z, w))
         law, elapsed_s = self._filter, self._times.elapsed_s
         field = self._field(values)
-        if elapsed_s * 1e9 <= self.parameters.timeout:  # not for the first one, where it is NaN
+        if elapsed_s * 1e9 <= self.parameters.timeout:  # False for the first sample (NaN)
             law.update(self._unbiased(rate, elapsed_s), acceleration, field, elapsed_s)
         else:
             law.begin(acceleration, field, law.heading)
@@ -198,7 +199,7 @@ class ImuSensorBroadcaster(Controller[ImuParameters]):
         return _product(self._east, (law.x, law.y, law.z, law.w))
 
     def _field(self, values: list[float]) -> Vector | None:
-        """Return the magnetic field, if it is there and no older than the timeout."""
+        """Return the magnetic field, or None if it is missing or older than the timeout."""
         if self.parameters.magnetometer is None:
             return None
         x, y, z, age_s = values[7:11]
@@ -207,7 +208,7 @@ class ImuSensorBroadcaster(Controller[ImuParameters]):
         return self._turned([x, y, z])
 
     def _unbiased(self, rate: Vector, dt: float) -> Vector:
-        """Return the rate without the gyroscope's bias, and learn that while the body rests."""
+        """Return the rate without the gyroscope bias, which is estimated while the body is at rest."""
         rest = self.parameters.rest
         if rest is None:
             return rate
@@ -220,7 +221,7 @@ class ImuSensorBroadcaster(Controller[ImuParameters]):
         return rate[0] - x, rate[1] - y, rate[2] - z
 
     def _look_for_silence(self, time_ns: int) -> None:
-        """Report, once, that samples stay out."""
+        """Report once that samples are missing."""
         timeout = self.parameters.timeout
         if not self._silent and self._times.age_s(time_ns) * 1e9 > timeout:
             self._silent = True
@@ -230,10 +231,10 @@ class ImuSensorBroadcaster(Controller[ImuParameters]):
             )
 
     def _is_finite(self, values: list[float], own: int) -> bool:
-        """Return whether a sample has numbers only; report, once, that it has not."""
+        """Return True if all values of a sample are finite. Report once if they are not."""
         if all(map(math.isfinite, values[:own])):
             return True
-        if not (self._wrong or math.isnan(values[own])):  # without an age there was never one
+        if not (self._wrong or math.isnan(values[own])):  # age NaN: the first sample is still to come
             self._wrong = True
             self.context.say(f"{self.parameters.sensor} measured NaN or infinity: such samples are left out")
         return False
@@ -244,7 +245,7 @@ Quaternion = tuple[float, float, float, float]
 
 
 def _product(a: Quaternion, b: Quaternion) -> Quaternion:
-    """Return the rotation b followed by a."""
+    """Return the quaternion product a b: rotation b followed by rotation a."""
     ax, ay, az, aw = a
     bx, by, bz, bw = b
     return (
@@ -272,6 +273,6 @@ def _matrix(roll: float, pitch: float, yaw: float) -> tuple[Vector, Vector, Vect
 
 
 def _fill(matrix: Floats, variances: tuple[float, ...] | None) -> None:
-    """Write variances into the diagonal of a covariance, shape (9,)."""
+    """Write variances into the diagonal of a covariance matrix, shape (9,)."""
     if variances is not None:
         matrix[[0, 4, 8]] = variances

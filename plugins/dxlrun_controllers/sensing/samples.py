@@ -1,30 +1,32 @@
-"""Samples of a device or a sensor: which values that a controller reads are new, and when they were true."""
+"""Samples of a device or sensor: detection of new samples, and their times."""
 
 from __future__ import annotations
 
 import math
 
 FRESH = 0.25
-"""Of the controller's period: a sample is a new one when it is younger than the one before by so much. Ages
-of the same sample differ by the microseconds in which they are computed."""
+"""Fraction of the controller's period by which two samples must differ in time. The time of one sample varies
+by some microseconds, because its age is computed again in each cycle."""
 
 
 class SampleTimes:
-    """When the newest sample was measured, from its age, so that lost samples are counted with true times."""
+    """Time of the newest sample, computed from its age, so that a gap between samples has its true length."""
 
     def __init__(self, period_ns: int) -> None:
-        """`period_ns` is the controller's."""
+        """Set the smallest time between two samples from the period of the controller, ns."""
         self._least_s = FRESH * period_ns * 1e-9
         self.forget()
 
     def forget(self) -> None:
-        """Begin anew: the next sample is the first one."""
+        """Discard the last sample. The next one counts as the first."""
         self.time_s = self.elapsed_s = math.nan
 
     def take(self, time_ns: int, age_s: float) -> bool:
-        """Return whether the sample is a new one; `elapsed_s` is the time since the one before, else NaN.
+        """Return True for a new sample, and set `elapsed_s` to the time since the last one, or to NaN.
 
-        `age_s` NaN: there is none yet.
+        Args:
+            time_ns: Time of the cycle, ns.
+            age_s: Age of the sample, s; NaN while there is none.
         """
         sampled_s = time_ns * 1e-9 - age_s
         if math.isnan(sampled_s) or sampled_s - self.time_s <= self._least_s:
@@ -34,5 +36,5 @@ class SampleTimes:
         return True
 
     def age_s(self, time_ns: int) -> float:
-        """Return how old the newest sample is, s; NaN where there is none."""
+        """Return the age of the newest sample, s; NaN without one."""
         return time_ns * 1e-9 - self.time_s

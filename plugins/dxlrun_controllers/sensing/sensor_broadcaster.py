@@ -1,4 +1,4 @@
-"""sensor_broadcaster: publishes states of devices, sensors and joints as a message of ROS 2 for them."""
+"""sensor_broadcaster: publish states of devices, sensors and joints as a standard message of ROS 2."""
 
 from __future__ import annotations
 
@@ -41,9 +41,9 @@ MESSAGES: Mapping[MessageName, tuple[str, type]] = {
     "Temperature": ("temperature", Temperature),
     "WrenchStamped": ("wrench", WrenchStamped),
 }
-"""Topics, named as ROS 2's own broadcasters name them, and messages."""
+"""Topic and type of each message. The topics have the names that the broadcasters of ROS 2 use."""
 Cell = Annotated[tuple[Length, ...], Field(min_length=2, max_length=2)]
-"""x forward and y to the left in the sole's frame, m."""
+"""Position of a force sensor in the frame of the sole: x forward and y to the left, m"""
 
 
 class SensorParameters(ParametersModel):
@@ -52,18 +52,19 @@ class SensorParameters(ParametersModel):
     message: MessageName
     """Type of the message."""
     fields: dict[str, str | float | dict[str, float]] = Field(default_factory=dict)
-    """Fields of the message: a state (`sonar/range`), a number, or states with the factors of their sum."""
+    """Fields of the message. The value is a state (`sonar/range`), a number, or a weighted sum: a mapping of
+    states to factors."""
     cells: dict[str, Cell] = Field(default_factory=dict)
-    """Of a WrenchStamped: states that are forces upwards on a sole, N, and where they act."""
+    """Force sensors of a WrenchStamped: states with upward forces on a sole, N, and their positions."""
     scale: Annotated[float, Field(gt=0)] = 1.0
-    """N for each unit of the cells' states."""
+    """Force per unit of the states of `cells`, N."""
     frame: str = ""
     """Name of the frame in the messages."""
     timeout: Annotated[Duration, Field(gt=0)] = 500_000_000
-    """ns; with an older value nothing is published."""
+    """Age of a value above which nothing is published."""
 
     def mistakes(self) -> Iterator[Mistake]:
-        """Yield fields that the message does not have, and states that cannot be meant."""
+        """Yield unknown fields of the message, values of the wrong type, and invalid names of states."""
         yield from super().mistakes()
         if self.cells and self.message != "WrenchStamped":
             yield ("cells",), f"cells make a WrenchStamped, not a {self.message}; take them out"
@@ -88,9 +89,9 @@ class SensorParameters(ParametersModel):
 
     @property
     def weights(self) -> dict[str, dict[str, float]]:
-        """Factors of the states, by the field of which they are a part; without fields that are numbers.
+        """Factors of the states, by field. Fields with a constant number are not included.
 
-        A force F upwards at (x, y) has the torque (y F, -x F, 0) about the origin.
+        An upward force F at (x, y) has the torque (y F, -x F, 0) about the origin.
         """
         found = {
             path: {value: 1.0} if isinstance(value, str) else value
@@ -110,16 +111,16 @@ _OF_CELLS = ("wrench.force.z", "wrench.torque.x", "wrench.torque.y")
 
 
 class SensorBroadcaster(Controller[SensorParameters]):
-    """Publishes a message when at least one of its states has a new value.
+    """Controller that publishes a message when at least one of its states has a new value.
 
-    With one that is NaN, infinite, or older than `timeout` nothing is published, and an event says so once.
+    Nothing is published while a state is NaN, infinite, or older than `timeout`. An event reports that once.
     """
 
     Parameters = SensorParameters
 
     @classmethod
     def interfaces(cls, parameters: SensorParameters, joints: tuple[str, ...]) -> Interfaces:
-        """Read the states, and how old they are."""
+        """Read the states and their ages."""
         states = _states(parameters)
         return Interfaces((), reads=(*states, *(f"{owner}/age" for owner in _owners(states))))
 
@@ -130,7 +131,7 @@ class SensorBroadcaster(Controller[SensorParameters]):
         return {topic: message}
 
     def on_configure(self, context: Context) -> None:
-        """Make the message, and the matrix that its fields are computed with."""
+        """Allocate the message, and the matrix that computes its fields."""
         super().on_configure(context)
         parameters = self.parameters
         states, weights = _states(parameters), parameters.weights
@@ -148,19 +149,19 @@ class SensorBroadcaster(Controller[SensorParameters]):
         self._times = [SampleTimes(context.period_ns) for _ in _owners(states)]
 
     def on_activate(self, time_ns: int) -> None:
-        """Begin anew."""
+        """Discard all previous samples."""
         for times in self._times:
             times.forget()
         self._silent = False
 
     def update(self, time_ns: int, period_ns: int) -> None:
-        """Publish what is new."""
+        """Publish the message if there is a new sample."""
         reads = self.context.reads
         ages = reads[self._count :].tolist()
         new = False
         for times, age_s in zip(self._times, ages, strict=True):
             new |= times.take(time_ns, age_s)
-        if math.isnan(sum(ages)):  # not all of them have measured yet
+        if math.isnan(sum(ages)):  # a sensor has no sample yet
             return
         values = (self._matrix @ reads[: self._count]).tolist()
         if not all(map(math.isfinite, values)) or max(ages) * 1e9 > self.parameters.timeout:
@@ -190,7 +191,7 @@ def _owners(states: tuple[str, ...]) -> tuple[str, ...]:
 
 
 def _numbers(message: MessageName) -> dict[str, type[int] | type[float]]:
-    """Return the fields of a message that are numbers, by their paths, but for those of the header."""
+    """Return the paths and types of all numeric fields of a message, except those of the header."""
     found: dict[str, type[int] | type[float]] = {}
 
     def add(value: object, path: str) -> None:
@@ -205,6 +206,6 @@ def _numbers(message: MessageName) -> dict[str, type[int] | type[float]]:
 
 
 def _place(message: object, path: str) -> tuple[object, str]:
-    """Return the object that has a field, and the field's name in it."""
+    """Resolve the path of a field to the object that contains it and its name there."""
     outer, _, name = path.rpartition(".")
     return attrgetter(outer)(message) if outer else message, name

@@ -1,4 +1,4 @@
-"""Standard sensors, each run in a process of its own.
+"""Standard sensors. Each runs in a process of its own.
 
-What controllers make of their samples belongs in `sensing`.
+The controllers that use their samples are in `sensing`.
 """

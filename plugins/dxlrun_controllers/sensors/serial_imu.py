@@ -1,12 +1,12 @@
-"""serial_imu: an inertial measurement unit that sends lines of text over a serial port.
+"""serial_imu: inertial measurement unit that sends lines of text over a serial port.
 
-A line ends with a line feed and has one number for each column, parted by commas or blanks, such as
+A line ends with a line feed and has one number for each column, separated by commas or blanks, such as
 
     0.02,-0.11,9.79,0.001,0.000,-0.002
 
-With a `prefix` only lines that begin with it count (`$IMU,...`). With `checksum: true` a line ends with `*`
-and two hexadecimal digits, the exclusive or of all bytes between a leading `$`, if there is one, and the `*`,
-as in NMEA 0183. A line that is anything else is garbage: it is counted, reported, and not used.
+With a `prefix`, each line must start with it (`$IMU,...`). With `checksum: true`, a line ends with `*` and
+two hexadecimal digits: the exclusive or of all bytes before the `*`, without a leading `$`, as in NMEA 0183.
+Any other line is garbage, which is counted, reported, and ignored.
 """
 
 from __future__ import annotations
@@ -34,14 +34,15 @@ _SIX = (
 )
 _IGNORED = "-"
 _LONGEST_LINE = 4096
-"""Bytes; what is longer has no line feed where one belongs."""
+"""Length above which a line is discarded, bytes. It lacks its line feed, for example at a wrong baud rate."""
 _LOOK_S = 0.5
+"""Timeout of one `read`, s, so that the sensor process can stop"""
 _REPORT_NS = 1_000_000_000
-"""Garbage is reported once in this time at most."""
+"""Shortest time between two reports of garbage, ns"""
 
 
 class SerialImuParameters(ParametersModel):
-    """The port, and what stands in a line."""
+    """Serial port and format of the lines"""
 
     port: str = Field(min_length=1, description="Serial device.", examples=["/dev/ttyACM0"])
     baud_rate: int = Field(default=115_200, gt=0, description="bit/s.", examples=["115_200"])
@@ -81,9 +82,9 @@ class SerialImuParameters(ParametersModel):
 
 
 class SerialImu(Sensor[SerialImuParameters]):
-    """Reads the newest line that has come; its time is that of its last byte.
+    """Sensor that reads the newest line. The time of a sample is the arrival of its line.
 
-    A device that is unplugged is an error of `read`: the runtime opens it again once a second.
+    `read` raises an error if the device is unplugged. The runtime then tries to open it once a second.
     """
 
     Parameters = SerialImuParameters
@@ -95,14 +96,14 @@ class SerialImu(Sensor[SerialImuParameters]):
         return tuple(column for column in parameters.columns if column != _IGNORED)
 
     def open(self, context: SensorContext) -> None:
-        """Open the port for this process alone. Raises OSError."""
+        """Open the port for exclusive use. Raises OSError."""
         super().open(context)
         own = self.parameters
         self._places = [index for index, column in enumerate(own.columns) if column != _IGNORED]
         self._scales = [own.scale.get(state.partition(".")[0], 1.0) for state in self.states(own)]
         self._port = open_serial(own.port, own.baud_rate)
         self._received = b""
-        self._begun = False  # the first line may have begun before
+        self._begun = False  # the first line may be incomplete, so it is skipped
         self._garbage, self._shown = 0, b""
         self._reported_ns = -_REPORT_NS
 
@@ -112,7 +113,7 @@ class SerialImu(Sensor[SerialImuParameters]):
             port.close()
 
     def read(self, values: Floats) -> int | None:
-        """Wait for a line, half a second at most. Raises OSError when the port is gone."""
+        """Wait for a line, at most 0.5 s. Raises OSError if the device is unplugged."""
         if not select.select([self._port.fileno()], [], [], _LOOK_S)[0]:
             return None
         data = os.read(self._port.fileno(), 65536)
@@ -140,7 +141,7 @@ class SerialImu(Sensor[SerialImuParameters]):
             self._begun = True
 
     def _numbers(self, line: bytes) -> list[float] | None:
-        """Return the numbers of a line; None for one that is none, which is counted."""
+        """Parse the numbers of a line. Return None for garbage, and count it."""
         prefix = self.parameters.prefix.encode()
         text: bytes | None = line if line.startswith(prefix) else None
         if text is not None and self.parameters.checksum:
@@ -166,7 +167,7 @@ class SerialImu(Sensor[SerialImuParameters]):
 
 
 def checked(line: bytes) -> bytes | None:
-    """Return a line without its checksum; None where that is wrong."""
+    """Return a line without its checksum, or None if the checksum is missing or wrong."""
     text, star, digits = line.rpartition(b"*")
     try:
         given = int(digits, 16)

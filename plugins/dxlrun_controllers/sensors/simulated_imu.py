@@ -1,4 +1,4 @@
-"""simulated_imu: what an inertial measurement unit on a link of the simulated robot would measure."""
+"""simulated_imu: simulated inertial measurement unit on a link of the simulated robot."""
 
 from __future__ import annotations
 
@@ -11,14 +11,14 @@ from pydantic import Field
 from dxlrun import AngularVelocity, Body, Floats, LinearAcceleration, ParametersModel, Sensor, SensorContext
 
 GRAVITY = np.array((0.0, 0.0, -9.81))
-"""m/s^2, in the world's frame, as MuJoCo's."""
+"""m/s^2 in the world frame; the default of MuJoCo"""
 _AXES = ("x", "y", "z")
 
 Density = Annotated[float, Field(ge=0)]
 
 
 class Gyroscope(ParametersModel):
-    """How wrong the gyroscope is."""
+    """Gyroscope model: noise, bias and drift of the bias."""
 
     noise_density: Density = Field(default=0.0, description="White noise, rad/s/sqrt(Hz).", examples=["1e-4"])
     bias: tuple[AngularVelocity, AngularVelocity, AngularVelocity] = Field(
@@ -32,7 +32,7 @@ class Gyroscope(ParametersModel):
 
 
 class Accelerometer(ParametersModel):
-    """How wrong the accelerometer is."""
+    """Accelerometer model: noise, bias and drift of the bias."""
 
     noise_density: Density = Field(default=0.0, description="White noise, m/s^2/sqrt(Hz).", examples=["2e-3"])
     bias: tuple[LinearAcceleration, LinearAcceleration, LinearAcceleration] = Field(
@@ -46,7 +46,7 @@ class Accelerometer(ParametersModel):
 
 
 class Magnetometer(ParametersModel):
-    """The field that it is in, and how wrong it is."""
+    """Magnetometer model: ambient field, noise and bias."""
 
     field: tuple[float, float, float] = Field(
         default=(0.0, 2.0e-5, -4.4e-5),
@@ -60,7 +60,7 @@ class Magnetometer(ParametersModel):
 
 
 class ImuParameters(ParametersModel):
-    """Where the unit is, and how wrong it is."""
+    """Link of the unit, and models of its sensors"""
 
     link: str = Field(min_length=1, description="Link of the URDF that it sits on, in its frame.")
     gyroscope: Gyroscope = Gyroscope()
@@ -72,8 +72,11 @@ class ImuParameters(ParametersModel):
 
 
 class _Noise:
-    """White noise and a bias that wanders, three axes; discrete standard deviations as in Kalibr's IMU model:
-    density x sqrt(rate), and walk / sqrt(rate) a sample."""
+    """White noise and random walk of the bias, for three axes.
+
+    The discrete standard deviations are those of Kalibr's IMU model: density * sqrt(rate) for the noise, and
+    walk / sqrt(rate) for the step of the bias per sample.
+    """
 
     def __init__(self, density: float, bias: tuple[float, ...], walk: float, rate: float) -> None:
         self._white = density * math.sqrt(rate)
@@ -89,9 +92,9 @@ class _Noise:
 
 
 class SimulatedImu(Sensor[ImuParameters]):
-    """Specific force and rate of a link, and the magnetic field, in the link's frame.
+    """Simulated specific force, angular velocity and magnetic field, in the frame of the link.
 
-    At rest the accelerometer shows +9.81 m/s^2 upwards (sensor_msgs/Imu; REP 145).
+    At rest the accelerometer measures +9.81 m/s^2 upwards (sensor_msgs/Imu; REP 145).
     """
 
     Parameters = ImuParameters
@@ -100,14 +103,14 @@ class SimulatedImu(Sensor[ImuParameters]):
 
     @classmethod
     def states(cls, parameters: ImuParameters) -> tuple[str, ...]:
-        """Return the states: those of ros2_control's IMU sensors, and of a magnetometer."""
+        """Return the states: those of ros2_control's IMU sensors, and optionally the magnetic field."""
         groups = ["angular_velocity", "linear_acceleration"]
         groups += ["magnetic_field"] if parameters.magnetometer is not None else []
         return tuple(f"{group}.{axis}" for group in groups for axis in _AXES)
 
     @classmethod
     def noisy(cls, parameters: ImuParameters) -> tuple[str, ...]:
-        """Return the states that the file gives noise; without noise a link at rest shows the same."""
+        """Return the states with noise. All others are constant while the link is at rest."""
         gyroscope, accelerometer = parameters.gyroscope, parameters.accelerometer
         groups = ["angular_velocity"] if gyroscope.noise_density or gyroscope.random_walk else []
         groups += ["linear_acceleration"] if accelerometer.noise_density or accelerometer.random_walk else []
@@ -115,11 +118,11 @@ class SimulatedImu(Sensor[ImuParameters]):
 
     @classmethod
     def links(cls, parameters: ImuParameters) -> tuple[str, ...]:
-        """Return the link that it sits on."""
+        """Return the link that carries the unit."""
         return (parameters.link,)
 
     def open(self, context: SensorContext) -> None:
-        """Begin the noise anew."""
+        """Restart the noise from its seed."""
         super().open(context)
         if context.body is None:
             raise RuntimeError("there is no simulated body")
@@ -135,7 +138,7 @@ class SimulatedImu(Sensor[ImuParameters]):
         self._magnet_noise = None if magnet is None else _Noise(magnet.noise_density, magnet.bias, 0.0, rate)
 
     def read(self, values: Floats) -> int:
-        """Measure the body as it is now."""
+        """Measure the present motion of the body."""
         t_ns = self.context.now_ns()
         motion = self._body.motion(self.parameters.link)
         generator = self._generator
@@ -149,7 +152,7 @@ class SimulatedImu(Sensor[ImuParameters]):
 
 
 def turned_back(orientation: Floats, vector: Floats) -> Floats:
-    """Return a vector of the world in the frame that an orientation x, y, z, w turns into the world's."""
+    """Rotate a vector from the world frame into the frame of a body with the orientation x, y, z, w."""
     axis, w = -orientation[:3], orientation.item(3)
     twice = 2.0 * np.cross(axis, vector)
     turned: Floats = vector + w * twice + np.cross(axis, twice)
