@@ -1,6 +1,6 @@
-"""Counts of whole numbers, and their exact quantiles; memory grows with the number of different values.
+"""Counts of integers and their exact quantiles. Memory grows with the number of distinct values.
 
-`quantile` and `median` are the definitions of every percentile that is shown (docs/reference/analyze.md).
+`quantile` and `median` define every percentile that is shown (docs/reference/analyze.md).
 """
 
 from __future__ import annotations
@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 
 Numbers = NDArray[np.int64]
 
-_GROUP = 40  # Bits of a value, shifted so that none is negative; above them its group
+_GROUP = 40  # Low bits of a key hold the value, shifted to be non-negative; the bits above hold its group
 _ZERO = 1 << (_GROUP - 1)
 _MOST_PENDING = 1 << 18
 _FEWEST = 10
@@ -18,7 +18,7 @@ _TIMES_MORE = 10
 
 
 class Counts:
-    """Counts values of several groups: times in us of servos, for example."""
+    """Counter of integer values in several groups, for example reply times in us by servo."""
 
     def __init__(self) -> None:
         self._keys = np.zeros(0, np.int64)
@@ -27,21 +27,26 @@ class Counts:
         self._waiting = 0
 
     def take(self, group: Numbers, value: Numbers) -> None:
-        """Count values, each in its group (0 to 2^23); shape (values,)."""
+        """Count values in their groups.
+
+        Args:
+            group: Group of each value, 0 to 2^23; shape (values,).
+            value: Values to count; shape (values,).
+        """
         self._pending.append((group << _GROUP) + np.clip(value, -_ZERO, _ZERO - 1) + _ZERO)
         self._waiting += len(value)
         if self._waiting > _MOST_PENDING:
             self._merge()
 
     def of(self, group: int) -> tuple[Numbers, Numbers]:
-        """Return the values of a group, ascending, and how often each was seen."""
+        """Return the distinct values of a group, ascending, and the count of each value."""
         self._merge()
         begin, end = np.searchsorted(self._keys, [group << _GROUP, (group + 1) << _GROUP])
         return self._keys[begin:end] - (group << _GROUP) - _ZERO, self._counts[begin:end]
 
     @property
     def groups(self) -> list[int]:
-        """The groups that have values, ascending."""
+        """Groups that have values, ascending."""
         self._merge()
         return sorted(set((self._keys >> _GROUP).tolist()))
 
@@ -57,27 +62,31 @@ class Counts:
 
 
 def quantile(values: Numbers, counts: Numbers, share: float) -> float:
-    """Return a quantile by nearest rank: the smallest value that at least this share does not exceed.
+    """Return a quantile by nearest rank: the smallest value whose cumulative share reaches `share`.
 
-    It is a value that was seen, never interpolated. Of several seen n times in all it has rank
-    ceil(share * n).
+    The result is an observed value, never an interpolated one. Its rank among n observations is ceil(share *
+    n).
 
     Args:
-        values: Ascending, without repetition.
-        counts: How often each was seen.
+        values: Distinct values, ascending.
+        counts: Number of observations of each value.
         share: 0.99 for 99 %.
 
     Returns:
-        The value; 0 if there is none.
+        The quantile, or 0 without observations.
     """
     seen = np.cumsum(counts)
     if not len(seen):
         return 0.0
+    # The factor keeps a product such as 0.99 * 100 from rounding up to the next rank.
     return float(values[np.searchsorted(seen, share * seen[-1] * (1 - 1e-12))])
 
 
 def median(values: Numbers, counts: Numbers) -> float:
-    """Return the median, of an even number of values the mean of the two in the middle; 0 of none."""
+    """Return the median, or 0 without values.
+
+    The median of an even number is the mean of the two middle values.
+    """
     seen = np.cumsum(counts)
     if not len(seen):
         return 0.0
@@ -87,8 +96,9 @@ def median(values: Numbers, counts: Numbers) -> float:
 
 
 def has_them_alone(own: int, others: int) -> bool:
-    """Return whether one of several has so many of something, and all others so few, that it is named.
+    """Return whether one part accounts for nearly all occurrences, so that a finding may name it.
 
-    Ten at least, and ten times as many as all others together: plain counts, which a sentence can give.
+    This needs at least ten occurrences, and ten times as many as in all other parts together. The bounds are
+    plain counts, so a sentence can quote them.
     """
     return own >= max(_FEWEST, _TIMES_MORE * others)

@@ -1,12 +1,12 @@
-"""The one gate in front of all rules: is the evidence complete, and what does a finding still accuse?
+"""Evidence gate of all rules: drop findings whose evidence is incomplete or explained by another finding.
 
-A rule speaks only where the evidence that it needs (`Needs` in rules.py) is complete, start-up included. A
-machine that was too busy is named in any case, and stands for what it explains: late and missing replies,
-which it causes for real servos, too, as they wait in its driver, and all that is derived from goals and
-states that did not come when they were due. What failed is told all the same, without a remedy.
+A rule applies only if the evidence that it needs (`Needs` in rules.py) is complete, start-up included. A busy
+machine is always reported. It explains late and missing replies, also those of real servos, because replies
+wait in the driver. It also explains everything derived from goals and states that were late. Failures are
+still reported, but without a remedy.
 
-Of findings about the same replies the one with the most direct evidence stays: what holds for the machine or
-a bus stands for its servos.
+Of several findings about the same replies, the one with the most direct evidence is kept. A finding about the
+machine or a bus replaces those about its servos.
 """
 
 from __future__ import annotations
@@ -26,29 +26,31 @@ _REPLIES = (
     *("power_lost", "another_host", "late_replies", "broken_replies", "slow_servo", "noise", "lossy_servo"),
     "lossy_line",
 )
-"""Codes of what is wrong with replies, the most direct evidence first."""
+"""Codes of problems with replies, the most direct evidence first."""
 _WEAK = ("noise", "lossy_line")
-"""Those that only say that bytes belong to no packet, or that replies are missing."""
+"""Codes of indirect evidence: bytes that belong to no packet, or missing replies."""
 _SPOILT = frozenset(("power_lost", "noise", "broken_replies", "lossy_line", "bus_lost"))
-"""Codes after which goals wait, and joints follow worse that are not at fault; another host does the same
-whose goals or replies are among those of this run."""
+"""Codes of faults that delay goals and make healthy joints follow worse. Another host has the same effect if
+its goals or replies are mixed into those of this run."""
 _UNANSWERED = frozenset(("servo_lost", "silent"))
-"""Codes of what failed by replies that did not come, which may be a busy machine's."""
+"""Codes of failures inferred from missing replies, which a busy machine can also cause."""
 _FAILED = _UNANSWERED | {"servo_rebooted", "torque_lost"}
 _SHARED = "Check what these buses share: the USB hub, its driver, the supply."
 _MARGIN = 0.1
-"""A busy machine makes no greater a share of the replies late than so much above its share of the run."""
+"""Margin between the share of late replies and the busy share of the run. A larger share of late replies has
+another cause than the busy machine."""
 _LATE_SHARE = 0.01
-"""Wake-ups more than 1 ms late from which replies wait for the loop as often as for the line."""
-_LEAST_CYCLES = 3  # One stall of a machine is not a busy one
-_PART = 5  # Of the excess of long cycles: what has less than a fifth is not worth its words
+"""Share of wake-ups more than 1 ms late from which the loop itself accounts for late replies."""
+_LEAST_CYCLES = 3  # One stall does not make a machine busy
+_PART = 5  # Causes below a fifth of the excess of long cycles are not reported
 
 
 def busy_machine(totals: RunTotals) -> list[str]:
-    """Return what shows that the machine was too busy, in words; nothing: it was not.
+    """Return the evidence of a busy machine in words, or an empty list.
 
-    Its samples, waits for simulated servos, wake-ups that were late, and what woke the loop late where that
-    has most of what long cycles took. The wake-ups of a sequential loop wait for nothing.
+    The evidence consists of machine samples, waits for simulated servos, late wake-ups, and the causes of
+    late wake-ups if they account for most of the time of long cycles. Wake-ups of a sequential loop have no
+    deadline and are not used.
     """
     load, causes = totals.causes.load, totals.causes.causes
     parts = [load.text] if load.share else []
@@ -74,7 +76,7 @@ def busy_machine(totals: RunTotals) -> list[str]:
 
 
 def complete(totals: RunTotals) -> Needs:
-    """Return which evidence of a run is complete; states and replies are asked joint by joint."""
+    """Return the evidence that is complete for a whole run. States and replies are checked joint by joint."""
     found = Needs.STATES | Needs.INTACT
     if not busy_machine(totals):
         found |= Needs.MACHINE
@@ -86,7 +88,7 @@ def complete(totals: RunTotals) -> Needs:
 
 
 def accused(totals: RunTotals, found: Iterable[Finding]) -> tuple[Finding, ...]:
-    """Return the findings for which the evidence is complete, with their rank and what helps."""
+    """Return the findings with complete evidence, with their rank and remedy."""
     found = tuple(found)
     there, load = complete(totals), totals.causes.load
     spoilt = {one.subject for one in found if one.code in _SPOILT}
@@ -102,7 +104,7 @@ def accused(totals: RunTotals, found: Iterable[Finding]) -> tuple[Finding, ...]:
             and one.subject != "machine"
             and one.share > load.share + _MARGIN
         ):
-            missing = Needs.NOTHING  # it is more than the machine explains
+            missing = Needs.NOTHING  # The share exceeds the part that the busy machine explains
         parts = {"machine", one.subject, totals.bus_of(one.subject)}
         missing |= needs & (Needs.STATES if parts & doubtful else Needs.NOTHING)
         missing |= needs & (Needs.INTACT if parts & spoilt else Needs.NOTHING)
@@ -119,7 +121,7 @@ def accused(totals: RunTotals, found: Iterable[Finding]) -> tuple[Finding, ...]:
 
 
 def _is_explained(totals: RunTotals, failed: Finding, found: Iterable[Finding]) -> bool:
-    """Return whether another finding accuses the bus of what failed, or what all buses share."""
+    """Return whether another finding accuses the bus of a failed servo, or a part that all buses share."""
     return any(
         one is not failed
         and RULES[one.code].accuses
@@ -130,10 +132,10 @@ def _is_explained(totals: RunTotals, failed: Finding, found: Iterable[Finding]) 
 
 
 def _one_accused(totals: RunTotals, found: Iterable[Finding]) -> tuple[Finding, ...]:
-    """Leave one finding for what is wrong with the replies of a part, see the module."""
+    """Keep one finding about the replies of each part; the module docstring has the priorities."""
     found = tuple(found)
     named = sorted((one for one in found if one.code in _REPLIES), key=lambda one: _REPLIES.index(one.code))
-    # servos of several buses that were lost at once stand for the late and missing replies of each
+    # A simultaneous loss on several buses explains the late and missing replies of each bus.
     kept = [one for one in found if (one.code, one.subject) == ("servo_lost", "machine")]
     for one in named:
         bus = totals.bus_of(one.subject)
@@ -146,7 +148,7 @@ def _one_accused(totals: RunTotals, found: Iterable[Finding]) -> tuple[Finding, 
 
 
 def _explaining(totals: RunTotals, found: tuple[Finding, ...]) -> tuple[Finding, ...]:
-    """Put each cause before what it explains: a servo that failed, or states, periods and replies."""
+    """Rank each cause before its effect: a servo failure, or invalid states, skipped periods and errors."""
     failed = {group.source for group in severe_of(totals.events, *HURTS, EventCode.DEVICE_LOST)}
     failed |= {finding.subject for finding in found if finding.rank == Rank.SERVO}
     failed |= {servo.bus for servo in totals.servos if servo.joint in failed}
@@ -164,13 +166,15 @@ def _explaining(totals: RunTotals, found: tuple[Finding, ...]) -> tuple[Finding,
 
 
 def remedy(finding: Finding, totals: RunTotals) -> str:
-    """Return what to do about a finding: the one place that knows whether what it accuses is simulated.
+    """Return the remedy of a finding; the only function that depends on whether the accused part is
+    simulated.
 
-    Of a simulated part there is nothing to check or to exchange, whatever the table proposes for a real one.
+    A simulated part has nothing to check or to exchange, so the remedy for a real part does not apply.
     """
     rule = RULES[finding.code]
     if finding.code == "busy_machine":
-        buses = () if totals.virtual else totals.plan.buses  # on virtual time it runs already
+        # On virtual time the remedy is already in effect.
+        buses = () if totals.virtual else totals.plan.buses
         ends = _sentence(free_machine("sim" if bus.simulated else bus.port for bus in buses))
         return ends if totals.real_time.granted else f"{ends} {wake_up_remedy(totals.real_time)}"
     text = finding.remedy or (_SHARED if finding.subject == "machine" else rule.remedy)
@@ -185,7 +189,7 @@ def _sentence(text: str) -> str:
 
 
 def _names(subject: str, totals: RunTotals) -> dict[str, str]:
-    """Return what remedies call the bus, its port and the servo that a finding accuses."""
+    """Return the values of the placeholders in remedies: name, bus, port and ID of the accused servo."""
     for bus in totals.plan.buses:
         ids = [str(servo_id) for servo_id, name in bus.names.items() if name == subject]
         if ids or subject in (bus.name, *(servo.joint for servo in bus.servos)):
@@ -196,7 +200,7 @@ def _names(subject: str, totals: RunTotals) -> dict[str, str]:
 
 
 def wake_up_remedy(real_time: RealTime) -> str:
-    """Return what makes wake-ups punctual: the next of scheduler, kernel and machine."""
+    """Return the next step towards punctual wake-ups: scheduler, kernel or machine."""
     if not real_time.requested:
         return "`loop: {scheduler: {policy: round_robin}}` in the robot file helps."
     if not real_time.granted:

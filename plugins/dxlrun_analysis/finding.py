@@ -1,4 +1,4 @@
-"""A finding: one thing that a run shows, as data for programs and as a sentence for a person."""
+"""Finding: one observation about a run, as data for programs and as a sentence for a person."""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ from enum import IntEnum, unique
 from dxlrun.tooling.records import EventCode
 
 ROBOT = "robot"
-"""The code of the first line: what the robot did. It accuses nothing, and stands before all others."""
+"""Code of the first line, the summary of the robot. It accuses nothing and precedes all other findings."""
 
 
 HURTS = {
@@ -17,58 +17,61 @@ HURTS = {
     EventCode.SERVO_LOST: "was lost",
     EventCode.SERVO_LIMP: "lost its torque",
 }
-"""What happens to servos, and what is said of them."""
+"""Severe events of servos, with the verb that reports them."""
 
 
 @unique
 class Rank(IntEnum):
-    """Severity of a finding; the first is the worst."""
+    """Severity of a finding, the worst first."""
 
-    NEVER_RAN = 0  # Nor to its end, where a process of the run failed
+    NEVER_RAN = 0  # The run did not start, or one of its processes failed
     LINE = 1
     SERVO_CAUSE = 2  # Explains why a servo failed
     SERVO = 3
     SHARE_CAUSE = 4  # Explains invalid states, skipped periods or errors
-    SHARE = 5  # Of the time: joints and periods, the largest share first
+    SHARE = 5  # Share of time: joints and periods, the largest share first
     ERROR = 6
     LOG = 7
-    CAUSE = 8  # Leads to any of these, but has not yet: the run may be good
+    CAUSE = 8  # Can lead to any of the ranks above, but has not; the run may be good
     REMARK = 9
 
 
 @dataclass(frozen=True, slots=True)
 class Finding:
-    """One finding. Rules of every room of the analysis make them; `judge` sorts them, the worst first."""
+    """One finding.
+
+    Rules of all rooms of the analysis create findings; `judge` sorts them, the worst first.
+    """
 
     code: str
-    """A word for programs, of `dxlrun_analysis.rules.RULES`, or ROBOT."""
-    subject: str  # The bus, servo, joint, controller or process that it accuses; empty: none
-    sentence: str  # What was found, for a person
+    """Code for programs: a key of `dxlrun_analysis.rules.RULES`, or ROBOT."""
+    subject: str  # Accused bus, servo, joint, controller or process, or empty
+    sentence: str  # Observation, for a person
     remedy: str = ""
-    """What to do about it, a sentence or a command: rules leave it empty unless they measured what helps, and
-    `judge` takes that of the table."""
+    """Recommended action, a sentence or a command. Rules leave it empty unless they measured a remedy;
+    `judge` then uses the remedy of the table."""
     rank: Rank = Rank.REMARK
     share: float = 0.0
-    """Findings of one rank are sorted by it, the greatest first; those of one share keep their order."""
+    """Sort key within a rank, the greatest first. Findings with equal shares keep their order."""
 
     @property
     def order(self) -> tuple[int, float]:
-        """By it findings are sorted."""
+        """Sort key: rank, then descending share."""
         return self.rank, -self.share
 
     @property
     def line(self) -> str:
-        """The sentence, and the remedy behind it."""
+        """Sentence followed by the remedy."""
         return f"{self.sentence} {self.remedy}".rstrip()
 
 
 def listed(names: Iterable[str], most: int = 3) -> str:
-    """Return the first of some names, each once, and how many more there are."""
+    """Return the first `most` distinct names, and the number of further ones."""
     shown = list(dict.fromkeys(names))
     more = len(shown) - most
     return ", ".join(shown[:most]) + (f" and {more} more" if more > 0 else "")
 
 
 def cause(code: str, subject: str, sentence: str, remedy: str = "", share: float = 1.0) -> Finding:
-    """Return a finding that leads to what makes a run not good, see Rank.CAUSE."""
+    """Return a finding of rank CAUSE."""
     return Finding(code, subject, sentence, remedy, Rank.CAUSE, share)

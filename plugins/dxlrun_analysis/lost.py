@@ -1,4 +1,4 @@
-"""What was lost in a run: lines, servos, devices, states and replies; rules of the verdict."""
+"""Losses in a run: buses, servos, devices, states and replies; rules of the verdict."""
 
 from __future__ import annotations
 
@@ -13,19 +13,20 @@ from dxlrun_analysis.finding import HURTS, Finding, Rank, cause
 from dxlrun_analysis.servos.traffic import ServoTraffic
 from dxlrun_analysis.tally import RunTotals
 
-INVALID_SHARE = 0.01  # More invalid states of a joint than this, and the run was not good
+# A run is not good if more than this share of a joint's states is invalid.
+INVALID_SHARE = 0.01
 _FEW_INVALID = 2
-"""So few are tolerated however short the run: a servo that misses three replies in a row is lost."""
+"""Invalid states tolerated in a run of any length. A servo that misses three replies in a row is lost."""
 _MOST_NAMED = 3
 
 
 def severe_of(events: Iterable[EventGroup], *codes: EventCode) -> list[EventGroup]:
-    """Return the errors of some codes."""
+    """Return the event groups of some codes with severity error or above."""
     return [group for group in events if group.code in codes and group.severity >= Severity.ERROR]
 
 
 def lost_lines(totals: RunTotals) -> Iterable[Finding]:
-    """Report each line that was lost."""
+    """Report each bus whose port was lost."""
     for group in severe_of(totals.events, EventCode.PORT_LOST):
         times = "" if group.count == 1 else f" {group.count} times"
         line = sentence_of(group)
@@ -70,9 +71,10 @@ def lost_servos(totals: RunTotals) -> Iterable[Finding]:
     lost_at = {one.name: one.lost_at for one in totals.tracking if one.unit is ROTARY}
     if len(by_source) == 1 and (at := lost_at.get(ordered[0][0])) is not None:
         sentence = f"{sentence[:-1]}, at {math.degrees(at):.0f} deg."
-    if len(by_source) <= _FEWEST_OF_BUS:  # of more it is what they share
+    # With more servos the common cause matters, not the reason of each servo.
+    if len(by_source) <= _FEWEST_OF_BUS:
         for source, (*_, why) in totals.returns.items():
-            # what is behind the question is about the plugs of a real servo
+            # The rest of the text is about plugs, which a simulated servo does not have.
             seen = _CABLES.sub("?", why) if totals.plan.is_simulated(source) else why
             sentence += f" {source} {seen}" + ("" if seen.endswith("?") else ".")
     codes = {group.code for group in ordered[0][1]}
@@ -87,8 +89,7 @@ def lost_servos(totals: RunTotals) -> Iterable[Finding]:
 
 
 def _failed_together(totals: RunTotals, failed: Mapping[str, Sequence[EventGroup]]) -> bool:
-    """Return whether several servos of a bus failed in the same way, at once and as often as each other, and
-    not all that it has."""
+    """Return whether several but not all servos of a bus failed at once in the same way, equally often."""
     bus_of = {servo.joint: servo.bus for servo in totals.servos if servo.joint and not servo.device}
     bus, *others = {bus_of.get(source, "") for source in failed}
     first = [min(groups, key=lambda group: group.t_ns) for groups in failed.values()]
@@ -114,10 +115,13 @@ def lost_devices(totals: RunTotals) -> Iterable[Finding]:
 
 
 def whole_buses(totals: RunTotals) -> Iterable[Finding]:
-    """Report what happened to all servos of a bus, which share supply and adapter, or of several at once."""
+    """Report events that affected all servos of a bus, or several buses, at once.
+
+    Servos of a bus share supply and adapter.
+    """
     gone = {group.source for group in severe_of(totals.events, EventCode.PORT_LOST)}
     servos = [servo for servo in totals.servos if servo.joint and not servo.device]
-    silent: dict[str, int] = {}  # When the first servo was lost, ns, of each bus that lost all
+    silent: dict[str, int] = {}  # Time of the first loss, ns, for each bus that lost all its servos
     for bus in sorted({servo.bus for servo in servos} - gone):
         joints = {servo.joint for servo in servos if servo.bus == bus}
         if _all_at_once(totals, EventCode.SERVO_REBOOTED, joints) is not None:
@@ -138,7 +142,10 @@ def whole_buses(totals: RunTotals) -> Iterable[Finding]:
 
 
 def _all_at_once(totals: RunTotals, code: EventCode, joints: set[str]) -> int | None:
-    """Return when a thing happened first that happened to all these joints at once, ns; None: it did not."""
+    """Return the time (ns) of the first of simultaneous events on all given joints.
+
+    None: the events were not simultaneous, or some joints had none.
+    """
     times = {group.source: group.t_ns for group in severe_of(totals.events, code) if group.source in joints}
     if len(joints) < _FEWEST_OF_BUS or set(times) != joints:
         return None
@@ -152,7 +159,7 @@ def _joined(parts: Sequence[str]) -> str:
 
 
 def invalid_states(totals: RunTotals) -> Iterable[Finding]:
-    """Name the joints whose states were invalid too often; the cycles that were skipped have none."""
+    """Report joints whose states were invalid too often. Skipped cycles have no states."""
     cycles, counts = totals.periods.records, invalid_joints(totals)
     if not counts:
         return
@@ -168,7 +175,7 @@ def invalid_states(totals: RunTotals) -> Iterable[Finding]:
 
 
 def invalid_joints(totals: RunTotals) -> dict[str, int]:
-    """Return how many states of each joint were invalid, where they were so too often."""
+    """Return the number of invalid states of each joint that exceeds the tolerance."""
     cycles = totals.periods.records
     return {
         joint: count
@@ -178,7 +185,7 @@ def invalid_joints(totals: RunTotals) -> dict[str, int]:
 
 
 def waited_in_vain(totals: RunTotals) -> set[str]:
-    """Return the joints that were invalid too often, but mostly not by lost replies of their own servos."""
+    """Return joints with too many invalid states that lost replies of their own servos do not explain."""
     counts = invalid_joints(totals)
     servos = {(servo.bus, servo.servo_id): servo for servo in totals.servos}
     found = set()
@@ -192,7 +199,7 @@ def waited_in_vain(totals: RunTotals) -> set[str]:
 
 
 def implausible(totals: RunTotals) -> Iterable[Finding]:
-    """Name joints whose positions the loop did not believe."""
+    """Report joints with positions that the loop rejected as implausible."""
     named = {one.subject for one in totals.findings if one.code == "position_jumped"}
     for group in totals.events:
         if group.code == EventCode.IMPLAUSIBLE and group.source in totals.plan.movers.keys() - named:
@@ -200,7 +207,7 @@ def implausible(totals: RunTotals) -> Iterable[Finding]:
 
 
 def missing_replies(totals: RunTotals) -> Iterable[Finding]:
-    """Report the servos without all replies, or that there are none."""
+    """Report servos with missing replies, or that all servos answered."""
     asked = [servo for servo in totals.servos if servo.asked]
     if not asked:
         return
@@ -208,7 +215,7 @@ def missing_replies(totals: RunTotals) -> Iterable[Finding]:
     if not losers and any(
         severe_of(totals.events, EventCode.PORT_LOST, EventCode.SERVO_LOST, EventCode.DEVICE_LOST)
     ):
-        return  # they answered while they were asked; what was lost is told above
+        return  # Servos answered as long as they were asked; another rule reports the loss
     if not losers:
         yield Finding("replies", "", f"{_all(asked)} answered every time.")
         return
@@ -232,7 +239,7 @@ def _kinds(asked: Sequence[ServoTraffic]) -> str:
 
 
 def servo_errors(totals: RunTotals) -> Iterable[Finding]:
-    """Report the error bits of servos."""
+    """Report servos with error bits."""
     troubled = [servo for servo in totals.servos if servo.errors]
     if not troubled:
         return
@@ -247,7 +254,7 @@ def servo_errors(totals: RunTotals) -> Iterable[Finding]:
 
 
 def _more(joining: str, count: int, one: str = "more servo", many: str = "more servos") -> str:
-    """Return how many there are beyond those that are named."""
+    """Return the count of names beyond those that are listed."""
     beyond = count - _MOST_NAMED
     return f"{joining} {counted(beyond, one, many)}" if beyond > 0 else ""
 
@@ -258,6 +265,6 @@ def _name(servo: ServoTraffic) -> str:
 
 
 def sentence_of(group: EventGroup) -> str:
-    """Return an event's text in a line: all problems of a start, of a traceback what was raised."""
+    """Return an event's text in one line: all problems of a start-up, or the last line of a traceback."""
     lines = group.text.strip().splitlines() or [group.name]
     return "; ".join(lines) if group.code == EventCode.SETUP else lines[-1]

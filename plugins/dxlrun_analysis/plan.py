@@ -1,4 +1,4 @@
-"""The plan in a log, as far as the analysis reads it."""
+"""Plan in a log, as far as the analysis reads it."""
 
 from __future__ import annotations
 
@@ -39,22 +39,22 @@ class LoggedServo(msgspec.Struct):
     rad_s_per_tick: float = 0.0
     registers: list[LoggedRegister] = []
     row: int = -1
-    name: str = ""  # Its own, where several servos move one joint
-    ratio: float = 1.0  # rad of its joint, or m, for each rad of the servo
+    name: str = ""  # Own name, if several servos move one joint
+    ratio: float = 1.0  # rad (or m) of the joint per rad of the servo
 
     @property
     def own_name(self) -> str:
-        """A name that no other servo has."""
+        """Name that is unique among servos."""
         return self.name or self.joint
 
     @property
     def declared(self) -> dict[str, int]:
-        """The integer on the wire that the robot file gives an item, by item."""
+        """Raw value that the robot file gives each control table item, by item name."""
         return {register.name: register.value for register in self.registers}
 
 
 class LoggedDevice(msgspec.Struct):
-    """One device of the plan: on a bus, and no servo."""
+    """One device of the plan: a node on a bus that is not a servo."""
 
     name: str = ""
     servo_id: int = -1
@@ -73,21 +73,22 @@ class LoggedBus(msgspec.Struct):
     servos: list[LoggedServo] = []
     devices: list[LoggedDevice] = []
     noted: bool = False
-    """The run noted that it is simulated: the link to the port of `dxlrun sim` may be gone since."""
+    """Mark of the run that this bus is simulated. The link to the port of `dxlrun sim` may no longer
+    exist."""
 
     @property
     def simulated(self) -> bool:
-        """It has no real servos."""
+        """True if all servos of the bus are simulated."""
         return self.noted or is_simulated(self.port)
 
     @property
     def names(self) -> dict[int, str]:
-        """The servo, as its joint is called or by its own name, or the device of each ID."""
+        """Name of the servo or device with each ID. A servo has its joint's name, or its own."""
         joints = {servo.servo_id: servo.own_name for servo in self.servos}
         return joints | {device.servo_id: device.name for device in self.devices}
 
     def called(self, servo_id: int) -> tuple[str, str]:
-        """Return what findings call a servo: its name, and the same with its ID and its bus."""
+        """Return the name of a servo as findings use it, and the name with ID and bus."""
         name = self.names.get(servo_id) or f"servo {servo_id}"
         return name, f"{name} (servo {servo_id} on bus {self.name})"
 
@@ -97,36 +98,36 @@ class Mover(NamedTuple):
 
     bus: LoggedBus
     servo: LoggedServo
-    share: float  # rad of the joint, or m, for each rad of the servo, without its sign
+    share: float  # rad (or m) of the joint per rad of the servo, unsigned
 
 
 NO_LOOP = LoopPlan(0, SchedulerPlan("other", 0, lock_memory=False), (), (), (), None)
-"""Of a log without a plan."""
+"""Loop plan of a log without a plan."""
 UNKNOWN_JOINT = JointPlan("", -math.inf, math.inf, None)
 
 
 class LoggedPlan(msgspec.Struct):
-    """The loop as it was planned, and of the buses what is read here."""
+    """Plan of the loop, and those parts of the buses that the analysis reads."""
 
     loop: LoopPlan = NO_LOOP
     buses: list[LoggedBus] = []
     mechanics: MechanicsPlan = MechanicsPlan()
 
     def joint(self, name: str) -> JointPlan:
-        """Return a joint; of one that the plan does not have only its name is known."""
+        """Return a joint by name; for a joint that is not in the plan, a placeholder with its name."""
         unknown = structs.replace(UNKNOWN_JOINT, name=name)
         return next((joint for joint in self.loop.joints if joint.name == name), unknown)
 
     def controller(self, name: str) -> ControllerPlan:
-        """Return a controller; of one that the plan does not have only its name is known."""
+        """Return a controller by name; for one that is not in the plan, a placeholder with its name."""
         unknown = ControllerPlan(name, "", "", "{}", (), (), (), active=False, every=1)
         return next((one for one in self.loop.controllers if one.name == name), unknown)
 
     @property
     def movers(self) -> dict[str, tuple[Mover, ...]]:
-        """The servos that move each joint, by its name."""
+        """Servos that move each joint, by joint name."""
         servos = {servo.row: (bus, servo) for bus in self.buses for servo in bus.servos}
-        # by name, as the plan of a damaged log may lack the joints
+        # Use names because the plan of a damaged log may lack the joints.
         found: dict[str, tuple[Mover, ...]] = {
             servo.joint: (Mover(bus, servo, servo.ratio),)
             for bus in self.buses
@@ -145,10 +146,11 @@ class LoggedPlan(msgspec.Struct):
         return found
 
     def is_simulated(self, subject: str) -> bool:
-        """Return whether what a finding accuses is simulated.
+        """Return whether the subject of a finding is simulated.
 
-        In a robot with a simulated bus all is that the plan does not have elsewhere: on a real bus, as a
-        controller or a sensor. A controller may have the name of its bus: the bus is meant then.
+        In a robot with a simulated bus, every subject counts as simulated unless the plan has it on a real
+        bus, as a controller or as a sensor. If a controller and a bus have the same name, the name means the
+        bus.
         """
         if not any(bus.simulated for bus in self.buses):
             return False
@@ -157,29 +159,32 @@ class LoggedPlan(msgspec.Struct):
         for bus in self.buses:
             if not bus.simulated:
                 real |= {bus.name, *bus.names.values(), *(servo.joint for servo in bus.servos)}
-        of_bus = subject.rpartition(" ")[0]  # `main 7`: a servo that the plan does not have
+        of_bus = subject.rpartition(" ")[0]  # `main 7` is a servo that is not in the plan
         return subject not in real and of_bus not in real
 
     @property
     def sensors(self) -> set[str]:
-        """Names of the sources that are sampled by processes of their own."""
+        """Names of the sources that separate processes sample."""
         return {one.name for one in self.loop.sources if one.kind == "sensor"}
 
     @property
     def by_name(self) -> dict[str, LoggedBus]:
-        """The buses by name."""
+        """Buses by name."""
         return {bus.name: bus for bus in self.buses}
 
 
 def plan_of(log: Log) -> LoggedPlan:
-    """Return the plan in a log; an empty one where it has none that can be read. It is not to be changed."""
+    """Return the plan in a log, or an empty plan if none can be read. Callers must not modify it."""
     noted = log.metadata.get("run", {}).get("simulated", "")
     return _decoded(log.attachments.get("plan.json", b"{}"), noted)
 
 
 @lru_cache(maxsize=8)
 def _decoded(data: bytes, noted: str) -> LoggedPlan:
-    """Return a plan that every slice of a log asks for anew, with the buses that were noted as simulated."""
+    """Decode a plan, and mark the buses that the run recorded as simulated.
+
+    The result is cached because every slice of a log requests the plan.
+    """
     try:
         plan = decode_plan(data, LoggedPlan)
     except UNREADABLE:

@@ -1,4 +1,4 @@
-"""The verbs of the analysis, by the same hooks as any other package."""
+"""Commands of the analysis, registered by the same hooks as those of any other package."""
 
 from __future__ import annotations
 
@@ -11,13 +11,13 @@ _PLACE = "dxlrun_analysis.commands"
 
 @hookimpl
 def dxlrun_contract() -> int:
-    """Return the contract that this package was written for: the one it is published with."""
+    """Return the contract version that this package was written for: the one it is published with."""
     return CONTRACT_VERSION
 
 
 @hookimpl
 def dxlrun_commands() -> Sequence[Command]:
-    """Return the verbs that read logs."""
+    """Return the commands that read logs."""
     return (
         Command("analyze", f"{_PLACE}.analyze:analyze", group="Every day"),
         Command("export", f"{_PLACE}.export:export", group="Logs"),

@@ -1,4 +1,4 @@
-"""The report on one log: its parts in order, the verdict in words, and their tables."""
+"""Report on one log: its parts, the verdict in words, and their tables."""
 
 from __future__ import annotations
 
@@ -39,19 +39,23 @@ PARTS: tuple[ReportPart[Any], ...] = (
     STEERING,
     PAUSES,
     TOPICS,
-    ReportPart("gaps", lambda report: report.totals.gaps),  # Records that the recorder did not get
+    # Records that the recorder did not receive.
+    ReportPart("gaps", lambda report: report.totals.gaps),
     ReportPart("complete", lambda report: report.about.complete),
     ReportPart("damage", lambda report: report.about.damage),
-    ReportPart(
-        "being_written", lambda report: report.about.being_written
-    ),  # The report is about the run so far
+    # True while a run writes the log: the report covers the run so far.
+    ReportPart("being_written", lambda report: report.about.being_written),
     SOURCES,
 )
-"""In the order of `--json`, and of the tables."""
+"""Parts in the order of `--json` and of the tables."""
 
 
 def analyze_log(path: str | Path) -> Report:
-    """Analyze one log. Raises LogError with one sentence when it cannot be read."""
+    """Analyze one log.
+
+    Raises:
+        LogError: The log cannot be read; the message is one sentence.
+    """
     return analyze(open_log(path))
 
 
@@ -60,10 +64,17 @@ def analyze(
     *watching: Callable[[Log], None],
     exchanges: Callable[[Exchanges], None] = lambda _: None,
 ) -> Report:
-    """Analyze a log slice by slice. Raises LogError when it, or a packet in it, cannot be read.
+    """Analyze a log slice by slice.
 
-    Each of `watching` gets the slices too, and `exchanges` those of their packets: a log is decompressed
-    once, and each packet is paired once.
+    The log is decompressed once, and each packet is paired once.
+
+    Args:
+        reader: The log, whole or as a reader.
+        watching: Functions that also receive each slice.
+        exchanges: Function that receives the paired packets of each slice.
+
+    Raises:
+        LogError: The log, or a packet in it, cannot be read.
     """
     tally = Tally(exchanges, (part.collector for part in PARTS if part.collector is not None))
     for log in reader.slices():
@@ -79,7 +90,7 @@ def analyze(
 
 
 def parts(report: Report) -> tuple[Part, ...]:
-    """Return what a terminal shows: the verdict first, then the tables."""
+    """Return the terminal output: the verdict, then the tables."""
     tone: Tone = "good" if report.verdict.good else "warning"
     return (
         *(Sentence(sentence, tone) for sentence in report.verdict.sentences),
@@ -88,7 +99,7 @@ def parts(report: Report) -> tuple[Part, ...]:
 
 
 def tables(report: Report, section: str = "") -> dict[str, Table]:
-    """Return the tables that have rows, by name: of a section of the page, or all for a terminal."""
+    """Return the tables that have rows, by name: those of one section of the page, or all."""
     chosen = sorted(
         (part for part in PARTS if part.section == section or not section),
         key=lambda part: not part.first if section else part.late,
@@ -101,7 +112,7 @@ def tables(report: Report, section: str = "") -> dict[str, Table]:
 
 
 def began(log: Log, report: Report) -> str:
-    """Return the wall time of the first deadline, in UTC; empty where none is known."""
+    """Return the wall-clock time of the first deadline, in UTC, or an empty string if it is unknown."""
     offset_ns = log.header.epoch_offset_ns
     if not offset_ns:
         return ""
@@ -110,7 +121,7 @@ def began(log: Log, report: Report) -> str:
 
 
 def facts(log: Log, report: Report) -> tuple[Table, ...]:
-    """Return the tables of the run that have rows: robot, buses, real time, software."""
+    """Return the tables about the run that have rows: robot, buses, real time, software."""
     planned = plan_of(log).by_name
     buses = ((f"bus {name}", _bus(planned.get(name))) for name in log.buses)
     found = (
@@ -162,7 +173,7 @@ def _bus(bus: LoggedBus | None) -> str:
 
 
 def _real_time(log: Log) -> Iterator[tuple[str, Value]]:
-    """Yield the real-time settings that the robot file requests, and which of them were granted."""
+    """Yield the requested real-time settings, and the result of each request."""
     requested = log.metadata.get("scheduler", {})
     if requested:
         locked = ", memory locked" if requested.get("lock_memory") == "true" else ""

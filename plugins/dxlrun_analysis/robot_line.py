@@ -1,8 +1,8 @@
-"""The first line of a verdict: what an onlooker would say about the robot, before the loop and its parts.
+"""First line of a verdict: the robot's behaviour as an onlooker would describe it.
 
-Motions played and how closely (the joint that was furthest from where it could have been), goals reached or
-not, falls, limp and lost joints, takeovers and fallbacks. Where none of these is why a run was not good, the
-first reason is.
+The line has the motions played with the largest tracking error, goals reached or missed, falls, limp and lost
+joints, takeovers and fallbacks. If none of these explains why a run was not good, the line has the first
+reason.
 """
 
 from __future__ import annotations
@@ -18,7 +18,7 @@ from dxlrun_analysis.finding import ROBOT, Finding, Rank, listed
 from dxlrun_analysis.tally import RunTotals
 
 _MOST_NAMED = 3
-_AT_ONCE_NS = 500_000_000  # What happens to joints within that time has one time
+_AT_ONCE_NS = 500_000_000  # Events of several joints within 0.5 s are reported with one time
 _NOTICED_RAD = math.radians(0.05)
 _FAILED = {
     EventCode.SERVO_LIMP: "went limp",
@@ -39,14 +39,21 @@ _REASONS = {
     "invalid_states": "states of {subject} were often invalid",
     "log_not_whole": "the log is not whole",
 }
-"""By code; of others the code itself says it: `stood still`. Goals are named in any case."""
+"""Reason by code; the code itself is the reason for all others (`stood still`). Missed goals have a clause of
+their own."""
 _RELEASED = "torque off: "
 _FACTS = (Rank.NEVER_RAN, Rank.LINE, Rank.SERVO, Rank.SHARE, Rank.ERROR, Rank.LOG)
 _LONGEST = 100
 
 
 def robot_line(totals: RunTotals, word: str, found: Sequence[Finding]) -> Finding:
-    """Return the line; `word` of the verdict, `found` what it is based on, the worst first."""
+    """Return the first line.
+
+    Args:
+        totals: Totals of the run.
+        word: Verdict in words.
+        found: Findings behind the verdict, the worst first.
+    """
     parts = [*_failures(totals), *_takeovers(totals)]
     facts = (one for one in found if one.rank in _FACTS)
     worst = next(facts, next((one for one in found if one.rank == Rank.SERVO_CAUSE), None))
@@ -64,7 +71,7 @@ def robot_line(totals: RunTotals, word: str, found: Sequence[Finding]) -> Findin
 
 def _reason(worst: Finding) -> str:
     text = worst.sentence.partition(f"of {worst.subject}: ")[2] or worst.subject
-    if worst.subject == "loop":  # why it ended, after how long it ran
+    if worst.subject == "loop":  # The end of the loop has its reason after the time that it ran
         text = text.partition(": ")[2] or text
     words = f"{worst.subject}: {worst.code.replace('_', ' ')}"
     sentence = f"{worst.sentence[:1].lower()}{worst.sentence[1:-1]}"
@@ -73,7 +80,10 @@ def _reason(worst: Finding) -> str:
 
 
 def _failures(totals: RunTotals) -> Iterator[str]:
-    """Yield a fall, and what went limp, was lost or rebooted: as it came, for the same joints together."""
+    """Yield a fall, then joints that went limp, were lost or rebooted.
+
+    Events are in order of time; those of the same joints are combined.
+    """
     conduct = totals.conduct
     fallen = next((one for one in conduct.takeovers if one.fell), None)
     if conduct.lies or fallen:
@@ -103,14 +113,14 @@ def _what(groups: Sequence[EventGroup]) -> str:
 
 
 def _when(groups: Sequence[EventGroup], begin_ns: int) -> str:
-    """Return when it was, or from when on where the joints did it one after the other."""
+    """Return the time of simultaneous events, or the time of the first if they followed one another."""
     first = _at(groups[0].t_ns, begin_ns)
     later = first and groups[-1].t_ns - groups[0].t_ns > _AT_ONCE_NS
     return f"{first.replace(' at ', ' from ')} on" if later else first
 
 
 def _at(t_ns: int, begin_ns: int) -> str:
-    """Return when it was since the first deadline; empty: there was none."""
+    """Return the time since the first deadline as text; empty without a first deadline."""
     return f" at {max((t_ns - begin_ns) / 1e9, 0.0):.1f} s" if begin_ns else ""
 
 
@@ -156,7 +166,7 @@ def _takeovers(totals: RunTotals) -> Iterator[str]:
 
 
 def _played(totals: RunTotals) -> str:
-    """Return which motions were played, or what moved the robot, and how closely."""
+    """Return the motions played, or another source of motion, and the largest tracking error."""
     until_ns = totals.periods.seconds * 1e9
     begun = [one for one in totals.plan.loop.commands if one.at_ns <= until_ns and totals.periods.records]
     motions = sum(one.goal is not None for one in begun) or len({one.controller for one in begun})
@@ -172,7 +182,7 @@ def _played(totals: RunTotals) -> str:
 
 
 def _within(totals: RunTotals) -> str:
-    """Return the joint that was furthest from where it could have been; of those that failed none."""
+    """Return the joint with the largest tracking error, excluding joints that failed."""
     failed = {group.source for group in totals.events if group.code in _FAILED}
     worst = max(
         (one for one in totals.tracking if one.worst_rad is not None and one.name not in failed),

@@ -1,9 +1,8 @@
-"""The rules of the verdict as one table: what each counts, from how much on, what it accuses, and what helps.
+"""Rules of the verdict in one table: signal, bound, accused part and remedy of each.
 
-Rooms of the analysis count (the lines in `servos/`, the joints in `joints/`, the loop in `causes/`, what
-sensors show in `conduct/`) and tell what they saw as findings with one of these codes. What is done about it
-stands here alone. `evidence.py` decides before that whether a rule may speak at all: what it `needs` is
-evidence that has to be complete.
+Rooms of the analysis measure: buses in `servos/`, joints in `joints/`, the loop in `causes/`, sensors in
+`conduct/`. They report findings with the codes of this table, which is the only place with remedies.
+`evidence.py` first decides whether a rule applies: the evidence that it `needs` must be complete.
 """
 
 from __future__ import annotations
@@ -14,14 +13,15 @@ from typing import NamedTuple
 
 
 class Needs(Flag):
-    """Evidence that has to be complete before a rule may accuse anything."""
+    """Evidence that must be complete before a rule may accuse a part."""
 
     NOTHING = 0
     MACHINE = auto()
-    """The machine gave the loop its time: late and missing replies are its own otherwise."""
-    LOOP = auto()  # The loop kept its rate: goals came when they were due
-    STATES = auto()  # The states of the joint are whole
-    INTACT = auto()  # The replies of its bus are not spoilt, so its positions can be believed
+    """The machine scheduled the loop on time; otherwise late and missing replies can be the machine's
+    fault."""
+    LOOP = auto()  # The loop kept its rate, so goals were on time
+    STATES = auto()  # The states of the joint are complete
+    INTACT = auto()  # The replies of its bus are intact, so its positions are credible
     LOG = auto()  # No record was lost on the way to the log
 
 
@@ -30,13 +30,13 @@ _JOINT = Needs.MACHINE | Needs.LOOP | Needs.STATES | Needs.INTACT | Needs.LOG
 
 
 class Rule(NamedTuple):
-    """One rule about a part of the robot, of the machine or of the run."""
+    """One rule about a part of the robot, the machine or the run."""
 
-    accuses: str  # In words, for the reference
+    accuses: str  # Accused part in words, for the reference
     signal: str
-    bound: str  # From how much on, and why from so much
+    bound: str  # Threshold and its reason
     remedy: str = ""
-    """`{name}`, `{bus}`, `{port}` and `{servo_id}` are those of what it accuses."""
+    """Placeholders `{name}`, `{bus}`, `{port}` and `{servo_id}` describe the accused part."""
     needs: Needs = Needs.NOTHING
 
 
@@ -217,4 +217,4 @@ RULES: Mapping[str, Rule] = {
     "steered": Rule("", "requests of clients", "one"),
     "replies": Rule("", "servos that answered, and the worst three of those that did not", "always told"),
 }
-"""By code, lines first, then servos, supply, joints, the loop, sensors and devices, and the run."""
+"""Rules by code: lines first, then servos, supply, joints, the loop, sensors and devices, and the run."""

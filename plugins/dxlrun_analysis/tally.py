@@ -1,4 +1,4 @@
-"""The totals of a run that a verdict is based on, counted slice by slice: a log may be of any length."""
+"""Totals of a run, the input of the verdict, counted slice by slice from a log of any length."""
 
 from __future__ import annotations
 
@@ -34,55 +34,56 @@ from dxlrun_analysis.servos.exchanges import Exchanges
 from dxlrun_analysis.servos.traffic import BusTraffic, ServoTraffic, Traffic
 
 _SHORT_RUN_S = 2.0
-"""A shorter run may skip as much as one of this: a machine that stalls once is not overloaded."""
-_ANSWERS = " answers "  # What a servo does that is lost all the same: it cannot be taken back
+"""Length of the run that the tolerance of a shorter run is based on. One stall does not overload a
+machine."""
+_ANSWERS = " answers "  # Event text about a lost servo that answers again but cannot be taken back
 
 
 @dataclass(frozen=True, slots=True)
 class RealTime:
-    """The real-time scheduling that the loop requested, and whether it was granted."""
+    """Real-time scheduling that the loop requested, and whether it was granted."""
 
-    requested: bool = False  # A real-time scheduler
+    requested: bool = False  # A real-time scheduler was requested
     granted: bool = False
-    kernel: bool = False  # The kernel is a real-time one
+    kernel: bool = False  # The kernel is a real-time kernel
 
 
 @dataclass(frozen=True, slots=True)
 class RunTotals:
-    """One run in numbers: all that the rules of the verdict read."""
+    """Totals of one run: the complete input of the rules of the verdict."""
 
     periods: Periods
-    latency: Latency | None = None  # None where the loop never ran a cycle, and without a log
+    latency: Latency | None = None  # None if the loop never ran a cycle, and without a log
     slowest: Slowest | None = None
-    causes: Causes = NO_CAUSES  # Why cycles were late or too long
+    causes: Causes = NO_CAUSES  # Causes of late and long cycles
     virtual: bool = False
     plan: LoggedPlan = field(default_factory=LoggedPlan)
     real_time: RealTime = RealTime()
     joints: tuple[str, ...] = ()
     invalid: tuple[int, ...] = ()
-    """Cycles in which the state of each joint was not valid; those of a requested reboot do not count."""
+    """Cycles in which the state of each joint was invalid, except those of a requested reboot."""
     servos: tuple[ServoTraffic, ...] = ()
     buses: tuple[BusTraffic, ...] = ()
-    events: tuple[EventGroup, ...] = ()  # In the order of the first of each
+    events: tuple[EventGroup, ...] = ()  # In order of the first event of each group
     returns: dict[str, list[str]] = field(default_factory=dict)
-    """Why servos that were lost and answer again were not taken back, by joint."""
+    """Reasons why lost servos that answer again were not taken back, by joint."""
     acts: tuple[Act, ...] = ()
     pauses: tuple[Pause, ...] = ()
-    failures: tuple[str, ...] = ()  # What failed outside of the loop, one sentence each
+    failures: tuple[str, ...] = ()  # Failures outside the loop, one sentence each
     wait: SimulationWait = field(
         default_factory=SimulationWait
-    )  # Of the loop, for simulated servos whose process did not run
-    gaps: int = 0  # Records that the recorder did not get
+    )  # Waits of the loop for simulated servos whose process was not scheduled
+    gaps: int = 0  # Records that the recorder did not receive
     damage: tuple[str, ...] = ()
-    tracking: tuple[JointTracking, ...] = ()  # How each joint followed; in the order of `joints`
+    tracking: tuple[JointTracking, ...] = ()  # Tracking of each joint, in the order of `joints`
     conduct: Conduct = NO_CONDUCT
-    findings: tuple[Finding, ...] = ()  # What the accumulators of each room found by rules of their own
+    findings: tuple[Finding, ...] = ()  # Findings from the rules of each room's accumulators
 
     @property
     def unreached_goals(self) -> list[UnreachedGoal]:
-        """Goals of played motions that the run did not reach, as the run itself judged them.
+        """Goals of played motions that the run missed, judged as in the run itself.
 
-        A motion that begins in another part of the log is not one of them.
+        Excludes motions that begin in another part of the log.
         """
         conduct, ran_ns = self.conduct, round(self.periods.seconds * 1e9)
         found = find_unreached_goals(self.plan.loop, conduct.goals, ran_ns)
@@ -90,40 +91,45 @@ class RunTotals:
 
     @property
     def tolerated_skips(self) -> float:
-        """How many periods the run may skip."""
+        """Number of periods that the run may skip."""
         fewest = _SHORT_RUN_S * self.periods.rate_hz
         return self.plan.loop.tolerated_skips * max(self.periods.elapsed, fewest)
 
     @property
     def kept_rate(self) -> bool:
-        """Whether the loop ran, and skipped no more periods than that."""
+        """True if the loop ran and skipped no more than `tolerated_skips` periods."""
         return bool(self.periods.records) and self.periods.skipped <= self.tolerated_skips
 
     def bus_of(self, subject: str) -> str:
-        """Return the bus of a servo or joint that a finding accuses; of another subject itself."""
+        """Return the bus of an accused servo or joint, or `subject` itself if it is neither."""
         movers = (
             mover.bus.name for mover in self.plan.movers.get(subject, ())
-        )  # of a joint of several servos
+        )  # The joint has several servos
         return next((servo.bus for servo in self.servos if servo.subject == subject), next(movers, subject))
 
 
 class Collector(Protocol):
-    """Collects something of a log, slice by slice."""
+    """Accumulator that collects one subject of a log, slice by slice."""
 
     def take(self, log: Log) -> None:
-        """Take the next slice."""
+        """Add the next slice."""
 
 
 C = TypeVar("C", bound=Collector)
 
 
 class Tally:
-    """Counts a log, whole or slice by slice, in memory that does not grow with it."""
+    """Accumulator of a log, whole or slice by slice. Its memory does not grow with the log."""
 
     def __init__(
         self, watch: Callable[[Exchanges], None] = lambda _: None, others: Iterable[type[Collector]] = ()
     ) -> None:
-        """`watch` is called with all exchanges, too; one of each of `others` gets the slices."""
+        """Create the accumulators.
+
+        Args:
+            watch: Function that also receives all exchanges.
+            others: Further collector classes; one instance of each receives the slices.
+        """
         own = (
             *(Punctuality(), CycleCauses(), Traffic(watch), ServoHealth()),
             *(Tracking(), SteeringHistory(), ConductHistory(), Sensors()),
@@ -141,7 +147,11 @@ class Tally:
         return cast("C", self._collectors[kind])
 
     def take(self, log: Log) -> None:
-        """Count the next slice. Raises LogError when a packet in it cannot be read."""
+        """Count the next slice.
+
+        Raises:
+            LogError: A packet in the slice cannot be read.
+        """
         for collector in self._collectors.values():
             collector.take(log)
         for event in log.events:
@@ -160,7 +170,11 @@ class Tally:
                     self._wait = SimulationWait(wait.waited_ns + data.waited_ns, wait.times + data.times)
 
     def totals(self, log: Log) -> RunTotals:
-        """Return the totals of all slices; `log`: the metadata of the file, which come last."""
+        """Return the totals of all slices.
+
+        Args:
+            log: Metadata of the file, which the last slice completes.
+        """
         punctuality, traffic = self.of(Punctuality), self.of(Traffic)
         account, late = punctuality.finish()
         servos, buses = traffic.finish()

@@ -1,21 +1,21 @@
-"""The verdict: whether a run was good, and what a person wants to know first, in sentences.
+"""Verdict: whether a run was good, in sentences with the most important one first.
 
-The one set of rules of `analyze`, its page and its JSON; the exit code is 1 where a run was not good. A run
-itself ends with what its loop counted (`dxlrun.run.run_summary`). The most severe finding comes first. A run
-was not good when
+The one set of rules for `analyze`, its page and its JSON; the exit code is 1 if a run was not good. The end
+of a run itself uses the counts of the loop (`dxlrun.run.run_summary`). The most severe finding comes first. A
+run was not good if
 
 - a line or a servo was lost, a servo rebooted or lost its torque, the loop never ran a cycle, or another
   process of the run failed;
-- a joint's state was invalid in more than 1 % of the cycles, and in three at least; those of a reboot that a
-  client requested do not count;
-- more periods were skipped than the robot file tolerates (`loop: {tolerated_skips: ...}`), of two seconds at
-  least;
-- a played motion did not reach its goal: it was missed or aborted, or the run ended before, see
+- a joint's state was invalid in more than 1 % of the cycles, and in three at least, without those of a
+  reboot that a client requested;
+- more periods were skipped than the robot file tolerates (`loop: {tolerated_skips: ...}`), of two seconds
+  at least;
+- a played motion did not reach its goal: the goal was missed or aborted, or the run ended before, see
   `dxlrun.plan.played_goals`;
-- an error was logged, a servo reported one, or the log is not whole.
+- an error was logged, a servo reported one, or the log is incomplete.
 
-All else is reported and tolerated: a lost packet is data. What each rule counts stands in rules.py, whether
-it may speak in evidence.py.
+All else is reported and tolerated: a lost packet is data. The signal of each rule is in rules.py, the
+evidence that it requires in evidence.py.
 """
 
 from __future__ import annotations
@@ -48,10 +48,10 @@ from dxlrun_analysis.robot_line import robot_line
 from dxlrun_analysis.tally import RunTotals
 
 _LEAST_CYCLES = 3
-_LARGE_PART = 5  # Of the excess of long cycles: what has less than a fifth is not worth its words
+_LARGE_PART = 5  # Causes below a fifth of the excess of long cycles are not reported
 _ROUGH_SHARE = 0.01
-"""Of the wake-ups: M. A. Araujo (UFU, 2017) measured 1.74 % beyond 150 us at 1 kHz under stress on a stock
-kernel, none on a real-time one."""
+"""Share of wake-ups beyond 150 us that is reported. M. A. Araujo (UFU, 2017) measured 1.74 % at 1 kHz under
+stress on a stock kernel, and none on a real-time kernel."""
 _OF_LOOP = [
     "switch",
     "rate",
@@ -65,20 +65,20 @@ _OF_LOOP = [
     "reboot",
     "stop",
 ]
-"""Kinds of commands that the loop does itself."""
+"""Kinds of commands that the loop executes itself."""
 
 
 class Verdict(msgspec.Struct, frozen=True):
-    """What the robot did, then findings, the most severe first."""
+    """Verdict of a run: summary of the robot's behaviour, then findings, the most severe first."""
 
-    good: bool  # Nothing was found that a run may not have
+    good: bool  # No finding that makes a run not good
     word: str  # The verdict in words: good; good, with fallbacks; good, with missed goals; not good
-    sentences: tuple[str, ...]  # Of the findings, with their remedies
+    sentences: tuple[str, ...]  # Sentences of the findings, with their remedies
     findings: tuple[Finding, ...]
 
 
 def judge(totals: RunTotals) -> Verdict:
-    """Return whether a run was good, and what was and what was not."""
+    """Judge a run: combine the findings of all rules into a verdict."""
     judged = accused(
         totals,
         (
@@ -113,7 +113,7 @@ def judge(totals: RunTotals) -> Verdict:
 
 
 def _robot(totals: RunTotals) -> Iterable[Finding]:
-    """Report a robot that ended lying, and goals of played motions that were not reached."""
+    """Report a robot that was down at the end of the run, and missed goals of played motions."""
     if totals.conduct.lies:
         turned = totals.conduct.turned_rad
         how = "its fall_reflex had others take over" if turned is None else "gravity is "
@@ -166,7 +166,7 @@ def _loop(totals: RunTotals) -> Iterable[Finding]:
 
 
 def _longest(totals: RunTotals) -> str:
-    """Return how long the longest cycle took, where that was more than its period, and its main cause."""
+    """Return the length and the main cause of the longest cycle, or an empty string if it fits its period."""
     slowest = totals.slowest
     if slowest is None:
         return ""
@@ -185,14 +185,14 @@ def _machine(totals: RunTotals) -> Iterable[Finding]:
 
 
 def _steered(acts: Sequence[Act], pauses: Sequence[Pause]) -> Iterable[Finding]:
-    """Report the commands from outside."""
+    """Report commands from clients."""
     asked = [act for act in acts if act.origin != "loop"]
     if not asked:
         return
     done = Counter(
         f"{act.kind} request" if act.kind in _OF_LOOP else "command"
         for act in asked
-        if not (act.refusal or act.set_points or act.kind == "resume")  # a pause has an end
+        if not (act.refusal or act.set_points or act.kind == "resume")  # A resume is part of its pause
     )
     parts = [counted(count, what, f"{what}s") for what, count in done.items()]
     streams = [act for act in asked if act.set_points and not act.refusal]
@@ -216,11 +216,11 @@ def _steered(acts: Sequence[Act], pauses: Sequence[Pause]) -> Iterable[Finding]:
 
 
 _OTHER_RULES = frozenset((*HURTS, EventCode.DEVICE_LOST, EventCode.PORT_LOST, EventCode.RECORDER_GAP))
-"""Events that other rules report."""
+"""Event codes that other rules report."""
 
 
 def _events(totals: RunTotals) -> Iterable[Finding]:
-    """Report errors that were logged, but for those of controllers whose fallbacks took over."""
+    """Report logged errors, except those of controllers whose fallbacks took over."""
     taken_over = {one.controller for one in totals.conduct.takeovers} - set(totals.conduct.unanswered)
     severe = [
         group

@@ -1,5 +1,4 @@
 """Causes of late and long cycles, derived from the packets and the plan alone.
 
-Pairing packets with servos belongs in `servos`, on which this package builds. Verdicts belong in
-`verdict.py`.
+This package builds on `servos`, which pairs packets with servos. Verdicts belong in `verdict.py`.
 """

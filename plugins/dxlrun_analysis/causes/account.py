@@ -1,14 +1,15 @@
-"""Where the time of one late or long cycle went: its record, and its packets against the plan.
+"""Breakdown of one late or long cycle: its record, and its packets compared with the plan.
 
-The lateness of a wake-up is that of an exchange of the idle time that ended behind the deadline, else the
-machine's. A read waits for all lines at once, so the bus that was ready last counts. Its exchanges are
-planned to take what wire, return delays and the adapter's latency take; what they took beyond that is split:
+A late wake-up is attributed to an exchange of the idle time that ended after the deadline, otherwise to the
+machine. A read waits for all buses at once, so the bus that was ready last counts. The planned time of its
+exchanges consists of wire time, return delays and the adapter's latency. The excess is split into
 
-- a write() of the instruction that returned later than the wire needs;
-- a missing reply: from the last reply, or when it was due, to the next instruction or the end of the read;
-  the first servo that did not answer has it, and where nothing of a chain of replies came, the bus;
-- a late reply: lateness that the replies behind it do not make up for, of the bus: a single one does not tell
-  whether servo, adapter, kernel or simulation kept it; `servos/reply_times.py` compares the servos;
+- a write() of the instruction that returned later than the wire time requires;
+- a missing reply: from the last reply, or its due time, to the next instruction or the end of the read. It
+  is attributed to the first servo that did not answer, or to the bus if no reply of a chain came;
+- a late reply: lateness that later replies do not make up for. It is attributed to the bus, because a
+  single late reply does not show whether servo, adapter, kernel or simulation delayed it;
+  `servos/reply_times.py` compares the servos;
 - a retry: all of an exchange with a servo that was asked in the same read before.
 """
 
@@ -29,7 +30,7 @@ _NEVER = np.iinfo(np.int64).max
 
 
 class CauseName(NamedTuple):
-    """What tells causes apart; a servo by its ID, -1 where the cause is none."""
+    """Key of a cause. `servo_id` is -1 if the cause is not a servo."""
 
     kind: CauseKind
     subject: str = ""
@@ -38,30 +39,31 @@ class CauseName(NamedTuple):
 
 
 class _Exchange(NamedTuple):
-    """One instruction that asks servos, and what came; times in ns."""
+    """One instruction that asks servos, and its replies; times in ns."""
 
     bus: int
     servo_ids: tuple[int, ...]
     asked: int
-    blocked: int  # How long the write() of the instruction took beyond the wire's time
-    following: int  # When the next instruction of the bus was sent
+    blocked: int  # Time of the write() call beyond the wire time
+    following: int  # Time of the next instruction on the bus
     planned_end: int
-    last: int  # When the last reply was there; 0: none was
+    last: int  # Time of the last reply; 0 without replies
     lacks: int | None
-    """The servo that is waited for: the first without a reply; -1: none of several came; None: all came."""
+    """First servo without a reply; -1: no reply of several came; None: all replies came."""
 
     def end(self, given_up: int) -> int:
-        """Return when it was over; one without all replies not before the next instruction."""
+        """Return the end of the exchange: its last reply, or with replies missing the next instruction or
+        `given_up`."""
         return self.last if self.lacks is None else min(self.following, given_up)
 
     @property
     def unanswered(self) -> CauseName:
-        """The cause of a missing reply; where nothing of a chain came, its instruction may be lost."""
+        """Cause of a missing reply. If no reply of a chain came, the instruction itself may be lost."""
         return CauseName("missing reply", bus=self.bus, servo_id=-1 if self.lacks is None else self.lacks)
 
 
 class Account:
-    """The causes of one cycle's excess, ns."""
+    """Breakdown of one cycle's excess by cause, ns."""
 
     def __init__(
         self,
@@ -71,7 +73,7 @@ class Account:
         pairing: Pairing,
         controllers: Sequence[str],
     ) -> None:
-        """Split a cycle; it and the one before it are rows of `causes.cycles_of`."""
+        """Split the excess of a cycle. `cycle` and `before` are rows of `causes.cycles_of`."""
         self._cycle = cycle
         self.shares: Counter[CauseName] = Counter()
 
@@ -90,7 +92,7 @@ class Account:
         self.shares = +self.shares
 
     def _read(self) -> tuple[int, int]:
-        """Split the read; return what its exchanges were planned to take, and what they took."""
+        """Split the read phase; return the planned and the actual time of its exchanges, ns."""
         woken, read = int(self._cycle["woken"]), int(self._cycle["read"])
         within = [one for one in self._exchanges if woken <= one.asked <= read]
         if not within:
@@ -114,7 +116,7 @@ class Account:
         return sums[0], sums[1]
 
     def _beyond(self, one: _Exchange, beyond: int, read: int) -> None:
-        """Split what an exchange took beyond its plan."""
+        """Split the time that an exchange took beyond its plan."""
         blocked = min(one.blocked, beyond)
         self.shares[CauseName("write call", bus=one.bus)] += blocked
         beyond -= blocked
@@ -129,7 +131,7 @@ class Account:
         self.shares[CauseName("unexplained")] += beyond - late
 
     def _writes(self, packets: PacketColumns) -> int:
-        """Add the write() calls of goals; return what they took."""
+        """Attribute the write() calls of goals to their buses; return their total time, ns."""
         goals = (packets.kind == PacketKind.INSTRUCTION) & (packets.first_ns >= self._cycle["updated"])
         goals &= packets.last_ns <= self._cycle["written"]
         took = packets.last_ns - packets.first_ns
@@ -139,7 +141,8 @@ class Account:
         return int(took[goals].sum())
 
     def _idle(self, before: np.void, late: int) -> int:
-        """Add the exchange of the idle time that ended last behind the deadline; return what it has."""
+        """Attribute lateness to the idle-time exchange that ended last after the deadline; return its share,
+        ns."""
         due = max(int(self._cycle["scheduled"]), int(before["written"]))
         over = [
             (min(one.end(one.planned_end + TIMEOUT_MARGIN_NS) - due, late), one)
@@ -153,7 +156,7 @@ class Account:
         if one.lacks is not None:
             cause = one.unanswered
         elif one.last - one.planned_end < ns // 2:
-            cause = CauseName("own work")  # it was begun too late
+            cause = CauseName("own work")  # The exchange itself was on time but started too late
         self.shares[cause] += ns
         return ns
 

@@ -1,15 +1,16 @@
-"""Why cycles were late or too long: where the time of the worst of them went, from packets and plan alone.
+"""Causes of late and long cycles, from packets and plan alone. The worst cycles are split into causes.
 
-Two kinds of cycles are looked at:
+There are two kinds of cycles:
 
 - *late*: woken more than 150 us (ROUGH_NS) after it could begin. Its excess is that lateness.
-- *long*: it took longer than its period, or ended so late that periods were skipped behind it. Its excess is
-  its lateness and all that it took beyond its planned exchanges (at most a period): late and missing replies,
-  write() calls, controllers, own work. So its shares say where its time went, not only what was too much.
+- *long*: took longer than its period, or ended so late that the following periods were skipped. Its excess
+  is its lateness and all time beyond its planned exchanges (at most a period): late and missing replies,
+  write() calls, controllers, own work. The shares therefore show where its time went, not only by how much it
+  was too long.
 
-All of them are counted; the 200 worst are kept with their packets, and split by `Account`. Late wake-ups, and
-own work, are the machine's as far as a sample of /machine of that second has the time: steal first, then what
-the loop was runnable without a core, then interrupts.
+All late and long cycles are counted; the 200 worst are kept with their packets, and split by `Account`. Late
+wake-ups and own work are attributed to the machine as far as a sample of /machine of that second accounts for
+the time: steal first, then time in which the loop was runnable without a core, then interrupts.
 """
 
 from __future__ import annotations
@@ -34,24 +35,24 @@ from dxlrun_analysis.plan import LoggedBus, plan_of
 from dxlrun_analysis.servos.exchanges import Pairing
 
 KEPT = 200
-"""So many of the worst cycles are split ..."""
+"""Number of the worst cycles that are kept and split."""
 WORST = 10
-"""... and so many of them shown with their packets."""
+"""Number of the worst cycles that are shown with their packets."""
 _MACHINE = (CauseName("late wake-up"), CauseName("own work"))
-"""What may be the machine's, in the order in which that has it."""
+"""Causes that the machine can account for, in the order of attribution."""
 _TIMES = ("scheduled", "woken", "read", "updated", "written")
 Cycles = NDArray[np.void]
 
 
 @dataclass(frozen=True, slots=True)
 class Causes:
-    """All late and long cycles of a run."""
+    """Totals of the late and long cycles of a run."""
 
-    late: int = 0  # Cycles that woke late, long ones too
-    long: int = 0  # Cycles that took longer than their period, or ended so late that periods were skipped
-    excess_ns: int = 0  # Of the worst of them; the sum of the causes
-    causes: tuple[Cause, ...] = ()  # The largest first
-    worst: tuple[WorstCycle, ...] = ()  # The worst first
+    late: int = 0  # Cycles that woke late, including long ones
+    long: int = 0  # Cycles longer than their period, or so late that periods were skipped
+    excess_ns: int = 0  # Excess of the kept cycles; the sum of all causes
+    causes: tuple[Cause, ...] = ()  # Largest first
+    worst: tuple[WorstCycle, ...] = ()  # Worst first
     throttled: int = 0  # Samples of the machine with a core that was hot and slow
     load: MachineLoad = field(default_factory=MachineLoad)
 
@@ -63,29 +64,34 @@ class _Kept(NamedTuple):
     """One of the worst cycles so far."""
 
     cycle: np.void
-    before: np.void | None  # The cycle before it; None: it is the first
+    before: np.void | None  # The preceding cycle; None for the first
     packets: PacketColumns
 
 
 class CycleCauses:
-    """Finds the causes slice by slice of a log, in memory that does not grow with it."""
+    """Accumulator of causes, fed slice by slice. Its memory does not grow with the log."""
 
     def __init__(self) -> None:
         self._late = self._long = 0
         self._sequential = False
-        self._newest: Cycles | None = None  # The next one declares what was skipped behind it
-        self._before: Cycles | None = None  # The cycle before that
-        self._packets: list[PacketColumns] = []  # Those since its read
+        # Held back: the next cycle declares the periods skipped after this one.
+        self._newest: Cycles | None = None
+        self._before: Cycles | None = None  # Cycle before `_newest`
+        self._packets: list[PacketColumns] = []  # Packets since the read of `_before`
         self._buses: tuple[LoggedBus, ...] = ()
         self._controllers: tuple[str, ...] = ()
         self._machine = MachineHistory()
         self._samples: list[MachineSample] = []
         self._kept: list[_Kept] = []
         self._begin_ns: int | None = None
-        self._end_ns = 0  # Of the last cycle
+        self._end_ns = 0  # End of the last cycle
 
     def take(self, log: Log) -> None:
-        """Take the next slice. Raises LogError when a packet in it cannot be read."""
+        """Add the next slice.
+
+        Raises:
+            LogError: A packet in the slice cannot be read.
+        """
         plan = plan_of(log)
         if self._newest is None:
             self._buses = tuple(plan.by_name.get(name, LoggedBus(name)) for name in log.buses)
@@ -128,13 +134,17 @@ class CycleCauses:
         )
 
     def _advance(self, cycles: Cycles, *, final: bool = False) -> None:
-        """Look at the cycles that have one behind them: a slice of a log has all their packets."""
+        """Process all cycles but the newest.
+
+        A cycle is complete once its successor is known, as the successor declares the periods skipped after
+        it.
+        """
         count = len(cycles) if final else max(len(cycles) - 1, 0)
         self._newest = cycles[count:].copy()
         if not count:
             return
         ready, behind = cycles[:count].copy(), cycles[1 : count + 1]
-        # what was skipped behind a cycle is declared by the next one
+        # The next cycle declares the periods that were skipped after this one.
         followed = len(behind)
         ready["skipped"] = np.append(behind["skipped"], [0] * (count - followed))
         counted_from = ready["woken" if self._sequential else "scheduled"][:followed]
@@ -173,7 +183,7 @@ class CycleCauses:
         self._kept = sorted(self._kept, key=lambda one: -one.cycle["size"])[:KEPT]
 
     def _share_with_machine(self, accounts: Sequence[Account]) -> None:
-        """Let what took the loop's core have what was late in the time of a sample, as far as it goes."""
+        """Move late wake-ups and own work to the machine, up to the time that each sample accounts for."""
         woken = np.array([int(one.cycle["woken"]) for one in self._kept], np.int64)
         for sample in self._samples:
             then = (woken > sample.begin_ns) & (woken <= sample.end_ns)
@@ -192,17 +202,22 @@ class CycleCauses:
         for account in accounts:
             account.shares = +account.shares
 
-    # What causes are called
+    # Names of causes
 
     def _cause(self, name: CauseName, parts: list[tuple[int, bool]]) -> Cause:
-        """Return a cause over the run; `parts`: ns, and whether its cycle was long."""
+        """Return a cause over the run.
+
+        Args:
+            name: Key of the cause.
+            parts: Time (ns) in each cycle, and whether that cycle was long.
+        """
         subject, servo = self._subject(name)
         total, most = sum(ns for ns, _ in parts), max(ns for ns, _ in parts)
         long_ns = sum(ns for ns, long in parts if long)
         return Cause(name.kind, subject, len(parts), total, most, long_ns, servo)
 
     def _subject(self, name: CauseName) -> tuple[str, str]:
-        """Return what a cause accuses in words, and its servo's joint."""
+        """Return the subject of a cause in words, and the joint of its servo."""
         if name.bus < 0:
             return name.subject, ""
         bus, servo = self._buses[name.bus], name.servo_id
@@ -212,7 +227,7 @@ class CycleCauses:
         return f"servo {servo} ({joint or bus.name})", joint or f"{bus.name} {servo}"
 
     def _worst(self, one: _Kept, account: Account) -> WorstCycle:
-        """Return a cycle with its causes and the packets since the cycle before it ended."""
+        """Return a cycle with its causes, and the packets since the preceding cycle ended."""
         cycle, scheduled = one.cycle, int(one.cycle["scheduled"])
         shares = [
             CauseShare(name.kind, self._subject(name)[0], ns / 1e3)
@@ -239,9 +254,9 @@ class CycleCauses:
 
 
 def cycles_of(log: Log) -> Cycles:
-    """Return the times of cycles, ns; `skipped`: periods that were left out before each.
+    """Return the times of cycles, ns. `skipped` is the number of periods skipped before each cycle.
 
-    `late`, whether it is too `long`, and its `size`, by which the worst are kept, are filled in later.
+    `late`, `long` and `size` (the sort key of the worst cycles) are filled in later.
     """
     names = ("cycle", *_TIMES, "period", "skipped", "late", "size")
     shape = log.cycles["controller_ns"].shape[1:]

@@ -1,4 +1,4 @@
-"""Share of the machine in late wake-ups, by samples of /machine."""
+"""Share of the machine in late wake-ups, from samples of /machine."""
 
 from __future__ import annotations
 
@@ -19,38 +19,42 @@ OTHERS = "other processes on its core"
 INTERRUPTS = "interrupts on its core"
 TAKERS = (STEAL, OTHERS, INTERRUPTS)
 THROTTLED_SHARE = 0.6
-"""Of the highest frequency that was seen: a core that is slower while the loop is late is throttled [i]."""
+"""Share of the highest observed frequency. A slower core while the loop is late is throttled [i]."""
 _WAITING_SHARE = 0.001
 _INTERRUPTS_SHARE = 0.05
-"""Shares of a second that a well machine takes, too [i]: /proc/stat counts in steps of 10 ms."""
+"""Shares of a second that also occur on a healthy machine [i]. /proc/stat counts in steps of 10 ms."""
 HOT = 80.0  # deg C from which processors are throttled [i]
 
 
 @dataclass(frozen=True, slots=True)
 class MachineSample:
-    """One sample, as far as it explains what the loop did not get."""
+    """Time that the machine withheld from the loop in one sample."""
 
     begin_ns: int
     end_ns: int
-    taken_ns: tuple[int, ...]  # Beyond what a well machine takes, by TAKERS
+    taken_ns: tuple[int, ...]  # Excess over a healthy machine, in the order of TAKERS
 
 
 @dataclass(slots=True)
 class MachineHistory:
-    """Reads the samples."""
+    """Accumulator of machine samples."""
 
     _fastest: float = 0.0
     slow: int = 0  # Samples with a core that was hot and far below its highest frequency
     load_samples: list[LoadSample] = field(default_factory=list)
 
     def new(self, log: Log) -> list[MachineSample]:
-        """Return the samples of a slice. Raises LogError when one cannot be read."""
+        """Return the samples of a slice.
+
+        Raises:
+            LogError: A sample cannot be read.
+        """
         if LogTopic.MACHINE not in log.topics:
             return []
         return [self._sample(message) for message in log.messages(LogTopic.MACHINE)]
 
     def load(self, begin_ns: int, end_ns: int) -> MachineLoad:
-        """Return whether the machine was too busy in an interval of the samples so far."""
+        """Return the load of the machine in an interval of the samples so far."""
         meter = LoadMeter(begin_ns, end_ns)
         for sample in self.load_samples:
             meter.add(sample)
@@ -81,7 +85,7 @@ class MachineHistory:
 
 
 def _of_core(values: object, core: int) -> float:
-    """Return the share of one core, or where that is not known the greatest of all; 0: not known."""
+    """Return the value of one core. If the core is unknown, return the greatest value; without values, 0."""
     shares = np.nan_to_num(cast("NDArray[np.float64]", values))
     if 0 <= core < len(shares):
         return float(shares[core])

@@ -1,8 +1,8 @@
-"""Rules of the verdict about the loop: what made cycles too long.
+"""Rules of the verdict about the loop: causes of long cycles.
 
-A cause is a finding when it has at least half of what long cycles took beyond their planned exchanges, and a
-part of three cycles at least: one stall of a machine accuses nothing. Late and missing replies are left to
-the rules about lines and servos, which know whether the others of the bus answered.
+A cause is a finding if it has at least half of the excess of long cycles, and a share in at least three
+cycles: one stall of a machine is not evidence. Late and missing replies are judged by the rules about lines
+and servos, which know whether the other servos of the bus answered.
 """
 
 from __future__ import annotations
@@ -25,7 +25,7 @@ _OWN: dict[CauseKind, str] = {
 
 
 def own_work(causes: Causes) -> Iterable[Finding]:
-    """Yield what of the loop itself made cycles too long, the largest first."""
+    """Report causes within the loop that made cycles too long, the largest first."""
     total_ns = sum(one.long_ns for one in causes.causes)
     for one in causes.causes:
         cycles = min(one.cycles, causes.long)
@@ -38,5 +38,5 @@ def own_work(causes: Causes) -> Iterable[Finding]:
 
 
 def _subject(one: Cause) -> str:
-    """Return what a cause accuses, as findings call it: the loop, a controller or a bus."""
+    """Return the accused part as findings name it: the loop, a controller or a bus."""
     return "loop" if one.kind in ("own work", "plan") else one.subject.removeprefix("bus ")

@@ -1,4 +1,4 @@
-"""Causes and worst cycles as tables."""
+"""Tables of causes and of the worst cycles."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ _BROADCAST_ID = 0xFE
 
 
 def causes_table(causes: Causes) -> Table:
-    """Return why cycles were late or too long, the largest cause first; without rows where none was."""
+    """Return the causes of late and long cycles, the largest first; without causes, a table without rows."""
     columns = [
         Column("cause", "name"),
         Column("of", "text"),
@@ -42,7 +42,7 @@ def causes_table(causes: Causes) -> Table:
 
 
 def worst_tables(worst: Iterable[WorstCycle]) -> tuple[Table, ...]:
-    """Return a timeline of each cycle, in us since it was due, with what the plan expected beside it."""
+    """Return a timeline of each cycle in us since its deadline, with the planned times."""
     return tuple(_timeline(one) for one in worst)
 
 
@@ -76,7 +76,7 @@ def _timeline(one: WorstCycle) -> Table:
 
 
 def worst_title(one: WorstCycle) -> str:
-    """Return which cycle it is, how far it was beyond the plan, and its causes."""
+    """Return the title of a cycle: number, excess beyond the plan, and main causes."""
     causes = ", ".join(f"{share.name} {microseconds(share.us)}" for share in one.causes[:_MOST_NAMED])
     skipped = f", {counted(one.skipped, 'period', 'periods')} skipped behind it" if one.skipped else ""
     beyond = f"{microseconds(one.excess_us)} beyond the plan{skipped}"

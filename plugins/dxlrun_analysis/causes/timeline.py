@@ -1,4 +1,4 @@
-"""A cycle's packets in the order of time, with when the plan expects each."""
+"""Packets of a cycle in order of time, with their planned times."""
 
 from __future__ import annotations
 
@@ -24,7 +24,7 @@ _PLANNED = (PacketKind.INSTRUCTION, PacketKind.STATUS)
 def timeline(
     packets: PacketColumns, buses: tuple[LoggedBus, ...], scheduled_ns: int
 ) -> Iterator[TimelinePacket]:
-    """Yield packets in the order of time, with when the plan expects each; `buses` of the log."""
+    """Yield packets in order of time, with the planned time of each; `buses` in the order of the log."""
     joints = [bus.names for bus in buses]
     due: list[float | None] = [None] * len(buses)
     for packet in sorted(packets, key=lambda one: (one.first_ns, one.last_ns)):

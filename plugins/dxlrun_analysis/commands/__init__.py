@@ -1,4 +1,4 @@
 """Commands that read logs: `analyze`, `export`, `logs`.
 
-They parse options and print. What they print is computed in the other packages.
+They parse options and print results that the other packages compute.
 """

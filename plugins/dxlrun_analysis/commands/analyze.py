@@ -17,11 +17,11 @@ if TYPE_CHECKING:
 
     from dxlrun import LogReader
 
-MOST_WORST = 10  # Cycles of which the analysis keeps the packets
+MOST_WORST = 10  # Number of cycles whose packets the analysis keeps
 
 
 def _log(_: object, tokens: Sequence[Token]) -> Path:
-    """Return the path of a log, or of a copy of one that lies in a store."""
+    """Return the path of a log. A log in a store is copied to a local file first."""
     place = tokens[0].value
     if "://" not in place:
         return Path(place)
@@ -107,7 +107,11 @@ def analyze(
 
 
 def _check(logs: Sequence[Path], *, report: Path | None, worst: int) -> None:
-    """Refuse what cannot be done before anything is read. Raises InputError."""
+    """Validate the command line before any file is read.
+
+    Raises:
+        InputError: Some options or logs cannot be used.
+    """
     if not 0 <= worst <= MOST_WORST:
         raise InputError(f"--worst {worst}: so many cycles are not kept; give 1 to {MOST_WORST}")
     given = {"--report": report is not None, "--worst": worst > 0}
@@ -122,7 +126,7 @@ def _check(logs: Sequence[Path], *, report: Path | None, worst: int) -> None:
 
 
 def _analyze_measurement(log: LogReader, report: Path | None, *, as_json: bool) -> int:
-    """Show what `dxlrun latency` has measured, as it did."""
+    """Show the result of `dxlrun latency` in the same form as that command."""
     from dxlrun_analysis.latency.latency_log import machine_of, measurement
     from dxlrun_analysis.latency.tables import parts
 
@@ -142,10 +146,12 @@ def _analyze_measurement(log: LogReader, report: Path | None, *, as_json: bool) 
 
 
 def newest_log() -> Path:
-    """Return the newest log of a run that has ended, in the directory where runs started here leave theirs.
+    """Return the newest log of a finished run, in the directory where runs that start here record.
 
-    It is the default of `recording: {directory: ...}`, from the working directory. Raises InputError when
-    there is none.
+    This is the default of `recording: {directory: ...}`, relative to the working directory.
+
+    Raises:
+        InputError: No finished run has a log there.
     """
     from dxlrun.tooling.logs import is_being_written, is_log_directory
     from dxlrun.tooling.plans import RecordingPlan
@@ -165,7 +171,10 @@ def newest_log() -> Path:
 
 
 def _analyze_each(logs: Sequence[Path], *, as_json: bool) -> int:
-    """Print a line for each log, or all as JSON; one that cannot be read does not hide the others."""
+    """Print a line for each log, or all as JSON.
+
+    An unreadable log does not stop the analysis of later ones.
+    """
     from dxlrun import open_log
     from dxlrun_analysis.latency.latency_log import is_measurement, measurement
     from dxlrun_analysis.latency.tables import line

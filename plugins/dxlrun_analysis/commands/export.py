@@ -1,4 +1,4 @@
-"""`dxlrun export`: a log in another format."""
+"""`dxlrun export`: conversion of a log to another format."""
 
 from __future__ import annotations
 
@@ -70,18 +70,18 @@ def export(
 
 
 def _without_table(reader: LogReader, target: Path, to: Format) -> dict[str, str] | None:
-    """Return the topics that have no table, with reasons; None where the format has no tables."""
+    """Return the topics without a table, with reasons; None if the format has no tables."""
     if to not in ("csv", "parquet"):
         return None
     from dxlrun_analysis.export.parquet import has_file
     from dxlrun_analysis.export.tables import topics_without_table
 
-    # with --topic, CSV has each topic that has messages
+    # With --topic, CSV can hold any topic that has messages.
     return topics_without_table(reader, lambda name: to == "csv" or has_file(target, name))
 
 
 def _write(reader: LogReader, target: Path, to: Format, topic: str | None) -> int:
-    """Write the format; return how many records it has."""
+    """Write the log in a format; return the number of records."""
     if to == "csv":
         from dxlrun_analysis.export.csv_file import write_csv
 

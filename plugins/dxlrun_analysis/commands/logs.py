@@ -1,4 +1,4 @@
-"""`dxlrun logs`: the logs of a season as a table; `dxlrun upload`: logs into a store."""
+"""`dxlrun logs`: table of the logs of a season; `dxlrun upload`: copy of logs to a store."""
 
 from __future__ import annotations
 
@@ -99,8 +99,8 @@ def logs(
 def upload(directory: Path, store: str, /, *, as_json: JsonFlag = False, debug: DebugFlag = False) -> int:
     """Copy the logs below a directory to an object store, each with its row of `dxlrun logs`.
 
-    Logs that are there as a whole are left out, and so is one that a run is writing; what an ended
-    connection left is done the next time. Nothing is deleted, and no other run is written over. Needs
+    Logs that the store already has are skipped, and so is a log that a run is writing. The next upload
+    completes an interrupted one. Nothing is deleted, and no other run is overwritten. Needs
     `pip install 'dxlrun[store]'`. The exit code is 1 when a log could not be copied.
 
     Parameters
@@ -137,7 +137,7 @@ def upload(directory: Path, store: str, /, *, as_json: JsonFlag = False, debug: 
 
 
 def _prune(directory: Path, keep: str, *, as_json: bool) -> int:
-    """Show which logs are beyond a size, and delete them if the answer is yes."""
+    """List the oldest logs beyond a total size, and delete them after confirmation."""
     from rich.filesize import decimal
 
     from dxlrun.tooling.logs import oldest_beyond, stored_logs
@@ -148,7 +148,7 @@ def _prune(directory: Path, keep: str, *, as_json: bool) -> int:
     logs, oldest = stored_logs(directory), oldest_beyond(directory, keep_bytes)
     names = [str(one.path) for one in oldest]
     freed, whole = sum(one.bytes for one in oldest), sum(one.bytes for one in logs)
-    if as_json:  # a program deletes by itself what it is told
+    if as_json:  # With --json only list the logs: a program can delete the listed files itself
         show_json({"directory": str(directory), "bytes": whole, "oldest": names, "oldest_bytes": freed})
         return 0
     them = counted(len(logs), "log", "logs")
@@ -177,7 +177,11 @@ def _prune(directory: Path, keep: str, *, as_json: bool) -> int:
 
 
 def _found(place: str) -> Folder | Store:
-    """Return the logs of a directory or a store; raises InputError where there are none."""
+    """Return the logs of a directory or a store.
+
+    Raises:
+        InputError: The place has no logs.
+    """
     from dxlrun_analysis.season import runs
 
     if "://" not in place:
@@ -191,7 +195,11 @@ def _found(place: str) -> Folder | Store:
 
 
 def _check(place: str) -> None:
-    """Raise InputError with all that is wrong with the command line."""
+    """Validate the directory and the installed extras.
+
+    Raises:
+        InputError: One line for each problem.
+    """
     wrong: list[str] = []
     needed = ("logs", "duckdb", "pyarrow")
     directory = Path(place)

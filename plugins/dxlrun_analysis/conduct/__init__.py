@@ -1,4 +1,4 @@
-"""Conduct of a run: what clients requested, and what controllers and sensors did.
+"""Conduct of a run: requests of clients, and the behaviour of controllers and sensors.
 
-How well joints followed their goals belongs in `joints`, traffic on the bus in `servos`.
+The tracking of goals by joints belongs in `joints`, traffic on the bus in `servos`.
 """

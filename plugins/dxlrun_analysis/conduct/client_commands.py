@@ -1,4 +1,4 @@
-"""Commands from outside in a log, each with the reason for which it was refused, if it was."""
+"""Client commands in a log, each with the reason of its refusal, if any."""
 
 from __future__ import annotations
 
@@ -11,12 +11,12 @@ from dxlrun import Log
 from dxlrun.tooling.logs import UNREADABLE
 from dxlrun.tooling.records import ClientCommand, CommandOutcome, Event, EventCode, TakenCommand
 
-POLICY = "policy"  # Kind of the command that the loop leaves in the log when it begins a policy's steps
+POLICY = "policy"  # Kind of the command that the loop logs when the steps of a policy begin
 _LOOP = "loop"
 
 
 def client_commands(log: Log) -> tuple[ClientCommand, ...]:
-    """Return every command that came from outside, in the order of the cycles."""
+    """Return the commands of all clients, in order of the cycles."""
     answers = _answers(log)
     last = policy_begun(log)
     found: list[ClientCommand] = []
@@ -30,9 +30,11 @@ def client_commands(log: Log) -> tuple[ClientCommand, ...]:
 
 
 def policy_begun(log: Log) -> TakenCommand | None:
-    """Return the loop's own record of the cycle in which a policy's steps begin; None: no policy had any.
+    """Return the loop's own record of the cycle in which the steps of a policy begin, or None without a
+    policy.
 
-    Its time is before that cycle's wake-up; a client's command of this kind has the cycle's own time.
+    The time of this record is before the wake-up of its cycle. A client's command of the same kind has the
+    time of the cycle itself.
     """
     last = log.commands[-1] if log.commands else None
     if last is None or not last.for_loop or (last.kind, last.origin) != (POLICY, _LOOP):
@@ -42,7 +44,7 @@ def policy_begun(log: Log) -> TakenCommand | None:
 
 
 def unlogged_commands(log: Log) -> tuple[int, ...]:
-    """Return the cycles whose events answer more commands for the loop than the log has."""
+    """Return the cycles with more answers to loop commands than logged loop commands."""
     named_loop = any(controller.name == _LOOP for controller in log.controllers)
     held: dict[int, int] = {}
     for command in log.commands:
@@ -57,7 +59,7 @@ def unlogged_commands(log: Log) -> tuple[int, ...]:
 
 
 def _answers(log: Log) -> dict[int, deque[Event]]:
-    """Return the events that answer commands, by the cycle in which they happened."""
+    """Return the events that answer commands, by cycle."""
     woken, updated, numbers = (log.cycles[name] for name in ("woken_ns", "updated_ns", "cycle"))
     answers: dict[int, deque[Event]] = {}
     for event in log.events:
@@ -70,14 +72,17 @@ def _answers(log: Log) -> dict[int, deque[Event]]:
 
 
 def _refusal(command: TakenCommand, place: int, answers: deque[Event]) -> str:
-    """Take the answer to a command out of those of its cycle; a controller's is there only if it refused."""
+    """Remove the answer to a command from the answers of its cycle; return its refusal, or an empty string.
+
+    Controllers answer only commands that they refuse.
+    """
     source = command.controller or _LOOP
     for event in answers:
         outcome = _outcome(event, command)
         if event.source != source or (outcome.kind, outcome.origin) != (command.kind, command.origin):
             continue
         if outcome.place not in (0, place):
-            continue  # of another one with the same kind and origin, in this cycle
+            continue  # The answer belongs to another command of this cycle with the same kind and origin
         answers.remove(event)
         return outcome.refusal.text if outcome.refusal else ""
     return ""

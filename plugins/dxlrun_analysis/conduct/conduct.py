@@ -1,8 +1,9 @@
-"""What the robot did: its goals, takeovers, controllers that failed and what took over, and whether it fell.
+"""Conduct of the robot: goals, takeovers, failed controllers and their fallbacks, and falls.
 
-A robot fell when a fall_reflex let others take over. It lies when gravity, in the frame of its IMU, ended
-more than 60 deg from where it was at the start, unless it began lying and ended upright: that of the
-orientation (quaternion of the frame in the world), else the acceleration; the median of some cycles.
+A robot fell if a fall_reflex had other controllers take over. It is down at the end if gravity, in the frame
+of its IMU, ended more than 60 deg from its direction at the start, unless the robot began lying and ended
+upright. Gravity comes from the orientation (quaternion of the frame in the world), else from the
+acceleration, as the median of some cycles.
 """
 
 from __future__ import annotations
@@ -23,8 +24,8 @@ from dxlrun_analysis.cycles.latency import begins, first_deadline_ns
 from dxlrun_analysis.plan import LoggedPlan, plan_of
 
 _FALLEN_RAD = math.radians(60.0)
-_SOME = 50  # Cycles at the begin and at the end whose median gravity is compared
-_MOST_KEPT = 100  # Takeovers
+_SOME = 50  # Cycles at the start and at the end whose median gravity is compared
+_MOST_KEPT = 100  # Takeovers that are kept
 _GOALS = (EventCode.GOAL_ACCEPTED, EventCode.GOAL_ENDED)
 _ENDS = (EventCode.LOOP_STARTED, EventCode.LOOP_STOPPED)
 
@@ -32,44 +33,44 @@ Floats = NDArray[np.float64]
 
 
 class Takeover(NamedTuple):
-    """Controllers took over: for one that failed, or because one requested it."""
+    """Takeover by other controllers, after a failure or on request."""
 
     time_s: float  # Since the first deadline
-    controller: str  # Which failed, or requested it
-    by: str  # The fallback; empty: it was requested
+    controller: str  # Controller that failed or requested the takeover
+    by: str  # Fallback; empty for a requested takeover
     text: str
     fell: bool = False
 
 
 @dataclass(frozen=True, slots=True)
 class Conduct:
-    """What the robot did in a run."""
+    """Behaviour of the robot in a run."""
 
-    begin_ns: int = 0  # The first deadline, on the run's clock
+    begin_ns: int = 0  # First deadline, on the run's clock
     goals: GoalTotals = field(default_factory=GoalTotals)
     whole: bool = False  # The log has the first and the last cycle of the run
     takeovers: tuple[Takeover, ...] = ()
-    unanswered: tuple[str, ...] = ()  # Controllers that failed without a fallback that took over
-    turned_rad: float | None = None  # How far gravity turned from the start to the end; None: no IMU
-    lies: bool = False  # At the end
+    unanswered: tuple[str, ...] = ()  # Controllers that failed and whose fallback did not take over
+    turned_rad: float | None = None  # Angle of gravity between start and end; None without an IMU
+    lies: bool = False  # The robot was down at the end
 
 
 NO_CONDUCT = Conduct()
 
 
 class ConductHistory:
-    """Collects what the robot did, slice by slice of a log, in memory that does not grow with it."""
+    """Accumulator of the robot's behaviour, fed slice by slice. Its memory does not grow with the log."""
 
     def __init__(self) -> None:
         self._begin_ns: int | None = None
         self._goals = GoalHistory()
-        self._ends: set[int] = set()  # LOOP_STARTED and LOOP_STOPPED, as far as the log has them
+        self._ends: set[int] = set()  # LOOP_STARTED and LOOP_STOPPED, if the log has them
         self._takeovers: list[Takeover] = []
-        self._pending: list[Event] = []  # Controllers that failed, for which nothing has taken over yet
+        self._pending: list[Event] = []  # Faults of controllers without a takeover so far
         self._first, self._last = np.zeros((0, 3)), np.zeros((0, 3))  # Gravity in the frame of the IMU
 
     def take(self, log: Log) -> None:
-        """Take the next slice."""
+        """Add the next slice."""
         if self._begin_ns is None and begins(log):
             self._begin_ns = first_deadline_ns(log)
         plan = plan_of(log)
@@ -92,7 +93,8 @@ class ConductHistory:
         self._last = np.concatenate([self._last, gravity[-_SOME:]])[-_SOME:]
 
     def _activated(self, event: Event, plan: LoggedPlan) -> None:
-        """Note that a fallback took over: its own for the controller that failed, or of one above that."""
+        """Record a takeover by the fallback of the failed controller, or by that of a later one in the
+        chain."""
         fallbacks = {one.fallback for one in plan.loop.controllers}
         for failed in self._pending:
             own = plan.controller(failed.source).fallback
@@ -107,7 +109,7 @@ class ConductHistory:
             self._takeovers.append(Takeover(time_s, event.source, by, event.text, fell))
 
     def finish(self) -> Conduct:
-        """Return all of it."""
+        """Return the behaviour over all slices."""
         turned, lies = None, any(one.fell for one in self._takeovers)
         if len(self._first) and len(self._last):
             begin, end = (_unit(np.median(rows, axis=0)) for rows in (self._first, self._last))
@@ -127,7 +129,7 @@ class ConductHistory:
 
 
 def _gravity(log: Log) -> Floats:
-    """Return gravity's direction in the frame of the first IMU in each cycle in which that is valid."""
+    """Return the direction of gravity in the frame of the first IMU, for each cycle with valid values."""
     sources = log.header.sources
     for names in (("x", "y", "z", "w"), ("x", "y", "z")):
         item = "orientation" if len(names) > 3 else "linear_acceleration"
@@ -143,6 +145,7 @@ def _gravity(log: Log) -> Floats:
         if len(names) == 3:
             return values
         x, y, z, w = values.T
+        # Third row of the rotation matrix of the quaternion: the vertical axis of the world, in the frame.
         return np.stack([2 * (x * z - w * y), 2 * (y * z + w * x), 1 - 2 * (x * x + y * y)], axis=1)
     return np.zeros((0, 3))
 

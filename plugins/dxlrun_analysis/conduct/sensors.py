@@ -1,13 +1,14 @@
-"""Sensors and devices that hang: they answer, and their values are the same to the bit.
+"""Detection of frozen sensors and devices: they answer, but their values are identical to the bit.
 
-All times are those in which the values were valid, and so that long is told only where it is ten times as
-long as the values ever stayed before, and a second at least.
+Times count only cycles with valid values. A standstill is reported only if it lasts a second, and ten times
+as long as any standstill before.
 
-- A sensor hangs where no value changes while joints move.
-- Values that trembled stand still: of their last 40 changes 16 went back, to one of so many values that it
-  was noise, and where most of them stay is no end of what they had, as that of a foot in the air is. It is
-  told of a device, or a sensor, where all that trembled stay at once, while joints move or as they trembled
-  at rest, too; and of one value where the others still tremble.
+- A sensor is frozen if no value changes while joints move.
+- A value that trembled is frozen if it stops changing. A value trembled if 16 of its last 40 changes
+  reversed direction, and it took several distinct values. Most of the frozen values must be within the range
+  that they had before: an extreme value can be genuine, such as that of a foot in the air. A device or sensor
+  is reported if all its trembling values freeze at once, while joints move or after they also trembled at
+  rest. A single value is reported if others still tremble.
 """
 
 from __future__ import annotations
@@ -24,15 +25,16 @@ from dxlrun_analysis.plan import LoggedPlan, plan_of
 
 _HANGS_S = 1.0
 _TIMES_LONGER = 10
-"""Than ever before: those of a switch stay for long, and of a simulated sensor without noise at rest."""
-_MOVED_RAD = 0.1  # A robot at rest may have a sensor, a simulated one, that measures the same
+"""Required ratio to the longest standstill before. A switch rarely changes, and neither does a simulated
+sensor without noise at rest."""
+_MOVED_RAD = 0.1  # At rest, a simulated sensor can measure a constant value
 _RESTED_RAD = 0.02
 _CHANGES = 40
-"""So many of the last ones show whether a value trembles ..."""
+"""Number of the last changes that show whether a value trembles."""
 _REVERSALS = 16
-"""... as so many of them go back: a measured movement goes one way for longer."""
-_FEWEST_VALUES = 4  # A voltage between two steps has two
-_FEWEST_ALONE = 8  # Of one value, while others still tremble
+"""Reversals of direction among these changes; a measured movement keeps its direction for longer."""
+_FEWEST_VALUES = 4  # A voltage that alternates between two steps has only two values
+_FEWEST_ALONE = 8  # Bound for a single value while others still tremble
 _MOST_NAMED = 4
 
 Times = NDArray[np.int64]
@@ -40,35 +42,42 @@ Times = NDArray[np.int64]
 
 @dataclass(frozen=True, slots=True)
 class _Stay:
-    """The longest time for which something stayed as it was."""
+    """Longest standstill of a value or source."""
 
     hung_s: float = 0.0
     from_s: float = 0.0
-    usual_s: float = 0.0  # The longest time before
-    moved: bool = False  # Joints did, meanwhile
-    values: int = 0  # That it had in the changes before, where it trembled; 0: it did not
-    inside: bool = False  # It had greater and smaller values, and is not 0
+    usual_s: float = 0.0  # Longest standstill before
+    moved: bool = False  # Joints moved during the standstill
+    values: int = 0  # Distinct values in the changes before; 0 if it did not tremble
+    inside: bool = False  # The value is not 0 and not an extreme of its range
     rested: bool = False  # It trembled while no joint moved
 
 
 @dataclass(slots=True)
 class _Watched:
-    """One value, or all of a source: when it changed, and how long it stayed."""
+    """Change history of one value, or of a whole source."""
 
-    since_ns: int  # The last change
-    position: Floats  # Of the joints, at that change
-    moved: bool = False  # Since then
-    longest_ns: int = 0  # Between two changes
+    since_ns: int  # Time of the last change
+    position: Floats  # Joint positions at that change
+    moved: bool = False  # Joints have moved since then
+    longest_ns: int = 0  # Longest time between two changes
     low: float = np.inf
     high: float = -np.inf
     recent: Floats = field(default_factory=lambda: np.zeros(0))
-    """The values of the last changes ..."""
+    """Values at the last changes."""
     places: Floats = field(default_factory=lambda: np.zeros((0, 0)))
-    """... and the positions of the joints at each."""
+    """Joint positions at these changes, shape (changes, joints)."""
     stay: _Stay = field(default_factory=_Stay)
 
     def take(self, at_ns: Times, values: Floats, changed: NDArray[np.bool_], position: Floats) -> None:
-        """Take cycles; `at_ns`: valid time since the first one; `values`: of one value, else zeros."""
+        """Add cycles.
+
+        Args:
+            at_ns: Valid time since the first cycle, ns; shape (cycles,).
+            values: Values of one quantity; zeros for a whole source.
+            changed: Cycles in which the value changed.
+            position: Joint positions, rad; shape (cycles, joints).
+        """
         rows = np.flatnonzero(changed)
         times = np.concatenate([[self.since_ns], at_ns[rows], at_ns[-1:]])
         longest = np.maximum.accumulate(np.append(self.longest_ns, np.diff(times)))
@@ -103,11 +112,11 @@ class _Watched:
             self.recent, self.places = recent[-_CHANGES:].copy(), places[-_CHANGES:].copy()
         since = position[rows[-1] :] if len(rows) else position
         self.moved |= bool(np.abs(since - self.position).max(initial=0.0) > _MOVED_RAD)
-        self.longest_ns = int(longest[-2])  # the last one may go on
+        self.longest_ns = int(longest[-2])  # The last standstill can continue in the next slice
 
 
 class _Source:
-    """The values of one sensor or device."""
+    """Values of one sensor or device."""
 
     def __init__(self, at_ns: int, values: Floats, position: Floats) -> None:
         self._at_ns, self._lived_ns, self._was_valid, self._last = at_ns, 0, True, values
@@ -115,7 +124,7 @@ class _Source:
         self.each = [_Watched(0, position) for _ in values]
 
     def take(self, at_ns: Times, valid: NDArray[np.bool_], values: Floats, position: Floats) -> None:
-        """Take cycles, shape (cycles, values), with where the joints were."""
+        """Add cycles, shape (cycles, values), with the joint positions."""
         between = np.diff(at_ns, prepend=self._at_ns)
         between[~valid | ~np.append(self._was_valid, valid[:-1])] = 0
         lived = (self._lived_ns + np.cumsum(between))[valid]
@@ -132,14 +141,14 @@ class _Source:
 
 
 class Sensors:
-    """Finds sensors and devices that hang, in memory that does not grow with the log."""
+    """Accumulator that finds frozen sensors and devices. Its memory does not grow with the log."""
 
     def __init__(self) -> None:
         self._sources: dict[str, _Source] = {}
         self._plan, self._states = LoggedPlan(), dict[str, tuple[str, ...]]()
 
     def take(self, log: Log) -> None:
-        """Take the cycles of the next slice."""
+        """Add the cycles of the next slice."""
         if not len(log.cycles):
             return
         self._plan, self._states = plan_of(log), dict(log.header.sources)
@@ -162,7 +171,7 @@ class Sensors:
                 self._sources[name].take(at_ns, valid, values, position)
 
     def findings(self) -> Iterable[Finding]:
-        """Name the sensors and devices that hung."""
+        """Report frozen sensors and devices."""
         sensors = self._plan.sensors
         for name, one in self._sources.items():
             whole, stays = one.all.stay, [each.stay for each in one.each]
@@ -198,7 +207,7 @@ class Sensors:
 
 
 def _trembled(values: Floats) -> int:
-    """Return how many values the last changes had where they trembled; 0: they did not."""
+    """Return the number of distinct values of a trembling value; 0 if it does not tremble."""
     values = values[-_CHANGES:]
     steps = np.diff(values)
     if len(values) < _CHANGES or np.count_nonzero(steps[1:] * steps[:-1] < 0) < _REVERSALS:
@@ -207,6 +216,6 @@ def _trembled(values: Floats) -> int:
 
 
 def _at_once(stays: Collection[_Stay]) -> bool:
-    """Return whether values stood still from the same moment on, as far as their changes before tell it."""
+    """Return whether values froze at the same time, within the intervals of their changes before."""
     begins = [stay.from_s for stay in stays]
     return max(begins) - min(begins) <= max(stay.usual_s for stay in stays) + 0.1

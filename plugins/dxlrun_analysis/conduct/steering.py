@@ -1,4 +1,4 @@
-"""What was steered: commands from outside, streams as one, and for how long the loop was paused."""
+"""Steering history: client commands, streams combined into one entry, and pauses of the loop."""
 
 from __future__ import annotations
 
@@ -18,11 +18,11 @@ _LONGEST = 80
 _ANSWERS = frozenset((EventCode.STEERED, EventCode.COMMAND_REFUSED))
 _HELD = "its joints are held"
 _CYCLE = np.dtype([(name, "i8") for name in ("cycle", "scheduled_ns", "woken_ns", "updated_ns")])
-"""What is kept of a cycle until it is known what was asked in it."""
+"""Fields of a cycle that are kept until its commands and answers are complete."""
 
 
 class _Data(msgspec.Struct):
-    """The keys of the loop's commands; each kind has some of them."""
+    """Keys of the loop's commands. A command has those of its kind."""
 
     activate: tuple[str, ...] = ()
     deactivate: tuple[str, ...] = ()
@@ -39,34 +39,36 @@ class _Data(msgspec.Struct):
 
 @dataclass(frozen=True, slots=True)
 class Act:
-    """One command from outside, or a stream of set-points."""
+    """One client command, or a stream of set-points."""
 
-    time_s: float  # Since the loop's first deadline
+    time_s: float  # Time since the first deadline
     cycle: int
     kind: str
-    what: str  # In words
+    what: str  # Description in words
     origin: str
-    refusal: str  # Why it was not done; empty: it was
-    set_points: int = 0  # Of a stream; 0: this is none
-    controller: str = ""  # Of a stream
+    refusal: str  # Reason of the refusal; empty if the command was executed
+    set_points: int = 0  # Number of set-points; 0 if this is not a stream
+    controller: str = ""  # Controller of a stream
     ended_s: float | None = None
-    """When its lease ran out, of a stream that none went on for its controller; None: it did not."""
-    held: bool = False  # The controller held its joints from then on, to the end of the run
+    """Time at which the lease of a stream ran out and no later stream continued; None if it did not run
+    out."""
+    held: bool = False  # The controller then held its joints until the end of the run
 
 
 @dataclass(frozen=True, slots=True)
 class Pause:
     """One pause of the controllers' time."""
 
-    begin_s: float  # Since the loop's first deadline
+    begin_s: float  # Time since the first deadline
     end_s: float
     periods: int
 
 
 class SteeringHistory:
-    """Counts what was asked, slice by slice of a log; streams are one act each, so that little is kept.
+    """Accumulator of client commands, fed slice by slice. A stream is one entry, so memory use stays small.
 
-    An answer and its cycle may be in a later slice than the command: the newest are kept until all are there.
+    An answer and its cycle can be in a later slice than the command. The newest commands are kept until their
+    answers are complete.
     """
 
     def __init__(self) -> None:
@@ -79,16 +81,16 @@ class SteeringHistory:
         self._acts: list[Act] = []
         self._pauses: list[Pause] = []
         self._since: tuple[int, int] | None = None
-        """Cycle and deadline in which a pause began that has not ended."""
+        """Cycle and deadline at which the current pause began, or None."""
         self._streams: dict[str, tuple[int, TakenCommand]] = {}
         self._last: TakenCommand | None = None
         self._stale: dict[str, tuple[int, bool]] = {}
-        """When the last stream of each controller ran out, and whether its joints were held then ..."""
+        """Time at which the last stream of each controller ran out, and whether its joints were held."""
         self._left_ns: dict[str, int] = {}
-        """... and when it was deactivated later."""
+        """Time at which a controller whose last stream ran out was deactivated."""
 
     def take(self, log: Log) -> None:
-        """Take the next slice."""
+        """Add the next slice."""
         if not self._begun:
             self._start_ns = first_deadline_ns(log)
             self._begun = begins(log)
@@ -110,9 +112,9 @@ class SteeringHistory:
             self._digest(int(due[-1]) - DISORDER_NS)
 
     def finish(self) -> tuple[tuple[Act, ...], tuple[Pause, ...]]:
-        """Return what was asked, in the order of the cycles, and which policy began; and the pauses.
+        """Return the commands in order of the cycles, including the begin of a policy, and the pauses.
 
-        The last pause may end with the run, or where a policy begins.
+        The last pause can end with the run or at the begin of a policy.
         """
         if self._log is None:
             return (), ()
@@ -136,7 +138,7 @@ class SteeringHistory:
         return tuple(self._acts), tuple(self._pauses)
 
     def _digest(self, until_ns: int | None) -> None:
-        """Take the commands that are older than a time, all of them for None, with their answers."""
+        """Process the commands before a time with their answers; None: all commands."""
         log = self._log
         if log is None:
             return
@@ -181,7 +183,7 @@ class SteeringHistory:
 
 
 def _continues(last: TakenCommand, command: TakenCommand) -> bool:
-    """Return whether a set-point belongs to the stream of the one before."""
+    """Return whether a set-point continues the stream of the one before."""
     return (
         bool(command.lease_ns)
         and (command.kind, command.origin) == (last.kind, last.origin)
@@ -215,7 +217,7 @@ def _stream(command: TakenCommand, count: int) -> str:
 
 
 def _words(command: TakenCommand) -> str:
-    """Return a command in words; unreadable data as they are."""
+    """Return a command in words; unreadable data are returned as text."""
     if not command.for_loop:
         return f"{command.kind} for {command.controller}"
     try:

@@ -1,4 +1,4 @@
-"""Cycles of a log: wake-up times, durations of their steps, the worst of them.
+"""Cycles of a log: wake-up times, durations of their steps, and the worst cycles.
 
-Why a cycle was late belongs in `causes`.
+Causes of late cycles belong in `causes`.
 """

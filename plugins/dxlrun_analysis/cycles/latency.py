@@ -1,4 +1,4 @@
-"""How well the loop kept its time: wake-up latency, duration of each step, skipped periods."""
+"""Punctuality of the loop: wake-up latency, duration of each step, skipped periods."""
 
 from __future__ import annotations
 
@@ -15,17 +15,18 @@ from dxlrun_analysis.counts import Counts, median, quantile
 from dxlrun_analysis.plan import plan_of
 
 ROUGH_NS = 150_000
-"""A wake-up later than this does not happen on a real-time Linux kernel (M. A. Araujo, UFU 2017)."""
+"""Lateness that does not occur on a real-time Linux kernel (M. A. Araujo, UFU 2017)."""
 
 DISORDER_NS = RING_SECONDS * 1_000_000_000
-"""A log has the records of several rings in the order in which the recorder got them: no further apart."""
+"""Largest displacement between records of a log. The recorder drains several rings in turn, and each ring
+holds at most this time."""
 _MS = 1_000_000
-LATE_BINS_US = 100_000  # Wake-ups are counted in bins of 1 us; what is later is in the last one
+LATE_BINS_US = 100_000  # Wake-ups are counted in bins of 1 us; the last bin has all later ones
 _TENTH_NS = 100
-_MOST_RATES = 4  # More are not listed one by one
-_MOST_KEPT = 1000  # So many different rates are kept
-_LATEST_NS = 1 << 43  # Two hours and more; a wake-up that is later by damaged times counts as so late
-_LOW = 20  # Bits of the lower of two parts that are squared separately, so that sums fit 64 bits
+_MOST_RATES = 4  # A longer list of rates is shown as a range
+_MOST_KEPT = 1000  # Number of distinct rates that are kept
+_LATEST_NS = 1 << 43  # Clip for lateness from damaged times: more than two hours
+_LOW = 20  # Bits of the low part; parts are squared separately so that sums fit into 64 bits
 
 
 @dataclass(frozen=True, slots=True)
@@ -35,7 +36,7 @@ class Latency:
     max_us: float
     mean_us: float
     deviation_us: float  # Standard deviation of the population
-    mode_us: int  # Lower edge of the fullest bin of 1 us; the smallest where several are as full
+    mode_us: int  # Lower edge of the fullest bin of 1 us, the smallest of equal ones
     share_over_150_us: float
     share_over_1_ms: float
     share_over_period: float
@@ -47,7 +48,7 @@ class Latency:
 
 @dataclass(frozen=True, slots=True)
 class Duration:
-    """Time that one step of the cycle, or the update of one controller, took, us.
+    """Time of one step of the cycle, or of the update of one controller, us.
 
     Counted in steps of 0.1 us; `counts.py` defines the quantiles.
     """
@@ -61,7 +62,7 @@ class Duration:
 
 @dataclass(frozen=True, slots=True)
 class Slowest:
-    """A cycle that took longer than its period, ns."""
+    """Times of a cycle that was longer than its period, ns."""
 
     period_ns: int
     read_ns: int
@@ -70,35 +71,36 @@ class Slowest:
 
     @property
     def lasted_ns(self) -> int:
-        """From waking to the last write."""
+        """Time from the wake-up to the last write."""
         return self.read_ns + self.update_ns + self.write_ns
 
     @property
     def exceeded_ns(self) -> int:
-        """By how much it was too long."""
+        """Excess over the period."""
         return self.lasted_ns - self.period_ns
 
 
 @dataclass(frozen=True, slots=True)
 class Periods:
-    """Where the periods of the run went; `elapsed` counts from the first deadline to the last record.
+    """Account of the periods of a run: recorded, skipped and missing.
 
-    Of a log that begins with a later part it counts from the first record.
+    `elapsed` counts from the first deadline to the last record. If the first part of a log is missing, it
+    counts from the first record.
     """
 
     elapsed: int
     records: int
     skipped: int  # Declared skipped by the loop
-    missing: int  # Elapsed, but neither recorded nor declared skipped; 0 in a whole log
-    agree: bool  # records + skipped = elapsed, and each record declares what is missing right before it
+    missing: int  # Elapsed, but neither recorded nor declared skipped; 0 in a complete log
+    agree: bool  # records + skipped = elapsed, and each record declares the periods skipped right before it
     rate_hz: float  # At the start
     seconds: float
-    rates_hz: tuple[float, ...] = ()  # Every rate at which cycles ran, in the order in which they came first
-    begin_ns: int = 0  # The first deadline; in a log without cycles the first event
+    rates_hz: tuple[float, ...] = ()  # Rates at which cycles ran, in order of first occurrence
+    begin_ns: int = 0  # First deadline; in a log without cycles, the time of the first event
 
     @property
     def rates(self) -> str:
-        """The rates in words."""
+        """Rates in words."""
         rates = self.rates_hz or (self.rate_hz,)
         if len(rates) > _MOST_RATES:
             return f"{len(rates)} rates from {min(rates):g} to {max(rates):g} Hz"
@@ -112,7 +114,7 @@ def on_virtual_time(log: Log) -> bool:
 
 
 def first_deadline_ns(log: Log) -> int:
-    """Return the loop's first deadline; the time of the first event in a log without cycles."""
+    """Return the loop's first deadline; in a log without cycles, the time of the first event."""
     if log.activation is not None:
         return int(log.activation["scheduled_ns"][0])
     if len(log.cycles):
@@ -122,19 +124,20 @@ def first_deadline_ns(log: Log) -> int:
 
 
 def begins(log: Log) -> bool:
-    """Return whether the first deadline is known from this slice of a log."""
+    """Return whether this slice of a log determines the first deadline."""
     return log.activation is not None or len(log.cycles) > 0
 
 
 def late_bins(late_ns: NDArray[np.int64]) -> NDArray[np.int64]:
-    """Return how many wake-ups were so many us late, shape (LATE_BINS_US + 1,); earlier ones count as 0."""
+    """Return the number of wake-ups in each bin of 1 us, shape (LATE_BINS_US + 1,). Early ones count as 0."""
     return np.bincount(np.clip(late_ns // 1000, 0, LATE_BINS_US), minlength=LATE_BINS_US + 1)
 
 
 def cycle_periods_ns(log: Log) -> NDArray[np.int64]:
-    """Return the period in which each cycle ran, ns: the time to the next deadline, shape (cycles,).
+    """Return the period of each cycle, ns: the time to the next deadline, shape (cycles,).
 
-    A change of the rate holds from the cycle that took it. Where cycles are lost it is a mean over them.
+    A changed rate applies from the cycle that executed the change. Across missing cycles the period is a
+    mean.
     """
     if len(log.cycles) < 2:
         return np.full(len(log.cycles), log.period_ns, dtype=np.int64)
@@ -145,7 +148,7 @@ def cycle_periods_ns(log: Log) -> NDArray[np.int64]:
 def _between_ns(log: Log, cycles: NDArray[np.void]) -> NDArray[np.int64]:
     """Return the period from each cycle to the next, ns, shape (cycles - 1,).
 
-    A sequential schedule counts it from when a cycle began, not from its deadline.
+    In a sequential schedule the period counts from the wake-up of a cycle, not from its deadline.
     """
     due = cycles["scheduled_ns"]
     counted_from = cycles["woken_ns"] if plan_of(log).loop.schedule == "sequential" else due
@@ -159,18 +162,18 @@ STEPS = (
     ("write", "updated_ns", "written_ns"),
     ("cycle", "woken_ns", "written_ns"),
 )
-"""Name of each step, and the times of a cycle at which it begins and ends; the last one is their sum."""
+"""Name of each step, and the fields with its begin and end. The last step is the sum of the others."""
 
 
 class Durations:
-    """Measures the steps of the cycles and the updates of the controllers, slice by slice of a log."""
+    """Accumulator of the durations of cycle steps and controller updates, fed slice by slice."""
 
     def __init__(self) -> None:
-        self._took = Counts()  # In steps of 0.1 us: of each step, then of each controller
+        self._took = Counts()  # In steps of 0.1 us; groups are the steps, then the controllers
         self._controllers: tuple[str, ...] = ()
 
     def take(self, log: Log) -> None:
-        """Measure the cycles of the next slice."""
+        """Add the cycles of the next slice."""
         self._controllers = tuple(controller.name for controller in log.controllers)
         cycles = log.cycles
         steps = [cycles[end] - cycles[begin] for _, begin, end in STEPS]
@@ -179,8 +182,12 @@ class Durations:
             self._took.take(np.full(len(took_ns), group), np.maximum(took_ns, 0) // _TENTH_NS)
 
     def finish(self) -> tuple[tuple[Duration, ...], tuple[Duration, ...]]:
-        """Return read, update, write and their sum, empty without cycles; and the update of each controller
-        over the cycles in which it was updated."""
+        """Return the durations of all steps and of all controllers.
+
+        Returns:
+            Read, update, write and their sum, empty without cycles; and the update of each controller
+                over the cycles in which it was updated.
+        """
         steps = [self._duration(number, name) for number, (name, _, _) in enumerate(STEPS)]
         updates = (self._duration(number, name) for number, name in enumerate(self._controllers, len(STEPS)))
         return tuple(step for step in steps if step.cycles), tuple(updates)
@@ -192,15 +199,15 @@ class Durations:
 
 
 _TIMES = ("cycle", "scheduled_ns", "woken_ns", "read_ns", "updated_ns", "written_ns", "skipped")
-"""What is counted of cycles, without their rows of joints."""
+"""Fields of cycles that are counted; the per-joint fields are not needed."""
 _WHOLE = np.dtype([(name, np.int64) for name in _TIMES])
 
 
 class Punctuality:
-    """Counts how the loop kept its time, slice by slice of a log, in memory that does not grow with it."""
+    """Accumulator of the loop's punctuality, fed slice by slice. Its memory does not grow with the log."""
 
     def __init__(self) -> None:
-        self._held: NDArray[np.void] | None = None  # The newest cycle: its period ends with the next one
+        self._held: NDArray[np.void] | None = None  # Newest cycle: its period ends with the next one
         self._records = self._skipped = self._elapsed = 0
         self._agree = True
         self._start = 0  # Number of the first period that counts
@@ -212,10 +219,10 @@ class Punctuality:
         self._bins = np.zeros(LATE_BINS_US + 1, np.int64)
         self._late = Counts()  # In steps of 0.1 us, one group
         self._rates: dict[int, None] = {}
-        self.slowest: Slowest | None = None  # The cycle that exceeded its period most; None where none did
+        self.slowest: Slowest | None = None  # Cycle that exceeded its period most, or None
 
     def take(self, log: Log) -> None:
-        """Count the cycles of the next slice."""
+        """Add the cycles of the next slice."""
         if self._first:
             self._begin_ns = self._from_ns = first_deadline_ns(log)
             self._nominal_ns = self._period_ns = log.period_ns
@@ -262,7 +269,7 @@ class Punctuality:
             self.slowest = Slowest(int(each[worst]), read, update, write)
 
     def finish(self) -> tuple[Periods, Latency | None]:
-        """Return the account of the periods, of which none may vanish, and the wake-ups, None without."""
+        """Return the account of all periods, and the wake-up latency, which is None without cycles."""
         if self._held is not None:
             self._count(self._held, np.full(1, self._period_ns, np.int64))
             self._held = None

@@ -1,6 +1,6 @@
-"""What is found about late and long cycles: causes over a run, and the worst cycles as packet timelines.
+"""Records of late and long cycles: causes over a run, and the worst cycles as packet timelines.
 
-The forms only, for tables, plots and JSON; `dxlrun_analysis.causes` fills them.
+These are only the types, for tables, plots and JSON; `dxlrun_analysis.causes` creates them.
 """
 
 from __future__ import annotations
@@ -20,7 +20,7 @@ CauseKind = Literal[
     "plan",
     "unexplained",
 ]
-"""Where time went that a cycle was not planned to take; analyze.md has what each means."""
+"""Kind of unplanned time in a cycle; analyze.md explains each."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -28,18 +28,18 @@ class Cause:
     """One cause over a whole run."""
 
     kind: CauseKind
-    subject: str  # The servo with its joint, the bus, the controller, or what the machine did; empty: none
-    cycles: int  # In which it had a part
+    subject: str  # Servo with its joint, bus, controller or activity of the machine; empty for none
+    cycles: int  # Cycles with a share of this cause
     total_ns: int
-    worst_ns: int  # The most in one cycle
+    worst_ns: int  # Greatest share in one cycle
     long_ns: int
-    """Of the total, what it has of cycles that were too long; the rest is of such as only woke late."""
-    servo: str = ""  # The joint of the servo, or its bus and ID; empty: the cause is no servo
+    """Share of the total in long cycles; the rest is in cycles that only woke late."""
+    servo: str = ""  # Joint of the servo, or its bus and ID; empty if the cause is not a servo
 
 
 @dataclass(frozen=True, slots=True)
 class CauseShare:
-    """What one cause has of a cycle's excess, us."""
+    """Share of one cause in a cycle's excess, us."""
 
     kind: CauseKind
     subject: str  # As in Cause
@@ -47,7 +47,7 @@ class CauseShare:
 
     @property
     def name(self) -> str:
-        """The cause with its subject, as in a sentence; what the machine did is its own name."""
+        """Cause with its subject, as in a sentence. An activity of the machine is its own name."""
         if self.kind == "machine":
             return self.subject
         return f"{self.kind} of {self.subject}" if self.subject else self.kind
@@ -58,32 +58,34 @@ TimelineKind = Literal["instruction", "status", "noise", "late", "other host", "
 
 @dataclass(frozen=True, slots=True)
 class TimelinePacket:
-    """One packet of a cycle; times in us since the cycle was due, below 0 in the idle time before."""
+    """One packet of a cycle; times in us since the cycle's deadline, negative in the idle time before."""
 
     bus: str
     kind: TimelineKind
     servo_id: int  # 254: all servos
-    joint: str  # Of the servo that is asked or answers; empty: several, or the plan does not name it
-    begin_us: float  # Of an instruction before its write(), else after the read() that brought the first byte
-    end_us: float  # After the write(), or after the read() that brought the last byte
+    # Joint of the servo that is asked or answers; empty for several servos, or if the plan does not name it.
+    joint: str
+    begin_us: float  # Instruction: before its write(); else after the read() that returned the first byte
+    end_us: float  # After the write(), or after the read() that returned the last byte
     planned_us: float | None
-    """When the plan expects its last byte, the exchange having begun when it did; None where it has none."""
+    """Planned time of its last byte, relative to the actual begin of the exchange; None if it is not
+    planned."""
     size: int  # Bytes
 
 
 @dataclass(frozen=True, slots=True)
 class WorstCycle:
-    """One cycle with its packets; times in us since it was due (`scheduled_ns`)."""
+    """One cycle with its packets; times in us since its deadline (`scheduled_ns`)."""
 
     cycle: int
-    seconds: float  # When it was due, since the first deadline
-    scheduled_ns: int  # The same by the run's clock, which is the time base of all plots
+    seconds: float  # Deadline, since the first deadline
+    scheduled_ns: int  # Deadline on the run's clock, which is the time base of all plots
     period_us: float
-    woken_us: float  # Also how late the wake-up was
+    woken_us: float  # Equals the lateness of the wake-up
     read_us: float
     updated_us: float
-    written_us: float  # When it ended
-    skipped: int  # Periods that were left out behind it
-    excess_us: float  # Lateness, and what the cycle took beyond its planned exchanges: the sum of its causes
-    causes: tuple[CauseShare, ...]  # The largest first
-    packets: tuple[TimelinePacket, ...]  # In the order of time, those of the idle time before it too
+    written_us: float  # End of the cycle
+    skipped: int  # Periods skipped after this cycle
+    excess_us: float  # Lateness and time beyond the planned exchanges: the sum of the causes
+    causes: tuple[CauseShare, ...]  # Largest first
+    packets: tuple[TimelinePacket, ...]  # In order of time, including those of the preceding idle time

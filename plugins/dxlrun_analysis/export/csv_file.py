@@ -1,4 +1,4 @@
-"""CSV: one topic of a log, a line for each of its records, the names of the columns in the first."""
+"""CSV: one topic of a log, a line for each record, column names in the first line."""
 
 from __future__ import annotations
 
@@ -15,9 +15,14 @@ from dxlrun_analysis.export.tables import COMMANDS, CYCLES, EVENTS, WITHOUT_TABL
 
 
 def write_csv(reader: LogReader, target: Path, topic: str) -> int:
-    """Write the records of a topic; return how many. What is not known is empty, bytes are hexadecimal.
+    """Write the records of a topic. Unknown values are empty, bytes are hexadecimal.
 
-    Raises LogError when the log cannot be read, or has no such records; OSError.
+    Returns:
+        Number of records.
+
+    Raises:
+        LogError: The log cannot be read, or has no records of the topic.
+        OSError: The file cannot be written.
     """
     writer: csv.CSVWriter | None = None
     count = 0
@@ -40,7 +45,7 @@ def write_csv(reader: LogReader, target: Path, topic: str) -> int:
 
 
 def _plain(column: pa.ChunkedArray) -> pa.ChunkedArray:
-    """Return a column as CSV can hold it: lists as JSON, bytes in hexadecimal."""
+    """Return a column in a form that CSV can hold: lists as JSON, bytes in hexadecimal."""
     kind = column.type
     if pa.types.is_dictionary(kind):
         return column.cast(kind.value_type)

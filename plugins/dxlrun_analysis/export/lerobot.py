@@ -1,13 +1,13 @@
 """LeRobot: a log as a data set, in the layout of LeRobotDataset v3.0.
 
 Source: Hugging Face LeRobot, docs "LeRobotDataset v3.0", and the names and types of columns that lerobot 0.4
-writes: data/chunk-000/file-000.parquet with a row a frame, meta/info.json with features and rate,
+writes: data/chunk-000/file-000.parquet with a row per frame, meta/info.json with features and rate,
 meta/stats.json, meta/tasks.parquet, meta/episodes/chunk-000/file-000.parquet.
 
-A frame is a period of the loop. `observation.state` is the position of each joint, `action` what was sent to
-it: its goal position; of a joint that never got one its goal velocity, effort or PWM. Frames begin when every
-joint has both. Periods that were skipped, and states that were lost, repeat the frame before: a servo keeps
-its goal. Where other cycles are missing, another episode begins.
+A frame is a period of the loop. `observation.state` is the position of each joint, `action` its goal
+position; a joint that never received one has its goal velocity, effort or PWM. Frames begin when every joint
+has both. Skipped periods and lost states repeat the preceding frame, because a servo keeps its goal. After
+cycles that are missing for another reason, a new episode begins.
 """
 
 from __future__ import annotations
@@ -47,7 +47,7 @@ Floats = NDArray[np.float64]
 
 @dataclass(slots=True)
 class _Statistics:
-    """Minimum, maximum, mean and standard deviation of rows, taken in pieces."""
+    """Minimum, maximum, mean and standard deviation of rows, updated in batches."""
 
     count: int = 0
     low: Floats = field(default_factory=lambda: np.full(1, np.inf))
@@ -57,7 +57,7 @@ class _Statistics:
     """Sum of squared differences from the mean (Chan, Golub, LeVeque 1983: pairwise updates)."""
 
     def take(self, rows: NDArray[np.generic]) -> None:
-        """Take rows, shape (rows, elements)."""
+        """Add rows, shape (rows, elements)."""
         values = rows.astype(np.float64)
         mean = values.mean(axis=0)
         total, shift = self.count + len(values), mean - self.mean
@@ -80,9 +80,11 @@ class _Statistics:
 
 
 def write_dataset(reader: LogReader, directory: Path) -> int:
-    """Write the data set into a directory that is made; return how many frames it has.
+    """Write the data set into a new directory; return the number of frames.
 
-    Raises LogError where the log has none, or its rate is no whole number of Hz; OSError.
+    Raises:
+        LogError: The log has no frames, or its rate is not a whole number of Hz.
+        OSError: A file cannot be written.
     """
     goals = _commanded(reader)
     file = directory / _DATA.format(**_PLACE)
@@ -100,17 +102,17 @@ def write_dataset(reader: LogReader, directory: Path) -> int:
 
 
 class _Stretch(msgspec.Struct, frozen=True, eq=False):
-    """Frames that follow each other."""
+    """Consecutive frames."""
 
     log: Log
     states: Frames  # Shape (frames, joints)
     actions: Frames  # Shape (frames, commanded joints)
-    begins: bool  # They do not follow those before: an episode begins
+    begins: bool  # The frames do not continue the preceding ones: an episode begins
 
 
 @dataclass(slots=True)
 class _Episode:
-    """One episode: where it lies in the data set, and the statistics of its features."""
+    """One episode: its range of frames in the data set, and the statistics of its features."""
 
     begin: int
     end: int
@@ -118,7 +120,7 @@ class _Episode:
 
 
 class _Dataset:
-    """Writes frames, and keeps what is said about them."""
+    """Writer of frames. Keeps the episodes and statistics for the metadata."""
 
     def __init__(self, file: Path) -> None:
         self._file = file
@@ -129,7 +131,7 @@ class _Dataset:
 
     @property
     def frames(self) -> int:
-        """How many there are."""
+        """Number of frames so far."""
         return self.episodes[-1].end if self.episodes else 0
 
     def take(self, stretch: _Stretch) -> None:
@@ -150,13 +152,13 @@ class _Dataset:
         episode.end += len(index)
 
     def close(self) -> None:
-        """Finish the file. Raises OSError."""
+        """Close the file. Raises OSError."""
         if self._writer is not None:
             self._writer.close()
 
 
 def _commanded(reader: LogReader) -> dict[str, str]:
-    """Return which command interface the joints were commanded by; joints that never were are left out."""
+    """Return the first command interface that each joint received goals for; omits joints without goals."""
     seen: dict[str, NDArray[np.bool_]] = {}
     joints: tuple[str, ...] = ()
     for log in reader.slices():
@@ -172,7 +174,11 @@ def _commanded(reader: LogReader) -> dict[str, str]:
 
 
 def _stretches(reader: LogReader, goals: Mapping[str, str]) -> Iterator[_Stretch]:
-    """Yield the frames of a log, slice by slice. Raises LogError for a rate that a data set cannot have."""
+    """Yield the frames of a log, slice by slice.
+
+    Raises:
+        LogError: A data set cannot have this rate.
+    """
     held: tuple[Frames, Frames, NDArray[np.void]] | None = None
     begun = False
     for log in reader.slices():
@@ -183,7 +189,8 @@ def _stretches(reader: LogReader, goals: Mapping[str, str]) -> Iterator[_Stretch
         actions = np.empty((len(cycles), len(goals)), np.float32)
         for index, (joint, name) in enumerate(goals.items()):
             actions[:, index] = cycles[f"goal_{name}"][:, log.joints.index(joint)]
-        if held is not None:  # the newest row of the slice before: it goes on until the first of this one
+        # The newest row of the preceding slice is repeated until the first row of this one.
+        if held is not None:
             states, actions = np.vstack((held[0], states)), np.vstack((held[1], actions))
             cycles = np.concatenate((held[2], cycles))
         states, actions = _filled(states), _filled(actions)
@@ -199,7 +206,8 @@ def _stretches(reader: LogReader, goals: Mapping[str, str]) -> Iterator[_Stretch
             if begin == end:
                 continue
             times = np.append(steps[begin : end - 1], 1)
-            before = int(known and begun and begin == 0)  # that row was in the slice before
+            # The row was already yielded with the preceding slice.
+            before = int(known and begun and begin == 0)
             rows = np.repeat(np.arange(begin, end), times)[before:]
             if len(rows):
                 yield _Stretch(log, states[rows], actions[rows], not before)
@@ -207,7 +215,7 @@ def _stretches(reader: LogReader, goals: Mapping[str, str]) -> Iterator[_Stretch
 
 
 def _filled(values: NDArray[np.floating]) -> Frames:
-    """Return rows in which a value that is not known is that of the row before."""
+    """Return rows in which unknown values are replaced by those of the preceding row."""
     rows = np.where(np.isfinite(values), np.arange(len(values))[:, None], 0)
     np.maximum.accumulate(rows, axis=0, out=rows)
     filled: Frames = np.take_along_axis(values, rows, axis=0).astype(np.float32)
@@ -242,7 +250,10 @@ def _numbers(index: NDArray[np.int64], begin: int, episode: int, rate: int) -> d
 
 
 def _vectors(values: Frames) -> pa.Array:
-    """Return rows of numbers; a single number is one, as LeRobot has features of shape (1,)."""
+    """Return rows of numbers.
+
+    A row of one number becomes a plain number, as LeRobot has features of shape (1,).
+    """
     flat = pa.array(np.ascontiguousarray(values).reshape(-1), pa.float32())
     return flat if values.shape[1] == 1 else pa.FixedSizeListArray.from_arrays(flat, values.shape[1])
 
@@ -303,7 +314,7 @@ def _write_meta(directory: Path, log: Log, features: Mapping[str, object], made:
 
 
 def _tasks(task: str) -> pa.Table:
-    """Return the table of tasks; pandas reads the task as its index, as LeRobot looks it up."""
+    """Return the table of tasks. Its metadata make pandas use the task as index, which LeRobot looks up."""
     pandas = {
         "index_columns": ["task"],
         "column_indexes": [],

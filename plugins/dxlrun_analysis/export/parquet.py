@@ -15,16 +15,19 @@ from dxlrun_analysis.export.tables import PACKETS, tables_of
 
 _NAMES = {"/cycle": "cycles"}
 _ODD = re.compile(r"[^\w.-]|^\.")
-"""What a log that others made may have in a topic's name, and a file's name better has not."""
-_LONGEST = 100  # Characters of a file's name: 255 bytes of UTF-8, and its suffix
-_GROUP_BYTES = 32 << 20  # Of a table in memory; so much becomes one row group
+"""Characters to replace in file names. Logs of other programs can have them in topic names."""
+_LONGEST = 100  # Characters of a file name, which has at most 255 bytes of UTF-8 with its suffix
+_GROUP_BYTES = 32 << 20  # Size of a table in memory that is written as one row group
 
 
 def write_parquet(reader: LogReader, directory: Path) -> int:
-    """Write all tables of a log into a directory that is made; return how many rows they have.
+    """Write all tables of a log into a new directory; return their number of rows.
 
-    Memory does not grow with them. Raises LogError when the log cannot be read, OSError when the files cannot
-    be written.
+    Memory does not grow with the log.
+
+    Raises:
+        LogError: The log cannot be read.
+        OSError: A file cannot be written.
     """
     count = 0
     writers: dict[str, pq.ParquetWriter] = {}
@@ -36,7 +39,7 @@ def write_parquet(reader: LogReader, directory: Path) -> int:
             table = pa.concat_tables(waiting.pop(name)).unify_dictionaries().combine_chunks()
             if name not in writers:
                 file = directory / file_name(name)
-                if file.exists():  # of another topic, whose name differs in what a file's name cannot have
+                if file.exists():  # Another topic has the same file name after characters were replaced
                     file = file.with_suffix(f".{len(writers)}.parquet")
                 writers[name] = files.enter_context(pq.ParquetWriter(file, table.schema, compression="zstd"))
             writers[name].write_table(table)
@@ -52,12 +55,12 @@ def write_parquet(reader: LogReader, directory: Path) -> int:
 
 
 def has_file(directory: Path, topic: str) -> bool:
-    """Return whether a directory of tables has that of a topic; the packets of all buses are in one."""
+    """Return whether a directory has the table of a topic. The packets of all buses share one table."""
     table = PACKETS if topic.startswith(BUS_PREFIX) else topic
     return (directory / file_name(table)).exists()
 
 
 def file_name(topic: str) -> str:
-    """Return the file of a topic: `cycles.parquet`, `arm.error.parquet` for `/arm/error`."""
+    """Return the file name of a topic: `cycles.parquet`, `arm.error.parquet` for `/arm/error`."""
     name = _NAMES.get(topic, topic.strip("/").replace("/", "."))
     return f"{_ODD.sub('_', name)[:_LONGEST] or '_'}.parquet"

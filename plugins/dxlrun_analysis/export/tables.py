@@ -1,8 +1,8 @@
-"""A log as Arrow tables: one row a cycle, packet, event, command or message, made slice by slice.
+"""Arrow tables of a log: one row per cycle, packet, event, command or message, made slice by slice.
 
-Units are in the names of the columns; what is not known or not commanded is null. Every table has `time_s`, s
-since the log's first record, and `t_ns`, ns of the run's clock; wall time is that + `epoch_offset_ns`, which
-the tables carry as metadata.
+Column names have the units; unknown values and interfaces without a command are null. Every table has
+`time_s`, s since the log's first record, and `t_ns`, ns of the run's clock. Wall time is `t_ns` +
+`epoch_offset_ns`, which is in the metadata of the tables.
 """
 
 from __future__ import annotations
@@ -20,7 +20,7 @@ from dxlrun.tooling.topics import Codec, LoggedTopic, LogTopic, bus_topic, messa
 from dxlwire import Mode, PacketKind
 
 CYCLES, EVENTS, COMMANDS = LogTopic.CYCLE, LogTopic.EVENT, LogTopic.COMMANDS
-PACKETS = "/packets"  # The packets of all buses; `/bus/NAME` are those of one
+PACKETS = "/packets"  # Packets of all buses; `/bus/NAME` has those of one bus
 WITHOUT_TABLE: Mapping[str, str] = {
     LogTopic.JOINT_STATES: "the states are in /cycle",
     LogTopic.JOINT_COMMANDS: "the goals are in /cycle",
@@ -31,9 +31,9 @@ WITHOUT_TABLE: Mapping[str, str] = {
     LogTopic.ROSOUT: "the same events are in /events",
     LogTopic.ACTIVATION: "it is one message, the states and goals before the first cycle",
 }
-"""Topics of a log that no table has, and the reason."""
+"""Topics without a table, and the reason."""
 _ROWS = 4096
-"""Cycles that become one table: a slice of a log may have a few, and a table costs some time a column."""
+"""Cycles per table. A slice can have only a few cycles, and each table costs some time per column."""
 
 _JOINT_COLUMNS: tuple[tuple[str, str], ...] = (
     ("position", "position_rad"),
@@ -56,7 +56,7 @@ _JOINT_COLUMNS: tuple[tuple[str, str], ...] = (
     ("mode", "mode"),
     ("torque", "torque"),
 )
-"""Fields of a cycle with one element a joint, and what their columns are called behind `JOINT/`."""
+"""Fields of a cycle with one element per joint, and their column names after `JOINT/`."""
 _MODES = [mode.name.lower() for mode in Mode]
 _TORQUES = [torque.name.lower() for torque in Torque]
 _KINDS = ["", *(kind.name.lower() for kind in PacketKind)]
@@ -65,7 +65,7 @@ _KINDS = ["", *(kind.name.lower() for kind in PacketKind)]
 class Rows(msgspec.Struct, frozen=True, eq=False):
     """Some rows of one table."""
 
-    name: str  # The topic: `/cycle`, `/packets`, `/bus/NAME`, `/events`, `/commands`, that of a controller
+    name: str  # Topic: `/cycle`, `/packets`, `/bus/NAME`, `/events`, `/commands`, or one of a controller
     table: pa.Table
 
 
@@ -74,7 +74,7 @@ def topics_without_table(reader: LogReader, has_table: Callable[[str], bool]) ->
 
     Args:
         reader: The log.
-        has_table: Whether the table of a topic was written, for topics that can have one.
+        has_table: Predicate that is true if the table of a topic was written.
     """
     return {
         name: WITHOUT_TABLE.get(name, "the log has no message of it")
@@ -84,9 +84,14 @@ def topics_without_table(reader: LogReader, has_table: Callable[[str], bool]) ->
 
 
 def tables_of(slices: Iterable[Log], only: Container[str] | None = None) -> Iterator[Rows]:
-    """Yield the rows of a log, slice by slice, in memory that does not grow with it.
+    """Yield the rows of a log, slice by slice, in memory that does not grow with the log.
 
-    Of the topics in `only`; without, of all but `/bus/NAME`. Raises LogError when a record cannot be read.
+    Args:
+        slices: Slices of the log.
+        only: Topics to yield; without it, all topics but `/bus/NAME`.
+
+    Raises:
+        LogError: A record cannot be read.
     """
     begin_ns: int | None = None
     waiting: list[NDArray[np.void]] = []
@@ -112,7 +117,7 @@ def tables_of(slices: Iterable[Log], only: Container[str] | None = None) -> Iter
 
 
 def _first_ns(log: Log) -> int | None:
-    """Return the time of the first record, ns of the run's clock: `time_s` counts from there."""
+    """Return the time of the first record, ns of the run's clock: the zero of `time_s`."""
     times = [*(event.t_ns for event in log.events[:1]), *log.cycles["scheduled_ns"][:1].tolist()]
     return min(times, default=None)
 
@@ -132,8 +137,11 @@ def _packets(log: Log, begin_ns: int, only: Container[str] | None) -> Iterator[R
 
 
 def _cycle_table(log: Log, parts: Sequence[NDArray[np.void]], begin_ns: int) -> pa.Table:
-    """Return cycles as a table: first the times of each, then the values of each joint, then references,
-    then the states of devices, sensors and controllers, and the commands of devices."""
+    """Return cycles as a table.
+
+    The columns are the times of each cycle, controllers, joints, references, the states of devices, sensors
+    and controllers, and the commands of devices.
+    """
     cycles = np.concatenate(parts)
     columns = _cycle_times(cycles, begin_ns)
     for index, controller in enumerate(log.controllers):
@@ -158,7 +166,7 @@ def _cycle_table(log: Log, parts: Sequence[NDArray[np.void]], begin_ns: int) -> 
 
 
 def _cycle_times(cycles: NDArray[np.void], begin_ns: int) -> dict[str, pa.Array]:
-    """Return the columns of cycles that have neither joints nor controllers: numbers, times, durations."""
+    """Return the columns of cycles that belong to no joint or controller: numbers, times, durations."""
     return {
         "cycle": pa.array(cycles["cycle"]),
         **_times(cycles["scheduled_ns"], begin_ns),
@@ -175,7 +183,7 @@ def _cycle_times(cycles: NDArray[np.void], begin_ns: int) -> dict[str, pa.Array]
 def _joint_column(field: str, values: NDArray[np.generic]) -> pa.Array:
     if field == "age_ns":
         ages = values.astype(np.float64) / 1e6
-        return pa.array(ages, mask=ages < 0)  # -1 ns: no reply ever came
+        return pa.array(ages, mask=ages < 0)  # -1 ns means that no reply ever came
     if field in ("mode", "torque"):
         return _words(values, _MODES if field == "mode" else _TORQUES)
     return _known(values) if values.dtype.kind == "f" else pa.array(np.ascontiguousarray(values))
@@ -183,7 +191,7 @@ def _joint_column(field: str, values: NDArray[np.generic]) -> pa.Array:
 
 def _packet_table(log: Log, begin_ns: int) -> pa.Table:
     packets = log.packets
-    # the bytes of the packets lie one behind the other, but those of others may lie between them
+    # `data` can also have bytes of packets outside the selection, so gather those of each packet.
     ends = np.cumsum(packets.length)
     place = np.repeat(packets.start - (ends - packets.length), packets.length) + np.arange(
         int(ends[-1]) if len(ends) else 0
@@ -242,7 +250,7 @@ def _commands(log: Log, begin_ns: int) -> pa.Table:
 
 
 def _messages(log: Log, topic: LoggedTopic, begin_ns: int) -> pa.Table:
-    """Return messages with a column for each of their fields; those of nested messages by `a.b`."""
+    """Return messages with a column for each field; fields of nested messages are named `a.b`."""
     try:
         codec = Codec(topic.type)
         values = [codec.unpack(data) for data in topic.data]

@@ -1,4 +1,4 @@
-"""Quantities of joints over the run, in bins of time that double when the run outgrows them."""
+"""Quantities of joints over the run, in time bins that double in length when the run outgrows them."""
 
 from __future__ import annotations
 
@@ -12,11 +12,12 @@ _FIRST_BIN_NS = 100_000_000
 
 
 _JOINS = ((np.minimum, np.inf), (np.maximum, -np.inf), (np.add, 0.0), (np.add, 0.0))
-"""How bins are joined, and what an empty one has: least, most, sum, and the cycles in which it was known."""
+"""Reduction and neutral element of each array: minimum, maximum, sum, and number of known cycles."""
 
 
 class Bins:
-    """Least, mean and most of quantities of joints in each bin; in all, shape (quantities, bins, joints)."""
+    """Minimum, mean and maximum of joint quantities in time bins; arrays of shape (quantities, bins,
+    joints)."""
 
     def __init__(self, quantities: int = 0, joints: int = 0, begin_ns: int = 0) -> None:
         shape = (quantities, _BINS, joints)
@@ -24,7 +25,12 @@ class Bins:
         self._values = [np.full(shape, empty) for _, empty in _JOINS]
 
     def take(self, times: NDArray[np.int64], values: Floats) -> None:
-        """Take cycles; NaN is not known; shapes (cycles,) in ns, and (quantities, cycles, joints)."""
+        """Add cycles.
+
+        Args:
+            times: Times in ns, shape (cycles,).
+            values: Values, NaN if unknown; shape (quantities, cycles, joints).
+        """
         while int(times[-1]) - self.begin_ns >= _BINS * self.bin_ns:
             self._halve()
         index = np.clip((times - self.begin_ns) // self.bin_ns, 0, _BINS - 1)
@@ -37,7 +43,7 @@ class Bins:
             array[:, bins] = join(array[:, bins], join.reduceat(part, starts, axis=1))
 
     def _halve(self) -> None:
-        """Join the bins in pairs, which then last twice as long."""
+        """Merge the bins in pairs, which doubles their length."""
         half = _BINS // 2
         for (join, empty), array in zip(_JOINS, self._values, strict=True):
             array[:, :half] = join(array[:, 0::2], array[:, 1::2])
@@ -45,9 +51,11 @@ class Bins:
         self.bin_ns *= 2
 
     def joined(self, seconds: float) -> tuple[float, Floats, Floats, Floats]:
-        """Return how long windows of whole bins are, at least so long; and least, mean and most in each.
+        """Merge bins into windows of about `seconds`, one bin at least.
 
-        Those without a value have NaN, and there are as many as the run needs.
+        Returns:
+            Length of the windows in s, then minimum, mean and maximum in each window. The windows cover
+                the run; a window without a value has NaN.
         """
         used = int(np.max(np.nonzero(self._values[3].sum(axis=(0, 2)))[0], initial=-1)) + 1
         step = max(1, round(seconds * 1e9 / self.bin_ns))

@@ -1,9 +1,10 @@
-"""The delay with which a joint follows the goals as they were sent.
+"""Delay with which a joint follows the goals as they were sent.
 
-Of 24 delays up to 0.3 s, of 24 cycles where those take longer, the one with the least mean square difference
-between position and goal, refined by a parabola through it and its neighbours: to about a tenth of the step
-between two of them, 12.5 ms or a cycle. There is none where the goals hardly moved, where it is beyond the
-longest, or where it leaves more than a quarter of the worst one's mean square: the joint did not follow.
+Of 24 delays up to 0.3 s (up to 24 cycles if those take longer), the fit chooses the one with the least mean
+square difference between position and goal. A parabola through this delay and its neighbours refines it to
+about a tenth of the step between two delays, 12.5 ms or a cycle. The fit has no result if the goals hardly
+moved, if the best delay is the longest, or if the remaining mean square is more than a quarter of the worst
+one: the joint did not follow.
 """
 
 from __future__ import annotations
@@ -22,18 +23,19 @@ _EXPLAINED = 0.25
 
 @dataclass(slots=True)
 class DelayFit:
-    """Mean square differences between positions and goals that were sent earlier, by delay."""
+    """Mean square differences between positions and earlier goals, by delay."""
 
-    step: int = 0  # Cycles from one delay to the next
+    step: int = 0  # Cycles between consecutive delays
     period_s: float = 0.0
     squares: Floats = field(default_factory=lambda: np.zeros(_DELAYS))
     counts: Floats = field(default_factory=lambda: np.zeros(_DELAYS))
-    goals: Floats = field(default_factory=lambda: np.zeros(0))  # The newest, as far back as delays go
+    # Newest goals, as far back as the longest delay.
+    goals: Floats = field(default_factory=lambda: np.zeros(0))
     lowest: float = math.inf
     highest: float = -math.inf
 
     def take(self, times: Floats, goal: Floats, position: Floats, known: int) -> None:
-        """Take cycles; the first `known` of them were taken before."""
+        """Add cycles, of which the first `known` were added before."""
         if not self.step:
             self.period_s = float(np.median(np.diff(times))) if len(times) > 1 else 0.0
             self.step = max(1, round(_LONGEST_S / max(self.period_s, 1e-6) / _DELAYS))
@@ -44,18 +46,22 @@ class DelayFit:
         if len(finite):
             self.lowest, self.highest = min(self.lowest, finite.min()), max(self.highest, finite.max())
         for index in range(_DELAYS):
-            back = index * self.step + 1  # a goal reaches the servo behind the cycle's read
+            back = index * self.step + 1  # A goal reaches the servo after the read of its cycle
             first = max(0, back - before)
             if first >= len(position):
                 continue
             difference = position[first:] - goals[before + first - back : len(goals) - back]
             difference = difference[np.isfinite(difference)]
-            self.squares[index] += np.square(difference).sum()  # a product would start threads
+            self.squares[index] += np.square(difference).sum()  # A matrix product would start BLAS threads
             self.counts[index] += len(difference)
         self.goals = goals[-_DELAYS * self.step - 1 :]
 
     def best_s(self, least: float) -> float | None:
-        """Return the delay that fits best, s; None where none does, see the module."""
+        """Return the best delay in s, or None if no delay fits; the module docstring has the conditions.
+
+        Args:
+            least: Smallest range of goals for which a delay is determined, rad.
+        """
         if self.highest - self.lowest < least or not self.counts.all():
             return None
         mean = self.squares / self.counts

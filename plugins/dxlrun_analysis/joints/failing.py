@@ -1,18 +1,19 @@
-"""Joints that do not do what they are told: plain comparisons of each joint with its own time before.
+"""Joints that fail to follow their commands: comparison of each joint with its own earlier behaviour.
 
-All by the error, position minus the trajectory that the joint could reach (see tracking.py), while the servo
-has torque and controls a position, in bins of 0.1 s or more:
+All rules use the error, position minus the trajectory that the joint could reach (see tracking.py), while the
+servo has torque and controls a position, in bins of 0.1 s or more:
 
-- *stands still*: its position changes by two ticks at most for 0.5 s while its trajectory moves by 9 deg or
-  more, and it is as far behind; all times at that place count;
-- *far from its goal*, by 9 deg or more, more where the robot file declares a lower gain than the model's;
-- *follows worse*: three times the worst of any time before, and 4.6 deg, at goals at which it was before, and
-  not much faster. A joint whose load grew as much as its error carries more;
-- *oscillates*: its error swings by 2 deg or more, a dozen times a second more than its trajectory does; eight
-  times where a controller moves it with an effort, from the position that this one is to hold; or its goal
-  swings, which the joint cannot follow.
+- *stands still*: its position changes by at most two ticks for 0.5 s while its trajectory moves by 9 deg or
+  more, and its error is as large; all times at that place count;
+- *far from its goal*: by 9 deg or more, scaled up if the robot file declares a lower gain than the model's;
+- *follows worse*: three times the worst error of any earlier time, and 4.6 deg, at goals that it had
+  before, and at no much higher speed. A joint whose load grew in proportion to its error carries more;
+- *oscillates*: its error swings by 2 deg or more, twelve times a second more than its trajectory does. The
+  bound is eight times if a controller moves it with an effort, relative to the position that the controller
+  is to hold. The rule also applies if its goal swings, which the joint cannot follow.
 
-A joint that never followed well, or that is nowhere it was before, is compared with nothing.
+A joint that never followed well, or that is at places where it was not before, has no reference and is not
+compared.
 """
 
 from __future__ import annotations
@@ -28,22 +29,23 @@ from dxlrun_analysis.finding import Finding, Rank
 from dxlrun_analysis.joints.planned import PlannedJoint
 
 ERROR, WAY, POSITION, SPEED, LOAD, AWAY, SWINGS, GOALS = range(8)
-"""Quantities: signed error, trajectory, position, the trajectory's speed, load, the error that counts, and
-swings of the error, 1/s, less those of the trajectory; and swings of the goal, 1/s."""
+"""Quantities: signed error, trajectory, position, speed of the trajectory, load, error that counts, swings of
+the error less those of the trajectory (1/s), and swings of the goal (1/s)."""
 MOVED_RAD = 0.16
-"""9 deg: so far the trajectory of a joint goes that should not stand still, and so far it is behind."""
+"""9 deg: least movement of the trajectory, and least error, of a joint that stands still."""
 AWAY_RAD = 0.08  # 4.6 deg: a joint that follows is nearer
 WORSE = 3.0
-BAD_S = 1.0  # A joint that did not do what it was told for so long makes a run not good
+BAD_S = 1.0  # From this duration on, a failure makes a run not good
 _STILL_RAD, _STILL_S = 0.01, 0.5
 _MOSTLY = 0.8
-_DOUBTFUL = 1.5  # So much worse than before is not compared with: it may be the beginning of it
-_FASTER = 1.5  # So much faster than ever before a joint may err by the square of that, and not be worse
-_FEWEST = 4  # Windows with torque, from which a joint has a time before
-_LAG_S = 0.1  # So late a joint may be at its goals without being far from them
-_CATCH_UP_S = 2.0  # After it had no torque, or was not read
-_SHAKES_HZ = 12.0  # Swings a second, two of them to and fro
-_SHAKES_BY_EFFORT_HZ = 8.0  # The same where a controller moves it with an effort: it is slower than a servo's
+_DOUBTFUL = 1.5  # A window this much worse than before is not a reference: it may be the start of the failure
+_FASTER = 1.5  # Up to this speed ratio the error is comparable; beyond it, a larger error is expected
+_FEWEST = 4  # Windows with torque that are needed as reference
+_LAG_S = 0.1  # Lag that does not count as distance from the goal
+_CATCH_UP_S = 2.0  # Time to catch up after missing torque or positions
+_SHAKES_HZ = 12.0  # Swings a second; two make one oscillation
+# Bound for effort control by a controller, which is slower than the servo's own position control.
+_SHAKES_BY_EFFORT_HZ = 8.0
 
 _COMMANDED = "See which clients and controllers command it (`/commands` in the log), and let only one."
 
@@ -52,7 +54,7 @@ Flags = NDArray[np.bool_]
 
 @dataclass(frozen=True, slots=True)
 class Windows:
-    """One joint in windows of time: each quantity's least, mean and most, NaN where it had no torque."""
+    """One joint in windows of time: minimum, mean and maximum of each quantity, NaN without torque."""
 
     joint: PlannedJoint
     length_s: float
@@ -61,7 +63,7 @@ class Windows:
     most: Floats
 
     def reach(self, quantity: int, when: Flags) -> float:
-        """Return how far apart the values of a quantity are in some windows; 0 in none."""
+        """Return the range of a quantity over some windows, or 0 for none."""
         most = np.fmax.reduce(self.most[quantity, when], initial=-math.inf)
         return max(0.0, float(most - np.fmin.reduce(self.least[quantity, when], initial=math.inf)))
 
@@ -72,11 +74,11 @@ class Windows:
         return float(np.abs(values).mean()) if len(values) else math.nan
 
     def distance(self, way: float) -> str:
-        """Return a distance of the joint in the unit of its kind."""
+        """Return a distance of the joint as text, in the unit of the joint."""
         return distance(self.joint, way)
 
     def load_text(self, when: Flags, usual: Flags) -> str:
-        """Return with what load it was in some windows, and in others while it moved."""
+        """Return the load in some windows as text, compared with its load in others while it moved."""
         load, otherwise = self.typical(LOAD, when), self.typical(LOAD, usual & (self.mean[SPEED] > 0))
         if math.isnan(load):
             return "; its load is not read"
@@ -87,19 +89,20 @@ class Windows:
 
 @dataclass(frozen=True, slots=True)
 class Failing:
-    """A time in which one joint did not do what it was told."""
+    """Period in which one joint failed to follow its commands."""
 
     code: str
-    text: str  # What it did, behind its name
-    when: Flags  # The windows in which it did not
-    seconds: float  # That they last
+    text: str  # Description, continues a sentence that begins with the joint's name
+    when: Flags  # Windows in which the joint failed
+    seconds: float  # Total duration of these windows
     shared: bool = False
-    """A joint that is not at fault may show it too, where others do: it depends on load and motion."""
-    commanded: bool = False  # Its commands are the matter, whatever its servo is
+    """A healthy joint can also show this failure along with others, because it depends on load and motion."""
+    commanded: bool = False  # The commands are at fault, not the servo
 
     def finding(self, one: Windows) -> Finding:
-        """Return the finding about a joint, by the windows in which it was found."""
-        away = self.when & (one.mean[AWAY] > AWAY_RAD * one.joint.share)  # it may have been to stand there
+        """Return the finding about a joint, from the windows in which the failure was found."""
+        # The joint was possibly meant to stay there.
+        away = self.when & (one.mean[AWAY] > AWAY_RAD * one.joint.share)
         since_s = float(np.flatnonzero(away if away.any() else self.when)[0]) * one.length_s
         found = joint_finding(self.code, one.joint, self.text, since_s, brief=self.seconds < BAD_S)
         if not self.commanded:
@@ -109,18 +112,27 @@ class Failing:
 
 
 def joint_finding(code: str, joint: PlannedJoint, text: str, since_s: float, *, brief: bool) -> Finding:
-    """Return a finding about a joint; `text`: what it does, `brief`: for less than a second."""
+    """Return a finding about a joint.
+
+    Args:
+        code: Code of the rule.
+        joint: The joint.
+        text: Description of the failure.
+        since_s: Start of the failure, s since the start of the run.
+        brief: The failure lasted less than a second.
+    """
     sentence = f"{joint.name} ({joint.servos}) {text}; from {since_s:.1f} s of the run on."
     return Finding(code, joint.name, sentence, rank=Rank.CAUSE if brief else Rank.SERVO, share=3.0)
 
 
 def distance(joint: PlannedJoint, way: float) -> str:
-    """Return a distance of a joint as people read it."""
+    """Return a distance of a joint as text in the joint's unit."""
     return joint.logged.unit.text(way, digits=1)
 
 
 def failure_of(brief: Windows, one: Windows) -> tuple[Windows, Failing | None]:
-    """Return what is wrong with a joint, by the most direct evidence, in its short or long windows."""
+    """Return the failure of a joint with the most direct evidence, and the short or long windows that show
+    it."""
     if (still := _still(brief)) is not None:
         return brief, still
     if (found := _oscillates(one) or _worse(one)) is not None:
@@ -129,7 +141,7 @@ def failure_of(brief: Windows, one: Windows) -> tuple[Windows, Failing | None]:
 
 
 def _still(one: Windows) -> Failing | None:
-    """Return the longest time in which a joint stands still although it should move."""
+    """Return the longest standstill of a joint that should move."""
     near, moves = max(_STILL_RAD * one.joint.share, 2 * one.joint.tick), MOVED_RAD * one.joint.share
     least, most = one.least[POSITION], one.most[POSITION]
     away = one.mean[AWAY] > AWAY_RAD * one.joint.share
@@ -158,7 +170,7 @@ def _still(one: Windows) -> Failing | None:
 
 
 def _stood(one: Windows, when: Flags, there: Flags, seconds: float) -> Failing:
-    """Return what is said of a joint that stood still; `there`: whenever it was at that place."""
+    """Describe a standstill; `there` are all windows in which the joint was at that place."""
     at = np.nanmedian(one.least[POSITION, when])
     same = (one.least[POSITION] == at) & (one.most[POSITION] == at)
     exact = ", to the tick," if same[when].mean() >= _MOSTLY else ""
@@ -173,7 +185,7 @@ def _stood(one: Windows, when: Flags, there: Flags, seconds: float) -> Failing:
 
 
 def _far(one: Windows) -> Failing | None:
-    """Return the time in which a joint is far from its goal, and does not go there as fast as it can."""
+    """Return the time in which a joint is far from its goal and approaches it slower than it can."""
     away, speed = one.mean[AWAY], one.mean[SPEED]
     if not len(away):
         return None
@@ -195,7 +207,7 @@ def _far(one: Windows) -> Failing | None:
 
 
 def _oscillates(one: Windows) -> Failing | None:
-    """Return the time in which a joint swings around its trajectory, or is sent to and fro by its goals."""
+    """Return the time in which a joint swings around its trajectory, or its goals swing."""
     by_effort = np.isnan(one.mean[AWAY])
     shakes = one.mean[SWINGS] >= np.where(by_effort, _SHAKES_BY_EFFORT_HZ, _SHAKES_HZ)
     told = one.mean[GOALS] >= _SHAKES_HZ
@@ -214,19 +226,19 @@ def _oscillates(one: Windows) -> Failing | None:
 
 
 def _worse(one: Windows) -> Failing | None:
-    """Return the time in which a joint follows worse than ever before, see the module."""
+    """Return the time in which a joint follows worse than ever before; see the module docstring."""
     away = one.mean[AWAY]
     bad, well, before = (np.zeros(len(away), np.bool_) for _ in range(3))
     follows = True
     for at in range(len(away)):
-        if not away[at] >= 0:  # no torque: it has to catch up first
+        if not away[at] >= 0:  # Without torque: the joint must catch up first
             follows = False
             continue
         follows = follows or bool(away[at] <= AWAY_RAD * one.joint.share)
         bad[at] = follows and before.sum() >= _FEWEST and _is_worse(one, at, before)
         doubtful = before.sum() >= _FEWEST and away[at] > _DOUBTFUL * away[before].max()
         well[at] = follows and not (doubtful and away[at] > AWAY_RAD * one.joint.share / 2)
-        if at and well[at]:  # one right before a bad one may have its begin in it
+        if at and well[at]:  # The window before a bad one can contain its start
             before[at - 1] = well[at - 1]
     seconds = float(bad.sum()) * one.length_s
     if seconds < BAD_S:
@@ -245,7 +257,7 @@ def _is_worse(one: Windows, at: int, before: Flags) -> bool:
     new |= one.most[WAY, at] > one.most[WAY, before].max() + there
     if new or not speed[at] <= _FASTER * speed[before].max():
         return False
-    # by more load, as much more as the error; or it is not known
+    # The error is explained if the load grew in proportion, or is unknown.
     explained = not load[at] * one.typical(AWAY, before) < away[at] * one.typical(LOAD, before) / 2
     least = there * (2 if explained else 1)
     return bool(away[at] > max(least, WORSE * worst))

@@ -1,12 +1,13 @@
-"""Joints that follow, but otherwise than they did: compared place by place, and each way by itself.
+"""Joints that follow differently than before: comparison place by place, separately in each direction.
 
-A servo with a position control is behind its trajectory by a constant time, whatever its speed. So a joint is
-compared with its trajectory as late as joints of its kind are, and what is left is what weighs on it, rubs,
-or gives: its own. A *visit* is a stay at a place where the joint was before, going the same way as fast, or
-at rest; it is compared with the stays before. A joint *follows worse* where it is off by 2 deg more, or takes
-an eighth of its torque more or less, at three visits and half a second, and by three times as much as any
-other joint that moved, or any but one: where others show it too, it is the motion, the ground or the supply.
-It *oscillates* where it swings evenly around its goal, by 0.6 deg, ten times in a row, and that does not.
+A servo with position control lags behind its trajectory by a constant time at any speed. Each joint is
+therefore compared with its trajectory, delayed by the lag that is typical of its kind. The remainder is
+caused by load, friction or play of the joint itself. A *visit* is a stay at a place where the joint was
+before, in the same direction and at a similar speed, or at rest; it is compared with the earlier stays. A
+joint *follows worse* if its error differs by 2 deg, or its load by an eighth of its torque, at three visits
+and for half a second. The difference must be three times that of any other joint that moved, or any but one:
+if others show it too, the cause is the motion, the ground or the supply. A joint *oscillates* if it swings
+evenly around its goal, by 0.6 deg, ten times in a row, while the goal does not.
 """
 
 from __future__ import annotations
@@ -27,42 +28,45 @@ from dxlrun_analysis.joints.failing import joint_finding
 from dxlrun_analysis.joints.planned import PlannedJoint
 from dxlrun_analysis.joints.trail import Samples
 
-STROKE_RAD = 0.1  # 6 deg: by less to and fro a joint does not turn
+STROKE_RAD = 0.1  # 6 deg: least amplitude of a reversal
 _LAGS_S = np.arange(0.0, 0.31, 0.01)
 _MOVES_RAD_S = 0.05
-_FEWEST = 20  # Samples that move, from which a lag is known
-_LOST = 0.02  # Of the samples: where more are missing, goals are missing too, and the joint is not to blame
-_QUICK = 0.6  # Part of the model's speed above which a servo follows as it can
+_FEWEST = 20  # Moving samples that are needed for a lag
+# Skip joints with a greater share of missing samples: goals are missing too, so the error says nothing about
+# the joint.
+_LOST = 0.02
+_QUICK = 0.6  # Share of the model's top speed above which a servo cannot follow closely
 _SETTLES_S = 0.3
 _GONE_S = 0.16
-"""So long without a position are no lost replies: it had no torque ..."""
+"""Positions missing for longer are not lost replies: the joint had no torque."""
 _NEAR_AGAIN_RAD = 0.035
-"""... and has to come so near to its way first."""
+"""Distance from the trajectory at which a joint has caught up after that."""
 _PLACE_RAD = 0.05
-_AGAIN_S = 0.5  # A joint that was at a place so long ago comes there again
-_CREEPS_RAD_S = 0.1  # By less it is nearly at rest, and may be on either side of what rubs
+_AGAIN_S = 0.5  # Least time between a stay and a visit
+_CREEPS_RAD_S = 0.1  # Below this speed friction can act in either direction
 _FASTER = 1.5
-_MOST_BEFORE = 12  # Stays at a place that later ones are compared with: the first ones of a run
+_MOST_BEFORE = 12  # Stays kept as reference per place, the first of the run
 _BENDS_RAD_S = 0.6
-"""A trajectory whose speed changes by so much, and by half, in 0.2 s throws its joint off by itself."""
-_BENDS_S = 0.1  # So long before and behind it that is measured
-_SWING_RAD, _SWING_TICKS = 0.01, 4  # 0.6 deg, or as many ticks
+"""Change of speed within 0.2 s, at least by half, that causes an error in a healthy joint."""
+_BENDS_S = 0.1  # Interval before and after, over which the change is measured
+_SWING_RAD, _SWING_TICKS = 0.01, 4  # 0.6 deg, or this number of ticks
 _SWING_S = 0.2
-_UNEVEN = 0.4  # What swings by itself does so evenly
-_OTHERS = 3.0  # So many times what any other joint shows
+_UNEVEN = 0.4  # Self-excited swings are even: bound for the relative deviation of their periods
+_OTHERS = 3.0  # Required ratio to any other joint
 _FEWEST_OTHERS = 4
 _SIDE = re.compile("left|right|(?<![a-z])[lr](?![a-z])", re.IGNORECASE)
 _OFF_RAD = 0.035  # 2 deg
-_LOAD = 0.12  # Of its torque
+_LOAD = 0.12  # Share of its torque
 _FEWEST_VISITS, _LASTS_S = 3, 0.5
-_SWINGS = 10  # In a row, to and fro being two
+_SWINGS = 10  # Reversals in a row; two make one oscillation
 _WAYS = ((1, "upwards"), (-1, "downwards"), (0, "at rest"))
 
 Flags = NDArray[np.bool_]
 
 
 class Visit(NamedTuple):
-    """A stay at a place where the joint was before, and how far it is off: now, and before at its nearest."""
+    """Stay at a place where the joint was before: the error now, and the nearest error of the earlier
+    stays."""
 
     at_s: float
     seconds: float
@@ -71,23 +75,23 @@ class Visit(NamedTuple):
     was: float
     load: float
     load_was: float
-    even: bool  # Its speed stays nearly the same: more or less of it takes no load
+    even: bool  # The speed is nearly constant, so acceleration does not contribute to the load
     direction: int  # 0: nearly at rest
 
     @property
     def change(self) -> float:
-        """By how much it is off otherwise."""
+        """Difference of the error from the earlier stays."""
         return abs(self.off - self.was)
 
     @property
     def load_change(self) -> float:
-        """By how much its load differs; 0 where that is not read, or its speed changes."""
+        """Difference of the load; 0 if the load is not read, or the speed changes."""
         change = abs(self.load - self.load_was)
         return change if self.even and math.isfinite(change) else 0.0
 
 
 class _Stay(NamedTuple):
-    """How a joint was at a place."""
+    """Stay of a joint at a place."""
 
     end_s: float
     direction: int  # 0: nearly at rest
@@ -96,7 +100,7 @@ class _Stay(NamedTuple):
     load: float
 
     def is_like(self, later: _Stay) -> bool:
-        """Return whether a later one may be compared with it: it goes the same way as fast."""
+        """Return whether a later stay is comparable: same direction and similar speed."""
         if self.direction != later.direction:
             return False
         slow, fast = (self.speed, later.speed) if self.speed < later.speed else (later.speed, self.speed)
@@ -104,26 +108,27 @@ class _Stay(NamedTuple):
 
 
 class Followed(NamedTuple):
-    """One joint, in rad of its servo, sample by sample."""
+    """Samples of one joint, in rad of its servo."""
 
     row: int
     joint: PlannedJoint
-    alike: int  # Joints of its kind that moved, itself among them
-    lag_s: float  # Of its kind
-    step_s: float  # Between two samples
+    alike: int  # Number of joints of its kind that moved, including this one
+    lag_s: float  # Lag that is typical of its kind
+    step_s: float  # Time between samples
     at_s: Floats
-    goal: Floats  # Where a joint like it would be
+    goal: Floats  # Expected position of a joint of its kind
     position: Floats
     off: Floats
-    """Position minus goal; NaN where it can be anything: not read, as fast as it can, or catching up"""
-    load: Floats  # As a part of its torque
+    """Position minus goal; NaN without a position, near top speed, or while catching up"""
+    load: Floats  # Share of its torque
     speed: Floats
 
     def visits(self, least: float, least_load: float) -> Iterator[Visit]:
-        """Yield each stay at a place where it was before, going the same way as fast, or at rest.
+        """Yield each stay at a place where the joint was before, in the same direction at a similar speed, or
+        at rest.
 
-        Those that are off by less than `least` (rad), and whose load differs by less than `least_load`, are
-        what later ones are compared with.
+        Stays whose error differs by less than `least` (rad) and whose load differs by less than `least_load`
+        become the reference of later ones.
         """
         speed = np.nan_to_num(self.speed)
         direction = np.where(np.abs(speed) < _CREEPS_RAD_S, 0, np.sign(speed)).astype(int)
@@ -160,7 +165,7 @@ class Followed(NamedTuple):
                 yield Visit(at_s, seconds, middle, stay.off, was, stay.load, took, even, stay.direction)
 
     def _load_at_rest(self) -> Floats:
-        """Return the load without what the speed takes."""
+        """Return the load without the part that is proportional to speed."""
         known = np.isfinite(self.off) & np.isfinite(self.load)
         speed, load = self.speed[known], self.load[known]
         moved = float(speed @ speed)
@@ -168,7 +173,7 @@ class Followed(NamedTuple):
         return self.load - taken * self.speed
 
     def swings(self) -> Floats:
-        """Return when it turned in its longest series of even swings, s; of none where its goal swings."""
+        """Return the reversals of the longest series of even swings, s; empty if its goal swings as well."""
         least = max(_SWING_RAD, _SWING_TICKS * self.joint.tick / self.joint.share)
         turns = self._turns_of(self.off, least)
         parts = np.split(turns, np.flatnonzero(np.diff(turns) > _SWING_S) + 1)
@@ -179,14 +184,14 @@ class Followed(NamedTuple):
         return series
 
     def _turns_of(self, values: Floats, least: float) -> Floats:
-        """Return when values turn by so much, s, where it is known how it follows."""
+        """Return the times at which values reverse by `least` or more, s, where the error is known."""
         edges = np.flatnonzero(np.diff(np.isfinite(self.off), prepend=False, append=False))
         pairs = zip(edges[::2], edges[1::2], strict=True)
         turns = [begin + at for begin, end in pairs for at in _turning(values[begin:end], least)[1:-1]]
         return self.at_s[turns]
 
     def _bends(self) -> Flags:
-        """Return where the speed of its trajectory changes within 0.2 s, or is not known."""
+        """Return where the speed of the trajectory changes within 0.2 s, or is unknown."""
         bends = np.zeros(len(self.off), np.bool_)
         side = _samples(_BENDS_S, self.step_s)
         least = np.maximum(_BENDS_RAD_S, np.abs(self.speed[side:-side]) / 2)
@@ -195,7 +200,7 @@ class Followed(NamedTuple):
 
 
 def followed(joints: Sequence[PlannedJoint], samples: Samples) -> list[Followed]:
-    """Return the joints that moved with their replies nearly whole, each compared with those of its kind."""
+    """Return the joints that moved with few lost replies, each compared with the joints of its kind."""
     lags: dict[str, dict[int, float]] = defaultdict(dict)
     for row, joint in enumerate(joints):
         way, position = samples.way[:, row] / joint.share, samples.position[:, row] / joint.share
@@ -228,13 +233,13 @@ def _followed(row: int, joint: PlannedJoint, alike: int, lag_s: float, samples: 
 
 
 def _late(at_s: Floats, way: Floats, lag_s: float) -> Floats:
-    """Return a trajectory some time later; NaN before its begin."""
+    """Return a delayed trajectory; NaN before its begin."""
     late: Floats = np.interp(at_s - lag_s, at_s, way, left=np.nan)
     return late
 
 
 def _lag_s(at_s: Floats, way: Floats, position: Floats) -> float | None:
-    """Return the delay that explains most of where a joint is while it moves; None where it hardly does."""
+    """Return the delay that best explains the position while the joint moves; None if it hardly moves."""
     moves = np.abs(np.gradient(way, at_s)) > _MOVES_RAD_S
     best, lag_s = math.inf, None
     for each in _LAGS_S.tolist():
@@ -246,18 +251,18 @@ def _lag_s(at_s: Floats, way: Floats, position: Floats) -> float | None:
 
 
 def _samples(seconds: float, step_s: float) -> int:
-    """Return how many samples a time has, one at least."""
+    """Return the number of samples in a time, at least one."""
     return max(1, round(seconds / step_s))
 
 
 def _gone(position: Floats, step_s: float) -> Flags:
-    """Return where a joint was without a position for long."""
+    """Return where a joint had no position for a long time."""
     lost, many = np.isnan(position).astype(float), _samples(_GONE_S, step_s)
     return np.convolve(lost, np.ones(many))[: len(lost)] >= many
 
 
 def _lossy(position: Floats, step_s: float) -> bool:
-    """Return whether positions are missing now and then."""
+    """Return whether single positions are missing too often."""
     known = np.flatnonzero(np.isfinite(position))
     if not len(known):
         return True
@@ -266,12 +271,13 @@ def _lossy(position: Floats, step_s: float) -> bool:
 
 
 def _lasting(when: Flags, samples: int) -> Flags:
-    """Return where something is, or was so many samples before."""
+    """Return where a condition holds, or held up to that number of samples before."""
     return np.convolve(when.astype(float), np.ones(samples))[: len(when)] > 0
 
 
 def _turning(values: Floats, least: float) -> list[int]:
-    """Return where finite values turn by so much or more, from the first turn or end to the last."""
+    """Return the indices at which finite values reverse by `least` or more, including both ends of the
+    movement."""
     step = np.sign(np.diff(values))
     moved = np.flatnonzero(step)
     turns = moved[1:][step[moved[1:]] != step[moved[:-1]]]
@@ -295,15 +301,15 @@ def _even(at_s: Floats) -> bool:
 
 
 def _nearest(value: float, before: Sequence[float]) -> float:
-    """Return what is nearest to a value between the least and the greatest before; itself where none was."""
+    """Return the value nearest to `value` within the range of `before`; `value` itself if there was none."""
     return min(max(value, min(before)), max(before)) if before else value
 
 
-# The rules
+# Rules
 
 
 class _Shown(NamedTuple):
-    """What one joint shows: its visits and swings, and the most of each."""
+    """Evidence about one joint: its visits and swings, with the maximum of each."""
 
     one: Followed
     visits: list[Visit]
@@ -319,7 +325,12 @@ class _Shown(NamedTuple):
 
 
 def changed(joints: Sequence[Followed], named: Set[int]) -> Iterator[Finding]:
-    """Yield what joints show that no other does; `named`: the rows of those that other rules name."""
+    """Report joints with changes that no other joint shows.
+
+    Args:
+        joints: The joints that moved.
+        named: Rows of joints that other rules report.
+    """
     seen = [
         _Shown(one, list(one.visits(_OFF_RAD / 2, _LOAD / 2)), one.swings())
         for one in joints
@@ -333,10 +344,10 @@ def changed(joints: Sequence[Followed], named: Set[int]) -> Iterator[Finding]:
 
 
 def _most(values: Iterable[tuple[float, str]], name: str) -> float:
-    """Return the most that others show, 0.0 at least; `values`: each with the name of the joint.
+    """Return the maximum of the other joints, 0.0 at least; `values` are pairs of value and joint name.
 
-    Of many others the worst may be another one that is not well; unless it is its mirror image, which the
-    same happens to.
+    Among many joints, the greatest value may come from a second faulty joint, so it is skipped. It is kept if
+    it comes from the mirror image of this joint, to which the same can happen.
     """
     ordered = sorted((value, _SIDE.sub("", other) == _SIDE.sub("", name)) for value, other in values)
     alone = len(ordered) >= _FEWEST_OTHERS and not ordered[-1][1]
@@ -362,7 +373,7 @@ def _lasts(visits: Sequence[Visit]) -> bool:
 
 
 def _compared(one: Followed, name: str, visits: Iterable[Visit], way: int) -> str:
-    """Return by how much a joint is off in one direction, how late, and with what load; empty: not at all."""
+    """Describe error and load of a joint in one direction, or return an empty string without visits."""
     mine = [visit for visit in visits if visit.direction == way]
     if not mine:
         return ""

@@ -1,8 +1,8 @@
-"""Hot and overloaded servos, and supplies that are too high, too low or sag under load.
+"""Health of servos: temperature, overload, and supplies that are too high, too low or sag under load.
 
 The voltages of most servos on a bus fall together when the supply of the bus sags. The voltage of one servo
 falls alone when its own supply does. Limits are those of the models' control tables as shipped, or of the
-robot file's `registers`. A control table also has the meaning of hardware errors.
+robot file's `registers`. A control table also defines the meaning of hardware errors.
 """
 
 from __future__ import annotations
@@ -27,19 +27,19 @@ Numbers = NDArray[np.int64]
 _QUANTITIES = ("temperature", "voltage")
 
 _NONSENSE_C = 120.0
-_NEAR_LIMIT_C = 10.0  # The run warns at this distance from Temperature Limit, too
-_SAG = 0.03  # Part of its voltage by which a supply that sags falls
-_STEP_V = 0.1  # Voltages are read in such steps
+_NEAR_LIMIT_C = 10.0  # The run also warns at this distance from Temperature Limit
+_SAG = 0.03  # Relative drop of a voltage from which a supply sags
+_STEP_V = 0.1  # Resolution of Present Input Voltage in the control tables
 _LEAST_V = 0.3
 _FEWEST_VOLTAGES = 6
 _FEWEST_OTHERS = 2
-_DIPS_S = 1.5  # So long a servo's voltage has to be lower than the others': each is read about once a second
-_MOST_SAMPLES = 100_000  # Voltages kept
+_DIPS_S = 1.5  # Each voltage is read about once a second, so a dip must last longer than one reading
+_MOST_SAMPLES = 100_000  # Number of voltages that are kept
 
 
 @dataclass(frozen=True, slots=True)
 class Extremes:
-    """Highest temperature and lowest voltage of a joint in the run; None: never read."""
+    """Highest temperature and lowest voltage of a joint in the run; None if never read."""
 
     joint: str
     hottest_c: float | None
@@ -47,7 +47,7 @@ class Extremes:
 
 
 class _Sample(NamedTuple):
-    """A voltage when it was read as another one, and the loads of its bus then, as parts of the most."""
+    """Changed voltage, with the total load of its bus at that time as share of the maximum."""
 
     joint: int
     volts: float
@@ -55,17 +55,17 @@ class _Sample(NamedTuple):
 
 
 class ServoHealth:
-    """Collects temperatures, voltages and hardware errors, in memory that does not grow with the log."""
+    """Accumulator of temperatures, voltages and hardware errors. Its memory does not grow with the log."""
 
     def __init__(self) -> None:
         self._joints: tuple[PlannedJoint, ...] = ()
         self._bins = Bins()
-        self._faults: list[set[Fault]] = []  # Of each joint
+        self._faults: list[set[Fault]] = []  # By joint
         self._volts = np.zeros(0)
         self._samples: list[_Sample] = []
 
     def take(self, log: Log) -> None:
-        """Take the cycles of the next slice."""
+        """Add the cycles of the next slice."""
         cycles = log.cycles
         if not len(cycles):
             return
@@ -81,7 +81,7 @@ class ServoHealth:
         self._keep_volts(cycles)
 
     def _keep_volts(self, cycles: NDArray[np.void]) -> None:
-        """Keep the voltages that were read, each with the loads at that moment."""
+        """Keep changed voltages, each with the load of its bus at that time."""
         volts = cycles["voltage"]
         before = np.vstack([self._volts, volts[:-1]])
         rows, joints = np.nonzero(np.isfinite(volts) & (volts != before))
@@ -110,7 +110,12 @@ class ServoHealth:
         )
 
     def findings(self, movement: Sequence[Finding]) -> Iterable[Finding]:
-        """Name hot and overloaded servos, those that `movement` names left out, and supplies."""
+        """Report hot and overloaded servos, and supplies.
+
+        Args:
+            movement: Findings about movement. Overload of the joints that they accuse is not reported
+                again.
+        """
         if not self._joints:
             return
         named = {finding.subject for finding in movement}
@@ -147,7 +152,7 @@ class ServoHealth:
     def _supplies(
         self, bus: str, members: Numbers, least: Floats, mean: Floats, most: Floats
     ) -> Iterable[Finding]:
-        """Name the supply of a bus, or of one servo; voltages in shape (bins, members)."""
+        """Report the supply of a bus, or of one servo; voltages have shape (bins, members)."""
         lowest, highest = np.fmin.reduce(least, initial=np.inf), np.fmax.reduce(most, initial=-np.inf)
         reported = np.array(["voltage" in self._faults[index] for index in members])
         above = highest > np.array([self._joints[index].highest_volts for index in members]) + _STEP_V / 2
@@ -174,7 +179,7 @@ class ServoHealth:
                 return
 
     def _supply(self, bus: str, members: Numbers, least: Floats, most: Floats, how: str) -> Finding:
-        """Return what was measured of the voltage of some servos of a bus; shape (bins, members)."""
+        """Report the voltages of some servos of a bus; arrays of shape (bins, members)."""
         joints = [self._joints[index] for index in members]
         alone = len(joints) == 1
         where = f"at {joints[0].name} ({joints[0].servos})" if alone else f"of bus {bus}"
@@ -190,15 +195,15 @@ class ServoHealth:
         return cause("supply", joints[0].name if alone else bus, sentence, share=4.0)
 
     def _has_own_supply(self, volts: Floats, others: Floats) -> bool:
-        """Return whether the voltage of a servo falls while those of the others stay."""
+        """Return whether the voltage of a servo falls while the others stay constant."""
         if others.shape[1] < _FEWEST_OTHERS or not np.isfinite(volts).any():
             return False
         with warnings.catch_warnings():
-            warnings.simplefilter("ignore", RuntimeWarning)  # before the first voltage there is none
+            warnings.simplefilter("ignore", RuntimeWarning)  # Bins before the first voltage are all NaN
             usual = np.nanmedian(others, axis=1)
             below = usual - volts
             least_below, usually = np.nanquantile(below, (0.05, 0.25))
-            # it may always measure a little less, and waver about that
+            # A servo can constantly measure slightly less than the others, with some variation.
             below -= max(0.0, min(usually, least_below + _LEAST_V))
             lowest = np.fmin.reduce(others, axis=1)
         least = np.maximum(_SAG * usual, _LEAST_V)

@@ -1,7 +1,7 @@
-"""How the joints moved, collected over the run, and what is said of those that did not do as they were told.
+"""Movement of the joints over the run, and findings about joints that failed to follow their commands.
 
-See failing.py for the rules. Besides, two positions in half a second, with torque all the while, are a *jump*
-where they are 9 deg and a quarter further apart than the model turns in that time.
+The rules are in failing.py, with one exception: two positions within half a second, with torque throughout,
+are a *jump* if they are 9 deg and a quarter further apart than the model can turn in that time.
 """
 
 from __future__ import annotations
@@ -33,18 +33,18 @@ from dxlrun_analysis.joints.trail import Trail
 
 _NONE: Mapping[str, float] = {}
 _WINDOW_S = 0.5
-_JUMP_S = 0.5  # Positions that are further apart in time are not compared: it may have been moved
-_TOO_FAST = 1.25  # A supply at its limit and a load that pulls make a servo a little faster than its model
-_SWING_RAD = 0.035  # 2 deg: by less between two turns a joint does not shake
+_JUMP_S = 0.5  # Positions further apart are not compared: the joint may have been moved by hand
+_TOO_FAST = 1.25  # A supply at its limit and a pulling load make a servo slightly faster than its model
+_SWING_RAD = 0.035  # 2 deg: smallest swing that counts
 _FULL_SPEED = 0.8
-"""A joint that moves to its goal at this part of the greatest speed it ever had does what it can ..."""
+"""Share of the greatest observed speed from which a joint moves as fast as it can."""
 _SLOWEST_TOP = 0.4
-"""... and that is at least this part of its model's: a weak supply and a load make it slower."""
+"""Least top speed, as share of the model's: a weak supply and a load make a servo slower."""
 
 
 @dataclass(slots=True)
 class _Jumps:
-    """Positions of one joint that it cannot have gone to, and the last one that was read, with its time."""
+    """Implausible positions of one joint, and its last position with its time."""
 
     count: int = 0
     first_ns: int = 0
@@ -53,7 +53,7 @@ class _Jumps:
     position: float = math.nan
 
     def take(self, joint: PlannedJoint, at_ns: NDArray[np.int64], position: Floats) -> None:
-        """Take positions by time; NaN is one without torque, which the next one is not compared with."""
+        """Add positions in order of time; NaN without torque, which also interrupts the comparison."""
         at_ns, position = np.append(self.read_ns, at_ns), np.append(self.position, position)
         seconds, moved = np.diff(at_ns) * 1e-9, np.abs(np.diff(position))
         top = joint.logged.top_speed
@@ -66,7 +66,7 @@ class _Jumps:
         self.read_ns, self.position = int(at_ns[-1]), float(position[-1])
 
     def finding(self, joint: PlannedJoint, begin_ns: int) -> Finding:
-        """Return what is said of them."""
+        """Return the finding about the jumps."""
         times = "" if self.count == 1 else f" {self.count} times"
         most, since_s = distance(joint, self.longest), (self.first_ns - begin_ns) * 1e-9
         text = f"shows a position that jumped{times}, by up to {most}, faster than its model turns"
@@ -74,7 +74,7 @@ class _Jumps:
 
 
 class Movement:
-    """Collects how the joints moved, in memory that does not grow with the log."""
+    """Accumulator of joint movement. Its memory does not grow with the log."""
 
     def __init__(
         self, joints: Sequence[PlannedJoint] = (), begin_ns: int = 0, references: Sequence[str] = ()
@@ -83,14 +83,20 @@ class Movement:
         found = {name.partition("/")[2]: column for column, name in enumerate(references)}
         columns = [found.get(f"{joint.name}/position", -1) for joint in joints]
         self._references = {row: column for row, column in enumerate(columns) if column >= 0}
-        """Of the joints that a controller moves to a position by itself, with an effort"""
+        """Column of the reference position of each joint that a controller moves with an effort."""
         self._fastest = np.zeros(len(joints))
         self._jumps = [_Jumps() for _ in joints]
         self.bins = Bins(8, len(joints), begin_ns)
         self._trail = Trail(len(joints), begin_ns)
 
     def take(self, cycles: NDArray[np.void], way: Floats, known: int) -> None:
-        """Take cycles with the reachable trajectories, shape (cycles, joints); `known` were taken before."""
+        """Add cycles, of which the first `known` were added before.
+
+        Args:
+            cycles: Cycles of the log.
+            way: Reachable trajectories, rad or m; shape (cycles, joints).
+            known: Number of cycles that were added before.
+        """
         speed = np.full_like(way, np.nan)
         steps = np.diff(cycles["read_ns"] * 1e-9)[:, None]
         speed[1:] = np.abs(np.diff(way, axis=0)) / steps
@@ -135,7 +141,7 @@ class Movement:
         )
 
     def _sought(self, cycles: NDArray[np.void]) -> Floats:
-        """Return the positions that controllers of efforts are to hold, shape (cycles, joints)."""
+        """Return the reference positions of effort controllers, NaN elsewhere; shape (cycles, joints)."""
         sought = np.full(cycles["position"].shape, np.nan)
         by_effort = (cycles["torque"] == Torque.ON) & cycles["valid"] & np.isfinite(cycles["goal_effort"])
         for row, column in self._references.items():
@@ -143,22 +149,23 @@ class Movement:
         return sought
 
     def _swings(self, cycles: NDArray[np.void], values: Floats) -> Floats:
-        """Return where a swing ends, as swings a second, shape (cycles, joints)."""
+        """Return where a swing ends, as swings per second, shape (cycles, joints)."""
         found = np.zeros_like(values)
         rate = 1e9 / max(float(np.median(np.diff(cycles["read_ns"]))), 1.0) if len(cycles) > 2 else 0.0
         for row, joint in enumerate(self._joints):
             known = np.flatnonzero(np.isfinite(values[:, row]))
             mine = values[known, row]
-            new = np.flatnonzero(np.diff(mine, prepend=math.nan) != 0)  # goals are held between commands
+            new = np.flatnonzero(np.diff(mine, prepend=math.nan) != 0)  # Goals are constant between commands
             steps = np.diff(mine[new])
             turns = new[np.flatnonzero(steps[1:] * steps[:-1] < 0) + 1]
             far = np.abs(np.diff(mine[turns])) >= _SWING_RAD * joint.share
-            swings = turns[1:][far & (np.diff(known[turns]) == np.diff(turns))]  # none was missed between
+            # Only swings without missing cycles in between count.
+            swings = turns[1:][far & (np.diff(known[turns]) == np.diff(turns))]
             found[known[swings], row] = rate
         return found
 
     def _told(self, cycles: NDArray[np.void], way: Floats) -> Floats:
-        """Return where the error swings as it is told: the way does, or a goal steps after it was held."""
+        """Return commanded swings: those of the trajectory, and steps of a goal that was constant before."""
         steps = np.abs(np.diff(cycles["goal_position"], axis=0, prepend=np.nan))
         begins = steps >= _SWING_RAD * np.array([joint.share for joint in self._joints])
         begins[1:] &= steps[:-1] == 0.0
@@ -166,17 +173,18 @@ class Movement:
         return np.maximum(self._swings(cycles, way), np.where(begins, 2.0 * rate, 0.0))
 
     def findings(self, reached_off: Mapping[str, float] = _NONE) -> Iterable[Finding]:
-        """Name joints that stand still, oscillate, or follow worse than before, and positions that jumped.
+        """Report joints that stand still, oscillate, or follow worse than before, and positions that jumped.
 
         Args:
-            reached_off: Distance at which a goal of a joint was reached, rad or m. A joint is not at
-                fault within it, nor within the tolerance of the robot file.
+            reached_off: Distance at which a goal of a joint was reached, rad or m. Errors within it, or
+                within the tolerance of the robot file, do not count.
         """
         allowed = [max(reached_off.get(one.name, 0.0), one.logged.tolerance or 0.0) for one in self._joints]
         short, windows = self._windows(0.0, allowed), self._windows(_WINDOW_S, allowed)
         found = [failure_of(brief, each) for brief, each in zip(short, windows, strict=True)]
         shared = sum(failing is not None and failing.shared for _, failing in found)
-        together = shared > max(1, len(found) // 2)  # then it is the line, the supply, the load, the motion
+        # The cause is then the line, the supply, the load or the motion.
+        together = shared > max(1, len(found) // 2)
         named: set[int] = set()
         for row, (one, failing) in enumerate(found):
             if self._jumps[row].count:

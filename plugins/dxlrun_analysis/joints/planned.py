@@ -1,4 +1,4 @@
-"""What the plan in a log says about the joints and the servos that move them."""
+"""Joints of the plan in a log, with the limits of the servos that move them."""
 
 from __future__ import annotations
 
@@ -13,13 +13,13 @@ from dxlrun.tooling.plans import JointPlan
 from dxlrun_analysis.plan import UNKNOWN_JOINT, Mover, plan_of
 from dxlwire import ControlTable, Fault, HardwareErrors, find_table
 
-_TICK_RAD = math.tau / 4096  # Where the log's plan does not have the servo's
+_TICK_RAD = math.tau / 4096  # For a servo that is not in the plan of the log
 _NEAREST = (
     (np.fmin, ("temperature_limit", "motor_temperature_limit")),
     (np.fmax, ("min_voltage_limit",)),
     (np.fmin, ("max_voltage_limit",)),
 )
-"""Of a joint's servos the first that reaches it counts"""
+"""Limits of a joint: the first that one of its servos reaches."""
 _GAINS = ("position_p_gain", "p_gain")
 _SOFTEST = 3.0
 _ACCELERATIONS = ("profile_acceleration", "goal_acceleration")
@@ -27,25 +27,26 @@ _ACCELERATIONS = ("profile_acceleration", "goal_acceleration")
 
 @dataclass(frozen=True, slots=True)
 class PlannedJoint:
-    """One joint, and what its servos can do there; m instead of rad of a linear one."""
+    """One joint with the limits of its servos; m instead of rad for a linear joint."""
 
     name: str = ""
     bus: str = ""
-    servos: str = ""  # As sentences name them
-    hottest: float = math.nan  # The temperature limit, deg C
+    servos: str = ""  # Servos as sentences name them
+    hottest: float = math.nan  # Temperature limit, deg C
     lowest_volts: float = math.nan
-    highest_volts: float = math.nan  # The limits of its servos' supply, V
+    highest_volts: float = math.nan  # Limits of the supply of its servos, V
     top_effort: float = math.nan  # In the unit of its effort
     speed: float = math.inf  # rad/s
     acceleration: float = math.inf  # rad/s^2, of the profile that the robot file declares in its `registers`
     tick: float = _TICK_RAD  # rad
-    slowest: float = 0.0  # rad/s; a speed of 0 would be none
-    share: float = 1.0  # m of a linear joint for each rad of its servo; 1 of one that turns
-    softness: float = 1.0  # So many times lower than its model's is the gain in the robot file, from 1 to 3
-    alike: str = ""  # Models and registers: joints that have the same ones follow alike
-    wraps: bool = False  # Its position goes from one end of its range to the other in a wheel's turn
+    # rad/s: one tick of Goal Velocity. A goal of 0 does not mean standstill but no limit.
+    slowest: float = 0.0
+    share: float = 1.0  # m of a linear joint per rad of its servo; 1 for a rotary joint
+    softness: float = 1.0  # Ratio of the model's default gain to the gain in the robot file, 1 to 3
+    alike: str = ""  # Models and registers; joints with the same ones follow alike
+    wraps: bool = False  # Its position jumps between the ends of its range once per turn (wheel mode)
     logged: JointPlan = UNKNOWN_JOINT
-    errors: tuple[HardwareErrors, ...] = ()  # Of the models of its servos, each once
+    errors: tuple[HardwareErrors, ...] = ()  # Error bits of its servos' models, without duplicates
 
     def faults(self, value: int) -> frozenset[Fault]:
         """Return the faults that a value of `hardware_error` reports.
@@ -56,7 +57,7 @@ class PlannedJoint:
 
 
 def planned_joints(log: Log) -> tuple[PlannedJoint, ...]:
-    """Return the joints in the order of the log; of those that its plan does not have the names."""
+    """Return the joints in the order of the log. A joint that is not in the plan has only its name."""
     plan = plan_of(log)
     movers = plan.movers
     found = []
@@ -94,7 +95,7 @@ def planned_joints(log: Log) -> tuple[PlannedJoint, ...]:
 
 
 def _counts_one_turn(one: Mover) -> bool:
-    """Check whether a position has too few bytes for turns; as `ServoPlan.wraps`."""
+    """Return whether a position has too few bytes to count turns; the same test as `ServoPlan.wraps`."""
     table = _table(one)
     return table is not None and table.items["present_position"].size < 4
 
@@ -102,12 +103,13 @@ def _counts_one_turn(one: Mover) -> bool:
 def _table(one: Mover) -> ControlTable | None:
     try:
         return find_table(one.servo.model, one.bus.protocol)
-    except LookupError:  # a plug-in's model that is not installed here
+    except LookupError:  # The model of a plug-in that is not installed here
         return None
 
 
 def _register(one: Mover, names: tuple[str, ...], otherwise: float, *, shipped: bool = False) -> float:
-    """Return the first register that the robot file declares, or `shipped` the model, in its unit."""
+    """Return the first register of `names` that the robot file declares, or with `shipped` the model, in its
+    unit."""
     return _first_value(one, names, one.servo.declared, otherwise, shipped=shipped)
 
 
@@ -127,4 +129,4 @@ def _first_value(
 
 def _softness(one: Mover) -> float:
     softness = _first_value(one, _GAINS, {}, math.nan, shipped=True) / _register(one, _GAINS, math.nan)
-    return min(max(1.0, softness), _SOFTEST)  # 1.0 where either is not known
+    return min(max(1.0, softness), _SOFTEST)  # 1.0 if either gain is unknown

@@ -1,12 +1,12 @@
-"""How the joints followed their goals, and how fresh their states were.
+"""Tracking of goals by the joints, and age of their states.
 
-No servo is at its goal in the cycle after it was sent: it goes there at the commanded speed, or at its
-highest. So what a joint did is compared with its reachable trajectory: from where it stood towards the goals
-that were sent, within the limits of velocity and acceleration, without delay. What is left is the servo's
-lag, its settling, and the error with which it comes to rest.
+A servo does not reach its goal in one cycle: it moves at the commanded speed, or at its top speed. Each joint
+is therefore compared with its reachable trajectory. This starts at the position of the joint and moves
+towards the goals that were sent, within the limits of velocity and acceleration, without delay. The
+difference consists of the servo's lag, its settling, and its error at rest.
 
-Lag is the delay behind the reachable trajectory that explains most of the error by least squares, to the
-first order: error = -lag * velocity. The delay behind the goals that were sent is that of delay.py.
+Lag is the delay behind the reachable trajectory that explains most of the error by least squares, to first
+order: error = -lag * velocity. delay.py determines the delay behind the goals that were sent.
 """
 
 from __future__ import annotations
@@ -24,62 +24,65 @@ from dxlrun_analysis.joints.delay import DelayFit
 from dxlrun_analysis.joints.movement import Movement
 from dxlrun_analysis.joints.planned import PlannedJoint, planned_joints
 
-_REST_S = 0.3  # A reachable trajectory that does not change for so long is at rest: its joint is to settle
+# A reachable trajectory that is constant for this time is at rest, so its joint is expected to settle.
+_REST_S = 0.3
 _SETTLED_PART, _SETTLED_TICKS = 0.02, 2
-"""Settled: so near to where it stays, as a part of the way or in ticks, whichever is more."""
-_MOVED_TICKS = 4  # Shorter ways give no lag: positions are read in ticks
-_BLOCK = 1 << 16  # Cycles that are worked on at once, times joints; of eight for a robot of fewer
-_LONGEST_REST_S = 20.0  # What rests longer is counted as two rests
+"""Settled: within this share of the movement, or this number of ticks, of the rest position, whichever is
+more."""
+_MOVED_TICKS = 4  # Shorter movements give no lag, because positions are quantized in ticks
+_BLOCK = 1 << 16  # Cycles times joints that are processed at once, with eight joints at least
+_LONGEST_REST_S = 20.0  # A longer rest is counted as two
 
 Flags = NDArray[np.bool_]
 
 
 @dataclass(frozen=True, slots=True)
 class JointTracking:
-    """One joint over all cycles."""
+    """Tracking of one joint over all cycles."""
 
     name: str
-    invalid: int  # Cycles without an intact reply; those of a requested reboot do not count
+    invalid: int  # Cycles without an intact reply, except those of a requested reboot
     oldest_ms: float  # Greatest age of a state
     clamped: int  # Cycles in which the last gate changed the command
     rms_rad: float | None
-    """Of position minus the reachable trajectory; None where there was no goal or no position.
+    """RMS of position minus reachable trajectory; None without a goal or a position.
 
-    The servo's own lag is in it: a joint that moves is always behind.
+    The servo's own lag is included: a moving joint is always behind.
     """
     worst_rad: float | None
     lag_ms: float | None
-    """The delay with which the joint follows its reachable trajectory; None where that hardly moved."""
+    """Delay of the joint behind its reachable trajectory; None if the trajectory hardly moved."""
     settling_ms: float | None
-    """The longest time from the end of a reachable trajectory until the joint stayed near where it rests,
-    within 2 % of the way or two ticks; None where none ended."""
-    rest_rad: float | None  # The greatest error with which it came to rest; None where it never did
+    """Longest time from the end of a reachable trajectory until the joint stayed within 2 % of the movement,
+    or two ticks, of its rest position. None if no trajectory ended."""
+    rest_rad: float | None  # Greatest error at rest; None if the joint never came to rest
     delay_ms: float | None = None
-    """The delay with which the joint follows the goals as they were sent; None where none explains it."""
-    unit: JointUnit = ROTARY  # Of its errors, whatever their names say
+    """Delay of the joint behind the goals as they were sent; None if no delay explains the position."""
+    unit: JointUnit = ROTARY  # Unit of the errors, whatever the field names say
     lost_at: float | None = None
-    """Where it was when its servo was lost for the first time; None: it was not, or it is not known."""
+    """Position when its servo was lost for the first time; None if it was not lost, or the position is
+    unknown."""
 
 
 def tracking(log: Log) -> tuple[JointTracking, ...]:
-    """Return freshness and tracking of each joint; rows in the order of the log."""
+    """Return state age and tracking of each joint, in the order of the log."""
     collected = Tracking()
     collected.take(log)
     return collected.finish(log)
 
 
 def reachable(log: Log, row: int) -> Floats:
-    """Return where a joint could be in each cycle, rad, NaN where it had no goal; see the module."""
+    """Return the reachable trajectory of a joint in each cycle, rad; NaN without a goal."""
     limits = planned_joints(log)[row]
     return _reachable(_sent(log.cycles, row, limits), limits.acceleration, _Way())
 
 
-# The reachable trajectory
+# Reachable trajectory
 
 
 @dataclass(slots=True)
 class _Way:
-    """A trajectory, as far as it was worked out: its last two points, and whether it is behind its goal."""
+    """State of a trajectory between slices: its last two points, and whether it is behind its goal."""
 
     last: Floats = field(default_factory=lambda: np.zeros(0))
     behind: bool = False
@@ -88,7 +91,7 @@ class _Way:
 
 def _sent(cycles: NDArray[np.void], row: int, limits: PlannedJoint) -> _Sent:
     goal: Floats = cycles["goal_position"][:, row].astype(np.float64)
-    # with new torque the joint holds where it is: what it did not reach before is no longer its goal
+    # When torque is enabled, the servo holds its position; an earlier goal no longer applies.
     goal[cycles["torque"][:, row] == Torque.GIVEN] = np.nan
     position = np.where(cycles["valid"][:, row], cycles["position"][:, row], np.nan)
     commanded = np.abs(cycles["goal_velocity"][:, row])
@@ -99,9 +102,10 @@ def _sent(cycles: NDArray[np.void], row: int, limits: PlannedJoint) -> _Sent:
 
 
 def _reachable(sent: _Sent, acceleration: float, begun: _Way) -> Floats:
-    """A goal holds until the next cycle; where it can be reached by then, the trajectory is the goal.
+    """Return the reachable trajectory.
 
-    `begun` has the points of the first cycles that are known, and is carried on.
+    A goal holds until the next cycle. If it can be reached by then, the trajectory is the goal. `begun` has
+    the points of the first cycles, and is updated.
     """
     goal, speed, steps = sent.goal, sent.speed, sent.steps
     known = len(begun.last)
@@ -129,23 +133,23 @@ def _reachable(sent: _Sent, acceleration: float, begun: _Way) -> Floats:
 
 @dataclass(frozen=True, slots=True)
 class _Sent:
-    """What was sent to a joint in each cycle, and where it was."""
+    """Goals of a joint in each cycle, with its positions."""
 
     goal: Floats  # rad
-    speed: Floats  # rad/s, of the way to it
-    position: Floats  # rad, NaN where it was not read
-    steps: Floats  # s since the cycle before
+    speed: Floats  # rad/s, commanded speed of the movement
+    position: Floats  # rad; NaN if it was not read
+    steps: Floats  # s since the preceding cycle
 
 
 def _go(start: int, way: Floats, sent: _Sent, acceleration: float, begun: _Way) -> int:
-    """Fill a way from a cycle on until it has come to its goal; return the cycle behind."""
+    """Fill `way` from a cycle until it reaches its goal; return the index of the next cycle."""
     at = float(way[start - 1]) if start else math.nan
     velocity = begun.velocity
     cycle = start
     while cycle < len(way):
         desired = float(sent.goal[cycle - 1]) if cycle else math.nan
         if not (math.isfinite(at) and math.isfinite(desired)):
-            # it begins at the joint's position when it gets a goal
+            # The trajectory begins at the joint's position when it receives a goal.
             at, velocity = float(sent.position[cycle]) if math.isfinite(sent.goal[cycle]) else math.nan, 0.0
             way[cycle] = at
             cycle += 1
@@ -153,7 +157,8 @@ def _go(start: int, way: Floats, sent: _Sent, acceleration: float, begun: _Way) 
         left, dt = desired - at, float(sent.steps[cycle])
         fastest = math.copysign(float(sent.speed[cycle - 1]), left)
         if acceleration < math.inf:
-            # from where it can still brake: v^2 / 2a and half of this step's way are what is left
+            # Braking must stay possible: v^2 / 2a plus half of this step's distance equals the remaining
+            # distance.
             change = acceleration * dt
             braking = math.sqrt((change / 2) ** 2 + 2 * acceleration * abs(left)) - change / 2
             fastest = math.copysign(min(abs(fastest), braking), left)
@@ -170,33 +175,33 @@ def _go(start: int, way: Floats, sent: _Sent, acceleration: float, begun: _Way) 
     return len(way)
 
 
-# What is left of it
+# Remaining error
 
 
 @dataclass(frozen=True, slots=True)
 class _Rest:
-    """An interval in which a joint should rest."""
+    """Interval in which a joint is expected to rest."""
 
     settling_s: float | None
-    """From the start until the joint stayed near its rest position; None: it did not move before"""
+    """Time from the start until the joint stayed near its rest position; None if it did not move before."""
     error_rad: float  # Measured minus desired position at rest
 
 
 @dataclass(slots=True)
 class _OpenRest:
-    """Finds rests in slices of cycles; keeps the cycles of a rest that is not over, 20 s at most.
+    """Detector of rests in slices of cycles. It keeps the cycles of an open rest, 20 s at most.
 
-    A rest is an interval of 0.3 s or more in which the desired position does not change.
+    A rest is an interval of 0.3 s or more with a constant desired position.
     """
 
     times: Floats = field(default_factory=lambda: np.zeros(0))
     way: Floats = field(default_factory=lambda: np.zeros(0))
     error: Floats = field(default_factory=lambda: np.zeros(0))
     lowest: float = math.inf
-    highest: float = -math.inf  # Of the desired positions since the last rest, before those that are kept
+    highest: float = -math.inf  # Range of the desired positions since the last rest, before the kept cycles
 
     def take(self, times: Floats, way: Floats, error: Floats, tick: float, *, final: bool) -> Iterator[_Rest]:
-        """Yield the rests that have ended; with `final` the last one too.
+        """Yield completed rests, and with `final` also the open one.
 
         Args:
             times: s, shape (cycles,).
@@ -243,22 +248,22 @@ class _OpenRest:
             self.lowest, self.highest = min(self.lowest, known.min()), max(self.highest, known.max())
 
 
-# Slice by slice
+# Accumulation slice by slice
 
 
 class Tracking:
-    """Collects tracking slice by slice, in memory that does not grow with the log."""
+    """Accumulator of tracking, fed slice by slice. Its memory does not grow with the log."""
 
     def __init__(self) -> None:
         self._parts: list[NDArray[np.void]] = []
         self._count = 0
         self._held: NDArray[np.void] | None = None
-        """The last two cycles of those that are done: the next ones depend on them."""
+        """Last two processed cycles, which the next ones depend on."""
         self._rows: list[_Row] = []
-        self.movement = Movement()  # Of all that was taken, once it is finished
+        self.movement = Movement()  # Complete once `finish` was called
 
     def take(self, log: Log) -> None:
-        """Take the cycles of the next slice."""
+        """Add the cycles of the next slice."""
         if not len(log.cycles):
             return
         if not self._rows:
@@ -271,7 +276,7 @@ class Tracking:
             self._work()
 
     def finish(self, log: Log) -> tuple[JointTracking, ...]:
-        """Return the tracking of each joint; `log` has their names."""
+        """Return the tracking of each joint; `log` has the joint names."""
         self._work()
         nothing = np.zeros(0)
         for each in self._rows:
@@ -292,7 +297,7 @@ class Tracking:
 
 @dataclass(slots=True)
 class _Row:
-    """One joint, as far as its cycles were taken."""
+    """Accumulator of one joint."""
 
     row: int
     limits: PlannedJoint
@@ -305,16 +310,16 @@ class _Row:
     squares: float = 0.0
     worst: float = 0.0
     lowest: float = math.inf
-    highest: float = -math.inf  # Of the trajectory, where its velocity is known
+    highest: float = -math.inf  # Range of the trajectory while its velocity is known
     across: float = 0.0  # Sum of error times velocity
-    moved: float = 0.0  # Sum of the squares of the velocity
+    moved: float = 0.0  # Sum of squared velocities
     rest: _OpenRest = field(default_factory=_OpenRest)
     settled_s: float | None = None
     rest_rad: float | None = None
     delays: DelayFit = field(default_factory=DelayFit)
 
     def take(self, cycles: NDArray[np.void], known: int) -> Floats:
-        """Take cycles; the first `known` of them were taken before. Return the reachable trajectory."""
+        """Add cycles, of which the first `known` were added before; return the reachable trajectory."""
         new = cycles[known:]
         missing = ~new["valid"][:, self.row] & (new["torque"][:, self.row] != Torque.REBOOTING)
         self.invalid += int(np.count_nonzero(missing))
@@ -328,7 +333,7 @@ class _Row:
         times = cycles["read_ns"] * 1e-9
         error = sent.position - way
         if not known:
-            error[:1] = np.nan  # the trajectory begins there
+            error[:1] = np.nan  # The trajectory begins at this position, so its error is 0 by definition
         finite = error[known:][np.isfinite(error[known:])]
         self.errors += len(finite)
         self.squares += float((finite**2).sum())
@@ -339,7 +344,7 @@ class _Row:
         return way
 
     def rested(self, times: Floats, way: Floats, error: Floats, *, final: bool) -> None:
-        """Take the rests that have ended by these cycles; `final`: the last one ends, too."""
+        """Evaluate the rests that these cycles complete; `final` also completes the open one."""
         for rest in self.rest.take(times, way, error, self.limits.tick, final=final):
             self.rest_rad = max(abs(rest.error_rad), self.rest_rad or 0.0)
             if rest.settling_s is not None:
@@ -358,9 +363,8 @@ class _Row:
             self.moved += float(velocity[used] @ velocity[used])
 
     def result(self, name: str) -> JointTracking:
-        """Return what was found."""
         moved = self.highest - self.lowest >= _MOVED_TICKS * self.limits.tick
-        # it may jump between two trajectories, and rest where both neighbours are known
+        # The range can come from a jump between two trajectories at rest, so the velocity counts as well.
         lag_s = -self.across / self.moved if moved and self.moved else None
         delay_s = self.delays.best_s(_MOVED_TICKS * self.limits.tick)
         return JointTracking(

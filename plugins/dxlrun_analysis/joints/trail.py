@@ -1,4 +1,4 @@
-"""Samples of where joints should be and are, at most 50 a second: the first of a run and its newest."""
+"""Samples of desired and actual joint positions, at most 50 a second: the first of a run and the newest."""
 
 from __future__ import annotations
 
@@ -10,21 +10,21 @@ from numpy.typing import NDArray
 from dxlrun import Floats
 
 STEP_S = 0.02
-_MOST = 8_192  # Samples kept, nearly three minutes: of a longer run the first half of them, and the newest
+_MOST = 8_192  # Samples kept, nearly three minutes. A longer run keeps the first and the newest half
 
 
 class Samples(NamedTuple):
-    """Quantities by time; NaN where they are not known, and where samples were left out."""
+    """Quantities over time; NaN if unknown, and at the gap between first and newest samples."""
 
-    step_s: float  # Between two of them: of a loop below 50 Hz its period
-    at_s: Floats  # Since the first one, shape (samples,)
-    way: Floats  # The reachable trajectory, here and in the others of shape (samples, joints)
-    position: Floats  # Only with torque, in control of a position
+    step_s: float  # Time between samples; the period of a loop below 50 Hz
+    at_s: Floats  # Time since the start, shape (samples,)
+    way: Floats  # Reachable trajectory; this and the next arrays have shape (samples, joints)
+    position: Floats  # Only with torque and position control
     load: Floats
 
 
 class Trail:
-    """Collects samples, in memory that does not grow with the log."""
+    """Accumulator of samples. Its memory does not grow with the log."""
 
     def __init__(self, joints: int = 0, begin_ns: int = 0) -> None:
         self._begin_ns, self._slot = begin_ns, -1
@@ -32,7 +32,7 @@ class Trail:
         self._rows = np.zeros((0, 1 + 3 * joints))
 
     def take(self, at_ns: NDArray[np.int64], way: Floats, position: Floats, load: Floats) -> None:
-        """Take cycles, shapes (cycles,) and (cycles, joints); of each 20 ms the first is kept."""
+        """Add cycles, shapes (cycles,) and (cycles, joints). The first cycle of each 20 ms is kept."""
         since_s = (at_ns - self._begin_ns) * 1e-9
         if len(at_ns) > 2:
             self._step_s = max(STEP_S, float(np.median(np.diff(since_s))))
@@ -47,5 +47,5 @@ class Trail:
             self._rows[half, 1:] = np.nan
 
     def samples(self) -> Samples:
-        """Return what was kept."""
+        """Return the samples."""
         return Samples(self._step_s, self._rows[:, 0], *np.split(self._rows[:, 1:], 3, axis=1))

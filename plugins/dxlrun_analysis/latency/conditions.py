@@ -1,8 +1,8 @@
-"""What is measured: conditions, how many wake-ups of each, and in which order their blocks follow.
+"""Conditions of a latency measurement, number of wake-ups of each, and order of their blocks.
 
 Conditions are compared in alternating blocks, because a machine drifts (other programs, temperature, a busy
-host of a virtual machine): each block has all conditions, and their order changes from block to block, so
-that the drift meets all of them alike.
+host of a virtual machine). Each block has all conditions, and their order changes from block to block, so
+that the drift affects all of them alike.
 """
 
 from __future__ import annotations
@@ -20,56 +20,56 @@ POLICIES: tuple[Policy, ...] = ("other", "round_robin", "fifo")
 REAL_TIME: Policy = "round_robin"
 
 SHORTEST_NS, LONGEST_NS = 10_000, 1_000_000_000
-"""Of a period: from the highest rate of a robot file, 100 kHz, to the lowest that a run takes."""
-MOST_ITERATIONS = 10_000_000  # Of a condition; 16 bytes each
+"""Range of a period: from the highest rate of a robot file, 100 kHz, to the lowest that a run accepts."""
+MOST_ITERATIONS = 10_000_000  # Per condition; 16 bytes each
 LONGEST_S = 24 * 3600.0
 MOST_BLOCKS = 1000
 
 
 @dataclass(frozen=True, slots=True)
 class Condition:
-    """One way to wait for a deadline: dxlrun's own with a policy, or the program in C with one."""
+    """Method of waiting for a deadline: that of dxlrun or the C program, with a scheduling policy."""
 
-    name: str  # As it is written in --compare: other, round_robin, fifo, c
+    name: str  # Name in --compare: other, round_robin, fifo, c
     policy: Policy
 
     @property
     def in_c(self) -> bool:
-        """The yardstick, which sleeps until the deadline."""
+        """True for the yardstick, a C program that sleeps until the deadline."""
         return self.name == YARDSTICK
 
     @property
     def label(self) -> str:
-        """The condition in a table."""
+        """Name of the condition in tables."""
         return f"{self.name} ({self.policy})" if self.in_c else self.name
 
 
 @dataclass(frozen=True, slots=True)
 class Settings:
-    """A measurement: wake-ups of each condition, in blocks."""
+    """Settings of a measurement."""
 
-    iterations: int  # Of each condition, in all blocks together
+    iterations: int  # Per condition, over all blocks
     period_ns: int
     priority: int
     conditions: tuple[Condition, ...]
     blocks: int
-    cores: tuple[int, ...] = ()  # Where all conditions run; empty: anywhere
+    cores: tuple[int, ...] = ()  # Cores of all conditions; empty for any core
     polling_ns: int | None = None
     """Longest time that the clock is polled before a deadline; None: a tenth of the period, as in a run."""
-    idle_latency: bool = False  # Cores are kept from deep idle states meanwhile
+    idle_latency: bool = False  # Keep the cores from deep idle states during the measurement
 
     @property
     def seconds(self) -> float:
-        """How long all wake-ups take."""
+        """Duration of all wake-ups."""
         return self.iterations * self.period_ns * len(self.conditions) / 1e9
 
     def share(self, block: int) -> int:
-        """Return the wake-ups of a condition in a block: as many in each, the rest in the first ones."""
+        """Return the wake-ups of a condition in a block. A remainder is spread over the first blocks."""
         whole, rest = divmod(self.iterations, self.blocks)
         return whole + (block < rest)
 
     def scheduler(self, condition: Condition, lock_memory: bool) -> SchedulerPlan:
-        """Return what a condition requests of the operating system, as a robot file would."""
+        """Return the scheduling request of a condition in the form of a robot file."""
         return SchedulerPlan(
             policy=condition.policy,
             priority=self.priority,
@@ -79,7 +79,11 @@ class Settings:
         )
 
     def check(self, allowed_cores: frozenset[int]) -> None:
-        """Raise InputError with a sentence for each value with which nothing can be measured."""
+        """Validate the settings.
+
+        Raises:
+            InputError: One sentence for each value that does not allow a measurement.
+        """
         problems: list[str] = []
         if not SHORTEST_NS <= self.period_ns <= LONGEST_NS:
             problems.append(f"--period of {self.period_ns * 1e-9:g} s: give from 10 us to 1 s")
@@ -114,10 +118,14 @@ class Settings:
 
 
 def conditions(compare: str | None, policy: Policy | None) -> tuple[Condition, ...]:
-    """Return what `--compare` and `--policy` ask for; raises InputError with one sentence.
+    """Return the conditions that `--compare` and `--policy` select.
 
-    Without --compare it is dxlrun's own loop with --policy (other). `c` has the policy of --policy, else of
-    the condition before it, else of the one behind it; `--compare c` alone compares with dxlrun's own.
+    Without --compare, the condition is dxlrun's own loop with --policy (other). `c` has the policy of
+    --policy, else of the preceding condition, else of the following one. `--compare c` alone compares with
+    dxlrun's own loop.
+
+    Raises:
+        InputError: One sentence about the first problem.
     """
     if compare is None:
         return (Condition(policy or "other", policy or "other"),)
@@ -156,8 +164,8 @@ def _policy(name: str) -> Policy:
 def order(conditions: Sequence[Condition], block: int) -> tuple[Condition, ...]:
     """Return the order of the conditions in a block: rotated, and reversed after a whole round.
 
-    In 2 n blocks of n conditions each stands in each place twice, and (up to three) in front of each other
-    one as often as behind it.
+    In 2 n blocks of n conditions, each condition is in each place twice. With up to three conditions, each
+    one precedes any other as often as it follows it.
     """
     number = len(conditions)
     rounds, turn = divmod(block, number)

@@ -1,4 +1,4 @@
-"""The log of a measurement: an MCAP file as those of runs, with a topic of wake-ups for each condition.
+"""Log of a latency measurement: an MCAP file as those of runs, with a topic of wake-ups for each condition.
 
 `dxlrun analyze` computes the same tables from it; other tools plot the topics `/latency/CONDITION`.
 """
@@ -21,16 +21,16 @@ from dxlrun.tooling.logs import LogSummary, TopicWriter
 from dxlrun_analysis.latency.conditions import Settings
 from dxlrun_analysis.latency.statistics import Block, Result, Times, figures
 
-ROBOT = "latency"  # Stands where the logs of runs have the robot's name
-METADATA_NAME = "latency"  # The metadata record that makes a log one of a measurement
+ROBOT = "latency"  # Takes the place of the robot's name in logs of runs
+METADATA_NAME = "latency"  # Metadata record that marks the log of a measurement
 _TOPIC = "/latency/"
 _AT_ONCE = 10_000
-"""Wake-ups that become Python's integers at a time: ten millions of them take over a gigabyte."""
+"""Wake-ups that are converted to Python integers at a time; ten millions of them take over a gigabyte."""
 
 
 @dataclass(slots=True)
 class WakeUp:
-    """One wake-up: when it was due and when it came, ns of the monotonic clock, and in which block."""
+    """One wake-up: deadline and actual time, ns of the monotonic clock, and its block."""
 
     scheduled_ns: int
     woken_ns: int
@@ -38,19 +38,23 @@ class WakeUp:
 
 
 class About(msgspec.Struct, frozen=True):
-    """What the log says about the measurement beside its wake-ups."""
+    """Data about the measurement other than its wake-ups."""
 
     settings: Settings
     load: str
     remarks: tuple[str, ...]
     processes: tuple[tuple[str, int, int, int, int], ...]
-    """Of each block: condition, number, processor time, time that passed, polled time; ns."""
+    """One row per block: condition, number, processor time, elapsed time, polled time; ns."""
 
 
 def write(
     path: Path, settings: Settings, blocks: Sequence[Block], load: str, remarks: Sequence[str]
 ) -> LogSummary:
-    """Write the log of what was measured into a new or empty file. Raises OSError where it cannot begin."""
+    """Write the log of a measurement into a new or empty file.
+
+    Raises:
+        OSError: The file cannot be opened.
+    """
     processes = tuple((one.condition, one.number, one.cpu_ns, one.wall_ns, one.margin_ns) for one in blocks)
     about = About(settings, load, tuple(remarks), processes)
     metadata = {METADATA_NAME: {"about": msgspec.json.encode(about).decode()}}
@@ -65,25 +69,29 @@ def write(
 
 
 def machine() -> str:
-    """Return this machine in words, for a report."""
+    """Return a description of this machine for a report."""
     here = platform.uname()
     return f"{here.system} {here.release}, {here.version}, {here.machine}"
 
 
 def machine_of(log: LogReader) -> str:
-    """Return the machine on which a log was made."""
+    """Return a description of the machine on which a log was made."""
     kernel = log.metadata.get("kernel", {})
     system = f"{kernel.get('system', '')} {kernel.get('release', '')}".strip()
     return ", ".join(filter(None, (system, kernel.get("version"), kernel.get("machine"))))
 
 
 def is_measurement(log: LogReader) -> bool:
-    """Return whether a log is one of `dxlrun latency`."""
+    """Return whether a log was made by `dxlrun latency`."""
     return METADATA_NAME in log.metadata
 
 
 def measurement(log: LogReader) -> tuple[tuple[Block, ...], Result]:
-    """Return blocks and statistics of a measurement's log. Raises LogError where it is damaged."""
+    """Return the blocks and the statistics in the log of a measurement.
+
+    Raises:
+        LogError: The log is damaged.
+    """
     try:
         about = msgspec.json.decode(log.metadata[METADATA_NAME]["about"], type=About)
     except (KeyError, msgspec.MsgspecError) as error:
@@ -101,8 +109,8 @@ def measurement(log: LogReader) -> tuple[tuple[Block, ...], Result]:
 
 
 def _rows(log: LogReader, topic: str) -> tuple[Times, NDArray[np.int64]]:
-    """Return deadlines and wake-ups of a condition, and the block of each."""
-    if topic not in log.topics:  # it is there from its first message on: that of a full disk may lack it
+    """Return deadlines and wake-ups of a condition, shape (wake-ups, 2), and the block of each wake-up."""
+    if topic not in log.topics:  # A topic exists from its first message on, which a full disk can prevent
         return np.zeros((0, 2), np.int64), np.zeros(0, np.int64)
     found = log.columns(topic, "scheduled_ns", "woken_ns", "block")
     times = np.column_stack((found["scheduled_ns"], found["woken_ns"])).astype(np.int64)

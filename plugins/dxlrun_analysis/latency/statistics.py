@@ -23,14 +23,14 @@ Times = NDArray[np.int64]
 
 @dataclass(frozen=True, slots=True)
 class Block:
-    """Wake-ups that one process measured in a row."""
+    """Consecutive wake-ups that one process measured."""
 
     condition: str  # Name
     number: int
     times: Times
-    cpu_ns: int = 0  # Processor time of the process meanwhile
-    wall_ns: int = 0  # The same in time that passed; 0 where the block was broken off
-    margin_ns: int = 0  # How long the clock was polled before each deadline
+    cpu_ns: int = 0  # Processor time of the process during the block
+    wall_ns: int = 0  # Elapsed time; 0 if the block was interrupted
+    margin_ns: int = 0  # Polling time before each deadline
 
     @property
     def late_ns(self) -> Numbers:
@@ -66,31 +66,32 @@ class Figures:
     max_us: float
     mean_us: float
     deviation_us: float  # Standard deviation of the population
-    mode_us: int  # Lower edge of the fullest bin of 1 us; the smallest where several are as full
+    mode_us: int  # Lower edge of the fullest bin of 1 us, the smallest of equal ones
     share_over_150_us: float
     share_over_1_ms: float
     median_us: float
     p99_us: float
     p999_us: float
-    processor_share: float | None  # Of one core, over the blocks that were finished; None: none was
+    processor_share: float | None  # Share of one core, over completed blocks; None if there was none
     polling_us: float
-    """How long before each deadline the clock was polled, on average over the blocks; 0: never."""
-    over_blocks: dict[str, Interval]  # mean_us, median_us, p99_us of each whole block, or of what there is
+    """Polling time before each deadline, on average over the blocks; 0 without polling."""
+    # mean_us, median_us, p99_us of complete blocks, or of interrupted ones if none is complete.
+    over_blocks: dict[str, Interval]
     ratios: dict[str, Interval]
-    """mean_us, p99_us of each block divided by those of the reference in the same block."""
+    """Ratios of mean_us and p99_us to those of the reference in the same block."""
 
 
 @dataclass(frozen=True, slots=True)
 class Result:
-    """What was measured, and what is to be known about it; its fields are those of --json."""
+    """Result of a measurement; its fields are those of --json."""
 
     iterations: int
     period_us: float
     priority: int
     blocks: int
-    load: str  # In words; empty: none
-    reference: str  # Name of the condition that the others are divided by; empty: there is only one
-    conditions: tuple[Figures, ...]  # Those that have wake-ups
+    load: str  # In words; empty without load
+    reference: str  # Condition that the others are divided by; empty for a single condition
+    conditions: tuple[Figures, ...]  # Conditions that have wake-ups
     remarks: tuple[str, ...]
 
 
@@ -185,7 +186,10 @@ def _figures(
 
 
 def _over_blocks(settings: Settings, blocks: Sequence[Block]) -> dict[int, dict[str, float]]:
-    """Return the values of each block; one that was broken off weighs too much, so it counts only alone."""
+    """Return the values of each block.
+
+    Interrupted blocks would weigh too much and count only if none is complete.
+    """
     whole = [block for block in blocks if len(block.times) >= settings.share(block.number)]
     return {block.number: _of_block(block) for block in whole or blocks}
 
@@ -209,13 +213,13 @@ def _skipped(times: Times, period_ns: int) -> int:
 
 
 def mode_us(late_ns: NDArray[np.int64]) -> int:
-    """Return the lower edge of the fullest bin of 1 us, the smallest where several are as full."""
+    """Return the lower edge of the fullest bin of 1 us, the smallest of equal ones."""
     bins, counts = np.unique(late_ns // 1000, return_counts=True)
     return int(bins[int(np.argmax(counts))])
 
 
 def interval(values: Sequence[float]) -> Interval:
-    """Return mean and confidence interval of values that were measured independently (Student's t)."""
+    """Return mean and confidence interval of independently measured values (Student's t)."""
     number = len(values)
     mean = math.fsum(values) / number
     if number < 2:

@@ -1,4 +1,4 @@
-"""A measurement as tables: the thesis' table with a column for each condition, intervals over the blocks."""
+"""Tables of a latency measurement: the thesis' table, one column per condition; intervals over the blocks."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ _OVER_BLOCKS = {"mean_us": "mean", "median_us": "median", "p99_us": "99 %"}
 
 
 def parts(result: Result) -> tuple[Part, ...]:
-    """Return what a terminal shows."""
+    """Return the terminal output."""
     return (
         statistics_table(result),
         *((blocks_table(result),) if result.blocks > 1 else ()),
@@ -20,7 +20,7 @@ def parts(result: Result) -> tuple[Part, ...]:
 
 
 def line(result: Result) -> str:
-    """Return the measurement in one line."""
+    """Return a summary in one line."""
     each = (
         f"{one.label} {duration(one.mean_us)} late on average, at most {duration(one.max_us)}"
         for one in result.conditions
@@ -29,7 +29,7 @@ def line(result: Result) -> str:
 
 
 def title(result: Result) -> str:
-    """Return what was measured, in words."""
+    """Return the title: period, number of blocks and load."""
     load = f"; load: {result.load}" if result.load else "; no load"
     period = f"{result.period_us / 1e3:g} ms" if result.period_us >= 1e3 else f"{result.period_us:g} us"
     return f"Wake-up latency, period {period}, {counted(result.blocks, 'block', 'blocks')}{load}"
@@ -82,14 +82,14 @@ def blocks_table(result: Result) -> Table:
 
 
 def duration(us: float) -> str:
-    """Return a latency as a person writes it, with fractions of a microsecond where they matter."""
+    """Return a latency as text, with fractions of a microsecond below 100 us."""
     return f"{us:.2f} us" if us < 100 else microseconds(us)
 
 
 def _interval(interval: Interval, written: Callable[[float], str]) -> Cell:
     if interval.low is None or interval.high is None:
         return Cell(written(interval.mean))
-    # neither a latency nor a ratio is negative, but the interval of few, scattered blocks may be
+    # Latencies and ratios are never negative, but the interval of few, scattered blocks can be.
     low, high = written(max(0.0, interval.low)), written(interval.high)
     if low.partition(" ")[2] == high.partition(" ")[2]:
         low = low.partition(" ")[0]

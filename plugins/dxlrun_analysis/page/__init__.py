@@ -1,4 +1,4 @@
 """Page of `analyze --report`: curves of a whole run in bounded size, zoomable plots by Bokeh, tables.
 
-It shows what other packages computed, and computes only what a plot needs.
+It shows results of other packages, and computes only the data of its plots.
 """

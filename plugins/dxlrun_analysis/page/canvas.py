@@ -1,7 +1,7 @@
-"""How the zoomable plots are drawn: Bokeh figures that share the time of the run, and their script.
+"""Zoomable plots: Bokeh figures that share the time axis of the run, and their script.
 
-Bokeh is imported in this room only, because it takes a second. Its script is a part of the page, so the page
-loads nothing; the one line that starts it is all that it needs of ours.
+Only this room imports Bokeh, because the import takes a second. The page embeds Bokeh's script and loads
+nothing; it needs only a short script of ours that starts Bokeh.
 """
 
 from __future__ import annotations
@@ -39,14 +39,14 @@ BLUE, ORANGE, GREEN, PURPLE = "#1f66cc", "#d9620a", "#12896b", "#8248b8"
 WARNING, ERROR = "#a86a00", "#c0241b"
 MANY = (BLUE, ORANGE, GREEN, PURPLE, ERROR, "#0e8aa8", "#8a5a2b", "#c23c86", "#6b7f00", INK)
 _DASHES = ("solid", "dashed", "dotted", "dotdash")
-TIME = "time"  # Name of the range that all plots of the run's time share
+TIME = "time"  # Name of the range that all plots over the time of the run share
 _TIME_LABEL = "time since the first deadline, s"
 _TOOLS = "xpan,xwheel_zoom,reset,save"
-_LEFT = 78  # Pixels left of all plots, so that their times stand above one another
+_LEFT = 78  # Pixels left of all plots, which aligns their time axes
 _ALIKE = 0.95
 _DURATIONS = tuple(10**exponent for exponent in range(8))  # us, from 1 us to 10 s
-_FEW_BANDS = 5  # More bands over one another would hide the curves
-_FEW_ROWS = 60  # So few rows are drawn with a dot each
+_FEW_BANDS = 5  # More overlapping bands would hide the curves
+_FEW_ROWS = 60  # With at most this many rows, each row is drawn as a dot
 _FONT = "DejaVu Sans, Verdana, system-ui, sans-serif"
 _START = """
 const plots = JSON.parse(document.getElementById("plots").textContent);
@@ -62,19 +62,19 @@ document.addEventListener("click", ({target}) => {
 
 @dataclass(frozen=True, slots=True)
 class Line:
-    """A curve in a plot."""
+    """Curve in a plot."""
 
-    curve: str  # Its name among the curves
-    name: str  # For the legend
+    curve: str  # Name of the curve in `Curves`
+    name: str  # Text in the legend
     colour: str
     dash: str = "solid"
     width: float = 1.2
 
 
 def many_lines(curves: Curves, named: Iterable[tuple[str, str]]) -> list[Line]:
-    """Return lines for those of the named curves that there are: ten colours, then the same ones dashed.
+    """Return lines for those of the named curves that exist: ten colours, then the same ones dashed.
 
-    Curves that are equal are one line with all their names: only the last of them would be seen.
+    Equal curves become one line with all their names, because they would hide each other.
     """
     found: dict[str, list[str]] = {}
     for curve, name in named:
@@ -88,7 +88,7 @@ def many_lines(curves: Curves, named: Iterable[tuple[str, str]]) -> list[Line]:
 
 
 def _alike(curves: Curves, one: str, other: str) -> bool:
-    """Return whether two curves are equal where both have values, which is nearly everywhere."""
+    """Return whether two curves have values at nearly the same times, and equal ones there."""
     known = np.isfinite([curves.low(one), curves.low(other)])
     both = known.all(axis=0)
     equal = (np.array_equal(side(one)[both], side(other)[both]) for side in (curves.low, curves.high))
@@ -97,30 +97,30 @@ def _alike(curves: Curves, one: str, other: str) -> bool:
 
 @dataclass(slots=True)
 class Plot:
-    """One plot, with the words around it."""
+    """One plot with its texts."""
 
     name: str
     title: str
     label: str
-    """What it shows, for readers that cannot see it, where it has no title: at first its vertical axis'."""
-    text: str  # Its caption: what is drawn and what is found
+    """Description for screen readers if the plot has no title; initially the label of the vertical axis."""
+    text: str  # Caption: content of the plot and results
     model: bokeh_figure
     _legend: list[Element] = field(default_factory=list)
 
     def ticks(self, axis: str, names: Mapping[float, str], minor: Sequence[float] = ()) -> None:
-        """Put ticks with these names at their places on the axis `x` or `y`."""
+        """Put named ticks at their positions on the axis `x` or `y`."""
         (one,) = getattr(self.model, f"{axis}axis")
         one.ticker = FixedTicker(ticks=list(names), minor_ticks=list(minor))
         one.major_label_overrides = dict(names)
 
     def rows(self, names: Sequence[str]) -> None:
-        """Make the vertical axis one of rows with names, the first one on top."""
+        """Make the vertical axis one of named rows, the first at the top."""
         self.model.y_range = Range1d(len(names) - 0.5, -0.5)
         self.ticks("y", dict(enumerate(names)))
         self.model.ygrid.grid_line_color = None
 
     def durations(self, axis: str) -> None:
-        """Write the ticks of a logarithmic axis in us as a person does: 100 us, 1 ms."""
+        """Label the ticks of a logarithmic axis in us with readable units: 100 us, 1 ms."""
         names = {
             us: f"{us // 10**6} s" if us >= 10**6 else f"{us // 1000} ms" if us >= 1000 else f"{us} us"
             for us in _DURATIONS
@@ -128,15 +128,15 @@ class Plot:
         self.ticks(axis, names, [part * us for us in _DURATIONS for part in (2, 5)])
 
     def reference(self, at: float, dimension: str, colour: str = MUTED) -> None:
-        """Draw a dashed line across the plot: its `width` or its `height`."""
+        """Draw a dashed line across the plot's `width` or `height`."""
         self.model.add_layout(Span(location=at, dimension=dimension, line_color=colour, line_dash="dashed"))
 
     def hover(self, drawn: GlyphRenderer, *tips: tuple[str, str]) -> None:
-        """Show names and values where the mouse is on what was drawn."""
+        """Show names and values when the mouse is over a glyph."""
         self.model.add_tools(HoverTool(renderers=[drawn], tooltips=list(tips)))
 
     def named(self, name: str, *drawn: GlyphRenderer) -> None:
-        """Give what was drawn a name in the legend, in the colour of the first; a click on it hides them."""
+        """Add a legend entry for glyphs in the colour of the first. A click on the entry hides them."""
         for one in drawn:
             one.name = name
         glyph = drawn[0].glyph
@@ -167,13 +167,13 @@ class Plot:
 
 @dataclass(slots=True)
 class Canvas:
-    """The plots of one page. Times are ns of the run's clock; plots show s since the first deadline."""
+    """Plots of one page. Times are ns of the run's clock; plots show s since the first deadline."""
 
-    start_ns: int  # The first deadline
+    start_ns: int  # First deadline
     begin_ns: int
-    end_ns: int  # From `begin_ns` to `end_ns` the plots show the run at first
-    pauses: Sequence[tuple[float, float]] = ()  # Shaded: begin and end, s
-    changes: Sequence[float] = ()  # When the run was steered, s: a dotted line each
+    end_ns: int  # Initially visible: from `begin_ns` to `end_ns`
+    pauses: Sequence[tuple[float, float]] = ()  # Shaded intervals: begin and end, s
+    changes: Sequence[float] = ()  # Times of steering, s, drawn as dotted lines
     time: Range1d = field(init=False)
     _plots: list[Plot] = field(default_factory=list)
     _sources: list[tuple[Curves, ColumnDataSource]] = field(default_factory=list)
@@ -184,7 +184,7 @@ class Canvas:
         self.time = Range1d(begin - margin, end + margin, name=TIME)
 
     def seconds(self, t_ns: NDArray[np.int64]) -> Floats:
-        """Return times as the plots show them."""
+        """Return times in s since the first deadline."""
         since: Floats = (t_ns - self.start_ns) / 1e9
         return since
 
@@ -194,7 +194,7 @@ class Canvas:
         return frozenset(plot.name for plot in self._plots)
 
     def timed(self, name: str, title: str, label: str, height: int, *, log: bool = False) -> Plot:
-        """Return an empty plot over the time of the run; the caption is to be filled in."""
+        """Return an empty plot over the time of the run, without a caption."""
         plot = self.free(name, title, (_TIME_LABEL, label), height, "y" if log else "", self.time)
         for begin, end in self.pauses:
             box = BoxAnnotation(left=begin, right=end, fill_color=MUTED, fill_alpha=0.13, line_color=None)
@@ -213,7 +213,7 @@ class Canvas:
         log: str = "",
         time: Range1d | None = None,
     ) -> Plot:
-        """Return an empty plot with labelled axes of its own; `log`: which of `xy` are logarithmic."""
+        """Return an empty plot with its own labelled axes; `log` contains the logarithmic ones of `xy`."""
         model = bokeh_figure(
             name=name,
             height=height,
@@ -228,10 +228,12 @@ class Canvas:
         model.toolbar.active_drag = zoom
         model.toolbar.logo = None
         model.toolbar.autohide = True
-        model.toolbar_location, model.toolbar_inner = "above", True  # beside a low plot it has no room
+        # A low plot has no room for the toolbar next to it.
+        model.toolbar_location, model.toolbar_inner = "above", True
         model.xaxis.axis_label, model.yaxis.axis_label = axes
         model.outline_line_color = None
-        model.background_fill_color = model.border_fill_color = PAPER  # the ink is dark, pages may be, too
+        # The text is dark, and the page can be dark as well.
+        model.background_fill_color = model.border_fill_color = PAPER
         model.min_border_left, model.min_border_right, model.min_border_top = _LEFT, 12, 6
         for axis in model.axis:
             axis.axis_label_text_font_style = "normal"
@@ -244,14 +246,21 @@ class Canvas:
         self._plots.append(plot)
         return plot
 
-    # What is drawn
+    # Content of plots
 
     def curves(  # noqa: PLR0917  what is drawn, and how its axis is laid out
         self, plot: Plot, curves: Curves, lines: Sequence[Line], unit: str, least: float, scale: float = 1.0
     ) -> None:
-        """Draw the lines that have values, times `scale`, later ones above; a band from smallest to largest.
+        """Draw the lines that have values, later ones on top, with a band from smallest to largest value.
 
-        The axis spans at least so much: a joint at rest is a calm line, not the ticks of its servo.
+        Args:
+            plot: The plot.
+            curves: The curves.
+            lines: Lines to draw.
+            unit: Unit of the drawn values.
+            least: Least span of the axis. It makes a joint at rest a calm line, not the ticks of its
+                servo.
+            scale: Factor on the values.
         """
         shown = [line for line in lines if line.curve in curves]
         if not shown:
@@ -311,7 +320,7 @@ class Canvas:
         return source
 
     def _column(self, source: ColumnDataSource, curves: Curves, name: str, side: str, scale: float) -> str:
-        """Return the column of a curve's smallest or largest values, the same one where they agree."""
+        """Return the column of a curve's smallest or largest values; one column if they are equal."""
         if side == "high" and curves.only_samples(name):
             side = "low"
         column = f"{side}{curves.columns[name]}"
@@ -320,14 +329,14 @@ class Canvas:
             source.add(values * np.float32(scale), column)
         return column
 
-    # Into the page
+    # Output
 
     def elements(self, plots: Iterable[Plot]) -> list[Element]:
-        """Return the places of plots in the page, each with its title and caption."""
+        """Return the elements of plots in the page, each with its title and caption."""
         return [figure(plot.name, plot.title, plot.place(), plot.text) for plot in plots]
 
     def scripts(self) -> list[Element]:
-        """Return what the page has at its end: the plots as JSON, Bokeh's script, and the line that draws."""
+        """Return the end of the page: the plots as JSON, Bokeh's script, and the script that starts it."""
         if not self._plots:
             return []
         document = Document()
@@ -345,7 +354,10 @@ class Canvas:
 
 
 def _renamed(value: object, names: dict[str, str]) -> object:
-    """Return a document with the identifiers of its models counted from 0: Bokeh counts on in a process."""
+    """Renumber the identifiers of models from 0, which makes the page reproducible.
+
+    Bokeh counts identifiers over the lifetime of a process.
+    """
     if isinstance(value, Mapping):
         return {
             key: names.setdefault(one, f"m{len(names)}") if key == "id" else _renamed(one, names)

@@ -1,4 +1,4 @@
-"""What the plots of a run show, taken slice by slice of a log: curves over its time in bounded size.
+"""Curves of a run over time in bounded size, collected slice by slice.
 
 Each curve is an envelope of the whole run, with every sample in the windows around its worst cycles.
 """
@@ -16,23 +16,23 @@ from dxlrun_analysis.cycles.latency import LATE_BINS_US, ROUGH_NS, STEPS, cycle_
 from dxlrun_analysis.page.envelope import Envelope, Rows, Samples, Times
 
 BYTES_OF_CURVES = 7_000_000
-"""Of all curves of the cycles in a page, before they are text: 4 bytes a number, two numbers a row."""
+"""Size of all curves of cycles in a page before conversion to text: 4 bytes a number, two numbers a row."""
 _FEWEST_ROWS, _MOST_ROWS = 100, 6000
 _BYTES_A_VALUE = 8
-_PART_OF_WINDOWS = 2 / 3  # Of the rows; the rest are bins of the whole run
-_AT_ONCE = 4096  # So many cycles are laid in bins together
+_PART_OF_WINDOWS = 2 / 3  # Share of the rows for windows; the rest are bins of the whole run
+_AT_ONCE = 4096  # Cycles that are binned together
 _GAP_NS = 500_000_000
-_GAP_PERIODS = 3  # A longer time without cycles is a gap in the curves
-_WINDOW_NS = 1_000_000_000  # Around a worst cycle
-LEAST_US = 1.0  # Earlier wake-ups are drawn here: the axis is logarithmic
-_LEAST_NS = 100  # Steps that took less, or no time at all on virtual time, are drawn here
+_GAP_PERIODS = 3  # A longer interval without cycles is a gap in the curves
+_WINDOW_NS = 1_000_000_000  # Length of the window around a worst cycle
+LEAST_US = 1.0  # Lower bound for drawn wake-ups, because the axis is logarithmic
+_LEAST_NS = 100  # Lower bound for drawn durations; on virtual time steps take no time
 _QUANTITIES = ("position", "velocity", "effort")
 _JOINT_FIELDS = (
     *(f"{kind}{quantity}" for quantity in _QUANTITIES for kind in ("", "goal_", "command_")),
     "temperature",
     "voltage",
 )
-_GOAL = "goal_position"  # Fields of a cycle with a number a joint that become curves of that name
+_GOAL = "goal_position"  # Name of a cycle's field and of its curves
 
 
 @dataclass(frozen=True, slots=True)
@@ -41,11 +41,11 @@ class Curves:
 
     rows: Rows
     columns: Mapping[str, int]
-    """Which column of the rows each curve is; one that never had a value is not there."""
+    """Column of each curve; curves without any value are omitted."""
 
     @classmethod
     def of(cls, rows: Rows, names: Iterable[str]) -> Curves:
-        """Return the curves that ever had a value; `names` of all columns."""
+        """Return the curves that have any value; `names` has one name per column."""
         there: NDArray[np.bool_] = np.asarray(np.isfinite(rows.low).any(axis=0))
         return cls(rows, {name: index for index, name in enumerate(names) if there[index]})
 
@@ -61,21 +61,21 @@ class Curves:
         return self.rows.high[:, self.columns[name]]
 
     def only_samples(self, name: str) -> bool:
-        """Return whether each row of a curve is a single sample, or a value that did not change."""
+        """Return whether the smallest and largest values of a curve are equal in every row."""
         return bool(np.array_equal(self.low(name), self.high(name), equal_nan=True))
 
 
 @dataclass(frozen=True, slots=True)
 class CurvesOfRun:
-    """All curves of a run, and how its wake-ups are distributed."""
+    """All curves of a run, and the distribution of its wake-ups."""
 
     cycles: Curves
     late_bins: NDArray[np.int64]
-    """How many wake-ups were so many us late, shape (LATE_BINS_US + 1,); earlier ones count as 0."""
+    """Number of wake-ups in each bin of 1 us, shape (LATE_BINS_US + 1,). Early ones count as 0."""
     windows: tuple[tuple[int, int], ...]
-    """Where the curves of the cycles have every sample: begin and end, ns of the run's clock."""
+    """Windows in which the curves have every sample: begin and end, ns of the run's clock."""
     begin_ns: int
-    end_ns: int  # From the first cycle to the last, by their deadlines
+    end_ns: int  # `begin_ns` and `end_ns` are the first and the last deadline
 
 
 def joint_curve(field: str, joint: str) -> str:
@@ -84,7 +84,7 @@ def joint_curve(field: str, joint: str) -> str:
 
 
 class CurveCollector:
-    """Takes a log slice by slice; `worst_ns`: deadlines around which every sample is kept."""
+    """Accumulator of curves; `worst_ns` are deadlines around which every sample is kept."""
 
     def __init__(self, worst_ns: Iterable[int] = ()) -> None:
         self._worst_ns = tuple(worst_ns)
@@ -99,10 +99,10 @@ class CurveCollector:
         self._late_bins = np.zeros(LATE_BINS_US + 1, np.int64)
         self._span: tuple[int, int] | None = None
         self._goal: NDArray[np.float64] | None = None
-        """Position goals of the cycle before, shape (joints,); None where there is none."""
+        """Position goals of the preceding cycle, shape (joints,), or None."""
 
     def take(self, log: Log) -> None:
-        """Take the next slice."""
+        """Add the next slice."""
         if self._envelope is None:
             self._begin(log)
         if len(log.cycles):
@@ -112,7 +112,7 @@ class CurveCollector:
                 self._digest()
 
     def finish(self) -> CurvesOfRun:
-        """Return the curves; none of a log without slices."""
+        """Return the curves; for a log without slices, no curves."""
         self._digest()
         rows = Envelope(0, 2, 1).rows()
         if self._envelope is not None and self._log is not None:
@@ -168,7 +168,8 @@ class CurveCollector:
 
 
 def windows(worst_ns: Iterable[int], most: int, period_ns: int) -> list[tuple[int, int]]:
-    """Return windows around cycles, apart and in order: a second each, or as long as `most` cycles allow."""
+    """Return disjoint ascending windows around cycles: a second each, or shorter to hold `most` cycles at
+    most."""
     worst = list(worst_ns)
     if not worst:
         return []
@@ -186,7 +187,10 @@ def windows(worst_ns: Iterable[int], most: int, period_ns: int) -> list[tuple[in
 def _values(log: Log, goals: NDArray[np.float64]) -> Samples:
     """Return the values of all curves, shape (cycles, curves), in the order of their names; times in us.
 
-    `goals`: of positions, those of the cycle before each, which a read position had been given.
+    Args:
+        log: Log with the cycles.
+        goals: Position goals of the cycle before each, which the servo had received when its position was
+            read.
     """
     cycles, count = log.cycles, len(log.cycles)
     late: NDArray[np.int64] = cycles["woken_ns"] - cycles["scheduled_ns"]

@@ -1,4 +1,4 @@
-"""Curves of a run of any length in bounded memory: the smallest and the largest value in each bin of time."""
+"""Envelope: curves of a run in bounded memory, as the smallest and the largest value in each time bin."""
 
 from __future__ import annotations
 
@@ -7,23 +7,30 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-Samples = NDArray[np.float32]  # Shape (rows, curves); NaN: no value
+Samples = NDArray[np.float32]  # Shape (rows, curves); NaN without a value
 Times = NDArray[np.int64]  # Shape (rows,), ns
 
 
 @dataclass(frozen=True, slots=True)
 class Rows:
-    """Curves over common times: between `low` and `high` lies every sample; where they agree it is one."""
+    """Curves over common times.
+
+    All samples of a row are between `low` and `high`; equal bounds are one sample.
+    """
 
     t_ns: Times
     low: Samples
     high: Samples
 
     def and_samples(self, times: Times, values: Samples, windows: list[tuple[int, int]]) -> Rows:
-        """Return rows with every sample in windows of time, (begin, end) in ns each, apart and in order.
+        """Return rows in which all samples replace the bins within windows.
 
-        `times` and `values`: the samples in the windows. A bin that lies in a window gives way to them; one
-        that goes on behind its end is drawn from there.
+        A bin that extends beyond the end of a window is drawn from that end on.
+
+        Args:
+            times: Times of the samples in the windows, ns.
+            values: The samples, shape (samples, curves).
+            windows: Disjoint ascending windows, (begin, end) in ns.
         """
         t_ns, keep = self.t_ns.copy(), np.ones(len(self.t_ns), dtype=np.bool_)
         ends = np.append(t_ns[1:], np.iinfo(np.int64).max)
@@ -37,7 +44,7 @@ class Rows:
         return Rows(t_ns[order], low, high)
 
     def with_gaps(self, longest_ns: int) -> Rows:
-        """Return rows with one of NaN wherever there is nothing for longer: no line goes across it."""
+        """Return rows with a row of NaN in each longer gap, so that no line crosses it."""
         before = np.flatnonzero(np.diff(self.t_ns) > longest_ns) + 1
         if not len(before):
             return self
@@ -50,13 +57,19 @@ class Rows:
 
 
 class Envelope:
-    """Takes samples of several curves in the order of time, and keeps `most` bins of them at most.
+    """Accumulator of samples of several curves in at most `most` bins.
 
-    When they do not suffice, each two become one: the bins are twice as wide from then on.
+    When the bins do not suffice, pairs of bins are merged, which doubles their width.
     """
 
     def __init__(self, curves: int, most: int, width_ns: int) -> None:
-        """`width_ns`: of a bin at first; with the time between two samples each has a bin of its own."""
+        """Create an empty envelope.
+
+        Args:
+            curves: Number of curves.
+            most: Largest number of bins; an odd number is rounded up.
+            width_ns: Initial width of a bin; the sample interval gives each sample a bin of its own.
+        """
         most += most % 2
         self._width_ns = max(1, width_ns)
         self._origin_ns: int | None = None
@@ -65,7 +78,7 @@ class Envelope:
         self._high = self._low.copy()
 
     def take(self, t_ns: Times, values: Samples) -> None:
-        """Take the next samples; `values`: shape (samples, curves), NaN where a curve has none."""
+        """Add the next samples; `values` has shape (samples, curves), NaN without a value."""
         if not len(t_ns):
             return
         if self._origin_ns is None:
@@ -85,11 +98,11 @@ class Envelope:
 
     @property
     def apart_ns(self) -> int:
-        """How far apart the rows of two bins may be that follow each other: a longer time has no samples."""
+        """Largest distance of rows within continuous samples, ns; a longer interval has no samples."""
         return 2 * self._width_ns
 
     def rows(self) -> Rows:
-        """Return a row for each bin that has samples, at the time of its first one."""
+        """Return a row for each bin that has samples, at the time of its first sample."""
         filled = np.flatnonzero(self._t_ns != np.iinfo(np.int64).max)
         return Rows(self._t_ns[filled], self._low[filled], self._high[filled])
 

@@ -1,4 +1,4 @@
-"""The events of a run: those that a page can name, and their plot over its time."""
+"""Events of a run: selection for a page, and their plot over time."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ from dxlrun.tooling.output import counted
 from dxlrun.tooling.records import Event, Severity
 from dxlrun_analysis.page.canvas import BLUE, ERROR, WARNING, Canvas, Plot
 
-MOST_EVENTS = 1500  # Of each grade the first are kept
+MOST_EVENTS = 1500  # The first events of each grade are kept
 _LONGEST = 200
 _GRADES = (
     ("information", "circle", BLUE, 5),
@@ -21,20 +21,20 @@ _ROW = 17
 
 
 class EventCollector:
-    """Keeps the first events of each grade, slice by slice."""
+    """Accumulator of the first events of each grade."""
 
     def __init__(self) -> None:
         self._kept: tuple[list[Event], ...] = tuple([] for _ in _GRADES)
 
     def take(self, log: Log) -> None:
-        """Take the events of the next slice."""
+        """Add the events of the next slice."""
         for event in log.events:
             of_grade = self._kept[grade(event.severity)]
             if len(of_grade) < MOST_EVENTS:
                 of_grade.append(event)
 
     def finish(self) -> tuple[Event, ...]:
-        """Return the events in the order of time."""
+        """Return the events in order of time."""
         return tuple(sorted((one for kept in self._kept for one in kept), key=lambda event: event.t_ns))
 
 
@@ -44,7 +44,7 @@ def grade(severity: int) -> int:
 
 
 def events_plot(canvas: Canvas, events: tuple[Event, ...], number: int) -> Plot:
-    """Return the events over the run, one row a kind; `events`: some of this number."""
+    """Return a plot of events over the run, one row per kind; `number` is the count before selection."""
     kinds = list(dict.fromkeys(event.name for event in events))
     plot = canvas.timed("events-timeline", "Events over the run", "", 90 + _ROW * len(kinds))
     times = canvas.seconds(np.array([event.t_ns for event in events], np.int64))

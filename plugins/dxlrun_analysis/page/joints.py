@@ -1,4 +1,4 @@
-"""Plots of the joints: position, velocity and error of each, and how warm and how loaded all of them were."""
+"""Plots of the joints: position, velocity and error of each; temperature, voltage and load of all."""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ from dxlrun_analysis.page.canvas import BLUE, ERROR, INK, ORANGE, PURPLE, Canvas
 from dxlrun_analysis.page.curves import Curves, joint_curve
 
 _LEAST, _LEAST_SPEED, _LEAST_ERROR, _LEAST_EFFORT = 5.0, 25.0, 1.0, 0.1
-"""What an axis spans at least: deg or mm, deg/s or mm/s."""
+"""Least span of an axis: deg or mm, deg/s or mm/s, effort."""
 _ALL = (
     ("temperature", "Temperature of the servos", "temperature, deg C", "deg C", 4.0),
     ("voltage", "Voltage at the servos", "voltage, V", "V", 1.0),
@@ -18,7 +18,7 @@ _ALL = (
 
 
 def joint_plots(canvas: Canvas, cycles: Curves, row: int, joint: JointTracking) -> list[Plot]:
-    """Return the plots of one joint that have anything in them."""
+    """Return the plots of one joint that have content."""
     unit, scale = joint.unit.shown, joint.unit.factor
     position = canvas.timed(f"joint-{row}", joint.name, f"position, {unit}", 210)
     canvas.curves(position, cycles, _lines(joint.name, "position"), unit, _LEAST, scale)
@@ -39,7 +39,7 @@ def joint_plots(canvas: Canvas, cycles: Curves, row: int, joint: JointTracking) 
         ("velocity", f"{unit}/s", speed, _LEAST_SPEED, scale),
         ("effort", f"{joint.unit.torque} or share", effort, _LEAST_EFFORT, 1.0),
     ):
-        # all loads are in a plot of their own
+        # The measured loads of all joints have a common plot.
         if any(line.curve in cycles for line in (lines[1:] if quantity == "effort" else lines)):
             plot = canvas.timed(f"joint-{row}-{quantity}", "", f"{quantity}, {label}", 150)
             canvas.curves(plot, cycles, lines, label, least, times)
@@ -49,7 +49,7 @@ def joint_plots(canvas: Canvas, cycles: Curves, row: int, joint: JointTracking) 
 
 
 def _lines(joint: str, quantity: str) -> list[Line]:
-    """Return a broad curve, a thinner one and a dashed one above it: where they coincide, all are seen."""
+    """Return a broad curve, a thinner one and a dashed one, which stay visible where they coincide."""
     return [
         Line(joint_curve(quantity, joint), "read", BLUE, width=4.0),
         Line(joint_curve(f"goal_{quantity}", joint), "sent", ORANGE, width=1.8),
@@ -76,7 +76,7 @@ def _followed(joint: JointTracking) -> str:
 
 
 def state_plots(canvas: Canvas, cycles: Curves, joints: Sequence[str]) -> list[Plot]:
-    """Return temperature, voltage and load of all joints, those that were read."""
+    """Return plots of temperature, voltage and load of all joints, as far as they were read."""
     plots = []
     for field, title, label, unit, least in _ALL:
         lines = many_lines(cycles, ((joint_curve(field, joint), joint) for joint in joints))

@@ -1,4 +1,4 @@
-"""Plots of the loop's time: wake-up latency and how it is distributed, the steps of a cycle, controllers."""
+"""Plots of the loop's time: wake-up latency and its distribution, the steps of a cycle, controllers."""
 
 from __future__ import annotations
 
@@ -38,7 +38,7 @@ def latency_plots(canvas: Canvas, run: CurvesOfRun, latency: Latency) -> tuple[P
 
 
 def steps_plot(canvas: Canvas, cycles: Curves) -> Plot:
-    """Return how long each step of the cycles took over the run, with the period as a line."""
+    """Return the duration of each step over the run, with the period as a line."""
     plot = canvas.timed("steps", "Duration of the steps", "duration", 260, log=True)
     lines = [
         Line(name, name, _COLOURS[name], width=3.5 if name == "cycle" else 1.2)
@@ -63,7 +63,7 @@ def steps_plot(canvas: Canvas, cycles: Curves) -> Plot:
 
 
 def controllers_plot(canvas: Canvas, cycles: Curves, controllers: Sequence[Duration]) -> Plot | None:
-    """Return how long the update of each controller took; None where none took any time."""
+    """Return the duration of each controller's update; None if none took any time."""
     lines = many_lines(cycles, ((f"controller {one.name}", one.name) for one in controllers))
     if not lines:
         return None
@@ -78,7 +78,7 @@ def controllers_plot(canvas: Canvas, cycles: Curves, controllers: Sequence[Durat
 
 
 def typical_plot(canvas: Canvas, steps: Sequence[Duration], period_us: float) -> Plot:
-    """Return the steps of a typical cycle as bars in a row, against the period."""
+    """Return the steps of a typical cycle as stacked bars, compared with the period."""
     bars = (
         ("median of each step", [step.median_us for step in steps[:-1]]),
         ("99 % of each step", [step.p99_us for step in steps[:-1]]),

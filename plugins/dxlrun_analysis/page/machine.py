@@ -1,4 +1,4 @@
-"""The machine beside the cycles: what its cores did each second, how fast and warm they were."""
+"""Machine plots: activity, frequency and temperature of its cores over the run."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ from dxlrun_analysis.page.curves import Curves
 from dxlrun_analysis.page.envelope import Envelope
 
 MOST_ROWS = 600
-MOST_CORES = 10  # Curves of cores in a plot: the loop's and those that are the busiest
+MOST_CORES = 10  # Cores in a plot: the loop's, then the busiest
 _BIN_NS = 1_000_000_000
 _GAP_NS = 5_000_000_000
 _OF_A_CORE = ("busy", "interrupts", "steal", "frequency")
@@ -35,15 +35,19 @@ Numbers = NDArray[np.float64]
 
 
 class MachineCollector:
-    """Takes the samples of `/machine`, slice by slice; `busy 0` is a curve of core 0."""
+    """Accumulator of the samples of `/machine`; `busy 0` is a curve of core 0."""
 
     def __init__(self) -> None:
         self._cores = 0
         self._envelope: Envelope | None = None
-        self._loop: dict[int, int] = {}  # On which cores the loop ran, and in how many samples
+        self._loop: dict[int, int] = {}  # Number of samples with the loop on each core
 
     def take(self, log: Log) -> None:
-        """Take the samples of the next slice. Raises LogError when one cannot be read."""
+        """Add the samples of the next slice.
+
+        Raises:
+            LogError: A sample cannot be read.
+        """
         if LogTopic.MACHINE not in log.topics:
             return
         for message in log.messages(LogTopic.MACHINE):
@@ -83,14 +87,17 @@ class MachineCollector:
 
 
 def _of(cores: int, values: Numbers) -> Numbers:
-    """Return a number for each core; NaN for one that went offline, none for one that came later."""
+    """Return a number for each core; NaN for a core that went offline.
+
+    Cores that were added later are ignored.
+    """
     found = np.full(cores, np.nan)
     found[: len(values)] = values[:cores]
     return found
 
 
 def machine_plots(canvas: Canvas, machine: Curves, cores: Iterable[int]) -> list[Plot]:
-    """Return the plots of the machine that have anything in them."""
+    """Return the plots of the machine that have content."""
     plots = []
     if "waiting" in machine:
         plot = canvas.timed("machine-waiting", "The loop waited for a core", "ms in each second", 150)

@@ -1,4 +1,4 @@
-"""The report as one page: HTML with zoomable plots, style and numbers inside; it loads nothing."""
+"""Report as one page: HTML with zoomable plots, style and numbers inside; it loads nothing."""
 
 from __future__ import annotations
 
@@ -28,7 +28,7 @@ from dxlrun_analysis.report import analyze, began, facts, tables
 
 _MOST_EVENTS = 100
 _MARKED = ("switch", "rate", "load", "unload", "policy")
-_FEW_CHANGES = 60  # More lines would bury the curves
+_FEW_CHANGES = 60  # More lines would hide the curves
 _PLOTS = {
     "machine-busy": "busy_machine",
     "lateness": "kept_rate",
@@ -38,20 +38,29 @@ _PLOTS = {
     "all-voltage": "supply power_lost",
     "events-timeline": "servo_error errors_logged another_host",
 }
-"""Plots of the page, and the codes of the findings that each shows."""
+"""Plots of the page with the codes of the findings that they show."""
 
 
 def analyzed_page(reader: LogReader | Log, *watching: Callable[[Log], None]) -> tuple[Report, str]:
-    """Analyze a log, and return its page as well. Takes bokeh. Raises LogError as `analyze`."""
+    """Analyze a log, and also return its page; needs bokeh.
+
+    Raises:
+        LogError: As in `analyze`.
+    """
     replies = ReplyCollector()
     report = analyze(reader, *watching, exchanges=replies.take)
     return report, page(reader, report, replies.finish())
 
 
 def page(reader: LogReader | Log, report: Report, replies: Curves) -> str:
-    """Return the page of a log and its report: well-formed, self-contained, the same bytes each time.
+    """Return the page of a log and its report: well-formed, self-contained and reproducible to the byte.
 
-    `replies`: as ReplyCollector has them. It goes through the cycles of the log once more, slice by slice.
+    This reads the cycles of the log once more, slice by slice.
+
+    Args:
+        reader: The log.
+        report: Report on the log.
+        replies: Curves of a ReplyCollector.
     """
     run = _drawn(reader, report, replies)
     when = began(run.log, report)
@@ -67,13 +76,13 @@ def page(reader: LogReader | Log, report: Report, replies: Curves) -> str:
 
 
 class _Run(NamedTuple):
-    """What the page shows of a log."""
+    """Content of a log that the page shows."""
 
-    log: Log  # Without cycles, and with the events that a page can name
+    log: Log  # Without cycles, with the events that the page can name
     curves: CurvesOfRun
     replies: Curves
     machine: Curves
-    cores: tuple[int, ...]  # Those that are drawn
+    cores: tuple[int, ...]  # Cores that are drawn
     canvas: Canvas
 
 
@@ -99,7 +108,7 @@ def _drawn(reader: LogReader | Log, report: Report, replies: Curves) -> _Run:
 
 
 def _header(report: Report, when: str, plots: Collection[str]) -> Element:
-    """Return the verdict, the robot's line first, with links to the plots of this page."""
+    """Return the header: summary of the robot, verdict with links to the plots of this page, key numbers."""
     first, *others = report.verdict.findings
     rows = {joint.name: f"joint-{row}" for row, joint in enumerate(report.totals.tracking)}
     sentences = []
@@ -117,7 +126,7 @@ def _header(report: Report, when: str, plots: Collection[str]) -> Element:
 
 
 def _plot_of(code: str) -> str:
-    """Return the name of the plot that shows findings of a code, or an empty text."""
+    """Return the name of the plot that shows findings of a code, or an empty string."""
     return next((plot for plot, codes in _PLOTS.items() if code in codes.split()), "")
 
 
@@ -140,7 +149,7 @@ def _key_numbers(report: Report) -> list[tuple[str, str]]:
 
 
 def _sections(run: _Run, report: Report) -> list[Element]:
-    """Return the sections in the order of the page; one without a part is left out."""
+    """Return the sections in the order of the page."""
     canvas, totals = run.canvas, report.totals
 
     def shown(section: str) -> list[Element]:
@@ -228,7 +237,7 @@ def _events(run: _Run, report: Report, table: list[Element]) -> list[Element]:
 
 
 def _each_event(run: _Run, number: int) -> list[Element]:
-    """Return the events one by one; of very many only the first warnings and errors."""
+    """Return a table of single events; of a long list only the first warnings and errors."""
     chosen, title = run.log.events, "Each event"
     if number > _MOST_EVENTS:
         severe = [event for event in chosen if event.severity >= Severity.WARNING]

@@ -1,4 +1,4 @@
-"""How soon each servo replied over a run, and when it did not, taken slice by slice of a log."""
+"""Reply times and lost replies of each servo over a run, collected slice by slice."""
 
 from __future__ import annotations
 
@@ -12,23 +12,24 @@ from dxlrun_analysis.plan import LoggedBus
 from dxlrun_analysis.servos.exchanges import Exchanges
 from dxlrun_analysis.servos.requests import IDS
 
-BYTES_OF_REPLIES = 1_000_000  # In a page, before they are text: 4 bytes a number, two numbers a row and curve
+# Size in a page before conversion to text: 4 bytes a number, two numbers per row and curve.
+BYTES_OF_REPLIES = 1_000_000
 _FEWEST_ROWS, _MOST_ROWS = 50, 1500
 _BYTES_A_VALUE = 8
-_BIN_NS = 1_000_000  # Of a bin at first
+_BIN_NS = 1_000_000  # Initial width of a bin
 
 
 class ReplyCollector:
-    """Takes the exchanges of a log: its curves are `reply BUS ID`, us, and `lost BUS ID`, 1 where one is."""
+    """Accumulator of exchanges. Its curves are `reply BUS ID`, us, and `lost BUS ID`, 1 for a lost reply."""
 
     def __init__(self) -> None:
         self._columns = np.zeros(0, np.int64)
-        """Number of each servo of the plan, by bus and ID; -1: it is not in it."""
+        """Column of each servo by bus and ID; -1: not in the plan."""
         self._names: tuple[str, ...] = ()
         self._envelope = Envelope(0, 2, 1)
 
     def take(self, exchanges: Exchanges) -> None:
-        """Take the next exchanges."""
+        """Add the next exchanges."""
         if not len(self._columns):
             self._begin(exchanges.buses)
         count, due = len(self._names), exchanges.due
@@ -40,7 +41,8 @@ class ReplyCollector:
         values[of, column[came]] = took_ns / 1e3
         lost = np.flatnonzero((due.reply < 0) & (column >= 0) & exchanges.ended[due.exchange])
         values[due.exchange[lost], count + column[lost]] = 1
-        # the first exchange of each bus has no instruction, and many instructions ask nothing
+        # Skip exchanges without replies: the first of each bus has no instruction, and many instructions
+        # request nothing.
         rows = np.flatnonzero(np.isfinite(values).any(axis=1))
         rows = rows[np.argsort(exchanges.asked_ns[rows], kind="stable")]
         self._envelope.take(exchanges.asked_ns[rows], values[rows])
@@ -64,5 +66,5 @@ class ReplyCollector:
 
 
 def rows_of_replies(servos: int) -> int:
-    """Return how many bins the curves of so many servos may have."""
+    """Return the number of bins that the curves of some servos may have."""
     return min(max(BYTES_OF_REPLIES // (2 * _BYTES_A_VALUE * max(servos, 1)), _FEWEST_ROWS), _MOST_ROWS)

@@ -1,4 +1,4 @@
-"""Plots of the buses: how soon each servo replied over the run, and when replies were lost."""
+"""Plots of the buses: reply times and lost replies of each servo over the run."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ from dxlrun_analysis.page.canvas import BLUE, ERROR, MUTED, ORANGE, Canvas, Plot
 from dxlrun_analysis.page.curves import Curves
 from dxlrun_analysis.servos.traffic import ServoTraffic
 
-_ROW = 17  # Pixels a servo
+_ROW = 17  # Pixels per servo
 
 
 def reply_plots(canvas: Canvas, replies: Curves, servos: Sequence[ServoTraffic]) -> list[Plot]:

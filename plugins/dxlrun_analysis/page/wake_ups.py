@@ -1,7 +1,7 @@
-"""Plots of wake-up latency, of a run or of several ways to wait: over the time, as a histogram, cumulative.
+"""Plots of wake-up latency, of a run or of several conditions: over time, as a histogram, cumulative.
 
-As in M. A. Araujo, UFU 2017, Figures 25 to 30: per iteration, as a histogram to 150 us, and cumulative.
-Logarithmic axes: the tails are what matters.
+They correspond to M. A. Araujo, UFU 2017, Figures 25 to 30: per iteration, as a histogram to 150 us, and
+cumulative. The axes are logarithmic because the tails matter most.
 """
 
 from __future__ import annotations
@@ -23,10 +23,10 @@ _SHARES = (1e-6, 1e-5, 1e-4, 1e-3, 0.01, 0.1, 0.5, 0.9, 0.99, 0.999, 0.9999, 0.9
 
 
 class WakeUps(NamedTuple):
-    """Wake-ups that belong together."""
+    """Series of wake-ups with one line."""
 
-    line: Line  # Of their lateness in us, among the curves
-    bins: NDArray[np.int64]  # As `late_bins` returns them
+    line: Line  # Line of their lateness in us
+    bins: NDArray[np.int64]  # Output of `late_bins`
 
 
 def wake_up_plots(

@@ -1,4 +1,4 @@
-"""The worst cycles as packet timelines: what loop, servos and wire did, beside when the plan expected it."""
+"""Worst cycles as packet timelines: activity of loop, servos and wire, with the planned times."""
 
 from __future__ import annotations
 
@@ -13,8 +13,8 @@ from dxlrun_analysis.page.canvas import BLUE, ERROR, GREEN, INK, MUTED, ORANGE, 
 from dxlwire import BROADCAST_ID
 
 MOST_CYCLES = 5
-MOST_PACKETS = 400  # Of one cycle: noise may come in any number of pieces
-_ROW = 17  # Pixels a row
+MOST_PACKETS = 400  # Per cycle, because the number of noise packets is unlimited
+_ROW = 17  # Pixels per row
 _MS = 10_000  # us; longer cycles are drawn in ms
 _KINDS = (
     ("instruction", "instruction", ORANGE),
@@ -60,7 +60,7 @@ def _name(bus: str, servo: int, joint: str) -> str:
 
 
 def _loop(plot: Plot, one: WorstCycle, scale: float, unit: str) -> None:
-    """Draw the steps of the loop in the uppermost row."""
+    """Draw the steps of the loop in the top row."""
     steps = (
         ("late wake-up", 0.0, one.woken_us, WARNING),
         ("read", one.woken_us, one.read_us, BLUE),
@@ -80,7 +80,7 @@ def _loop(plot: Plot, one: WorstCycle, scale: float, unit: str) -> None:
 def _packets(
     plot: Plot, packets: Sequence[TimelinePacket], rows: Sequence[int], scale: float, unit: str
 ) -> None:
-    """Draw packets in the rows of their servos: a bar, a tick at its end, and what the plan expected."""
+    """Draw packets in the rows of their servos: a bar with a tick for the last byte, and the planned time."""
     for kind, name, colour in _KINDS:
         mine = [(packet, row) for packet, row in zip(packets, rows, strict=True) if packet.kind == kind]
         if not mine:

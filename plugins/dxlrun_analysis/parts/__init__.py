@@ -1,4 +1,4 @@
-"""Parts of the report: each module has numbers of a log, for `--json`, with the table that shows them.
+"""Parts of the report: each module computes numbers of a log for `--json`, and the table that shows them.
 
-Plots belong to `page/`, what only the verdict reads to the folder of its subject. `report.py` has the order.
+Plots belong in `page/`, data of the verdict alone in the folder of their subject. `report.py` has the order.
 """

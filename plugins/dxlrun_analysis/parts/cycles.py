@@ -1,4 +1,4 @@
-"""Parts about cycles: periods, wake-ups, the steps of a cycle, updates of controllers, long cycles."""
+"""Parts of the report about cycles: periods, wake-ups, steps, updates of controllers, long cycles."""
 
 from __future__ import annotations
 
@@ -44,7 +44,7 @@ def _loop(report: Report, periods: Periods) -> Table:
 
 
 def _controllers(_: Report, updates: Sequence[Duration]) -> Table:
-    # on virtual time no update takes any
+    # On virtual time updates take no time.
     shown = updates if any(item.cycles for item in updates) else ()
     return Table.listing("Controllers", [(Column("update of", "name"), "name"), *_DURATION], shown)
 

@@ -1,4 +1,4 @@
-"""Parts about what happened: events, requests from outside, messages of controllers."""
+"""Parts of the report about the course of a run: events, client requests, messages of controllers."""
 
 from __future__ import annotations
 
@@ -17,29 +17,29 @@ _MOST_ACTS = 100
 
 
 class EventCount(msgspec.Struct, frozen=True):
-    """How often one kind of event is in the log."""
+    """Number of events of one kind in the log."""
 
     name: str
     severity: int
     count: int
-    first: str  # Source and text of the first one
+    first: str  # Source and text of the first event
 
 
 class TopicCount(msgspec.Struct, frozen=True):
-    """How many messages of one topic of a controller are in the log."""
+    """Number of messages of one topic of a controller in the log."""
 
     name: str
     type: str
     messages: int
-    rate: float | None  # Hz; None for fewer than two
+    rate: float | None  # Hz; None for fewer than two messages
 
 
 class TopicCounts:
-    """Counts the messages of each topic, slice by slice."""
+    """Counter of the messages of each topic."""
 
     def __init__(self) -> None:
         self._found: dict[str, tuple[str, int, int, int]] = {}
-        """Type, number of messages, when the first and the last was published; in the order of the first."""
+        """Type, number of messages, and times of the first and the last; in order of the first message."""
 
     def take(self, log: Log) -> None:
         """Count the messages of the next slice."""
@@ -81,7 +81,7 @@ def tone_of(severity: int) -> Tone:
 
 
 def _once(text: str) -> str:
-    """Return `source: text` for a cell, without a source that its text repeats; of a traceback the end."""
+    """Return `source: text` for a cell, without repeating the source; of a traceback, only its last line."""
     source, _, rest = text.partition(": ")
     line = rest.strip().splitlines()[-1].strip() if rest.strip() else ""
     return line if line.startswith(source) else f"{source}: {line}"

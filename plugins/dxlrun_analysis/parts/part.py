@@ -1,4 +1,4 @@
-"""Parts of the report: numbers of a log that the report has under one name, and their table."""
+"""Part: numbers of a log under one name of the report, and their table."""
 
 from __future__ import annotations
 
@@ -18,11 +18,11 @@ T = TypeVar("T")
 class Report:
     """All results of `dxlrun analyze` on a log."""
 
-    about: Log  # The log, without its records
+    about: Log  # The log without its records
     tally: Tally
     totals: RunTotals
     verdict: Verdict
-    numbers: dict[str, object]  # Of each part, by its name: what `--json` prints
+    numbers: dict[str, object]  # Numbers of each part by name: the output of `--json`
 
     @property
     def robot(self) -> str:
@@ -32,26 +32,27 @@ class Report:
 
 @dataclass(frozen=True, slots=True)
 class ReportPart(Generic[T]):
-    """A part of the report."""
+    """One part of the report."""
 
     name: str  # Key of `--json`, and name of its table
     numbers: Callable[[Report], T]
-    table: Callable[[Report, T], Table] | None = None  # Without rows it is not shown
-    collector: type[Collector] | None = None  # Gets the log slice by slice; `report.tally.of` returns it
-    section: str = ""  # Of the page, which has the table
+    table: Callable[[Report, T], Table] | None = None  # A table without rows is not shown
+    # Accumulator that receives the log slice by slice; `report.tally.of` returns it.
+    collector: type[Collector] | None = None
+    section: str = ""  # Section of the page that has the table
     first: bool = False  # The table is the first of its section
     late: int = 0  # In a terminal, tables with a higher number come later
 
     def of(self, report: Report) -> T:
-        """Return its numbers of a log."""
+        """Return the numbers of this part."""
         return cast("T", report.numbers[self.name])
 
     def table_of(self, report: Report) -> Table | None:
-        """Return its table, where it has one with rows."""
+        """Return the table of this part, or None without a table or rows."""
         found = self.table and self.table(report, self.of(report))
         return found if found and found.rows else None
 
 
 def listing(title: str, columns: Columns[T]) -> Callable[[Report, Sequence[T]], Table]:
-    """Return a function that makes a table with a row for each of several things."""
+    """Return a function that makes a table with a row for each item."""
     return lambda _, things: Table.listing(title, columns, things)

@@ -1,4 +1,4 @@
-"""Parts about servos, their buses and joints: traffic, how joints follow, heat and voltage."""
+"""Parts of the report about servos, buses and joints: traffic, tracking, temperature and voltage."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ from dxlrun_analysis.servos.traffic import BusTraffic, ServoTraffic
 
 
 def _error(name: str) -> Callable[[JointTracking], Value]:
-    """Return an error in deg, or with its unit that of a linear joint."""
+    """Return a function that formats an error: deg, or value with unit for a linear joint."""
 
     def error(joint: JointTracking) -> Value:
         value = getattr(joint, name)

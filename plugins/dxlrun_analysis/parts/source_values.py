@@ -1,4 +1,4 @@
-"""Values of sources over a run: least, mean and greatest of each state of a device, sensor or controller."""
+"""Source values: minimum, mean and maximum of each state of a device, sensor or controller over a run."""
 
 from __future__ import annotations
 
@@ -14,18 +14,18 @@ _DIGITS = 4
 
 
 class SourceValues(msgspec.Struct, frozen=True):
-    """One state of a source over a run, SI units; None: it was never valid."""
+    """One state of a source over a run, SI units; None if it was never valid."""
 
     name: str  # `imu/angular_velocity.x`
-    unit: str  # Empty: it has none, or the log does not know it
-    cycles: int  # In which it was valid
+    unit: str  # Empty if the state has no unit, or the log does not record it
+    cycles: int  # Cycles with a valid value
     least: float | None
     mean: float | None
     greatest: float | None
 
 
 class SourceHistory:
-    """Counts the states of sources, slice by slice."""
+    """Accumulator of the states of sources."""
 
     def __init__(self) -> None:
         self._names: tuple[str, ...] = ()
@@ -36,7 +36,7 @@ class SourceHistory:
         self._greatest: Floats = np.zeros(0)
 
     def take(self, log: Log) -> None:
-        """Count the cycles of the next slice."""
+        """Add the cycles of the next slice."""
         layout = log.header.layout
         if not len(log.cycles) or not layout.source_states:
             return

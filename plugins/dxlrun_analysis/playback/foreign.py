@@ -1,9 +1,9 @@
 """Foreign recordings: JointState and JointTrajectory messages of MCAP files and ROS 2 bags.
 
 A bag is a directory with metadata.yaml and files of one of rosbag2's two storages, MCAP or sqlite3. Messages
-are CDR. A JointState has the time of its header, or where that is 0 the one at which it was recorded. A
-JointTrajectory begins at its header's time (0: when it was recorded) and replaces what was left of the one
-before, as joint_trajectory_controller of ros2_controllers has it (control.ros.org).
+are CDR. The time of a JointState is that of its header, or the recording time if the header has 0. A
+JointTrajectory begins at its header's time (if 0, the recording time) and replaces the remainder of the
+preceding one, as in joint_trajectory_controller of ros2_controllers (control.ros.org).
 """
 
 from __future__ import annotations
@@ -43,42 +43,43 @@ _TYPES: Mapping[str, tuple[What, Codec]] = {
 BAG_FILE = "metadata.yaml"
 _MCAP, _SQLITE = b"\x89MCAP0\r\n", b"SQLite format 3\0"
 _JUST_BEFORE_S = 1e-6
-_CDR = b"\x00\x01"  # CDR, little-endian; the two bytes behind it count the padding at the end
+_CDR = b"\x00\x01"  # CDR, little-endian; the next two bytes are the number of padding bytes at the end
 
 
 class _Found(NamedTuple):
-    """A message that may be played."""
+    """Message with joint positions."""
 
     topic: str
     type: str
-    t_ns: int  # When it was recorded
+    t_ns: int  # Recording time
     data: bytes
 
 
 class _Recording(msgspec.Struct, frozen=True):
-    """What a foreign recording has."""
+    """Content of a foreign recording."""
 
     path: Path
     messages: list[_Found]
     topics: dict[str, str]  # All topics, with their types
-    remarks: list[str]  # A sentence for each thing that could not be read
+    remarks: list[str]  # One sentence for each problem of reading
 
 
 class _Moments(NamedTuple):
-    """The positions of a message."""
+    """Positions in one message."""
 
     topic: str
     what: What
     start_ns: int
     joints: tuple[str, ...]
-    after_s: Floats  # Since the start, shape (moments,)
-    position: Floats  # Shape (moments, joints), rad
+    after_s: Floats  # Time since the start, shape (moments,)
+    position: Floats  # rad, shape (moments, joints)
 
 
 def is_foreign(path: Path) -> bool:
     """Return whether a recording is a ROS 2 bag, or a file that dxlrun did not write.
 
-    Raises LogError for a file that is neither MCAP nor sqlite3.
+    Raises:
+        LogError: The file is neither MCAP nor sqlite3.
     """
     if path.is_dir():
         return (path / BAG_FILE).is_file()
@@ -94,9 +95,10 @@ def is_foreign(path: Path) -> bool:
 def foreign_series(
     path: Path, what: What | None, topic: str | None
 ) -> tuple[dict[str, Series], tuple[str, ...]]:
-    """Return the joints of a foreign recording, and a sentence for each thing that could not be read.
+    """Return the joints of a foreign recording, and a sentence for each problem of reading.
 
-    Raises InputError where it has none, or a joint is in several topics and none was chosen.
+    Raises:
+        InputError: The recording has no joints, or a joint is in several topics and none was chosen.
     """
     recording = _Recording(path, [], {}, [])
     for file in _files(path):
@@ -188,7 +190,7 @@ def _series(path: Path, moments: Sequence[_Moments]) -> dict[str, Series]:
 
 
 def _end_before(times: list[Floats], positions: list[Floats], start_s: float) -> None:
-    """Cut the trajectories so far where another one begins, at which the joint is where they led it."""
+    """Truncate the trajectories so far where another one begins, and add the position reached by then."""
     if not times:
         return
     time, position = np.concatenate(times), np.concatenate(positions)
@@ -204,7 +206,11 @@ def _end_before(times: list[Floats], positions: list[Floats], start_s: float) ->
 
 
 def _files(path: Path) -> list[Path]:
-    """Return the files of a recording, in order of time. Raises InputError for a bag that is none."""
+    """Return the files of a recording, in order of time.
+
+    Raises:
+        InputError: The directory is not a ROS 2 bag.
+    """
     if path.is_file():
         return [path]
     try:
@@ -212,7 +218,8 @@ def _files(path: Path) -> list[Path]:
         names = [str(name) for name in content["rosbag2_bagfile_information"]["relative_file_paths"]]
     except (OSError, UnicodeDecodeError, yaml.YAMLError, LookupError, TypeError) as error:
         raise InputError(f"{path}: its {BAG_FILE} is not that of a ROS 2 bag: {_said(error)}") from error
-    files = [path / Path(name).name for name in names]  # beside it, whatever the path says
+    # The files are next to metadata.yaml, whatever path it contains.
+    files = [path / Path(name).name for name in names]
     missing = [file.name for file in files if not file.is_file()]
     if missing or not files:
         raise InputError(f"{path}: the bag lacks {', '.join(missing) or 'its files'}")
@@ -220,7 +227,11 @@ def _files(path: Path) -> list[Path]:
 
 
 def _read(file: Path, recording: _Recording) -> None:
-    """Add the messages of a file. Raises InputError for one of another form."""
+    """Add the messages of a file.
+
+    Raises:
+        InputError: The file has an unknown format.
+    """
     try:
         with file.open("rb") as stream:
             head = stream.read(len(_SQLITE))

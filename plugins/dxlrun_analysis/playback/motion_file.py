@@ -18,24 +18,24 @@ from dxlrun_analysis.playback.recorded_motion import Floats, RecordedMotion
 from dxlrun_analysis.playback.spline_path import TURN_SIZES, SplinePath, fit
 from dxlrun_controllers.laws.tracking import CLOSING_SPEED
 
-LEAD_S = 1.0  # Before the first point: controllers lead their joints there meanwhile, as in the thesis
-_STEP_S = 0.02  # Between two points of a controller that takes single positions
+LEAD_S = 1.0  # Before the first point, during which controllers move their joints there, as in the thesis
+_STEP_S = 0.02  # Between points of a controller that accepts single positions
 
 
 class MotionFile(msgspec.Struct, frozen=True):
-    """What is written."""
+    """Text of a motion file, with the number of points by controller."""
 
     text: str
     points: Mapping[str, int]  # By controller
 
 
 class _Part(msgspec.Struct, frozen=True):
-    """What one controller is to play."""
+    """Share of a motion for one controller."""
 
     controller: str
     joints: tuple[str, ...]
-    trajectory: bool  # It takes points with their velocities; else one position after the other
-    speeds: bool = False  # It takes a speed beside each single position
+    trajectory: bool  # The controller accepts points with velocities; else single positions
+    speeds: bool = False  # The controller accepts a speed with each single position
 
 
 def motion_file(
@@ -48,13 +48,22 @@ def motion_file(
     plans: Sequence[ControllerPlan] | None = None,
     speeds: Mapping[str, float] | None = None,
 ) -> MotionFile:
-    """Return the file for a recorded motion, within `allowed` of it, rad, shape (joints,).
+    """Return the motion file of a recorded motion.
 
-    `origin` is the comment at its beginning.
+    It has points for the controllers that moved the joints in the log, for `controller`, or for the active
+    ones of `plans`.
 
-    Its parts are for the controllers that moved the joints in the log, or for `controller`, which has to take
-    trajectories, or for those among `plans` that are active. `speeds` are the highest of the joints, rad/s or
-    m/s; without them those of the log's robot count. Raises InputError where no controller is known.
+    Args:
+        motion: The recorded motion.
+        allowed: Tolerance of each joint, rad or m; shape (joints,).
+        target: Path of the file, which determines the name of the motion.
+        controller: Controller for all joints; it must accept trajectories.
+        origin: Comment at the beginning of the file.
+        plans: Controllers of the robot; without them, those in the log.
+        speeds: Top speed by joint, rad/s or m/s; without them, those of the log's robot.
+
+    Raises:
+        InputError: A joint has no suitable controller.
     """
     if speeds is None:
         robot = () if motion.plan is None else _logged_loop(motion).joints
@@ -74,7 +83,7 @@ def motion_file(
         points[part.controller] = len(rows)
         lines += [f"  - controller: {part.controller}", "    points:", *rows]
     text = "\n".join(lines) + "\n"
-    parse_motion(text, target)  # what was written is read as every motion file
+    parse_motion(text, target)  # Validate the text like any motion file
     return MotionFile(text, points)
 
 
@@ -84,7 +93,7 @@ def _path_of(part: _Part, motion: RecordedMotion, allowed: Floats) -> SplinePath
 
 
 def _closing_speed(joint: str, unit: JointUnit, speeds: Mapping[str, float]) -> float:
-    """Return the least speed given with a position: a slower servo would not be there within the step."""
+    """Return the least speed to send with a position. A slower servo would not arrive within the step."""
     speed = CLOSING_SPEED * TURN_SIZES[unit]
     return min(speed, speeds.get(joint, speed))
 
@@ -122,8 +131,7 @@ def _targets(
 
 
 def player_of(joint: str, plans: Sequence[ControllerPlan]) -> str | None:
-    """Return the controller that a motion of a joint is for: an active one, of several one that takes
-    trajectories."""
+    """Return the controller for motions of a joint, or None: an active one, preferably for trajectories."""
     part = _part_of(joint, plans)
     return None if part is None else part.controller
 
@@ -138,7 +146,11 @@ def _plans_of(motion: RecordedMotion) -> Sequence[ControllerPlan]:
 
 
 def _logged_loop(motion: RecordedMotion) -> LoopPlan:
-    """Return the loop's plan of a log of dxlrun; raises LogError."""
+    """Return the loop's plan in a log of dxlrun.
+
+    Raises:
+        LogError: The plan cannot be read.
+    """
     try:
         return from_json(motion.plan or b"").loop
     except ValueError as error:
@@ -179,7 +191,7 @@ def _parts(motion: RecordedMotion, plans: Sequence[ControllerPlan] | None) -> li
 
 
 def _part_of(joint: str, plans: Sequence[ControllerPlan]) -> _Part | None:
-    """Return the part of one joint: of its controllers one that takes trajectories, if any does."""
+    """Return the part of one joint, for a controller that accepts trajectories if there is one."""
     offers = load_plugins().controllers
     found = None
     for plan in plans:

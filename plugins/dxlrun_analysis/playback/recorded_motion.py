@@ -1,4 +1,4 @@
-"""Recorded motion: where joints were, or were sent, at times; cut, renamed, with every mistake at once."""
+"""Recorded motion: joint positions or goals over time. Input errors are reported all at once."""
 
 from __future__ import annotations
 
@@ -19,22 +19,22 @@ Floats: TypeAlias = NDArray[np.float64]
 What: TypeAlias = Literal["goals", "states"]
 
 LONGEST_HOLE_S = 1.0
-"""Between two moments of a joint: where nothing is known for longer, there is no motion to play."""
+"""Longest time between two positions of a joint in a motion; a longer hole is an error."""
 MOST_NUMBERS = 8_000_000  # Moments x joints of a motion: 64 MB, 20 joints at 100 Hz for an hour
 
 
 class Series(msgspec.Struct, frozen=True, eq=False):
-    """The positions of one joint."""
+    """Positions of one joint over time."""
 
-    time_s: Floats  # Shape (moments,), s since the recording's beginning
-    position: Floats  # Shape (moments,), rad
-    what: What  # Goals that it was sent, or states that were measured
+    time_s: Floats  # Shape (moments,), s since the start of the recording
+    position: Floats  # Shape (moments,), rad (m for a linear joint)
+    what: What  # Goals that were sent, or measured states
     continued: bool = False
-    """True: between two moments the joint goes from one to the other, however far apart they are."""
-    unit: JointUnit = ROTARY  # Of its positions
+    """True if the joint moves from one position to the next however long that takes."""
+    unit: JointUnit = ROTARY  # Unit of the positions
 
     def ordered(self) -> Series:
-        """Return the finite ones in order of time; of several at one time the last."""
+        """Return the finite positions in order of time; of several at one time, the last."""
         known = np.flatnonzero(np.isfinite(self.position) & np.isfinite(self.time_s))
         order = known[np.argsort(self.time_s[known], kind="stable")]
         time = self.time_s[order]
@@ -43,38 +43,42 @@ class Series(msgspec.Struct, frozen=True, eq=False):
         return replace(self, time_s=time[last], position=self.position[order][last])
 
     def between(self, begin_s: float, end_s: float) -> Series:
-        """Return the part between two times."""
+        """Return the part between two times, both included."""
         inside = slice(*np.searchsorted(self.time_s, (begin_s, np.nextafter(end_s, math.inf))))
         return replace(self, time_s=self.time_s[inside], position=self.position[inside])
 
 
 class RecordedMotion(msgspec.Struct, frozen=True, eq=False):
-    """Joints at common times."""
+    """Positions of several joints at common times."""
 
     path: Path
     joints: tuple[str, ...]
-    what: tuple[What, ...]  # Of each joint
-    time_s: Floats  # Shape (moments,), growing, from 0
-    position: Floats  # Shape (moments, joints), rad
-    begin_s: float  # Of the recording, where the motion begins
-    units: tuple[JointUnit, ...]  # Of the joints, by the plan of the run
-    remarks: tuple[str, ...] = ()  # A sentence for each thing that could not be read
-    plan: bytes | None = None  # The plan of the run, as JSON; None: a foreign recording
+    what: tuple[What, ...]  # By joint
+    time_s: Floats  # Shape (moments,), ascending, from 0
+    position: Floats  # Shape (moments, joints), rad (m for linear joints)
+    begin_s: float  # Start of the motion in the recording
+    units: tuple[JointUnit, ...]  # Units of the joints, from the plan of the run
+    remarks: tuple[str, ...] = ()  # One sentence for each problem of reading
+    plan: bytes | None = None  # Plan of the run, as JSON; None for a foreign recording
 
     @property
     def duration_s(self) -> float:
-        """From the first moment to the last."""
+        """Time from the first moment to the last."""
         return float(self.time_s[-1])
 
 
 class Stretch(msgspec.Struct, frozen=True):
-    """A part of a recording, s since its beginning; None: from there, or to its end."""
+    """Part of a recording, s since its start. None means the start or the end of the recording."""
 
     begin_s: float | None = None
     end_s: float | None = None
 
     def check(self) -> None:
-        """Raise InputError for times that are none."""
+        """Validate the times.
+
+        Raises:
+            InputError: A time is negative or not finite, or the start is not before the end.
+        """
         for option, value in (("--from", self.begin_s), ("--to", self.end_s)):
             if value is not None and not (math.isfinite(value) and value >= 0):
                 raise InputError(f"{option} {value:g}: give seconds since the recording's beginning")
@@ -86,7 +90,14 @@ WHOLE = Stretch()
 
 
 def parse_names(words: Sequence[str]) -> dict[str, str]:
-    """Return `--map RECORDED=JOINT` by recorded name; an empty joint leaves it out. Raises InputError."""
+    """Parse `--map RECORDED=JOINT`.
+
+    Returns:
+        Joint by recorded name; an empty joint omits the recorded one.
+
+    Raises:
+        InputError: All words with a mistake.
+    """
     names: dict[str, str] = {}
     mistakes: list[str] = []
     for word in words:
@@ -102,7 +113,11 @@ def parse_names(words: Sequence[str]) -> dict[str, str]:
 
 
 def chosen(path: Path, series: Mapping[str, Series], only: Sequence[str]) -> dict[str, Series]:
-    """Return the series of some recorded joints; of all without one. Raises InputError for unknown ones."""
+    """Return the series of the recorded joints in `only`, or of all if it is empty.
+
+    Raises:
+        InputError: Unknown joints.
+    """
     wrong = [
         f"{path}: --joint {name}: the recording has no joint {name}; {suggestion(name, tuple(series))}"
         for name in only
@@ -118,7 +133,8 @@ def motion_of(
 ) -> RecordedMotion:
     """Return a motion of series by recorded joint, renamed by `names`.
 
-    Raises InputError with everything that keeps it from being one motion.
+    Raises:
+        InputError: All reasons why the series do not form one motion.
     """
     wrong = [
         f"{path}: --map {name}: the recording has no joint {name}; {suggestion(name, tuple(series))}"

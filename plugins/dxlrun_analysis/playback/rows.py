@@ -1,4 +1,4 @@
-"""Rows: a recorded motion as it is played: positions of all joints, one row a period, within their limits."""
+"""Rows of a recorded motion for playback: positions of all joints per period, within their limits."""
 
 from __future__ import annotations
 
@@ -15,37 +15,37 @@ from dxlrun.tooling.plans import JointPlan
 from dxlrun_analysis.playback.recorded_motion import Floats, RecordedMotion
 from dxlrun_analysis.playback.spline_path import SplinePath, fit, tolerances
 
-LEAST_SPEED, MOST_SPEED = 0.01, 10.0  # Factors on a motion's speed, as of `dxlrun play`
-MOST_NUMBERS = 500_000  # Of all rows: what a sample_player keeps of one table
-LONGEST_PERIOD_S = 0.02  # Between two rows, where there would be too many with one in each cycle
-WINDOW_S = 0.05  # Over which speeds and accelerations are measured
+LEAST_SPEED, MOST_SPEED = 0.01, 10.0  # Factors on a motion's speed, as in `dxlrun play`
+MOST_NUMBERS = 500_000  # Numbers in all rows: the most that a sample_player keeps of one table
+LONGEST_PERIOD_S = 0.02  # Longest time between rows, if one row per cycle would be too many
+WINDOW_S = 0.05  # Interval over which speeds and accelerations are measured
 RAMP_S = 0.3
-"""For which the motion becomes faster at its beginning and slower at its end, wherever it was cut."""
+"""Ramp of the speed at both ends of a motion, wherever it was cut."""
 
 
 class Rows(msgspec.Struct, frozen=True, eq=False):
-    """What is played: a motion at a speed, which grows from 0 at its beginning, and goes back to 0."""
+    """Motion at a given speed, which ramps up from 0 at the start and down to 0 at the end."""
 
     motion: RecordedMotion
     speed: float
     period_s: float
     at_s: Floats  # Shape (rows,)
-    recorded_s: Floats  # The time of the motion in each row
-    positions: Floats  # Shape (rows, joints), rad
+    recorded_s: Floats  # Time in the motion of each row
+    positions: Floats  # Shape (rows, joints), rad (m for linear joints)
 
     @property
     def joints(self) -> tuple[str, ...]:
-        """In the order of columns."""
+        """Joints in the order of the columns."""
         return self.motion.joints
 
     @property
     def duration_s(self) -> float:
-        """How long it takes to be played."""
+        """Duration of the playback."""
         return len(self.positions) * self.period_s
 
     @classmethod
     def of(cls, motion: RecordedMotion, path: SplinePath, speed: float, period_s: float) -> Self:
-        """Return the rows of a motion's path, wherever limits are."""
+        """Return the rows of a motion's path, without regard to limits."""
         duration_s = path.duration_s
         ramp_s = min(RAMP_S, duration_s / speed)
         seconds = duration_s / speed + ramp_s
@@ -67,11 +67,18 @@ def rows_of(
     tolerance: float | None,
     period_s: float,
 ) -> Rows:
-    """Return a motion for a robot with these joints, `speed` times as fast, one row each cycle of `period_s`.
+    """Return the rows of a motion for a robot, one row per cycle of `period_s`.
 
-    It is smoothed within `tolerance`, rad (None: see spline_path); as far it may be beyond a position limit,
-    and is held to it.
-    Raises InputError with every joint that the robot lacks, and all that is beyond its limits.
+    Args:
+        motion: The recorded motion.
+        joints: Plans of the robot's joints, by name.
+        speed: Factor on the speed of the motion.
+        tolerance: Tolerance of smoothing, rad; None: see spline_path. A position may exceed its limit by
+            it and is clamped.
+        period_s: Period of the loop.
+
+    Raises:
+        InputError: Every joint that the robot lacks, and everything beyond the joints' limits.
     """
     if not LEAST_SPEED <= speed <= MOST_SPEED:
         raise InputError(f"--speed {speed:g}: give a factor from {LEAST_SPEED:g} to {MOST_SPEED:g}")
@@ -112,7 +119,7 @@ def _check_joints(motion: RecordedMotion, joints: Mapping[str, JointPlan]) -> No
 
 
 def _all_beyond(plans: Sequence[JointPlan], played: Rows, allowed: Floats) -> list[str]:
-    """Return a sentence for each joint and quantity that is beyond a limit, where it is farthest so."""
+    """Return a sentence for each joint and quantity beyond a limit, at the greatest excess."""
     return [
         f"at {played.motion.begin_s + played.recorded_s[row]:.3f} s {plan.name} {text}"
         for column, plan in enumerate(plans)
@@ -123,10 +130,10 @@ def _all_beyond(plans: Sequence[JointPlan], played: Rows, allowed: Floats) -> li
 def _beyond(
     plan: JointPlan, positions: Floats, period_s: float, tolerance: float
 ) -> Iterator[tuple[int, str]]:
-    """Yield the row and a sentence for what is so far beyond a limit that the joint is off by `tolerance`.
+    """Yield row and sentence for each quantity so far beyond its limit that the joint errs by `tolerance`.
 
-    Speeds and accelerations are those of WINDOW_S: what is shorter moves no joint out of its way. Before and
-    behind the rows the joint is at rest.
+    Speeds and accelerations are averaged over WINDOW_S: shorter peaks do not move a joint off its path. The
+    joint is at rest before and after the rows.
     """
     unit = plan.unit
     if plan.bounded:
@@ -157,7 +164,7 @@ def _beyond(
 def _slow_enough(
     plans: Sequence[JointPlan], played: Rows, path: SplinePath, period_s: float, allowed: Floats
 ) -> float | None:
-    """Return a lower speed at which nothing is beyond a limit, in hundredths; None: none is."""
+    """Return the highest lower speed without a limit exceeded, in steps of 0.01, or None."""
     low, high = 0, math.ceil(played.speed * 100)
     while high - low > 1:
         middle = (low + high) // 2

@@ -36,12 +36,21 @@ def read_motion(
     names: Mapping[str, str] | None = None,
     topic: str | None = None,
 ) -> RecordedMotion:
-    """Return the motion of a log, a foreign MCAP file, or a ROS 2 bag.
+    """Read the motion of a log, a foreign MCAP file, or a ROS 2 bag.
 
-    `what`: the goals that were sent, or the states that were measured. None: of a log of dxlrun the goals of
-    joints that were sent a path of positions, and the states of the others; of foreign recordings the states
-    where there are any. `only`: recorded joints, empty: all. `names`: joints by recorded name, empty to leave
-    one out. `topic`: of a foreign recording with several. Raises InputError and LogError.
+    Args:
+        path: The recording.
+        what: Goals that were sent, or measured states. None selects, for a log of dxlrun, the goals of
+            joints that were sent a path of positions, and the states of all others; for a foreign recording,
+            states if it has any.
+        stretch: Part of the recording.
+        only: Recorded joints; empty for all.
+        names: Joint by recorded name; an empty joint omits the recorded one.
+        topic: Topic of a foreign recording with several.
+
+    Raises:
+        InputError: The options do not select a motion.
+        LogError: The recording cannot be read.
     """
     stretch.check()
     if not path.exists():
@@ -62,7 +71,7 @@ def read_motion(
 def _own_series(
     path: Path, what: What | None, stretch: Stretch
 ) -> tuple[dict[str, Series], tuple[str, ...], bytes | None]:
-    """Return the joints of a log of dxlrun by the times of its cycles, its damage, and its plan."""
+    """Return the joints of a log of dxlrun over the times of its cycles, its damage, and its plan."""
     joints: tuple[str, ...] = ()
     columns: dict[str, list[NDArray[np.generic]]] = {field: [] for field in _FIELDS}
     reader = open_log(path)
@@ -78,7 +87,7 @@ def _own_series(
     inside = (time_s >= begin) & (time_s <= end)
     goals: Floats = cycles["goal_position"]
     measured: Floats = np.where(cycles["valid"], cycles["position"], np.nan)
-    # a position with a speed beside it is a destination, and not where the joint is to be then
+    # A position with a speed is a destination, not the position for that cycle.
     led = np.isfinite(goals) & ~np.isfinite(cycles["command_velocity"])
     plan = plan_of(reader.about)
     found: dict[str, Series] = {}

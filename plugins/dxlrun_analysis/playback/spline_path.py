@@ -1,10 +1,10 @@
-"""Path: a recorded motion as few knots and cubic pieces between them, within a tolerance.
+"""Spline path: a recorded motion as a few knots with cubic pieces between them, within a tolerance.
 
-Noise and steps of encoders below the tolerance disappear, so that speeds and accelerations are the motion's.
-Knots are added where the path is farthest from the recording, until it is nowhere farther than the
-tolerance. Their velocities are those of a parabola through three knots, held to what keeps a piece between
-its ends (F. N. Fritsch, R. E. Carlson, "Monotone Piecewise Cubic Interpolation", SIAM J. Numer. Anal. 17,
-1980), give or take half the tolerance.
+Noise and quantization steps below the tolerance disappear, so that speeds and accelerations are those of the
+motion. Knots are added where the path is farthest from the recording, until it is within the tolerance
+everywhere. The velocities at the knots come from a parabola through three knots. They are limited to values
+that keep a piece between its ends (F. N. Fritsch, R. E. Carlson, "Monotone Piecewise Cubic Interpolation",
+SIAM J. Numer. Anal. 17, 1980), with half the tolerance as margin.
 """
 
 from __future__ import annotations
@@ -21,24 +21,24 @@ from dxlrun_analysis.playback.recorded_motion import Floats, RecordedMotion
 
 GOAL_TOLERANCE = math.radians(0.1)
 TURN_SIZES: Mapping[JointUnit, float] = {ROTARY: 1.0, LINEAR: 0.01}
-"""Movement of a joint, rad or m, that counts as much as 1 rad: 10 mm, as of a pinion with this radius. [i]"""
+"""Movement of a joint, rad or m, equivalent to 1 rad: 10 mm, as of a pinion with this radius. [i]"""
 STATE_TOLERANCE = math.radians(0.5)
 """More than half a unit of the coarsest encoder, an AX-12A's with 0.29 deg."""
 _OVERSHOOT = 27 / 8
-"""A cubic piece that begins at slope v, and is flat otherwise, leaves its ends by 4/27 of v times its length;
-this slope, times the tolerance, by half of that."""
+"""A cubic piece of length L with slope v at one end and otherwise flat overshoots by 4/27 v L. With v = 27/8
+tolerance / L this is half the tolerance."""
 
 
 class SplinePath(msgspec.Struct, frozen=True, eq=False):
-    """A motion by knots; between them it is cubic."""
+    """Motion as knots with cubic pieces between them."""
 
-    time_s: Floats  # Shape (knots,), growing, from 0
+    time_s: Floats  # Shape (knots,), ascending, from 0
     position: Floats  # Shape (knots, joints), rad
     velocity: Floats  # Shape (knots, joints), rad/s
 
     @property
     def duration_s(self) -> float:
-        """From the first knot to the last."""
+        """Time from the first knot to the last."""
         return float(self.time_s[-1])
 
     def at(self, time_s: Floats) -> Floats:
@@ -56,9 +56,9 @@ class SplinePath(msgspec.Struct, frozen=True, eq=False):
 
 
 def tolerances(motion: RecordedMotion, given: float | None) -> Floats:
-    """Return the tolerance of each joint, rad: the given one, or what suits goals and measured states.
+    """Return the tolerance of each joint: the given one, or the default for goals and measured states.
 
-    That of a linear joint is in m, as much as it moves in such a turn (`TURN_SIZES`).
+    The tolerance of a linear joint is in m: its movement for that angle (`TURN_SIZES`).
     """
     usual = [GOAL_TOLERANCE if what == "goals" else STATE_TOLERANCE for what in motion.what]
     found = np.array(usual) if given is None else np.full(len(motion.what), given)
@@ -66,7 +66,7 @@ def tolerances(motion: RecordedMotion, given: float | None) -> Floats:
 
 
 def fit(motion: RecordedMotion, tolerance: Floats) -> SplinePath:
-    """Return a path nowhere farther than `tolerance`, rad, shape (joints,), from a recorded motion."""
+    """Fit a path to a recorded motion that stays within `tolerance`, rad or m, shape (joints,)."""
     times, positions = motion.time_s, motion.position
     chosen = np.zeros(len(times), dtype=np.bool_)
     chosen[[0, -1]] = True
@@ -77,7 +77,7 @@ def fit(motion: RecordedMotion, tolerance: Floats) -> SplinePath:
         off[knots] = 0.0
         if off.max() <= 1.0:
             return path
-        # the worst moment of each piece that is too far off
+        # Add the worst moment of each piece that exceeds the tolerance.
         piece = np.clip(np.searchsorted(knots, np.arange(len(times)), side="right") - 1, 0, len(knots) - 2)
         worst = np.maximum.reduceat(off, knots[:-1])
         chosen[(off == worst[piece]) & (off > 1.0)] = True
@@ -93,7 +93,7 @@ def _velocities(times: Floats, positions: Floats, knots: NDArray[np.intp], toler
     steepest = np.where(same, 3 * np.minimum(np.abs(slope[:-1]), np.abs(slope[1:])), 0.0)
     steepest += _OVERSHOOT * tolerance / np.maximum(before, after)
     found[1:-1] = np.clip(inner, -steepest, steepest)
-    # at both ends as if the path came from, and went on to, without acceleration
+    # Natural end conditions: no acceleration at either end.
     for end, near in ((0, 1), (-1, -2)):
         most = 3 * np.abs(slope[end]) + _OVERSHOOT * tolerance / width[end]
         found[end] = np.clip((3 * slope[end] - found[near]) / 2, -most, most) if len(knots) > 2 else slope[0]

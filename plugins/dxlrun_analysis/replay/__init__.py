@@ -1,6 +1,6 @@
 """Replay: the controllers of a log, run again on its inputs, and a comparison of their commands.
 
-Playing a recorded motion on a robot is not a replay and belongs in `playback`.
+Playback of a recorded motion on a robot is not a replay; it belongs in `playback`.
 """
 
 from dxlrun_analysis.replay.changes import Setting

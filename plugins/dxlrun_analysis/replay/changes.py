@@ -1,4 +1,4 @@
-"""Changes: what a replay does otherwise than the run, on purpose: parameters, arguments of the robot file."""
+"""Changes: intended differences between a replay and its run: parameters, arguments of the robot file."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ from dxlrun_analysis.replay.recorded import RecordedPlan
 
 
 class Setting(msgspec.Struct, frozen=True):
-    """One parameter with another value: `--set left_arm.tolerances.path=0.1`."""
+    """New value of one parameter: `--set left_arm.tolerances.path=0.1`."""
 
     controller: str
     parameter: tuple[str, ...]
@@ -26,7 +26,11 @@ class Setting(msgspec.Struct, frozen=True):
 
     @classmethod
     def parse(cls, text: str) -> Setting:
-        """Read `CONTROLLER.PARAMETER=VALUE`; the value is written as in the robot file. Raises InputError."""
+        """Parse `CONTROLLER.PARAMETER=VALUE`; the value has the syntax of the robot file.
+
+        Raises:
+            InputError: The text has another form, or its value is not YAML.
+        """
         place, sign, value = text.partition("=")
         controller, *parameter = place.strip().split(".")
         if not sign or not parameter or not all((controller, *parameter)):
@@ -41,7 +45,11 @@ class Setting(msgspec.Struct, frozen=True):
 
 
 def with_settings(loop: LoopPlan, settings: Sequence[Setting], plugins: PlugIns) -> LoopPlan:
-    """Return the plan with these parameters. Raises InputError for what is not there or does not fit."""
+    """Return the plan with changed parameters.
+
+    Raises:
+        InputError: A controller does not exist, or a value does not fit.
+    """
     names = tuple(controller.name for controller in loop.controllers)
     joints = {joint.name: joint for joint in loop.joints}
     controllers = {controller.name: controller for controller in loop.controllers}
@@ -58,9 +66,15 @@ def with_settings(loop: LoopPlan, settings: Sequence[Setting], plugins: PlugIns)
 
 
 def with_changed_code(loop: LoopPlan, then: LoopPlan, plugins: PlugIns) -> LoopPlan:
-    """Return the plan with what controllers of changed files claim now; raises InputError for a misfit.
+    """Return the plan with the current claims of controllers from changed files.
 
-    `then`: the loop of the run.
+    Args:
+        loop: Plan with the current code.
+        then: Plan of the run.
+        plugins: Installed plug-ins.
+
+    Raises:
+        InputError: A changed controller does not fit the plan.
     """
     joints = {joint.name: joint for joint in loop.joints}
     return replace(
@@ -86,10 +100,11 @@ def _changed(plan: ControllerPlan, setting: Setting) -> ControllerPlan:
 
 
 def with_arguments(plan: RecordedPlan, loop: LoopPlan, arguments: Mapping[str, str]) -> LoopPlan:
-    """Return the loop of the log's robot file with other arguments; its cycles and commands stay.
+    """Return the loop of the log's robot file with changed arguments. Its cycles and commands stay.
 
-    Raises InputError when the file does not compile with them, or gives a loop for which the recorded inputs
-    are none.
+    Raises:
+        InputError: The file does not compile with the arguments, or the recorded inputs do not fit the
+            resulting loop.
     """
     if not arguments:
         return loop

@@ -1,6 +1,6 @@
 """Code: the single files that a replay executes.
 
-A log comes from anybody, so the Python text in it is executed only where the user says so.
+A log can come from an untrusted source, so the Python text in it is executed only on request.
 """
 
 from __future__ import annotations
@@ -15,13 +15,16 @@ from dxlrun.tooling.robots import published_by, read_file
 from dxlrun_analysis.replay.recorded import RecordedPlan
 
 CodeChoice = Literal["current", "log"]
-"""`current`: the files beside the robot file as they are now. `log`: the texts in the log."""
+"""`current`: the files next to the robot file as they are now. `log`: the texts in the log."""
 
 
 def with_code(plan: RecordedPlan, choice: CodeChoice | None) -> tuple[RecordedPlan, tuple[str, ...]]:
-    """Return the plan with the code that the replay executes, and remarks on what has changed since the run.
+    """Return the plan with the code that the replay executes, and remarks on changes since the run.
 
-    Without a choice the files on the disk must be those of the log. Raises InputError where they are not.
+    Without a choice, the files on disk must equal those in the log.
+
+    Raises:
+        InputError: A file differs from the log and no choice was made, or a file cannot be read.
     """
     code = {name: text for name, text in plan.included.items() if name.endswith(".py")}
     if not code:
@@ -44,9 +47,9 @@ def with_code(plan: RecordedPlan, choice: CodeChoice | None) -> tuple[RecordedPl
 
 
 def _text(folder: Path, name: str) -> str | None:
-    """Return the text of a file beside the robot file; None: there is none."""
+    """Return the text of a file next to the robot file, or None if it cannot be read."""
     if Path(name).name != name:
-        return None  # no compiler wrote this name
+        return None  # Compilers write only plain file names, so a path is an attempt to read other files
     try:
         return read_file(folder / name).decode("utf-8")
     except (OSError, ValueError):

@@ -1,4 +1,4 @@
-"""Comparison: what a replayed loop commands, cycle by cycle, against the log; down to the bits."""
+"""Comparison of the commands of a replayed loop with the log, cycle by cycle and bit by bit."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ from dxlwire import COMMAND_INTERFACES
 _COMMANDS = tuple(f"command_{interface}" for interface in COMMAND_INTERFACES)
 _GOALS = tuple(f"goal_{interface}" for interface in COMMAND_INTERFACES)
 _COMPARED = (*CycleRecord.COMPUTED, *_COMMANDS, *_GOALS)
-"""In the order in which they are computed: what differs first is the cause of the rest."""
+"""Compared fields in order of computation. The first difference causes the later ones."""
 _WHAT = {
     **{f"command_{interface}": f"command of the {interface}" for interface in COMMAND_INTERFACES},
     **{
@@ -30,7 +30,7 @@ _MASK = 0xFFFFFFFFFFFFFFFF
 
 
 class JointDifferences(msgspec.Struct, frozen=True):
-    """In how many cycles one joint's values differ."""
+    """Number of cycles in which the values of one joint differ."""
 
     joint: str
     commands: int
@@ -39,15 +39,22 @@ class JointDifferences(msgspec.Struct, frozen=True):
 
 
 class Comparison:
-    """Compares each cycle of a replay with the recorded one; NaN and zero by their bits too."""
+    """Comparison of a replay with the recorded cycles. NaN and zero are compared by their bits."""
 
     def __init__(
         self, plan: LoopPlan, inputs: RecordedInputs, controllers: Callable[[], Sequence[ControllerPlan]]
     ) -> None:
-        """`controllers` returns the plans of those that run, by their bits in the masks."""
+        """Create a comparison.
+
+        Args:
+            plan: Plan of the replayed loop.
+            inputs: Recorded inputs and results.
+            controllers: Function that returns the plans of the running controllers, in order of their
+                bits in the masks.
+        """
         self.first: ReplayDifference | None = None
         self.compared = 0  # Cycles
-        self.different = 0  # Cycles in which anything differs
+        self.different = 0  # Cycles in which any value differs
         self._plan = plan
         self._inputs = inputs
         self._controllers = controllers
@@ -58,7 +65,7 @@ class Comparison:
         )
 
     def joints(self) -> tuple[JointDifferences, ...]:
-        """Return the joints of which anything differs, in the order of rows."""
+        """Return the joints with differences, in order of rows."""
         found = (
             JointDifferences(joint.name, int(command), int(goal), int(reference))
             for joint, command, goal, reference in zip(
@@ -72,7 +79,11 @@ class Comparison:
         return tuple(one for one in found if one.commands or one.goals or one.references)
 
     def compare(self, record: CycleRecord, row: np.void, index: int) -> None:
-        """Compare one finished cycle. Raises LogError when its inputs are not the recorded ones."""
+        """Compare one finished cycle.
+
+        Raises:
+            LogError: The inputs of the cycle are not the recorded ones.
+        """
         if record.cycle == row["cycle"] and record.scheduled_ns != row["scheduled_ns"]:
             raise LogError(
                 f"cycle {record.cycle} was due {self._since_start(int(row['scheduled_ns']))} in the run and "
@@ -119,13 +130,18 @@ class Comparison:
         bit = (changed & -changed).bit_length() - 1
         states = [("active" if mask >> bit & 1 else "not active") for mask in (recorded, active)]
         plans = self._controllers()
-        # one that the replay could not load has no name here
+        # A controller that the replay could not load has no name here.
         name = plans[bit].name if bit < len(plans) else f"number {bit}, loaded in the run"
         return self._inputs.difference(index, "active", None, name, *states)
 
     def _named(self, field: str, place: int, active: int) -> tuple[str, str | None, str | None]:
-        """Return what a place in a field of a cycle is called, its joint, and the controller that commands
-        it; `active`: those that were, in the run or in the replay."""
+        """Return the name of an element of a cycle's field, its joint, and the controller that commands it.
+
+        Args:
+            field: Name of the field.
+            place: Index in the field.
+            active: Mask of the controllers that were active in the run or in the replay.
+        """
         layout, plans = self._plan.layout, self._controllers()
         actives = [one for bit, one in enumerate(plans) if active >> bit & 1]
         name = layout.names_of(field)[place] if field in CycleRecord.COMPUTED else ""
@@ -155,6 +171,6 @@ def _values(record: CycleRecord) -> tuple[Floats, ...]:
 
 
 def shown_bits(bits: int) -> str:
-    """Return a float64 as text from which its bits can be read again; a bare `nan` would hide its payload."""
+    """Return a float64 as text that preserves its bits; a bare `nan` would hide its payload."""
     value = float(np.uint64(bits).view(np.float64))
     return repr(value) if np.isfinite(value) else f"{value} (bits {bits:#018x})"

@@ -1,7 +1,7 @@
-"""Prepared: commands made ready again from their requests in the log, against the arrays that were handed on.
+"""Prepared commands: arrays that `prepare` makes again from logged requests, compared with those of the run.
 
-A controller's `prepare` ran outside of the loop: for a planned command when the robot was compiled, for one
-of a client in the gateway.
+A controller's `prepare` ran outside of the loop: at compilation for a planned command, in the gateway for the
+command of a client.
 """
 
 from __future__ import annotations
@@ -31,9 +31,9 @@ _LONGEST_REASON = 200
 
 
 class PreparedComparison:
-    """Prepares commands again and compares each array, bit for bit.
+    """Prepares commands again and compares each array bit by bit.
 
-    The replay hands on its own arrays. A command whose request is not in the log is handed on as it was.
+    The replay executes its own arrays. A command without a request in the log is executed as recorded.
     """
 
     def __init__(self, inputs: RecordedInputs) -> None:
@@ -43,8 +43,8 @@ class PreparedComparison:
         self.different = 0
         self.without_request = 0  # Commands whose request is not in the log
         self._parameters: dict[str, list[ParametersModel]] = {}
-        """All that a controller had until now: one of a client may have been prepared shortly before others
-        became valid."""
+        """All parameters of a controller so far. A client's command may have been prepared shortly before a
+        change of parameters."""
 
     def of_plan(self, plan: LoopPlan, plugins: PlugIns) -> LoopPlan:
         """Return the plan with its commands prepared again."""
@@ -53,7 +53,7 @@ class PreparedComparison:
         for one in plan.controllers:
             offer = plugins.controllers.get(one.type)
             if offer is None:
-                continue  # the manager reports it, and parameters that do not fit
+                continue  # The manager reports a missing type, and parameters that do not fit
             with suppress(Exception):
                 model = offer.controller.Parameters
                 known[one.name] = offer.controller, model.model_validate_json(one.parameters)
@@ -68,7 +68,12 @@ class PreparedComparison:
         return replace(plan, commands=(*commands, *plan.commands[len(commands) :]))
 
     def of_client(self, taken: TakenCommand, controller_of: Callable[[str], Controller[Any] | None]) -> bytes:
-        """Return the data of a command prepared again; `controller_of` returns one as it is now."""
+        """Return the data of a client's command, prepared again.
+
+        Args:
+            taken: The command as the loop executed it.
+            controller_of: Function that returns a controller in its current state.
+        """
         if not taken.for_loop:
             return self._one(taken, taken.controller, taken.kind, taken.request, taken.data, controller_of)
         if taken.kind != "play":
@@ -78,7 +83,7 @@ class PreparedComparison:
             parts = msgspec.json.decode(head, type=Play).parts
             requests = [json.dumps(one).encode() for one in json.loads(taken.request or b"[]")]
         except UNREADABLE:
-            return taken.data  # the loop refuses it, as it did
+            return taken.data  # The loop refuses the command, as in the run
         sizes = [size for part in parts for size in part.sizes]
         if 8 * sum(sizes) != len(numbers) or min(sizes, default=0) < 0:
             return taken.data
@@ -108,7 +113,7 @@ class PreparedComparison:
     ) -> bytes:
         controller = controller_of(name)
         if controller is None or kind not in controller.Commands:
-            return data  # it is refused, as it was
+            return data  # The command is refused, as in the run
         seen = self._parameters.setdefault(name, [])
         if not seen or seen[-1] is not controller.parameters:
             seen.append(controller.parameters)
@@ -124,7 +129,7 @@ class PreparedComparison:
         recorded: bytes,
         cycle: int,
     ) -> bytes:
-        """Return what `prepare` makes of a request now, and compare it."""
+        """Prepare a request again and compare the result; return the data for the replay."""
         if not request:
             self.without_request += 1
             return recorded
@@ -138,7 +143,7 @@ class PreparedComparison:
         self.different += 1
         if (
             self.first is None or cycle < self.first.cycle
-        ):  # those of the plan were prepared before all others
+        ):  # The commands of the plan were prepared before all others
             numbers = self._inputs.log.cycles["cycle"]
             index = min(int(np.searchsorted(numbers, cycle)), len(numbers) - 1)
             what, then, now = _where(kind, recorded, made)
@@ -149,19 +154,20 @@ class PreparedComparison:
 def _prepared(
     cls: type[Controller[Any]], parameters: ParametersModel, kind: str, request: bytes
 ) -> bytes | str:
-    """Return the array of a request, little-endian, or why there is none."""
+    """Return the array of a request, little-endian, or the reason of a failure."""
     try:
         command = cls.Commands[kind].model_validate_json(request)
         return np.ascontiguousarray(cls.prepare(kind, command, parameters), dtype="<f8").tobytes()
     except ValidationError as error:
         reason = str(error.errors(include_url=False)[0]["msg"])
-    except (Exception, SystemExit) as error:  # foreign code: one sentence instead of its traceback
+    # Foreign code can raise anything; one sentence replaces its traceback.
+    except (Exception, SystemExit) as error:
         reason = f"{type(error).__name__}: {error}"
     return f"no array ({' '.join(reason.split())[:_LONGEST_REASON]})"
 
 
 def _where(kind: str, recorded: bytes, replayed: bytes | str) -> tuple[str, str, str]:
-    """Return which number differs first, and both."""
+    """Return the place of the first difference, and both values."""
     what = f"array that prepare made of {kind}"
     then = np.frombuffer(recorded[: len(recorded) // 8 * 8], "<u8")
     if isinstance(replayed, str):

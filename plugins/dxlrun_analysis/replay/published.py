@@ -1,4 +1,4 @@
-"""Published: the messages of a replay against those in the log, byte by byte."""
+"""Published messages of a replay, compared with those in the log byte by byte."""
 
 from __future__ import annotations
 
@@ -18,27 +18,28 @@ from dxlrun_analysis.replay.recorded import RecordedInputs, ReplayDifference
 
 RING = "loop/messages"
 _NOT_COMPARED = frozenset((LogTopic.MACHINE, "/snapshots"))
-"""Topics that no replay publishes; /snapshots: of logs from before this version."""
+"""Topics that a replay does not publish. Only logs of earlier versions have /snapshots."""
 _LONGEST_SHOWN = 120
 
 
 @dataclass(slots=True)
 class _Pending:
-    """A topic of the log, and which of its messages the replay comes to next."""
+    """Topic of the log, with its messages that are not compared yet."""
 
     type: MessageType
     waiting: deque[tuple[int, bytes]] = field(default_factory=deque)
-    """Times and messages that were read and not compared."""
+    """Times and messages that were read but not compared."""
 
 
 class MessageComparison(MessageSink):
-    """Takes what a replayed loop publishes, and compares it with the log as it comes.
+    """Receiver of the messages of a replayed loop, which compares each with the log.
 
-    Topics that the log does not have are not compared: it is from a dxlrun that did not publish them.
+    Topics that the log does not have are not compared: they are from an earlier dxlrun that did not publish
+    them.
     """
 
     def __init__(self, inputs: RecordedInputs) -> None:
-        """The messages of the log come by `feed`."""
+        """Create a comparison; `feed` adds the messages of the log."""
         self.first: ReplayDifference | None = None
         self._first_ns = 0
         self.compared = 0
@@ -50,19 +51,20 @@ class MessageComparison(MessageSink):
         self._whole = inputs.end == len(inputs.log.cycles) and any(
             event.code == EventCode.LOOP_STOPPED for event in inputs.log.events
         )
-        """The run ended, in order, with the last cycle that is compared."""
+        """The run stopped normally with the last compared cycle."""
         self.lost = _lost(inputs.log)
-        """Messages that the recorder did not get: those of the replay have none to be compared with."""
+        """Number of messages that the recorder lost. Without them, a message of the replay can lack its
+        counterpart."""
 
     @property
     def remarks(self) -> tuple[str, ...]:
-        """What a person should know about the comparison."""
+        """Remarks on the comparison for the user."""
         if not self.lost:
             return ()
         return (f"the log misses {counted(self.lost, 'message', 'messages')} of topics",)
 
     def feed(self, part: Log) -> None:
-        """Take the messages of a slice of the log."""
+        """Add the messages of a slice of the log."""
         for name, logged in part.topics.items():
             if name in _NOT_COMPARED:
                 continue
@@ -70,7 +72,7 @@ class MessageComparison(MessageSink):
             pending.waiting += zip(logged.t_ns.tolist(), logged.data, strict=True)
 
     def announce(self, topic: PublishedTopic) -> int:
-        """Take a topic; return its number."""
+        """Register a topic; return its number."""
         self._announced.append(topic)
         return len(self._announced) - 1
 
@@ -92,12 +94,12 @@ class MessageComparison(MessageSink):
             self._differs(t_ns, name, "", "no message", "a message")
 
     def finish(self, reached_ns: int) -> None:
-        """Look for messages that the replay did not publish, up to the cycle that it reached."""
+        """Report messages up to the last replayed cycle that the replay did not publish."""
         for name, pending in self._topics.items():
             self._pass(name, pending, min(reached_ns, self._until_ns) + 1)
 
     def _pass(self, name: str, pending: _Pending, t_ns: int) -> None:
-        """Go past recorded messages from before this time: the replay has none for them."""
+        """Report recorded messages from before a time: the replay did not publish them."""
         while pending.waiting and pending.waiting[0][0] < t_ns:
             at_ns, _ = pending.waiting.popleft()
             self.compared += 1
@@ -145,7 +147,7 @@ def _where(
 
 
 def _leaves(value: object, place: str) -> dict[str, str]:
-    """Return all values that a message is made of, as text, by their places: `error[1]`."""
+    """Return all leaf values of a message as text, by path: `error[1]`."""
     if isinstance(value, Mapping):
         parts = [(f"{place}.{name}" if place else str(name), one) for name, one in value.items()]
     elif isinstance(value, np.ndarray | list):

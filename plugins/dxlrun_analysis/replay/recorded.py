@@ -1,4 +1,4 @@
-"""Recorded: what a log gives a replay, judged: the plan, each cycle's inputs, and where they end."""
+"""Recorded inputs of a replay, validated: the plan, each cycle's inputs, and the end of usable cycles."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ from dxlrun.tooling.runs import RunInputs, kept_states_of
 from dxlrun_analysis.conduct.client_commands import client_commands, policy_begun, unlogged_commands
 
 PLAN = "plan.json"
-_LIBRARIES = ("dxlrun", "numpy")  # A different version of these may change a command
+_LIBRARIES = ("dxlrun", "numpy")  # Another version of these libraries can change a command
 
 
 class _Begun(msgspec.Struct):
@@ -30,7 +30,7 @@ class _Begun(msgspec.Struct):
 
 
 class RecordedPlan(msgspec.Struct, frozen=True):
-    """The part of the plan in a log that a replay needs; how the buses were driven is none of it."""
+    """Fields of a log's plan that a replay needs, without those about the buses."""
 
     robot: str
     loop: LoopPlan
@@ -41,36 +41,40 @@ class RecordedPlan(msgspec.Struct, frozen=True):
 
 
 class ReplayDifference(msgspec.Struct, frozen=True):
-    """One value that is not the same."""
+    """One value that differs between run and replay."""
 
     cycle: int
-    time_s: float  # Of the cycle's wake-up, since the loop's first deadline
+    time_s: float  # Time of the cycle's wake-up, since the loop's first deadline
     what: str
     """`command of the position`, `goal of the velocity ...`, `reference arm_pid/j0/position`, `active`."""
     joint: str | None
-    """None: a controller was active in one of the two and not in the other, or a message differs."""
-    controller: str | None  # The one that claims the joint, or commands the reference; None when none does
-    recorded: str  # The shortest number with these bits, and the bits where they are not a finite number's
+    """None if a controller was active in only one of run and replay, or if a message differs."""
+    controller: str | None  # Controller that claims the joint or commands the reference; None without one
+    recorded: str  # Shortest decimal number with these bits; if it is not finite, also the bits
     replayed: str
 
 
 class RecordedInputs(RunInputs, frozen=True, eq=False):
-    """The inputs of one run, and what a replay says about them."""
+    """Inputs of one run, with the number of cycles that a replay can compare."""
 
     plan: RecordedPlan
-    stopped: str  # Why some cycles cannot be compared; empty when all can
+    stopped: str  # Reason why some cycles cannot be compared; empty if all can
 
     def difference(  # noqa: PLR0917  what a difference is made of
         self, index: int, what: str, joint: str | None, controller: str | None, recorded: str, replayed: str
     ) -> ReplayDifference:
-        """Return a difference in a cycle, by its index; -1: before the first one."""
+        """Return a difference in a cycle, by the cycle's index; -1: before the first cycle."""
         cycle = self.activation if index < 0 else self.log.cycles[index]
         time_s = (int(cycle["woken_ns"]) - self.start_ns) * 1e-9
         return ReplayDifference(int(cycle["cycle"]), time_s, what, joint, controller, recorded, replayed)
 
 
 def recorded(log: Log) -> RecordedInputs:
-    """Return the inputs that a log holds, as `overview` returns it. Raises LogError when it has none."""
+    """Return the inputs in a log that `overview` has read.
+
+    Raises:
+        LogError: The log has no usable inputs.
+    """
     plan = _plan(log)
     activation = _beginning(log)
     start_ns = int(activation["scheduled_ns"])
@@ -97,8 +101,10 @@ def recorded(log: Log) -> RecordedInputs:
 
 
 def _beginning(log: Log) -> np.void:
-    """Return states and goals when the controllers were activated. Raises LogError for a log that begins
-    later: what its controllers knew is not in it.
+    """Return states and goals at the activation of the controllers.
+
+    Raises:
+        LogError: The log begins later, so the state of its controllers is unknown.
     """
     path, cycles = log.path, log.cycles
     if not len(cycles):
@@ -117,7 +123,7 @@ def _beginning(log: Log) -> np.void:
 
 
 def version_remarks(inputs: RecordedInputs, plugins: PlugIns) -> tuple[str, ...]:
-    """Return a sentence for each part that has another version than in the recorded run."""
+    """Return a sentence for each component with another version than in the recorded run."""
     then = inputs.log.metadata.get("versions", {})
     sentences = []
     for name in _LIBRARIES:
@@ -135,7 +141,7 @@ def version_remarks(inputs: RecordedInputs, plugins: PlugIns) -> tuple[str, ...]
 
 
 def code_remarks(inputs: RecordedInputs) -> tuple[str, ...]:
-    """Return a sentence for each plug-in of these controllers whose files have changed, and dxlrun itself."""
+    """Return a sentence for dxlrun, and each plug-in of these controllers, if its files have changed."""
     publishers = [plan.distribution for plan in inputs.plan.loop.controllers]
     return changed_code(inputs.log.metadata.get(IDENTITY_NAME, {}), publishers)
 
@@ -172,7 +178,7 @@ def _plan(log: Log) -> RecordedPlan:
 
 
 def _check_controllers(log: Log, loop: LoopPlan) -> None:
-    """Refuse controllers that no compiler has made: with an unknown joint, or a rate divider below 1."""
+    """Refuse controllers that a compiler cannot produce: with an unknown joint, or a rate divider below 1."""
     for controller in loop.controllers:
         unknown = set(controller.joints) - set(log.joints)
         if unknown or controller.every < 1:
@@ -188,10 +194,10 @@ def _version(log: Log) -> str:
 
 
 def _check_times(log: Log, start_ns: int, period_ns: int) -> None:
-    """Refuse times that no loop can have had; a replay would follow them without an end.
+    """Refuse times that contradict a periodic loop; a replay would follow them without an end.
 
-    The time between two deadlines is as many periods as their numbers differ by; another period begins only
-    in a cycle that took a change of the rate, and none is known where cycles are lost.
+    The time between two deadlines is the difference of their numbers times the period. The period changes
+    only in a cycle that executed a change of the rate. Across missing cycles it is unknown.
     """
     cycles = log.cycles
     number, due, woken = cycles["cycle"], cycles["scheduled_ns"], cycles["woken_ns"]
@@ -212,12 +218,13 @@ def _check_times(log: Log, start_ns: int, period_ns: int) -> None:
 
 
 def _check_sequence(log: Log, start_ns: int, period_ns: int) -> None:
-    """Refuse times that no sequential schedule can have had: one period after the cycle before began."""
+    """Refuse times that contradict a sequential schedule: a deadline is a period after the preceding
+    wake-up."""
     cycles = log.cycles
     number, due, woken = cycles["cycle"], cycles["scheduled_ns"], cycles["woken_ns"]
     before = np.roll(woken, 1)
     before[0] = start_ns - period_ns
-    lost = np.diff(number, prepend=-1) != 1  # when the lost ones began is not known
+    lost = np.diff(number, prepend=-1) != 1  # The begin of a lost cycle is unknown
     _refuse_wrong(log, (woken < due) | (cycles["read_ns"] < woken) | (due != before + period_ns) & ~lost)
 
 
@@ -228,7 +235,7 @@ def _refuse_wrong(log: Log, wrong: NDArray[np.bool_]) -> None:
 
 
 def _check_commands(log: Log) -> None:
-    """Refuse a command whose time is not that of the cycle that took it."""
+    """Refuse a command whose time is not that of the cycle that executed it."""
     policy = policy_begun(log)
     for command in log.commands:
         at = _index_of(log, command.cycle)
@@ -240,16 +247,16 @@ def _check_commands(log: Log) -> None:
 
 
 def _index_of(log: Log, cycle: int) -> int | None:
-    """Return the index of a cycle by its number; None: the log does not have it."""
+    """Return the index of a cycle by its number, or None if the log does not have it."""
     number = log.cycles["cycle"]
     at = int(np.searchsorted(number, cycle))
     return at if at < len(number) and int(number[at]) == cycle else None
 
 
 def _until_hole(log: Log) -> tuple[int, int, str]:
-    """Return how many cycles can be compared, the first that is a policy's, and why not more.
+    """Return the number of usable cycles, the first cycle of a policy, and the reason for the end.
 
-    Behind a missing cycle or command it is not known what the controllers know.
+    After a missing cycle or command, the state of the controllers is unknown.
     """
     end, ends, stopped = _until_policy(log, len(log.cycles))
     hole, why = _first_hole(log)
@@ -261,7 +268,10 @@ def _until_hole(log: Log) -> tuple[int, int, str]:
 
 
 def _first_hole(log: Log) -> tuple[int, str]:
-    """Return before which cycle something is missing first, and what; behind the last cycle: nothing is."""
+    """Return the index of the first cycle with missing data before it, and the reason.
+
+    Without missing data, the index is the number of cycles.
+    """
     cycles = log.cycles
     number = cycles["cycle"]
     gaps = [event.text for event in log.events if event.code == EventCode.RECORDER_GAP]
@@ -284,9 +294,9 @@ def _first_hole(log: Log) -> tuple[int, str]:
 
 
 def _until_policy(log: Log, usable: int) -> tuple[int, int, str]:
-    """Return how many cycles can be compared, how many of them are the controllers', and why not more.
+    """Return the number of usable cycles, the number without a policy, and the reason for the end.
 
-    A cycle in which a bus failed is not in the log, but the time of the one after it counts from it.
+    A cycle in which a bus failed is not in the log, although the time of the next cycle depends on it.
     """
     cycles, policy = log.cycles, policy_begun(log)
     if policy is None:
@@ -306,7 +316,7 @@ def _until_policy(log: Log, usable: int) -> tuple[int, int, str]:
 
 
 def _loop(log: Log, plan: LoopPlan) -> LoopPlan:
-    """Return the loop as the replay runs it: what time and signals decided in the run is in the log."""
+    """Return the loop of the replay. Time and signals do not end it, because their effects are in the log."""
     taken = {command.planned for command in log.commands if command.planned >= 0}
     if beyond := sorted(number for number in taken if number >= len(plan.commands)):
         cycle = next(command.cycle for command in log.commands if command.planned == beyond[0])
@@ -321,7 +331,7 @@ def _loop(log: Log, plan: LoopPlan) -> LoopPlan:
 
 
 def _policies(log: Log, policies: PolicyPlan) -> PolicyPlan:
-    """Let the run's own policy begin where it is stopped."""
+    """Make the policy of the run begin at the end of its cycles."""
     begun = policy_begun(log)
     if begun is None:
         return policies

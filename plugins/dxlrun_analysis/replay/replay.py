@@ -1,4 +1,4 @@
-"""Replay: run the controllers of a log again on the inputs in it, and compare what they command."""
+"""Replay: run the controllers of a log again on its inputs, and compare their commands."""
 
 from __future__ import annotations
 
@@ -23,35 +23,35 @@ from dxlrun_analysis.replay.tape import Tape, overview
 
 
 class ReplayReport(msgspec.Struct, frozen=True):
-    """The result of `dxlrun replay`."""
+    """Result of `dxlrun replay`."""
 
     log: str
     robot: str
-    cycles: int  # That the log has
-    compared: int  # The first so many
-    last: int  # Number of the last of these
-    different: int  # Cycles in which anything differs
+    cycles: int  # Cycles in the log
+    compared: int  # Cycles that were compared, from the first
+    last: int  # Number of the last compared cycle
+    different: int  # Cycles in which any value differs
     first: ReplayDifference | None
-    joints: tuple[JointDifferences, ...]  # Those of which anything differs
-    fault: str  # Why the replay ended before the run did; empty when it did not
-    stopped: str  # Why not all cycles were compared; empty when they were, or when `fault` is the reason
+    joints: tuple[JointDifferences, ...]  # Joints with differences
+    fault: str  # Reason why the replay ended before the run; empty if it did not
+    stopped: str  # Reason why not all cycles were compared; empty if all were, or if `fault` is the reason
     remarks: tuple[str, ...]  # Other versions, damage of the log
-    messages: int = 0  # Messages of topics that were compared, or are in one of the two only
+    messages: int = 0  # Messages that were compared, or exist in only one of run and replay
     different_messages: int = 0
     prepared: int = 0  # Commands that were prepared again
     different_prepared: int = 0
     unprepared: int = 0
-    """Commands whose request the log does not have: it was too long, or its dxlrun is an older one."""
+    """Commands without a request in the log: it was too long, or the log is from an earlier dxlrun."""
 
     @property
     def same(self) -> bool:
-        """True when everything that can be compared was, and nothing differs."""
+        """True if everything comparable was compared and nothing differs."""
         differ = self.different or self.different_messages or self.different_prepared
         return not differ and not self.fault
 
     @property
     def sentence(self) -> str:
-        """The result in one sentence."""
+        """Result in one sentence."""
         cycles = counted(self.compared, "cycle", "cycles")
         if self.compared < self.cycles:
             cycles = f"cycles 0 to {self.last} ({self.compared} of {self.cycles})"
@@ -79,12 +79,21 @@ def replay_log(
     arguments: Mapping[str, str] | None = None,
     code: CodeChoice | None = None,
 ) -> ReplayReport:
-    """Run the controllers of a log on its inputs and compare what they command; changes are made before.
+    """Run the controllers of a log on its inputs and compare their commands.
 
-    `code`: which single files are executed where those on the disk are not those of the log. Memory does not
-    grow with packets, states and messages of the log. Raises LogError when the log does not hold the inputs,
-    PlugInError when a controller is not to be had, InputError when a change does not fit or code has changed
-    since the run, ControllerFault when a controller cannot be configured.
+    Memory does not grow with packets, states and messages of the log.
+
+    Args:
+        log: The log.
+        settings: Changed parameters.
+        arguments: Changed arguments of the robot file.
+        code: Source of the single files to execute, if those on disk differ from the log.
+
+    Raises:
+        LogError: The log does not hold the inputs.
+        PlugInError: A controller is not available.
+        InputError: A change does not fit, or code has changed since the run.
+        ControllerFault: A controller cannot be configured.
     """
     reader = open_log(log)
     read = overview(reader)
@@ -107,7 +116,7 @@ def replay_log(
 
     early = comparison.compared < inputs.end
     messages.finish((int(woken_ns[comparison.compared - 1]) if comparison.compared else -1) - early)
-    # of one cycle a prepared array differs first, then the command, then a message about it
+    # Within a cycle, a difference appears first in a prepared array, then in the command, then in a message.
     firsts = [one for one in (prepared.first, comparison.first, messages.first) if one is not None]
     fault = f"the replay ended: {result.detail or 'its policy was done'}" if early else ""
     return ReplayReport(

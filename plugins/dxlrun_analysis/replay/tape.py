@@ -1,4 +1,4 @@
-"""Tape: a log gone through twice in flat memory: first what is needed of all of it, then cycle by cycle."""
+"""Tape: a log read twice in constant memory: first an overview of the whole log, then cycle by cycle."""
 
 from __future__ import annotations
 
@@ -36,12 +36,18 @@ _EVENTS = frozenset(
     )
 )
 AHEAD_NS = 5_000_000_000
-"""How much later than a cycle the log may have its messages: the recorder empties ring after ring."""
+"""Largest delay of messages behind their cycle in the log. The recorder drains one ring after the other."""
 
 
 def overview(reader: LogReader) -> Log:
-    """Return what a replay needs of all of a log before its cycles: the scalars of these, the events that
-    matter and all commands; no packets and topics. Raises LogError as `open_log`."""
+    """Return the data of a whole log that a replay needs before the cycles.
+
+    These are the scalar fields of the cycles, the relevant events, and all commands, without packets and
+    topics.
+
+    Raises:
+        LogError: As in `open_log`.
+    """
     first: Log | None = None
     cycles: list[NDArray[np.void]] = []
     commands: list[TakenCommand] = []
@@ -76,24 +82,34 @@ def _scalars(cycles: NDArray[np.void]) -> NDArray[np.void]:
 
 
 class Tape:
-    """The cycles of a log, one after the other, with a few seconds of what follows."""
+    """Cycles of a log in sequence, with a few seconds of following records."""
 
     def __init__(
         self, reader: LogReader, woken_ns: NDArray[np.int64], messages: Callable[[Log], None]
     ) -> None:
-        """`messages` takes each slice when it is read; `woken_ns`: of all cycles."""
+        """Create a tape.
+
+        Args:
+            reader: The log.
+            woken_ns: Wake-up times of all cycles.
+            messages: Function that receives each slice when it is read.
+        """
         self._slices: Iterator[Log] = reader.slices()
         self._woken_ns = woken_ns
         self._messages = messages
         self._parts: deque[NDArray[np.void]] = deque()
         self._first = self._end = 0
-        """Indices of the first cycle that is there, and of the first that is not read yet."""
+        """Index of the first buffered cycle, and of the first that is not read yet."""
         self._read_all = False
 
     def row(self, index: int) -> np.void:
-        """Return a cycle; one before the last one that was asked for may be gone. Raises LogError."""
+        """Return a cycle. Only the preceding cycle is guaranteed to be available again.
+
+        Raises:
+            LogError: The log cannot be read, or has changed.
+        """
         self._read_until(index)
-        while self._parts and self._first + len(self._parts[0]) < index:  # the one before is kept
+        while self._parts and self._first + len(self._parts[0]) < index:  # The preceding cycle is kept
             self._first += len(self._parts.popleft())
         at = index - self._first
         for part in self._parts:

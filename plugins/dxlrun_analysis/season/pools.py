@@ -1,4 +1,4 @@
-"""Pools: processes on this machine, reached by pipes: nothing listens."""
+"""Pools of processes on this machine, connected by pipes without a listening socket."""
 
 from __future__ import annotations
 
@@ -15,27 +15,29 @@ _PR_SET_PDEATHSIG = 1
 
 @contextmanager
 def processes(count: int) -> Iterator[Executor]:
-    """Give processes on this machine, which are killed when the context is left, or this process is."""
-    # spawn: threads of this process (Arrow's) are no good company for a fork
+    """Yield a pool of processes, which are killed when the context is left with an error, or this process
+    exits."""
+    # Do not fork: Arrow has threads in this process, and a forked child could deadlock on their locks.
     pool = ProcessPoolExecutor(count, get_context("spawn"), initializer=_follow)
     before = set(active_children())
-    resource_tracker.ensure_running()  # which would take the mask away again where it is started later
+    resource_tracker.ensure_running()  # Started later, the tracker would reset the signal mask
     mask = signal.pthread_sigmask(signal.SIG_BLOCK, {signal.SIGINT})
     try:
-        pool.submit(int)  # starts them, without a Ctrl-C: one from the terminal goes to all processes
+        # Start the processes with SIGINT blocked: Ctrl-C at a terminal goes to all processes.
+        pool.submit(int)
     finally:
         signal.pthread_sigmask(signal.SIG_SETMASK, mask)
     try:
         yield pool
     except BaseException:
         for process in set(active_children()) - before:
-            process.kill()  # in the middle of its work: nothing waits for its result
+            process.kill()  # Interrupt the work: its result is not needed
         raise
     finally:
         pool.shutdown(wait=True, cancel_futures=True)
 
 
 def _follow() -> None:
-    """End with the process that started this one, and give way to others: a robot may run here."""
+    """Exit with the parent process, and run at low priority, because a robot may run on this machine."""
     os.nice(10)
     ctypes.CDLL(None).prctl(_PR_SET_PDEATHSIG, signal.SIGKILL)

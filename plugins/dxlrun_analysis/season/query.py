@@ -1,6 +1,6 @@
-"""Filter and sort a table of runs by SQL expressions, with DuckDB.
+"""Query: filter and sort a table of runs by SQL expressions, with DuckDB.
 
-Expressions can only read the table: no file, no extension, no setting.
+Expressions can only read the table. They cannot access files, extensions or settings.
 """
 
 from __future__ import annotations
@@ -31,7 +31,7 @@ def select_runs(runs: pa.Table, where: str | None, sort: str | None) -> list[dic
     """Return the rows that meet the condition `where`, ordered by `sort`, by default by name.
 
     Raises:
-        InputError: an expression is wrong; the message names its option of the command line.
+        InputError: An expression is wrong; the message names its option of the command line.
     """
     with duckdb.connect(":memory:", config=_READ_ONLY) as database:
         database.register(TABLE, runs)
@@ -47,7 +47,7 @@ def select_runs(runs: pa.Table, where: str | None, sort: str | None) -> list[dic
 
 @contextmanager
 def _input_errors(option: str, runs: pa.Table) -> Iterator[None]:
-    """Raise an error of DuckDB as one sentence, without the kind of error, candidates and the place."""
+    """Convert an error of DuckDB to one sentence without error class, candidates and position."""
     try:
         yield
     except duckdb.Error as error:

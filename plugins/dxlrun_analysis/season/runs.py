@@ -1,6 +1,6 @@
-"""The runs below a directory as one table, a row a log: what the report on each says, kept as Parquet.
+"""Runs below a directory as one table, one row per log with results of its report, kept as Parquet.
 
-A log whose files are as they were, by size, inode and time of change, is not read again.
+A log is read again only if size, inode or a time of its files has changed.
 """
 
 from __future__ import annotations
@@ -29,16 +29,17 @@ from dxlrun_analysis.season.pools import processes
 
 Row = dict[str, object]
 Progress = Callable[[str, float], None]
-_MEASUREMENT = "latency"  # The metadata record of a log that `dxlrun latency` wrote
+_MEASUREMENT = "latency"  # Metadata record of a log that `dxlrun latency` wrote
 _LOG, _LEDGER = ".mcap", ".ledger.jsonl"
 _ENDED = "the process that read it ended: it crashed, or had too little memory"
 _SETTLED_NS = 2_000_000_000
-"""Coarsest ticks of file systems (2 s of FAT): a file that changed later may change again within one."""
+"""Coarsest time resolution of file systems (2 s of FAT). A file that changed more recently can change again
+without a new time stamp."""
 _TEXT, _WHOLE, _NUMBER, _YES = pa.string(), pa.int64(), pa.float64(), pa.bool_()
 
 
 def _began(report: Report, log: Log) -> datetime | None:
-    """Return the wall time of the first deadline, in UTC without a mark; None on virtual time."""
+    """Return the wall-clock time of the first deadline, in UTC without a time zone; None on virtual time."""
     offset_ns = log.header.epoch_offset_ns
     if not offset_ns:
         return None
@@ -108,7 +109,7 @@ COLUMNS: Mapping[str, tuple[pa.DataType, Value]] = {
     "kernel": (_TEXT, lambda _, log: log.metadata.get("kernel", {}).get("release")),
     "version": (_TEXT, lambda _, log: log.metadata.get("versions", {}).get("dxlrun")),
 }
-"""The columns that come from the report on a log, with their types."""
+"""Columns that come from the report on a log, with their types."""
 SCHEMA = pa.schema(
     [
         ("log", _TEXT),
@@ -123,16 +124,16 @@ _KEPT = SCHEMA.append(pa.field("stamp", _TEXT))
 class FoundLog(NamedTuple):
     """One log below the directory."""
 
-    name: str  # Its path from there
+    name: str  # Path relative to the directory
     path: Path  # A file, or the directory of a log in parts
     files: tuple[Path, ...]
 
     @property
     def stamp(self) -> str:
-        """State of its files; empty while they may change unseen, or a run writes them."""
+        """State of its files; empty while they can change unnoticed, or a run writes them."""
         try:
             found = [file.stat() for file in self.files]
-        except OSError:  # it is gone, or may not be looked at: reading it says so
+        except OSError:  # It is deleted or not accessible, which reading reports
             return ""
         if any(time_ns() - one.st_mtime_ns < _SETTLED_NS for one in found) or is_being_written(self.path):
             return ""
@@ -140,15 +141,19 @@ class FoundLog(NamedTuple):
 
 
 class Folder(NamedTuple):
-    """What lies below a directory."""
+    """Logs below a directory."""
 
     directory: Path
     logs: tuple[FoundLog, ...]
-    others: tuple[str, ...]  # Files that are no logs, and do not belong to one
+    others: tuple[str, ...]  # Other files that do not belong to a log
 
 
 def find_logs(directory: Path) -> Folder:
-    """Return the logs below a directory, by name. Raises InputError where there are none."""
+    """Return the logs below a directory, by name.
+
+    Raises:
+        InputError: The directory has no logs.
+    """
     logs: list[FoundLog] = []
     others: list[str] = []
     for folder, folders, files in os.walk(directory):
@@ -162,7 +167,8 @@ def find_logs(directory: Path) -> Folder:
             path = here / name
             if path in parts:
                 continue
-            if name.endswith(_LOG) and (path.is_file() or not path.exists()):  # a pipe would be read for ever
+            # Skip pipes, from which a read would not return.
+            if name.endswith(_LOG) and (path.is_file() or not path.exists()):
                 logs.append(FoundLog(_name(path, directory), path, (path,)))
             elif not name.startswith(".") and not _belongs(name, files):
                 others.append(_name(path, directory))
@@ -173,7 +179,7 @@ def find_logs(directory: Path) -> Folder:
 
 def _name(path: Path, directory: Path) -> str:
     name = directory.resolve().name if path == directory else str(path.relative_to(directory))
-    return name.encode(errors="backslashreplace").decode()  # names of files need not be UTF-8
+    return name.encode(errors="backslashreplace").decode()  # File names are not necessarily UTF-8
 
 
 def _belongs(name: str, files: Sequence[str]) -> bool:
@@ -181,7 +187,7 @@ def _belongs(name: str, files: Sequence[str]) -> bool:
 
 
 def row_of(log: FoundLog) -> Row:
-    """Return the row of a log; of one that cannot be read it has the sentence that says why."""
+    """Return the row of a log. The row of an unreadable log has the reason."""
     row: Row = {"log": log.name, "bytes": sum(file.stat().st_size for file in log.files if file.is_file())}
     try:
         reader = open_log(log.path)
@@ -191,7 +197,7 @@ def row_of(log: FoundLog) -> Row:
         return row | {name: value(report, reader.about) for name, (_, value) in COLUMNS.items()}
     except LogError as error:
         return row | {"unreadable": str(error).removeprefix(f"{log.path}: ")}
-    except Exception as error:  # of this log alone: the others are not hidden by it
+    except Exception as error:  # A failure on this log must not hide the rows of other logs
         reason = str(error).strip().partition("\n")[0]
         return row | {"unreadable": f"internal error: {type(error).__name__}: {reason}"}
 
@@ -199,31 +205,33 @@ def row_of(log: FoundLog) -> Row:
 def cache_directory() -> Path:
     """Return `$XDG_CACHE_HOME/dxlrun/logs` (XDG Base Directory Specification; ~/.cache by default).
 
-    Raises RuntimeError without a home directory.
+    Raises:
+        RuntimeError: The user has no home directory.
     """
     named = Path(os.environ.get("XDG_CACHE_HOME", ""))
     return (named if named.is_absolute() else Path.home() / ".cache") / "dxlrun" / "logs"
 
 
 def table_of(folder: Folder, progress: Progress) -> tuple[pa.Table, int]:
-    """Return the table of all logs, and how many of them were read this time, several at once.
+    """Return the table of all logs, and how many of them were read this time, several in parallel.
 
-    Raises OSError when the table cannot be kept for the next time.
+    Raises:
+        OSError: The table cannot be kept for the next time.
     """
     place = os.fsencode(folder.directory.resolve())
     return kept_table(place, folder.logs, lambda missing: _rows(missing, progress))
 
 
 class Stamped(Protocol):
-    """A log of a table that is kept."""
+    """Log in a table that is kept."""
 
     @property
     def name(self) -> str:
-        """Its name in the table."""
+        """Name in the table."""
 
     @property
     def stamp(self) -> str:
-        """How it is now; empty: it may change without another stamp."""
+        """Version of the content; empty if it can change without a new stamp."""
 
 
 AnyLog = TypeVar("AnyLog", bound=Stamped)
@@ -232,15 +240,23 @@ AnyLog = TypeVar("AnyLog", bound=Stamped)
 def kept_table(
     place: bytes, logs: Sequence[AnyLog], read: Callable[[Sequence[AnyLog]], Mapping[str, Row]]
 ) -> tuple[pa.Table, int]:
-    """Return the table of the logs of a place, and how many rows were read: those whose stamps changed.
+    """Return the table of the logs of a place, and the number of rows that were read.
 
-    Raises OSError when the table cannot be kept for the next time.
+    Rows are read if their stamp has changed.
+
+    Args:
+        place: Key of the kept table: path of a directory or URL of a store.
+        logs: The logs.
+        read: Function that returns the rows of logs by name.
+
+    Raises:
+        OSError: The table cannot be kept for the next time.
     """
     name = blake2b(place, digest_size=16).hexdigest()
     kept_at = cache_directory() / runtime_hash()[:16] / f"{name}.parquet"
     kept_at.parent.mkdir(parents=True, exist_ok=True)
     known: dict[str, Row] = {}
-    with suppress(OSError, pa.ArrowException):  # there is none yet, or it is damaged: all are read again
+    with suppress(OSError, pa.ArrowException):  # Without a table, or with a damaged one, all logs are read
         known = {row["log"]: row for row in parquet.read_table(kept_at, schema=_KEPT).to_pylist()}
     stamps = {log.name: log.stamp for log in logs}
     missing = [
@@ -261,14 +277,16 @@ def kept_table(
 def _rows(logs: Sequence[FoundLog], progress: Progress) -> dict[str, Row]:
     found = _together(logs, len(os.sched_getaffinity(0)), progress) if logs else {}
     for log in logs:
-        if log.name not in found:  # a process ended, and with it the pool: alone it is seen which
+        # A crashed process breaks the whole pool. Each remaining log is read alone, which identifies the
+        # cause.
+        if log.name not in found:
             ended: Row = {"log": log.name, "unreadable": _ENDED}
             found |= _together([log], 1, progress) or {log.name: ended}
     return found
 
 
 def _together(logs: Sequence[FoundLog], count: int, progress: Progress) -> dict[str, Row]:
-    """Return the rows of logs that processes of their own read, as far as none of them ends."""
+    """Return the rows that a pool of processes reads before one of them crashes."""
     found: dict[str, Row] = {}
     with suppress(BrokenExecutor), processes(count) as pool:
         running = [pool.submit(row_of, log) for log in logs]

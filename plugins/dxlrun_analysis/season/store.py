@@ -1,7 +1,7 @@
 """Logs in an object store, reached by fsspec: `s3://BUCKET/PREFIX`, or `file:///DIRECTORY` for a mounted one.
 
-Beside each log lies its row of the table of logs, as JSON. It is written last: a log that has one is there
-as a whole, and the table of a store is made of these rows, without a byte of the logs.
+Next to each log is its row of the table of logs, as JSON. The row is written last, so a log with a row is
+complete. The table of a store consists of these rows; the logs themselves are not read.
 """
 
 from __future__ import annotations
@@ -30,7 +30,7 @@ _ROW, _LOG = ".run.json", ".mcap"
 UNFINISHED = "its upload has not ended; `dxlrun upload` of its robot goes on with it"
 DAMAGED = f"its row in the store (NAME{_ROW}) is damaged; `dxlrun upload` of its robot writes it anew"
 _AT_ONCE = 500
-"""Rows that are asked for together."""
+"""Rows that are requested together."""
 _OPTIONS: Mapping[str, Mapping[str, object]] = {
     "s3": {
         "skip_instance_cache": True,
@@ -46,14 +46,14 @@ class StoredLog(NamedTuple):
     """One log of a store."""
 
     name: str
-    row: str  # Where its row is; empty: there is none yet
+    row: str  # Path of its row; empty if the row does not exist yet
     stamp: str
 
 
 class Store(NamedTuple):
-    """What a store has below a prefix."""
+    """Logs of a store below a prefix."""
 
-    directory: str  # The URL
+    directory: str  # URL
     files: fsspec.AbstractFileSystem
     root: str
     logs: tuple[StoredLog, ...]
@@ -62,7 +62,8 @@ class Store(NamedTuple):
     def table(self, progress: Progress) -> tuple[pa.Table, int]:
         """Return the table of all logs, and how many rows were read this time.
 
-        Raises OSError when the table cannot be kept for the next time.
+        Raises:
+            OSError: The table cannot be kept for the next time.
         """
         return kept_table(self.directory.encode(), self.logs, lambda missing: self._rows(missing, progress))
 
@@ -79,7 +80,12 @@ class Store(NamedTuple):
 
 
 def find_store(url: str) -> Store:
-    """Return what lies in a store. Raises InputError for a wrong URL, DxlrunError without connection."""
+    """List the logs of a store.
+
+    Raises:
+        InputError: The URL is wrong.
+        DxlrunError: The store cannot be reached.
+    """
     files, root = _opened(url)
     with _reached(url):
         found = files.find(root, detail=True)
@@ -100,7 +106,7 @@ def find_store(url: str) -> Store:
 
 
 def fetch(url: str) -> Path:
-    """Return a copy of one log of a store, which is deleted at this program's end."""
+    """Return a local copy of one log of a store, which is deleted when the process exits."""
     files, root = _opened(url)
     copy = Path(mkdtemp(prefix="dxlrun-")) / root.rpartition("/")[2]
     atexit.register(shutil.rmtree, copy.parent, ignore_errors=True)
@@ -110,18 +116,20 @@ def fetch(url: str) -> Path:
 
 
 class Upload(NamedTuple):
-    """What became of the logs of a directory."""
+    """Result of an upload, as names of logs."""
 
     uploaded: tuple[str, ...]
-    there: tuple[str, ...]  # before
-    written: tuple[str, ...]  # by a run that has not ended
-    others: tuple[str, ...]  # of which the store has another run with the same name
+    there: tuple[str, ...]  # Already complete in the store
+    written: tuple[str, ...]  # Being written by a run
+    others: tuple[str, ...]  # The store has another run with the same name
 
 
 def upload(folder: Folder, url: str, progress: Progress) -> Upload:
-    """Copy the logs of runs that have ended to a store, each with its row; what is there as a whole stays.
+    """Copy the logs of finished runs to a store, each with its row. Complete logs in the store are not
+    copied.
 
-    Raises DxlrunError when the store cannot be reached; the next call goes on behind the last whole log.
+    Raises:
+        DxlrunError: The store cannot be reached. The next call continues after the last complete log.
     """
     store = find_store(url)
     ended = folder._replace(logs=tuple(log for log in folder.logs if not is_being_written(log.path)))
@@ -151,7 +159,7 @@ def upload(folder: Folder, url: str, progress: Progress) -> Upload:
 
 
 def _put(store: Store, file: Path, log: FoundLog) -> int:
-    """Copy one file; return how many bytes the store has of it."""
+    """Copy one file; return its size in the store, bytes."""
     to = f"{store.root}/{log.name}" + ("" if file == log.path else f"/{file.name}")
     store.files.put_file(str(file), to)
     return int(store.files.info(to)["size"])
@@ -185,7 +193,8 @@ def _opened(url: str) -> tuple[fsspec.AbstractFileSystem, str]:
 
 @contextmanager
 def _reached(url: str) -> Iterator[None]:
-    """Raise DxlrunError with the URL for whatever the library of a store raises: it has no common class."""
+    """Raise DxlrunError with the URL for any exception, because the exceptions of store libraries have no
+    common class."""
     try:
         yield
     except Exception as error:

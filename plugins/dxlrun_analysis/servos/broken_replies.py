@@ -1,4 +1,4 @@
-"""Bytes that belong to no packet: where one ID alone is due, and nowhere else, or anywhere on a bus."""
+"""Bytes that belong to no packet: in place of the replies of one ID, or as noise anywhere on a bus."""
 
 from __future__ import annotations
 
@@ -15,25 +15,26 @@ from dxlrun_analysis.servos.losses import ServoLosses
 from dxlrun_analysis.servos.requests import IDS
 
 _FEWEST = 5
-_FEWEST_NOISY, _NOISY_SHARE = 10, 0.005  # Exchanges, and their share, from which it is no plug that is moved
-_BESIDE = 12  # Bytes of a status packet beside its data, at most; others that came belong to another sender
-_ALONE = 0.7  # Share of the exchanges of a bus with such bytes from which they are one ID's
+# Fewer exchanges, or a smaller share, can come from a plug that is moved.
+_FEWEST_NOISY, _NOISY_SHARE = 10, 0.005
+_BESIDE = 12  # Largest overhead of a status packet, bytes; with more, another sender is involved
+_ALONE = 0.7  # Share of the exchanges of a bus with stray bytes from which a single ID causes them
 
 
 class BrokenReplies:
-    """Counts broken replies of each ID, and noise."""
+    """Counter of broken replies by ID, and of noise by bus."""
 
     def __init__(self, buses: int) -> None:
         self._broken, self._first, self._cut = np.zeros((3, buses * IDS), np.int64)
-        """Of each servo; of these as the first of several, none of them intact; and at the end of a shared
-        status packet."""
+        """Broken replies by servo: all; those as first of several without an intact reply; those at the end
+        of a shared status packet."""
         self._noisy, self._disturbed, self._asked = np.zeros((3, buses), np.int64)
-        """Exchanges of each bus with such bytes, those where they are no cut reply, and all."""
+        """Exchanges by bus: those with stray bytes; those whose stray bytes are not cut replies; all."""
 
     def take(self, exchanges: Exchanges) -> None:
-        """Count those of some exchanges."""
+        """Count the stray bytes of some exchanges."""
         due, buses = exchanges.due, len(self._noisy)
-        # of a chain of which nothing is intact although bytes came, but no more than of its first reply
+        # Count the first servo of a chain without an intact reply, if the bytes fit into its reply alone.
         longest = np.array([max(kind.sizes, default=0) + _BESIDE for kind in exchanges.requests.kinds])
         noise = exchanges.noise[due.exchange]
         first = (due.loss == Loss.LINE) & (due.place == 0) & (noise > 0)
@@ -46,7 +47,7 @@ class BrokenReplies:
         self._broken += np.bincount(servo, minlength=buses * IDS)
         self._cut += np.bincount(cut, minlength=buses * IDS)
         self._noisy += np.bincount(exchanges.bus[(exchanges.noise > 0) & exchanges.ended], minlength=buses)
-        # in an incomplete fast status they are cut blocks
+        # In an incomplete fast status packet, stray bytes are cut blocks.
         cut_blocks = exchanges.requests.fast[exchanges.request]
         cut_blocks[np.setdiff1d(np.arange(len(cut_blocks)), due.exchange[due.reply < 0])] = False
         disturbed = (exchanges.noise > 0) & ~cut_blocks
@@ -54,7 +55,7 @@ class BrokenReplies:
         self._asked += np.bincount(exchanges.bus[exchanges.request > 0], minlength=buses)
 
     def findings(self, index: int, bus: LoggedBus, losses: Mapping[int, ServoLosses]) -> Sequence[Finding]:
-        """Name the one ID of a bus whose replies are broken, or noise on it."""
+        """Report the single ID of a bus whose replies are broken, or noise on the bus."""
         return self._broken_ones(index, bus, losses) or self._noise(index, bus)
 
     def _noise(self, index: int, bus: LoggedBus) -> Sequence[Finding]:
@@ -70,13 +71,13 @@ class BrokenReplies:
     ) -> Sequence[Finding]:
         mine = self._broken[index * IDS : (index + 1) * IDS]
         total = int(self._noisy[index])
-        if total < _FEWEST or len(losses) < 2:  # of a single servo it is the line
+        if total < _FEWEST or len(losses) < 2:  # With a single servo, the line is as likely the cause
             return ()
         servo_id = int(np.argmax(mine))
         broken, lost = int(mine[servo_id]), losses.get(servo_id)
         if broken < _ALONE * total or lost is None:
             return ()
-        # in a short chain the line spoils the first one often, too
+        # On a short chain, a faulty line also hits the first servo often.
         head = int(self._first[index * IDS + servo_id])
         behind = broken - head >= max(_FEWEST, _ALONE * (total - head))
         if not behind and not has_them_alone(broken, total - broken):

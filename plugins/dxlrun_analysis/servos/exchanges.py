@@ -1,8 +1,9 @@
-"""Pair the instructions of a log with the replies to them: one table, as columns; no loop goes over packets.
+"""Exchanges: the instructions of a log paired with their replies, as columns of one table.
 
-The packets are parsed here anew, so that nothing depends on what the run believed. A reply belongs to the
-last instruction before it on its bus. Sources: ROBOTIS e-Manual, Protocol 1.0 and Protocol 2.0, instruction
-and status packets.
+
+Pairing is vectorized, without a loop over packets. The packets are parsed again here, so that nothing depends
+on the interpretation of the run. A reply belongs to the last instruction before it on its bus. Sources:
+ROBOTIS e-Manual, Protocol 1.0 and Protocol 2.0, instruction and status packets.
 """
 
 from __future__ import annotations
@@ -21,103 +22,113 @@ from dxlrun_analysis.servos import requests
 from dxlrun_analysis.servos.requests import IDS, Flags, Numbers, Requests, RequestTable
 from dxlwire import BROADCAST_ID, PacketKind
 
-_ROWS = 40  # Bits of an exchange's index in a key; above them the servo
-_BYTE_NS = 10_000_000_000  # Ten bits a byte, over the rate in bit/s
+_ROWS = 40  # Low bits of a key hold the index of the exchange; the bits above hold the servo
+_BYTE_NS = 10_000_000_000  # Wire time of a byte times the rate in bit/s: ten bits a byte
 _HEAD_2 = 8  # Bytes before error, ID and data of the blocks of a fast status packet
-_LATEST_NS = 100_000_000  # A block of a fast status packet that comes later is taken for noise
+_LATEST_NS = 100_000_000  # A block of a fast status packet that comes later is treated as noise
 
 
 class Exchanges(NamedTuple):
     """Instructions with their replies, bus by bus and in order of time; columns of shape (exchanges,).
 
-    The first of each bus has no instruction: what arrived before one did.
+    The first exchange of each bus has no instruction. It holds packets that arrived before the first
+    instruction.
     """
 
     buses: tuple[LoggedBus, ...]
-    requests: Requests  # By `request`
+    requests: Requests  # Indexed by `request`
     bus: Numbers
-    cycle: Numbers  # Number of the cycle of the instruction; of the first of each bus -1
+    cycle: Numbers  # Cycle of the instruction; -1 for the first exchange of each bus
     request: Numbers  # Index in `requests`
     asked_ns: Numbers  # Before the write() of the instruction
-    blocked_ns: Numbers  # How long the write() took beyond the wire's time, where the rate is known
-    sent_ns: Numbers  # When the line had carried it, by its rate
-    last_ns: Numbers  # After the last reply; where there is none, `sent_ns`
+    blocked_ns: Numbers  # Time of the write() beyond the wire time, if the rate is known
+    sent_ns: Numbers  # End of the instruction on the wire, from its rate
+    last_ns: Numbers  # After the last reply; equals `sent_ns` without replies
     ended: Flags
-    """False: the log ends before the next instruction, so a missing reply may have come a moment later."""
+    """False if the log ends before the next instruction. A missing reply may then have come after the end."""
     noise: Numbers  # Bytes that belong to no intact packet
     replies: Replies
     due: Due
     late: Late
     others: PacketColumns  # Instructions of other hosts on the line
-    echoes: Numbers  # The bus of each own instruction that came back
-    unasked: Numbers  # The servo of each intact reply that no instruction of this host asks for
+    echoes: Numbers  # Bus of each own instruction that was echoed
+    unasked: Numbers  # Servo of each intact reply that no instruction of this host requests
     stray: PacketColumns  # Bytes that belong to no intact packet
 
 
 class Replies(NamedTuple):
-    """What came of single servos, of a fast status packet several; shape (replies,), in order of time."""
+    """Replies of single servos; a fast status packet has several. Shape (replies,), in order of time."""
 
     exchange: Numbers  # Index in the exchanges
     servo: Numbers
-    place: Numbers  # In the replies that the instruction requests; -1: it does not
+    place: Numbers  # Place in the replies that the instruction requests; -1: not requested
     error: Numbers  # The error byte
     protocol: Numbers
-    wire_ns: Numbers  # How long the line needs for the status packet
+    wire_ns: Numbers  # Wire time of the status packet
     last_ns: Numbers  # After the read() of the status packet's last byte
     before_ns: Numbers
-    """That of the status packet before it in its exchange; when the instruction was sent, for the first."""
-    due_ns: Numbers  # When it would have been there by wire and return delay, with all replies before it
-    answers: Flags  # True: requested, in time, and the servo's first in the exchange
-    strange: Flags  # True: a whole status packet of one servo that its exchange does not request
+    """`last_ns` of the preceding status packet in the exchange; for the first one, the end of the
+    instruction."""
+    due_ns: Numbers  # Planned time by wire time and return delay, with all replies before it
+    answers: Flags  # True: requested, in time, and the first reply of the servo in the exchange
+    strange: Flags  # True: a complete status packet of one servo that the exchange does not request
 
 
 @unique
 class Loss(IntEnum):
-    """Whose loss a missing reply is, as far as its exchange shows it."""
+    """Attribution of a missing reply, as far as its exchange shows it."""
 
-    NONE = -1  # It is not missing
-    OWN = 0  # The servo's: it was asked alone, or is the first of several without an intact reply
-    BEHIND = 1  # That of a servo before it in the chain, or in the fast status packet
-    LINE = 2  # Nothing of several replies is intact: the instruction may be lost, or the first of them
-    LATE = 3  # None: the reply came, after it was given up
+    NONE = -1  # Not missing
+    OWN = 0  # Of the servo: asked alone, or the first of several without an intact reply
+    BEHIND = 1  # Of a preceding servo in the chain or in the fast status packet
+    LINE = 2  # No reply of several is intact: the instruction may be lost, or the first reply
+    LATE = 3  # Not lost: the reply came after it was given up
 
 
 class Due(NamedTuple):
-    """Each reply that was requested, exchange by exchange and in order of places; shape (due replies,)."""
+    """Requested replies, exchange by exchange and in order of places; shape (due replies,)."""
 
     exchange: Numbers  # Index in the exchanges
     servo: Numbers
-    place: Numbers  # In the replies that the instruction requests
-    reply: Numbers  # The answer, an index in the replies; -1: it is missing
-    loss: Numbers  # A Loss each
+    place: Numbers  # Place in the replies that the instruction requests
+    reply: Numbers  # Index in the replies; -1: missing
+    loss: Numbers  # A `Loss`
     broken: Flags
-    """Bytes that belong to no intact packet came in its place; always False where the loss is not its own."""
+    """Stray bytes came in place of the reply; always False if `loss` is not OWN."""
 
 
 class Late(NamedTuple):
     """Intact replies that came after they were given up; shape (late replies,)."""
 
-    servo: Numbers  # ID 254: those of several in one fast status
-    exchange: Numbers  # The newest one that lacks it; -1: that is not among these
+    servo: Numbers  # ID 254: the replies of several servos in one fast status packet
+    exchange: Numbers  # Newest exchange that lacks the reply; -1: not among these exchanges
     at_ns: Numbers  # After the read() of its last byte
-    late_ns: Numbers  # How long after its instruction had been sent; 0: not known
+    late_ns: Numbers  # Time since the end of its instruction; 0: unknown
 
 
 class Pairing:
-    """Pairs slice by slice, in memory that does not grow with the log; keeps what may not be in order yet."""
+    """Pairs packets slice by slice. Its memory does not grow with the log.
+
+    Packets that are possibly not in order of time yet are held back.
+    """
 
     def __init__(self, buses: tuple[LoggedBus, ...] = ()) -> None:
-        """`buses`: of the log; without them those of the first slice."""
-        self.buses = buses  # The buses of the log, with what its plan says about them
+        """Create a pairing.
+
+        Args:
+            buses: Buses of the log; without them, those of the first slice.
+        """
+        self.buses = buses  # Buses of the log, as its plan describes them
         self._waiting: list[PacketColumns] = []
         self._requests = RequestTable()
         self._free_ns = np.zeros(len(buses), np.int64)
-        """When the line of each bus has carried all that was sent."""
+        """Time at which the line of each bus has carried everything that was sent."""
 
     def take(self, log: Log) -> Exchanges | None:
-        """Take the packets of the next slice. Return exchanges that are certain to be whole.
+        """Add the packets of the next slice; return exchanges that are certain to be complete.
 
-        Raises LogError when a packet cannot be read.
+        Raises:
+            LogError: A packet cannot be read.
         """
         if not self.buses:
             planned = plan_of(log).by_name
@@ -131,7 +142,7 @@ class Pairing:
             return None
         packets = ordered(PacketColumns.joined(self._waiting))
         certain = packets.first_ns < newest_ns - DISORDER_NS
-        # the last instruction of each bus is held: its replies may still come
+        # Hold back the last instruction of each bus: its replies can still come.
         instructions = np.flatnonzero(certain & (packets.kind == PacketKind.INSTRUCTION))
         last = np.full(IDS, len(packets), np.int64)
         last[packets.bus[instructions]] = instructions
@@ -140,7 +151,7 @@ class Pairing:
         return self._paired(packets.take(certain))
 
     def finish(self) -> Exchanges | None:
-        """Return the exchanges that are left."""
+        """Return the remaining exchanges."""
         if not self._waiting:
             return None
         packets = ordered(PacketColumns.joined(self._waiting))
@@ -148,12 +159,12 @@ class Pairing:
         return self._paired(packets, final=True)
 
     def alone(self, packets: PacketColumns) -> Exchanges:
-        """Return the exchanges of some packets as if nothing was before them, and each was ended."""
+        """Return the exchanges of some packets without history. All of them count as ended."""
         self._free_ns[:] = 0
         return self._paired(packets)
 
     def _paired(self, packets: PacketColumns, *, final: bool = False) -> Exchanges:
-        """Return the exchanges of the next packets, bus by bus in order of time; `final`: none come after."""
+        """Return the exchanges of the next packets, by bus and time; `final` if no packets follow."""
         count, kind = len(self.buses), packets.kind
         bus = packets.bus.astype(np.int64)
         instructs = kind == PacketKind.INSTRUCTION
@@ -267,9 +278,9 @@ class Pairing:
             mine = rows[request[rows] == index]
             packets = status.take(mine)
             at = _HEAD_2
-            # a block: error, ID, data, CRC
+            # A block consists of error, ID, data and CRC.
             for number, size in enumerate(self._requests.all.kinds[index].sizes):
-                there = at + size + 4 <= packets.length  # one that was cut has its intact blocks
+                there = at + size + 4 <= packets.length  # A truncated packet still has intact blocks
                 numbers = np.full(int(there.sum()), number, np.int64)
                 pieces.append((mine[there], numbers, packets.byte(at + 1)[there], packets.byte(at)[there]))
                 at += size + 4
@@ -281,7 +292,8 @@ class Pairing:
         place = np.arange(len(exchange)) - begin[exchange]
         servo_id = self._requests.all.ids[request[exchange], place - count[exchange]]
         reply = np.full(len(exchange), -1, np.int64)
-        rows = np.flatnonzero(replies.answers)[::-1]  # of several replies of a servo the first counts
+        # Reversed, so that the first of several replies of a servo counts.
+        rows = np.flatnonzero(replies.answers)[::-1]
         reply[begin[replies.exchange[rows]] + replies.place[rows]] = rows
         replies.answers[:] = False
         replies.answers[reply[reply >= 0]] = True
@@ -295,7 +307,7 @@ class Pairing:
     def _late_blocks(
         self, noise: PacketColumns, exchange: Numbers, request: Numbers, asked_ns: Numbers, due: Due
     ) -> tuple[Numbers, NDArray[np.uint8]]:
-        """Return bytes that are the block that a fast status packet lacks, come later; and its ID."""
+        """Return noise that is the missing block of a fast status packet and came late: row and ID."""
         lacks = np.flatnonzero((due.loss == Loss.OWN) & self._requests.all.fast[request[due.exchange]])
         at = np.searchsorted(due.exchange[lacks], exchange) - 1
         rows = np.flatnonzero(at >= 0)
@@ -313,9 +325,10 @@ class Pairing:
 
 
 def _unasked(replies: Replies, due: Due, to: Numbers) -> Numbers:
-    """Return the servo of each reply that nothing asks for; `to`: the ID of each instruction, -1: all.
+    """Return the servo of each reply that no instruction requests; `to` is the ID of each instruction, or -1.
 
-    A servo may acknowledge what is written to it, and one whose last reply is missing is late with that.
+    Two kinds of replies are excluded: acknowledged writes, and the late reply of a servo whose last reply is
+    missing.
     """
     rows = np.flatnonzero(replies.strange)
     exchange, servo = replies.exchange[rows], replies.servo[rows]
@@ -337,9 +350,9 @@ def _last_ns(sent_ns: Numbers, replies: Replies) -> Numbers:
 
 
 def _late(servo: Numbers, exchange: Numbers, at_ns: Numbers, sent_ns: Numbers, due: Due) -> Late:
-    """Match late replies to the exchanges that lack them, and note them there."""
+    """Match late replies to the exchanges that lack them, and set `loss` there to LATE."""
     missing = np.flatnonzero(due.reply < 0)
-    # of a fast status the first of its servos stands for all
+    # The late reply of a fast status packet covers all its servos; its first one represents them.
     whole = np.flatnonzero((due.loss == Loss.LINE) & (due.place == 0))
     index = np.append(missing, whole)
     of = np.append(due.servo[missing], due.servo[whole] // IDS * IDS + BROADCAST_ID)
@@ -359,7 +372,14 @@ def _late(servo: Numbers, exchange: Numbers, at_ns: Numbers, sent_ns: Numbers, d
 
 
 def _came_back(packets: PacketColumns, others: Numbers, rows: Numbers, sent: Numbers) -> Flags:
-    """Return which instructions of `others` are one of the last two of this host: `rows`, `sent` so far."""
+    """Return which instructions of `others` equal one of the last two instructions of this host.
+
+    Args:
+        packets: All packets.
+        others: Rows of instructions of other hosts.
+        rows: Rows of own instructions.
+        sent: Number of own instructions before each packet.
+    """
 
     def text(row: int) -> bytes:
         start = int(packets.start[row])
@@ -371,14 +391,14 @@ def _came_back(packets: PacketColumns, others: Numbers, rows: Numbers, sent: Num
 
 
 def _free_ns(first_ns: Numbers, wire_ns: Numbers, free_ns: np.int64) -> Numbers:
-    """Return when a line has carried each instruction: one begins when it is written and the line is free."""
+    """Return the end of each instruction on the wire: it begins when it is written and the line is free."""
     sent = np.cumsum(wire_ns)
     begin: Numbers = np.maximum(np.maximum.accumulate(first_ns - sent + wire_ns), free_ns)
     return begin + sent
 
 
 def ordered(packets: PacketColumns) -> PacketColumns:
-    """Return packets bus by bus in order of time; those of one time keep theirs."""
+    """Return packets bus by bus in order of time. Packets with equal times keep their order."""
     order = np.argsort(packets.bus, kind="stable")
     bus, first_ns = packets.bus[order], packets.first_ns[order]
     if ((np.diff(first_ns) < 0) & (np.diff(bus) == 0)).any():

@@ -1,8 +1,8 @@
-"""What another host wrote to the servos of the plan: which items, to which servo, and what failed then.
+"""Writes of other hosts to servos of the plan: items and servos, and subsequent failures.
 
-One instruction is enough, where noise has to look like several: it is intact, has the ID of a servo, and
-begins and ends with items of its control table. Sources: ROBOTIS e-Manual, Protocol 1.0 and 2.0, Write, Reg
-Write, Sync Write, Bulk Write, Factory Reset and Reboot.
+A single instruction is sufficient evidence, because noise hardly looks like one: it is intact, has the ID of
+a servo, and begins and ends at items of its control table. Sources: ROBOTIS e-Manual, Protocol 1.0 and 2.0,
+Write, Reg Write, Sync Write, Bulk Write, Factory Reset and Reboot.
 """
 
 from __future__ import annotations
@@ -15,7 +15,7 @@ from dxlrun_analysis.finding import HURTS, listed
 from dxlrun_analysis.plan import LoggedBus, LoggedServo
 from dxlwire import BROADCAST_ID, find_table, protocol1, protocol2
 
-_AFTER_NS = 2_000_000_000  # A servo that fails so soon after it was written to fails by that
+_AFTER_NS = 2_000_000_000  # A failure within this time after a write is attributed to the write
 _MOST_KEPT = 1000
 _MOST_NAMED = 3
 _HEADER_2 = b"\xff\xff\xfd\x00"
@@ -27,35 +27,35 @@ _RESETS = {
 
 
 class _Write(NamedTuple):
-    """One item that was written to one servo."""
+    """Write of one item of one servo."""
 
     t_ns: int
     bus: int
     servo_id: int
-    name: str  # As the joint is called
+    name: str  # Name of the joint
     what: str  # `baud_rate`, or `a reboot`
     value: int | None
 
 
 class ForeignWrites:
-    """Collects what other hosts wrote, and when servos failed."""
+    """Accumulator of writes by other hosts, and of servo failures."""
 
     def __init__(self) -> None:
         self._writes: list[_Write] = []
         self._failures: list[Event] = []
 
     def take(self, bus: int, plan: LoggedBus, packet: LoggedPacket) -> None:
-        """Take an instruction that this run did not send."""
+        """Add an instruction that this run did not send."""
         if len(self._writes) < _MOST_KEPT:
             self._writes += _written(bus, plan, packet)
 
     def failed(self, event: Event) -> None:
-        """Note an event where it says that a servo failed."""
+        """Keep an event if it reports the failure of a servo."""
         if event.code in HURTS and len(self._failures) < _MOST_KEPT:
             self._failures.append(event)
 
     def of(self, bus: int) -> tuple[str, bool]:
-        """Return what was written on a bus, as the end of a sentence, and whether a servo failed by it."""
+        """Return the writes on a bus as the end of a sentence, and whether they made a servo fail."""
         writes = [one for one in self._writes if one.bus == bus]
         ends = {
             one.name: event
@@ -65,7 +65,7 @@ class ForeignWrites:
         }
         told = [one for one in writes if one.name in ends] or writes
         parts = []
-        # those that did not fail are told by ID: nothing is wrong with them
+        # Servos that did not fail are listed by ID only, because nothing is wrong with them.
         by_items: dict[str, list[tuple[int, str]]] = {}
         for servo_id in dict.fromkeys(one.servo_id for one in told):
             last = {one.what: one for one in told if one.servo_id == servo_id}
@@ -87,7 +87,7 @@ class ForeignWrites:
 
 
 def _written(bus: int, plan: LoggedBus, packet: LoggedPacket) -> Iterator[_Write]:
-    """Yield the items that an instruction writes to servos of the plan, and resets."""
+    """Yield the items of the plan's servos that an instruction writes, and resets."""
     data = packet.data
     second = data.startswith(_HEADER_2)
     at = 4 if second else 2
@@ -107,7 +107,7 @@ def _written(bus: int, plan: LoggedBus, packet: LoggedPacket) -> Iterator[_Write
 
 
 def _parts(servo_id: int, code: int, body: bytes, width: int) -> Iterator[tuple[int, int, bytes]]:
-    """Yield ID, address and data of what is written; addresses and sizes have `width` bytes."""
+    """Yield ID, address and data of each write; addresses and sizes have `width` bytes."""
     if code in _WRITES:
         yield servo_id, int.from_bytes(body[:width], "little"), body[width:]
     elif code == protocol2.Instruction.SYNC_WRITE:
@@ -127,10 +127,10 @@ def _addressed(plan: LoggedBus, servo_id: int) -> list[LoggedServo]:
 
 
 def _items(plan: LoggedBus, servo: LoggedServo, address: int, data: bytes) -> list[tuple[str, int]]:
-    """Return the items that some bytes fill, from the first byte to the last; none: they do not."""
+    """Return the control table items that exactly cover the bytes, or an empty list."""
     try:
         items = find_table(servo.model, plan.protocol).items
-    except LookupError:  # a plug-in's model that is not installed here
+    except LookupError:  # The model of a plug-in that is not installed here
         return []
     sizes = {item.address: (name, item.size) for name, item in items.items()}
     found, at = [], 0

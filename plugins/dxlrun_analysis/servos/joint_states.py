@@ -1,4 +1,4 @@
-"""At which angle, speed and temperature each joint was in each cycle, and for how long, in bins of each."""
+"""Angle, speed and temperature of each joint by cycle, and the time spent in each bin of them."""
 
 from __future__ import annotations
 
@@ -18,32 +18,35 @@ Numbers = NDArray[np.int64]
 _IDS = 256
 BINS = 200
 QUANTITIES = ANGLE, SPEED, TEMPERATURE = range(3)
-_STEPS = np.array([math.radians(5), 0.1, 1.0])  # rad, rad/s, deg C: what one bin has
-_FIRST = np.array([-BINS // 2, 0, 0])  # The number of steps where the first bin begins
-_MOST_HELD = 200_000  # Cycles that wait for their exchanges; in a whole log they are those of 20 s
+_STEPS = np.array([math.radians(5), 0.1, 1.0])  # rad, rad/s, deg C: width of a bin
+_FIRST = np.array([-BINS // 2, 0, 0])  # Lower edge of the first bin, in bin widths
+_MOST_HELD = 200_000  # Cycles that wait for their exchanges; in a complete log they cover 20 s
 
 
 @dataclass(frozen=True, slots=True)
 class Places:
-    """Where the joints were in some cycles."""
+    """States of the joints in some cycles, as bins."""
 
     cycle: Numbers = field(default_factory=lambda: np.zeros(0, np.int64))
-    """Their numbers, ascending; shape (cycles,)."""
+    """Cycle numbers, ascending; shape (cycles,)."""
     bins: Numbers = field(default_factory=lambda: np.zeros((0, len(QUANTITIES), 0), np.int64))
-    """Of each quantity, -1: not known, or offline; shape (cycles, quantities, joints)."""
+    """Bin of each quantity; -1: unknown or offline; shape (cycles, quantities, joints)."""
 
 
 class JointStates:
-    """Holds the states of cycles until their exchanges come, in memory that does not grow with the log."""
+    """Buffer of joint states until the exchanges of their cycles are paired.
+
+    Its memory does not grow with the log.
+    """
 
     def __init__(
         self, buses: Sequence[str] = (), joints: Sequence[str] = (), plan: LoggedPlan | None = None
     ) -> None:
         self.joint_of = np.full(len(buses) * _IDS, -1, np.int64)
-        """Row of the joint that each servo moves; one that moves several counts with the first."""
+        """Row of the joint that each servo moves, the first if it moves several."""
         self.share = np.ones(len(joints))
-        """m of a linear joint for each rad of its servo, whose angle then counts; 1 of one that turns"""
-        self.time_ns = np.zeros((len(joints), len(QUANTITIES), BINS), np.int64)  # Spent in each bin
+        """m of a linear joint per rad of its servo, whose angle is binned; 1 for a rotary joint."""
+        self.time_ns = np.zeros((len(joints), len(QUANTITIES), BINS), np.int64)  # Time spent in each bin
         self._held: list[tuple[Numbers, Numbers, Floats, NDArray[np.bool_], Floats]] = []
         indices = {name: index for index, name in enumerate(buses)}
         rows = {name: row for row, name in enumerate(joints)}
@@ -68,7 +71,7 @@ class JointStates:
             self._held.pop(0)
 
     def until(self, cycle: int, *, everything: bool = False) -> Places:
-        """Return where the joints were in the cycles up to one; between two angles these are interpolated."""
+        """Return the states up to and including a cycle. Missing angles are interpolated."""
         if not self._held:
             return Places()
         numbers, period_ns, angle, usable, heat = (
@@ -92,7 +95,7 @@ class JointStates:
         return Places(numbers[:end], bins)
 
     def range_text(self, joint: int, quantity: int, low: int, high: int) -> str:
-        """Write a range of bins for people, the last one included, in the unit of the joint."""
+        """Return a range of bins as text in the unit of the joint; `high` is included."""
         begin, end = ((at + _FIRST[quantity]) * _STEPS[quantity] for at in (low, high + 1))
         if quantity == TEMPERATURE:
             return f"from {begin:.0f} deg C on" if high == BINS - 1 else f"at {begin:.0f} to {end:.0f} deg C"
@@ -104,7 +107,7 @@ class JointStates:
 
 
 def _speeds(numbers: Numbers, period_ns: Numbers, angle: Floats) -> Floats:
-    """Return how fast each joint was between the cycles around each, rad/s, in shape (cycles, joints)."""
+    """Return the speed of each joint between its neighbouring cycles, rad/s, shape (cycles, joints)."""
     found = np.full(angle.shape, np.nan)
     if len(numbers) > 2:
         took_s = np.maximum((numbers[2:] - numbers[:-2]) * period_ns[1:-1] * 1e-9, 1e-9)

@@ -1,18 +1,18 @@
-"""Missing replies: who failed in the same cycles as whom, over all buses, and who answered meanwhile.
+"""Missing replies: coincident losses over all buses, and replies of other servos at the same time.
 
-An *outage* is what a servo misses until it answers again; it begins with a loss that may be its own: of a
-chain of replies only the first that is missing is, those behind wait for it in vain (ROBOTIS e-Manual,
-Protocol 2.0, Sync Read; see `Loss`). Outages that overlap, or begin in one cycle, are one *occasion*. Whose
-it is:
+An *outage* lasts from the first missing reply of a servo until its next answer. It begins with a loss that
+may be the servo's own: in a chain only the first missing reply is, because the following servos wait for it
+in vain (ROBOTIS e-Manual, Protocol 2.0, Sync Read; see `Loss`). Outages that overlap, or begin in one cycle,
+are one *occasion*. An occasion is attributed to
 
-- of the machine, or of what buses share, where servos of several buses failed in it. It counts against no
-  servo and no single bus;
-- of the bus, where several failed, and no reply came from the first loss to the last;
-- else of the servos that failed, together: others of their bus answered.
+- the machine, or a part that buses share, if servos of several buses failed. It does not count against any
+  servo or single bus;
+- the bus, if several servos failed, and no reply came from the first loss to the last;
+- otherwise the servos that failed, together: others of their bus answered.
 
-Where nothing came of a chain, it is open whether its instruction or its first servo is why. It is that
-servo's where instructions to single servos are hardly ever lost: a line would spoil those, too, two fifths as
-often as they are shorter [i].
+If no reply of a chain came, its instruction or its first servo can be the cause. It is the servo if
+instructions to single servos are hardly ever lost: a bad line would spoil those two fifths as often, because
+they are shorter [i].
 """
 
 from __future__ import annotations
@@ -33,47 +33,47 @@ from dxlrun_analysis.servos.joint_states import ANGLE, BINS, QUANTITIES, JointSt
 from dxlrun_analysis.servos.requests import IDS, Flags, Numbers
 
 _APART_NS = (
-    200_000_000  # Occasions of one part count as one until so long after the first: a plug that flickers
+    200_000_000  # Occasions of one part within this time after the first count as one: a plug can flicker
 )
-_UNKNOWN_NS = 10_000_000  # Without cycles those are of one moment that are so close: a period of many robots
-_FEWEST = 5  # Occasions from which a part is named
-_TIMES_MORE = 10  # than another servo of the bus has in the median
-_TOGETHER = 0.7  # Share of the occasions of two servos that are of both: of a cable that they share
-_MOST = 0.6  # Share of a bus' occasions from which they are those of several buses
-_SHORTER = 0.4  # Bytes of an instruction to one servo, beside those of one to a chain
+_UNKNOWN_NS = 10_000_000  # Resolution of moments without cycle numbers: the period of many robots
+_FEWEST = 5  # Occasions from which a part is reported
+_TIMES_MORE = 10  # Required ratio to the median of the other servos of the bus
+_TOGETHER = 0.7  # Share of common occasions from which two servos fail together, such as by a shared cable
+_MOST = 0.6  # Share of a bus' occasions from which several buses fail together
+_SHORTER = 0.4  # Length of an instruction to one servo relative to one to a chain
 _MOST_KEPT = 100_000  # Outages of a run, and cycles with late replies
-_INSIDE = 0.9  # Share of the losses in a range of angles, speeds or temperatures that is told
-_CHANCE = 1e-3  # With which they would be there if they did not depend on it
+_INSIDE = 0.9  # Share of the losses that a reported range of angles, speeds or temperatures must contain
+_CHANCE = 1e-3  # Probability of this concentration if losses were independent of the quantity
 
 
 @dataclass(frozen=True, slots=True)
 class ServoLosses:
-    """One servo's own missing replies."""
+    """Own missing replies of one servo."""
 
-    asked: int  # Those that it could have answered: none before them in a chain was missing
+    asked: int  # Requests that it could have answered: no reply before its own in the chain was missing
     lost: int
-    broken_off: int = 0  # Reads of several in which it answers first, of which nothing came
+    broken_off: int = 0  # Chains that begin with it and of which no reply came
 
 
 @dataclass(slots=True)
 class _Outage:
-    """What one servo misses until it answers again."""
+    """Outage of one servo, until it answers again."""
 
     servo: int
     at_ns: int
     cycle: int
     places: list[int]  # Bins of its joint's angle, speed and temperature
-    answers: int  # Of its bus before its end; it has an end when it is new
-    answered: int  # By the servo itself
-    line: bool  # The whole chain was missing, at first
+    answers: int  # Replies on its bus before the outage
+    answered: int  # Replies of the servo itself before the outage
+    line: bool  # At the start, the whole chain was missing
     last: int = 0  # Cycle of its last loss, within 0.2 s
-    last_answers: int = 0  # Of its bus before that
-    late: bool = False  # No loss at all: a reply that came late
+    last_answers: int = 0  # Replies on its bus before the last loss
+    late: bool = False  # Not a loss but a late reply
 
 
 @dataclass(slots=True)
 class _Count:
-    """Occasions of one part: all, and those that are so far apart that they count by themselves."""
+    """Occasions of one part that are far enough apart to count separately."""
 
     apart: int = 0
     last_ns: int = -(1 << 62)
@@ -86,22 +86,22 @@ class _Count:
 
 
 class Losses:
-    """Collects outages, and cycles with late replies, in memory that does not grow with the log."""
+    """Accumulator of outages, and of cycles with late replies. Its memory does not grow with the log."""
 
     def __init__(self, states: JointStates) -> None:
         self._states, servos = states, len(states.joint_of)
         self._asked, self._lost, self._answered = np.zeros((3, servos), np.int64)
         self._chains, self._broken_off, self._alone, self._lost_alone = np.zeros((4, servos), np.int64)
-        """Reads of several servos, by the first; those of which nothing came; reads of one; lost ones."""
-        self._answers = np.zeros(servos // IDS, np.int64)  # Of each bus so far
-        self._open: dict[int, _Outage] = {}  # The last outage of each servo
+        """Chain reads by first servo; those without any reply; single reads; lost single reads."""
+        self._answers = np.zeros(servos // IDS, np.int64)  # Replies of each bus so far
+        self._open: dict[int, _Outage] = {}  # Last outage of each servo
         self._outages: list[_Outage] = []
         self._late: list[_Outage] = []  # Cycles of a bus with late replies
 
-    # Collecting
+    # Collection
 
     def take(self, exchanges: Exchanges, places: Places) -> None:
-        """Take the missing replies of some exchanges; `places`: of the joints in their cycles."""
+        """Add the missing replies of some exchanges; `places` are the joint states in their cycles."""
         due, count = exchanges.due, exchanges.requests.servos[exchanges.request]
         ended, exchange, bus = exchanges.ended[due.exchange], due.exchange, due.servo // IDS
         cycles = _moments(exchanges)
@@ -143,7 +143,7 @@ class Losses:
                 self._outages.append(out)
 
     def late(self, bus: Numbers, exchanges: Exchanges, rows: Numbers) -> None:
-        """Take exchanges whose replies were late, and their buses: one for each cycle."""
+        """Add exchanges with late replies and their buses, one for each cycle."""
         if len(self._answers) < 2:
             return
         cycles = _moments(exchanges)[rows]
@@ -165,7 +165,11 @@ class Losses:
         }
 
     def occasions(self, always_late: Iterable[int] = ()) -> Occasions:
-        """Return whose each occasion is; `always_late`: buses whose late replies are no occasions."""
+        """Return the occasions with their attribution.
+
+        Args:
+            always_late: Buses with constantly late replies, which do not count as occasions.
+        """
         found = Occasions(self._states, self._heads())
         skipped = set(always_late)
         late = (one for one in self._late if one.servo // IDS not in skipped)
@@ -181,7 +185,7 @@ class Losses:
         return found
 
     def _heads(self) -> set[int]:
-        """Return first servos of chains of which nothing came, where lost instructions cannot be why."""
+        """Return first servos of silent chains for which lost instructions are not a plausible cause."""
         found = set()
         for servo in np.flatnonzero(self._broken_off).tolist():
             ids = slice(servo // IDS * IDS, (servo // IDS + 1) * IDS)
@@ -193,19 +197,19 @@ class Losses:
 
 
 class Occasions:
-    """Counts the occasions of each part."""
+    """Counter of occasions by part."""
 
     def __init__(self, states: JointStates, heads: set[int]) -> None:
-        """`heads`: first servos of chains whose silence is their own."""
+        """Create an empty counter; `heads` are first servos that cause the silence of their chains."""
         self._states, self._heads = states, heads
-        self._all: Counter[int] = Counter()  # Of each bus, and those that it shared with others
+        self._all: Counter[int] = Counter()  # Occasions by bus, and below those shared with other buses
         self._shared: Counter[int] = Counter()
-        self._late: Counter[int] = Counter()  # Of those that were shared those with late replies
+        self._late: Counter[int] = Counter()  # Shared occasions with late replies
         self._machine = _Count()
         self._bus: dict[int, _Count] = {}
         self._servos: dict[int, _Count] = {}
         self._pairs: Counter[tuple[int, int]] = Counter()
-        """Of two servos, or of one twice: all, not only those that are apart."""
+        """Common occasions of two servos, or all occasions of one; not only those far apart."""
 
     def add(self, outages: Sequence[_Outage]) -> None:
         """Count one occasion."""
@@ -228,7 +232,8 @@ class Occasions:
             self._pairs.update((one.servo, servo) for servo in {each.servo for each in lost})
 
     def together(self) -> tuple[tuple[int, ...], bool]:
-        """Return the buses that lost replies, or had them late, in the same cycles; and whether late."""
+        """Return the buses that lost replies, or had late ones, in the same cycles; and whether they were
+        mostly late."""
         found = tuple(
             bus
             for bus, shared in sorted(self._shared.items())
@@ -238,7 +243,7 @@ class Occasions:
         return (found if len(found) > 1 else ()), late
 
     def machine(self, buses: Sequence[LoggedBus], longest_ms: float) -> Iterator[Finding]:
-        """Name the machine, or what buses share, where they fail in the same cycles."""
+        """Report the machine, or a part that buses share, if buses fail in the same cycles."""
         shared, late = self.together()
         if not shared:
             return
@@ -251,9 +256,13 @@ class Occasions:
     def findings(
         self, index: int, bus: LoggedBus, losses: dict[int, ServoLosses], explained: set[int]
     ) -> Iterator[Finding]:
-        """Name servos that lose replies alone or together, and a bus that does as a whole.
+        """Report servos that lose replies alone or together, and a bus that loses replies as a whole.
 
-        `losses`: of each servo of the bus that was asked; `explained`: those whose losses have another cause.
+        Args:
+            index: Index of the bus.
+            bus: The bus.
+            losses: Losses by ID of each servo of the bus that was asked.
+            explained: IDs whose losses have another cause.
         """
         base = index * IDS
         counts = {servo % IDS: count for servo, count in self._servos.items() if servo // IDS == index}
@@ -283,7 +292,7 @@ class Occasions:
             yield cause("lossy_line", bus.name, sentence, share=(whole + sum(left)) / max(asked, 1))
 
     def _group(self, base: int, servo: int, times: dict[int, int]) -> set[int]:
-        """Return a servo, and those that lose their replies at the same occasions."""
+        """Return a servo together with those that lose replies on the same occasions."""
         own = self._pairs[base + servo, base + servo]
         return {servo} | {
             other
@@ -312,7 +321,8 @@ class Occasions:
         return cause("lossy_servo", name, sentence, share=share)
 
     def _where(self, servo: int) -> str:
-        """Return at which angle, speed or temperature of its joint a servo's occasions begin; empty: any."""
+        """Return the angles, speeds or temperatures of its joint to which a servo's losses are confined, as
+        text."""
         joint = int(self._states.joint_of[servo])
         if joint < 0:
             return ""
@@ -329,11 +339,16 @@ class Occasions:
 
 
 def narrowest(time: Numbers, begun: Numbers, *, open_above: bool) -> tuple[int, int, int, float] | None:
-    """Return the bins, the first and the last, in which a joint is when its replies are lost.
+    """Return the narrowest range of bins that contains nearly all losses.
 
-    Of each bin: how long it was there, and occasions that began there. With them come how many are inside,
-    and the share of the time there. None: they may be anywhere, but for one in a thousand such joints.
-    `open_above`: the range has no upper end.
+    Args:
+        time: Time spent in each bin.
+        begun: Occasions that began in each bin.
+        open_above: The range has no upper end.
+
+    Returns:
+        First and last bin, number of occasions inside, and share of the time there. None if the
+            concentration is plausible by chance, with probability 1 in 1000.
     """
     total, spent = int(begun.sum()), int(time.sum())
     at = np.flatnonzero(begun)
@@ -346,7 +361,7 @@ def narrowest(time: Numbers, begun: Numbers, *, open_above: bool) -> tuple[int, 
     enough = np.flatnonzero((inside >= _INSIDE * total) & (high >= low))
     best = min(enough.tolist(), key=lambda row: (share[row], -inside[row]))
     count, part = int(inside[best]), float(share[best])
-    # so many in any window of that width (Naus 1965, to the first order)
+    # Probability of this count in any window of that width (Naus 1965, to first order).
     chance = math.log(count * math.comb(total, count)) + (count - 1) * math.log(max(part, 1e-9))
     if chance > math.log(_CHANCE) or part > 1 / 2:
         return None
@@ -354,13 +369,13 @@ def narrowest(time: Numbers, begun: Numbers, *, open_above: bool) -> tuple[int, 
 
 
 def _moments(exchanges: Exchanges) -> Numbers:
-    """Return the cycle of each exchange; where none is known, a number for each 10 ms."""
+    """Return the cycle of each exchange; if it is unknown, a distinct number for each 10 ms."""
     before = exchanges.asked_ns // _UNKNOWN_NS - (1 << 60)
     return np.where(exchanges.cycle > BEFORE_FIRST_CYCLE, exchanges.cycle, before)
 
 
 def _before(group: Numbers, came: Flags, so_far: Numbers) -> Numbers:
-    """Return how many replies came of the group of each row before it, and add all to those so far."""
+    """Return the replies of each row's group before that row, and update the totals in `so_far`."""
     order = np.argsort(group, kind="stable")
     count = np.cumsum(came[order])
     begins = np.flatnonzero(np.diff(group[order], prepend=-1))

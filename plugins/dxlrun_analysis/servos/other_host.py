@@ -1,8 +1,9 @@
-"""Another host on a bus: how many instructions it sent, which, and to which IDs.
+"""Other hosts on a bus: number, kind and IDs of their instructions.
 
-One that sends at the same time as a servo spoils its reply, and its own instruction: what is left of that
-ends as an instruction does, by length and code. A reply does not: it has its error, or 0x55, in the place of
-a code. Of one that uses the same adapter only the replies are seen, which nothing here asked for.
+A host that sends at the same time as a servo spoils the servo's reply and its own instruction. The end of the
+instruction remains recognizable by its length and code: a reply has its error, or 0x55, in place of a code.
+If the other host uses the same adapter, only the replies are visible, which no instruction of this run
+requests.
 """
 
 from __future__ import annotations
@@ -22,22 +23,22 @@ from dxlrun_analysis.servos.requests import IDS, Flags, Numbers, instruction_of
 from dxlwire import BROADCAST_ID, protocol1, protocol2
 
 SPOILS, _FAILED = 1.5, 5.0
-"""Shares of a finding about a host that wrote goals, or whose replies may be taken for those of this run, and
-about one by which a servo failed."""
+"""Shares of findings: a host that wrote goals or whose replies may be mistaken for those of this run; a host
+that made a servo fail."""
 _FEWEST = 3
-"""Instructions from which it is no noise that looks like one: of 256 checksums of Protocol 1.0 one fits.
-Of those that write items of a servo one is enough."""
+"""Fewer instructions can be noise: one of 256 checksums of Protocol 1.0 fits by chance. A single write of
+servo items is sufficient."""
 _FEWEST_UNASKED = 10
-"""Replies that nothing asked for: a servo that is late once or a spoilt ID makes no more of them."""
+"""Fewer unrequested replies can come from a servo that is late once, or from a corrupted ID."""
 _MOST_NAMED = 3
-_ALL = 0.9  # Of the instructions from which an adapter always echoes, which it may
+_ALL = 0.9  # Share of echoed instructions from which the adapter always echoes, which is permitted
 _LONGEST = 48
-_PIECES = 0.1  # Part of the bytes without a packet from which those that end as an instruction are no chance
+_PIECES = 0.1  # Share of the stray bytes from which ends of instructions are not a coincidence
 _PING, _READ, _WRITE, _SYNC_WRITE, _BULK_READ = 0x01, 0x02, 0x03, 0x83, 0x92
 
 
 class OtherHosts:
-    """Collects the instructions of other hosts, in memory that does not grow with the log."""
+    """Accumulator of instructions of other hosts. Its memory does not grow with the log."""
 
     def __init__(self, buses: int) -> None:
         self._sent, self._pieces, self._unasked = Counts(), Counts(), Counts()
@@ -45,7 +46,7 @@ class OtherHosts:
         self.writes = ForeignWrites()
 
     def take(self, exchanges: Exchanges) -> None:
-        """Take those between some exchanges, and how many replies are missing there."""
+        """Add the foreign instructions in some exchanges, and count the missing replies."""
         others, due = exchanges.others, exchanges.due
         self._sent.take(others.bus.astype(np.int64), instruction_of(others) * IDS + others.servo_id)
         for packet in others:
@@ -63,7 +64,7 @@ class OtherHosts:
             np.add(counts, np.bincount(buses, minlength=len(counts)), out=counts)
 
     def _of(self, index: int) -> tuple[Numbers, Numbers]:
-        """Return code and ID of the instructions on a bus, and how often each was seen."""
+        """Return code and ID of the instructions on a bus as one number, with their counts."""
         pieces = int(self._pieces.of(index)[1].sum())
         enough = pieces >= max(_FEWEST, _PIECES * self._stray[index])
         found = [self._sent, self._pieces] if enough else [self._sent]
@@ -73,13 +74,13 @@ class OtherHosts:
         return values, counts
 
     def explains(self, index: int) -> bool:
-        """Return whether a bus has another host that may have spoilt its missing replies."""
+        """Return whether another host on the bus explains its missing replies."""
         sent, unasked = int(self._of(index)[1].sum()), int(self._unasked.of(index)[1].sum())
         seen = max(sent if sent >= _FEWEST else 0, unasked if unasked >= _FEWEST_UNASKED else 0)
         return seen > 0 and 2 * seen >= int(self._lost[index])
 
     def findings(self, index: int, bus: LoggedBus) -> Sequence[Finding]:
-        """Name the other host of a bus, or an adapter that began to echo; none: neither."""
+        """Report another host on a bus, or an adapter that echoed some of the instructions."""
         echoes, asked = self._echoes[index], self._asked[index]
         if _FEWEST <= echoes < _ALL * asked:
             sentence = (
@@ -109,7 +110,7 @@ class OtherHosts:
         return (cause("another_host", bus.name, sentence, share=share),)
 
     def _by_replies(self, index: int, bus: LoggedBus) -> Iterable[Finding]:
-        """Name another host of which only the replies to it are seen."""
+        """Report another host of which only the replies are visible."""
         ids, counts = self._unasked.of(index)
         if (total := int(counts.sum())) >= _FEWEST_UNASKED:
             sentence = (
@@ -120,7 +121,7 @@ class OtherHosts:
 
 
 def _ends(stray: PacketColumns, second: Flags) -> tuple[Numbers, Numbers]:
-    """Return bus, and code and ID as one number, of the bytes that end as an instruction does."""
+    """Return bus, and code and ID as one number, of stray bytes that end like an instruction."""
 
     def from_end(count: int) -> Numbers:
         found = np.zeros(len(stray), np.int64)
@@ -130,7 +131,7 @@ def _ends(stray: PacketColumns, second: Flags) -> tuple[Numbers, Numbers]:
 
     parts = []
     total = from_end(1)
-    for length in range(2, _LONGEST):  # of what is behind the length
+    for length in range(2, _LONGEST):  # `length` counts the bytes after the length field
         total += from_end(length)
         code, servo_id = from_end(length), np.where(second, from_end(length + 3), ~(total + length) % IDS)
         known = (code == _PING) & (length == 2 + second) | (code == _READ) & (length == 4 + 3 * second)

@@ -1,19 +1,19 @@
-"""Late replies: of a servo beside the others of its bus, and of a whole bus beside its plan.
+"""Late replies: of a servo compared with the others of its bus, and of a whole bus compared with its plan.
 
-A servo of a group read waits for the replies before its own: from the end of the reply before it (of the
-instruction, for the first) until its own ended, less the time of its bytes on the wire, is its own time: its
-return delay, and what adapter and host add. It is known where replies come one by one; those that were handed
-over together with the one before or behind, and those behind a reply that is missing, are left out, and so
-are fast status packets, which all servos of a bus share. Source of the order of replies: ROBOTIS e-Manual,
+A servo of a group read waits for the replies before its own. Its own time is the time from the end of the
+preceding reply (for the first, of the instruction) to the end of its reply, less the wire time of its bytes.
+It consists of its return delay and the time that adapter and host add. It is known only if replies arrive one
+by one. Excluded are replies that were delivered together with a neighbour, replies after a missing one, and
+fast status packets, which all servos of a bus share. Source of the order of replies: ROBOTIS e-Manual,
 Protocol 2.0, Sync Read and Bulk Read.
 
-What differs from servo to servo is the servos', what all have in common the adapter's: a servo is compared
-with the others of its bus. Only like is compared with like: replies behind others in a chain, replies of a
-servo that was asked alone right behind an exchange, and those after a rest of the line, when host and adapter
-take longer. The first reply of a chain, and the first of each cycle, are always those of the same servo, and
-have what wakes host, adapter and kernel in them: they are compared with none.
+Times common to all servos are attributed to the adapter, differences to the servos, so a servo is compared
+with the others of its bus. Only replies of the same kind are compared: replies after others in a chain,
+replies of a servo that was asked alone right after an exchange, and those after a rest of the line, when host
+and adapter take longer. The first reply of a chain, and the first of each cycle, always come from the same
+servo and include the wake-up of host, adapter and kernel. They are not compared.
 
-A bus is late by those late exchanges that are not of a servo that is named.
+A bus is judged late by its late exchanges without those of servos that are reported.
 """
 
 from __future__ import annotations
@@ -32,36 +32,37 @@ from dxlrun_analysis.servos.requests import IDS, Flags, Numbers
 from dxlwire import BROADCAST_ID
 
 _KINDS = _CHAINED, _FIRST, _RESTED, _NEXT = range(4)
-"""Of replies: behind others in a chain; first of a chain or of a cycle, and compared with none; asked alone
-after a rest of the line, or right behind an exchange."""
+"""Kinds of replies: after others in a chain; first of a chain or of a cycle, not compared; asked alone after
+a rest of the line; asked alone right after an exchange."""
 _REST_NS = 1_000_000
 _FEWEST = 20  # Replies from which a servo or a bus is judged
-_ODD_US = 100  # A servo differs from the others by more: clocks of servos and hosts do by some 10 us [i]
+_ODD_US = 100  # Threshold for a servo: clocks of servos and hosts differ by some 10 us [i]
 _MOST = 0.75
-_FEWEST_LATE, _TIMES_MORE = 5, 10  # Late replies of a servo, and so many times as all others have, and
-_CHANCE = 1e-3  # so seldom all late replies of a bus would be of one servo if any could be late
-_LATE_US = 300  # A reply that comes so much later than usual on its bus is a late one
+_FEWEST_LATE, _TIMES_MORE = 5, 10  # Late replies of a servo, and their ratio to those of all others
+_CHANCE = 1e-3  # Probability that all late replies of a bus come from one servo by chance
+_LATE_US = 300  # Threshold of a late reply over the usual time on its bus
 _LONGEST_DELAY_US = 508  # Return Delay Time (5, 9) is at most 254 times 2 us
-_STEADY_US = 60  # A return delay is always the same; a servo that is busy is not [i]
-_LATE_NS = 2_000_000  # An adapter that adds so much more than the plan expects is late
-_LATE_SHARE = 0.1  # Of the exchanges of a bus, from which it is late
+_STEADY_US = 60  # A return delay is constant; the delay of a busy servo is not [i]
+_LATE_NS = 2_000_000  # Threshold of a late adapter over the planned latency
+_LATE_SHARE = 0.1  # Share of its exchanges from which a bus is late
 
 _Values = tuple[Numbers, Numbers]
-"""Own times of replies of one kind, us, ascending, and how often each was seen."""
+"""Distinct own times of replies of one kind, us, ascending, and their counts."""
 
 
 class ReplyTimes:
-    """Collects the own times of replies, and late exchanges, in memory that does not grow with the log."""
+    """Accumulator of own reply times, and of late exchanges. Its memory does not grow with the log."""
 
     def __init__(self, buses: int) -> None:
         self._own_us = Counts()
-        self._late_us = Counts()  # Of late exchanges, by the servo that was late in each
+        self._late_us = Counts()  # Lateness of late exchanges, by the slowest servo of each
         self._given_up, self._single, self._single_late = np.zeros((3, buses * IDS), np.int64)
-        """Of each servo late replies that were given up; exchanges with it alone, and late ones of these."""
+        """Counts of each servo: late replies that were given up; exchanges with it alone; late ones of
+        these."""
         self._exchanges = np.zeros(buses, np.int64)
 
     def take(self, exchanges: Exchanges, losses: Losses) -> None:
-        """Take the replies of some exchanges; `losses` is told which were late."""
+        """Add the replies of some exchanges, and report late ones to `losses`."""
         replies, late = exchanges.replies, exchanges.late
         count, requests = len(replies.exchange), exchanges.requests
         self._exchanges += np.bincount(
@@ -79,7 +80,7 @@ class ReplyTimes:
         known = np.flatnonzero(in_turn & (asked[replies.exchange] > 0) & ~together & ~followed)
         kind = np.where(number[known] == 0, kinds[replies.exchange[known]], _CHAINED)
         self._own_us.take(replies.servo[known] * len(_KINDS) + kind, own_ns[known] // 1000)
-        # those that were given up count with the time of the reply before them
+        # Replies that were given up count from the end of the preceding reply.
         rows = np.flatnonzero((late.exchange >= 0) & ~_in_time(exchanges))
         of, servo = late.exchange[rows], late.servo[rows]
         self._given_up += np.bincount(servo, minlength=len(self._given_up))
@@ -95,7 +96,7 @@ class ReplyTimes:
     def _take_late(
         self, exchanges: Exchanges, own_ns: Numbers, given_up: tuple[Numbers, ...], losses: Losses
     ) -> None:
-        """Count exchanges that were late as a whole, and the servo whose reply took longest in each."""
+        """Count exchanges that were late as a whole, each with the servo whose reply took longest."""
         replies, count = exchanges.replies, len(exchanges.request)
         due = exchanges.requests.servos[exchanges.request]
         answers = np.flatnonzero(replies.answers)
@@ -103,7 +104,7 @@ class ReplyTimes:
         order = np.lexsort((own_ns[answers], of))
         last, slowest = np.full((2, count), -1, np.int64)
         last[of], slowest[of[order]] = answers, answers[order]
-        # without a rate it is not known when they are due
+        # Without a rate, the due time is unknown.
         whole = np.flatnonzero((np.bincount(of, minlength=count) == due) & (due > 0))
         whole = whole[np.array([bus.baud_rate > 0 for bus in exchanges.buses])[exchanges.bus[whole]]]
         extra_ns = replies.last_ns[last[whole]] - replies.due_ns[last[whole]]
@@ -111,7 +112,8 @@ class ReplyTimes:
         whole, extra_ns = (each[extra_ns >= limits[exchanges.bus[whole]]] for each in (whole, extra_ns))
         lacks, first = np.unique(given_up[0], return_index=True)
         rows = np.append(whole, lacks)
-        fast = exchanges.requests.fast[exchanges.request[whole]]  # they may be of any
+        # Any servo of a fast status packet can be late.
+        fast = exchanges.requests.fast[exchanges.request[whole]]
         of_any = exchanges.bus[whole] * IDS + BROADCAST_ID
         servo = np.append(np.where(fast, of_any, replies.servo[slowest[whole]]), given_up[1][first])
         single = due == 1
@@ -124,15 +126,16 @@ class ReplyTimes:
     # Results
 
     def always_late(self) -> list[int]:
-        """Return buses of which half of the exchanges are late: that is no occasion."""
+        """Return buses with at least half of their exchanges late. Constant lateness is not an occasion."""
         return [bus for bus in range(len(self._exchanges)) if self._share(bus, set()) >= 1 / 2]
 
     def longest_ms(self) -> float:
-        """Return how late any reply came."""
+        """Return the greatest lateness of any reply."""
         return max((self._late_us.of(group)[0][-1] / 1e3 for group in self._late_us.groups), default=0.0)
 
     def servos(self, index: int, bus: LoggedBus, *, now_and_then: bool) -> Iterator[Finding]:
-        """Name servos that answer later than the others of their bus: always, or also now and then."""
+        """Report servos that answer later than the others of their bus, always or with `now_and_then` also at
+        times."""
         samples: dict[int, dict[int, _Values]] = {}
         for group in self._own_us.groups:
             servo, kind = divmod(group, len(_KINDS))
@@ -141,7 +144,7 @@ class ReplyTimes:
         return _slow_servos(bus, samples, now_and_then=now_and_then)
 
     def line(self, index: int, bus: LoggedBus, slow: Iterable[str]) -> Iterator[Finding]:
-        """Name a bus whose replies are late; `slow`: names of its servos that are named."""
+        """Report a bus with late replies; `slow` are names of its servos that are already reported."""
         of_servos = {servo for servo, name in bus.names.items() if name in set(slow)}
         of_servos |= {BROADCAST_ID} if of_servos else set()
         ids = slice(index * IDS, (index + 1) * IDS)
@@ -149,7 +152,7 @@ class ReplyTimes:
         share = self._share(index, of_servos)
         if share < _LATE_SHARE and given_up < _FEWEST_LATE:
             return
-        # an adapter is late with replies of single servos, too, whichever it is
+        # A late adapter delays the replies of any servo that is asked alone.
         single, late = self._single[ids], self._single_late[ids]
         others = np.arange(IDS) != np.argmax(late)
         if late[others].sum() < share * single[others].sum() / _TIMES_MORE - 1:
@@ -161,7 +164,7 @@ class ReplyTimes:
         yield cause("late_replies", bus.name, sentence, f"{fix}." if fix else "", share)
 
     def _late(self, index: int, without: set[int]) -> _Values:
-        """Return how late the exchanges of a bus were, us, ascending."""
+        """Return the lateness of a bus' exchanges, us, ascending, with counts."""
         parts = [
             self._late_us.of(group)
             for group in self._late_us.groups
@@ -180,16 +183,16 @@ _NOTHING: _Values = (np.zeros(0, np.int64), np.zeros(0, np.int64))
 
 
 def _rested(exchanges: Exchanges) -> Flags:
-    """Return before which exchanges the line had carried nothing for a while, shape (exchanges,)."""
+    """Return which exchanges follow a rest of the line, shape (exchanges,)."""
     found = np.ones(len(exchanges.bus), np.bool_)
     found[1:] = exchanges.asked_ns[1:] - exchanges.last_ns[:-1] > _REST_NS
     return found
 
 
 def _in_time(exchanges: Exchanges) -> Flags:
-    """Return which late replies came no later than others were awaited to the same request.
+    """Return which late replies came within the longest waiting time of the same request.
 
-    They were given up for another reason, such as bytes that the line lost before them.
+    They were given up for another reason, such as lost bytes before them.
     """
     replies, late = exchanges.replies, exchanges.late
     of = replies.exchange[replies.answers]
@@ -203,10 +206,15 @@ def _in_time(exchanges: Exchanges) -> Flags:
 def _slow_servos(
     bus: LoggedBus, samples: dict[int, dict[int, _Values]], *, now_and_then: bool
 ) -> Iterator[Finding]:
-    """Name servos that answer later than the others of their bus; `samples`: by ID and kind of reply.
+    """Report servos that answer later than the others of their bus.
 
-    One is always later, in each kind of reply that they share; or it has the late replies of the bus almost
-    alone. Where neither holds, the log does not show whose they are.
+    A servo is reported if it is always later, in each kind of reply that it shares with others, or if it has
+    nearly all late replies of the bus. Otherwise the log does not show which servo is slow.
+
+    Args:
+        bus: The bus.
+        samples: Own times by ID and kind of reply.
+        now_and_then: Also report servos that are late at times.
     """
     for servo_id, kinds in samples.items():
         others = {
@@ -236,23 +244,24 @@ def _slow_servos(
 
 
 def _usual(others: list[_Values]) -> float:
-    """Return the median of what some servos need, us."""
+    """Return the median of the medians of some servos, us."""
     return float(np.median([median(*each) for each in others]))
 
 
 def _always_later(own: _Values, others: list[_Values]) -> bool:
-    """Return whether three quarters of its replies are later than three quarters of those of the others."""
+    """Return whether three quarters of a servo's replies are later than three quarters of those of the
+    others."""
     late = float(np.median([quantile(*each, _MOST) for each in others]))
     return median(*own) - _usual(others) >= _ODD_US and quantile(*own, 1 - _MOST) > late
 
 
 def _late_servo(bus: LoggedBus, servo_id: int, own: _Values, usual_us: float) -> Iterator[Finding]:
     planned_us = bus.return_delay_ns / 1e3
-    # what adapter and host add to every reply is not this servo's
+    # Exclude the time that adapter and host add to every reply.
     delay_us = median(*own) - max(0.0, usual_us - planned_us)
     steady = quantile(*own, 0.9) - quantile(*own, 0.1) <= _STEADY_US
     if steady and delay_us - planned_us < _ODD_US:
-        return  # the others answer sooner than planned
+        return  # The others answer sooner than planned
     name, named = bus.called(servo_id)
     seen, command = f"{named} answers {median(*own) - usual_us:.0f} us later than the others of its bus", ""
     if steady and delay_us <= _LONGEST_DELAY_US + _STEADY_US:

@@ -1,4 +1,4 @@
-"""What instructions request: which servos answer, in which order, with how many bytes of data each.
+"""Requests of instructions: servos that answer, order of their replies, and number of data bytes.
 
 Sources: ROBOTIS e-Manual, Protocol 1.0 and Protocol 2.0, instruction packets.
 """
@@ -13,40 +13,41 @@ from numpy.typing import NDArray
 from dxlrun.tooling.logs import PacketColumns
 from dxlwire import BROADCAST_ID
 
-IDS = 256  # A servo is one number: that of its bus times this, plus its ID
+IDS = 256  # Servos are numbered by index of the bus times this, plus ID
 _HEADER_2 = b"\xff\xff\xfd\x00"
 _STUFFED, _PLAIN = b"\xff\xff\xfd\xfd", b"\xff\xff\xfd"
 PING, _READ = 0x01, 0x02
 _SYNC_READ, _FAST_SYNC_READ, _BULK_READ, _FAST_BULK_READ = 0x82, 0x8A, 0x92, 0x9A
 _FAST = (_FAST_SYNC_READ, _FAST_BULK_READ)
 _MIXED = np.random.default_rng(15).integers(1, 2**63, 1 << 17, dtype=np.uint64) | np.uint64(1)
-"""Odd weights of a multilinear hash (Dietzfelbinger 1996): two instructions hardly ever have the same."""
+"""Odd weights of a multilinear hash (Dietzfelbinger 1996), which makes collisions of instructions
+improbable."""
 
 Numbers = NDArray[np.int64]
 Flags = NDArray[np.bool_]
 
 
 class LoggedRequest(NamedTuple):
-    """The replies that one instruction requests: from which servos, with how many bytes of data each."""
+    """Replies that one instruction requests."""
 
     servo_ids: tuple[int, ...] = ()
-    sizes: tuple[int, ...] = ()  # Bytes of data a servo; only for reads of several servos
-    fast: bool = False  # All answer in one status packet
+    sizes: tuple[int, ...] = ()  # Data bytes per servo; only for reads of several servos
+    fast: bool = False  # All servos answer in one status packet
 
 
 class Requests(NamedTuple):
-    """All different requests: none, of each servo by itself, then as found; columns of shape (requests,)."""
+    """All distinct requests: none, single servos by ID, then as found; columns of shape (requests,)."""
 
     kinds: tuple[LoggedRequest, ...] = ()
-    servos: Numbers = np.zeros(0, np.int64)  # How many each asks
+    servos: Numbers = np.zeros(0, np.int64)  # Number of servos that each request asks
     fast: Flags = np.zeros(0, np.bool_)
     places: Numbers = np.zeros((0, IDS), np.int64)
-    """Each servo's place in the replies to each request, -1: it has none; shape (requests, 256)."""
+    """Place of each servo in the replies; -1: not asked; shape (requests, 256)."""
     ids: Numbers = np.zeros((0, IDS), np.int64)
-    """IDs in the order of places, those that are asked at the end; shape (requests, 256)."""
+    """IDs with those that are asked at the end, in order of places; shape (requests, 256)."""
 
     def and_more(self, kinds: tuple[LoggedRequest, ...]) -> Requests:
-        """Return these and more requests."""
+        """Return a table with additional requests."""
         places = np.full((len(kinds), IDS), -1, np.int64)
         for row, one in zip(places, kinds, strict=True):
             row[list(one.servo_ids)] = np.arange(len(one.servo_ids))
@@ -63,14 +64,14 @@ _ALONE = Requests().and_more((LoggedRequest(), *(LoggedRequest((servo_id,)) for 
 
 
 class RequestTable:
-    """Collects the requests of a log: each different instruction is parsed once."""
+    """Table of the requests of a log. Each distinct instruction is parsed once."""
 
     def __init__(self) -> None:
         self.all = _ALONE
         self._known: dict[bytes, int] = {}
 
     def of(self, packets: PacketColumns) -> Numbers:
-        """Return which request each instruction is."""
+        """Return the index of the request of each instruction."""
         second, code = second_of(packets), instruction_of(packets)
         servo_id = np.where(second, packets.byte(4), packets.byte(2)).astype(np.int64)
         found = np.zeros(len(packets), np.int64)
@@ -99,7 +100,10 @@ def instruction_of(packets: PacketColumns) -> Numbers:
 
 
 def second_of(packets: PacketColumns) -> Flags:
-    """Return the protocol by the header; a Protocol 1.0 packet of ID 253 has no length 0."""
+    """Return which packets have the Protocol 2.0 header.
+
+    A Protocol 1.0 packet of ID 253 cannot have length 0.
+    """
     second = packets.length >= len(_HEADER_2)
     for index, byte in enumerate(_HEADER_2):
         second &= packets.byte(index) == byte
@@ -123,7 +127,10 @@ def request_of(data: bytes) -> LoggedRequest:
 
 
 def _entries(body: bytes, width: int, at: int, *, fast: bool) -> LoggedRequest:
-    """Return the servos of a bulk read: entries of `width` bytes, the ID at `at`, the size first or last."""
+    """Return the servos of a bulk read.
+
+    Entries have `width` bytes, the ID at `at`, and the size first or last.
+    """
     entries = [body[start : start + width] for start in range(0, len(body) - width + 1, width)]
     sizes = (entry[0] if at else int.from_bytes(entry[3:5], "little") for entry in entries)
     return LoggedRequest(tuple(dict.fromkeys(entry[at] for entry in entries)), tuple(sizes), fast)

@@ -1,4 +1,4 @@
-"""Traffic of each bus and servo: requests, replies, reply times, error bits; by the bytes in the log."""
+"""Traffic of buses and servos: requests, replies, reply times, error bits; from the bytes in the log."""
 
 from __future__ import annotations
 
@@ -26,39 +26,39 @@ _KINDS = max(PacketKind) + 1
 
 @dataclass(frozen=True, slots=True)
 class ServoTraffic:
-    """One servo's traffic over the whole log, set-up and shutdown included."""
+    """Traffic of one servo over the whole log, set-up and shutdown included."""
 
     bus: str
     servo_id: int
-    joint: str  # Or the device; empty where the log's plan names none
-    instructions: int  # Addressed to it alone
+    joint: str  # Joint or device; empty if the log's plan names none
+    instructions: int  # Instructions addressed to it alone
     asked: int
-    """Pings and reads, also those of several servos at once: what it has to answer at every status return
+    """Pings and reads, including those of several servos: requests that it answers at every status return
     level."""
     lost: int
-    """Of `asked`, without a status packet of this servo before the bus' next instruction. What is still open
-    where the log ends is in neither: its reply may have come a moment later."""
+    """Requests of `asked` without a status packet of this servo before the next instruction on the bus. A
+    request that is open at the end of the log is in neither count, as its reply may have come later."""
     replies: int  # Status packets, acknowledged writes included
     errors: int  # Replies with any error bit
     error_names: tuple[str, ...]
     reply_median_us: float
-    """From before the write() of a ping or read to after the read() of the reply's last byte; in a read of
-    several servos at once, those that answer later have the replies before theirs in it."""
+    """Time from before the write() of a ping or read to after the read() of the reply's last byte. In a read
+    of several servos it includes the preceding replies."""
     reply_max_us: float
     reply_p99_us: float = 0.0
     losses: ServoLosses | None = None
-    """Of `lost`, what is its own and not that of a servo before it in a chain."""
-    device: bool = False  # It is a device of the plan, and no servo
+    """Share of `lost` that is its own and not caused by a preceding servo of a chain."""
+    device: bool = False  # A device of the plan, not a servo
 
     @property
     def subject(self) -> str:
-        """What findings accuse: its joint, or its bus and ID."""
+        """Name that findings accuse: its joint, or its bus and ID."""
         return self.joint or f"{self.bus} {self.servo_id}"
 
 
 @dataclass(frozen=True, slots=True)
 class BusTraffic:
-    """One bus over the whole log."""
+    """Traffic of one bus over the whole log."""
 
     name: str
     instructions: int
@@ -68,20 +68,24 @@ class BusTraffic:
     bytes_out: int
     bytes_in: int
     extra_us: float | None = None
-    """Median of how much longer than wire and return delay a complete exchange took: what the adapter adds;
-    None where the log's plan does not have it, and where replies wait for the next cycle."""
-    planned_latency_us: float | None = None  # What the plan expects of that
+    """Median excess of a complete exchange over wire time and return delay: the latency of the adapter. None
+    if the log's plan lacks the bus, or if replies wait for the next cycle."""
+    planned_latency_us: float | None = None  # Planned value of `extra_us`
     port: str = ""
 
 
 class Traffic:
-    """Counts packets, slice by slice of a log, in memory that does not grow with it."""
+    """Accumulator of packets, fed slice by slice. Its memory does not grow with the log."""
 
     def __init__(self, watch: Callable[[Exchanges], None] = lambda _: None) -> None:
-        """`watch` is called with all exchanges, too: they are paired once."""
+        """Create the accumulator.
+
+        Args:
+            watch: Function that also receives the exchanges, so that packets are paired once.
+        """
         self._pairing, self._watch = Pairing(), watch
         self._extra_us, self._reply_us = Counts(), Counts()
-        self.findings: tuple[Finding, ...] = ()  # By the rules of this room; known when all is finished
+        self.findings: tuple[Finding, ...] = ()  # Findings of this room's rules; complete after `finish`
         self._size(0, JointStates())
 
     def _size(self, buses: int, states: JointStates) -> None:
@@ -97,7 +101,11 @@ class Traffic:
         self._errors = np.zeros((servos, _BYTES), np.int64)  # By error byte
 
     def take(self, log: Log) -> None:
-        """Count the packets of the next slice. Raises LogError when one cannot be read."""
+        """Count the packets of the next slice.
+
+        Raises:
+            LogError: A packet cannot be read.
+        """
         if len(self._packets) != len(log.buses):
             self._size(len(log.buses), JointStates(log.buses, log.joints, plan_of(log)))
         packets = log.packets
@@ -131,14 +139,14 @@ class Traffic:
     def _findings(
         self, plans: Sequence[LoggedBus], losses: Mapping[tuple[int, int], ServoLosses]
     ) -> Iterator[Finding]:
-        """Name what is wrong with replies: first what several buses share, then bus by bus."""
+        """Report problems with replies: first those that several buses share, then bus by bus."""
         occasions = self._losses.occasions(self._reply_times.always_late())
         shared, are_late = occasions.together()
         yield from occasions.machine(plans, self._reply_times.longest_ms())
         for index, plan in enumerate(plans):
             yield from self._others.findings(index, plan)
             if self._others.explains(index):
-                continue  # what is late, missing or spoilt then is a consequence
+                continue  # Late, missing or broken replies are then a consequence
             alone = not (are_late and index in shared)
             slow = tuple(self._reply_times.servos(index, plan, now_and_then=alone))
             yield from slow
@@ -165,7 +173,7 @@ class Traffic:
         self._broken.take(exchanges)
         self._others.take(exchanges)
         count, due, replies = len(self._asked), exchanges.due, exchanges.replies
-        # what is still open where the log ends may have been answered a moment later
+        # A request that is open at the end of the log may have been answered later.
         lost = (due.reply < 0) & exchanges.ended[due.exchange]
         for counts, servo in (
             (self._asked, due.servo[(due.reply >= 0) | lost]),
@@ -174,7 +182,7 @@ class Traffic:
         ):
             np.add(counts, np.bincount(servo, minlength=count), out=counts)
         self._seen[due.servo] = self._seen[replies.servo] = True
-        self._protocol[replies.servo] = replies.protocol  # the last of each counts
+        self._protocol[replies.servo] = replies.protocol  # The last reply of a servo counts
         errors = np.bincount(replies.servo * _BYTES + replies.error, minlength=self._errors.size)
         self._errors += errors.reshape(self._errors.shape)
         answers = np.flatnonzero(replies.answers)
@@ -186,7 +194,7 @@ class Traffic:
         self._extra(exchanges, of, answers)
 
     def _extra(self, exchanges: Exchanges, of: Numbers, answers: Numbers) -> None:
-        """Count how much longer than wire and return delay each complete exchange took."""
+        """Count the excess of each complete exchange over wire time and return delay."""
         replies, count = exchanges.replies, len(exchanges.request)
         due = exchanges.requests.servos[exchanges.request]
         complete = (np.bincount(of, minlength=count) == due) & (due > 0)
