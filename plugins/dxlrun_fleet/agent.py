@@ -1,8 +1,8 @@
-"""Agent: starts robots where none runs, for clients with the role admin, by mutual TLS.
+"""Agent: starts robots on request of clients with the role admin, over mutual TLS.
 
-It starts the lines of its own file and nothing else: a request has a robot's name alone. A run is a process
-of its own, which goes on when the agent ends. Its output goes to NAME.out beside the file; that is locked
-for as long as a process of the run lives, so that a robot runs once, whichever agent started it.
+It starts only the command lines of its own file: a request contains just a robot's name. Each run is a
+separate process, which continues when the agent exits. Its output goes to NAME.out next to the file. This
+output file is locked while a process of the run lives, so a robot runs only once, whichever agent started it.
 """
 
 from __future__ import annotations
@@ -22,13 +22,13 @@ from dxlrun.tooling.live import Listener, Role, serve_clients
 from dxlrun_fleet.fleet_file import Agent
 
 START = "/robots/"
-"""Before the name of a robot: POST starts it, GET asks whether it runs; 200: it does."""
+"""Path prefix before a robot's name. POST starts the robot; GET returns 200 if it runs."""
 _MOST_TOLD, _LINES_TOLD = 4096, 6
 _MAIN = "from dxlrun.cli import main; raise SystemExit(main())"
 
 
 class Starter:
-    """Starts the robots of an agent, each once."""
+    """ASGI application that starts the robots of an agent, each once."""
 
     def __init__(self, agent: Agent, directory: Path) -> None:
         self._agent, self._directory = agent, directory
@@ -73,6 +73,11 @@ class Starter:
 
 
 async def serve(agent: Agent, directory: Path) -> None:
-    """Serve until the process ends. Raises InputError for certificates that are refused, and OSError."""
+    """Serve until the process ends.
+
+    Raises:
+        InputError: The certificates are refused.
+        OSError: The address cannot be used.
+    """
     await serve_clients(Listener.secured(agent.address), Starter(agent, directory))
     await asyncio.Event().wait()

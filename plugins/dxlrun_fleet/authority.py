@@ -1,8 +1,8 @@
-"""Authority: a certificate authority of one's own, which signs for robots and clients (extra `network`).
+"""Authority: a private certificate authority for robots and clients (extra `network`).
 
-Its key and all certificates that it signed lie in `authority` of the keys' directory. Certificates after
-RFC 5280: a robot's serves only as a server's, a client's only as a client's (extended key usage), and the
-role of a client is the organizational unit of its subject.
+Its key and all certificates that it signed are in `authority` of the keys' directory. Certificates follow RFC
+5280: a robot's is valid only for servers, a client's only for clients (extended key usage). The role of a
+client is the organizational unit of its subject.
 """
 
 from __future__ import annotations
@@ -30,26 +30,26 @@ from dxlrun.tooling.output import unwritable
 
 _AUTHORITY_DAYS = 3650
 _EARLIER = timedelta(minutes=5)
-"""Certificates are valid from this long before: clocks of computers differ."""
+"""Certificates are valid from this long before their creation, because clocks of computers differ."""
 
 
 class Issued(NamedTuple):
-    """What the authority signed for a robot or a client."""
+    """Certificates that the authority signed for one robot or client."""
 
     name: str
     certificate: x509.Certificate
-    """The newest."""
+    """Newest certificate."""
     earlier: tuple[x509.Certificate, ...] = ()
 
     @property
     def role(self) -> str:
-        """The role of a client; `robot` of a robot."""
+        """Role of a client; `robot` for a robot."""
         found = self.certificate.subject.get_attributes_for_oid(NameOID.ORGANIZATIONAL_UNIT_NAME)
         return str(found[0].value) if found else "robot"
 
     @property
     def serials(self) -> list[str]:
-        """The newest certificate's number, then those before: hexadecimal with even digits, as TLS has it."""
+        """Serial numbers, newest first, in the form of TLS: hexadecimal with an even number of digits."""
         found = [f"{one.serial_number:X}" for one in (self.certificate, *self.earlier)]
         return [digits.zfill(len(digits) + len(digits) % 2) for digits in found]
 
@@ -60,27 +60,33 @@ def place() -> Path:
 
 
 def issued() -> Iterator[Issued]:
-    """Yield what was signed for each name, in order of the names."""
+    """Yield the issued certificates by name, in order of the names."""
     for path in sorted(place().glob("issued/*.crt")):
         *earlier, newest = x509.load_pem_x509_certificates(path.read_bytes())
         yield Issued(path.stem, newest, (*earlier,))
 
 
 def revoke(one: Issued) -> None:
-    """Let the robots of this computer refuse all certificates of a name from now on."""
+    """Make the robots of this computer refuse all certificates of a name from now on."""
     lines = "".join(f"{serial}\n" for serial in sorted(revoked().union(one.serials)))
     _write(keys_place() / "revoked", lines.encode())
 
 
 def issue(name: str, role: Role | None, days: int, to: Path) -> Issued:
-    """Sign a certificate, and write it with its key and the authority's to a directory.
+    """Sign a certificate, and write it with its key and the authority's certificate to a directory.
 
-    `role` is a client's; None: the certificate is a robot's. Raises InputError when a file would be written
-    over that is another name's or another authority's.
+    Args:
+        name: Name of the robot or client.
+        role: Role of a client; None for a robot.
+        days: Validity from now, days.
+        to: Directory of the files.
+
+    Raises:
+        InputError: A file to be overwritten belongs to another name or another authority.
     """
     file = name if role is None else CLIENT
     try:
-        to.mkdir(parents=True, exist_ok=True, mode=0o700)  # before the certificate counts as issued
+        to.mkdir(parents=True, exist_ok=True, mode=0o700)  # Fail before the certificate counts as issued
     except OSError as error:
         raise unwritable(to, error) from error
     issuer, signer = _authority()
@@ -120,7 +126,7 @@ def _is_named(path: Path, name: str) -> bool:
 
 
 def _authority() -> tuple[x509.Certificate, ec.EllipticCurvePrivateKey]:
-    """Return the authority's certificate and key, which are made at the first use."""
+    """Return the authority's certificate and key. The first call creates them."""
     certificate, path = keys_place() / "ca.crt", place() / "ca.key"
     if not path.exists():
         if certificate.exists():
@@ -178,7 +184,7 @@ def _write_key(path: Path, key: ec.EllipticCurvePrivateKey) -> None:
 
 
 def _write(path: Path, data: bytes) -> None:
-    """Write a file whole, and so that only this user can read it."""
+    """Write a file atomically and readable only by this user."""
     part = path.with_suffix(".part")
     part.unlink(missing_ok=True)
     with os.fdopen(os.open(part, os.O_WRONLY | os.O_CREAT | os.O_EXCL, 0o600), "wb") as stream:

@@ -1,4 +1,4 @@
-"""`dxlrun fleet`: several robots in one table, started and stopped from here."""
+"""`dxlrun fleet`: table of several robots, and commands that start and stop them."""
 
 from __future__ import annotations
 
@@ -22,7 +22,7 @@ if TYPE_CHECKING:
     from dxlrun_fleet.fleet_file import Fleet
 
 _START_S = 300.0
-"""Ten robots that start together on a small computer take minutes; one that cannot listen ends by itself."""
+"""Ten robots that start together on a small computer take minutes; one that cannot listen exits before."""
 _POLL_S = 0.2
 Names = Annotated[tuple[str, ...], Parameter(negative=(), show_default=False, consume_multiple=True)]
 
@@ -51,7 +51,7 @@ def fleet(
     stop
         Stop these robots, by their policy on_exit; needs the role command.
     serve
-        Be the agent of this name: start the robots that the file names for it. Robots go on when it ends.
+        Be the agent of this name: start the robots that the file names for it. Robots continue when it exits.
     """
     from dxlrun.tooling.live import client_context
     from dxlrun_fleet.fleet_file import read_fleet
@@ -59,7 +59,7 @@ def fleet(
     found = read_fleet(file)
     if serve is not None:
         return _serve(found, serve)
-    client_context()  # what is wrong with the certificates is wrong with all robots
+    client_context()  # A problem with the certificates affects all robots, so report it once
     found.require((*start, *stop))
     if start or stop:
         return _change(found, start, stop, as_json=as_json)
@@ -88,7 +88,7 @@ def _serve(fleet: Fleet, name: str) -> int:
 
 
 def _change(fleet: Fleet, start: tuple[str, ...], stop: tuple[str, ...], *, as_json: bool) -> int:
-    """Start and stop robots, all at once: one that does not answer delays no other."""
+    """Start and stop robots in parallel, so that an unresponsive robot does not delay another."""
     work = {
         **{name: partial(_start, fleet) for name in start},
         **{name: partial(_stop, fleet) for name in stop},
@@ -112,7 +112,7 @@ def _change(fleet: Fleet, start: tuple[str, ...], stop: tuple[str, ...], *, as_j
 
 
 def _start(fleet: Fleet, name: str) -> str:
-    """Let a robot's agent start it; return when it can be reached."""
+    """Request a robot's start from its agent; return when the robot accepts connections."""
     from dxlrun.tooling.live import NetworkLink
     from dxlrun_fleet.agent import START
 
@@ -135,7 +135,7 @@ def _stop(fleet: Fleet, name: str) -> str:
     from dxlrun.tooling.live import NetworkLink
 
     with RemoteRobot(name, NetworkLink(fleet.robots[name], "dxlrun fleet")) as robot:
-        robot.info()  # to a client, one that cannot be reached has been stopped
+        robot.info()  # To a client, an unreachable robot counts as stopped
         robot.stop()
     return f"{name} has ended"
 

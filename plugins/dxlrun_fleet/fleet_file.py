@@ -1,4 +1,4 @@
-"""The file of a fleet: where its robots listen, and the agents that start them."""
+"""Fleet file: addresses of robots, and the agents that start them."""
 
 from __future__ import annotations
 
@@ -41,7 +41,7 @@ class FleetForm(Form):
 
 
 class Agent(NamedTuple):
-    """An agent, and the words behind `dxlrun` of each robot that it starts."""
+    """Agent, with the arguments of `dxlrun` for each robot that it starts."""
 
     address: Address
     starts: dict[str, tuple[str, ...]]
@@ -55,21 +55,29 @@ class Fleet(NamedTuple):
     directory: Path
 
     def agent_of(self, robot: str) -> Agent:
-        """Return the agent that starts a robot; raises InputError."""
+        """Return the agent that starts a robot.
+
+        Raises:
+            InputError: None of the agents starts it.
+        """
         for agent in self.agents.values():
             if robot in agent.starts:
                 return agent
         raise InputError(f"no agent of the file starts {robot}; name it under agents: NAME: starts")
 
     def require(self, names: tuple[str, ...]) -> None:
-        """Raise InputError for the first name that is no robot."""
+        """Raise InputError for the first name that is not a robot."""
         for name in names:
             if name not in self.robots:
                 raise InputError(f"the file has no robot {name}; {suggestion(name, tuple(self.robots))}")
 
 
 def read_fleet(path: Path) -> Fleet:
-    """Return the fleet of a file; raises InputError with the place of each mistake."""
+    """Return the fleet of a file.
+
+    Raises:
+        InputError: The file has mistakes; the message has the place of each.
+    """
     form = read_yaml(path, FleetForm)
     return Fleet(
         {name: Address.parse(text, name) for name, text in form.robots.items()},

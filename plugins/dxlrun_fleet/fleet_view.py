@@ -1,4 +1,4 @@
-"""View of a fleet: what each robot replied last, by a thread a robot: none delays another."""
+"""Fleet view: the last reply of each robot, polled by one thread per robot so that none delays another."""
 
 from __future__ import annotations
 
@@ -15,48 +15,48 @@ from dxlrun.tooling.output import Cell, Column, Columns, Table
 
 LOOK_S = 0.5
 SILENT_S = 1.5
-"""A robot that has not replied for so long is unreachable."""
+"""A robot that has not replied for this time is unreachable."""
 _ERROR = 40
-"""The least severity of an event that is an error."""
+"""Least severity of an error event."""
 
 
 class Seen(msgspec.Struct, frozen=True):
-    """One robot, as it replied last."""
+    """State of one robot at its last reply."""
 
     robot: str
     state: str = "connecting"
     """connecting, starting, running, paused, unreachable"""
     since: str = ""
-    """Wall time of the last reply, or of the first try, of a robot that is unreachable."""
+    """Wall-clock time of the last reply of an unreachable robot, or of the first attempt."""
     reason: str = ""
     voltage: float | None = None
-    """The lowest of its servos, V"""
+    """Lowest voltage of its servos, V"""
     temperature: float | None = None
-    """The highest of its servos, deg C"""
+    """Highest temperature of its servos, deg C"""
     hottest: str = ""
     error: str = ""
-    """The text of its last error."""
+    """Text of its last error."""
     log: str | None = None
 
 
 class RobotView:
-    """Looks at one robot twice a second."""
+    """Poller of one robot, twice a second."""
 
     def __init__(self, name: str, address: Address) -> None:
         self._address = address
         self._seen = Seen(name)
         self._replied = time.monotonic()
         self.tried = threading.Event()
-        """Set once the first look succeeded or failed."""
+        """Set once the first poll has succeeded or failed."""
         self._ended = threading.Event()
         threading.Thread(target=self._look_on, daemon=True).start()
 
     def close(self) -> None:
-        """Look no more; a robot that hangs is not waited for."""
+        """Stop polling, without waiting for a robot that hangs."""
         self._ended.set()
 
     def seen(self) -> Seen:
-        """Return the robot as it is now."""
+        """Return the current state of the robot."""
         seen, silent = self._seen, time.monotonic() - self._replied
         if seen.state != "unreachable" and silent <= SILENT_S:
             return seen
@@ -80,7 +80,7 @@ class RobotView:
             self.tried.set()
 
     def _look(self, robot: RemoteRobot, last: int) -> int:
-        """Ask the robot; return the number of its last event."""
+        """Poll the robot; return the number of its last event."""
         info = msgspec.convert(robot.info(), RobotInfo)
         events = msgspec.convert(robot.events(last), Events)
         errors = [event.text for event in events.events if event.severity >= _ERROR]
@@ -110,12 +110,12 @@ class RobotView:
 
 
 def _at_most(values: np.ndarray[tuple[int, ...], np.dtype[np.float64]]) -> int | None:
-    """Return where the highest value is; None: none is known."""
+    """Return the index of the highest value, or None if all are unknown."""
     return int(np.nanargmax(values)) if np.isfinite(values).any() else None
 
 
 def fleet_table(robots: list[Seen]) -> Table:
-    """Return a row for each robot."""
+    """Return a table with a row for each robot."""
     columns: Columns[Seen] = [
         (Column("robot", "name"), lambda one: one.robot),
         (Column("state", "name"), _state),

@@ -38,15 +38,15 @@ def keys(
     Parameters
     ----------
     action
-        robot NAME and client NAME make a certificate, renew NAME makes it anew, revoke NAME lets the robots
-        of this computer refuse it, list shows all.
+        robot NAME and client NAME make a certificate, renew NAME replaces it, revoke NAME makes the robots of
+        this computer refuse it, list shows all.
     name
         Of a robot, as in its robot file, or of a client, as the robot's log shall name it.
     role
-        What a client may do: observe (if left out), command, or admin, which is registers, rates and
+        What a client may do: observe (the default), command, or admin, which is registers, rates and
         controllers, too.
     days
-        How long the certificate is valid, 365 if left out.
+        How long the certificate is valid, 365 by default.
     output
         Write the result to this directory, to be copied to `~/.config/dxlrun/keys` of another computer;
         without it this computer uses it.
@@ -121,7 +121,7 @@ _ACTIONS_WITH = {
 
 
 def _refuse_unused(action: str, given: Mapping[str, object]) -> None:
-    """Raise InputError for what is given and this action does not use."""
+    """Raise InputError for an option that this action does not use."""
     for option, value in given.items():
         if value is not None and action not in _ACTIONS_WITH[option]:
             actions = " and ".join(_ACTIONS_WITH[option])

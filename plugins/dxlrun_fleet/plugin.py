@@ -1,4 +1,4 @@
-"""The verbs for several robots and computers, by the same hooks as any other package."""
+"""Commands for several robots and computers, registered by the same hooks as those of any other package."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ def dxlrun_contract() -> int:
 
 @hookimpl
 def dxlrun_commands() -> Sequence[Command]:
-    """Return the verbs."""
+    """Return the commands."""
     return (
         Command("fleet", "dxlrun_fleet.fleet:fleet", group="Robots that run"),
         Command("keys", "dxlrun_fleet.keys:keys", group="Robots that run"),

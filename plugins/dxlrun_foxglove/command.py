@@ -1,4 +1,4 @@
-"""`dxlrun foxglove`: a running robot in Foxglove or Lichtblick."""
+"""`dxlrun foxglove`: server that shows a running robot in Foxglove or Lichtblick."""
 
 from __future__ import annotations
 
@@ -23,9 +23,9 @@ if TYPE_CHECKING:
 
 PORT = 8765
 NICENESS = 10
-"""As the gateway's: viewers get the processor time that the robot leaves."""
+"""As the gateway: viewers use processor time that the robot leaves."""
 APP = "https://app.foxglove.dev"
-"""The viewer on the web, the one page that may connect without `--origin`."""
+"""The viewer on the web, the only page that may connect without `--origin`."""
 
 
 def foxglove(
@@ -97,7 +97,11 @@ async def _serve(served: FoxgloveServer, listener: Listener, tls: ssl.SSLContext
 
 
 def tls_of(cert: Path | None, key: Path | None) -> ssl.SSLContext | None:
-    """Return what TLS is made with; None: without. Raises InputError."""
+    """Return the TLS context, or None without a certificate.
+
+    Raises:
+        InputError: The certificate or the key cannot be used.
+    """
     if cert is None:
         return None
     context = ssl.SSLContext(ssl.PROTOCOL_TLS_SERVER)

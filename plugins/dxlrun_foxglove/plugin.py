@@ -1,4 +1,4 @@
-"""The verb that serves Foxglove and Lichtblick, by the same hooks as any other package."""
+"""Command that serves Foxglove and Lichtblick, registered by the same hooks as that of any other package."""
 
 from __future__ import annotations
 
@@ -15,5 +15,5 @@ def dxlrun_contract() -> int:
 
 @hookimpl
 def dxlrun_commands() -> Sequence[Command]:
-    """Return the verb."""
+    """Return the command."""
     return (Command("foxglove", "dxlrun_foxglove.command:foxglove", group="Robots that run"),)

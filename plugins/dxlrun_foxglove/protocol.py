@@ -1,4 +1,4 @@
-"""Frames of `foxglove.websocket.v1`, the protocol of live viewers: what they send, and what they are sent.
+"""Frames of `foxglove.websocket.v1`, the protocol of live viewers, in both directions.
 
 The specification is in github.com/foxglove/ws-protocol. `foxglove.sdk.v1` has the same frames.
 """
@@ -13,11 +13,11 @@ import msgspec
 
 SUBPROTOCOLS = ("foxglove.websocket.v1", "foxglove.sdk.v1")
 MESSAGE, CALL, RESPONSE = 1, 2, 3
-"""Operations of binary frames; a call is a viewer's."""
+"""Opcodes of binary frames; viewers send CALL, the server MESSAGE and RESPONSE."""
 MESSAGE_HEAD = struct.Struct("<BIQ")
-"""Operation, subscription, time (ns since 1970); the message follows."""
+"""Opcode, subscription, time (ns since 1970); the message follows."""
 _CALL_HEAD = struct.Struct("<BIII")
-"""Operation, service, number of the call, length of the encoding's name; name and body follow."""
+"""Opcode, service, number of the call, length of the encoding's name; name and body follow."""
 WARNING, ERROR = 1, 2
 """Levels of a status."""
 Operation = Literal[
@@ -34,7 +34,7 @@ Number = Annotated[int, msgspec.Meta(ge=0, lt=1 << 32)]
 
 
 class Subscription(msgspec.Struct, frozen=True, rename="camel"):
-    """A viewer's own number for a channel."""
+    """Subscription of a viewer: its own number for a channel."""
 
     id: Number
     channel_id: Number
@@ -48,7 +48,7 @@ class Parameter(msgspec.Struct, frozen=True):
 
 
 class Words(msgspec.Struct, frozen=True, rename="camel"):
-    """A viewer's frame of text; each operation has one of the fields."""
+    """Text frame of a viewer. Each operation uses some of the fields."""
 
     op: Operation
     subscriptions: list[Subscription] = []
@@ -56,11 +56,11 @@ class Words(msgspec.Struct, frozen=True, rename="camel"):
     parameters: list[Parameter] = []
     parameter_names: list[str] = []
     id: str | None = None
-    """Of the answer, too."""
+    """Number of the request, which its answer repeats."""
 
 
 class Call(msgspec.Struct, frozen=True):
-    """A call of a service."""
+    """Service call."""
 
     service: int
     number: int
@@ -72,7 +72,11 @@ _decode = msgspec.json.Decoder(Words).decode
 
 
 def received(frame: str | bytes) -> Words | Call:
-    """Return what a viewer has sent. Raises ValueError."""
+    """Parse a frame from a viewer.
+
+    Raises:
+        ValueError: The frame does not follow the protocol.
+    """
     if isinstance(frame, str):
         try:
             return _decode(frame)
@@ -92,7 +96,7 @@ def response(call: Call, body: bytes) -> bytes:
 
 
 def failure(request: Words | Call, why: str) -> str:
-    """Return the frame for a request that was refused."""
+    """Return the frame that refuses a request, with the reason."""
     if isinstance(request, Call):
         return text("serviceCallFailure", serviceId=request.service, callId=request.number, message=why)
     return status(ERROR, why)
@@ -104,7 +108,7 @@ def values(parameters: Sequence[Parameter], number: str | None) -> str:
 
 
 def text(operation: str, **fields: object) -> str:
-    """Return a frame of text."""
+    """Return a text frame."""
     return msgspec.json.encode({"op": operation, **fields}).decode()
 
 

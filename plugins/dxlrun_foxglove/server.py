@@ -1,7 +1,8 @@
-"""Server of live viewers, with a guard at its door.
+"""Server for live viewers, with access control.
 
-A viewer shows the token of the address; where it says which web page it belongs to (Origin, as every browser
-does), that page is one that was named. What has no token yet has five seconds, and room for few.
+A viewer presents the token of the address. If it sends the web page that it belongs to (Origin, as every
+browser does), this page must be an allowed one. A connection without a token is closed after five seconds,
+and only few of these are open at a time.
 """
 
 from __future__ import annotations
@@ -34,19 +35,25 @@ from dxlrun_foxglove.viewer import MOST_REQUESTS, Channel, Viewer
 MOST_VIEWERS = 8
 OPENING_S = 5.0
 PING_S = 10.0
-"""Between two pings; a viewer that answers none for twice as long is gone."""
+"""Interval between pings; a viewer that does not answer for twice as long is disconnected."""
 MOST_BYTES = 1 << 16
-"""Of a frame of a viewer."""
+"""Largest frame from a viewer."""
 GOING_AWAY, TRY_AGAIN = 1001, 1013
 ONLY_SHOWN = "this only shows the robot: start `dxlrun foxglove --control` to change it"
 _SILENT = logging.Logger("dxlrun foxglove", logging.CRITICAL)
 
 
 class FoxgloveServer:
-    """Serves the runs of one robot, one after the other, to viewers."""
+    """Server of the consecutive runs of one robot to viewers."""
 
     def __init__(self, name: str, origins: Sequence[str], *, control: bool = False) -> None:
-        """`origins`: web pages that may connect."""
+        """Create a server.
+
+        Args:
+            name: Name of the robot.
+            origins: Web pages that may connect.
+            control: Allow viewers to change parameters and to call services.
+        """
         self.name, self.control = name, control
         self.token = secrets.token_urlsafe(16)
         self._origins = [None, *map(Origin, origins)]
@@ -56,8 +63,9 @@ class FoxgloveServer:
         self._beginning = asyncio.Lock()
 
     async def serve(self, listener: Listener, tls: ssl.SSLContext | None = None) -> Server:
-        """Let viewers connect from now on."""
-        workers = ThreadPoolExecutor(2 * MOST_VIEWERS * MOST_REQUESTS)  # none waits for another's
+        """Start accepting viewers."""
+        # Enough threads that no request waits for another.
+        workers = ThreadPoolExecutor(2 * MOST_VIEWERS * MOST_REQUESTS)
         asyncio.get_running_loop().set_default_executor(workers)
         self._listener = listener
         more: dict[str, Any] = {"ssl": tls, "ssl_handshake_timeout": OPENING_S} if tls else {}
@@ -78,10 +86,10 @@ class FoxgloveServer:
             **more,
         )
 
-    # The door
+    # Access
 
     def _let_in(self, connection: ServerConnection, request: Request) -> Response | None:
-        """Return the refusal of a request without the token, or None; what it belongs to is seen later."""
+        """Return the refusal of a request without the token, or None. The origin is checked separately."""
         given = parse_qs(urlsplit(request.path).query).get("token", [""])[0]
         if not secrets.compare_digest(given.encode(), self.token.encode()):
             why = "open the address that `dxlrun foxglove` printed: it has the token\n"
@@ -92,7 +100,7 @@ class FoxgloveServer:
         return None
 
     async def _served(self, connection: ServerConnection) -> None:
-        """Serve a viewer until it leaves, or the run ends."""
+        """Serve a viewer until it disconnects or the run ends."""
         self._listener.admit(connection.remote_address)
         viewer = Viewer(connection)
         self._viewers.add(viewer)
@@ -117,10 +125,14 @@ class FoxgloveServer:
                 self._following.cancel()
                 self._run = self._following = None
 
-    # The run
+    # Run
 
     async def _begun(self) -> ViewedRun:
-        """Return the run that viewers see. Raises DxlrunError when the robot does not run."""
+        """Return the run that viewers see.
+
+        Raises:
+            DxlrunError: The robot does not run.
+        """
         async with self._beginning:
             if self._run is None:
                 run = await asyncio.to_thread(ViewedRun, self.name)
@@ -129,10 +141,11 @@ class FoxgloveServer:
             return self._run
 
     async def _follow(self, run: ViewedRun) -> None:
-        """Pass on a run's messages; when it has ended close the connections: viewers open them again."""
+        """Forward a run's messages; close the connections when it has ended. Viewers then reconnect."""
         try:
             why = await run.follow()
-        except Exception as error:  # the last resort: viewers see that nothing more comes
+        # Without this handler viewers would show stale data as if the robot still ran.
+        except Exception as error:
             traceback.print_exc()
             why = f"{type(error).__name__}: {error}"
         if self._run is run:
@@ -160,7 +173,7 @@ class FoxgloveServer:
     # Requests
 
     def _take(self, viewer: Viewer, run: ViewedRun, frame: str | bytes) -> None:
-        """Do what a frame asks; what is wrong with it is a status for the viewer."""
+        """Process a frame. An invalid frame results in a status for the viewer."""
         try:
             received = protocol.received(frame)
         except ValueError as error:
@@ -189,7 +202,10 @@ class FoxgloveServer:
                 self._ask(viewer, run, received)
 
     def _ask(self, viewer: Viewer, run: ViewedRun, request: Words | Call) -> None:
-        """Have the robot asked beside the messages; of one viewer few at once, halt as often again."""
+        """Answer a request in a task of its own, so that messages continue.
+
+        Further requests of a viewer are refused beyond MOST_REQUESTS, a halt beyond twice as many.
+        """
         halts = isinstance(request, Call) and request.service == HALT
         if len(viewer.requests) >= MOST_REQUESTS * (1 + halts):
             viewer.reply(protocol.failure(request, "too many requests at once; wait for the answers"))
@@ -218,7 +234,7 @@ class FoxgloveServer:
             viewer.reply(protocol.failure(request, str(error)))
 
     def _tell_parameters(self, run: ViewedRun, controller: str) -> None:
-        """Send parameters that have changed to the viewers that want to know."""
+        """Send changed parameters to the viewers that subscribed to them."""
         for viewer in run.viewers:
             names = [one for one in viewer.parameters if one.startswith(f"{controller}.")]
             if names:

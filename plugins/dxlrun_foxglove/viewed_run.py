@@ -1,4 +1,4 @@
-"""Viewed run: the messages of a running robot for its viewers, and what they ask of it."""
+"""Viewed run: the messages of a running robot for its viewers, and the viewers' requests to the robot."""
 
 from __future__ import annotations
 
@@ -15,15 +15,15 @@ from dxlrun_foxglove.protocol import WARNING, Call, Parameter, status, text
 from dxlrun_foxglove.viewer import Channel, Viewer
 
 ENCODING = "json"
-"""Of calls of services."""
+"""Encoding of service calls."""
 RATE = 50.0
-"""Hz: so often what has come meanwhile is taken; more costs the machine, and no screen shows it."""
+"""Hz, rate of receiving messages; a higher rate costs processor time without a visible effect on a screen."""
 LOOK_S = 2.0
-"""Between two looks for topics that were opened meanwhile."""
+"""Interval between checks for new topics."""
 
 
 class Switch(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
-    """Data of `switch`: names of controllers; all of it happens in one cycle, or nothing does."""
+    """Data of `switch`: names of controllers. The whole switch happens in one cycle, or is refused."""
 
     activate: tuple[str, ...] = ()
     deactivate: tuple[str, ...] = ()
@@ -35,24 +35,24 @@ class TorqueRequest(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     joints: tuple[str, ...]
     on: bool
     release: bool = False
-    """Deactivate the controllers that command the joints, in the same cycle. Without it torque off is refused
-    while there are any; torque on starts them again where the joints are."""
+    """Deactivate the controllers that command the joints, in the same cycle. Without it, torque off is
+    refused while any are active. Torque on restarts them at the current positions of the joints."""
 
 
 class Nothing(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
-    """Body of a service that needs no words."""
+    """Body of a service without arguments."""
 
 
 SERVICES = (("/halt", Nothing), ("/switch", Switch), ("/torque", TorqueRequest))
-"""Their numbers are their places."""
+"""Services of the server; the number of a service is its index."""
 HALT = 0
 
 
 class ViewedRun(LiveMessages):
-    """One run of a robot, as long as a viewer looks."""
+    """One run of a robot, while it has viewers."""
 
     def __init__(self, name: str) -> None:
-        """Look at the run of a robot as it is now. Raises DxlrunError."""
+        """Connect to the current run of a robot. Raises DxlrunError."""
         with _robot(name) as robot:
             super().__init__(robot.log_header())
         self._name = name
@@ -77,7 +77,7 @@ class ViewedRun(LiveMessages):
             viewer.show(put, wall_ns, data)
 
     async def follow(self) -> str:
-        """Pass on what the robot publishes, until its run has ended; return why nothing more comes."""
+        """Forward the messages of the robot until its run has ended; return the reason of the end."""
         known: set[str] = set()
         why = ""
         try:
@@ -92,12 +92,12 @@ class ViewedRun(LiveMessages):
         return why
 
     def _topics(self) -> set[str]:
-        """Return the topics that the log has too, or whose messages it makes others of."""
+        """Return the topics that the log has as well, or from whose messages others are derived."""
         with _robot(self._name) as robot:
             return self.heard(robot.topics())
 
     async def _listen(self, topics: set[str]) -> None:
-        """Take the messages of topics until the run ends. Raises DxlrunError then, too."""
+        """Receive the messages of topics until the run ends, which raises DxlrunError."""
         with _robot(self._name) as robot:
             listen = partial(robot.listen, *topics, rate=RATE, newest=False)
             async for message in await asyncio.to_thread(listen):
@@ -105,23 +105,23 @@ class ViewedRun(LiveMessages):
         raise DxlrunError(f"the run of {self._name} has ended")
 
     def take(self, message: TopicMessage) -> None:
-        """Pass a message on, and say what was lost before it."""
+        """Forward a message, and report messages that were lost before it."""
         if message.lost:
             lost = f"{message.lost} messages of {message.topic} were lost before they came here"
             for viewer in self.viewers:
                 viewer.reply(status(WARNING, lost))
         super().take(message)
 
-    # What viewers ask
+    # Requests of viewers
 
     @property
     def channels(self) -> list[Channel]:
-        """Those that have had a message."""
+        """Channels that have had a message."""
         return [one for one in self._channels if one.newest is not None]
 
     @property
     def graph(self) -> str:
-        """The frame with what publishes each topic: controllers, or the robot itself."""
+        """Frame with the publisher of each topic: controllers, or the robot itself."""
         names = [one.name for one in self.header.controllers]
         rows = []
         for topic in [one.topic for one in self.channels]:
@@ -134,7 +134,7 @@ class ViewedRun(LiveMessages):
         return text("connectionGraphUpdate", publishedTopics=rows, **dict.fromkeys(others, ()))
 
     def parameters(self, names: Collection[str]) -> list[Parameter]:
-        """Return these parameters, or all. Raises DxlrunError."""
+        """Return these parameters, or all without names. Raises DxlrunError."""
         with _robot(self._name) as robot:
             return [
                 Parameter(f"{controller}.{one.name}", one.value)
@@ -145,7 +145,7 @@ class ViewedRun(LiveMessages):
             ]
 
     def set_parameters(self, parameters: Sequence[Parameter]) -> None:
-        """Change parameters, those of each controller in one cycle. Raises DxlrunError."""
+        """Change parameters; those of a controller change in one cycle. Raises DxlrunError."""
         with _robot(self._name) as robot:
             for controller in _controllers(robot, [one.name for one in parameters]):
                 begin = f"{controller}."
@@ -153,7 +153,7 @@ class ViewedRun(LiveMessages):
                 robot.set_parameters(controller, {one.name.removeprefix(begin): one.value for one in own})
 
     def call(self, call: Call) -> bytes:
-        """Do what a service does; return its answer as JSON. Raises DxlrunError."""
+        """Execute a service; return its answer as JSON. Raises DxlrunError."""
         if call.service >= len(SERVICES) or call.encoding != ENCODING:
             raise InputError(f"there is no service {call.service} that takes {call.encoding}")
         name, kind = SERVICES[call.service]
@@ -177,13 +177,13 @@ def _robot(name: str) -> RemoteRobot:
 
 
 def _controllers(robot: RemoteRobot, names: Collection[str]) -> list[str]:
-    """Return the controllers that have parameters of these names; of no names all."""
+    """Return the controllers that have parameters of these names; without names, all."""
     every = [one.name for one in msgspec.convert(robot.info(), RobotInfo).controllers]
     return [one for one in every if not names or any(name.startswith(f"{one}.") for name in names)]
 
 
 def advertised(channels: Sequence[Channel]) -> str:
-    """Return the frame that makes channels known."""
+    """Return the frame that announces channels."""
     rows = [
         {
             "id": one.number,
@@ -199,7 +199,7 @@ def advertised(channels: Sequence[Channel]) -> str:
 
 
 def advertised_services() -> str:
-    """Return the frame that makes the services known."""
+    """Return the frame that announces the services."""
     form = {"encoding": ENCODING, "schemaName": "Executed", "schemaEncoding": "jsonschema", "schema": "{}"}
     rows = []
     for number, (name, kind) in enumerate(SERVICES):

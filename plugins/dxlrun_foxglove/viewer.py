@@ -1,4 +1,4 @@
-"""Viewer: one connection, and what waits to be sent on it, in memory that does not grow."""
+"""Viewer: one connection with its send queues, in bounded memory."""
 
 from __future__ import annotations
 
@@ -12,38 +12,38 @@ from dxlrun.tooling.topics import MessageType
 from dxlrun_foxglove.protocol import MESSAGE, MESSAGE_HEAD, WARNING, status
 
 MOST_BYTES = 4 << 20
-"""Of messages that wait for a slow viewer; of more the oldest are left out."""
+"""Size of the queue of messages for a slow viewer; the oldest messages are dropped."""
 MOST_REPLIES = 1000
-"""Other frames that wait; a viewer that takes none of so many is gone."""
+"""Length of the queue of all other frames; a viewer that does not receive them is disconnected."""
 MOST_REQUESTS = 4
-"""Of one viewer at once, halt beside them."""
+"""Simultaneous requests of one viewer. A halt is accepted up to twice this number."""
 SLOW = "Send buffer limit reached"
-"""Lichtblick explains this sentence."""
+"""Lichtblick shows an explanation for exactly this sentence."""
 
 
 class Channel(msgspec.Struct, eq=False):
-    """A topic as viewers know it."""
+    """Topic as announced to viewers."""
 
     number: int
     topic: str
     type: MessageType
     latched: bool
-    """A viewer that subscribes late gets its newest message."""
+    """A viewer that subscribes late receives the newest message."""
     newest: tuple[int, bytes] | None = None
-    """Time, ns since 1970, and CDR; None: there was none, and viewers do not know the channel yet."""
+    """Time, ns since 1970, and CDR. None before the first message, when the channel is not announced yet."""
 
 
 class Viewer:
-    """What one viewer has subscribed to, and what waits for it."""
+    """Subscriptions and send queues of one viewer."""
 
     def __init__(self, connection: ServerConnection) -> None:
         self.connection = connection
         self.subscriptions: dict[int, int] = {}
-        """Its own numbers of channels."""
+        """Subscription numbers of the viewer by channel."""
         self.parameters: set[str] = set()
         self.graph = False
         self.requests: set[asyncio.Task[None]] = set()
-        """Those that the robot has not answered yet."""
+        """Requests that the robot has not answered yet."""
         self._replies: deque[str | bytes] = deque()
         self._messages: deque[bytes] = deque()
         self._bytes = 0
@@ -51,7 +51,7 @@ class Viewer:
         self._more = asyncio.Event()
 
     def reply(self, frame: str | bytes) -> None:
-        """Send a frame; they all come, in order."""
+        """Queue a frame. These frames are all delivered, in the order in which they were queued."""
         if len(self._replies) == MOST_REPLIES:
             self.connection.transport.abort()
             return
@@ -59,7 +59,10 @@ class Viewer:
         self._more.set()
 
     def show(self, channel: Channel, wall_ns: int, data: bytes) -> None:
-        """Send a message, if the viewer has subscribed to it."""
+        """Queue a message if the viewer has subscribed to its channel.
+
+        A slow viewer loses the oldest messages.
+        """
         subscription = self.subscriptions.get(channel.number)
         if subscription is None:
             return
@@ -73,7 +76,7 @@ class Viewer:
         self._more.set()
 
     async def send(self) -> None:
-        """Send what waits, as fast as the viewer takes it. Raises ConnectionClosed."""
+        """Send queued frames as fast as the viewer receives them. Raises ConnectionClosed."""
         while True:
             self._more.clear()
             while self._replies or self._messages:

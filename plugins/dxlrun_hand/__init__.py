@@ -1,4 +1,4 @@
-"""Work at the robot, by hand: set servos up, calibrate joints, teach motions.
+"""Dialogues for work on a robot by hand: servo setup, joint calibration, teaching of motions.
 
-Each is a dialogue that asks before it writes. Commands without a dialogue belong in the core's `cli/tools`.
+Each dialogue asks before it writes. Commands without a dialogue belong in the core's `cli/tools`.
 """

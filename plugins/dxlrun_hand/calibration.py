@@ -1,8 +1,8 @@
-"""Calibration: the joints are limp, a hand brings them to zero and to both ends, their servos are read.
+"""Calibration: limp joints are moved by hand to zero and to both ends while their servos are read.
 
 s = direction * (theta - reference) * ratio, where theta is the angle of the servo and s the position of its
-joint (`description/joints/mechanics.py`): the zero pose gives the reference, the end that a person calls
-positive the direction, and the two ends the limits.
+joint (`description/joints/mechanics.py`). The zero pose gives the reference, the end that the user calls
+positive gives the direction, and the two ends give the limits.
 """
 
 from __future__ import annotations
@@ -23,45 +23,50 @@ from dxlwire import BusPlan, ControlTable, ServoPlan
 
 _degrees = ROTARY.number
 LEAST_WAY = math.radians(5.0)
-"""Of the servo between both ends: less may be a hand that slipped."""
+"""Least angle of the servo between both ends; the hand may have slipped on a shorter way."""
 _STEPS: Mapping[JointUnit, float] = {ROTARY: math.radians(0.1), LINEAR: 1e-4}
-"""To which limits are rounded, towards the inside: beyond them the joint is at its stop."""
+"""Resolution of limits. They are rounded inwards, because the joint is at its stop beyond them."""
 _READINGS = 5
-"""Of a joint at rest, whose middle one counts."""
+"""Readings of a joint at rest, whose median is used."""
 _SHIFTING = {
     "drive_mode": (0x01, 0),
     "homing_offset": (-1, 0),
     "multi_turn_offset": (-1, 0),
     "resolution_divider": (-1, 1),
 }
-"""Items that change what a position means: which bits of them, and their only value."""
+"""Items that change the meaning of a position: mask of the relevant bits, and their only accepted value."""
 
 
 class Measured(msgspec.Struct, frozen=True):
-    """What was measured of a joint."""
+    """Measured calibration of a joint."""
 
     joint: str
     reference: float
     """rad of the servo, from its raw 0"""
     direction: int
     limits: tuple[float, float] | None
-    """rad, or m of a linear joint; None: it turns without end."""
+    """rad, or m of a linear joint; None for a continuous joint."""
     unit: JointUnit
     tick: float
-    """rad of the servo"""
+    """rad of the servo per tick"""
     ratio: float
-    """What the joint moves while its servo turns by 1 rad."""
+    """rad, or m, of the joint per rad of its servo."""
 
 
 class BeyondTurn(ServoFault):
-    """A hand has turned a servo further than its positions count."""
+    """Error of a servo that was turned by hand beyond the range of its positions."""
 
 
 class HandJoint:
-    """A limp joint with one servo, which is read while a hand moves it."""
+    """Limp joint with one servo, which is read while it is moved by hand."""
 
     def __init__(self, tool: ToolLine, plan: BusPlan, servo: ServoPlan) -> None:
-        """Raises ServoFault where its servo does not answer, is another model, or counts otherwise."""
+        """Find the servo of a joint.
+
+        Raises:
+            ServoFault: The servo does not answer, is another model, or has settings that shift its
+                angles.
+        """
         self.name, self.servo = servo.joint, servo
         self._label = plan.label(servo)
         self._port = plan.port
@@ -88,33 +93,46 @@ class HandJoint:
         self._turn = round(math.tau / self.table.rad_per_tick)
         self._raw = self._travelled = 0
         self.limp = False
-        """True when its torque was switched off here."""
+        """True if this object switched the torque off."""
 
     def let_go(self) -> None:
-        """Switch its torque off."""
+        """Switch the torque off."""
+        # Set the flag first: the servo can be limp even if its reply is lost.
         self.limp = True
         self._one.torque(False)
 
     def begin(self) -> float:
-        """Count from here; return the angle of the servo, rad, within the turn that its goals are in."""
+        """Start counting turns; return the angle of the servo, rad, within the turn of its goals."""
         readings = sorted(self._read() for _ in range(_READINGS))
         self._raw = readings[_READINGS // 2]
-        # one that counted turns, as a wheel, is in its first one when it is switched on again
+        # A servo that counted turns, such as in wheel mode, is in its first turn after power-up.
         self._travelled = self.table.min_tick + (self._raw - self.table.min_tick) % self._turn
         return self._angle
 
     def follow(self) -> float:
-        """Return the angle now, rad, counted on from the one before; raises ServoFault."""
+        """Return the current angle, rad, counted across turns.
+
+        Raises:
+            ServoFault: The servo does not answer.
+        """
         raw = self._read()
         step = raw - self._raw
-        if 2 * abs(step) > self._turn:  # its count begins again at the end of a turn
+        if 2 * abs(step) > self._turn:  # The position wraps around at the end of a turn
             step -= round(step / self._turn) * self._turn
         self._raw = raw
         self._travelled += step
         return self._angle
 
     def check_turn(self, lowest: float, highest: float) -> None:
-        """Raise BeyondTurn where the servo left the angles that its goals reach; `lowest`, `highest`: rad."""
+        """Check that the servo stayed within the angles that its goals reach.
+
+        Args:
+            lowest: Lowest angle of the servo, rad.
+            highest: Highest angle of the servo, rad.
+
+        Raises:
+            BeyondTurn: The servo left this range.
+        """
         tick = self.table.rad_per_tick
         least, most = self.table.min_tick * tick, self.table.max_tick * tick
         if not self.servo.continuous and (lowest < least - tick or highest > most + tick):
@@ -138,7 +156,11 @@ class HandJoint:
 
 
 def measure(joints: Sequence[HandJoint], dialogue: Dialogue) -> list[Measured]:
-    """Lead a person through the measurement of joints; their torque is off afterwards. Raises ServoFault."""
+    """Guide the user through the measurement of joints. Their torque is off afterwards.
+
+    Raises:
+        ServoFault: A servo does not answer any more.
+    """
     dialogue.ask("The torque goes off now: hold what could fall, and press Enter ")
     for joint in joints:
         joint.let_go()
@@ -170,7 +192,8 @@ def _measure(joint: HandJoint, zero: float, dialogue: Dialogue) -> Measured:
 
 
 def _ends(joint: HandJoint, dialogue: Dialogue) -> tuple[float, float, float, float]:
-    """Return the servo's angle at the positive end, at the other one, the lowest and the highest, rad."""
+    """Return the servo's angle at the positive and at the other end, and its lowest and highest angle,
+    rad."""
     begin = joint.begin()
     seen = [begin, begin]
     now = begin
@@ -198,7 +221,7 @@ def _inside(lower: float, upper: float, unit: JointUnit) -> tuple[float, float]:
     return math.ceil(lower / step - 1e-6) * step, math.floor(upper / step + 1e-6) * step
 
 
-# Into the robot file
+# Changes of the robot file
 
 
 def keys_of(joint: str, *, continuous: bool) -> list[KeyPath]:
@@ -214,7 +237,14 @@ def keys_of(joint: str, *, continuous: bool) -> list[KeyPath]:
 def replacements(
     text: RobotText, servo: ServoPlan, limits: tuple[float, float] | None, found: Measured
 ) -> list[Replacement]:
-    """Return what of a joint differs from the file by more than a tick; `limits`: those that it has."""
+    """Return the keys of a joint whose measured value differs from the file by more than a tick.
+
+    Args:
+        text: The robot file.
+        servo: Plan of the joint's servo.
+        limits: Position limits in the file, rad or m; None without limits.
+        found: Measured calibration.
+    """
     reference, direction, *position = keys_of(found.joint, continuous=servo.continuous)
     changes: list[Replacement] = []
     if abs(servo.reference - found.reference) > found.tick:

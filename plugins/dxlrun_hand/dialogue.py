@@ -1,4 +1,4 @@
-"""Dialogue: sentences and questions at the terminal, and what is measured until a person presses Enter."""
+"""Dialogue: output and questions at the terminal, and measurements that run until the user presses Enter."""
 
 from __future__ import annotations
 
@@ -14,17 +14,17 @@ from dxlrun import InputError
 from dxlrun.tooling.output import print_error
 
 LOOK_S = 0.02
-"""Between two looks while Enter is awaited."""
+"""Polling interval while the dialogue waits for Enter."""
 
 
 def yes(dialogue: Dialogue, question: str) -> bool:
-    """Ask a question that only a clear yes agrees to."""
+    """Ask a question; only y or yes counts as agreement."""
     return dialogue.ask(f"{question} [y/N] ").lower() in ("y", "yes")
 
 
 @contextmanager
 def ending_with(sentence: Callable[[], str]) -> Iterator[None]:
-    """Print how things are left when what is inside ends early, by Ctrl-C or an error; empty: nothing."""
+    """Print the remaining state, unless it is empty, if the context ends early by Ctrl-C or an error."""
     try:
         yield
     except BaseException:
@@ -34,10 +34,14 @@ def ending_with(sentence: Callable[[], str]) -> Iterator[None]:
 
 
 class Dialogue:
-    """What a task says and asks at the terminal; raises KeyboardInterrupt at Ctrl-C."""
+    """Dialogue of a task at the terminal. Ctrl-C raises KeyboardInterrupt."""
 
     def __init__(self, verb: str) -> None:
-        """Raises InputError where there is no terminal."""
+        """Open the terminal.
+
+        Raises:
+            InputError: Standard input or output is not a terminal.
+        """
         self._input = sys.stdin.fileno() if sys.stdin.isatty() else -1
         if self._input < 0 or not sys.stdout.isatty():
             raise InputError(
@@ -51,11 +55,14 @@ class Dialogue:
         sys.stdout.flush()
 
     def ask(self, question: str) -> str:
-        """Return the line that a person types; what was typed before the question does not count."""
+        """Return the line that the user types. Input from before the question is discarded."""
         return self._answer(question, None)
 
     def ask_while(self, question: str, look: Callable[[], str]) -> str:
-        """Ask, and call `look` until the answer comes; its text is one line that changes."""
+        """Ask, and call `look` until the answer comes.
+
+        Its text is shown in a line that is updated in place.
+        """
         return self._answer(f"{question}\n", look)
 
     def _answer(self, question: str, look: Callable[[], str] | None) -> str:
@@ -66,7 +73,7 @@ class Dialogue:
             while (line := self._line(LOOK_S if look else None)) is None:
                 if look:
                     self._write(f"\r\x1b[K{look()[: shutil.get_terminal_size().columns - 1]}")
-        except BaseException:  # what is said next begins a line
+        except BaseException:  # The next output must begin a new line
             self._write("\n")
             raise
         return line
@@ -76,7 +83,7 @@ class Dialogue:
         sys.stdout.flush()
 
     def _line(self, timeout_s: float | None) -> str | None:
-        """Return the line that is complete, None where none is yet; the end of the input is as Ctrl-C."""
+        """Return the next complete line, or None. The end of the input counts as Ctrl-C."""
         if select.select([self._input], [], [], timeout_s)[0]:
             data = os.read(self._input, 4096)
             if not data:

@@ -1,4 +1,4 @@
-"""The lines of a robot file's buses: found by their adapters, opened for this process alone."""
+"""Serial lines of a robot file's buses: found by their adapters, opened exclusively for this process."""
 
 from __future__ import annotations
 
@@ -15,13 +15,17 @@ from dxlwire import lasting_name
 
 TRIES = 3
 Opened = Callable[[str], TunablePort]
-"""Opens a port by its path."""
+"""Function that opens a port by its path."""
 Devices = Callable[[], Iterable[str]]
-"""Returns the serial ports that are there, lasting names first."""
+"""Function that returns the available serial ports, persistent names first."""
 
 
 def find_port(bus: str, dialogue: Dialogue, devices: Devices) -> str:
-    """Return the lasting name of the adapter that is plugged in; raises PortError after three tries."""
+    """Return the persistent name of the adapter that the user plugs in.
+
+    Raises:
+        PortError: Three attempts failed.
+    """
     for _ in range(TRIES):
         dialogue.ask(f"Unplug the adapter of bus {bus}, and press Enter ")
         others = {os.path.realpath(path) for path in devices()}
@@ -49,14 +53,19 @@ def find_port(bus: str, dialogue: Dialogue, devices: Devices) -> str:
 
 
 class BusLines:
-    """The lines of buses, each open only while it is used.
+    """Lines of buses, each open only while it is used.
 
     A board that powers its servos by USB drops out when a servo is plugged in, and its port comes back as
-    another device: it is opened again by its lasting name.
+    another device. The persistent name stays valid, so the port is opened again by this name.
     """
 
     def __init__(self, ports: Mapping[str, str], opened: Opened = TunablePort) -> None:
-        """Raises PortError for a port that cannot be opened, InputError for a simulated bus: it has none."""
+        """Check that each port can be opened.
+
+        Raises:
+            PortError: A port cannot be opened.
+            InputError: A bus is simulated and has no port.
+        """
         for bus, port in ports.items():
             if port == SIMULATED:
                 raise InputError(
@@ -71,7 +80,7 @@ class BusLines:
 
     @contextmanager
     def open(self, bus: str) -> Iterator[ToolLine]:
-        """Provide the line of a bus; raises PortError."""
+        """Yield the line of a bus. Raises PortError."""
         with self._opened(self._names[bus]) as port:
             yield ToolLine(port)
 
@@ -79,7 +88,11 @@ class BusLines:
 def chosen_names(
     words: Sequence[str], known: Sequence[str], groups: Mapping[str, Sequence[str]]
 ) -> list[str]:
-    """Return the names that are meant by words, groups among them; all without a word. Raises InputError."""
+    """Return the names that words select, where a word can be a group; all names without words.
+
+    Raises:
+        InputError: Unknown words.
+    """
     wrong = [word for word in words if word not in known and word not in groups]
     if wrong:
         every = (*known, *groups)

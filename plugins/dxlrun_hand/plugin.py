@@ -1,4 +1,4 @@
-"""The verbs of what is done by hand, by the same hooks as any other package."""
+"""Commands with a dialogue, registered by the same hooks as those of any other package."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ def dxlrun_contract() -> int:
 
 @hookimpl
 def dxlrun_commands() -> Sequence[Command]:
-    """Return the verbs that lead a person through a task, step by step."""
+    """Return the commands that guide the user through a task step by step."""
     return (
         Command("setup", f"{_PLACE}.setup:setup", group="Servos"),
         Command("calibrate", f"{_PLACE}.calibrate:calibrate", group="Servos"),

@@ -1,8 +1,7 @@
-"""The text of a robot file in which values are replaced: every other byte stays, and so do its comments.
+"""Robot file as text in which single values are replaced. All other bytes stay, comments included.
 
-A library that reads a file and writes it anew keeps comments, but not the spaces, quotes and line breaks of
-the rest; so the nodes that the robot file's own reader finds say where a value stands, and only that is cut
-out.
+A library that parses and rewrites the file would keep comments, but not spaces, quotes and line breaks.
+Therefore the nodes of the robot file's own parser locate each value, and only these characters are replaced.
 """
 
 from __future__ import annotations
@@ -26,7 +25,7 @@ from dxlrun.tooling.robots import Source, read_sources
 
 
 class _Edit(NamedTuple):
-    """Characters that are replaced; none: something is put in."""
+    """Replacement of characters; an empty range inserts text."""
 
     start: int
     end: int
@@ -34,17 +33,25 @@ class _Edit(NamedTuple):
 
 
 class RobotText:
-    """A robot file with those that it includes; `put` plans what `write` does."""
+    """Robot file with its included files; `put` plans changes and `write` executes them."""
 
     def __init__(self, robot: Path) -> None:
-        """Raises InputError where one of them cannot be read."""
+        """Read the files.
+
+        Raises:
+            InputError: A file cannot be read.
+        """
         self._sources: Sequence[Source] = read_sources(robot)
         self._before = {source.path: source.path.read_bytes() for source in self._sources}
         self._edits: dict[Path, list[_Edit]] = {source.path: [] for source in self._sources}
         self._uses = [Counter(map(id, _nodes(source.tree.root))) for source in self._sources]
 
     def check(self, path: KeyPath) -> None:
-        """Raise InputError where a value could not be put at a path, or its file not be written."""
+        """Check that a value can be put at a path.
+
+        Raises:
+            InputError: The value cannot be put there, or its file is read-only.
+        """
         source, at, node = self._own(path)
         if not os.access(source.path.resolve(), os.W_OK):
             raise InputError(f"{source.path} cannot be written: it is read-only; change that first")
@@ -59,7 +66,7 @@ class RobotText:
             raise _refuse_node(source, node, f"{_words(at)} is no mapping", "write its keys below it")
 
     def put(self, path: KeyPath, value: str | Sequence[str]) -> None:
-        """Plan a value at a path, or the items of a list; raises InputError as `check`."""
+        """Plan a value, or the items of a list, for a path. Raises InputError as `check`."""
         self.check(path)
         source, at, node = self._own(path)
         edits = self._edits[source.path]
@@ -71,14 +78,14 @@ class RobotText:
             edits.append(_replaced(node, _flow(value)))
 
     def unit(self, path: KeyPath) -> str:
-        """Return the unit in which a value, or the first of a list, is written; empty: there is none."""
+        """Return the unit of a value, or of the first item of a list; empty without a unit."""
         _, at, node = self._own(path)
         scalars = [one for one in _nodes(node) if isinstance(one, yaml.ScalarNode)] if at == path else []
         found = re.search(r"[a-z]+$", scalars[0].value) if scalars else None
         return found[0] if found else ""
 
     def diff(self) -> list[str]:
-        """Return the lines that change, as `diff -u` shows them."""
+        """Return the changed lines in the format of `diff -u`."""
         lines: list[str] = []
         for path in [path for path, edits in self._edits.items() if edits]:
             old, new = (data.decode().splitlines() for data in (self._before[path], self._after(path)))
@@ -87,7 +94,11 @@ class RobotText:
         return lines
 
     def write(self) -> None:
-        """Write what was planned; each file appears whole. Raises InputError where one was changed."""
+        """Write the planned changes. Each file is replaced atomically.
+
+        Raises:
+            InputError: A file was changed after it was read, or cannot be written.
+        """
         changed = {path.resolve(): path for path, edits in self._edits.items() if edits}
         for place, path in changed.items():
             if place.read_bytes() != self._before[path]:
@@ -108,25 +119,27 @@ class RobotText:
     def _after(self, path: Path) -> bytes:
         data = self._before[path]
         text, mark = data.decode("utf-8-sig"), codecs.BOM_UTF8 if data.startswith(codecs.BOM_UTF8) else b""
-        # from the end, so that places stay; of two at one place the later is written first
+        # Edit from the end, so that earlier positions stay valid. Of two edits at one position, the later
+        # comes first.
         for edit in sorted(self._edits[path], key=lambda one: one.start)[::-1]:
             text = text[: edit.start] + edit.text + text[edit.end :]
         return mark + text.encode()
 
     def _own(self, path: KeyPath) -> tuple[Source, KeyPath, yaml.Node]:
-        """Return the file that has a value, or else the most of the way to it, with the node there."""
+        """Return the file that has a value, or else the longest prefix of its path, with the node there."""
         found = ((source, *_nearest(source.tree.root, path)) for source in reversed(self._sources))
-        return max(found, key=lambda one: len(one[1]))  # the first of the longest: the strongest file
+        # max returns the first of equal lengths: the file with the highest priority.
+        return max(found, key=lambda one: len(one[1]))
 
 
 def _refuse_node(source: Source, node: yaml.Node, what: str, fix: str) -> InputError:
-    """Return the error of a value that cannot be replaced, at its place."""
+    """Return the error for a value that cannot be replaced, with its position."""
     place = node.start_mark
     return InputError([Problem(Mark(str(source.path), place.line + 1, place.column + 1), what, fix)])
 
 
 def _nodes(node: yaml.Node) -> Iterator[yaml.Node]:
-    """Yield a node and all below it, each as often as it is used."""
+    """Yield a node and all nodes below it. A node behind several aliases is yielded once per use."""
     yield node
     children = node.value if isinstance(node, yaml.SequenceNode) else ()
     if isinstance(node, yaml.MappingNode):
@@ -136,7 +149,7 @@ def _nodes(node: yaml.Node) -> Iterator[yaml.Node]:
 
 
 def _nearest(root: yaml.Node, path: KeyPath) -> tuple[KeyPath, yaml.Node]:
-    """Return the way to a value as far as there is one, and the node at its end."""
+    """Return the longest existing prefix of a path, and its node."""
     node = root
     for index, key in enumerate(path):
         pairs = node.value if isinstance(node, yaml.MappingNode) else ()
@@ -152,9 +165,10 @@ def _replaced(node: yaml.Node, text: str) -> _Edit:
 
 
 def _inserted(text: str, node: yaml.CollectionNode, keys: KeyPath, value: str) -> _Edit:
-    """Return the edit that gives a mapping another key, behind those that it has."""
+    """Return the edit that adds a key to a mapping, after its other keys."""
     entry = f"{keys[0]}: " + "".join(f"{{{key}: " for key in keys[1:]) + value + "}" * (len(keys) - 1)
-    here = [child for name, child in node.value if child.start_mark.index > name.start_mark.index]  # no alias
+    # The value of an alias is before its key.
+    here = [child for name, child in node.value if child.start_mark.index > name.start_mark.index]
     if node.flow_style:
         if here and here[-1] is node.value[-1][1]:
             return _Edit(here[-1].end_mark.index, here[-1].end_mark.index, f", {entry}")

@@ -1,4 +1,4 @@
-"""New servos, connected one after the other, get what a robot file has for them; then all is compared."""
+"""Setup of new servos: each is connected alone and configured from a robot file; then all are compared."""
 
 from __future__ import annotations
 
@@ -24,7 +24,7 @@ SKIP = ("s", "skip")
 
 
 class SetUp:
-    """Leads through the servos of a robot file; `done` has those that are as the file has them."""
+    """Dialogue that configures the servos of a robot file; `done` lists the finished ones."""
 
     def __init__(self, description: Description, dialogue: Dialogue) -> None:
         self.description = description
@@ -34,7 +34,7 @@ class SetUp:
         self.plans: Sequence[BusPlan] = compile_robot(description, []).plan.buses
         self.done: list[str] = []
         self.changing = ""
-        """The servo that is being written to; empty: none is."""
+        """Servo that is being written to, or empty."""
 
     def connect_each(self, lines: BusLines, chosen: Collection[str]) -> None:
         """Set up the chosen servos, each connected alone."""
@@ -44,7 +44,7 @@ class SetUp:
                     self.done.append(servo.own_name)
 
     def compare_all(self, lines: BusLines, chosen: Collection[str]) -> bool:
-        """Read the chosen servos of each bus back, all connected; return whether all are as in the file."""
+        """Read the chosen servos of each bus back, all connected; return whether all match the file."""
         for plan in self.plans:
             servos = tuple(servo for servo in plan.servos if servo.own_name in chosen)
             while servos:
@@ -62,7 +62,7 @@ class SetUp:
         return True
 
     def _set_up(self, lines: BusLines, index: int, name: str) -> bool:
-        """Set one servo up; False: the person skipped it."""
+        """Set one servo up; return False if the user skipped it."""
         while True:
             plan = self.plans[index]
             servo = _named(plan, name)
@@ -90,7 +90,11 @@ class SetUp:
             return True
 
     def _alone(self, tool: ToolLine, plan: BusPlan, servo: ServoPlan) -> FoundServo:
-        """Return the only servo that answers; raises ServoFault where none or several do, or another."""
+        """Return the only servo that answers.
+
+        Raises:
+            ServoFault: No servo answers, several do, or a wrong one does.
+        """
         table = find_table(servo.model, plan.protocol)
         rates = dict.fromkeys((plan.baud_rate, factory_rate(table)))
         found = scan(tool, Search((plan.protocol,), tuple(rates))).servos
@@ -126,15 +130,18 @@ class SetUp:
 
 
 def factory_rate(table: ControlTable) -> int:
-    """Return the rate at which a model is shipped, bit/s."""
+    """Return the factory default baud rate of a model, bit/s."""
     item = table.items.get("baud_rate") or table.items["baud_rate_bus"]
     return table.baud_rates.get(item.initial or 0, next(iter(table.baud_rates.values())))
 
 
 def bring(one: OneServo, plan: BusPlan, servo: ServoPlan) -> list[str]:
-    """Give a servo rate, ID and what its EEPROM shall hold; return what was done. Raises ServoFault.
+    """Set baud rate, ID and EEPROM registers of a servo; return a sentence for each change.
 
-    Settings with which no run would start, such as a Secondary ID, become the factory's.
+    Settings that would prevent a run, such as a Secondary ID, are reset to factory defaults.
+
+    Raises:
+        ServoFault: The servo cannot be configured.
     """
     done: list[str] = []
     if one.holds_torque():

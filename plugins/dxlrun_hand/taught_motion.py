@@ -1,4 +1,4 @@
-"""What was shown by hand as one motion: without standstill and trembling, slow enough for the joints."""
+"""Taught motion: poses and motions shown by hand, joined to one, trimmed, smoothed and within limits."""
 
 from __future__ import annotations
 
@@ -16,34 +16,34 @@ from dxlrun_analysis.playback.recorded_motion import Floats, RecordedMotion, Wha
 from dxlrun_analysis.playback.spline_path import TURN_SIZES, fit, tolerances
 
 MOVED_RAD = np.radians(1.0)
-"""A joint that is nearer to where it was stands still; a linear one by that times its `TURN_SIZES`."""
+"""Movement below which a joint stands still; for a linear joint multiplied by its `TURN_SIZES`."""
 REST_S = 0.2
-"""Of standstill that is left at both ends, so that a motion begins and ends at rest."""
+"""Standstill that is kept at both ends, so that a motion begins and ends at rest."""
 WINDOW_S = 0.2
-"""Over which positions are averaged: a hand trembles at 8 to 12 Hz (R. J. Elble, "Physiologic and essential
+"""Averaging window of positions: a hand trembles at 8 to 12 Hz (R. J. Elble, "Physiologic and essential
 tremor", Neurology 36, 1986)."""
 LEAST_WAY_S = 0.5
 _STEP_S = 0.01
 _SPARE = 0.9
-"""Part of a joint's highest speed that a motion uses."""
+"""Share of a joint's top speed that a motion uses."""
 
 
 class Shown(msgspec.Struct, frozen=True, eq=False):
-    """What was shown at once: a pose, or a motion."""
+    """Single pose or motion shown by hand."""
 
     time_s: Floats
-    """Shape (moments,), from 0; one moment is a pose."""
+    """s, shape (moments,), from 0; a single moment is a pose."""
     position: Floats
-    """Shape (moments, joints), rad or m."""
+    """rad or m, shape (moments, joints)."""
 
 
 class Taught(msgspec.Struct, frozen=True):
-    """The joints that were shown, and how they may move."""
+    """Joints that are taught, with their limits."""
 
     joints: tuple[str, ...]
     units: tuple[JointUnit, ...]
     lower: Floats
-    """rad or m, of each joint; infinite without a limit, as `upper` and `speed`"""
+    """rad or m by joint; infinite without a limit, as in `upper` and `speed`"""
     upper: Floats
     speed: Floats
     way_speed: float
@@ -51,11 +51,11 @@ class Taught(msgspec.Struct, frozen=True):
 
     @property
     def size(self) -> Floats:
-        """How much of each joint is as much as 1 rad of one that turns."""
+        """Movement of each joint that is equivalent to 1 rad of a rotary joint."""
         return np.array([TURN_SIZES[unit] for unit in self.units])
 
     def trimmed(self, shown: Shown) -> Shown:
-        """Return a motion without the standstill at both ends; one that stands still throughout is a pose."""
+        """Return a motion without the standstill at both ends. A motion that never moves becomes a pose."""
         time, position = shown.time_s, shown.position
         still = MOVED_RAD * self.size
         begun = np.flatnonzero((np.abs(position - position[0]) > still).any(axis=1))
@@ -66,7 +66,7 @@ class Taught(msgspec.Struct, frozen=True):
         return Shown(time[kept] - time[kept][0], position[kept])
 
     def smoothed(self, shown: Shown) -> Shown:
-        """Return a motion at equal steps, averaged over a window that is highest in its middle (Hann)."""
+        """Return a motion at equal steps, smoothed with a Hann window."""
         count = round(float(shown.time_s[-1]) / _STEP_S) + 1
         if count < 3:
             return Shown(np.zeros(1), shown.position[-1:])
@@ -83,7 +83,7 @@ class Taught(msgspec.Struct, frozen=True):
         return Shown(time, np.array(columns, np.float64).T)
 
     def joined(self, parts: Sequence[Shown], path: Path) -> RecordedMotion:
-        """Return all that was shown as one motion within the limits, with a way between two parts."""
+        """Return all parts as one motion within the limits, with a transition between consecutive parts."""
         times, positions = [0.0], [self._within(parts[0].position[0])]
         for part in parts:
             inside = self._within(part.position)
@@ -98,13 +98,13 @@ class Taught(msgspec.Struct, frozen=True):
         )
 
     def slowed(self, motion: RecordedMotion) -> tuple[RecordedMotion, float]:
-        """Return a motion that no joint is too slow for, and how many times longer it takes."""
+        """Return a motion slow enough for all joints, and the factor of its duration."""
         fastest = np.abs(fit(motion, tolerances(motion, None)).velocity).max(axis=0)
         longer = max(1.0, float((fastest / (_SPARE * self.speed)).max()))
         return replace(motion, time_s=motion.time_s * longer), longer
 
     def beyond(self, parts: Sequence[Shown]) -> list[str]:
-        """Return the joints that were shown where they may not be."""
+        """Return the joints that were shown beyond their limits."""
         positions, slack = np.concatenate([part.position for part in parts]), MOVED_RAD * self.size
         out = ((positions < self.lower - slack) | (positions > self.upper + slack)).any(axis=0)
         return [joint for joint, is_out in zip(self.joints, out, strict=True) if is_out]
@@ -117,7 +117,7 @@ class Taught(msgspec.Struct, frozen=True):
         return max(LEAST_WAY_S, float((np.abs(end - begin) / speed).max()))
 
     def text_of(self, motion: RecordedMotion, plans: Sequence[ControllerPlan], origin: str) -> str:
-        """Return the motion file for the controllers among `plans` that are active."""
+        """Return the text of the motion file for the active controllers of `plans`."""
         allowed = tolerances(motion, None)
         speeds = dict(zip(self.joints, self.speed.tolist(), strict=True))
         return motion_file(motion, allowed, motion.path, None, origin, plans=plans, speeds=speeds).text

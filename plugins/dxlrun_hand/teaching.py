@@ -1,4 +1,4 @@
-"""Teaching: joints of a running robot are limp, a hand shows poses and motions, the robot plays them."""
+"""Teaching: limp joints of a running robot are moved by hand to poses and motions, which the robot plays."""
 
 from __future__ import annotations
 
@@ -20,17 +20,27 @@ from dxlrun_hand.dialogue import Dialogue, ending_with, yes
 from dxlrun_hand.taught_motion import Shown, Taught
 
 LONGEST_AGE_NS = 1_000_000_000
-"""A joint whose newest position is older does not answer."""
+"""Age of a joint's newest position from which the joint does not answer."""
 HELP = "Enter: take this pose; r: record a motion; u: undo; limp NAME, hold NAME; s: save; q: quit"
 
 
 class Teaching:
-    """One motion that is taught to a robot."""
+    """Teaching of one motion to a robot."""
 
     def __init__(
         self, robot: RemoteRobot, dialogue: Dialogue, words: Sequence[str], way_speed: float
     ) -> None:
-        """`words`: joints, groups and controllers that become limp; all without. Raises InputError."""
+        """Select the joints to teach.
+
+        Args:
+            robot: Connection to the running robot.
+            dialogue: Dialogue with the user.
+            words: Joints, groups and controllers that become limp; empty for all.
+            way_speed: Speed between two poses, rad/s.
+
+        Raises:
+            InputError: A word is unknown, or a joint has no active controller that plays motions.
+        """
         self._robot, self._dialogue = robot, dialogue
         info = cast("Mapping[str, Any]", robot.info())
         self._groups = _groups(info)
@@ -63,12 +73,12 @@ class Teaching:
             way_speed,
         )
         self.limp: list[str] = []
-        """Joints that were made limp here, and have no torque yet."""
+        """Joints that were made limp here and are still without torque."""
         self.released: list[str] = []
         """Controllers that were deactivated here."""
 
     def teach(self) -> list[Shown]:
-        """Let the joints be shown poses and motions; return them, none where the person gave up."""
+        """Run the teaching dialogue; return the poses and motions, or an empty list if the user quits."""
         self._dialogue.ask(f"Limp become: {', '.join(self._asked)}. Hold them, and press Enter ")
         self._let_go(self._asked)
         shown: list[Shown] = []
@@ -91,7 +101,11 @@ class Teaching:
                 self._dialogue.say(f"  {typed!r} does nothing here" if shown else "  nothing was shown yet")
 
     def save(self, shown: Sequence[Shown], target: Path) -> None:
-        """Write what was shown into a new motion file; raises InputError."""
+        """Write the poses and motions to a new motion file.
+
+        Raises:
+            InputError: The file cannot be written.
+        """
         taught = self._taught
         for joint in taught.beyond(shown):
             self._dialogue.say(f"  {joint} was shown beyond its limits: the motion keeps it at them.")
@@ -106,7 +120,7 @@ class Teaching:
         self._dialogue.say(f"{target}: {motion.duration_s:.1f} s of {len(taught.joints)} joints")
 
     def hold(self) -> None:
-        """Give the joints torque where they are, and their controllers back."""
+        """Enable torque at the current positions of the joints, and activate their controllers again."""
         while self.limp:
             self._dialogue.ask("The torque comes back where the joints are: hold them, and press Enter ")
             self._try(self._hold, list(self.limp))
@@ -114,7 +128,8 @@ class Teaching:
         self.released = []
 
     def play(self, motion: Path) -> bool:
-        """Play the motion, begun slowly from where the joints are; return whether all goals were reached."""
+        """Play the motion, with a slow start from the current positions; return whether it reached all
+        goals."""
         done = self._robot.play(motion)
         numbers = [goal.number for goal in done.goals]
         try:
@@ -126,7 +141,7 @@ class Teaching:
         return all(state.reached for state in states)
 
     def left(self) -> str:
-        """Return how the robot is when teaching ends early; empty: as it was."""
+        """Return the remaining state if teaching ends early; empty if the robot is as before."""
         parts = [f"{', '.join(self.limp)} limp still: `dxlrun torque on {' '.join(self.limp)}`"] * bool(
             self.limp
         )
@@ -140,14 +155,14 @@ class Teaching:
     def _let_go(self, names: Sequence[str]) -> None:
         joints = [joint for name in names for joint in self._groups[name] if joint not in self.limp]
         if joints:
-            self.limp += joints  # before, as an answer may get lost
+            self.limp += joints  # Before the request: the joints can be limp even if the answer is lost
             try:
                 self._robot.torque(joints, False, release=True)
-            finally:  # also where it is refused, as a servo does not answer: its controller was deactivated
+            finally:  # A refusal by an unresponsive servo still leaves controllers deactivated
                 self.released = self._deactivated()
 
     def _deactivated(self) -> list[str]:
-        """Return the controllers that were active at the beginning, and are not now."""
+        """Return the controllers that were active at the start and are not any more."""
         controllers = cast("Mapping[str, Any]", self._robot.info())["controllers"]
         inactive = {one["name"] for one in controllers if not one["active"]}
         return [plan.name for plan in self._plans if plan.active and plan.name in inactive]
@@ -167,7 +182,8 @@ class Teaching:
         self._try(self._let_go if verb == "limp" else self._hold, names)
 
     def _try(self, switch: Callable[[Sequence[str]], None], names: Sequence[str]) -> None:
-        """Switch the torque of joints, and tell why where the robot refuses: one stands beyond its limits."""
+        """Switch the torque of joints; print the reason if the robot refuses, such as a joint beyond its
+        limits."""
         try:
             switch(names)
         except Refused as error:
@@ -176,7 +192,11 @@ class Teaching:
     # Positions
 
     def _now(self) -> tuple[float, Floats]:
-        """Return the time of the newest cycle, s, and where the joints are; raises ServoFault."""
+        """Return the time of the newest cycle, s, and the joint positions.
+
+        Raises:
+            ServoFault: A joint does not answer any more.
+        """
         states = self._robot.states()
         rows = [states.joints.index(joint) for joint in self._taught.joints]
         ages = states.age_ns[rows].tolist()
@@ -216,7 +236,7 @@ class Teaching:
 def taught(
     robot: RemoteRobot, dialogue: Dialogue, words: Sequence[str], target: Path, way_speed: float
 ) -> int:
-    """Teach a motion, save it, and play it where the person says so; return the exit code."""
+    """Teach a motion, save it, and play it after confirmation; return the exit code."""
     task = Teaching(robot, dialogue, words, way_speed)
     with ending_with(task.left):
         shown = task.teach()
@@ -232,14 +252,14 @@ def taught(
 
 
 def _groups(info: Mapping[str, Any]) -> dict[str, tuple[str, ...]]:
-    """Return the joints of everything that has a name: joints, groups, controllers, `all`."""
+    """Return the joints by name of a joint, group or controller, and `all`."""
     controllers = {one["name"]: tuple(one["joints"]) for one in info["controllers"] if one["command"]}
     groups = {name: tuple(joints) for name, joints in info["groups"].items()}
     return {"all": tuple(info["joints"]), **controllers, **groups, **{one: (one,) for one in info["joints"]}}
 
 
 def _plan(one: Mapping[str, Any]) -> ControllerPlan:
-    """Return what a motion needs to know of a controller that runs."""
+    """Return the plan of a running controller with the fields that a motion needs."""
     joints, command = tuple(one["joints"]), tuple(one["command"])
     return ControllerPlan(
         one["name"], one["type"], "", "{}", joints, command, (), active=one["active"], every=1

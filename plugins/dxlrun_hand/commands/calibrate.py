@@ -19,7 +19,7 @@ if TYPE_CHECKING:
     from dxlrun_hand.lines import Opened
 
 Joints = Annotated[tuple[str, ...], Parameter(negative=(), show_default=False, consume_multiple=True)]
-"""Names of joints or groups, one or several behind the option."""
+"""Names of joints or groups, one or several after the option."""
 
 
 def calibrate(
@@ -45,7 +45,7 @@ def calibrate(
 def calibrated(
     result: Compiled, dialogue: Dialogue, opened: Opened, words: Sequence[str], assignments: Sequence[str]
 ) -> int:
-    """Calibrate a robot; return the exit code. Where it raises an error, the file is as it was."""
+    """Calibrate a robot; return the exit code. An error leaves the file unchanged."""
     from dxlrun.tooling.robots import compile_robot, read_robot
     from dxlrun_hand.calibration import HandJoint, keys_of, measure, replacements
     from dxlrun_hand.dialogue import ending_with, yes
@@ -95,7 +95,11 @@ def _limp(hands: Sequence[HandJoint]) -> str:
 
 
 def _joints(result: Compiled, words: Sequence[str], dialogue: Dialogue) -> dict[str, CompiledJoint]:
-    """Return the chosen joints that have one servo each; raises InputError where none is left."""
+    """Return the chosen joints that have one servo each.
+
+    Raises:
+        InputError: No such joint was chosen.
+    """
     from dxlrun_hand.lines import chosen_names
 
     every = {one.plan.name: one for one in result.joints}

@@ -1,4 +1,4 @@
-"""`dxlrun setup`: new servos get the IDs, rates and registers of a robot file."""
+"""`dxlrun setup`: configuration of new servos with the IDs, rates and registers of a robot file."""
 
 from __future__ import annotations
 
@@ -57,7 +57,8 @@ def set_up(
     from dxlrun_hand.lines import BusLines, chosen_names
 
     servos = [servo.own_name for plan in task.plans for servo in plan.servos]
-    moved = tuple(dict.fromkeys(name.partition("/")[0] for name in servos))  # joints and transmissions
+    # Names of joints and transmissions.
+    moved = tuple(dict.fromkeys(name.partition("/")[0] for name in servos))
     names = chosen_names(words, moved, task.description.groups)
     chosen = [name for name in servos if name.partition("/")[0] in names]
     ports = {}
@@ -72,7 +73,7 @@ def set_up(
 
 
 def _left(task: SetUp) -> str:
-    """Return how the servos are when the dialogue ends early."""
+    """Return the state of the servos if the dialogue ends early."""
     done = f"set up: {', '.join(task.done)}" if task.done else "no servo was set up"
     if not task.changing:
         return f"{done}; all others are as they were"
@@ -80,7 +81,7 @@ def _left(task: SetUp) -> str:
 
 
 def _port(task: SetUp, plan: BusPlan, devices: Devices, *, search: bool) -> str:
-    """Return the port of a bus: that of the file where it is there, else the one that is plugged in."""
+    """Return the port of a bus: the one in the file if it exists, else the one that the user plugs in."""
     from dxlrun.tooling.robots import SIMULATED
     from dxlrun_hand.dialogue import yes
     from dxlrun_hand.lines import find_port
@@ -95,7 +96,7 @@ def _port(task: SetUp, plan: BusPlan, devices: Devices, *, search: bool) -> str:
     text = RobotText(robot)
     try:
         text.put(("buses", plan.name, "port"), found)
-    except InputError:  # it comes from an argument
+    except InputError:  # The port comes from an argument
         dialogue.say(f"Give it to other commands, as argument of the robot file: {found}")
         return found
     dialogue.say(*text.diff())
