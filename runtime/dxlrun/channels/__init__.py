@@ -1,4 +1,5 @@
 """Channels between processes: rings, slots, mailbox, heartbeat, sockets, and the records in them.
 
-Every record that crosses has its type here. What a process does with it belongs in the room of that process.
+This package declares the type of every record that crosses a process boundary. Code that produces or consumes
+the records belongs to the package of the process.
 """

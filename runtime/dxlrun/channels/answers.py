@@ -1,8 +1,8 @@
-"""Answers: what became of a command from outside, as data; sentences are made of it for a person, at the end.
+"""Answers: results of client commands as data, and their texts.
 
-The loop's process answers each command by its number: `Done`, `Refusal`, or first `Waiting` and one of the
-two later. The gateway passes an answer on as JSON, the Python client makes objects of it. A program goes by
-`code` and `fields`; the text is for people, and its wording may change.
+The loop's process answers each command by its number, with `Done` or `Refusal`. A command that takes longer
+is answered with `Waiting` first. The gateway forwards answers as JSON, and the Python client decodes them to
+objects. Programs should use `code` and `fields`: the wording of the text may change.
 """
 
 from __future__ import annotations
@@ -16,20 +16,20 @@ import msgspec
 Field: TypeAlias = str | int | float | tuple[str, ...]
 _MOST_BITS = 63
 MOST_NAMED = 4
-"""Names of a list in a sentence; a program has all of them."""
+"""Most names of a list in a sentence; `fields` has all of them."""
 
 
 @unique
 class Code(StrEnum):
-    """Why a command is refused, with the sentence that is made of the refusal's fields.
+    """Code of a refusal, with the format string of its text.
 
-    A field `hint` that the sentence does not name follows at its end.
+    A field `hint` that the format string does not contain is appended to the text.
     """
 
     text: str
 
     def __new__(cls, code: str, text: str) -> Code:
-        """Keep the sentence beside the value."""
+        """Create a member with its format string."""
         member = str.__new__(cls, code)
         member._value_ = code
         member.text = text
@@ -141,50 +141,50 @@ class Code(StrEnum):
 
 
 class Halted(msgspec.Struct, frozen=True):
-    """What was measured when a halted robot stood still."""
+    """Measurement at the end of a halt."""
 
     seconds: float
-    """Since the loop took the command."""
+    """Time since the loop received the command."""
     joint: str
-    """The fastest one then."""
+    """Joint with the highest speed."""
     velocity: float
-    """Its speed, rad/s"""
+    """Speed of that joint, rad/s or m/s."""
 
 
 class Done(msgspec.Struct, frozen=True, tag="done"):
     """The command was executed."""
 
     cycle: int
-    """The loop's cycle that did it."""
+    """Cycle of the loop that executed the command."""
     place: int | None = None
-    """Of a controller that was loaded: its bit in the masks of the cycles."""
+    """Place of a loaded controller, its bit in the masks of the cycles; None for other commands."""
     goals: tuple[int, ...] = ()
-    """Numbers of the goals that the command began; none where it is no goal."""
+    """Numbers of the goals that the command started; empty if the command is not a goal."""
     value: int | None = None
-    """Of a register: what the servo has, or had before it was written; None: it is not known."""
+    """Value of a register that was read, or before it was written; None: not known."""
     halted: Halted | None = None
-    """Of a halt; None: it was none."""
+    """Measurement of a halt; None for other commands."""
     deactivated: tuple[str, ...] = ()
-    """Controllers that torque or a reboot took the joints from."""
+    """Controllers that were deactivated because of a torque request or a reboot."""
 
 
 class Waiting(msgspec.Struct, frozen=True, tag="waiting"):
-    """The command was accepted; another answer follows.
+    """The command was accepted, and another answer follows.
 
-    Controllers enter when their joints are in the modes that they need; torque and reboots take idle time.
+    Controllers may wait for the modes of their joints. Torque requests and reboots use idle time.
     """
 
     controllers: tuple[str, ...]
 
 
 class Refusal(msgspec.Struct, frozen=True, tag="refused"):
-    """Nothing was done, for a reason that a program can read."""
+    """The command was refused and had no effect. Code and fields state the reason."""
 
     code: Code
     fields: Mapping[str, Field] = {}
 
     def __post_init__(self) -> None:
-        """Make texts of integers beyond 64 bits, and escape what no UTF-8 has, such as a name of a file."""
+        """Convert integers beyond 64 bits to text, and escape lone surrogates, such as in file names."""
         shown = {name: _writable(value) for name, value in self.fields.items()}
         msgspec.structs.force_setattr(self, "fields", shown)
 
@@ -204,39 +204,45 @@ Answer: TypeAlias = Done | Waiting | Refusal
 
 
 class CommandOutcome(msgspec.Struct, frozen=True):
-    """Data of the events STEERED and COMMAND_REFUSED: what became of a command from outside."""
+    """Data of the events STEERED and COMMAND_REFUSED: result of a client command."""
 
     kind: str
     origin: str
     refusal: Refusal | None = None
     place: int = 0
-    """Of the command among those from outside that its cycle took, from 1; 0: none of them, or not known."""
+    """Number of the command among the client commands of its cycle, from 1; 0: another one, or not known."""
 
 
 def list_names(names: Sequence[str]) -> str:
-    """Return names in a sentence: all of a few, else the first ones and how many more there are."""
+    """Return a list of names as text: all of a few, otherwise the first ones and the number of others."""
     beyond = len(names) - MOST_NAMED
-    if beyond < 2:  # a name is no longer than "1 more"
+    if beyond < 2:  # "and 1 more" would not be shorter than the name
         return ", ".join(names)
     return f"{', '.join(names[:MOST_NAMED])} and {beyond} more"
 
 
 def _writable(value: Field) -> Field:
-    if isinstance(value, int) and value.bit_length() > _MOST_BITS:  # MessagePack has no longer ones
+    if isinstance(value, int) and value.bit_length() > _MOST_BITS:  # the longest integers of MessagePack
         return str(value)
     return value.encode(errors="backslashreplace").decode() if isinstance(value, str) else value
 
 
 class Answered(msgspec.Struct, frozen=True, array_like=True, tag_field="is", tag=5):
-    """An answer on its way to the gateway."""
+    """Message with an answer for the gateway."""
 
     number: int
-    """Of the command."""
+    """Number of the command."""
     answer: Answer
 
 
 def encode_answer(number: int, answer: Answer, most: int) -> bytes:
-    """Return the record of an answer, of at most so many bytes; of long texts and lists as much as fits."""
+    """Encode an answer, and cut long texts and lists so that it fits.
+
+    Args:
+        number: Number of the command.
+        answer: The answer.
+        most: Longest record, bytes.
+    """
     data = msgspec.msgpack.encode(Answered(number, answer))
     while len(data) > most:
         if isinstance(answer, Waiting):

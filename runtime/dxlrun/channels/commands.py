@@ -1,7 +1,7 @@
-"""Commands: on their way into the loop, and, once a cycle has taken them, to the log as inputs of the run.
+"""Commands: their records in the loop's inbox, and in the log as inputs of the run.
 
-A command is for one controller, or for the loop itself (its name is then LOOP): switch, rate, pause, resume,
-load, unload, register, stop. Both are prepared and checked before they come here, and both are in the log.
+A command is for one controller or for the loop itself, with LOOP as the name: switch, rate, pause, resume,
+load, unload, register, stop. The sender prepares and checks both kinds, and both are logged.
 """
 
 from __future__ import annotations
@@ -19,12 +19,12 @@ from dxlrun.channels.answers import Answer
 from dxlrun.channels.ring import RING_SECONDS, Appender, RecordKind, record_size
 
 LOOP = ""
-"""Name of the addressee of a command that is for the loop itself; no controller can be called so."""
+"""Name of the loop as the addressee of a command; not a valid name of a controller."""
 
 MOST_PER_CYCLE = 8
-"""Commands that one cycle takes; the others wait for the next."""
+"""Most commands in a cycle; more wait for the next one."""
 LONGEST_COMMAND = 256 * 1024
-"""Bytes of a command's record: a trajectory of some thousand points for twenty joints."""
+"""Longest record of a command, bytes: a trajectory of some thousand points for twenty joints."""
 
 _USUAL_COMMAND = 512
 _NUMBER = 8
@@ -32,32 +32,32 @@ _NUMBER = 8
 
 
 class Command(msgspec.Struct, frozen=True, array_like=True, tag_field="is", tag=1):
-    """A request to a controller, or to the loop."""
+    """A request to a controller or to the loop."""
 
     number: int
-    """The sender's; the answer names it."""
+    """Number that the sender assigns; the answer refers to it."""
     controller: str
     kind: str
     data: bytes
-    """For a controller what its `prepare` made, little-endian float64; for the loop JSON (UTF-8), for `play`
-    with a line break and such an array behind it."""
+    """Little-endian float64 from the controller's `prepare`. For the loop, JSON (UTF-8); for `play`, JSON, a
+    line break and an array."""
     origin: str
-    """The client, for the log."""
+    """Client that sent the command, for the log."""
     lease_ns: Annotated[int, msgspec.Meta(ge=0)] = 0
-    """For how long it counts unless another one follows, ns; 0: for ever."""
+    """Lease: time for which the command is valid unless another one follows, ns; 0: unlimited."""
     request: bytes = b""
-    """What `prepare` made the data of, for the log: the command as JSON, for `play` a list of all; empty:
-    nothing was prepared, or it was too long."""
+    """Input of `prepare` for the log: the command as JSON, for `play` a list. Empty if nothing was prepared,
+    or if it was too long."""
 
 
 class TakenCommand(msgspec.Struct, frozen=True, array_like=True, tag_field="is", tag=2):
-    """One command that a cycle took: for a controller, active or not, or for the loop itself."""
+    """A command that a cycle has executed or refused, for a controller or for the loop."""
 
     t_ns: int
     """Time of the cycle's wake-up, ns of the run's clock."""
     cycle: int
     planned: int
-    """Number of the command in the plan's commands, whose array it is; -1: the array is `data`."""
+    """Index in the plan's commands, which have the array; -1: the array is in `data`."""
     controller: str
     """Empty: the loop itself."""
     kind: str
@@ -66,39 +66,41 @@ class TakenCommand(msgspec.Struct, frozen=True, array_like=True, tag_field="is",
     data: bytes
     """As in Command; empty for a planned command."""
     lease_ns: int = 0
-    """For how long a set-point of a stream counts; 0: for ever."""
+    """Lease of a setpoint in a stream; 0: unlimited."""
     request: bytes = b""
     """As in Command; empty for a planned command."""
 
     @property
     def for_loop(self) -> bool:
-        """True where no controller but the loop itself is meant."""
+        """True if the command is for the loop itself."""
         return not self.controller
 
     @property
     def text(self) -> str:
-        """The data as the log's text: JSON for the loop, hexadecimal for what is no array of numbers, else
-        empty. Bytes that are no UTF-8 become escapes that no JSON has: what was refused stays refused."""
+        """The data as text for the log: JSON for the loop, hexadecimal if they are not an array, else empty.
+
+        Invalid UTF-8 becomes escapes that are invalid in JSON, so a replay refuses the command again.
+        """
         if self.for_loop:
             return self.data.partition(b"\n")[0].decode(errors="backslashreplace")
         return self.data.hex() if len(self.data) % _NUMBER else ""
 
     @property
     def numbers(self) -> NDArray[np.float64]:
-        """The data as the log's array; empty where it is the text."""
+        """The array in the data for the log; empty if `text` has the data."""
         data = self.data.partition(b"\n")[2] if self.for_loop else self.data
         return np.frombuffer(data if len(data) % _NUMBER == 0 else b"", dtype="<f8")
 
 
 class ClientCommand(msgspec.Struct, frozen=True):
-    """One command that is not in the plan."""
+    """A command that is not in the plan."""
 
     command: TakenCommand
-    refusal: str  # Why nothing was done; empty where it was done, or where the event with the refusal is lost
+    refusal: str  # Text of the refusal; empty on success, or if the event with the refusal was lost
 
 
 def data_of(controller: str, text: str, numbers: NDArray[np.float64]) -> bytes:
-    """Return a command's data from its text and its array in the log. Raises ValueError when neither fits."""
+    """Return a command's data from its text and its array in the log. Raises ValueError for invalid text."""
     if controller and text:
         return bytes.fromhex(text)
     if controller:
@@ -107,48 +109,49 @@ def data_of(controller: str, text: str, numbers: NDArray[np.float64]) -> bytes:
 
 
 class Inbox(Protocol):
-    """Where the loop finds commands; never blocks, never raises."""
+    """Source of commands for the loop. Its methods never block and never raise."""
 
     def take(self) -> Sequence[Command]:
-        """Return what has come, in order, at most MOST_PER_CYCLE and the newest set-point of each stream."""
+        """Return new commands in the order of arrival: at most MOST_PER_CYCLE, and the newest setpoint of
+        each stream."""
         ...
 
     def answer(self, number: int, answer: Answer) -> None:
-        """Answer a command by its number; after `Waiting` another answer follows."""
+        """Answer a command by its number. Another answer follows after `Waiting`."""
         ...
 
 
 class NoInbox:
-    """The inbox of a loop that takes no commands from outside."""
+    """Inbox of a loop without clients."""
 
     def take(self) -> Sequence[Command]:
-        """Return nothing."""
+        """Return no commands."""
         return ()
 
     def answer(self, number: int, answer: Answer) -> None:
-        """Forget it: no command came from here."""
+        """Do nothing."""
 
 
 class QueueInbox:
-    """Commands from the same process, on virtual time; `answers` has the newest answer to each number."""
+    """Inbox for commands of the same process, on virtual time. `answers` has the last answer by number."""
 
     def __init__(self) -> None:
         self.waiting: deque[Command] = deque()
         self.answers: dict[int, Answer] = {}
 
     def take(self) -> Sequence[Command]:
-        """Return what has been put into `waiting`."""
+        """Return the commands in `waiting`, at most MOST_PER_CYCLE."""
         if not self.waiting:
             return ()
         return [self.waiting.popleft() for _ in range(min(len(self.waiting), MOST_PER_CYCLE))]
 
     def answer(self, number: int, answer: Answer) -> None:
-        """Keep the answer."""
+        """Store the answer."""
         self.answers[number] = answer
 
 
 class CommandSink(Protocol):
-    """Takes the commands that cycles took; never blocks, never raises."""
+    """Destination of executed commands. Never blocks and never raises."""
 
     def take(self, command: TakenCommand) -> None:
         """Record one command."""
@@ -156,14 +159,14 @@ class CommandSink(Protocol):
 
 
 class NoCommands:
-    """Forgets commands: a run without a log, a replay."""
+    """Drops commands, for runs without a log."""
 
     def take(self, command: TakenCommand) -> None:
-        """Forget it."""
+        """Do nothing."""
 
 
 class CommandRing:
-    """Appends the commands that cycles took to a ring."""
+    """Appends executed commands to a ring."""
 
     __slots__ = ("_writer",)
 
@@ -176,8 +179,7 @@ class CommandRing:
 
 
 def encode_command(command: Command, most: int = LONGEST_COMMAND) -> bytes:
-    """Return the record of a command on its way to the loop; without its request where it would be longer
-    than `most`."""
+    """Encode a command for the loop. The request is omitted if the record would be longer than `most`."""
     record = msgspec.msgpack.encode(command)
     if command.request and len(record) > most:
         record = msgspec.msgpack.encode(replace(command, request=b""))
@@ -185,9 +187,12 @@ def encode_command(command: Command, most: int = LONGEST_COMMAND) -> bytes:
 
 
 def command_capacity(period_ns: int, controllers: int, mailbox: int) -> int:
-    """Return how many bytes of a ring hold 10 s in which every controller takes a command in each cycle.
+    """Return the capacity of a ring, bytes, for 10 s with a command for every controller in each cycle.
 
-    Beside them there is room for everything that a full mailbox of so many bytes gives at once.
+    Args:
+        period_ns: Period of the loop.
+        controllers: Number of controllers.
+        mailbox: Additional room for the records of a full mailbox, bytes.
     """
     commands = RING_SECONDS * 1_000_000_000 // period_ns * controllers
     return commands * record_size(_USUAL_COMMAND) + mailbox

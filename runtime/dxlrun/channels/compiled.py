@@ -1,4 +1,4 @@
-"""The C sources of all rooms, and whether each was compiled."""
+"""C sources of all packages, and the check that they were compiled."""
 
 from __future__ import annotations
 
@@ -12,11 +12,11 @@ SOURCES = tuple(
     Path(__file__).parents[2] / name
     for name in ("dxlrun/channels/shared_memory.c", "dxlrun/control/gate.c", "dxlwire/exchange/kernel.c")
 )
-"""All that the build compiles."""
+"""C sources that the build compiles."""
 
 
 def missing() -> str:
-    """Return why a compiled object cannot be used, in one sentence; empty when all can."""
+    """Return one sentence about a compiled object that cannot be used; empty if all can."""
     try:
         for source in SOURCES:
             load_compiled(source, ctypes.PyDLL)

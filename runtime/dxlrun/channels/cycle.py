@@ -1,9 +1,9 @@
-"""One cycle of the loop: states, commands and goals of the joints, and the layout of their record.
+"""Cycle: states, commands and goals of the joints in one cycle of the loop, and the layout of their record.
 
-The record's memory is the arrays that the loop works on: its bytes are, as they are, the CDR body
-(little-endian, after the encapsulation header) of the message dxlrun_msgs/msg/Cycle of the log: scalars of 64
-bits, then sequences, each with its length of 32 bits in front and aligned as its elements ask. So the loop
-fills arrays, the ring copies once, and the recorder writes what it finds.
+The loop's arrays are views of the record's memory. The bytes of the record are the CDR body (little-endian,
+after the encapsulation header) of the log's message dxlrun_msgs/msg/Cycle: 64-bit scalars, then sequences,
+each with a 32-bit length and the alignment of its elements. So a record is copied once, into the ring, and
+the recorder writes it without conversion.
 """
 
 from __future__ import annotations
@@ -23,12 +23,12 @@ from dxlrun.description.source_names import SOURCE_COMMAND
 from dxlwire.modes import COMMAND_INTERFACES
 
 Floats = NDArray[np.float64]
-"""Shape (joints,): rad, rad/s, Nm, A, or the fraction of maximum where the servo measures no torque."""
+"""Shape (joints,): rad, rad/s, Nm, A, or the fraction of maximum if the servo does not measure torque."""
 LOST_CYCLES = 3
-"""A servo that missed so many replies in a row is lost, until it answers again ..."""
+"""Consecutive missing replies after which a servo is lost, if its last reply is older than LOST_AGE_NS."""
 LOST_AGE_NS = 50_000_000
-"""... and whose last reply is so old: at 50 Hz it is by then, but three cycles at 1 kHz are less than
-what hosts, virtual machines and USB adapters stand still for [i]."""
+"""Age of the last reply after which a servo is lost. Three cycles at 1 kHz are shorter than the stalls of
+hosts, virtual machines and USB adapters; three cycles at 50 Hz are not [i]."""
 MOST_CONTROLLERS = 63
 
 SCALARS: tuple[tuple[str, str], ...] = (
@@ -44,7 +44,7 @@ SCALARS: tuple[tuple[str, str], ...] = (
     ("published", "uint64"),
     ("command_count", "int64"),
 )
-"""Name and type of the fields that a cycle has once."""
+"""Name and type of the scalar fields."""
 
 SEQUENCES: tuple[tuple[str, str, str], ...] = (
     ("position", "float64", "joints"),
@@ -73,41 +73,42 @@ SEQUENCES: tuple[tuple[str, str, str], ...] = (
     ("source_age_ns", "int64", "sources"),
     ("source_valid", "bool", "sources"),
 )
-"""Name, element type and what it has one element of."""
+"""Name, element type and dimension of the sequences."""
 _OWNERS = {name: per for name, _, per in SEQUENCES}
 
 
 @unique
 class Torque(IntEnum):
-    """Whether a joint's servo holds torque; the numbers are in the log."""
+    """Torque state of a joint's servo. The log has the numbers."""
 
     UNKNOWN = 0
-    """In logs of versions that did not record it."""
+    """Not recorded, in logs of older versions."""
     ON = 1
-    """It holds torque for certain, and gets goals."""
+    """Torque is enabled, and the servo gets goals."""
     DOUBT = 2
-    """It gets no goals until its torque enable was read: a reply was lost, or torque was just given."""
+    """Uncertain after a lost reply or after torque was enabled. The servo gets goals again as soon as its
+    Torque Enable was read."""
     OFF = 3
-    """It has none: it was reset, its torque was cut, or it shut itself down."""
+    """Torque is off because the servo was reset, its torque was cut, or it shut down."""
     RELEASED = 4
-    """It has none, because a client, a policy or the robot file switched it off."""
+    """Torque is off because a client, a policy or the robot file disabled it."""
     LOST = 5
-    """It is not known: the servo is lost."""
+    """Not known: the servo is lost."""
     REBOOTING = 6
-    """The servo reboots because a client requested it: that it is silent is no loss."""
+    """The servo reboots at the request of a client. Missing replies do not count as a loss."""
     GIVEN = 7
-    """It was just given torque where it is: the loop's goal becomes that, and its controllers start again."""
+    """Torque was just enabled. The goal becomes the measured position, and the controllers are restarted."""
 
     @property
     def word(self) -> str:
-        """The state in every output; a joint without torque is `limp`, whatever the reason."""
+        """Word for outputs. A joint without torque is `limp` for any reason."""
         return "limp" if self in LIMP else self.name.lower()
 
 
 LIMP = (Torque.OFF, Torque.RELEASED)
-"""Joints that move freely."""
+"""Torque states of joints that move freely."""
 OFFLINE = (Torque.LOST, Torque.REBOOTING)
-"""Joints whose servos are not read."""
+"""Torque states of joints whose servos are not read."""
 _UNABLE = {
     Torque.OFF: "is limp: it was reset, its torque was cut, or it shut itself down",
     Torque.RELEASED: "is limp: its torque was switched off",
@@ -118,28 +119,27 @@ _UNABLE = {
 
 @dataclass(frozen=True, slots=True)
 class States:
-    """States of the joints: one row a joint; an invalid row keeps its last values and its age grows."""
+    """States of the joints, one element a joint. Invalid ones keep their last values and grow older."""
 
     motion: Floats
-    """Shape (3, joints): position, velocity and effort, for use all at once."""
+    """Shape (3, joints): position, velocity and effort in one array."""
     position: Floats = field(init=False)
     velocity: Floats = field(init=False)
     effort: Floats = field(init=False)
     valid: NDArray[np.bool_]
-    """True where this cycle's reply arrived intact."""
+    """True if this cycle's reply arrived intact."""
     age_ns: NDArray[np.int64]
-    """Time since the reply that the row shows arrived; -1 while none ever did."""
+    """Time since the last valid reply arrived; -1 before the first one."""
     temperature: Floats
-    """deg C, read now and then; NaN until it was."""
+    """deg C, read at a low rate; NaN until first read."""
     voltage: Floats
-    """V at the servo, read now and then; NaN until it was."""
+    """Supply voltage at the servo, V, read at a low rate; NaN until first read."""
     hardware_error: NDArray[np.uint8]
-    """Bits of the e-Manual's Hardware Error Status; Protocol 1.0: those of ERR that are states; 0: none."""
+    """Bits of the e-Manual's Hardware Error Status; Protocol 1.0: the bits of ERR that are states."""
     mode: NDArray[np.uint8]
-    """A Mode: in which the servo is known to be; UNKNOWN while that changes."""
+    """Mode of the servo, as a `Mode`; UNKNOWN during a change."""
     torque: NDArray[np.uint8]
-    """A Torque: whether the servo holds torque, as known before this cycle's read; in doubt where a reply
-    of it reports an error that is new."""
+    """Torque state, as a `Torque`, before this cycle's read; DOUBT if the reply reports a new error."""
 
     def __post_init__(self) -> None:
         for name, row in zip(("position", "velocity", "effort"), self.motion, strict=True):
@@ -147,18 +147,18 @@ class States:
 
     @property
     def has_lost(self) -> bool:
-        """True while one of these joints is lost: nothing is commanded to it, and the others are held."""
+        """True while any joint is lost. Lost joints get no commands, and their controllers are held."""
         return Torque.LOST in self.torque.tobytes()
 
     def unable(self, rows: Iterable[int]) -> tuple[int, str] | None:
-        """Return the first joint, of these rows, that goes nowhere, and why; None: there is none."""
+        """Return the row of the first joint that cannot move, and the reason; None if all can."""
         for row in rows:
             if why := _UNABLE.get(Torque(self.torque.item(row))):
                 return row, why
         return None
 
     def doubtful(self, rows: Iterable[int]) -> tuple[int, str] | None:
-        """Return the first joint, of these rows, whose reply or torque is missing for now, and which."""
+        """Return the row of the first joint with a missing reply or uncertain torque, and the reason."""
         for row in rows:
             if not self.valid.item(row):
                 return row, "has not answered"
@@ -168,7 +168,7 @@ class States:
 
     @classmethod
     def empty(cls, joints: int) -> States:
-        """Return arrays of NaN, invalid, of no age and of unknown mode."""
+        """Return invalid states: NaN, age -1, unknown mode and torque."""
         return cls(
             motion=np.full((3, joints), np.nan),
             valid=np.zeros(joints, dtype=np.bool_),
@@ -183,18 +183,18 @@ class States:
 
 @dataclass(frozen=True, slots=True)
 class SourceStates:
-    """States of what is no joint: of devices on a bus, sensors, and controllers that provide some."""
+    """States of sources other than joints: devices on a bus, sensors, and controllers that provide states."""
 
     values: Floats
-    """Shape (states,), in the order of the layout's `source_states`; NaN until there is one."""
+    """Shape (states,), in the order of the layout's `source_states`; NaN until first updated."""
     valid: NDArray[np.bool_]
-    """Shape (sources,): True where this cycle brought its states."""
+    """Shape (sources,): True if this cycle updated the states of the source."""
     age_ns: NDArray[np.int64]
-    """Shape (sources,): time since its states were true; -1 while none ever came."""
+    """Shape (sources,): time since the states were measured; -1 before the first update."""
 
     @classmethod
     def empty(cls, sources: int = 0, states: int = 0) -> SourceStates:
-        """Return the states before anything came."""
+        """Return the states before the first update."""
         return cls(
             values=np.full(states, np.nan),
             valid=np.zeros(sources, dtype=np.bool_),
@@ -204,23 +204,23 @@ class SourceStates:
 
 @dataclass(frozen=True, slots=True)
 class Commands:
-    """Commands of the joints: one row a joint, NaN = not commanded.
+    """Commands of the joints, one element a joint; NaN = not commanded.
 
-    Which of them count depends on the joint's mode, see `mode_of`.
+    The joint's mode decides which commands apply, see `mode_of`.
     """
 
     values: Floats
-    """Shape (4, joints): all of them, in the order of COMMAND_INTERFACES, for use all at once."""
+    """Shape (4, joints): all commands in one array, in the order of COMMAND_INTERFACES."""
     position: Floats = field(init=False)
-    """rad"""
+    """rad or m."""
     velocity: Floats = field(init=False)
-    """rad/s. Beside a position: magnitude of the speed toward it, NaN = as fast as the servo can. Alone: the
-    speed at which the joint turns, with its sign."""
+    """rad/s or m/s. With a position: speed toward it, a magnitude, NaN = as fast as the servo can. Alone:
+    signed velocity of the joint."""
     effort: Floats = field(init=False)
-    """In the unit of the state's effort: Nm, A, or the fraction of maximum. Beside a position: the most that
-    the servo may exert, a magnitude. Alone: with its sign."""
+    """Unit of the state's effort: Nm, A, or the fraction of maximum. With a position: effort limit of the
+    servo, a magnitude. Alone: signed effort."""
     pwm: Floats = field(init=False)
-    """Fraction of the full voltage, -1..1"""
+    """Fraction of the full voltage, -1..1."""
 
     def __post_init__(self) -> None:
         for name, row in zip(COMMAND_INTERFACES, self.values, strict=True):
@@ -232,39 +232,44 @@ class Commands:
         return cls(np.full((len(COMMAND_INTERFACES), joints), np.nan))
 
     def clear(self) -> None:
-        """Command nothing any more."""
+        """Set all commands to NaN."""
         self.values.fill(np.nan)
 
 
 @unique
 class Clamp(IntFlag):
-    """What the last gate did to a joint's command in a cycle; the bits are in the log."""
+    """Clamps that the gate applied to a joint's command in a cycle. The log has the bits."""
 
     LOWER = 1
-    """Raised to the lower position limit."""
+    """Position raised to the lower limit."""
     UPPER = 2
-    """Lowered to the upper position limit."""
+    """Position lowered to the upper limit."""
     STEP = 4
-    """The change since the last goal was cut to the step limit, or to what the acceleration limit allows."""
+    """Change of the goal reduced to the step limit or the acceleration limit."""
     VELOCITY = 8
-    """The velocity was cut to the velocity limit."""
+    """Velocity reduced to the velocity limit."""
     NOT_FINITE = 16
-    """NaN after a finite value, or infinite: the last goal was kept, the controller is at fault."""
+    """Infinite, or NaN after a finite value: a fault of the controller. The last goal was kept."""
     EFFORT = 32
-    """The effort was cut to the effort limit."""
+    """Effort reduced to the effort limit."""
     PWM = 64
-    """The PWM was cut to the full voltage."""
+    """PWM reduced to the full voltage."""
     OUTWARD = 128
-    """A velocity, an effort or a PWM that leads out of the position limits was cut, at the end to 0."""
+    """Velocity, effort or PWM toward a position limit reduced, to 0 at the limit."""
 
 
 class CycleLayout:
-    """The numpy dtype of a robot's cycle record; rows are in the order of the plan's joints and controllers.
+    """Layout of a robot's cycle record, as a numpy dtype.
 
-    `references` are the names of the controllers' reference interfaces: `arm_pid/shoulder/position`.
-    `sources` are devices, sensors and the controllers that provide states, each with the names of its states;
-    `source_commands` are names such as `light/led`. Raises ValueError for more than 63 controllers (they are
-    bits of a mask).
+    Args:
+        joints: Names of the joints, in the order of the plan.
+        controllers: Names of the controllers, in the order of the plan.
+        references: Names of the controllers' reference interfaces: `arm_pid/shoulder/position`.
+        sources: Names of the states of each device, sensor and controller that provides states.
+        source_commands: Names of the commands of sources: `light/led`.
+
+    Raises:
+        ValueError: More than 63 controllers, which are bits of a mask.
     """
 
     __slots__ = (
@@ -312,13 +317,13 @@ class CycleLayout:
         end = 8 * len(SCALARS)
         self.lengths: dict[str, int] = {}
         self.places: dict[str, slice] = {}
-        """The bytes of each sequence's elements in a record."""
+        """Range of bytes of each sequence's elements in a record."""
         for name, kind, per in SEQUENCES:
             element = np.dtype(kind).newbyteorder("<")
             count = counts[per]
             self.lengths[f"{name}_length"] = count
             at = -(-end // 4) * 4
-            # An empty CDR sequence is its length alone: nothing follows that would have to be aligned.
+            # An empty CDR sequence has only its length, without padding for elements.
             body = -(-(at + 4) // element.itemsize) * element.itemsize if count else at + 4
             names += [f"{name}_length", name]
             formats += [np.dtype("<u4"), (element, (count,))]
@@ -331,66 +336,67 @@ class CycleLayout:
 
     @property
     def size(self) -> int:
-        """Bytes of one record."""
+        """Size of a record, bytes."""
         return self.dtype.itemsize
 
     def place(self, name: str) -> int:
-        """Return where the elements of a sequence of 64 bits begin in `CycleRecord.floats`."""
+        """Return the index of a 64-bit sequence's first element in `CycleRecord.floats`."""
         first: int = self.places[name].start
         return first // 8
 
     def names_of(self, sequence: str) -> tuple[str, ...]:
-        """Return the names of the elements of a sequence that belong to no joint: `light/led`."""
+        """Return the names of a sequence's elements, for sequences without joints: `light/led`."""
         names: tuple[str, ...] = getattr(self, _OWNERS[sequence])
         return names
 
     def source_slice(self, source: str) -> slice:
-        """Return where the states of a source are among `source_states`."""
+        """Return the slice of a source's states in `source_states`."""
         places = [index for index, name in enumerate(self.source_states) if name.partition("/")[0] == source]
         return slice(places[0], places[-1] + 1) if places else slice(0, 0)
 
 
 class _Scalars(ctypes.LittleEndianStructure):
-    """The fields that a cycle has once."""
+    """Scalar fields of a cycle."""
 
     _fields_ = tuple((name, getattr(ctypes, f"c_{kind}")) for name, kind in SCALARS)
 
 
 class CycleRecord(_Scalars):
-    """One cycle's memory, filled again and again: the arrays that hardware, controllers and gate share.
+    """Record of the current cycle: the arrays that hardware, controllers and gate share.
 
-    Times are int64 ns of the run's clock, shape of arrays is (joints,) or (controllers,).
+    Each cycle overwrites it. Times are int64 ns of the run's clock. Arrays have the shape (joints,) or
+    (controllers,).
     """
 
     COMPUTED: ClassVar = {"source_state": "state", "reference": "reference", SOURCE_COMMAND: "command"}
-    """Sequences of float64 that belong to no joint, as a cycle computes them, with the word for one."""
+    """float64 sequences without joints, in the order of computation, with the noun for an element."""
 
     cycle: int
-    """Number of the period since the loop's first deadline, skipped ones counted."""
+    """Number of the period since the loop's first deadline, including skipped periods."""
     scheduled_ns: int
-    """The deadline of this cycle: start + cycle * period."""
+    """Deadline of this cycle: start + cycle * period."""
     woken_ns: int
-    """After the wake-up."""
+    """Time after the wake-up."""
     read_ns: int
-    """After the states were read."""
+    """Time after the states were read."""
     updated_ns: int
-    """After the controllers and the gate."""
+    """Time after the controllers and the gate."""
     written_ns: int
-    """After the goals were sent."""
+    """Time after the goals were sent."""
     period_ns: int
-    """The true time since the cycle before, as controllers saw it, capped."""
+    """Measured time since the previous cycle, capped, as controllers get it."""
     skipped: int
-    """Whole periods that were declared skipped before this cycle."""
+    """Number of periods skipped before this cycle."""
     active: int
     """Bit i: controller i is active."""
     published: int
-    """Bit i: controller i marked this cycle for the topics it publishes."""
+    """Bit i: controller i marked this cycle for its topics."""
     command_count: int
-    """Commands handed to controllers in this cycle."""
+    """Commands that controllers accepted in this cycle."""
     _array: NDArray[np.void]
 
     def __new__(cls, layout: CycleLayout) -> Self:
-        """Lay a record out in memory of its own."""
+        """Allocate a record."""
         array: NDArray[np.void] = np.zeros(1, dtype=layout.dtype)
         record = cls.from_buffer(array.view(np.uint8).data)
         record._array = array
@@ -402,7 +408,7 @@ class CycleRecord(_Scalars):
         for name, count in layout.lengths.items():
             array[name] = count
         self.raw: memoryview = array.view(np.uint8).data
-        """The bytes of the record; a view, not a copy."""
+        """Bytes of the record, a view."""
         self.states = States(
             motion=_rows(array, "position", 3),
             valid=array["valid"][0],
@@ -413,18 +419,18 @@ class CycleRecord(_Scalars):
             mode=array["mode"][0],
             torque=array["torque"][0],
         )
-        """The servos' states."""
+        """States of the servos."""
         self.commands = Commands(_rows(array, "command_position", len(COMMAND_INTERFACES)))
-        """What the controllers want, merged; NaN = not commanded."""
+        """Merged commands of the controllers; NaN = not commanded."""
         self.goals = Commands(_rows(array, "goal_position", len(COMMAND_INTERFACES)))
-        """What goes to the servos, after the last gate."""
+        """Goals for the servos, from the gate."""
         self.controller_ns: NDArray[np.int64] = array["controller_ns"][0]
-        """How long each controller's update took; 0 where it was not updated in this cycle."""
+        """Duration of each controller's update; 0 without an update in this cycle."""
         self.clamped: NDArray[np.uint8] = array["clamped"][0]
-        """Bits of Clamp, one element a joint."""
+        """Bits of Clamp for each joint."""
         self.reference: Floats = _row(array, "reference")
-        """What controllers command of each other's references, one element a name of the layout's references;
-        NaN = not commanded."""
+        """Commands of controllers for the references of other controllers, in the order of the layout's
+        references; NaN = not commanded."""
         self.sources = SourceStates(
             values=_row(array, "source_state"),
             valid=array["source_valid"][0],
@@ -432,11 +438,11 @@ class CycleRecord(_Scalars):
         )
         """States of devices, sensors and controllers."""
         self.source_commands: Floats = _row(array, SOURCE_COMMAND)
-        """Commands of sources, one element a name of the layout's source_commands; NaN = not commanded."""
+        """Commands of sources, in the order of the layout's source_commands; NaN = not commanded."""
         self.computed: tuple[Floats, ...] = tuple(_row(array, name) for name in self.COMPUTED)
         """The sequences of COMPUTED."""
         self.floats: Floats = np.frombuffer(self.raw[: layout.size - layout.size % 8], dtype="<f8")
-        """The record as float64: the element at `layout.place(name)` is the first of a sequence of them."""
+        """Record as float64. `layout.place(name)` is the index of a sequence's first element."""
         for name, kind, _ in SEQUENCES:
             if kind == "float64":
                 array[name] = np.nan
@@ -448,13 +454,13 @@ class CycleRecord(_Scalars):
         )
 
     def renew(self) -> None:
-        """Begin a cycle: nothing was published, taken, clamped or updated in it yet."""
+        """Reset the fields that count or mark events of a cycle."""
         self.published = self.command_count = 0
         for part, nothing in self._renewed:
             part[:] = nothing
 
     def wake(self, cycle: int, scheduled_ns: int, woken_ns: int, period_ns: int) -> None:
-        """Take what is known of a cycle when it begins."""
+        """Set the fields that are known at the begin of a cycle."""
         self.cycle, self.scheduled_ns, self.woken_ns, self.period_ns = (
             cycle,
             scheduled_ns,
@@ -463,17 +469,17 @@ class CycleRecord(_Scalars):
         )
 
     def set_times(self, read_ns: int, updated_ns: int, written_ns: int) -> None:
-        """Take when the parts of a cycle ended."""
+        """Set the times after read, update and write."""
         self.read_ns, self.updated_ns, self.written_ns = read_ns, updated_ns, written_ns
 
     @property
     def valid(self) -> NDArray[np.bool_]:
-        """True where this cycle's reply arrived intact."""
+        """True if this cycle's reply arrived intact."""
         return self.states.valid
 
     @property
     def age_ns(self) -> NDArray[np.int64]:
-        """Time since the reply that the row shows arrived; -1 while none ever did."""
+        """Time since the last valid reply arrived; -1 before the first one."""
         return self.states.age_ns
 
 
@@ -483,11 +489,19 @@ def _row(array: NDArray[np.void], name: str) -> Floats:
 
 
 def _rows(array: NDArray[np.void], first: str, count: int) -> Floats:
-    """Return float64 sequences from `first` on, which stand in equal distances: one length lies between."""
+    """Return consecutive float64 sequences as one array.
+
+    Their stride is constant: one sequence, and the length and padding of the next.
+    """
     row = _row(array, first)
     return as_strided(row, (count, row.size), (row.nbytes + row.itemsize, row.itemsize))
 
 
 def cycle_capacity(period_ns: int, size: int) -> int:
-    """Return how many bytes of a ring hold 10 s of cycles of this size, with a margin of a second."""
+    """Return the capacity of a ring, bytes, for 10 s of cycles and a margin of 1 s.
+
+    Args:
+        period_ns: Period of the loop.
+        size: Size of a cycle record, bytes.
+    """
     return record_size(size) * max(64, (RING_SECONDS + 1) * 1_000_000_000 // period_ns)

@@ -1,4 +1,4 @@
-"""Events: what happened beside the regular cycle, for the log and for clients."""
+"""Events: reports of processes, joints and controllers, for the log and for clients."""
 
 from __future__ import annotations
 
@@ -26,13 +26,13 @@ class Severity(IntEnum):
 
 @unique
 class EventCode(IntEnum):
-    """What kind of thing happened; the number is in the log and is never used for something else."""
+    """Kind of an event. The log has the number, which is never used again for another kind."""
 
     LOOP_STARTED = 1
     LOOP_STOPPED = 2
     OVERRUN = 3
     SCHEDULER = 4
-    """A request about scheduler, memory or collector, and whether it was granted."""
+    """Result of a request for scheduler, memory or collector; the data are Granted."""
     SIMULATION_STALLED = 5
     """The process of simulated servos did not run, and the loop waited for it; the data are Waited."""
     SETUP = 10
@@ -41,13 +41,13 @@ class EventCode(IntEnum):
     SHUTDOWN_FAILED = 13
     REGISTER_DIFFERS = 14
     REGISTER_WRITTEN = 15
-    """A register was written because the robot file declares it or a client wants it; read back, too."""
+    """A register that the robot file declares or a client requested was written and read back."""
     SERVO_LIMITS = 16
     """Registers of a joint's servo limit its goals further than the manual; the data are ServoLimit."""
     READ_LOST = 20
-    """The first of a row of missed replies of one servo."""
+    """First of several consecutive missing replies of a servo."""
     READ_BACK = 21
-    """The servo answers again; the text counts what was missed."""
+    """The servo replies again; the text has the number of missing replies."""
     SERVO_ERROR = 22
     """The error byte of a status packet changed."""
     SERVO_LIMP = 23
@@ -56,16 +56,16 @@ class EventCode(IntEnum):
     PORT_LOST = 25
     PORT_BACK = 26
     SERVO_LOST = 27
-    """A servo missed several replies in a row: it leaves the exchange and is asked once a second."""
+    """Several consecutive replies of a servo were missing. It is only probed once a second."""
     SERVO_BACK = 28
-    """A servo that was lost was looked at as at the start, and takes part again."""
+    """A lost servo replied, was checked as at the start, and is read again."""
     DEVICE_LOST = 18
-    """A device on a bus missed several replies in a row; it is asked once a second until it is back."""
+    """Several consecutive replies of a device on a bus were missing. It is probed once a second."""
     DEVICE_BACK = 19
-    """A device that was lost is read again."""
+    """A lost device is read again."""
     SERVO_REBOOTED = 29
     COMMAND = 30
-    """A command was handed to a controller."""
+    """A command was passed to a controller."""
     COMMAND_REFUSED = 31
     CONTROLLER_ACTIVATED = 32
     CONTROLLER_DEACTIVATED = 33
@@ -73,17 +73,17 @@ class EventCode(IntEnum):
     CONTROLLER_SAYS = 35
     """Free text of a controller: goal reached, goal preempted, tolerance violated."""
     STEERED = 36
-    """The loop did what a client asked of it: switch, rate, pause, resume, load, unload, stop."""
+    """The loop executed a client's request: switch, rate, pause, resume, load, unload, stop."""
     STALE_COMMAND = 37
-    """A stream of commands ended without a word; the policy for it begins."""
+    """The lease of a command stream expired, and the policy for that begins."""
     CONTROLLER_LOADED = 38
-    """A controller came or went while the loop was paused; the text has the time that it took."""
+    """A controller was loaded or unloaded while the loop was paused; the text has the duration."""
     POLICY = 39
-    """A policy of the robot file begins or ends: what for, and what it does."""
+    """A policy of the robot file begins or ends; the text has its reason and its actions."""
     GATE = 40
-    """A command was clamped at the last gate; the text names joint, controller and limit."""
+    """The gate clamped a command; the text names joint, controller and limit."""
     MODE = 45
-    """A joint goes into another mode, or controllers wait until theirs have."""
+    """A joint changes its mode, or controllers wait for the modes of their joints."""
     IMPLAUSIBLE = 41
     """A servo's position jumped further than it can turn: the sample is not valid."""
     SERVO_HOT = 42
@@ -91,26 +91,26 @@ class EventCode(IntEnum):
     WATCHDOG = 43
     """The Bus Watchdog of servos was armed, disarmed, or has stopped them."""
     UNREQUESTED = 46
-    """Packets came that answer no request of this run: another host writes on the line."""
+    """Packets arrived that do not answer a request of this run: another host writes to the line."""
     GOAL_ACCEPTED = 47
     """A controller has a new goal; the data are a GoalReport."""
     GOAL_ENDED = 48
     """A goal was reached, missed, aborted, cancelled or preempted; the data are a GoalReport."""
     PARAMETERS = 49
-    """Live parameters of a controller were changed, all of one request in one cycle."""
+    """Live parameters of a controller were changed in one cycle."""
     SERVOS_DISAGREE = 59
-    """Servos that move one joint stand further apart than its tolerance, or agree again."""
+    """The positions of servos that move one joint differ by more than its tolerance, or agree again."""
     GUARDIAN = 50
     KEPT = 51
-    """A controller begins with the state that it kept in an earlier run, or anew, and why."""
+    """A controller starts with its state from an earlier run, or without it for the reason in the text."""
     SENSOR = 52
-    """A sensor, or its process, reports: it cannot be opened, ended, was opened again, or has a sentence."""
+    """Report of a sensor or its process: open failed, ended, opened again, or a text of the driver."""
     SENSOR_LOST = 53
-    """A sensor brought nothing new for its timeout, or values that are not finite: its row is not valid."""
+    """A sensor had no new samples within its timeout, or values that are not finite. It is not valid."""
     SENSOR_BACK = 54
-    """A sensor that was lost brings samples again."""
+    """A lost sensor has samples again."""
     TAKEOVER = 58
-    """A controller requested that others take over; the text has why."""
+    """A controller requested a takeover; the text has the reason."""
     RECORDER_GAP = 61
 
 
@@ -119,78 +119,78 @@ class LostRecords(msgspec.Struct, frozen=True):
 
     ring: str
     lost: int
-    """Records."""
+    """Number of lost records."""
 
 
 class Waited(msgspec.Struct, frozen=True):
-    """Data of SIMULATION_STALLED, since the event of this kind before."""
+    """Data of SIMULATION_STALLED: waits since the last event of this kind."""
 
     waited_ns: int
     times: int
 
 
 class Granted(msgspec.Struct, frozen=True):
-    """Data of SCHEDULER: whether the operating system granted a request of a process."""
+    """Data of SCHEDULER: request of a process to the operating system."""
 
     request: str
     granted: bool
 
 
 RUN_ENDED = "the run ended"
-"""Text of a goal that was running when its run ended."""
+"""Text of a goal that was aborted by the end of the run."""
 
 
 class GoalReport(msgspec.Struct, frozen=True):
     """Data of GOAL_ACCEPTED and GOAL_ENDED."""
 
     goal: int
-    """Its number in the run, from 1."""
+    """Number of the goal in the run, from 1."""
     controller: str
     kind: str
-    """The command that it came with."""
+    """Kind of the command."""
     origin: str
-    """The client, or the place in a motion file."""
+    """Client, or position in a motion file."""
     status: str
-    """`accepted`, or how it ended: `reached`, `missed`, `aborted`, `cancelled`, `preempted`."""
+    """`accepted`, or the outcome: `reached`, `missed`, `aborted`, `cancelled`, `preempted`."""
     text: str = ""
-    """What its controller reported at the end, for people."""
+    """Reason of the outcome, for people."""
     joint: str = ""
-    """The worst one at the end; empty: none was named."""
+    """Joint with the largest error at the end; empty: none."""
     error: float | None = None
-    """How far that joint was from the goal, SI units; None: not known."""
+    """Distance of that joint from its target, rad or m; None: not known."""
 
     @property
     def cut(self) -> bool:
-        """True for a goal that was aborted because the run ended."""
+        """True if the goal was aborted by the end of the run."""
         return self.status == "aborted" and self.text == RUN_ENDED
 
     @property
     def failed(self) -> bool:
-        """True for a goal that was missed or aborted, but not because the run ended."""
+        """True if the goal was missed, or aborted for another reason than the end of the run."""
         return self.status in ("missed", "aborted") and not self.cut
 
     @property
     def sentence(self) -> str:
-        """How a failed goal ended: `arm missed the goal of its trajectory: after 2 s, joint elbow is ...`."""
+        """Text about a failed goal: `arm missed the goal of its trajectory: after 2 s, joint ...`."""
         verb = "missed" if self.status == "missed" else "aborted"
         return f"{self.controller} {verb} the goal of its {self.kind}: {self.text}"
 
 
 MOST_FAILED = 100
-"""Failed goals that are kept of motion files, and of clients."""
+"""Most failed goals that are stored, of motion files and of clients each."""
 
 
 class GoalTotals(msgspec.Struct, frozen=True):
-    """The goals of a run."""
+    """Totals of a run's goals."""
 
     counts: dict[str, int] = {}
-    """Number of goals that were accepted, and that ended in each way."""
+    """Number of goals by status."""
     begun: dict[str, int] = {}
-    """Number of goals of motion files that were accepted, by their origins."""
+    """Number of accepted goals of motion files by origin."""
     failed: tuple[GoalReport, ...] = ()
-    """Goals that were missed or aborted: the first hundred of motion files, the first hundred of clients."""
+    """Missed and aborted goals: the first hundred of motion files, and the first hundred of clients."""
     allowed: dict[str, float] = {}
-    """Largest distance at which a goal was reached, by the joint that was farthest off, rad or m."""
+    """Largest error of reached goals by joint, rad or m."""
 
     @property
     def asked(self) -> int:
@@ -206,7 +206,7 @@ class GoalTotals(msgspec.Struct, frozen=True):
 
 
 class GoalHistory:
-    """Counts goals by their events; goals of clients never take the places of those of motion files."""
+    """Counts goals by their events. Failed goals of clients and of motion files have separate limits."""
 
     def __init__(self) -> None:
         self.planned: Container[str] = ()
@@ -218,7 +218,7 @@ class GoalHistory:
         self._allowed: dict[str, float] = {}
 
     def add(self, report: GoalReport) -> None:
-        """Count a report, and keep it if the goal failed and few of its kind did before."""
+        """Count a report, and store a failed goal up to MOST_FAILED."""
         planned = report.origin in self.planned
         self._counts[report.status] += 1
         if report.status == "accepted" and planned:
@@ -232,15 +232,23 @@ class GoalHistory:
 
     @property
     def totals(self) -> GoalTotals:
-        """The goals that were added until now."""
+        """Totals of the goals so far."""
         return GoalTotals(dict(self._counts), dict(self._begun), tuple(self._failed), self._allowed.copy())
 
 
 class EventSink(Protocol):
-    """Takes events; never blocks, never raises."""
+    """Destination of events. Never blocks and never raises."""
 
     def emit(self, code: EventCode, severity: Severity, source: str, text: str, data: bytes = b"") -> None:
-        """Record an event of `source` (a joint, a controller, a process); `data`: JSON for programs."""
+        """Record an event.
+
+        Args:
+            code: Kind of the event.
+            severity: Severity.
+            source: Name of a joint, a controller or a process.
+            text: Sentence for people.
+            data: JSON for programs.
+        """
         ...
 
 
@@ -248,26 +256,26 @@ LONGEST_SOURCE = 64
 LONGEST_TEXT = 8192
 """Characters; a longer text, such as a plug-in's traceback, is cut."""
 LONGEST_DATA = 4096
-"""Bytes; longer data are left out."""
+"""Bytes; longer data are omitted, as a part would not be valid JSON."""
 LONGEST_EVENT = 4 * LONGEST_TEXT + 4 * LONGEST_SOURCE + LONGEST_DATA + 64
-"""Bytes of an event's record."""
+"""Longest record of an event, bytes: UTF-8 has up to 4 bytes a character."""
 _GOALS = (EventCode.GOAL_ACCEPTED, EventCode.GOAL_ENDED)
 _USUAL_EVENT = 192
 
 
 class Event(msgspec.Struct, frozen=True, array_like=True, tag_field="is", tag=0):
-    """One thing that happened."""
+    """An event."""
 
     t_ns: int
-    """ns of the run's clock"""
+    """ns of the run's clock."""
     code: int
-    """An EventCode; a plain number where a log was written by a newer version."""
+    """An EventCode; another number in the log of a newer version."""
     severity: int
     source: str
-    """A joint, a controller, a process."""
+    """Name of a joint, a controller or a process."""
     text: str
     data: bytes = b""
-    """JSON for programs, where they need to know more than code and source; the text is for people."""
+    """JSON for programs; the text is for people."""
 
     @property
     def name(self) -> str:
@@ -286,9 +294,9 @@ class EventGroup(msgspec.Struct, frozen=True):
     source: str
     count: int
     t_ns: int
-    """Of the first one; ns of the run's clock."""
+    """Time of the first event, ns of the run's clock."""
     text: str
-    """Of the first one."""
+    """Text of the first event."""
 
     @property
     def name(self) -> str:
@@ -297,7 +305,7 @@ class EventGroup(msgspec.Struct, frozen=True):
 
 
 class EventCounts:
-    """Counts events by kind and source: no more is kept than there are joints, controllers and processes."""
+    """Counts events by kind and source, so its size is bounded by joints, controllers and processes."""
 
     __slots__ = ("_groups",)
 
@@ -315,22 +323,22 @@ class EventCounts:
 
     @property
     def groups(self) -> tuple[EventGroup, ...]:
-        """All of them, in the order of the first of each."""
+        """All groups, in the order of their first events."""
         return tuple(self._groups.values())
 
 
 class EventTotals(msgspec.Struct, frozen=True):
-    """What a run's events come to, for the summary at its end."""
+    """Totals of a run's events, for the summary."""
 
     errors: tuple[EventGroup, ...] = ()
-    """And takeovers that controllers requested."""
+    """Errors, and takeovers that controllers requested."""
     goals: GoalTotals = GoalTotals()
     started_ns: int = 0
-    """When the loop started; ns of the run's clock."""
+    """Start of the loop, ns of the run's clock."""
 
 
 class EventRing:
-    """Takes events of one process and appends them to its ring; never blocks, never raises."""
+    """Appends the events of a process to its ring. Never blocks and never raises."""
 
     __slots__ = ("_clock", "_errors", "_started_ns", "_writer", "goals")
 
@@ -343,11 +351,11 @@ class EventRing:
 
     @property
     def totals(self) -> EventTotals:
-        """What was emitted until now."""
+        """Totals of the events so far."""
         return EventTotals(self._errors.groups, self.goals.totals, self._started_ns)
 
     def emit(self, code: EventCode, severity: Severity, source: str, text: str, data: bytes = b"") -> None:
-        """Record an event of `source` (a joint, a controller, a process), now."""
+        """Record an event with the current time; see `EventSink.emit`."""
         t_ns = self._clock.now_ns()
         if severity >= Severity.ERROR or code == EventCode.TAKEOVER:
             self._errors.add(Event(t_ns, code, severity, source, _writable(text)))
@@ -367,14 +375,14 @@ class EventRing:
 
 
 def _writable(text: str) -> str:
-    """Replace what no UTF-8 has: a traceback may name a file with such a name."""
+    """Replace lone surrogates, which file names in tracebacks may contain."""
     return text.encode(errors="replace").decode()
 
 
 def event_capacity(period_ns: int, servos: int) -> int:
-    """Return how many bytes of a ring hold 10 s of the worst storm: one event a servo and four more a cycle.
+    """Return the capacity of a ring, bytes, for 10 s with an event for each servo and four more a cycle.
 
-    That is what a robot reports whose servos all fail and recover in turn; a row of misses is one event.
+    This is the worst case: all servos fail and recover in turn. Consecutive missing replies are one event.
     """
     events = max(1024, RING_SECONDS * 1_000_000_000 // period_ns * (servos + 4))
     return LONGEST_EVENT + events * record_size(_USUAL_EVENT)

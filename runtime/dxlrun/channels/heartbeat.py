@@ -1,13 +1,14 @@
-"""Heartbeats: shared memory by which loop, guardian and supervisor see that the others respond.
+"""Heartbeats: shared memory with which loop, guardian and supervisor check that the other two respond.
 
-`SimulationProgress` is the same for the process of simulated servos: how far it has served each line.
+`SimulationProgress` has the same purpose for the process of simulated servos: its progress on each line.
 
-Each field has one writer: the supervisor for `supervisor_looks` and `steering`, the guardian for `looks`,
-and the loop's process for the others. Each field is one aligned 64-bit store through a cast memoryview,
-which 64-bit processors make whole. (`struct.pack_into` would not do: it clears its target first, and a
-process killed in between would seem never to have begun.) A phase becomes visible behind what was shown
-before it, and what makes the guardian's timeout shorter behind the beat before it: a guardian that saw it
-without that beat would take what the loop did in the longer time for a standstill.
+Each field has one writer: the supervisor for `supervisor_looks` and `steering`, the guardian for `looks`, and
+the loop's process for all others. A field is written with one aligned 64-bit store through a cast memoryview,
+which 64-bit processors execute atomically. (`struct.pack_into` clears its target first, so a process that is
+killed in between would leave 0.)
+
+A phase becomes visible after all earlier writes. A value that shortens the guardian's timeout becomes visible
+after the preceding beat. Otherwise the guardian would apply the shorter timeout to the time before the beat.
 """
 
 from __future__ import annotations
@@ -30,35 +31,35 @@ _STEP_BITS = 8
 
 @unique
 class Phase(IntEnum):
-    """How far the loop's process has come; the guardian's timeout depends on it."""
+    """Phase of the loop's process, on which the guardian's timeout depends."""
 
     LOADING = 0
-    """No byte has been sent; plug-ins are imported and configured."""
+    """Plug-ins are imported and configured; nothing has been sent to servos."""
     SETUP = 1
-    """Servos are checked and set; no torque was switched on."""
+    """Servos are checked and configured; torque is not enabled."""
     ENGAGING = 2
-    """Torque is switched on."""
+    """Torque is being enabled."""
     RUNNING = 3
     STOPPING = 4
     DONE = 5
-    """The loop itself has left the robot as by its policy: limp, as far as servos answered, or holding."""
+    """The loop has left the robot according to its policy: limp, if servos replied, or holding."""
 
 
 @unique
 class Steering(IntEnum):
-    """Whether a run can be steered, as its supervisor knows it."""
+    """Availability of the gateway for client commands."""
 
     AWAITED = 0
-    """The gateway was not started yet, or does not listen yet."""
+    """The gateway does not listen yet."""
     POSSIBLE = 1
     """The gateway listens."""
     IMPOSSIBLE = 2
-    """The run has no gateway, or has lost it."""
+    """The run never had a gateway, or its gateway has exited."""
 
 
 @unique
 class ControllerMethod(IntEnum):
-    """What of a controller is called."""
+    """Method of a controller."""
 
     NONE = 0
     INIT = 1
@@ -78,12 +79,12 @@ class ControllerMethod(IntEnum):
 
 
 def create() -> int:
-    """Return the descriptor of a fresh page."""
+    """Return the descriptor of a new page."""
     return shared_memory.create("heartbeat", _SIZE)
 
 
 class Heartbeat:
-    """The page, mapped; each process writes its own fields."""
+    """Mapped heartbeat page. Each process writes its own fields."""
 
     __slots__ = ("_beats", "_memory", "_words")
 
@@ -93,56 +94,56 @@ class Heartbeat:
         self._beats = 0
 
     def beat(self) -> None:
-        """Show that the loop is alive; called once a cycle, and while replies are awaited."""
+        """Increment the loop's heartbeat. Called once a cycle, and during waits for replies."""
         self._beats += 1
         self._words[_BEATS] = self._beats
 
     def cycle(self, cycle: int, skipped: int) -> None:
-        """Show how many cycles ran, and how many periods were skipped; the first one is a beat."""
+        """Publish the numbers of executed cycles and skipped periods. The first cycle also sends a beat."""
         self._words[_SKIPPED] = skipped
-        if cycle == 1:  # from here on the guardian waits for less
+        if cycle == 1:  # the guardian's timeout is shorter from now on
             self.beat()
             store(self._words, _CYCLE, cycle)
         else:
             self._words[_CYCLE] = cycle
 
     def may_take(self, cycle_ns: int) -> None:
-        """Show how long a cycle may take from now on, ns: the period, or more while the loop is paused."""
+        """Publish the timeout of a cycle, ns: the period, or more while the loop is paused."""
         store(self._words, _CYCLE_NS, cycle_ns)
 
     def enter(self, phase: Phase) -> None:
-        """Show that a phase begins."""
+        """Publish the begin of a phase."""
         store(self._words, _PHASE, phase)
 
     def name_controller(self, place: int, name: str) -> None:
-        """Keep the name of the controller in this place; a very long one is cut."""
+        """Publish the name of the controller at a place, cut to 128 bytes."""
         data = name.encode()[:_NAME_BYTES].ljust(_NAME_BYTES, b"\0")
         self._memory[_NAMES + place * _NAME_BYTES :][:_NAME_BYTES] = data
 
     def call(self, place: int, step: int) -> None:
-        """Show which controller is called, and what of it; a step of 0: none."""
+        """Publish the place of the controller that is called, and the method; step 0: none."""
         self._words[_CALL] = place << _STEP_BITS | step
 
     def look(self) -> None:
-        """Show that the guardian watches; called by the guardian alone."""
+        """Increment the guardian's counter. Only the guardian calls it."""
         self._words[_LOOKS] += 1
 
     def supervisor_look(self) -> None:
-        """Show that the supervisor watches; called by the supervisor alone."""
+        """Increment the supervisor's counter. Only the supervisor calls it."""
         self._words[_SUPERVISOR_LOOKS] += 1
 
     def set_steering(self, steering: Steering) -> None:
-        """Publish whether the run can be steered; called by the supervisor alone."""
+        """Publish the availability of the gateway. Only the supervisor calls it."""
         self._words[_STEERING] = steering
 
     @property
     def steering(self) -> Steering:
-        """Whether the run can be steered."""
+        """Availability of the gateway."""
         return Steering(self._words[_STEERING])
 
     @property
     def activity(self) -> str:
-        """What of which controller was called and has not returned, as words; empty where there is none."""
+        """Running call of a controller, as text: `update of controller arm`. Empty: none."""
         place, step = divmod(self._words[_CALL], 1 << _STEP_BITS)
         if not step:
             return ""
@@ -151,37 +152,37 @@ class Heartbeat:
 
     @property
     def looks(self) -> int:
-        """Number of times that the guardian has looked at the loop."""
+        """Number of the guardian's checks."""
         return self._words[_LOOKS]
 
     @property
     def supervisor_looks(self) -> int:
-        """Number of times that the supervisor has looked at guardian and loop."""
+        """Number of the supervisor's checks of guardian and loop."""
         return self._words[_SUPERVISOR_LOOKS]
 
     @property
     def phase(self) -> Phase:
-        """The phase that was entered last."""
+        """Current phase of the loop."""
         return Phase(load(self._words, _PHASE))
 
     @property
     def beats(self) -> int:
-        """Number of beats."""
+        """Number of the loop's beats."""
         return self._words[_BEATS]
 
     @property
     def cycles(self) -> int:
-        """Number of cycles that ran."""
+        """Number of executed cycles."""
         return load(self._words, _CYCLE)
 
     @property
     def cycle_ns(self) -> int:
-        """How long a cycle may take, ns; 0 before the loop has set it."""
+        """Timeout of a cycle, ns; 0: not set yet."""
         return load(self._words, _CYCLE_NS)
 
     @property
     def skipped(self) -> int:
-        """Number of periods that were skipped."""
+        """Number of skipped periods."""
         return self._words[_SKIPPED]
 
 
@@ -193,15 +194,15 @@ _LINE_WORDS = 4
 
 
 def create_progress(lines: int) -> int:
-    """Return the descriptor of fresh memory for the progress of a simulation of so many lines."""
+    """Return the descriptor of new memory for the progress of a simulation with this number of lines."""
     return shared_memory.create("simulation", 8 * (_LINES + _LINE_WORDS * lines))
 
 
 class SimulationProgress:
-    """Time up to which the process of simulated servos has served its lines; it is the one writer.
+    """Progress of the process of simulated servos, which is the only writer.
 
-    By this a reply that is late because that process had no core is distinguished from a servo that stays
-    silent on purpose. All times are CLOCK_MONOTONIC, ns.
+    It distinguishes replies that are late because that process did not get a core from replies that are
+    missing on purpose. All times are CLOCK_MONOTONIC, ns.
     """
 
     __slots__ = ("_words",)
@@ -210,14 +211,14 @@ class SimulationProgress:
         self._words = shared_memory.mapped(descriptor).cast("Q")
 
     def note_stall(self, begin_ns: int, end_ns: int) -> None:
-        """Publish a time in which the process did not run although it had to."""
+        """Publish an interval in which the process should have run but did not."""
         count = self._words[_STALLS]
         place = _FIRST_STALL + 2 * (count % _KEPT_STALLS)
         self._words[place], self._words[place + 1] = begin_ns, end_ns
         store(self._words, _STALLS, count + 1)
 
     def stalled_ns(self, since_ns: int, until_ns: int) -> int:
-        """Return for how long the process did not run between two times; of the last 16 stalls."""
+        """Return the duration of stalls between two times. Only the last 16 stalls are known."""
         load(self._words, _STALLS)
         ends = self._words[_FIRST_STALL:_LINES]
         return sum(
@@ -243,15 +244,15 @@ class LineProgress:
     # The simulation's side
 
     def serve(self, until_ns: int) -> None:
-        """Publish that all bytes that reach the host before `until_ns` were handed over."""
+        """Publish that all bytes that are due to the host before `until_ns` were delivered."""
         store(self._words, _SERVED, until_ns)
 
     def take(self, off_wire_ns: int) -> None:
-        """Publish when the last byte is off the wire that was taken from the host, and executed."""
+        """Publish the time at which the last executed byte of the host has left the wire."""
         store(self._words, _TAKEN, off_wire_ns)
 
     def give(self, due_ns: int, now_ns: int) -> None:
-        """Publish when the newest bytes for the host were due, and that they are handed over now."""
+        """Publish the due time of the newest bytes for the host, and that they are delivered now."""
         self._words[_DUE] = due_ns
         store(self._words, _GIVEN, now_ns)
 
@@ -259,30 +260,30 @@ class LineProgress:
 
     @property
     def taken_ns(self) -> int:
-        """When the last byte of the host is off the wire that the simulation has taken; to be read first."""
+        """Time at which the last executed byte of the host has left the wire. Must be read first."""
         return load(self._words, _TAKEN)
 
     @property
     def served_ns(self) -> int:
-        """Time before which nothing is due to the host that it was not given."""
+        """Time before which all bytes that are due to the host were delivered."""
         return load(self._words, _SERVED)
 
     @property
     def given_ns(self) -> int:
-        """When the newest bytes were handed over to the host; 0: none were."""
+        """Time of the newest delivery to the host; 0: none."""
         return load(self._words, _GIVEN)
 
     @property
     def due_ns(self) -> int:
-        """When these bytes were due."""
+        """Due time of the bytes of the newest delivery."""
         return self._words[_DUE]
 
 
 class Standstill:
-    """How long something that should change has stood still, while the watcher itself was awake to see it.
+    """Duration for which a watched value has not changed while the watcher itself was running.
 
-    A machine that was suspended, a virtual machine that was paused, or a watcher that had to wait for a
-    processor: the watched had no chance to move either, so one look counts for at most `longest_ns`.
+    If the machine was suspended, or the watcher waited for a processor, the watched process could not run
+    either. So the time between two checks counts as at most `longest_ns`.
     """
 
     __slots__ = ("_longest_ns", "_looked_ns", "_seen", "_still_ns")
@@ -294,7 +295,12 @@ class Standstill:
         self._seen: object = None
 
     def ns(self, seen: object, now_ns: int) -> int:
-        """Look: return for how long it has been what it is now, ns."""
+        """Check the value, and return the duration for which it has not changed, ns.
+
+        Args:
+            seen: Current value.
+            now_ns: Current time.
+        """
         step = min(now_ns - self._looked_ns, self._longest_ns)
         self._looked_ns = now_ns
         self._still_ns = self._still_ns + step if seen == self._seen else 0
@@ -303,10 +309,10 @@ class Standstill:
 
 
 class ProcessorTime:
-    """The processor time that a watched process got while it stood still, from /proc/PID.
+    """Processor time of a watched process during a standstill, from /proc/PID.
 
-    schedstat has it (kernel: Documentation/scheduler/sched-stats.rst), stat the state of its first thread
-    (proc_pid_stat(5)). Both are read only while it stands still; a kernel without them gives no answer.
+    The time is in schedstat (kernel: Documentation/scheduler/sched-stats.rst), the state of the first thread
+    in stat (proc_pid_stat(5)). Both are read only during a standstill. They may be missing in a kernel.
     """
 
     __slots__ = ("_begin_ns", "_folder")
@@ -316,17 +322,27 @@ class ProcessorTime:
         self._begin_ns: int | None = None
 
     def look(self, still_ns: int) -> None:
-        """Note the time it had when it began to stand still; `still_ns`: for how long it does."""
+        """Store the processor time at the begin of a standstill.
+
+        Args:
+            still_ns: Duration of the standstill so far; 0: none.
+        """
         if not still_ns:
             self._begin_ns = None
         elif self._begin_ns is None:
             self._begin_ns = self._total_ns()
 
     def starved_ns(self, still_ns: int) -> int | None:
-        """Return what it got since it stands still, ns, if it could run and got less than half of the time.
+        """Return the processor time since the begin of the standstill if the process was starved.
 
-        None where it waits for something else, used its processor, or nothing is known. To be asked before
-        it is killed.
+        It must be called before the process is killed.
+
+        Args:
+            still_ns: Duration of the standstill.
+
+        Returns:
+            Processor time, ns, if the process was ready to run and got less than half of the duration; else
+            None.
         """
         total_ns = self._total_ns()
         if self._begin_ns is None or total_ns is None or not self._may_run():

@@ -1,7 +1,7 @@
-"""Kept state: what a controller keeps from one run to the next, on its way out of the loop and back into it.
+"""Kept state: format of the state that a controller keeps from one run to the next.
 
-A state leaves as messages of the topic /kept, in pieces; joined, they are the file that another process
-writes: a line with what the file is, as JSON, then the controller's own bytes, then the CRC-32 of all that.
+The loop publishes a state in pieces as messages of the topic /kept. Another process joins them to a file: a
+line of JSON that describes the file, the controller's bytes, and the CRC-32 of both.
 """
 
 from __future__ import annotations
@@ -21,26 +21,26 @@ from dxlrun.messages.declared import Number
 
 TOPIC = "/kept"
 MOST_KEPT = 1 << 20
-"""Bytes of one controller's state."""
+"""Longest state of a controller, bytes."""
 PIECE = 8192
-"""Bytes of a state that leave in one cycle: 1 MiB takes 128 cycles."""
+"""Longest piece, bytes. One piece is published a cycle, so 1 MiB takes 128 cycles."""
 LONGEST_FILE = MOST_KEPT + (1 << 18)
-"""Bytes; the rest is for the line that says what the file is."""
+"""Longest file, bytes, with 256 KiB for its first line."""
 _MAGIC = b"dxlrun kept state 1 "
 _CRC_BYTES = 4
 
 Facts = dict[str, str]
-"""What a state was made with: `elbow model` -> `MX-64`."""
+"""Facts on which a state depends: `elbow model` -> `MX-64`."""
 
 
 @dataclass(slots=True)
 class KeptPiece:
-    """Message of /kept: a part of a file; those of a file follow each other, from piece 0 on."""
+    """Message of /kept: a piece of a file. The pieces of a file are published in sequence from 0."""
 
     header: Header
     controller: str
     state: Annotated[int, Number("uint32")]
-    """Which of the run's kept states it is a part of, from 0."""
+    """Number of the state in the run, from 0."""
     piece: Annotated[int, Number("uint32")]
     pieces: Annotated[int, Number("uint32")]
     data: NDArray[np.uint8]
@@ -49,34 +49,34 @@ class KeptPiece:
 class _FirstLine(msgspec.Struct, frozen=True):
     controller: str
     bytes: int
-    """Of the controller's own part."""
+    """Length of the controller's bytes."""
     made_with: Facts
 
 
 @dataclass(frozen=True, slots=True)
 class KeptFile:
-    """What was read for a controller when a run started."""
+    """File of a controller, read at the start of a run."""
 
     place: str
     """Path of the file."""
     state: bytes = b""
     made_with: Facts = field(default_factory=dict)
     problem: str = ""
-    """Why it cannot be used; empty: it can."""
+    """Reason why the file cannot be used; empty: it can."""
 
 
 @dataclass(frozen=True, slots=True)
 class KeptStates:
-    """What the controllers of a run may begin with; JSON on its way to the loop, and in the log."""
+    """Kept states for the controllers of a run; passed to the loop and logged as JSON."""
 
     files: dict[str, KeptFile] = field(default_factory=dict)
-    """By controller."""
+    """Files by controller."""
     servos: dict[str, Facts] = field(default_factory=dict)
-    """What is known about the servo of each joint: another one, and a state does not fit."""
+    """Facts about the servo of each joint. A state does not fit after the servo was replaced."""
 
 
 def file_pieces(controller: str, state: bytes, made_with: Facts) -> tuple[int, Iterator[bytes]]:
-    """Return how many pieces a file has, and these one by one, of PIECE bytes at most."""
+    """Return the number of pieces of a file, and an iterator of the pieces, at most PIECE bytes each."""
     line = _MAGIC + msgspec.json.encode(_FirstLine(controller, len(state), made_with)) + b"\n"
     return 1 + -(-len(line) // PIECE) + -(-len(state) // PIECE), _pieces(line, state)
 
@@ -92,7 +92,7 @@ def _pieces(line: bytes, state: bytes) -> Iterator[bytes]:
 
 
 def opened_file(data: bytes, controller: str) -> tuple[bytes, Facts]:
-    """Return state and facts of a file. Raises ValueError with the reason when it is none, or not whole."""
+    """Return state and facts of a file. Raises ValueError with the reason if the file is not valid."""
     if len(data) > LONGEST_FILE:
         raise ValueError(f"is longer than {LONGEST_FILE} bytes")
     if not data.startswith(_MAGIC):
@@ -113,7 +113,7 @@ def opened_file(data: bytes, controller: str) -> tuple[bytes, Facts]:
 
 
 def difference(then: Mapping[str, str], now: Mapping[str, str]) -> str:
-    """Return the first fact that is another one, as a sentence's part; empty when all are the same."""
+    """Return the first difference between facts, as a clause; empty if they are equal."""
     for name in (*now, *(name for name in then if name not in now)):
         was, is_ = then.get(name, "not there"), now.get(name, "not there")
         if was != is_:
@@ -122,16 +122,27 @@ def difference(then: Mapping[str, str], now: Mapping[str, str]) -> str:
 
 
 class Assembly:
-    """Joins pieces to files; memory is bounded by LONGEST_FILE for each controller."""
+    """Joins pieces to files. Memory is bounded by LONGEST_FILE for each controller.
+
+    Args:
+        codec: Codec of KeptPiece, as the topic was announced.
+    """
 
     def __init__(self, codec: Codec) -> None:
-        """`codec` of KeptPiece, as the topic was announced."""
         self._codec = codec
         self._parts: dict[str, tuple[int, list[bytes]]] = {}
 
     def take(self, data: bytes) -> tuple[str, bytes] | None:
-        """Take a message; return controller and file when it was the last piece. A piece that does not follow
-        the one before is left out, with all of its file. Raises ValueError when it is no message of /kept."""
+        """Add a message.
+
+        A piece out of sequence drops its file.
+
+        Returns:
+            Controller and file after the last piece, else None.
+
+        Raises:
+            ValueError: The data are not a message of /kept.
+        """
         values = self._codec.unpack(data)
         controller, state = str(values["controller"]), int(str(values["state"]))
         piece, pieces = int(str(values["piece"])), int(str(values["pieces"]))
@@ -149,5 +160,5 @@ class Assembly:
 
     @property
     def unfinished(self) -> tuple[str, ...]:
-        """Controllers of which the last pieces are missing."""
+        """Controllers with incomplete files."""
         return tuple(self._parts)

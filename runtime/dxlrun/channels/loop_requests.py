@@ -1,4 +1,4 @@
-"""Requests to the loop itself: the data of its commands, as clients send them and as the log has them."""
+"""Requests to the loop: data of its commands, in the form that clients send and the log has."""
 
 from __future__ import annotations
 
@@ -6,7 +6,7 @@ import msgspec
 
 
 class Switch(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
-    """Data of `switch`: names of controllers; all of it happens in one cycle, or nothing does."""
+    """Data of `switch`: names of controllers. The switch is executed in one cycle as a whole, or refused."""
 
     activate: tuple[str, ...] = ()
     deactivate: tuple[str, ...] = ()
@@ -26,25 +26,25 @@ class Unload(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
 
 
 class Cancel(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
-    """Data of `cancel`: a goal by its number, or the one that a controller has."""
+    """Data of `cancel`: number of a goal, or the controller whose goal is cancelled."""
 
     goal: int = 0
     controller: str = ""
 
 
 class NewCommander(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
-    """Data of `commander`: another client commands from now on; the event that reports it is all."""
+    """Data of `commander`: another client commands the robot from now on. It only causes an event."""
 
     client: str
     instead: str
 
 
 class Parameters(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
-    """Data of `parameters`: live parameters of a controller, checked against its model before."""
+    """Data of `parameters`: live parameters of a controller, already validated by its model."""
 
     controller: str
     values: dict[str, bool | int | float]
-    """By dotted name, in SI units."""
+    """Values by dotted name, in SI units."""
 
 
 class TorqueRequest(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
@@ -53,8 +53,8 @@ class TorqueRequest(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     joints: tuple[str, ...]
     on: bool
     release: bool = False
-    """Deactivate the controllers that command the joints, in the same cycle. Without it torque off is refused
-    while there are any; torque on starts them again where the joints are."""
+    """Deactivate the controllers that command the joints, in the same cycle. Otherwise, torque off is refused
+    while there are such controllers, and torque on restarts them at the positions of the joints."""
 
 
 class RebootRequest(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
@@ -68,19 +68,19 @@ class RegisterReading(msgspec.Struct, frozen=True, forbid_unknown_fields=True, o
     """Data of `get`."""
 
     joint: str
-    """Or one of its servos, where it has several"""
+    """Name of a joint, or of one of its servos if it has several."""
     item: str
     row: int | None = None
-    """Of that servo, behind those of the joints"""
+    """Row of that servo, after the rows of the joints."""
 
 
 class Register(msgspec.Struct, frozen=True, forbid_unknown_fields=True, omit_defaults=True):
-    """Data of `register`; whether the item may be written was checked before."""
+    """Data of `register`. The sender has checked that the item may be written."""
 
     joint: str
-    """Or one of its servos, where it has several"""
+    """Name of a joint, or of one of its servos if it has several."""
     item: str
     value: int
-    """The integer on the wire, signed where the item is."""
+    """Raw value of the register, signed if the item is."""
     row: int | None = None
-    """Of that servo, behind those of the joints"""
+    """Row of that servo, after the rows of the joints."""

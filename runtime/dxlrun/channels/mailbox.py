@@ -1,11 +1,11 @@
-"""Mailbox: shared memory by which one other process hands commands to the loop, which it can never delay.
+"""Mailbox: shared memory through which the gateway passes commands to the loop without ever delaying it.
 
-Two lanes. *Operations* go through a ring, first in, first out; the loop reports how far it has taken them,
-and what would overwrite one that it has not taken is refused. *Set-points* of streams have a small ring for
-each controller, of which the loop takes the newest record. Answers come back through a ring of their own.
+There are two lanes. *Operations* go through a ring, first in, first out. The loop reports its position, and
+an operation that would overwrite an unread one is refused. *Setpoints* of streams have a small ring for each
+controller, of which the loop reads the newest record. Answers return through a ring of their own.
 
-One writer (the gateway), one reader (the loop). The reader trusts nothing that it finds: whatever is not
-whole is dropped. Layout, little-endian, 64-bit words aligned:
+There is one writer (the gateway) and one reader (the loop). The reader validates all records and drops
+invalid ones. Layout, little-endian, 64-bit words aligned:
 
     header      magic u64, places u64, generation u64 (set-points ever put), 40 bytes reserved
     operations  a ring
@@ -31,12 +31,12 @@ from dxlrun.channels.shared_memory import load, store
 from dxlrun.channels.tagged import Tagged, decode
 
 LONGEST_SET_POINT = 4096
-"""Bytes of a set-point's record."""
+"""Longest record of a setpoint, bytes."""
 MOST_BYTES = 64 * 1024
-"""After so many a cycle takes no more operations, so that of long ones it takes one: copying 256 KiB into the
-log takes some 2 ms [measured]."""
+"""Bytes of operations after which a cycle reads no more, so that it reads only one long operation: copying
+256 KiB into the log takes some 2 ms [measured]."""
 LONGEST_ANSWER = 2048
-"""Bytes of an answer's record; long texts of a refusal are cut."""
+"""Longest record of an answer, bytes; long texts of a refusal are cut."""
 ANSWERS_CAPACITY = 256 * 1024
 
 _CAPACITY = 4 * LONGEST_COMMAND
@@ -50,7 +50,7 @@ _FIXED = struct.Struct("=QQ")
 
 
 def create(places: int) -> int:
-    """Create a mailbox with a place for each of so many streams; return its descriptor."""
+    """Create a mailbox with a place for each stream; return its descriptor."""
     descriptor = shared_memory.create("mailbox", _size(places))
     with mmap.mmap(descriptor, 0) as mapped, memoryview(mapped) as memory:
         _FIXED.pack_into(memory, 0, _MAGIC, places)
@@ -64,7 +64,7 @@ def create(places: int) -> int:
 
 
 def capacity(places: int) -> int:
-    """Return how many bytes of records a full mailbox holds."""
+    """Return the size of all records in a full mailbox, bytes."""
     return _CAPACITY + places * _PLACE_CAPACITY
 
 
@@ -73,14 +73,14 @@ def _size(places: int) -> int:
 
 
 def _parts(memory: memoryview, places: int) -> list[memoryview]:
-    """Return the memory of the operations, and of each place."""
+    """Return the memory of the operations' ring and of each place."""
     start = _HEADER + _OPERATIONS_SIZE
     ends = [start + index * _PLACE_SIZE for index in range(places + 1)]
     return [memory[_HEADER:start], *(memory[end : end + _PLACE_SIZE] for end in ends[:-1])]
 
 
 def _mapped(descriptor: int) -> tuple[memoryview, list[memoryview]]:
-    """Map a mailbox; return the words of its header, and its parts. Raises ValueError when it is none."""
+    """Map a mailbox; return the words of its header, and its parts. Raises ValueError for other memory."""
     memory = shared_memory.mapped(descriptor)
     magic, places = _FIXED.unpack_from(memory)
     if magic != _MAGIC or len(memory) != _size(places):
@@ -89,7 +89,7 @@ def _mapped(descriptor: int) -> tuple[memoryview, list[memoryview]]:
 
 
 class MailboxWriter:
-    """The gateway's end."""
+    """Writer of a mailbox, in the gateway."""
 
     def __init__(self, descriptor: int) -> None:
         self._words, (operations, *places) = _mapped(descriptor)
@@ -98,11 +98,11 @@ class MailboxWriter:
 
     @property
     def used(self) -> bool:
-        """Whether an operation was put into it, by whichever process."""
+        """True if any process has posted an operation."""
         return self._operations.head > 0
 
     def post(self, command: Command) -> bool:
-        """Put an operation behind the others; False when there is no room, or it is too long."""
+        """Append an operation; return False if there is not enough room or the operation is too long."""
         payload = encode_command(command)
         lane = self._operations
         untaken = lane.head - lane.taken
@@ -112,19 +112,19 @@ class MailboxWriter:
         return True
 
     def set_point(self, place: int, command: Command) -> bool:
-        """Put the newest set-point of a stream into its place; False when it is too long."""
+        """Write the newest setpoint of a stream into its place; return False if it is too long."""
         payload = encode_command(command, LONGEST_SET_POINT)
         if len(payload) > LONGEST_SET_POINT:
             return False
         self._places[place].append(RecordKind.TAGGED, payload)
         store(
             self._words, _GENERATION, self._words[_GENERATION] + 1
-        )  # last: then the loop looks at the places
+        )  # last, because the loop reads the places after it has seen a new generation
         return True
 
 
 class Mailbox:
-    """The loop's end: an Inbox."""
+    """Reader of a mailbox, in the loop. Implements `Inbox`."""
 
     def __init__(self, descriptor: int, answers: Appender) -> None:
         self._words, (operations, *places) = _mapped(descriptor)
@@ -134,8 +134,10 @@ class Mailbox:
         self._generation = 0
 
     def take(self) -> Sequence[Command]:
-        """Return what has come, in order, at most MOST_PER_CYCLE (fewer where they are long, see MOST_BYTES)
-        and the newest set-point of each stream."""
+        """Return new operations, oldest first, and the newest setpoint of each stream.
+
+        There are at most MOST_PER_CYCLE operations, fewer if they are long (see MOST_BYTES).
+        """
         lane, generation = self._operations, self._words[_GENERATION]
         if lane.head <= lane.position and generation == self._generation:
             return ()
@@ -147,37 +149,37 @@ class Mailbox:
             _append_command(record, commands)
         lane.report_taken()
         if generation != self._generation:
-            self._generation = load(self._words, _GENERATION)  # the places are no older
+            self._generation = load(self._words, _GENERATION)  # acquire: the places are at least as new
             for place in self._places:
                 if place.head > place.position:
                     _append_command(place.newest(), commands)
         return commands
 
     def answer(self, number: int, answer: Answer) -> None:
-        """Answer a command of the gateway; long texts in a refusal's fields are cut."""
+        """Answer a command of the gateway. Long texts in a refusal's fields are cut."""
         self._answers.append(RecordKind.TAGGED, encode_answer(number, answer, LONGEST_ANSWER))
 
 
 class Answers:
-    """The gateway's end of the ring of answers."""
+    """Reader of the ring of answers, in the gateway."""
 
     def __init__(self, descriptor: int) -> None:
         self._ring = RingReader(descriptor)
 
     def new(self) -> list[Answered]:
-        """Return the answers since the last call, each with its command's number."""
+        """Return the answers since the last call."""
         found = [_found(one) for one in iter(self._ring.read, None) if isinstance(one, Record)]
         return [one for one in found if isinstance(one, Answered)]
 
 
 def _append_command(record: Record | Gap | None, commands: list[Command]) -> None:
-    """Append the command of a record; a record that is not whole is dropped."""
+    """Append the command of a record; drop an invalid record."""
     if isinstance(record, Record) and isinstance(found := _found(record), Command):
         commands.append(found)
 
 
 def _found(record: Record) -> Tagged | None:
-    """Return what a record has; None where that is nothing of ours."""
+    """Decode a record; return None if it is invalid."""
     try:
         return decode(record.payload)
     except ValueError:

@@ -1,8 +1,8 @@
-"""Messages of topics: encoded where they are made, and handed on as they are, to the log and to clients.
+"""Messages of topics: encoded when they are published, and forwarded unchanged to the log and to clients.
 
-A topic is announced once, with its definition, before its first message; its messages name it by the number
-that it gets then, which is not used again: controllers that are loaded in the run announce topics, too. Each
-message has its number among those of its topic's name, so a reader knows how many it missed.
+A topic is announced once, with its definition, before its first message. The announcement assigns a number,
+which its messages contain and which is never used again, because controllers that are loaded later announce
+topics too. Messages are numbered by topic name, so a reader can count missing ones.
 """
 
 from __future__ import annotations
@@ -13,14 +13,14 @@ from dxlrun.channels.ring import RING_SECONDS, Appender, RecordKind, record_size
 from dxlrun.messages.definition import MessageType
 
 LONGEST_MESSAGE = 64 * 1024
-"""Bytes of a message as CDR; a trajectory's state of a hundred joints is a fifth of it."""
+"""Longest message as CDR, bytes. The state of a trajectory of a hundred joints has a fifth of that."""
 LEAST_CAPACITY = 1 << 20
-"""Bytes of a ring: for the topics of the runtime, and of controllers that are loaded in the run."""
+"""Smallest ring, bytes: for topics of the runtime, and of controllers that are loaded in the run."""
 MOST_CAPACITY = 64 << 20
 
 
 class PublishedTopic(msgspec.Struct, frozen=True):
-    """A topic that the loop publishes: its name, its type, and the joints that rows of its arrays are of."""
+    """A topic that the loop publishes. `joints` are the names for the rows of its arrays."""
 
     name: str
     """`/CONTROLLER/TOPIC`, or `/goals` of the runtime."""
@@ -29,39 +29,39 @@ class PublishedTopic(msgspec.Struct, frozen=True):
 
 
 class OpenedTopic(msgspec.Struct, frozen=True, array_like=True, tag_field="is", tag=3):
-    """A topic that has messages from here on."""
+    """Announcement of a topic."""
 
     number: int
-    """By which its messages name it, in the order of announcement."""
+    """Number of the topic in its messages, in the order of announcement."""
     before: int
-    """How many messages its name has had."""
+    """Number of earlier messages with the same topic name."""
     topic: PublishedTopic
 
 
 class TopicMessage(msgspec.Struct, frozen=True, array_like=True, tag_field="is", tag=4):
-    """One message."""
+    """A message of a topic."""
 
     t_ns: int
-    """Wake-up of the cycle that published it, ns of the run's clock."""
+    """Wake-up time of the cycle that published it, ns of the run's clock."""
     topic: int
-    """Its number."""
+    """Number of its topic."""
     number: int
-    """Of the message among those of its topic's name, from 1."""
+    """Number of the message among those with the same topic name, from 1."""
     data: bytes
-    """CDR."""
+    """Payload as CDR."""
 
 
 class MessageSink:
-    """Takes topics and their messages; never blocks, never raises. This one forgets them: there is no log."""
+    """Destination of topics and messages. Never blocks and never raises. This base class drops them."""
 
     __slots__ = ()
 
     def announce(self, topic: PublishedTopic) -> int:
-        """Take a topic; return its number."""
+        """Announce a topic; return its number."""
         return 0
 
     def message(self, topic: int, t_ns: int, data: bytes) -> None:
-        """Take one message of an announced topic, of LONGEST_MESSAGE at most."""
+        """Publish a message of an announced topic, at most LONGEST_MESSAGE bytes."""
 
 
 class MessageRing(MessageSink):
@@ -72,12 +72,12 @@ class MessageRing(MessageSink):
     def __init__(self, writer: Appender) -> None:
         self._writer = writer
         self._counts: list[int] = []
-        """Messages so far, by the topic's number."""
+        """Number of messages so far, by topic number."""
         self._numbers: dict[str, int] = {}
-        """Of each name the newest topic."""
+        """Number of the newest topic of each name."""
 
     def announce(self, topic: PublishedTopic) -> int:
-        """Append a topic; return its number. The messages of a name are counted on."""
+        """Append a topic; return its number. The count of messages of its name continues."""
         number, before = len(self._counts), self._numbers.get(topic.name)
         count = 0 if before is None else self._counts[before]
         self._counts.append(count)
@@ -87,22 +87,22 @@ class MessageRing(MessageSink):
         return number
 
     def message(self, topic: int, t_ns: int, data: bytes) -> None:
-        """Append one message."""
+        """Append a message."""
         self._counts[topic] = number = self._counts[topic] + 1
         message = TopicMessage(t_ns, topic, number, data)
         self._writer.append(RecordKind.TAGGED, msgspec.msgpack.encode(message))
 
 
 LONGEST_RECORD = LONGEST_MESSAGE + 64
-"""Bytes of a record; a definition is shorter by far."""
+"""Longest record, bytes. A definition is far shorter."""
 
 
 def usual_message(joints: int) -> int:
-    """Return about how many bytes a message has that is of so many joints: eight rows, and names."""
+    """Return the typical size of a message for a number of joints, bytes: eight rows, and names."""
     return 256 + joints * (8 * 8 + 24)
 
 
 def message_capacity(bytes_per_second: float) -> int:
-    """Return how many bytes of a ring hold 10 s of messages, within LEAST_CAPACITY and MOST_CAPACITY."""
+    """Return the capacity of a ring for 10 s of messages, bytes, from LEAST_CAPACITY to MOST_CAPACITY."""
     wanted = RING_SECONDS * int(bytes_per_second) + 2 * record_size(LONGEST_RECORD)
     return -(-min(max(LEAST_CAPACITY, wanted), MOST_CAPACITY) // 8) * 8

@@ -1,4 +1,4 @@
-"""Packets as the log keeps them: every byte on every bus, with the times at which it was seen."""
+"""Packets in the log: all bytes on all buses, with their times."""
 
 from __future__ import annotations
 
@@ -10,20 +10,21 @@ from dxlrun.channels.ring import RING_SECONDS, Appender, Payload, RecordKind, Ri
 from dxlwire.packets import RECORD, RECORD_HEADER, Desk, PacketKind, PacketLog
 
 LONGEST_BATCH = 16 * 1024
-"""Bytes: a batch has the packets of one cycle, of a large robot and of noisy lines in pieces of this size."""
+"""Longest batch, bytes. A batch has the packets of one cycle; a large robot or noisy lines need several."""
 
 _BATCH = struct.Struct("<QQ")
-"""In front of a batch, cycles counted from 1, 0: before the first. The cycle of its first packets; then the
-cycle of all others, shifted by _MARK_BITS, and where those begin. One word, so that it is never torn."""
+"""Header of a batch. First word: cycle of the first packets. Second word: cycle of the following packets,
+shifted by _MARK_BITS, and their offset. They share a word so that they change together. Cycles are counted
+from 1; 0: before the first cycle."""
 _MARK_BITS = 16
 _USED, _POSITION, _EARLIER, _CYCLE = range(4)
 _WORDS = 4
 _DESK_HEADER = 8 * _WORDS
 _BATCH_AT = 8 * _EARLIER
 DESK_SIZE = _BATCH_AT + LONGEST_BATCH
-"""Bytes of memory for a batch that is not finished."""
+"""Bytes of memory for an unfinished batch."""
 BEFORE_FIRST_CYCLE = -1
-"""Cycle of the packets that set the servos up."""
+"""Cycle number of the packets that configure the servos."""
 
 
 _KINDS = frozenset(int(kind) for kind in PacketKind)
@@ -31,35 +32,39 @@ _KINDS = frozenset(int(kind) for kind in PacketKind)
 
 @dataclass(frozen=True, slots=True)
 class LoggedPacket:
-    """One packet, or one run of noise, on one bus.
+    """A packet or a sequence of noise bytes on a bus.
 
-    An instruction's times: before and after the write() that sent it. A status packet's: after the read()
-    that brought its first and its last byte. ns of the run's clock.
+    Times of an instruction packet: before and after the write() that sent it. Times of a status packet: after
+    the read() calls that returned its first and its last byte. Unit: ns of the run's clock.
     """
 
     bus: int
     """Index in the plan's buses."""
     kind: PacketKind
     servo_id: int
-    """Of the servo that is addressed or that answers; 254: all of them, and noise of unknown origin."""
+    """ID of the addressed or responding servo; 254: broadcast, or noise of unknown origin."""
     first_ns: int
     last_ns: int
     data: bytes
 
 
 class PacketBatch(PacketLog):
-    """Collects packets in a buffer made before real time; one `commit` a cycle hands them on together.
+    """Collects packets in a preallocated buffer. One `commit` a cycle appends them to a ring as a batch.
 
-    A batch has the packets of one cycle, and in front of them those of the idle time before it, which are of
-    the period of an earlier cycle: `wake` marks where the cycle begins.
+    A batch starts with the packets of the idle time before the cycle, which belong to the period of an
+    earlier cycle. `wake` marks the begin of the cycle.
 
-    A full buffer commits by itself. Bytes longer than the buffer (noise only) become several packets.
+    A full buffer is committed automatically. Noise that is longer than the buffer becomes several packets.
 
-    `desk` is the memory where the unfinished batch lies, usually of DESK_SIZE; shared memory lets whichever
-    process outlives this one take it up with `salvage`, so that a loop that dies in the middle of a cycle
-    does not take that cycle's packets with it. Four 64-bit words lead it: bytes used, the position of its
-    ring at which the batch will lie, and the cycles of the batch, with which it begins. Each is one store,
-    because a process may be killed between any two.
+    The unfinished batch is in the memory `desk`. If that is shared memory, a process that outlives this one
+    can recover the batch with `salvage`, so the packets of a cycle in which the loop is killed are not lost.
+    The desk begins with four 64-bit words: bytes used, ring position of the batch, and the two words of the
+    batch's header. Each change is a single store, because the process may be killed between two of them.
+
+    Args:
+        writer: Ring for the batches.
+        desk: Memory for the unfinished batch, usually DESK_SIZE bytes; None: private memory.
+        cycle: Cycle of the first packets.
     """
 
     __slots__ = ("_batch", "_buffer", "_room", "_words", "_writer", "commit")
@@ -80,14 +85,14 @@ class PacketBatch(PacketLog):
         if self._room <= RECORD_HEADER:
             raise ValueError(f"a desk of {self._room} bytes holds no packet")
         self.commit: Callable[[], object] = self._hand_on
-        """Hands on what was collected; without packets nothing is."""
+        """Appends the collected packets as a batch, if there are any."""
         if isinstance(writer, RingWriter):
             self.commit = writer.commits(desk, len(self._batch))
 
     def packet(  # noqa: PLR0917  called for every packet in the loop: positional is quickest
         self, bus: int, kind: int, servo_id: int, first_ns: int, last_ns: int, data: Payload
     ) -> None:
-        """Record bytes that were sent or received; times in ns of the run's clock."""
+        """Add sent or received bytes; see `LoggedPacket` for the arguments."""
         length = len(data)
         start = self._words[_USED]
         body = start + RECORD_HEADER
@@ -101,7 +106,7 @@ class PacketBatch(PacketLog):
 
     @property
     def desk(self) -> Desk:
-        """The memory in which the batch is collected."""
+        """Memory in which the batch is collected."""
         return Desk(self._buffer, self._words[_USED : _USED + 1])
 
     def _overfull(self, head: tuple[int, int, int, int, int], data: Payload) -> None:
@@ -111,27 +116,35 @@ class PacketBatch(PacketLog):
             self.packet(*head, data[start : start + most])
 
     def wake(self, cycle: int) -> None:
-        """Note that a cycle begins: what was collected before was of the idle time of an earlier one."""
+        """Mark the begin of a cycle. Packets collected before belong to the idle time of an earlier cycle."""
         words = self._words
         words[_CYCLE] = cycle + 1 << _MARK_BITS | words[_USED]
 
     def _hand_on(self) -> None:
-        # as dxl_commit in kernel.c does, for a reader in the same process
+        # Same as dxl_commit in shared_memory.c, for a reader in the same process.
         words = self._words
         if used := words[_USED]:
             position = self._writer.append(RecordKind.PACKETS, self._batch[: _BATCH.size + used])
             words[_USED] = 0
             words[_POSITION] = position
         number = words[_CYCLE] >> _MARK_BITS
-        words[_CYCLE] = number << _MARK_BITS  # from here on the earlier one means nothing
+        words[_CYCLE] = number << _MARK_BITS  # offset 0: the earlier cycle is unused
         words[_EARLIER] = number
 
 
 def salvage(desk: memoryview, head: int, writer: Appender) -> int:
-    """Append the batch that a process left unfinished when it died; call it when that process is gone.
+    """Append the unfinished batch of a process that has exited.
 
-    `head`: that of its ring. A process that died after it had appended the batch, and before it had cleared
-    the desk, left nothing unfinished. Return the cycle in whose period it died.
+    The batch is ignored if the process exited after it had appended the batch and before it had cleared the
+    desk.
+
+    Args:
+        desk: The desk of the process.
+        head: Head of the ring of the process.
+        writer: Ring that receives the batch.
+
+    Returns:
+        The cycle in whose period the process exited.
     """
     words = desk[:_DESK_HEADER].cast("Q")
     used = words[_USED]
@@ -142,13 +155,14 @@ def salvage(desk: memoryview, head: int, writer: Appender) -> int:
 
 
 BatchedPacket = tuple[int, int, int, int, int, int, bytes]
-"""Cycle, and the fields of LoggedPacket, as plain values."""
+"""Cycle, and the fields of LoggedPacket, as a tuple."""
 
 
 def split_packets(payload: Payload) -> list[BatchedPacket]:
-    """Return the packets as plain values: the recorder takes thousands a second.
+    """Return the packets of a batch as tuples, because the recorder handles thousands a second.
 
-    Raises ValueError when the payload is not a batch.
+    Raises:
+        ValueError: The payload is not a batch.
     """
     packets: list[BatchedPacket] = []
     start, end = _BATCH.size, len(payload)
@@ -176,10 +190,14 @@ def split_packets(payload: Payload) -> list[BatchedPacket]:
 
 
 def packet_capacity(period_ns: int, servos: int) -> int:
-    """Return how many bytes of a ring hold 10 s of a robot with `servos` servos in all.
+    """Return the capacity of a ring, bytes, for 10 s of packets of a robot.
 
-    Per cycle: one instruction and one status a servo (Protocol 1.0 reads), goals, one probe, at most 40
-    bytes each beside the header.
+    A cycle has one instruction and one status packet a servo (Protocol 1.0 reads), goals and one probe, each
+    of at most 40 bytes plus the header.
+
+    Args:
+        period_ns: Period of the loop.
+        servos: Number of servos on all buses.
     """
     cycle = record_size((2 * servos + 4) * (RECORD_HEADER + 40))
     return max(32 * LONGEST_BATCH, RING_SECONDS * 1_000_000_000 // period_ns * cycle)

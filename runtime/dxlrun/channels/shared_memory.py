@@ -1,6 +1,6 @@
-"""Shared memory: nameless, sealed in its size, and read and written in an order that every processor keeps.
+"""Shared memory: anonymous, with a sealed size, and with memory barriers for all processors.
 
-Python has no memory barriers: what needs one is in C (`shared_memory.c`).
+Python has no memory barriers, so the functions that need one are in C (`shared_memory.c`).
 """
 
 from __future__ import annotations
@@ -18,8 +18,13 @@ SOURCE = Path(__file__).with_name("shared_memory.c")
 
 @cache
 def library() -> ctypes.PyDLL:
-    """Return the compiled functions, which keep the interpreter: they take no time in which others could have
-    it. Raises NotCompiled where they were not built, or of another source."""
+    """Return the compiled functions.
+
+    They are called without releasing the GIL, because they take less time than a release.
+
+    Raises:
+        NotCompiled: The object was not built, or was built from another source.
+    """
     found = load_compiled(SOURCE, ctypes.PyDLL)
     address, word, number = ctypes.c_void_p, ctypes.c_uint64, ctypes.c_int64
     words = ctypes.POINTER(word)
@@ -37,30 +42,35 @@ def library() -> ctypes.PyDLL:
 
 
 def load(words: memoryview, index: int) -> int:
-    """Return a shared word; what is read after it is no older."""
+    """Load a shared word with acquire semantics: later reads are at least as new."""
     found: int = library().dxl_load(ctypes.c_uint64.from_buffer(words, 8 * index))
     return found
 
 
 def store(words: memoryview, index: int, value: int) -> None:
-    """Publish a shared word; what was written before it is seen before it."""
+    """Store a shared word with release semantics: earlier writes become visible before it."""
     library().dxl_store(ctypes.c_uint64.from_buffer(words, 8 * index), value)
 
 
 def create(name: str, size: int) -> int:
-    """Return the descriptor of fresh memory (memfd), which no process can resize under another.
+    """Return the descriptor of new memory (memfd) whose size is sealed, so that no process can resize it.
 
-    Hand it to a process with `pass_fds`; nothing is left in /dev/shm.
+    Pass it to a child process with `pass_fds`. It leaves no file in /dev/shm.
+
+    Args:
+        name: Name for diagnostics, shown in /proc.
+        size: Size, bytes.
     """
     import fcntl
 
     descriptor = os.memfd_create(f"dxlrun-{name}", os.MFD_CLOEXEC | os.MFD_ALLOW_SEALING)
     os.ftruncate(descriptor, size)
-    seals = fcntl.F_SEAL_SHRINK | fcntl.F_SEAL_GROW | fcntl.F_SEAL_SEAL  # nor may a driver add another one
+    # F_SEAL_SEAL, because a driver must not add a seal against writes.
+    seals = fcntl.F_SEAL_SHRINK | fcntl.F_SEAL_GROW | fcntl.F_SEAL_SEAL
     fcntl.fcntl(descriptor, fcntl.F_ADD_SEALS, seals)
     return descriptor
 
 
 def mapped(descriptor: int, flags: int = 0) -> memoryview:
-    """Map memory that several processes share; `flags`: see mmap(2)."""
+    """Map shared memory; `flags` are additional flags of mmap(2)."""
     return memoryview(mmap.mmap(descriptor, 0, flags=mmap.MAP_SHARED | flags))

@@ -1,7 +1,7 @@
-"""Tagged messages: all that processes share beside cycles and packets, one union as MessagePack.
+"""Tagged messages: union of all records except cycles and packets, as MessagePack arrays with a leading tag.
 
-What reports (events, commands that were taken, topics and their messages) goes through rings to the log and
-to clients; commands and their answers go through the mailbox. Each is an array that its tag begins.
+Events, executed commands, topics and their messages go through rings to the log and to clients. Commands and
+answers go through the mailbox.
 """
 
 from __future__ import annotations
@@ -19,4 +19,4 @@ Tagged: TypeAlias = Event | TakenCommand | OpenedTopic | TopicMessage | Command 
 
 _DECODER: msgspec.msgpack.Decoder[Tagged] = msgspec.msgpack.Decoder(Tagged)
 decode = _DECODER.decode
-"""Return the message of a record of kind TAGGED; raises ValueError when it is none."""
+"""Decode the payload of a record of kind TAGGED. Raises ValueError for other data."""
