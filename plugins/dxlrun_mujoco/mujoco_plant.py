@@ -162,6 +162,7 @@ class MujocoBodies:
             _SharedBodies(one, moved.rows, np.array([model.joint(name).id for name in one.joints]))
             for one in moved.shared
         ]
+        # MuJoCo imports `mimic` as equality constraints between joints.
         following = model.eq_type == mujoco.mjtEq.mjEQ_JOINT
         self._mimics = list(
             zip(model.eq_obj1id[following], model.eq_obj2id[following], model.eq_data[following], strict=True)
@@ -224,6 +225,7 @@ class MujocoBodies:
 
     def _set_step(self, dt_s: float) -> None:
         self._dt_s = self._model.opt.timestep = dt_s
+        # As in `IndependentJoints`: subtract half a step of damping, but keep at least half of the inertia.
         armature = np.maximum(self._armature - self._motor_damping * dt_s / 2, self._armature / 2)
         self._model.dof_armature[self._numbers] = armature
 

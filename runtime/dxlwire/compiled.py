@@ -45,7 +45,9 @@ def parse_structs(source: str) -> Mapping[str, type[ctypes.Structure]]:
     Supported fields are numbers of fixed size, pointers, structs defined earlier in the source, and arrays of
     these.
     """
+    # Comments may contain semicolons, which separate the fields below.
     text = re.sub(r"/\*.*?\*/", "", source, flags=re.DOTALL)
+    # Array lengths may be macros, such as MOST_PIECES.
     sizes = dict(re.findall(r"#define (\w+) (\d+)", text))
     found: dict[str, type[ctypes.Structure]] = {}
     for body, struct in re.findall(r"typedef struct(?: \w+)? \{(.*?)\n\} (\w+);", text, re.DOTALL):

@@ -20,7 +20,7 @@ class Status(NamedTuple):
     """Parsed status packet; a tuple for speed, because the loop creates one for every reply."""
 
     servo_id: int
-    error: int  # Protocol-specific; `describe_error` has the words
+    error: int  # Protocol-specific; `describe_error` formats it
     parameters: bytes | memoryview
 
 

@@ -95,6 +95,7 @@ class SimulatedAdapter:
         """
         timer_ns = self.timer_ns
         oldest_ns = max(queue[0].passed_ns(queue[0].given), self._timed_ns + 1)
+        # The timer is periodic: round up to its next expiry (-(-a // b) is a ceiling division).
         runs_out_ns = self._timed_ns - -(oldest_ns - self._timed_ns) // timer_ns * timer_ns
         missing = BURST
         for each in queue:

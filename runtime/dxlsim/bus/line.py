@@ -127,6 +127,7 @@ class SimulatedLine:
         """
         early, late = sorted((one, other), key=_first)
         offset = round((late.first_ns - early.first_ns) / self.duration_ns(1))
+        # An idle line reads as FF, the neutral element of AND.
         mixed = bytearray(early.data).ljust(offset + len(late.data), b"\xff")
         for index, byte in enumerate(late.data, start=offset):
             mixed[index] &= byte

@@ -82,7 +82,7 @@ class RecordedBus(SimulatedBus):
         if waiting is not None:
             yield waiting
 
-    # What is known from other reads
+    # Answers from other reads
 
     def _recorded_reads(self) -> Iterator[tuple[bytes, tuple[ReadEntry, ...]]]:
         for instruction in self._recording.instructions:

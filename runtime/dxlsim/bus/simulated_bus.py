@@ -183,7 +183,7 @@ class SimulatedBus:
             self.lateness_ns.append(late_ns)
         return b"".join(taken)
 
-    # What tests see and do
+    # Interface for tests and faults
 
     def servo(self, servo_id: int) -> SimulatedServo:
         """Return the first servo with this ID. Raises LookupError without one."""

@@ -70,7 +70,7 @@ class SimulatedDevice(SimulatedNode):
     def _identify(self) -> None:
         self.servo_id = self.registers["id"]
 
-    # What the bus asks
+    # Interface to the bus
 
     @property
     def baud_rate(self) -> int:
@@ -149,7 +149,7 @@ class SimulatedDevice(SimulatedNode):
     def _state(self) -> int:
         return 0
 
-    # What it shows
+    # Live items
 
     def _live_items(self) -> Mapping[str, Callable[[], int]]:
         live = {name: show for name, show in self._shown.items() if self.table.items[name].bit is None}
@@ -172,7 +172,7 @@ class SimulatedDevice(SimulatedNode):
         self.registers[place] = wire
         self.registers.show_no_more(place)
 
-    # What faults do
+    # Interface for faults
 
     def protect(self, refused: int = 0) -> None:
         """Do nothing: a device has no torque to switch off."""

@@ -74,6 +74,7 @@ class SimulatedBody:
         facing, position = NO_TURN, np.zeros(3)
         speed, rate, gain, spin = np.zeros(3), np.zeros(3), np.zeros(3), np.zeros(3)
         for step in self._chain(link):
+            # Acceleration of a point on a rotating link: Euler term (spin x arm) and centripetal term.
             arm = np.array(rotated(facing, step.offset))
             position = position + arm
             gain = gain + _cross(spin, arm) + _cross(rate, _cross(rate, arm))
@@ -91,6 +92,7 @@ class SimulatedBody:
                 way = axis * q
                 position = position + way
                 gain = gain + _cross(spin, way) + _cross(rate, _cross(rate, way))
+                # Coriolis acceleration, and the slide's own.
                 gain = gain + 2 * dq * _cross(rate, axis) + ddq * axis
                 speed = speed + _cross(rate, way) + dq * axis
             else:
@@ -179,7 +181,7 @@ class SensedBody:
     """Current body of a simulation in this process."""
 
     def __init__(self, bodies: UrdfBodies, mechanics: Mechanics, now_ns: Callable[[], int]) -> None:
-        """Raises:     InputError: The URDF is invalid."""
+        """Load the URDF. Raises InputError for an invalid one."""
         self._body, self._mechanics, self._now_ns = SimulatedBody(bodies), mechanics, now_ns
         self._count = bodies.servos
         mechanics.sense()

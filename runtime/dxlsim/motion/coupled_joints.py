@@ -111,6 +111,7 @@ class CoupledJoints:
 
     def _take_braking(self, braking: Floats, dt_s: float) -> None:
         self._braking, self._dt_s = braking, dt_s
+        # As in `IndependentJoints`: subtract half a step of damping, but keep at least half of the inertia.
         rotors = np.maximum(self._rotors - self._own_damping * dt_s / 2, self._rotors / 2)
         self._mass = self._loads + np.diag(rotors)
         slowing = np.diag((braking + self._viscous) * dt_s)

@@ -94,6 +94,7 @@ class Mechanics:
         self._motors.append(motor)
         self._loads.append(load)
         self._recounted.append(0.0)
+        # The arrays of a plant have a fixed size, so all parts are rebuilt, and their state is copied.
         self._build(np.append(plant.angle, angle), np.append(plant.velocity, 0.0))
         self._commands[:, :count] = commands
         self._commands[ROWS["goal"], count] = angle
@@ -270,6 +271,7 @@ class Mechanics:
         law.step(profiles, plant.angle, plant.velocity)
         if self._before is not None:
             self._before = plant.velocity.copy()
+        # A check for rest needs copies of the arrays, so it is not made in every step.
         if (self.grid_ns - self._start_ns) // STEP_NS % _STEPS_A_LOOK:
             plant.step(law.drive, law.damping, STEP_NS * 1e-9)
             return

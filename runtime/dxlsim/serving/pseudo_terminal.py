@@ -137,6 +137,7 @@ class PseudoTerminal:
         _set_rate(slave, self.bus.baud_rate)
         os.set_blocking(master, False)
         name = os.ttyname(slave)
+        # No slave stays open, because programs look for other users of the port.
         os.close(slave)
         return master, name
 
@@ -165,6 +166,7 @@ class DeviceLink:
         """
         if os.path.lexists(self._path) and not self._path.is_symlink():
             raise FileExistsError(f"{self._path} is no link; it is not replaced")
+        # A rename replaces the link atomically, so the path always leads to a terminal.
         new = self._path.with_name(f"{self._path.name}.{os.getpid()}")
         new.symlink_to(target)
         try:

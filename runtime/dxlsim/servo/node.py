@@ -83,7 +83,7 @@ class SimulatedNode(ABC):
     def _set_delay(self) -> None:
         self._delay_ns = self.registers.get("return_delay_time") * 2000 + self._later_ns
 
-    # What the bus asks
+    # Interface to the bus
 
     def listens_to(self, servo_id: int) -> bool:
         """Return True if an instruction to an ID, or a broadcast, is for this node."""
@@ -125,7 +125,7 @@ class SimulatedNode(ABC):
         delay_ns = self._later_ns if read.fast and entry is not read.entries[0] else self._delay_ns
         return ServoReply(self.servo_id, error | self._state(), data, delay_ns)
 
-    # What kinds of nodes do differently
+    # Differences between kinds of nodes
 
     @abstractmethod
     def advance(self, now_ns: int) -> None:
@@ -265,7 +265,7 @@ class SimulatedNode(ABC):
     def _refusal(self, run: Run) -> int:
         return refusal(self.registers, run, self._error_of)
 
-    # What faults do
+    # Interface for faults
 
     def silence(self, on: bool = True) -> None:
         """Cut its data line, or restore it. A cut node receives and sends nothing, but keeps moving."""

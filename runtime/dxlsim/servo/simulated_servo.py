@@ -58,7 +58,7 @@ class SimulatedServo(SimulatedNode):
         off = secondary is None or secondary > 252 or secondary == self.servo_id
         self.secondary_id = None if off else secondary
 
-    # What the bus asks
+    # Interface to the bus
 
     def advance(self, now_ns: int) -> None:
         """Advance the shaft and the live registers to a time; an earlier time is ignored."""
@@ -79,7 +79,7 @@ class SimulatedServo(SimulatedNode):
         """Exclude a stall of this process, ns, from the time of the Bus Watchdog."""
         self._received_ns += duration_ns
 
-    # What the protocols do differently
+    # Differences between the protocols
 
     @abstractmethod
     def protect(self, refused: int = 0) -> None:
@@ -129,7 +129,7 @@ class SimulatedServo(SimulatedNode):
         self.registers[name] = wire
         self.shaft.plan((name,))
 
-    # What time and load do
+    # Effects of time and load
 
     def _live_items(self) -> Mapping[str, Callable[[], int]]:
         return {
@@ -163,7 +163,7 @@ class SimulatedServo(SimulatedNode):
         self.protect()
         self.registers.refresh()
 
-    # What tests see and faults do
+    # Interface for tests and faults
 
     @property
     def position(self) -> float:

@@ -84,6 +84,7 @@ def listings(protocol: float) -> tuple[Listing, ...]:
         path.stem: path.read_text("utf-8")
         for path in sorted(folder.rglob("*.toml"), key=lambda path: path.stem)
     }
+    # Only the keys before the first table are parsed here: a process needs few of the models.
     heads = {name: tomllib.loads(text.partition("\n[")[0]) for name, text in texts.items()}
     return tuple(_listing(name, heads, texts) for name in texts)
 

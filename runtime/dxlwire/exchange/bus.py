@@ -88,6 +88,7 @@ class Bus:
         self.byte_ns = BITS_PER_BYTE * 1_000_000_000 // plan.baud_rate
         """Time that one byte takes on the wire, ns."""
         self._latency_ns = plan.latency_ns
+        # The adapter may hold bytes back for its latency, so the line is silent only after that time.
         self._quiet_ns = max(QUIET_BYTES * self.byte_ns, LEAST_QUIET_NS) + plan.latency_ns
         self._port = port
         self._sink = packets
@@ -95,7 +96,7 @@ class Bus:
         self.receiver = Receiver(self._take_packet, self._take_noise, self._dialect)
         """Its `pending` bytes are the beginning of a packet; a new request discards them as noise."""
         cyclic = {
-            (one.servo_id, one.length + more)  # As many lengths as late replies are distinguished by
+            (one.servo_id, one.length + more)  # Lengths that distinguish late replies
             for one in plan.members
             for more in range(1 + one.spare)
         }
@@ -105,9 +106,7 @@ class Bus:
         self._written: bytes | bytearray | memoryview = b""  # The packet that was sent last
         self._job: Job | None = None
         self._cyclic_job = self._waits = False
-        self._held: Transaction | None = (
-            None  # waits until the replies that are owed cannot be taken for its own
-        )
+        self._held: Transaction | None = None  # Waits until no owed reply can be taken for its own
         self._held_until_ns = 0
         self._asked_length = 0  # Parameter bytes that the job asked for; a read may return spare bytes
         self._before: Transaction | None = None  # The transaction before the awaited one
@@ -351,10 +350,12 @@ class Bus:
         reply.echoed = False
         self._sent_ns = started_ns
         reply.sent_ns = started_ns
+        # A late reply to an older repetition is accepted, so the data may be as old as that repetition.
         reply.asked_ns = started_ns if self._cyclic_job else self.owed.asked_ns(transaction, started_ns)
         if transaction.awaited:
             reply.outcome = _TIMEOUT
             self._state = _AWAITING
+            # Even a reply without parameters cannot end before instruction and overhead have passed the wire.
             self._earliest_ns = started_ns + (len(transaction.packet) + self._dialect.OVERHEAD) * self.byte_ns
             self._deadline_ns = started_ns + transaction.timeout_ns
             self._open = (1 << len(transaction.awaited)) - 1
@@ -402,6 +403,7 @@ class Bus:
             return
         self._note_owed()
         self._reply.outcome = Outcome.GARBLED if self._reply.strays else _TIMEOUT
+        # A line with endless noise must not block the next transaction.
         self._drain_end_ns = now_ns + DRAIN_LIMIT_NS
         self._deadline_ns = self._quiet_at()
         self._state = _DRAINING if self._deadline_ns > now_ns else _READY
@@ -538,6 +540,7 @@ class Bus:
             for index in range(len(awaited.awaited)):
                 if self._open >> index & 1:
                     self.owed.add(awaited, index, self._sent_ns)
+        # A fast form is a single packet, which is owed only if none of its entries has arrived.
         elif self._open == (1 << len(awaited.awaited)) - 1:
             self.owed.add(awaited, 0, self._sent_ns)
 

@@ -136,6 +136,7 @@ class CyclicReads:
         for group in self.given_up:
             self.plain(group)
         silence = any(missed and not away for missed, away in zip(self.missed, self.away, strict=True))
+        # Only the parser counts incomplete fast reads, so the kernel must wait until they are complete again.
         self._calm = 0 if silence or any(self._broken) else self._calm + 1
 
     def blamed(self, member: int) -> bool:
@@ -223,6 +224,7 @@ class CyclicReads:
         ]
         if any(self._owed.free_ns(one.transaction, any_age=True) for one in reads):
             return None
+        # An error number is a refusal, and its reply has no data. Only the alert bit comes with a full reply.
         refusals = 0xFF & ~self._line.dialect.ALERT if self._line.dialect.ALERT else 0
         if any(error & refusals for read in reads for error in read.errors):
             return None

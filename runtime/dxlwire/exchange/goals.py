@@ -119,6 +119,7 @@ class GoalArrays:
 
     def renew(self) -> None:
         """Rebuild the sync writes; every goal is sent again. Used after a lost line, too."""
+        # A sync write has one address and one length, so servos are grouped by their blocks of goals.
         groups: dict[tuple[Mode, tuple[GoalLayout, ...]], list[int]] = {}
         servos = self._plan.servos
         for index, (servo, mode) in enumerate(zip(servos, self._modes, strict=True)):

@@ -136,6 +136,7 @@ class IdleScheduler:
     def advance(self, reply: Reply | None) -> Transaction | None:
         """Pass a reply to the program that awaits it, and return the next transaction that fits."""
         if reply is not None and self._current is not None:
+            # The bus reuses the reply object and its buffer, so the program gets a copy.
             self._resume(self._current, replace(reply, parameters=bytes(reply.parameters)))
         first = reply is None
         while (task := self._ready()) is not None:
@@ -172,6 +173,8 @@ class IdleScheduler:
             chosen = task
             if task.servo != WHOLE_BUS and not task.begun:
                 chosen = next((one for one in self.tasks if one.begun and one.servo == task.servo), task)
+                # Priority inheritance: a slow program that has begun must not block an urgent one of the same
+                # servo.
                 chosen.pressed = min(chosen.pressed, task.pressed)
             if (not chosen.paused or chosen.wake_ns <= now) and not self._held_back(chosen, now):
                 return chosen
@@ -203,6 +206,7 @@ class IdleScheduler:
         if latest_ns > left_ns:
             if not first or not self._forced(task, latest_ns, left_ns):
                 return None
+            # A starved program gets a timeout that its reply can meet, at the cost of the next cycle.
             left_ns = latest_ns + SHORT_TIMEOUT_MARGIN_NS
         task.starved = 0
         return structs.replace(wanted, timeout_ns=min(wanted.timeout_ns, left_ns))

@@ -259,6 +259,7 @@ static int32_t receive(Kernel *k, Line *l)
 
 static int has_room(const Kernel *k, int64_t bytes)
 {
+    /* `reserved` is the space for replies that are still awaited: they must fit without a commit. */
     return !k->desk || (int64_t)*k->used + k->reserved + bytes <= k->desk_room;
 }
 
@@ -347,6 +348,7 @@ int64_t dxl_polling_begin(Polling *p, int64_t due_ns, int64_t now, int64_t deadl
     *until = 0;
     p->slept = 0;
     p->credit_ns += p->share * (double)(p->updated_ns < 0 ? 0 : now - p->updated_ns);
+    /* The credit is capped: a long pause must not allow a long burst of polling. */
     if (p->credit_ns > (double)p->saved_ns)
         p->credit_ns = (double)p->saved_ns;
     p->updated_ns = now;
@@ -573,6 +575,7 @@ static int take(Kernel *k, Line *l, int32_t count, int64_t at)
     int32_t from = l->have;
     l->have += count;
     l->piece[l->pieces++] = (Piece){at, l->have, 0};
+    /* More bytes than planned, or too many fragments to keep the time of each one: the parser takes over. */
     if (l->have > r->size || (l->have < r->size && l->pieces == MOST_PIECES))
         return UNEXPECTED;
     for (int32_t i = from; i < l->have; i++)
@@ -782,6 +785,7 @@ static int32_t goal_tick(const Cell *c, double goal, double ceiling)
         goal = ceiling;
     double exact = fabs(goal) / c->unit;
     if (exact >= c->low && exact <= c->high) /* a speed is a limit, so it is rounded down: goals.GoalCell */
+        /* 1e-6: a speed that equals a tick up to rounding errors must not become the tick below. */
         return (int32_t)(c->interface == 1 ? floor(exact + 1e-6) : rint(exact));
     return exact < c->low ? c->low : exact > c->high ? c->high : c->free;
 }
@@ -811,6 +815,7 @@ static int32_t build(Kernel *k, const Line *l, SyncWrite *w, uint8_t *packet)
         }
         changed |= served && !w->served[m];
         w->served[m] = served;
+        /* A changed goal is sent in two cycles, because the first packet may be lost without notice. */
         int due = served && (changed || w->again[m] || w->sent_at[m] <= cycle - REPEATED);
         w->again[m] = changed;
         if (!due)
@@ -867,6 +872,7 @@ static int write_goals(Kernel *k, Line *l)
     uint8_t packet[LONGEST_SYNC_WRITE];
     for (; !l->words[LOST] && !l->gone && k->write_number < l->write_count; k->write_number++) {
         SyncWrite *w = &l->writes[k->write_number];
+        /* Byte stuffing adds at most one byte to three, hence 4 / 3; 16 covers header and checksum. */
         if (!has_room(k, RECORD_HEADER + 16 + (w->length + 1) * w->count * 4 / 3))
             return FULL;
         int32_t size = build(k, l, w, packet);

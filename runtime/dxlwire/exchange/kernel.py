@@ -56,7 +56,7 @@ _TRANSFER = ctypes.CFUNCTYPE(c_int32, c_int32, POINTER(c_uint8), c_int32)
 _WAIT = ctypes.CFUNCTYPE(c_int32, c_int64, POINTER(c_uint8))
 
 SOURCE = Path(__file__).with_name("kernel.c")
-LIBRARY = SOURCE.with_name("libkernel.so")  # Where the build puts it
+LIBRARY = SOURCE.with_name("libkernel.so")  # Output of the build
 STRUCTS = parse_structs(SOURCE.read_text())
 _Field, _Servo, _DeviceField, _Block, _Device = (
     STRUCTS[name] for name in ("Field", "Servo", "DeviceField", "Block", "Device")
@@ -168,6 +168,7 @@ def _replies(plan: BusPlan, read: PlannedRead) -> _Replies:
         start = len(expected)
         packet = dialect.status_packet(awaited.servo_id, error, bytes(awaited.length))
         expected += packet
+        # The mask is 0 for parameters and checksum, which are not known in advance.
         known += b"\xff" * data_at + bytes(len(packet) - data_at)
         packets.append(_Packet(start, len(expected), awaited.servo_id))
         parts.append(_Part(servo, start + data_at, len(expected)))

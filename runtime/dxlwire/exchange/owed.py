@@ -52,7 +52,7 @@ class OwedReplies:
     """
 
     def __init__(self, now_ns: Callable[[], int]) -> None:
-        """Args:     now_ns: Returns the time of the run's clock."""
+        """`now_ns` returns the time of the run's clock."""
         self._now_ns = now_ns
         self.version = 0  # Increases with each reply that becomes owed
         self._entries: dict[int, list[_Entry]] = {}
@@ -65,12 +65,14 @@ class OwedReplies:
         """Time for which a reply is owed after its request, ns: more than the slowest recent reply took."""
         if self._slowest_ns and self._now_ns() - self._slowest_at_ns > SLOW_MEMORY_NS:
             self._slowest_ns = 0
+        # A margin of 25 % over the slowest reply, because the next one may be slower still.
         return min(max(LEAST_WINDOW_NS, self._slowest_ns * 5 // 4), MOST_WINDOW_NS)
 
     def add(self, transaction: Transaction, index: int, sent_ns: int) -> None:
         """Note that the reply at `index` of a transaction did not arrive in time."""
         servo_id, length, question = _shapes(transaction)[index]
         entries = self._entries.setdefault(servo_id, [])
+        # Replies to expired requests are no longer expected.
         entries[:] = [one for one in entries if one.last_ns + self.window_ns > sent_ns]
         entry = next((one for one in entries if (one.length, one.question) == (length, question)), None)
         if entry is None:

@@ -104,6 +104,7 @@ class Samples:
             counts_on = self.shown_ns[index] > self.recounted_ns[index]
             if counts_on and not self.jumps.can_be(index, float(steps[index]), elapsed_ns, now_ns):
                 self.doubted[index] = True
+                # A rejected reply does not count: the age refers to the last sample that was shown.
                 self.at_ns[index] = self.shown_ns[index]
         self.devices.judge(now_ns)
         self.show(now_ns)

@@ -142,6 +142,7 @@ def _partitions(
         groups = _grouped(keys)
         found.append((groups, tuple(False for _ in groups)))
     for keys in (alike, together):
+        # A fast form needs the capability in every servo of a group, so groups are split by it.
         groups = _grouped([(key, FAST in able[index]) for index, key in enumerate(keys)])
         found.append((groups, tuple(len(group) > 1 and FAST in able[group[0]] for group in groups)))
     return found

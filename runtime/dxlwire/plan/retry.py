@@ -99,6 +99,7 @@ def extend_timeouts(
             reply = (
                 yield replace(request, timeout_ns=request.timeout_ns + longer_ns) if longer_ns else request
             )
+            # Only a reply that cannot belong to an older repetition measures the lateness.
             certain = reply.answered and reply.asked_ns == reply.sent_ns
             if times is not None and request.awaited and certain:
                 times.late_ns.append(reply.last_ns - reply.sent_ns - request.due_ns - reply.stalled_ns)

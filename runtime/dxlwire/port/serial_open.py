@@ -53,6 +53,8 @@ class SerialLine:
         self.path = path
         self.baud_rate = 0
         """Rate that the driver actually set, bit/s."""
+        # O_NONBLOCK: opening does not wait for a carrier. O_NOCTTY: the line does not become the controlling
+        # terminal.
         self._descriptor = os.open(path, os.O_RDWR | os.O_NOCTTY | os.O_NONBLOCK)
         try:
             # An advisory lock, which pyserial programs respect
@@ -81,6 +83,7 @@ class SerialLine:
         """Set the baud rate, bit/s; return False if the driver's rate differs by more than 2 %. Raises
         OSError.
         """
+        # CLOCAL ignores modem lines. Without HUPCL the kernel leaves DTR unchanged on close.
         control = termios.CS8 | termios.CREAD | termios.CLOCAL | _BOTHER
         settings = _SETTINGS.pack(0, 0, control, 0, bytes(20), baud_rate, baud_rate)
         fcntl.ioctl(self._descriptor, _TCSETS2, settings)

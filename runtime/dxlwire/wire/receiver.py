@@ -101,6 +101,7 @@ class Receiver:
                 break
             size = self._size_at(buffer, start, end)
             stop = start + size
+            # A false header: the real one may begin at any later byte.
             if size < 0:
                 search = start + 1
                 continue
