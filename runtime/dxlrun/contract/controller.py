@@ -298,7 +298,7 @@ class Context(msgspec.Struct, frozen=True):
     provided: Floats = msgspec.field(default_factory=_none)
     """What it provides, shape (provides,), to be written by update; NaN = not known. Valid in the cycles in
     which it is updated and all of them are finite; all NaN: nothing new, what is shown grows older."""
-    source_commands: Floats = msgspec.field(default_factory=_none)
+    device_commands: Floats = msgspec.field(default_factory=_none)
     """Its commands of devices and other sources, shape (device_commands,), to be written by update, NaN = not
     commanded: the source keeps what it has."""
     kept: bytes = b""
@@ -318,9 +318,9 @@ class Context(msgspec.Struct, frozen=True):
     """Request that the run ends behind this cycle, by the policy `on_fault`, and why, in words."""
 
     @property
-    def device_commands(self) -> Floats:
-        """The same as `source_commands`: devices were the first sources with commands."""
-        return self.source_commands
+    def source_commands(self) -> Floats:
+        """The same as `device_commands`: devices were the first sources with commands."""
+        return self.device_commands
 
 
 class Controller(ABC, Generic[P]):
