@@ -133,7 +133,7 @@ class FormKey(Protocol):
 
     @property
     def before(self) -> str:
-        """Key that follows this key in lists of all keys; if the form lacks it, this key is the last."""
+        """Next key in lists of all keys; if the form lacks it, this key is the last."""
 
 
 def with_keys(form: type[F], keys: Iterable[FormKey], **replaced: object) -> type[F]:

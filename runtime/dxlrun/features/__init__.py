@@ -1,7 +1,8 @@
-"""Features: one folder for each section or key of the robot file, with all that belongs to it.
+"""Features: one folder for each section or key of the robot file, with everything that it needs.
 
-A folder holds what one feature needs in every stage, from its form to its part in the loop. What two features
-share belongs to the room of that stage. `feature.py` describes the files; `FEATURES` names the folders.
+A folder contains the files of one feature for every stage, from its form to its part in the loop. Code that
+two features share belongs to the package of that stage. `feature.py` describes the files; `FEATURES` lists
+the folders.
 """
 
 from __future__ import annotations
@@ -25,9 +26,9 @@ FEATURES = (
     Feature("registers", "dxlrun.features.registers"),
     Feature("recording", "dxlrun.features.recording"),
 )
-"""In the order in which every stage asks them; their states are in the cycle's record in this order.
+"""Built-in features, in the order in which every stage uses them and of their states in the cycle's record.
 
-Devices are the first, because their plans count columns of the record from 0.
+Devices come first, because their plans count columns of the record from 0.
 """
 
 _JOINTS = (
@@ -38,16 +39,17 @@ _JOINTS = (
 )
 _SECTIONS = "arguments include joint_defaults loop model name poses processes read_before simulation"
 _REPORT = "robot rate joints groups controllers buses policies motions graph duration online"
-"""Keys of the report of `dxlrun check`, which has the rows of a feature under its name."""
+"""Keys in the report of `dxlrun check`, which has the rows of a feature under its name."""
 RESERVED: Mapping[type[Section[Any] | JointKey[Any] | ServoKey[Any] | PolicyKey[Any]], str] = {
     Section: f"{_REPORT} {_SECTIONS}",
     JointKey: f"{_REPORT} {_JOINTS}",
     ServoKey: f"{_REPORT} {_JOINTS}",
     PolicyKey: f"{_REPORT} exit_timeout of_joint on_exit on_fault on_returned_servo",
 }
-"""Names of the core by kind of key: a key of a feature would replace what the core has by that name.
+"""Names of the core by kind of key. A feature's key with one of these names would replace the core's.
 
-The forms and the report are in rooms above this one, so they are not imported here. A test compares them.
+The forms and the report are in packages above this one, so they cannot be imported here. A test compares the
+names.
 """
 
 
@@ -59,18 +61,18 @@ def stages(kind: type[S], features: Iterable[Feature]) -> Iterator[tuple[Feature
 
 
 def installed_features() -> tuple[Feature, ...]:
-    """Return all features that a robot file may have: ours, then those of plug-ins by name."""
+    """Return all features that a robot file can use: the built-in ones, then those of plug-ins by name."""
     return _installed(installed_plugins())[0]
 
 
 def find_installed(features: Iterable[Feature]) -> tuple[Feature, ...]:
-    """Return the installed features with the names of these: a log may name any package to import."""
+    """Return the installed features with the given names, because a log may name any package to import."""
     names = {feature.name for feature in features}
     return tuple(feature for feature in installed_features() if feature.name in names)
 
 
 def broken_features() -> dict[str, str]:
-    """Return the features of plug-ins that cannot be used, with the reason, by name."""
+    """Return the reasons why features of plug-ins cannot be used, by name."""
     return _installed(installed_plugins())[1]
 
 
@@ -80,7 +82,7 @@ def _installed(plugins: tuple[InstalledPlugin, ...]) -> tuple[tuple[Feature, ...
     broken: dict[str, str] = {}
     for plugin in plugins:
         features: list[Feature] = []
-        with suppress(Exception, SystemExit):  # foreign code: `dxlrun plugins` says why it cannot be used
+        with suppress(Exception, SystemExit):  # foreign code: `dxlrun plugins` reports why it cannot be used
             features += _features_of(plugin)
         for feature in features:
             if fault := _find_fault(feature, found):
@@ -94,7 +96,8 @@ def _installed(plugins: tuple[InstalledPlugin, ...]) -> tuple[tuple[Feature, ...
 
 
 def _find_fault(feature: Feature, found: Container[str]) -> str:
-    """Return why a feature of a plug-in cannot be used beside those that were found; empty if it can."""
+    """Return the reason why a plug-in's feature cannot be used together with those found so far; empty if it
+    can."""
     name = feature.name
     try:
         keys = [key for kind in RESERVED if (key := feature.stage(kind)) is not None]
@@ -115,7 +118,7 @@ def _find_fault(feature: Feature, found: Container[str]) -> str:
 
 
 def _features_of(plugin: InstalledPlugin) -> Iterator[Feature]:
-    """Yield the features of one plug-in; raises whatever its code raises."""
+    """Yield the features of one plug-in; raise whatever its code raises."""
     hook = getattr(plugin.point.load(), "dxlrun_features", None)
     for feature in () if hook is None else hook():
         yield replace(feature, distribution=plugin.publisher)

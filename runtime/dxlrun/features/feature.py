@@ -1,10 +1,10 @@
-"""Feature: a section or a key of the robot file with everything that belongs to it, in a folder of its own.
+"""Feature: a section or a key of the robot file with everything that it needs, in one folder.
 
 A feature is a package whose files have fixed names, one for each stage in which it takes part: `form.py` has
 its section, `joint_key.py`, `servo_key.py` or `policy_key.py` its key of joints, servos or `policies`,
-`compile.py` its share of the plan, and so on. Such a file has one object `STAGE`. Its class belongs to the
-room that asks for it, and documents when that happens. A feature has as many of these files as it needs. The
-stage that asks for a file imports it, so `dxlrun check` imports nothing of the run.
+`compile.py` its share of the plan, and so on. Each file has one object `STAGE`. The class of the object
+belongs to the package of that stage, and documents when the stage is used. A feature has only the files that
+it needs. The stage imports its file, so `dxlrun check` does not import any file of the run.
 """
 
 from __future__ import annotations
@@ -32,9 +32,9 @@ S = TypeVar("S", bound=Stage)
 
 
 class Section(msgspec.Struct, Generic[T], frozen=True):
-    """Section of the robot file: `STAGE` of `form.py`, asked for before a file is read.
+    """Section of the robot file: `STAGE` of `form.py`, used before a file is read.
 
-    The form is built of the sections of all features, so none of them is named anywhere else.
+    The form consists of the sections of all features, so no section is named anywhere else.
     """
 
     FILE: ClassVar[str] = "form"
@@ -42,55 +42,55 @@ class Section(msgspec.Struct, Generic[T], frozen=True):
     name: str
     """Key at the top of the robot file, such as `devices`."""
     form: object
-    """Type of the section's value, for pydantic, such as `dict[Name, Device]`; or a function that returns it,
-    if features add keys to it."""
+    """Type of the section's value, for pydantic, such as `dict[Name, Device]`; or a function that returns the
+    type, if features add keys to it."""
     field: T
-    """Field of the key, with its default, as `dxlrun.description.form.key` returns it."""
+    """Field of the key with its default, as `dxlrun.description.form.key` returns it."""
     before: str = ""
-    """Key that follows it in lists of all keys; it is the last where there is no such key."""
+    """Next key in lists of all keys; if it does not exist, this key is the last."""
     moved_joints: Callable[[object], Iterable[str]] = lambda section: ()
-    """Yields the joints whose servos are in this section, which may have mistakes. Groups and defaults give
-    such joints no keys of servos."""
+    """Yields the joints whose servos are in this section, which may contain mistakes. These joints get no
+    keys of servos from groups and defaults."""
 
     def of(self, robot: object) -> T:
-        """Return the section of a robot file that was read."""
+        """Return the section of a validated robot file."""
         section: T = getattr(robot, self.name)
         return section
 
 
 class KeyedJoint(Protocol):
-    """Joint of a plan, with the keys of features that the robot file gives it."""
+    """Joint of a plan, with the features' keys that the robot file sets for it."""
 
     @property
     def keys(self) -> Mapping[str, object]:
-        """Values by key, as JSON has them."""
+        """Values by key, in JSON types."""
 
 
 class JointKey(msgspec.Struct, Generic[T], frozen=True):
-    """Key of a joint: `STAGE` of `joint_key.py`, asked for before a file is read.
+    """Key of a joint: `STAGE` of `joint_key.py`, used before a file is read.
 
-    Every joint may have it, and so may `groups` and `joint_defaults`. The plan of a joint has the value that
-    the robot file gives, numbers in SI units; `dxlrun check` and the clients of a run show it.
+    Every joint can have it, and so can `groups` and `joint_defaults`. The plan of a joint has the value from
+    the robot file, with numbers in SI units; `dxlrun check` and the clients of a run show it.
     """
 
     FILE: ClassVar[str] = "joint_key"
 
     name: str
-    """The key, such as `tolerance`; that of the feature."""
+    """The key, such as `tolerance`; also the name of the feature."""
     form: object
     """Type of the value in the file, for pydantic: `Position | None`."""
     field: object
-    """Field of the key, with its default, as `dxlrun.description.form.key` returns it."""
+    """Field of the key with its default, as `dxlrun.description.form.key` returns it."""
     value: type[T]
     """Type of the value in the plan: `float`, or a struct of msgspec for a form."""
     before: str = ""
-    """Key of a joint that follows it in lists of all keys; it is the last where there is no such key."""
+    """Next key of a joint in lists of all keys; if it does not exist, this key is the last."""
     examples: Mapping[JointUnit, str] = {}
-    """How a value is written where the joint turns, and where it is linear; one of the other kind is refused.
-    Empty: its unit has nothing to do with that of the joint."""
+    """Example of a value for rotary and for linear joints; a value of the other kind is refused. Empty: the
+    unit does not depend on that of the joint."""
 
     def of(self, joint: KeyedJoint) -> T | None:
-        """Return the value of a joint in a plan; None: the robot file gives none."""
+        """Return the value of a joint in a plan; None: the robot file does not set it."""
         return msgspec.convert(joint.keys[self.name], self.value) if self.name in joint.keys else None
 
 
@@ -99,70 +99,70 @@ class KeyedServo(Protocol):
 
     @property
     def keys(self) -> Mapping[str, object]:
-        """Values by key, as the form of the key has read them."""
+        """Values by key, as validated by the form of the key."""
 
 
 class ServoKey(msgspec.Struct, Generic[T], frozen=True):
-    """Key of a servo: `STAGE` of `servo_key.py`, asked for before a file is read.
+    """Key of a servo: `STAGE` of `servo_key.py`, used before a file is read.
 
-    A joint with servos of its own has it for all of them, and one of its servos for itself; so have `groups`,
-    `joint_defaults`, and the servos in the section of a feature.
+    A joint with its own servos has the key for all of them, and each servo can have it for itself. So can
+    `groups`, `joint_defaults`, and the servos in the section of a feature.
     """
 
     FILE: ClassVar[str] = "servo_key"
 
     name: str
-    """The key, such as `registers`; that of the feature."""
+    """The key, such as `registers`; also the name of the feature."""
     form: object
     """Type of the value in the file, for pydantic."""
     field: object
-    """Field of the key in a joint, with its default, as `dxlrun.description.form.key` returns it."""
+    """Field of the key in a joint with its default, as `dxlrun.description.form.key` returns it."""
     of_one: object
     """Field of the key in one of several servos of a joint. Its default is None: the value of the joint."""
     of_section: object
-    """Field of the key in a servo that has no joint of its own."""
+    """Field of the key in a servo without a joint of its own."""
     before: str = ""
-    """Key of a servo that follows it in lists of all keys; it is the last where there is no such key."""
+    """Next key of a servo in lists of all keys; if it does not exist, this key is the last."""
 
     def of(self, servo: KeyedServo) -> T:
-        """Return the value of a servo, which is that of its joint if it has none itself."""
+        """Return the value of a servo, which is its joint's value if the servo has none."""
         return cast("T", servo.keys[self.name])
 
 
 class PolicyKey(msgspec.Struct, Generic[T], frozen=True):
-    """Key of the section `policies`: `STAGE` of `policy_key.py`, asked for before a file is read."""
+    """Key of the section `policies`: `STAGE` of `policy_key.py`, used before a file is read."""
 
     FILE: ClassVar[str] = "policy_key"
 
     name: str
-    """The key, such as `on_lost_servo`; that of the feature."""
+    """The key, such as `on_lost_servo`; also the name of the feature."""
     form: object
     """Type of the value, for pydantic: `Literal["stop", "limp"] | None`."""
     field: T
-    """Field of the key, with its default, as `dxlrun.description.form.key` returns it."""
+    """Field of the key with its default, as `dxlrun.description.form.key` returns it."""
     before: str = ""
-    """Key of the section that follows it in lists of all keys; it is the last where there is no such key."""
+    """Next key of the section in lists of all keys; if it does not exist, this key is the last."""
     group: PolicyKey[Any] | None = None
     """The same key of `policies.groups.NAME`; None: groups do not have it."""
 
     def of(self, policies: object) -> T:
-        """Return the value in the section, or in one of its groups, that was read."""
+        """Return the value in the validated section, or in one of its groups."""
         value: T = getattr(policies, self.name)
         return value
 
 
 class Feature(msgspec.Struct, frozen=True):
-    """A feature by its name and the package that has its files."""
+    """Name of a feature, and the package with its files."""
 
     name: str
     """Its key in the robot file, such as `devices`: at the top, of joints, of servos or of `policies`."""
     package: str
     """Package with its files, such as `dxlrun.features.devices`."""
     distribution: str = ""
-    """Publisher of the plug-in that has the package: `name version`. Empty for the features of dxlrun."""
+    """Publisher of the plug-in with the package: `name version`. Empty for the features of dxlrun."""
 
     def stage(self, kind: type[S]) -> S | None:
-        """Return what the feature does in one stage, or None if it has no such file."""
+        """Return the feature's `STAGE` for one stage; None if the feature does not have the file."""
         return _stage(self.package, kind)
 
 

@@ -32,7 +32,7 @@ def compile_lights(compilation: Compilation) -> Contribution:
                 file.error(mark, what, "name another joint, or take one of the lights out")
             else:
                 found[name] = Light(light.joint, *place, led.address)
-    if len(found) < len(lights):  # without a source, no controller is blamed for its commands
+    if len(found) < len(lights):  # without the source, controllers with these commands get no error
         return Contribution(names=("lights",))
     source = SourcePlan(
         "lights", "light", (), tuple(found), ((0.0, 1.0),) * len(found), label="lights", commandable=True

@@ -1,4 +1,4 @@
-"""Plan of the lights: what the run needs of the section."""
+"""Plan of the lights: data of the section for the run."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Lights in a run: LEDs are written in idle time when their command changes."""
+"""Lights in a run: writes LEDs in idle time when their commands change."""
 
 from __future__ import annotations
 
@@ -7,7 +7,7 @@ import msgspec
 from dxlrun.tooling.features import BusContext, BusStage, Program, Urgency, plan_line
 from dxlrun_lights.plan import Light, decode_lights
 
-RETRY_NS = 1_000_000_000  # A servo without a reply costs a timeout, so it is not written in each cycle
+RETRY_NS = 1_000_000_000  # a servo that does not reply costs a timeout, so it is not written in every cycle
 
 
 class Led(msgspec.Struct):
@@ -16,9 +16,9 @@ class Led(msgspec.Struct):
     light: Light
     servo: int  # Index in the servos of the bus
     column: int  # Its command in `BusContext.commands`
-    shown: int | None = None  # What the servo acknowledged last; None: not known
+    shown: int | None = None  # last acknowledged value; None: not known
     writing: bool = False
-    due_ns: int = 0  # Controllers' time from which on it may be written
+    due_ns: int = 0  # controllers' time of the next permitted write
 
 
 class Lights:
@@ -32,18 +32,18 @@ class Lights:
         """Do nothing: LEDs are not read."""
 
     def recover_line(self) -> None:
-        """Write every LED again: a servo without power has forgotten it."""
+        """Write every LED again: a servo without power has lost its state."""
         for led in self._leds:
             led.shown = None
 
     def recover_servo(self, servo: int) -> None:
-        """Write the LED of a servo again, at once: it has forgotten it."""
+        """Write the LED of a servo again at once: the servo has lost its state."""
         for led in self._leds:
             if led.servo == servo:
                 led.shown, led.due_ns = None, 0
 
     def schedule_idle_work(self, time_ns: int) -> None:
-        """Write the LEDs that are not as commanded; at the start of a run that is not known."""
+        """Schedule writes of LEDs that differ from their commands, or whose state is unknown."""
         for led in self._leds:
             lit = int(self._context.commands[led.column] >= 0.5)  # NaN, not commanded, is off
             if led.shown != lit and not led.writing and led.due_ns <= time_ns:

@@ -1,4 +1,4 @@
-"""Lights at the end of a run: off, whichever process ends it."""
+"""Lights at the end of a run: switched off by the process that ends it."""
 
 from __future__ import annotations
 
@@ -8,7 +8,7 @@ from dxlwire import BusPlan
 
 
 def switch_lights_off(lines: Lines, plan: bytes) -> tuple[str, ...]:
-    """Switch the LEDs of the lights off; return a sentence for each that did not confirm it."""
+    """Switch the LEDs of the lights off; return a sentence for each LED that did not confirm it."""
     lights = decode_lights(plan)
     on_buses = [
         {name: light for name, light in lights.items() if light.bus == bus.name} for bus in lines.plans

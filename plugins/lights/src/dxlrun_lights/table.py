@@ -1,4 +1,4 @@
-"""Table of the lights, as `dxlrun check` shows it."""
+"""Table of the lights for `dxlrun check`."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Device checks: at the start each device of a bus must answer, be of its model, and give its states."""
+"""Device checks: at start-up each device of a bus must answer, be of its model, and return its states."""
 
 from __future__ import annotations
 
@@ -19,11 +19,12 @@ _MODEL_NUMBER = (0, 2)
 
 
 _SILENCE_NS = 60_000_000
-"""A board that waits for a status of an earlier chain gives up after 50 ms of silence (protocol.md)."""
+"""Silence on the line, ns: a board that waits for a status of an earlier chain gives up after 50 ms
+(protocol.md)."""
 
 
 def survey_devices(plan: BusPlan, found: Findings) -> Program[None]:
-    """Look at every device of the bus, and collect all problems of all devices; only reads."""
+    """Check every device of the bus and collect the problems of all of them; only reads."""
     line = setup_line(plan)
     for device in plan.devices:
         ping = line.ping(device.servo_id)
@@ -38,7 +39,7 @@ def survey_devices(plan: BusPlan, found: Findings) -> Program[None]:
 
 
 def inspect_device(plan: BusPlan, device: DevicePlan, line: Line) -> Program[str]:
-    """Return what is wrong with a device, behind its name; empty: it is in order."""
+    """Return the problem of a device, without its name; empty: none."""
     reply = yield from retry(line.ping(device.servo_id))
     if reply.outcome is Outcome.TIMEOUT:
         rate = f"that it runs at {plan.baud_rate} bit/s"

@@ -33,9 +33,9 @@ from dxlwire.wire.dialect import dialect_of
 
 
 def compile_devices(compilation: Compilation) -> Contribution:
-    """Return the devices of the file that have no mistake in their bus, model or states.
+    """Return the devices of the file without mistakes in their bus, model or states.
 
-    Columns of states and commands are counted from the first ones of the cycle's record.
+    Columns of states and commands are counted from the start of the cycle's record.
     """
     file, body = compilation.file, compilation.body
     described = form.STAGE.of(file.robot)
@@ -144,14 +144,14 @@ def _table(file: RobotFile, name: str, device: Device) -> DeviceTable | None:
 
 
 def _file(description: Description, name: str, device: Device) -> Path | None:
-    """Return the path of a device's own table; None: the model is one that dxlrun knows."""
+    """Return the path of a device's own table; None: dxlrun has a table of the model."""
     if not device.model.endswith(".toml"):
         return None
     return Path(description.marks.value("devices", name, "model").file).parent / device.model
 
 
 def _read(path: Path) -> DeviceTable:
-    """Return the table of a file; raises OSError, and ValueError when it is none."""
+    """Return the table in a file; raise OSError, or ValueError if it is not a table."""
     text = read_file(path).decode("utf-8")
     try:
         return replace(read_device_table(text), text=text)
@@ -194,7 +194,7 @@ def _written_items(file: RobotFile, name: str, device: Device, table: DeviceTabl
 def _with_safe_values(
     file: RobotFile, name: str, commands: Mapping[str, DeviceCommand]
 ) -> tuple[DeviceCommand, ...]:
-    """Return the commands of a device with the safe values that the file gives."""
+    """Return the commands of a device with the safe values in the file."""
     found = dict(commands)
     for each, value in form.STAGE.of(file.robot)[name].safe.items():
         mark = file.at("devices", name, "safe", each)
@@ -212,7 +212,7 @@ def _with_safe_values(
 def _named(
     file: RobotFile, at: KeyPath, pairs: Sequence[tuple[str, str]], table: DeviceTable
 ) -> dict[str, ControlItem]:
-    """Return items by the names that the file or the table gives them; `at`: where the file names them."""
+    """Return items by their names in the file or the table; `at` is the path of the names in the file."""
     found: dict[str, ControlItem] = {}
     _, name, key = at
     for index, (given, item_name) in enumerate(pairs):
@@ -232,7 +232,7 @@ def _named(
 
 
 def _item_mark(description: Description, at: KeyPath, index: int, given: str) -> Mark:
-    """Return where an item is named; the device's own place where its table names it."""
+    """Return the place where an item is named, else the device's own place."""
     marks = description.marks
     for path in ((*at, given), (*at, index)):
         if marks.has(path):

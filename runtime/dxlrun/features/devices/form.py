@@ -1,4 +1,4 @@
-"""Form of the section `devices`: what is on a servo bus and is not a servo."""
+"""Form of the section `devices`: nodes on a servo bus that are not servos."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ _ITEM = re.compile(r"[a-z][a-z0-9_]*", re.ASCII)
 
 
 def _items(value: object) -> tuple[tuple[str, str], ...]:
-    """Return pairs of name and item; of a list the names are empty: the device's table has them."""
+    """Return pairs of name and item. In a list the names are empty: the device's table supplies them."""
     if isinstance(value, list) and value:
         pairs = [("", each) for each in value]
     elif isinstance(value, dict) and value:
@@ -87,7 +87,7 @@ Numbers = Annotated[
 
 
 class DeviceSimulation(Form):
-    """What a device shows when it is simulated."""
+    """States of a simulated device."""
 
     values: Numbers = key(
         "What a state shows, SI units; else what the simulation knows of its name, or 0.",

@@ -17,10 +17,10 @@ HIGHEST_FLOAT32 = 3.4028234663852886e38
 
 
 class DeviceCommand(msgspec.Struct, frozen=True):
-    """One item of a device that controllers command: number on the wire = (value - offset) / scale."""
+    """One commanded item of a device: number on the wire = (value - offset) / scale."""
 
     name: str  # `led`
-    item: str  # As the control table has it
+    item: str  # name in the control table
     address: int
     size: int
     encoding: Literal["unsigned", "sign_magnitude", "twos_complement", "float32"]
@@ -28,13 +28,13 @@ class DeviceCommand(msgspec.Struct, frozen=True):
     offset: float
     lowest: float  # SI units
     highest: float
-    column: int  # Of the command among the commands of sources in the cycle's record
+    column: int  # column in the commands of sources in the cycle's record
     safe: float | None = None
-    """What it becomes when nothing commands it any more, and at the end, SI units; None: it stays."""
+    """Value without a command, and at the end of a run, SI units; None: it keeps its value."""
 
     @classmethod
     def build(cls, name: str, item: ControlItem, column: int) -> DeviceCommand:
-        """Return a command by its item."""
+        """Return the command for an item."""
         most = HIGHEST_FLOAT32 * abs(item.scale)
         ends = (item.offset - most, item.offset + most)
         if item.encoding != "float32":
@@ -55,7 +55,7 @@ class DeviceCommand(msgspec.Struct, frozen=True):
         )
 
     def data(self, value: float) -> bytes:
-        """Return what is written for a value, SI units, inside of its range; little-endian."""
+        """Return the bytes to write for a value in SI units, clamped to its range; little-endian."""
         exact = (min(max(value, self.lowest), self.highest) - self.offset) / self.scale
         if self.encoding == "float32":
             return struct.pack("<f", exact)
@@ -70,5 +70,5 @@ DevicesPlan: TypeAlias = Mapping[str, tuple[DeviceCommand, ...]]
 
 
 def decode_devices(plan: bytes) -> DevicesPlan:
-    """Return the commands of `Contribution.plan` by device; none for an empty one."""
+    """Return the commands in `Contribution.plan` by device; empty for an empty plan."""
     return msgspec.json.decode(plan, type=dict[str, tuple[DeviceCommand, ...]]) if plan else {}

@@ -1,7 +1,7 @@
-"""Devices of one bus from cycle to cycle: lost replies, their return, and their commands.
+"""Devices of one bus from cycle to cycle: lost replies, recovery, and commands.
 
-A device that does not answer leaves the cyclic reads at once, so that its silence takes no time of the
-servos. From then on it is asked in idle time: in each one until it counts as lost, then once a second.
+A device that does not answer leaves the cyclic reads at once, so that its timeouts do not delay the servos.
+It is then probed in idle time: in every cycle until it counts as lost, then once a second.
 """
 
 from __future__ import annotations
@@ -25,26 +25,26 @@ from dxlwire.transaction import Outcome, Program, Transaction
 from dxlwire.wire.dialect import dialect_of
 
 PROBE_NS = 1_000_000_000
-"""A device that is lost is asked once a second, as a servo is (failures.md)."""
+"""Probe period of a lost device, as for a servo (failures.md)."""
 REPEAT_NS = 1_000_000_000
-"""A command that stays is written again once a second: the device may have started anew unnoticed."""
+"""An unchanged command is written again after this time: the device may have rebooted unnoticed."""
 
 
 class _Loss(msgspec.Struct):
-    """What is known of a device that does not answer."""
+    """Record of a device that does not answer."""
 
     since_ns: int
     probe_at_ns: int
-    missed: int = 1  # Replies in a row
+    missed: int = 1  # consecutive missed replies
     probing: bool = False
-    reported: bool = False  # It counts as lost
-    problem: str = ""  # Why it cannot be read again, as reported last
+    reported: bool = False  # counts as lost and has been reported
+    problem: str = ""  # last reported reason why it cannot be read again
 
 
 class _Written(msgspec.Struct):
-    data: bytes = b""  # What was written and acknowledged last; empty: nothing was
+    data: bytes = b""  # last acknowledged data; empty: none
     at_ns: int = 0
-    commanded: bool = False  # A controller commanded it in this run
+    commanded: bool = False  # a controller commanded it in this run
     writing: bool = False
     refused: bool = False
 
@@ -65,33 +65,33 @@ class Devices:
             if member.device >= 0:
                 self._members[member.device].append(number)
         self._losses: list[_Loss | None] = [None] * len(plan.devices)
-        self._joined_ns = [-1] * len(plan.devices)  # when each was taken back into the cyclic reads
-        self._turns = [0] * len(plan.devices)  # how often each was probed
-        self._flaps = [0] * len(plan.devices)  # losses in a row right after a return
-        self._errors = [0] * len(plan.devices)  # error byte of each, as reported
+        self._joined_ns = [-1] * len(plan.devices)  # time of the last return of each to the cyclic reads
+        self._turns = [0] * len(plan.devices)  # number of probes of each
+        self._flaps = [0] * len(plan.devices)  # consecutive losses of each right after a return
+        self._errors = [0] * len(plan.devices)  # last reported error byte of each
         commands = decode_devices(context.plan)
         self._written = [
             [(command, _Written()) for command in commands.get(device.name, ())] for device in plan.devices
         ]
-        """Commands of each device, and what was written of them."""
+        """Commands of each device, each with its last write."""
 
     # The cyclic reads
 
     def judge_replies(self, now_ns: int) -> None:
-        """Report what changed with this cycle's replies; a device that did not answer leaves the reads."""
+        """Report changes that this cycle's replies show; a device that did not answer leaves the reads."""
         for index, members in enumerate(self._members):
             self._report_error(index, max(self._reads.errors[member] for member in members))
             if self._losses[index] is None and any(self._reads.blamed(member) for member in members):
                 self._miss(index, now_ns)
 
     def recover_line(self) -> None:
-        """Ask every device before it is read again: the line was gone, and maybe their power."""
+        """Probe every device before it is read again: its line was lost, and possibly its power."""
         now_ns = self._idle.now_ns()
         for index in range(len(self._losses)):
             self._leave(index, _Loss(now_ns, now_ns, missed=0, reported=True))
 
     def recover_servo(self, servo: int) -> None:
-        """Do nothing: a device returns without its neighbors."""
+        """Do nothing: a device returns independently of the servos."""
 
     def _miss(self, index: int, now_ns: int) -> None:
         garbled = any(self._reads.garbled[member] for member in self._members[index])
@@ -128,7 +128,7 @@ class Devices:
     # Idle time
 
     def schedule_idle_work(self, time_ns: int) -> None:
-        """Let the coming idle time ask those that do not answer, and write what is commanded."""
+        """Schedule probes of devices that do not answer, and writes of commands."""
         now_ns = self._idle.now_ns()
         for index, loss in enumerate(self._losses):
             if loss is None:
@@ -139,10 +139,11 @@ class Devices:
                 self._idle.add(self._probe(index, loss), Urgency.REPAIR, name)
 
     def _probe(self, index: int, loss: _Loss) -> Program[None]:
-        """See whether a device is there, then ask for its states; take it back when it gives them.
+        """Probe a device, then read its states; return it to the cyclic reads if it answers.
 
-        Replies come in the order of their requests, and the first one is of another length than those of the
-        requests before, so none of them is taken for it: behind it none is late any more.
+        Replies come in the order of their requests. The first probe has a reply of another length than the
+        requests before it, so a late reply cannot be taken for its reply, and after it no late reply can
+        follow.
         """
         device, line = self._plan.devices[index], plan_line(self._plan)
         probes = _probes(line, device)
@@ -151,15 +152,16 @@ class Devices:
         reads = (line.read(device.servo_id, block.address, block.length) for block in device.blocks)
         problem = ""
         for request in (first, *reads):
+            # Use a short timeout: a silent device must not take the idle time of the servos.
             brief_ns = request.due_ns + line.latency_ns + line.device_margin_ns
             reply = yield replace(request, timeout_ns=brief_ns)
             if not reply.answered:
                 problem = "refuses to be read" if reply.outcome is Outcome.REFUSED else "does not answer"
                 break
-        if not problem and loss.reported:  # it may have been replaced
+        if not problem and loss.reported:  # the device may have been replaced
             problem = yield from inspect_device(self._plan, device, line)
         if self._losses[index] is not loss:
-            return  # the line was gone meanwhile
+            return  # the line was lost during the probe
         now_ns = self._idle.now_ns()
         if not problem:
             self._take_back(index, loss)
@@ -182,7 +184,7 @@ class Devices:
         for member in self._members[index]:
             self._reads.join(member)
         for _, written in self._written[index]:
-            written.data = b""  # it may have started anew
+            written.data = b""  # the device may have rebooted
         if loss.reported:
             self._report(EventCode.DEVICE_BACK, Severity.INFO, index, "is in order and is read again")
         elif not self._flaps[index]:
@@ -192,9 +194,9 @@ class Devices:
     # Commands
 
     def _command(self, index: int, now_ns: int) -> None:
-        """Let the coming idle time write the commands that are new, or were written long ago.
+        """Schedule writes of commands that are new or were written long ago.
 
-        One that nothing commands any more becomes its safe value.
+        A command that nothing commands any more gets its safe value.
         """
         for command, written in self._written[index]:
             value = float(self._commands[command.column])
@@ -223,7 +225,7 @@ class Devices:
             text += self._dialect.describe_error(reply.error)
             self._report(EventCode.SERVO_ERROR, Severity.WARNING, index, text)
         written.refused = refused
-        # a refused value is not tried again before it is due
+        # Record a refused value as written, so that it is not tried again before it is due.
         written.data = data if reply.answered or refused else b""
         written.at_ns = self._idle.now_ns()
 
@@ -241,7 +243,10 @@ STAGE = BusStage(inspect=survey_devices, attach=attach_devices)
 
 
 def _probes(line: Line, device: DevicePlan) -> list[Transaction]:
-    """Return what shows in turn that a device is there: replies of different lengths, none as its states'."""
+    """Return requests that show in turn that a device answers.
+
+    The lengths of their replies differ from each other and from those of its states.
+    """
     block = device.blocks[0]
     found = [line.read(device.servo_id, block.address, length) for length in (1, 2) if length < block.length]
     if block.length != line.dialect.PING_LENGTH or not found:

@@ -1,6 +1,6 @@
-"""Safe values of devices: what their commands become at the end of a run, whichever process ends it.
+"""Safe values of devices: written at the end of a run by the process that ends it.
 
-Needs neither numpy nor the loop: the guardian writes them after the loop died.
+This module needs neither numpy nor the loop, because the guardian uses it after the loop process died.
 """
 
 from __future__ import annotations
@@ -14,9 +14,9 @@ from dxlwire.transaction import Outcome, Program
 
 
 def write_safe_values(lines: Lines, plan: bytes) -> tuple[str, ...]:
-    """Write the safe value of every command that has one; return a sentence for each that failed.
+    """Write the safe value of every command that has one; return a sentence for each failure.
 
-    Raises nothing. A line without devices gets no byte.
+    Does not raise. Nothing is sent on a line without devices.
     """
     commands = decode_devices(plan)
     if not any(commands.get(device.name) for bus in lines.plans for device in bus.devices):
@@ -37,7 +37,7 @@ def _write_safe_values(plan: BusPlan, commands: DevicesPlan) -> Program[list[str
                 text = f"did not confirm that {command.item} is {command.safe:g}, its safe value"
                 problems.append(f"{plan.label(device)} {text}")
             if reply.outcome is Outcome.TIMEOUT:
-                break  # it is not there
+                break  # the device does not answer at all
     return problems
 
 

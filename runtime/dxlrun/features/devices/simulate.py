@@ -1,4 +1,4 @@
-"""Simulated devices: the states that a device has on a simulated bus."""
+"""Simulated devices: the states of a device on a simulated bus."""
 
 from __future__ import annotations
 
@@ -19,10 +19,10 @@ def simulated_states(
     read: Mapping[str, ControlItem],
     links: Collection[str] | None,
 ) -> Shown:
-    """Return the states of a simulated device, by its items; add problems of the keys of its simulation.
+    """Return the states of a simulated device, by its items; add problems of its simulation keys.
 
     Args:
-        file: Robot file.
+        file: Robot file; collects the problems.
         name: Name of the device.
         table: Control table of its model.
         read: Item of each state, by the state's name.

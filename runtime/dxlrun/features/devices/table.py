@@ -1,4 +1,4 @@
-"""Table of the devices, as `dxlrun check` shows it."""
+"""Table of the devices for `dxlrun check`."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Lost servos: what a run does when servos do not answer, by policies of the robot and of its groups.
+"""Lost servos: reaction of a run to servos that do not answer, by policies of the robot and of its groups.
 
-How a lost servo is found again is in `dynamixel`.
+`dynamixel` recovers a lost servo.
 """

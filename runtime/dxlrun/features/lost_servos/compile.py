@@ -15,7 +15,7 @@ _GROUP_ACTIONS = {
 
 
 def compile_lost_servos(compilation: Compilation) -> Contribution:
-    """Return the policy of the robot, and those of groups that have one of their own."""
+    """Return the policy of the robot, and the policies of groups with their own."""
     policies = compilation.file.robot.policies
     rows = {name: row for row, name in enumerate(compilation.joints)}
     groups = tuple(

@@ -1,4 +1,4 @@
-"""Lost servos: policies for servos that do not answer, of the robot and of its groups."""
+"""Monitor of lost servos: applies the policies of the robot and of its groups."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ from dxlrun.plan.policy_plan import GroupPolicy, PolicyPlan
 
 
 class LostServos:
-    """Applies the policies for lost servos when other servos are lost than in the cycle before."""
+    """Applies the policies for lost servos when the set of lost joints has changed."""
 
     def __init__(self, joints: tuple[str, ...], states: States, actions: PolicyActions) -> None:
         self._joints = joints
@@ -23,7 +23,7 @@ class LostServos:
         self._actions = actions
         self._all_valid = bytes([True]) * len(joints)
         self._missed = MissedReplies(len(joints))
-        self._limp: set[str] = set()  # names of groups that a lost servo has left without torque
+        self._limp: set[str] = set()  # groups that have become limp after a lost servo
 
     @classmethod
     def build(cls, plan: LoopPlan, record: CycleRecord, actions: PolicyActions) -> Self:
@@ -31,7 +31,7 @@ class LostServos:
         return cls(tuple(one.name for one in plan.joints), record.states, actions)
 
     def check(self, time_ns: int) -> None:
-        """Count missed replies, and apply the policies when other joints are lost than before."""
+        """Count missed replies, and apply the policies if the set of lost joints has changed."""
         if self._missed.none and self._states.valid.tobytes() == self._all_valid:
             return
         if self._missed.count(self._states):
@@ -51,7 +51,7 @@ class LostServos:
             actions.hold_controllers(self, rows, "all its joints answer again")
 
     def _judge(self, policies: PolicyPlan) -> tuple[dict[str, list[int]], list[GroupPolicy]]:
-        """Return which policies end the run, for which lost rows, and which groups become limp by now."""
+        """Return the policies that end the run with their lost rows, and the groups that become limp now."""
         ending: dict[str, list[int]] = {}
         limp: list[GroupPolicy] = []
         for row in sorted(self._missed.lost):
@@ -68,19 +68,19 @@ class LostServos:
 
 
 class MissedReplies:
-    """Counts the replies that each joint missed in a row; a servo that reboots by request misses none."""
+    """Counts the consecutive missed replies of each joint; a reboot by request does not count."""
 
     def __init__(self, joints: int) -> None:
         self.lost: frozenset[int] = frozenset()
         """Rows of the joints that are lost now."""
         self.none = True
-        """No joint missed a reply in the last cycle that was counted."""
+        """True if no joint missed a reply in the last counted cycle."""
         self._missed = np.zeros(joints, dtype=np.int64)
 
     def count(self, states: States) -> bool:
-        """Count the states of a cycle, and return whether other joints are lost now.
+        """Count the states of a cycle; return True if the set of lost joints has changed.
 
-        Cycles without a missed reply may be left out while `none` is true.
+        Cycles without a missed reply may be skipped while `none` is true.
         """
         valid, age_ns = states.valid, states.age_ns
         self._missed += 1

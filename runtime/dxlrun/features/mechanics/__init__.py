@@ -1,6 +1,6 @@
-"""Mechanics: how servos move joints, from the section `transmissions` to the hardware of joints.
+"""Mechanics: motion of joints by servos, from the section `transmissions` to the hardware of joints.
 
-Checks and figures of a joint are the same for one servo, whose matrix is 1, for several, and for a
-transmission. In a run, only joints are known above the layer of this package, and only servos below it; it is
-absent where each servo has a joint of its own.
+Checks and figures of a joint are the same for one servo, whose matrix is 1, for several servos, and for a
+transmission. In a run, the code above the layer of this package knows only joints, and the code below only
+servos. The layer is omitted if each joint has its own servo.
 """

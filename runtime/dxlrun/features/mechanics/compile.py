@@ -11,7 +11,7 @@ from dxlrun.plan.mechanics_plan import CouplingPlan, MechanicsPlan
 
 
 def compile_mechanics(joints: Mapping[str, CompiledJoint]) -> MechanicsPlan:
-    """Return which servos move which joints; an empty plan where each joint has one of its own."""
+    """Return the assignment of servos to joints; an empty plan if each joint has its own servo."""
     drives = {name: joint.drive for name, joint in joints.items() if isinstance(joint.drive, CoupledDrive)}
     couplings = dict.fromkeys(drive.coupling for drive in drives.values() if not drive.coupling.direct)
     if not couplings:

@@ -1,6 +1,7 @@
-"""Couplings: the servos of one joint, and transmissions, checked; limits of joints against servos' ranges.
+"""Couplings: checks of joints with several servos and of transmissions, and of joint limits against servo
+ranges.
 
-A joint with one servo is a coupling, too, with the matrix 1.
+A joint with one servo is a coupling with the matrix 1.
 """
 
 from __future__ import annotations
@@ -25,43 +26,44 @@ from dxlwire.modes import Mode
 from dxlwire.plan.mode_plan import model_modes
 
 MOST_CONDITION = 100.0
-"""Condition number of a matrix: beyond it a tick of a servo is more than a hundred of a joint. [i]"""
-MOST_SPEED_RATIO = 1.5  # Between the top speeds of the servos of one joint. [i]
-_LEAST_SHARE = 0.01  # Of its reach that a joint without limits must be left by the limits of the others. [i]
+"""Highest condition number of a matrix: beyond it a tick of a servo is more than a hundred ticks of a joint.
+[i]"""
+MOST_SPEED_RATIO = 1.5  # highest ratio between the top speeds of a joint's servos [i]
+_LEAST_SHARE = 0.01  # least share of its reach for a joint without limits [i]
 
 Rows = tuple[tuple[float, ...], ...]
 MATRICES: Mapping[str, Rows] = {"differential": ((0.5, 0.5), (0.5, -0.5))}
-"""Transmissions that have a name: half of the sum and half of the difference."""
+"""Transmissions with a name: half of the sum and half of the difference."""
 
 
 class Coupling(msgspec.Struct, frozen=True, eq=False):
     """Servos that move joints together: q = M s."""
 
     name: str
-    place: KeyPath  # Of its joint or its transmission
+    place: KeyPath  # path of its joint or its transmission
     joints: tuple[str, ...]
     servos: tuple[CompiledServo, ...]
     matrix: Rows
     inverse: Rows
-    tolerance: float  # rad or m; 0 where no servo can disagree
+    tolerance: float  # rad or m; 0 if the servos cannot disagree
     transmission: bool
 
     @property
     def direct(self) -> bool:
-        """True when one servo moves one joint whose keys describe it."""
+        """True if one servo moves one joint, whose keys describe it."""
         return not self.transmission and len(self.servos) == 1
 
     @property
     def modes(self) -> tuple[Mode, ...]:
-        """The modes that all its servos have, without those in which they do not move the joints together."""
+        """Modes that all servos have and in which they can move the joints together."""
         each = [model_modes(one.table, one.described.continuous) for one in self.servos]
-        # a part of the voltage is neither a speed nor a torque, so it cannot be divided by a matrix
+        # A fraction of the voltage is neither a speed nor a torque, so a matrix cannot divide it.
         left_out = {Mode.PWM} if self.transmission else set()
         return tuple(mode for mode in each[0] if mode not in left_out and all(mode in one for one in each))
 
 
 def compile_couplings(file: RobotFile, servos: Mapping[str, CompiledServo]) -> list[Coupling]:
-    """Return the couplings of all joints; one with a mistake is omitted."""
+    """Return the couplings of all joints; couplings with mistakes are omitted."""
     found: list[Coupling] = []
     for name, joint in file.robot.joints.items():
         if not isinstance(joint, ServoJoint):
@@ -111,7 +113,7 @@ def compile_couplings(file: RobotFile, servos: Mapping[str, CompiledServo]) -> l
 
 
 def _check_joints(file: RobotFile, name: str, transmission: Transmission, owners: dict[str, str]) -> bool:
-    """Check that a transmission's joints are there, its own, and alike."""
+    """Check that a transmission's joints exist, belong to no other coupling, and have equal keys."""
     robot, good = file.robot, True
     for index, joint in enumerate(transmission.joints):
         mark = file.at("transmissions", name, "joints", index)
@@ -152,12 +154,12 @@ def _check_joints(file: RobotFile, name: str, transmission: Transmission, owners
 
 
 def _set(entry: object, key: str) -> bool:
-    """Return whether a joint's key is not as by default."""
+    """Return True if a joint's key does not have its default value."""
     return bool(getattr(entry, key)) is (key == "continuous")
 
 
 def _check_moved(file: RobotFile, owners: Mapping[str, str]) -> None:
-    """Check that every joint has a servo, or a transmission that moves it."""
+    """Check that every joint has a servo or a transmission."""
     for name, joint in file.robot.joints.items():
         if not isinstance(joint, ServoJoint) and name not in owners:
             file.error(
@@ -168,7 +170,7 @@ def _check_moved(file: RobotFile, owners: Mapping[str, str]) -> None:
 
 
 def _matrix(file: RobotFile, name: str, transmission: Transmission) -> tuple[Rows, Rows] | None:
-    """Return a transmission's matrix and its pseudo-inverse."""
+    """Return a transmission's matrix and its pseudo-inverse; None after a mistake."""
     servos, joints = len(transmission.servos), len(transmission.joints)
     mark, place = file.at("transmissions", name, "matrix"), file.key("transmissions", name)
     named = MATRICES.get(transmission.type)
@@ -207,11 +209,11 @@ def _matrix(file: RobotFile, name: str, transmission: Transmission) -> tuple[Row
 
 
 def _inverted(name: str, matrix: Rows, mark: Mark, problems: Problems) -> tuple[Rows, Rows] | None:
-    """Return a matrix and its pseudo-inverse; refuse one by which a joint cannot be moved on its own."""
-    import numpy as np  # not above: most robots have no transmission, and `check` needs no numpy for them
+    """Return a matrix and its pseudo-inverse; refuse a matrix that cannot move each joint independently."""
+    import numpy as np  # imported here, because most robots have no transmission
 
     values = np.array(matrix, dtype=np.float64)
-    most = np.abs(values).max(axis=1)  # of each joint
+    most = np.abs(values).max(axis=1)  # largest factor of each joint
     wrong = most[(most > 1 / LEAST_RATIO) | (most < 1 / MOST_RATIO)]
     if wrong.size:
         problems.error(
@@ -238,12 +240,13 @@ def _inverted(name: str, matrix: Rows, mark: Mark, problems: Problems) -> tuple[
         )
         return None
     inverse = np.linalg.pinv(values) if values.shape[0] != values.shape[1] else np.linalg.inv(values)
+    # Rounding removes the numerical noise, and adding 0.0 turns -0.0 into 0.0.
     inverse = np.round(inverse, 15) + 0.0
     return matrix, tuple(tuple(float(value) for value in row) for row in inverse)
 
 
 def _agree(file: RobotFile, coupling: Coupling) -> bool:
-    """Check that servos can move joints together."""
+    """Check that the servos can move their joints together."""
     first, *others = coupling.servos
     marks, buses = file.marks, file.robot.buses
     good = True
@@ -292,7 +295,8 @@ def _moved(coupling: Coupling) -> str:
 
 
 def allowed_limits(file: RobotFile, coupling: Coupling) -> tuple[Interval | None, ...]:
-    """Return the limits that the gate keeps of each joint, all of which its servos reach; None: a mistake."""
+    """Return the limits that the gate enforces for each joint, fully within the servos' reach; None: a
+    mistake."""
     joints = file.robot.joints
     if not coupling.transmission:
         (name,) = coupling.joints
@@ -314,7 +318,7 @@ def allowed_limits(file: RobotFile, coupling: Coupling) -> tuple[Interval | None
 
 
 def _allowed(file: RobotFile, name: str, joint: JointEntry, reach: Interval, model: str) -> Interval | None:
-    """Return the limits that the gate keeps: the file's, cut to the reach."""
+    """Return the limits that the gate enforces: those of the file, clamped to the reach."""
     limits = joint.limits.position
     if limits is None:
         return reach
@@ -337,7 +341,7 @@ def _allowed(file: RobotFile, name: str, joint: JointEntry, reach: Interval, mod
 
 
 def shared_reach(coupling: Coupling) -> Interval | None:
-    """Return where all servos of one joint reach; None: nowhere."""
+    """Return the positions that all servos of one joint reach; None: there are none."""
     reach: Interval | None = coupling.servos[0].reach
     for servo in coupling.servos[1:]:
         reach = None if reach is None else reach.meet(servo.reach)
@@ -345,14 +349,15 @@ def shared_reach(coupling: Coupling) -> Interval | None:
 
 
 def joint_reaches(coupling: Coupling) -> tuple[Interval, ...]:
-    """Return how far each joint goes, with the others where it goes farthest: the image of the ranges."""
+    """Return the reach of each joint while the other joints are where it is widest: the image of the servos'
+    ranges."""
     if not coupling.transmission:
         return (shared_reach(coupling) or Interval(0.0, 0.0),)
     return tuple(_image(row, [one.reach for one in coupling.servos]) for row in coupling.matrix)
 
 
 def servo_ranges(coupling: Coupling, limits: Sequence[Interval]) -> tuple[Interval, ...]:
-    """Return how far each servo goes within limits of the joints: the image of their box."""
+    """Return the range of each servo within limits of the joints: the image of the joints' box."""
     return tuple(_image(row, limits) for row in coupling.inverse)
 
 
@@ -366,10 +371,10 @@ def _image(row: Sequence[float], intervals: Sequence[Interval]) -> Interval:
 def box(
     file: RobotFile, coupling: Coupling, written: Sequence[Interval | None]
 ) -> tuple[Interval, ...] | None:
-    """Return the limits of a transmission's joints, all of whose corners its servos reach.
+    """Return the limits of a transmission's joints, such that its servos reach all corners.
 
-    Those that the file gives are kept or refused; the others become as wide as the servos let them be, each
-    by the same part of its reach.
+    Limits in the file are kept or refused. The others become as wide as the servos permit, each by the same
+    share of the joint's reach.
     """
     reaches = joint_reaches(coupling)
     ranges = [one.reach for one in coupling.servos]
@@ -412,7 +417,7 @@ def box(
 def _fits(
     file: RobotFile, coupling: Coupling, limits: Sequence[Interval], written: Sequence[Interval | None]
 ) -> bool:
-    """Refuse limits with a corner that a servo does not reach; name the worst corner of each servo."""
+    """Refuse limits with a corner that a servo does not reach; report the worst corner of each servo."""
     good = True
     for row, servo, needed in zip(
         coupling.inverse, coupling.servos, servo_ranges(coupling, limits), strict=True
@@ -440,13 +445,14 @@ def _fits(
 
 
 def theta(servo: CompiledServo, position: float) -> float:
-    """Return the angle of a servo, rad from its raw 0, where it has its joint or its input at a position."""
+    """Return the angle of a servo, rad from its raw 0, for a position of its joint or its transmission's
+    input."""
     described = servo.described
     return described.direction * position / described.ratio + described.reference
 
 
 def top_speeds(coupling: Coupling) -> tuple[tuple[float | None, float | None], ...]:
-    """Return of each joint how fast it goes alone, and how fast while all go as fast together."""
+    """Return two top speeds of each joint: while the others rest, and while all move equally fast."""
     speeds = [one.top_speed or None for one in coupling.servos]
     together = [
         None if speed is None else speed / sum(map(abs, row)) if any(row) else math.inf
@@ -467,7 +473,8 @@ def top_speeds(coupling: Coupling) -> tuple[tuple[float | None, float | None], .
 
 
 def top_efforts(coupling: Coupling) -> tuple[float | None, ...]:
-    """Return the highest effort of each joint with no effort of the others; None: its servos follow none."""
+    """Return the highest effort of each joint while the others have none; None: its servos have no effort
+    goal."""
     most = [one.top_effort for one in coupling.servos]
     found: list[float | None] = []
     for row in coupling.matrix:
@@ -487,7 +494,7 @@ def _least(values: Sequence[float | None]) -> float | None:
 
 
 def check_together(file: RobotFile, coupling: Coupling) -> None:
-    """Warn of written limits of several joints that are more than a servo has when all are asked for."""
+    """Warn of limits of several joints that together exceed what a servo can do."""
     written = [file.robot.joints[name].limits for name in coupling.joints]
     for which, limits, rows, most, unit in (
         (

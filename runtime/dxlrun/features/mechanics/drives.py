@@ -1,4 +1,4 @@
-"""Drives of joints: what each coupling does at its joints, and that its limits can be kept."""
+"""Drives of joints: figures of each coupling at its joints, and its joint limits."""
 
 from __future__ import annotations
 
@@ -26,7 +26,7 @@ class CoupledDrive(JointDrive, frozen=True, kw_only=True):
 
 
 def compile_drives(file: RobotFile, servos: Mapping[str, CompiledServo]) -> dict[str, JointDrive]:
-    """Return the drive of each joint; one whose servos have a mistake is missing."""
+    """Return the drive of each joint; joints whose servos have mistakes are omitted."""
     drives: dict[str, JointDrive] = {}
     for coupling in compile_couplings(file, servos):
         reaches, limits = joint_reaches(coupling), allowed_limits(file, coupling)

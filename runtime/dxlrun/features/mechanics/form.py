@@ -72,7 +72,7 @@ def _form() -> object:
 
 
 def _moved_joints(section: object) -> Iterator[str]:
-    """Yield the names under `joints` in a section that was not validated yet."""
+    """Yield the names under `joints` in a section that is not validated yet."""
     for entry in section.values() if isinstance(section, dict) else ():
         names = entry.get("joints") if isinstance(entry, dict) else None
         yield from map(str, names if isinstance(names, list) else ())

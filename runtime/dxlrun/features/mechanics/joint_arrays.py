@@ -1,7 +1,8 @@
-"""Joint arrays: states of servos become states of joints, goals of joints become goals of servos.
+"""Joint arrays: convert states of servos into states of joints, and goals of joints into goals of servos.
 
-Positions and speeds by q = M s and s = M^+ q, efforts by (M^+)^T and M^T, so that the power is the same on
-both sides. All couplings at once: their matrices are padded with zeros to one size and stacked.
+Positions and speeds are converted by q = M s and s = M^+ q, efforts by (M^+)^T and M^T, so that the power is
+equal on both sides. All couplings are computed at once: their matrices are padded with zeros to one size and
+stacked.
 """
 
 from __future__ import annotations
@@ -23,23 +24,25 @@ _WORSE: tuple[Torque, ...] = (
     Torque.LOST,
     Torque.UNKNOWN,
 )
-"""From the best to the worst: a joint has the worst torque of its servos."""
+"""From best to worst; a joint has the worst torque state of its servos."""
 _LEAST_SHARE = 0.05
-"""Of the speed that all its joints together would ask of a servo: a load may have moved one that need not."""
+"""Lowest speed of a servo as a share of the speed for all of its joints together: a load may have moved a
+servo that need not move."""
 
 
 class JointArrays:
-    """The arrays of the servos beside those of the joints, and the way between them.
+    """Arrays of the servos and of the joints, with the conversion between them.
 
-    The servos' have a row a servo, in the order of the plan's `servos`. A joint's row is valid where those of
-    all its servos are, keeps its values where not, and has the age of the oldest.
+    The servos' arrays have one row per servo, in the order of the plan's `servos`. A joint's row is valid if
+    the rows of all its servos are valid; otherwise it keeps its values. It has the age of the oldest of these
+    rows.
     """
 
     def __init__(self, plan: MechanicsPlan, states: States, goals: Commands) -> None:
         self.states = states
         self.goals = goals
-        self.servo_states = States.empty(len(plan.servos))  # Filled by the servos' hardware
-        self.servo_goals = Commands.empty(len(plan.servos))  # Sent by the servos' hardware
+        self.servo_states = States.empty(len(plan.servos))  # filled by the servos' hardware
+        self.servo_goals = Commands.empty(len(plan.servos))  # sent by the servos' hardware
         self._direct_joints = np.array([joint for joint, _ in plan.direct], dtype=np.intp)
         self._direct_servos = np.array([servo for _, servo in plan.direct], dtype=np.intp)
         count = len(plan.couplings)
@@ -48,7 +51,7 @@ class JointArrays:
         self._joint_rows = np.zeros((count, joints), dtype=np.intp)
         self._servo_rows = np.zeros((count, servos), dtype=np.intp)
         self._no_joint = np.ones((count, joints), dtype=np.bool_)
-        """Where a coupling has fewer joints than the largest."""
+        """True in the padding of couplings with fewer joints than the largest one."""
         self._no_servo = np.ones((count, servos), dtype=np.bool_)
         self._matrix: Floats = np.zeros((count, joints, servos))
         self._inverse: Floats = np.zeros((count, servos, joints))
@@ -63,24 +66,24 @@ class JointArrays:
         self._efforts = np.ascontiguousarray(self._inverse.transpose(0, 2, 1))
         self._coupling, self._column = np.nonzero(~self._no_joint)
         self._rows = self._joint_rows[self._coupling, self._column]
-        """Rows of all joints of couplings; `_coupling`, `_column`: which they are there."""
+        """Rows of all joints of couplings; `_coupling` and `_column` are their places there."""
         self._single = np.array([len(one.joints) == 1 for one in plan.couplings])[:, None]
         self._rank = np.zeros(len(Torque), dtype=np.uint8)
         for rank, torque in enumerate(_WORSE):
             self._rank[torque] = rank
         self.residual: Floats = np.zeros((count, servos))
-        """How far each servo is from where the joints would have it, rad or m: s - M^+ M s."""
+        """Deviation of each servo from its position according to the joints, rad or m: s - M^+ M s."""
         self._offset: Floats = np.zeros((count, servos))
         self._fade: Floats = np.zeros((count, 1))
-        """The part of `_offset` that is in the servos' goals still."""
+        """Share of `_offset` that is still in the servos' goals."""
         self._last_goal: Floats = np.full((count, joints), np.nan)
         self._last_speed: Floats = np.full((count, joints), np.nan)
         self._speeds: Floats = np.full((count, servos), np.nan)
 
     def begin(self) -> None:
-        """Let the joints' goals be those that their servos have, so that none of them moves.
+        """Set the joints' goals to those of their servos, so that no servo moves.
 
-        Servos that disagree a little keep that for the moment: `fade` takes it from them.
+        Small deviations of the servos are kept as offsets at first; `fade` removes them.
         """
         self.goals.values[:, self._direct_joints] = self.servo_goals.values[:, self._direct_servos]
         given = self.servo_goals.values[:, self._servo_rows]
@@ -92,13 +95,14 @@ class JointArrays:
         self._fade.fill(1.0)
 
     def fade(self, share: float) -> None:
-        """Take a share of what servos disagreed by from their goals, until they agree."""
+        """Reduce the offsets in the servos' goals by a share of their initial value."""
         np.maximum(0.0, self._fade - share, out=self._fade)
 
     def anchor(self, index: int) -> None:
-        """Let the servos of a coupling hold where each is when the goals of its joints are where these are.
+        """Hold the servos of a coupling at their present positions while the joints' goals equal the joints'
+        positions.
 
-        Servos that disagree a little keep that for the moment: `fade` takes it from them.
+        Small deviations of the servos are kept as offsets at first; `fade` removes them.
         """
         self._offset[index] = np.nan_to_num(self.residual[index])
         self._fade[index] = 1.0
@@ -135,6 +139,7 @@ class JointArrays:
         age[absent] = 0
         to.valid[self._rows] = shown
         to.age_ns[self._rows] = np.where(never, -1, age.max(axis=1))[coupling]
+        # fmax and fmin skip NaN: the hottest known servo and the lowest known voltage count.
         to.temperature[self._rows] = np.fmax.reduce(np.where(absent, np.nan, of.temperature[rows]), axis=1)[
             coupling
         ]
@@ -146,12 +151,13 @@ class JointArrays:
         to.mode[self._rows] = np.where(alike, mode[:, 0], Mode.UNKNOWN)[coupling]
         torque = of.torque[rows]
         ranks = self._rank[torque]
+        # Padding has the best rank, so that it is never the worst servo.
         ranks[absent] = 0
         worst = np.take_along_axis(torque, ranks.argmax(axis=1)[:, None], axis=1)[:, 0]
         to.torque[self._rows] = worst[coupling]
 
     def write(self) -> None:
-        """Fill the servos' goals from those of the joints; a joint without one leaves its servos without."""
+        """Fill the servos' goals from those of the joints; without a joint's goal its servos get none."""
         to, of = self.servo_goals, self.goals
         to.values[:, self._direct_servos] = of.values[:, self._direct_joints]
         wanted = of.values[:, self._joint_rows]
@@ -168,14 +174,15 @@ class JointArrays:
         most = self._times(np.abs(across), np.abs(effort))
         torque = np.where(mode == Mode.EFFORT, self._times(across, effort), most)
         to.effort[rows[here]] = torque[here]
-        # a part of the voltage is the same for all servos of one joint, and nothing for a transmission
+        # A PWM goal is the same for all servos of one joint, and undefined for a transmission.
         to.pwm[rows[here]] = np.where(self._single, pwm[:, :1], np.nan).repeat(rows.shape[1], axis=1)[here]
 
     def _divide_speeds(self, position: Floats, velocity: Floats) -> None:
-        """Let the servos of a coupling arrive together where its joints' goals or speeds have changed.
+        """Compute speeds with which the servos of a coupling arrive together, if joint goals or speeds have
+        changed.
 
-        The speed beside a position is the joint's on its way there: the way takes as long as that of its
-        slowest joint, and each servo gets the speed at which its own way takes as long.
+        The speed next to a position goal is the joint's speed on its way. The duration is that of the slowest
+        joint, and each servo gets the speed with which its own way takes that long.
         """
         same = _same(position, self._last_goal) & _same(velocity, self._last_speed)
         changed = ~np.all(same, axis=1)
@@ -186,7 +193,7 @@ class JointArrays:
         way[self._no_joint] = 0.0
         together = self._times(np.abs(self._inverse), np.abs(velocity))
         with np.errstate(divide="ignore", invalid="ignore"):
-            # a joint without a speed goes as fast as the others let it
+            # A joint without a speed moves as fast as the other joints permit.
             time = np.nanmax(np.where(way == 0.0, 0.0, np.abs(way) / np.abs(velocity)), axis=1, initial=0.0)
             own = np.abs(self._times(self._inverse, way)) / time[:, None]
         own = np.where((time == 0.0)[:, None] | self._single, together, np.fmax(own, _LEAST_SHARE * together))
@@ -195,9 +202,10 @@ class JointArrays:
         self._last_speed[changed] = velocity[changed]
 
     def joint_requests(self, requested: NDArray[np.uint8]) -> NDArray[np.uint8]:
-        """Return which mode each servo is to have, by that of its joints; UNKNOWN: leave it as it is.
+        """Return the requested mode of each servo from that of its joints; UNKNOWN: no change.
 
-        Joints of one coupling have one mode: a request that leaves one of them in another is not followed.
+        The joints of one coupling must have one mode: a request that would leave one of them in another mode
+        is ignored.
         """
         modes = np.zeros(len(self.servo_states.mode), dtype=np.uint8)
         modes[self._direct_servos] = requested[self._direct_joints]
@@ -220,6 +228,6 @@ class JointArrays:
 
 
 def _same(one: Floats, other: Floats) -> NDArray[np.bool_]:
-    """Compare elements; NaN is equal to NaN."""
+    """Compare elements; NaN equals NaN."""
     same: NDArray[np.bool_] = (one == other) | (np.isnan(one) & np.isnan(other))
     return same

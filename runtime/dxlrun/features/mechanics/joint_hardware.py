@@ -1,4 +1,4 @@
-"""Joint hardware: a robot some of whose joints need several servos, as the loop's hardware of joints."""
+"""Joint hardware: the loop's hardware for a robot with joints that have several servos."""
 
 from __future__ import annotations
 
@@ -19,9 +19,9 @@ from dxlrun.plan.mechanics_plan import CouplingPlan, MechanicsPlan
 from dxlwire.bus_plan import BusPlan, ServoPlan
 
 FADE_NS = 1_000_000_000
-"""In which time servos that disagree a little at the start are brought together: 1.5 deg a second at most by
-default."""
-AGREES = 0.7  # Part of the tolerance below which servos that disagreed agree again
+"""Time in which small deviations between servos at the start are removed: at most 1.5 deg per second with the
+default tolerance."""
+AGREES = 0.7  # share of the tolerance below which servos that disagreed agree again
 _HAS_TORQUE = (Torque.ON, Torque.DOUBT, Torque.GIVEN)
 
 Done = Callable[[str], None]
@@ -29,7 +29,7 @@ RegisterDone = Callable[[str, int | None], None]
 
 
 class _Together(msgspec.Struct):
-    """A request to all servos of a coupling that is not answered by all of them yet."""
+    """A request to all servos of a coupling that has not been answered by all of them."""
 
     left: int
     answers: list[Done] = []
@@ -37,7 +37,7 @@ class _Together(msgspec.Struct):
 
 
 class ServosTogether:
-    """What the servos of each coupling must have alike: where they stand, and torque."""
+    """Checks that the servos of each coupling agree in position and torque."""
 
     def __init__(
         self,
@@ -61,9 +61,10 @@ class ServosTogether:
         return self._labels[row]
 
     def at_start(self) -> list[str]:
-        """Return why joints of several servos must not get torque where they stand, one sentence each.
+        """Return reasons why joints with several servos must not get torque at their positions, one sentence
+        each.
 
-        Not of those that the start leaves limp (`torque: off`).
+        Joints that stay limp at the start (`torque: off`) are not checked.
         """
         self._arrays.read()
         problems: list[str] = []
@@ -73,10 +74,10 @@ class ServosTogether:
         return problems
 
     def torque_refused(self, index: int) -> str:
-        """Return why the servos of a coupling must not get torque again where they stand.
+        """Return the reason why the servos of a coupling must not get torque at their positions.
 
-        Each servo is checked against its own range when it gets torque; a wrist may be outside its limits
-        with both servos inside theirs. Empty: they are in order, or have torque already.
+        Empty: they may get torque, or have it already. Each servo is checked against its own range when it
+        gets torque. That is not enough: a wrist can be outside its limits with both servos inside theirs.
         """
         coupling = self._plan.couplings[index]
         if not any(self._arrays.servo_states.torque[row] in LIMP for row in coupling.servos):
@@ -90,7 +91,7 @@ class ServosTogether:
         self._events.emit(EventCode.TORQUE_ON, Severity.WARNING, name, text)
 
     def unfit(self, index: int) -> list[str]:
-        """Return why the servos of one coupling must not get torque where they were read last."""
+        """Return reasons why the servos of one coupling must not get torque at their last positions."""
         coupling = self._plan.couplings[index]
         if self._spread(index, coupling) > coupling.tolerance > 0:
             return [
@@ -100,6 +101,7 @@ class ServosTogether:
         problems: list[str] = []
         for row in coupling.joints:
             joint, position = self._joints[row], float(self._arrays.states.position[row])
+            # Allow one tick beyond the limits for rounding.
             tick = max(self._servos[servo].position_per_tick for servo in coupling.servos)
             if not joint.bounded or joint.lower - tick <= position <= joint.upper + tick:
                 continue
@@ -112,7 +114,7 @@ class ServosTogether:
         return problems
 
     def watch(self) -> None:
-        """Report servos that begin to disagree, and that agree again."""
+        """Report servos that start to disagree, and servos that agree again."""
         for index, coupling in enumerate(self._plan.couplings):
             if not coupling.tolerance or not self._arrays.states.valid[coupling.joints[0]]:
                 continue
@@ -128,7 +130,7 @@ class ServosTogether:
                 self._events.emit(EventCode.SERVOS_DISAGREE, Severity.INFO, coupling.name, text)
 
     def partners(self) -> list[tuple[int, tuple[int, ...], tuple[int, ...]]]:
-        """Return couplings with servos without torque beside some with it: index, and rows of both."""
+        """Return couplings with both limp servos and servos with torque: index, and rows of both kinds."""
         torque = self._arrays.servo_states.torque
         found = []
         for index, coupling in enumerate(self._plan.couplings):
@@ -139,7 +141,7 @@ class ServosTogether:
         return found
 
     def report_torque_off(self, index: int, limp: Sequence[int], pulling: Sequence[int]) -> None:
-        """Report that servos lose their torque because others of their joint have none."""
+        """Report that servos lose their torque because other servos of their joint have none."""
         names = " and ".join(self._labels[row] for row in limp)
         others = " and ".join(self._labels[row] for row in pulling)
         name = self._plan.couplings[index].name
@@ -147,7 +149,7 @@ class ServosTogether:
         self._events.emit(EventCode.TORQUE_OFF, Severity.WARNING, name, text)
 
     def _spread(self, index: int, coupling: CouplingPlan) -> float:
-        """Return by how much servos disagree, rad or m: of two on one joint the difference."""
+        """Return the disagreement of servos, rad or m: the difference for two servos on one joint."""
         residual = self._arrays.residual[index, : len(coupling.servos)]
         return float(residual.max() - residual.min())
 
@@ -166,10 +168,10 @@ class ServosTogether:
 
 
 class JointHardware(HardwareLayer):
-    """Joints in front of a hardware of servos; `contract.hardware.Hardware` has the contract.
+    """Joints in front of a hardware of servos; implements `contract.hardware.Hardware`.
 
-    The servos' hardware works on `arrays.servo_states` and `arrays.servo_goals`. A request for a joint is one
-    for all its servos, and so for all joints of its transmission; it is answered when all have done it.
+    The servos' hardware uses `arrays.servo_states` and `arrays.servo_goals`. A request for a joint applies to
+    all its servos, and so to all joints of its transmission. It is answered when all servos have answered.
     """
 
     def __init__(
@@ -186,16 +188,18 @@ class JointHardware(HardwareLayer):
         self._together = together
         self._fade_share = period_ns / FADE_NS
         self._asked: dict[tuple[int, str], _Together] = {}
-        """Requests that not all servos of a coupling have answered, by its index and what is requested."""
+        """Requests that some servos of a coupling have not answered, by its index and the kind of request."""
         self._read_limits: Mapping[int, Sequence[ServoLimit]] | None = None
-        """Limits of the servos, from which those of the joints were computed"""
+        """Limits of the servos from which those of the joints were computed."""
         self._joint_limits: Mapping[int, Sequence[ServoLimit]] = {}
 
     def start(self, engaging: Callable[[], None] = lambda: None) -> None:
-        """Start the servos, and let the joints' goals be where they stand.
+        """Start the servos, and set the joints' goals to their positions.
 
-        `engaging` is called before any of them gets torque. Servos of one joint that disagree are refused
-        before: `ServosTogether.at_start`.
+        `ServosTogether.at_start` refuses disagreeing servos of a joint before that.
+
+        Args:
+            engaging: Called before any servo gets torque.
         """
         self._hardware.start(engaging)
         self._arrays.begin()
@@ -203,7 +207,7 @@ class JointHardware(HardwareLayer):
 
     @property
     def servo_limits(self) -> Mapping[int, Sequence[ServoLimit]]:
-        """The registers that limit the goals of each joint's servos, each of them while the others rest."""
+        """Registers that limit the goals of each joint's servos, while the other joints rest."""
         own = self._hardware.servo_limits
         if own is self._read_limits:
             return self._joint_limits
@@ -236,7 +240,7 @@ class JointHardware(HardwareLayer):
         return tuple(tightest.values())
 
     def read(self) -> None:
-        """Read the servos, fill the joints' states; a servo without torque takes it from its partners."""
+        """Read the servos and fill the joints' states; if a servo has no torque, its partners lose theirs."""
         self._hardware.read()
         self._arrays.read()
         self._together.watch()
@@ -252,37 +256,38 @@ class JointHardware(HardwareLayer):
         self._hardware.write()
 
     def set_modes(self, modes: NDArray[np.uint8]) -> None:
-        """Bring the servos of joints into modes."""
+        """Change the modes of the joints' servos."""
         self._hardware.set_modes(self._arrays.joint_requests(modes))
 
     def set_register(self, row: int, item: str, value: int, done: RegisterDone) -> None:
-        """Write an item of all servos of a joint; `done` has what the first of them had before.
+        """Write an item of all servos of a joint; `done` receives the previous value of the first servo.
 
-        A row behind those of the joints is that of a single servo, here and in `read_register`.
+        A row after those of the joints is that of a single servo, here and in `read_register`.
         """
         self._registers(row, lambda servo, each: self._hardware.set_register(servo, item, value, each), done)
 
     def read_register(self, row: int, item: str, done: RegisterDone) -> None:
-        """Read an item of all servos of a joint; `done` says so where they have different values."""
+        """Read an item of all servos of a joint; `done` receives a problem if their values differ."""
         self._registers(
             row, lambda servo, each: self._hardware.read_register(servo, item, each), done, alike=True
         )
 
     def switch_torque(self, row: int, on: bool, done: Done) -> None:
-        """Switch the torque of all servos of a joint off, or on where they stand, if that is in order."""
+        """Switch the torque of all servos of a joint off, or on at their positions if these agree."""
         index = self._coupling(row)
         servos = self._plan.servo_rows(row)
         if index is None:
             self._hardware.switch_torque(servos[0], on, done)
         elif on and (problem := self._together.torque_refused(index)):
-            if row == self._plan.couplings[index].joints[0]:  # a request is for all joints of a transmission
+            # one report is enough for all joints of a transmission
+            if row == self._plan.couplings[index].joints[0]:
                 self._together.report_no_torque(index, problem)
             done(problem)
         else:
             self._ask(index, "on" if on else "off", servos, done)
 
     def follow_goals(self, rows: Sequence[int]) -> None:
-        """Let the servos of joints that were given torque get goals; each begins where it is."""
+        """Start sending goals to servos of joints that were given torque, from their present positions."""
         for index in dict.fromkeys(self._coupling(row) for row in rows):
             if index is not None:
                 self._arrays.anchor(index)
@@ -298,12 +303,12 @@ class JointHardware(HardwareLayer):
             self._ask(index, "reboot", servos, done)
 
     def _coupling(self, row: int) -> int | None:
-        """Return the coupling that moves a joint; None: it has one servo."""
+        """Return the coupling that moves a joint; None: the joint has its own servo."""
         places = (index for index, one in enumerate(self._plan.couplings) if row in one.joints)
         return next(places, None)
 
     def _ask(self, index: int, what: str, servos: Sequence[int], done: Done) -> None:
-        """Request the same of servos of a coupling, once while they have not all answered."""
+        """Send a request to servos of a coupling; a repeated request waits for the same answers."""
         waiting = self._asked.get((index, what))
         if waiting is not None:  # for another joint of the same transmission
             waiting.answers.append(done)
@@ -334,7 +339,7 @@ class JointHardware(HardwareLayer):
         *,
         alike: bool = False,
     ) -> None:
-        """Request something of all servos of a joint, or of one, and answer when all have answered."""
+        """Send a request to all servos of a joint, or to one servo, and answer when all have answered."""
         joints = len(self._arrays.states.valid)
         servos = self._plan.servo_rows(row) if row < joints else (row - joints,)
         found: dict[int, tuple[str, int | None]] = {}

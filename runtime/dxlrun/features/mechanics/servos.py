@@ -1,4 +1,4 @@
-"""Servos of transmissions, as the robot file has them."""
+"""Servos of transmissions in the notation of the robot file."""
 
 from __future__ import annotations
 

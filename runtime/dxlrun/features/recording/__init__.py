@@ -1,4 +1,4 @@
-"""Recording: the section about the log: its directory, how it is split, and what is kept.
+"""Recording: the section about the log: its directory, its parts, and the logs to keep.
 
-What writes and deletes logs by its plan belongs to `log/` and `run/`.
+`log/` and `run/` write and delete logs according to its plan.
 """

@@ -1,4 +1,4 @@
-"""Recording: how the log is split, and how long it is kept."""
+"""Recording: the size of the log's parts, and the limit for old logs."""
 
 from __future__ import annotations
 
@@ -7,11 +7,11 @@ from dxlrun.features.recording import form
 from dxlrun.plan.recording_plan import RecordingPlan
 
 _LEAST_BYTES, _LEAST_NS = 1_000_000, 1_000_000_000
-"""Of a part: each has the robot file and the plan once more."""
+"""Smallest part of a log: each part contains the robot file and the plan again."""
 
 
 def compile_recording(compilation: Compilation) -> Contribution:
-    """Return what the robot file says about the log. What cannot be done becomes a problem."""
+    """Return the settings of the log; impossible settings become problems."""
     file, marks = compilation.file, compilation.file.marks
     written = form.STAGE.of(file.robot)
     amount = {} if written.split is None else dict([written.split])

@@ -8,7 +8,7 @@ from dxlrun.features.feature import Section
 
 
 class Recording(Form):
-    """The log."""
+    """Settings of the log."""
 
     directory: str = key("Where logs are written, from the working directory.", "logs", "logs", min_length=1)
     split: SizeOrDuration | None = key(

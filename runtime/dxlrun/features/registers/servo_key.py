@@ -20,7 +20,7 @@ def _register(value: object) -> object:
 
 
 Register = Annotated[int | str, BeforeValidator(_register), WithJsonSchema({"type": ["integer", "string"]})]
-"""A raw integer, or a quantity with its unit as text: its item's unit is in the control table."""
+"""Raw integer, or text with a quantity and its unit, which must be that of the item in the control table."""
 
 STAGE: ServoKey[Mapping[str, Register]] = ServoKey(
     "registers",

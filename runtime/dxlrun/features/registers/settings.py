@@ -1,4 +1,4 @@
-"""Declared registers against the control tables of their servos, the bus, and the limits of joints."""
+"""Declared registers, checked against the servos' control tables, the bus, and the limits of joints."""
 
 from __future__ import annotations
 
@@ -22,9 +22,9 @@ _UPPER = ("max_position_limit", "ccw_angle_limit")
 def compile_registers(
     file: RobotFile, servo: DescribedServo, table: ControlTable
 ) -> tuple[RegisterValue, ...]:
-    """Return what a servo's keys declare, in the order in which it is written: EEPROM first, by address.
+    """Return the declared registers of a servo in the order of writing: EEPROM first, by address.
 
-    Before all of it Status Return Level, so that the other writes are acknowledged.
+    Status Return Level comes before all others, so that their writes are acknowledged.
     """
     found: list[RegisterValue] = []
     name = servo.title
@@ -34,7 +34,7 @@ def compile_registers(
             found.append(register_value(table, register, value))
         except UnfitRegister as error:
             file.error(mark, f"{name}: {error.what}", error.fix)
-        except ValueError as error:  # a quantity that is none
+        except ValueError as error:  # an invalid quantity
             what, _, fix = str(error).partition("; ")
             file.error(mark, f"{register} of {name}: {what}", fix)
     bus = file.robot.buses.get(servo.bus)
@@ -50,9 +50,9 @@ def compile_registers(
 
 
 def check_position_limits(file: RobotFile, plan: BusPlan) -> None:
-    """Refuse position limits that are declared narrower than those of the joint: goals would be refused.
+    """Refuse declared position limits narrower than those of the joint: the servo would refuse goals.
 
-    Multi-turn modes know no limits (e-Manual XM430-W350, Min/Max Position Limit (52, 48)).
+    Multi-turn modes ignore the limits (e-Manual XM430-W350, Min/Max Position Limit (52, 48)).
     """
     for servo in plan.servos:
         if servo.continuous:
@@ -67,7 +67,7 @@ def check_position_limits(file: RobotFile, plan: BusPlan) -> None:
 
 
 def _place(description: Description, servo: ServoPlan, register: str) -> Mark:
-    """Return where a servo of the plan declares a register."""
+    """Return the place where a servo of the plan declares a register."""
     for described in described_servos(description):
         if described.name == servo.own_name:
             return described.mark(description.marks, "registers", register)

@@ -1,4 +1,4 @@
-"""Sensors: sources of states that a process of their own samples.
+"""Sensors: sources of states, each sampled by its own process.
 
-The class of a sensor is in `contract`, and what is on a servo bus in `devices`.
+The class of a sensor is in `contract`; nodes on a servo bus are in `devices`.
 """

@@ -1,4 +1,4 @@
-"""Sensors of the robot file against plug-ins, names, the URDF and the simulation."""
+"""Sensors of the robot file, checked against plug-ins, names, the URDF and the simulation."""
 
 from __future__ import annotations
 
@@ -19,12 +19,13 @@ from dxlrun.features.sensors.offer import is_units, names_breach
 from dxlrun.features.sensors.plan import SensorPlan, encode_sensors
 from dxlrun.plan.loop_plan import SourcePlan
 
-_LEAST_TIMEOUT_NS = 50_000_000  # A process without real time may wait so long for a processor
+_LEAST_TIMEOUT_NS = 50_000_000  # a process without real-time priority may wait so long for a processor
+# default timeout in periods of the sensor; a single late sample must not make it invalid
 _TIMEOUT_PERIODS = 5
 
 
 def compile_sensors(compilation: Compilation) -> Contribution:
-    """Return the sensors of the file that have no mistake in their type, parameters and names."""
+    """Return the sensors of the file without mistakes in their type, parameters and names."""
     file, body = compilation.file, compilation.body
     links = None if body is None else body.urdf.links
     described = form.STAGE.of(file.robot)
@@ -79,7 +80,7 @@ def _compiled(
         name=name,
         type=entry.type,
         distribution=offer.distribution,
-        parameters=json.dumps(entry.parameters),  # as written: `60 deg` is what the model accepts
+        parameters=json.dumps(entry.parameters),  # as written, because the model accepts `60 deg`
         states=states,
         period_ns=period_ns,
         timeout_ns=entry.timeout or max(_TIMEOUT_PERIODS * period_ns, _LEAST_TIMEOUT_NS),
@@ -96,7 +97,9 @@ def _names(
 ) -> tuple[tuple[str, ...], tuple[str, ...], tuple[str, ...], dict[str, str]]:
     """Return the states of a sensor, its links, the states with noise, and the units of states.
 
-    Raises ValidationError (parameters), and WrongEntry.
+    Raises:
+        ValidationError: The parameters are invalid.
+        WrongEntry: The plug-in's code failed or broke its contract.
     """
     sensor, code = offer.driver, PlugInCode("sensor", name, offer.distribution)
     parameters = code.parameters(entry.parameters, sensor.Parameters)
@@ -121,7 +124,7 @@ def _check_links(
     links: Collection[str],
     known: Collection[str] | None,
 ) -> None:
-    """Check that what a simulated sensor senses is there."""
+    """Check that the links sensed by a simulated sensor exist."""
     robot = file.robot
     if not links:
         return
@@ -149,7 +152,7 @@ def _check_links(
 
 
 def _text_mark(file: RobotFile, name: str, entry: SensorEntry, text: str) -> Mark:
-    """Return where a parameter of a sensor has a text; the sensor's own place if nowhere."""
+    """Return the place of a text in a sensor's parameters, else the sensor's own place."""
     for key, value in entry.parameters.items():
         if value == text:
             return file.at("sensors", name, key)

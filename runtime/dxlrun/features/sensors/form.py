@@ -13,7 +13,7 @@ from dxlrun.features.feature import Section
 
 
 class SensorEntry(PlugInEntry):
-    """One sensor; the keys beside type, rate, timeout and on_lost are its own parameters."""
+    """One sensor. Keys other than type, rate, timeout and on_lost are its own parameters."""
 
     type: str = key("Type that a plug-in offers.", "serial_imu", min_length=1)
     rate: Annotated[float, Field(ge=0.001, le=100_000), units.rate] | None = key(

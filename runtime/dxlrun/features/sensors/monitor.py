@@ -1,4 +1,4 @@
-"""Monitor of needed sensors: a run ends when a sensor with `on_lost: stop` brings nothing new."""
+"""Monitor of needed sensors: ends a run when a sensor with `on_lost: stop` delivers no new samples."""
 
 from __future__ import annotations
 
@@ -17,13 +17,13 @@ class NeededSensors:
     """Ends the run when the newest sample of a needed sensor is older than its timeout."""
 
     needed: tuple[tuple[int, SensorPlan], ...]
-    """Sensors without which the run ends, with their rows among the sources."""
+    """Sensors whose loss ends the run, with their rows among the sources."""
     record: CycleRecord
     actions: PolicyActions
 
     @classmethod
     def build(cls, plan: LoopPlan, record: CycleRecord, actions: PolicyActions) -> Self | None:
-        """Return a monitor of the sensors that the run needs; None: it needs none."""
+        """Return a monitor of the needed sensors; None: there are none."""
         needed = tuple(
             (record.layout.sources.index(one.name), one)
             for one in decode_sensors(plan.feature_plans.get("sensors", b""))
@@ -32,7 +32,7 @@ class NeededSensors:
         return cls(needed, record, actions) if needed else None
 
     def check(self, time_ns: int) -> None:
-        """Compare ages with timeouts; a sensor that brought nothing until now is as old as the run."""
+        """Compare ages with timeouts; a sensor without a sample yet is as old as the run."""
         ages_ns = self.record.sources.age_ns
         for row, sensor in self.needed:
             age_ns = ages_ns.item(row)

@@ -11,7 +11,7 @@ from dxlrun.description.form import ParametersModel
 from dxlrun.features.sensors.form import SensorEntry
 
 _METHODS = ("__init__", "states", "units", "links", "noisy", "open", "read", "close")
-"""Called by dxlrun, all by position."""
+"""Methods that dxlrun calls, always with positional arguments."""
 
 
 def sensor_breach(sensor: object) -> Breach | None:
@@ -29,7 +29,7 @@ def sensor_breach(sensor: object) -> Breach | None:
 
 
 def names_breach(states: object, links: object) -> Breach | None:
-    """Check what a sensor's `states` and `links` returned."""
+    """Check the results of a sensor's `states` and `links`."""
     for what, names in (("states", states), ("links", links)):
         if not isinstance(names, tuple) or not all(isinstance(one, str) for one in names):
             return f"returns {names!r} from {what}", "return a tuple of names, such as angular_velocity.x"
@@ -47,7 +47,7 @@ def names_breach(states: object, links: object) -> Breach | None:
 
 
 def is_units(found: object, states: Collection[str]) -> bool:
-    """Check whether something has the unit of each of some states."""
+    """Return True if the value is a mapping from states to units."""
     return (
         isinstance(found, Mapping)
         and set(found) <= set(states)

@@ -1,4 +1,4 @@
-"""Processes of the sensors: one for each, which samples it at its own rate."""
+"""Processes of the sensors: one for each sensor, which samples it at its own rate."""
 
 from __future__ import annotations
 
@@ -25,14 +25,14 @@ def list_processes(plan: bytes) -> tuple[SourceProcess, ...]:
 
 
 def build_sampled_sensor(plan: bytes, context: SourceContext) -> SampledSensor:
-    """Build the sensor of a process. Raises PlugInError."""
+    """Build the sensor of a process; raise PlugInError."""
     sensor = msgspec.json.decode(plan, type=SensorPlan)
     built = build_sensor(context.plugins, sensor)
     return SampledSensor(sensor, built, context.writer, context.now_ns, context.body)
 
 
 def refuse_virtual_time(plan: bytes) -> str:
-    """Return which sensors measure the real world, where virtual time does not pass; empty: none."""
+    """Return a sentence about sensors of the real world, which cannot follow virtual time; empty: none."""
     measuring = [sensor for sensor in decode_sensors(plan) if not sensor.simulated]
     names = ", ".join(f"{sensor.name} ({sensor.type})" for sensor in measuring)
     return names and (

@@ -1,4 +1,4 @@
-"""Reader of the sensors: copies their newest samples into the cycle's record, and never waits."""
+"""Reader of the sensors: copies their newest samples into the cycle's record without blocking."""
 
 from __future__ import annotations
 
@@ -13,29 +13,29 @@ from dxlrun.control.source_process import ReaderContext, ReaderStage
 from dxlrun.features.sensors.plan import SensorPlan, decode_sensors
 
 _GONE = (SlotState.FAILED, SlotState.ENDED)
-"""The device is not there, or the process is not."""
+"""States of a slot without a device or without a process."""
 
 
 MOST_EQUAL = 20
-"""A sensor is stuck after so many equal samples. With noise of only 0.3 units of the last digit the six
+"""A sensor is stuck after this many equal samples. With noise of only 0.3 units of the last digit the six
 values of an IMU repeat in 2 of 5 samples, so 20 times in a row once in 10^8 samples. [i]"""
 STUCK_NS = 200_000_000
-"""Least time of equal samples of a stuck sensor."""
+"""Shortest time of equal samples of a stuck sensor."""
 STUCK_INTERVALS = 4
-"""The same time in intervals between two changes, the longest until now: a driver may be called more often
-than its device measures."""
+"""The same time in units of the longest interval between two changes so far: a driver may be called more
+often than its device measures."""
 FIRST_STUCK_NS = 2_000_000_000
-"""Most time of equal samples, also before the first change; a Phidget measures each 250 ms by default."""
+"""Longest time of equal samples, also before the first change; a Phidget measures every 250 ms by default."""
 QUIET_NS = 100_000_000
-"""Between two sentences of a sensor that is there: one that says something in each cycle fills no log."""
+"""Shortest time between two messages of a working sensor, so that they do not fill the log."""
 
 
 class Readings:
     """The loop's end of all slots.
 
-    A row is valid while its sensor is there, and its newest sample is finite and younger than its timeout.
-    Values and age are those of the last finite sample for ever. The samples of a stuck sensor, whose noisy
-    values stay the same, are as old as the first of them. What changes is an event, once.
+    A row is valid if its sensor is present, and its newest sample is finite and younger than its timeout.
+    Values and age remain those of the last finite sample. The samples of a stuck sensor, whose noisy values
+    stay constant, have the age of the first of them. Each change is one event.
     """
 
     def __init__(self, context: ReaderContext) -> None:
@@ -70,7 +70,7 @@ class _Row:
         self._quantities = [self._noisy[[one == each for each in quantities]] for one in {*quantities}]
         """Indices of the noisy states of each quantity."""
         self._equal, self._since_ns = 0, -1
-        """How many samples equal the one before, and the time of the first of them."""
+        """Number of samples equal to the one before, and the time of the first of them."""
         self._stuck_ns = FIRST_STUCK_NS
         """Time of equal samples after which the sensor is stuck."""
         self._longest_ns = 0
@@ -106,13 +106,13 @@ class _Row:
         return self._equal >= MOST_EQUAL and self._t_ns == self._since_ns
 
     def _take(self, sample: Floats, t_ns: int) -> None:
-        """Take a sample and its time; that of the first one where samples stay the same for too long."""
+        """Store a sample with its time; samples that stay equal for too long get the time of the first."""
         noisy = self._noisy
         if noisy.size and np.array_equal(sample[noisy], self._values[noisy]):
             self._equal += 1
         else:
             if self._since_ns >= 0:
-                if self._equal:  # else samples were missing, which says nothing about the device's interval
+                if self._equal:  # otherwise samples were missing, so the interval of the device is unknown
                     self._longest_ns = max(self._longest_ns, t_ns - self._since_ns)
                 self._stuck_ns = min(max(STUCK_NS, STUCK_INTERVALS * self._longest_ns), FIRST_STUCK_NS)
             self._equal, self._since_ns = 0, t_ns

@@ -1,4 +1,4 @@
-"""Sampling: a sensor at work, and its samples on their way into its slot; the same on both clocks."""
+"""Sampling: an open sensor that writes its samples into its slot, on real or virtual time."""
 
 from __future__ import annotations
 
@@ -16,11 +16,11 @@ from dxlrun.features.sensors.plan import SensorPlan
 from dxlsim.motion.link_motion import Body
 
 REOPEN_NS = 1_000_000_000
-"""A sensor that failed is opened again after this time."""
+"""Pause before a failed sensor is opened again."""
 
 
 class SampledSensor:
-    """One sensor and the writer of its slot; the sensor's errors leave it from `open_first` alone."""
+    """One sensor and the writer of its slot. Only `open_first` lets the sensor's exceptions propagate."""
 
     def __init__(
         self,
@@ -38,7 +38,7 @@ class SampledSensor:
         self._context = SensorContext(plan.name, plan.period_ns, now_ns, self._say, body)
         self._open = self._ahead = False
         self.reopen_ns = 0
-        """When it is opened again; of use only while it is not `open`."""
+        """Time at which it is opened again; meaningful only while it is not `open`."""
 
     @property
     def waits(self) -> bool:
@@ -51,7 +51,7 @@ class SampledSensor:
         return self._open
 
     def open_first(self) -> None:
-        """Open the device at the start of a run; raises whatever the sensor raises."""
+        """Open the device at the start of a run; raise whatever the sensor raises."""
         try:
             self.driver.open(self._context)
         except BaseException:
@@ -61,7 +61,7 @@ class SampledSensor:
         self._writer.say(SlotState.OPEN, "")
 
     def sample(self) -> bool:
-        """Take one sample, or open the device again when that is due; return whether there was a sample."""
+        """Take one sample, or reopen the device if that is due; return True if there was a sample."""
         if not self._open and not self._reopen():
             return False
         self._values.fill(np.nan)
@@ -75,13 +75,13 @@ class SampledSensor:
                 self._ahead = True
                 self._say(f"its times are {ahead_ns / 1e6:.0f} ms in the future: times of arrival are used")
             self._writer.write(min(int(t_ns), now_ns), self._values)
-        except Exception as error:  # a driver's fault is an event, whatever it is
+        except Exception as error:  # every error of a driver becomes an event
             self.fail(error)
             return False
         return True
 
     def close(self) -> None:
-        """Close the device, whatever it raises."""
+        """Close the device and report any exception."""
         self._open = False
         try:
             self.driver.close()
@@ -101,7 +101,7 @@ class SampledSensor:
         return True
 
     def fail(self, error: Exception) -> None:
-        """Close the device for what was raised, and open it again after a while."""
+        """Close the device after an exception, and schedule its reopening."""
         self.close()
         self.reopen_ns = self._now_ns() + REOPEN_NS
         self._writer.say(SlotState.FAILED, describe_error(error))
@@ -113,7 +113,8 @@ class SampledSensor:
 def build_sensor(plugins: PlugIns, plan: SensorPlan) -> Sensor[Any]:
     """Return a new sensor of the plan's type.
 
-    Raises PlugInError: the type is not available, or its class does not take the parameters.
+    Raises:
+        PlugInError: The type is not available, or its class refuses the parameters.
     """
     offer = plugins.drivers_of("sensors").get(plan.type)
     if offer is None:

@@ -1,4 +1,4 @@
-"""Table of the sensors, as `dxlrun check` shows it."""
+"""Table of the sensors for `dxlrun check`."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Stale commands: what a run does when a client's stream of commands stops.
+"""Stale commands: reaction of a run to a client whose stream of commands stops.
 
-`control/steering.py` finds that, because a command may come in the cycle in which its lease runs out.
+`control/steering.py` detects that, because a command may come in the cycle in which its lease expires.
 """
