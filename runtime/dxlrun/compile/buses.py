@@ -263,6 +263,7 @@ def _watchdog_ticks(file: RobotFile, plan: BusPlan) -> int:
     least_ns = math.ceil(LEAST_PERIODS * 1e9 / file.robot.loop.rate)
     if written == "auto":
         default_ns = max(WATCHDOG_NS, least_ns)
+        # Round up to whole steps of the register.
         return -(-default_ns // UNIT_NS) if plan.protocol == 2.0 and default_ns <= MOST_TICKS * UNIT_NS else 0
     if not written:
         return 0
@@ -281,6 +282,7 @@ def _watchdog_ticks(file: RobotFile, plan: BusPlan) -> int:
         what = f"a Bus Watchdog has {MOST_TICKS} steps of {UNIT_NS * 1e-6:g} ms"
         file.error(mark, what, f"write {MOST_TICKS * UNIT_NS * 1e-9:g} s at most, or 0 ms for none")
         return 0
+    # Round up: the watchdog must not trip earlier than the file says.
     return -(-written // UNIT_NS)
 
 

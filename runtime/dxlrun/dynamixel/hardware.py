@@ -239,6 +239,7 @@ class DynamixelHardware:
             if bus.failure is None:
                 known = program is not None and program is kernel.programs[index]
                 ready &= known or (program is not None and kernel.plan(index, program))
+                # Leave the beginning of an unfinished packet to the parser.
                 ready &= not bus.receiver.pending
         return ready
 
@@ -399,6 +400,7 @@ class DynamixelHardware:
         outcomes = self._limp()
         self._make_rest_safe()
         failures = tuple(f"{one}" for one in outcomes if not one.confirmed)
+        # A servo that did not confirm torque off keeps its watchdog: without instructions it stops.
         self._disarm({(one.bus, one.servo_id) for one in outcomes if one.confirmed})
         for sentence in failures:
             self._events.emit(EventCode.SHUTDOWN_FAILED, Severity.ERROR, "hardware", sentence)

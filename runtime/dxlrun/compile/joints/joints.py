@@ -40,7 +40,7 @@ _SAME = math.radians(1.0)  # references closer than this are equal: a horn has t
 
 
 _BY_ERROR = (("position",), ("position", "velocity"))
-"""Claims of controllers that send only positions, so the servo's position error alone holds a load."""
+"""Claims of controllers that send no effort, so only the position error of a servo holds a load."""
 _I_GAIN = "position_i_gain"
 
 

@@ -316,6 +316,7 @@ def inspect_states(servos: Sequence[tuple[Access, Mode]], found: Findings) -> Pr
         found: Collects the problems.
     """
     before: dict[int, tuple[int, int]] = {}
+    # Two rounds over all servos, so that time passes between the two readings of each servo.
     for again in (False, True):
         for one, mode in servos:
             servo = one.servo
@@ -425,6 +426,7 @@ def _jump(servo: ServoPlan, before: tuple[int, int], after: tuple[int, int]) -> 
     """Return the problem between two positions, each (ticks, time in ns), or an empty string."""
     moved = abs(after[0] - before[0]) * servo.rad_per_tick
     fastest = servo.max_speed_tick * servo.rad_s_per_tick * (after[1] - before[1]) * 1e-9
+    # Allow a rounding error of one tick in each reading.
     if moved <= fastest + 2 * servo.rad_per_tick:
         return ""
     return (

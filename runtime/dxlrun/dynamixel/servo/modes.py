@@ -203,6 +203,7 @@ def hold(one: Access, wanted: Mode, *, inward: bool = False) -> Program[Held]:
     if mode.speed is not None and any(layout.position and layout.speed for layout in mode.goals):
         speed_limits = yield from read_limits(one, ("speed",))
         slow = round(ENGAGE_SPEED / mode.speed.per_tick)
+        # At least 1: Profile Velocity (112) and Moving Speed (32) take 0 for the highest speed.
         slow = max(1, min(slow, mode.speed.most, *speed_limits.values()))
     if position is not None and len(mode.goals) > 1:
         most_effort, problem = yield from _most_effort(one, mode)

@@ -46,6 +46,7 @@ class TickReading(NamedTuple):
             return None
         elapsed_ms = (self.middle_ns - before.middle_ns) * 1e-6
         half = TICK_MODULUS_MS / 2
+        # The difference between counter and elapsed time, wrapped to half a turn in each direction.
         off = (self.tick - before.tick - elapsed_ms + half) % TICK_MODULUS_MS - half
         return abs(off) > DRIFT * elapsed_ms + SLACK_MS + self.half_ms + before.half_ms
 

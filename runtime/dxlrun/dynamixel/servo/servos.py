@@ -227,6 +227,7 @@ class Servos:
             if missed[index] == 1:
                 how = "sent a garbled reply" if self.reads.garbled[index] else "did not answer"
                 life.report(EventCode.READ_LOST, Severity.WARNING, index, how)
+            # Require an age, too: at a high rate a few cycles are too short to call a servo lost.
             elif missed[index] >= LOST_CYCLES and now_ns - self._samples.at_ns[index] >= LOST_AGE_NS:
                 text = f"missed {missed[index]} replies in a row; it is probed once a second until"
                 life.report(EventCode.SERVO_LOST, Severity.ERROR, index, f"{text} it is in order")

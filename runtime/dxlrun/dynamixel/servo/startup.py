@@ -186,6 +186,7 @@ class StartUp:
         """Yield a sentence for each bus whose replies usually come after the timeout of the cyclic reads."""
         for plan, times in zip(self._plans, self._times, strict=True):
             late_ns = times.late_ns
+            # Use the median: a few late replies may be due to the machine's load.
             usual_ns = median(late_ns) if len(late_ns) >= _SOME else 0.0
             if usual_ns > plan.latency_ns + TIMEOUT_MARGIN_NS:
                 observed = describe_late_start(plan.name, plan.port, late_ns, plan.latency_ns)

@@ -75,6 +75,7 @@ def reduced_torque_limits(
         modes: Present modes of the servos; UNKNOWN (the mode is changing) omits a servo.
     """
     writes = [
+        # At least one tick: 0 would look like a shutdown.
         (servo.servo_id, place.address, max(1, round(own * fraction)).to_bytes(place.size, "little"))
         for servo, own, mode in zip(plan.servos, full, modes, strict=True)
         if (place := servo.torque_limit) is not None and own and _limits(servo, mode)

@@ -57,6 +57,7 @@ def disarm(one: Access) -> Program[str]:
     if not (reply.answered and tripped(item, reply.word(item.size))):
         return (yield from _write(one, 0))
     speed, mode = one.items["profile_velocity"], one.items["operating_mode"]
+    # At least 1: Profile Velocity 0 means no limit (e-Manual XM430-W350, Profile Velocity (112)).
     slow = max(1, round(RETURN_SPEED / speed.scale))
     yield from one.write_bytes(speed.address, slow.to_bytes(speed.size, "little"))
     found = yield from one.read([mode.name])

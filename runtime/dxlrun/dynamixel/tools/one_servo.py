@@ -312,6 +312,7 @@ class OneServo(OneNode):
         if "realtime_tick" in self.table.items:
             tick = self.read(["realtime_tick"])["realtime_tick"]
             passed_ms = (self.tool.port.clock.now_ns() - before_ns) // 1_000_000
+            # After a turn of the counter the tick does not show a reboot.
             if tick > passed_ms + _TICK_SPARE_MS and passed_ms < _TICK_MODULUS:
                 raise self.fail(
                     f"did not start anew: its Realtime Tick is {tick} ms, {passed_ms} ms after the reboot"

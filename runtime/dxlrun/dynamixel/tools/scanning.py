@@ -155,6 +155,7 @@ def _search(tool: ToolLine, ids: Sequence[int], beat: Callable[[float], None]) -
     line, heard = tool.line, tool.heard
     yield listen(LATE_NS)  # replies that are still to come at the previous rate
     heard.clear()
+    # Only Protocol 2.0, whose ping replies contain the model number, has a broadcast ping with slots.
     if line.dialect.PING_LENGTH >= _IDENTITY_LENGTH and len(ids) > FEW:
         slot_ns = line.wire_ns(line.dialect.OVERHEAD + line.dialect.PING_LENGTH) + SLOT_NS
         ping = line.unanswered(line.dialect.ping(BROADCAST_ID))
