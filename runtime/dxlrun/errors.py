@@ -54,9 +54,10 @@ __all__ = [
 
 
 def told_once(problems: Iterable[Problem], names: Collection[str]) -> list[Problem]:
-    """Return the problems; of those that differ by one of the `names` alone, at one place, the first.
+    """Return the problems without repetitions: of problems at one place that differ only in one of the
+    `names`, the first.
 
-    A default of many joints is one mistake, not one of each joint.
+    A mistake in the defaults of many joints is one mistake.
     """
     found: dict[tuple[Mark, str, str], list[Problem]] = {}
     for problem in problems:
@@ -78,7 +79,8 @@ class PlugInError(InputError, ImportError):
 class Refused(DxlrunError):
     """A running robot refused a request; the message gives the reason and a request that would work.
 
-    `code` names the reason and `fields` are its data, for programs: their names stay, the wording may change.
+    `code` names the reason and `fields` are its data, for programs. Their names are stable; the wording may
+    change.
     """
 
     def __init__(
@@ -96,13 +98,13 @@ class Refused(DxlrunError):
 
 
 class GoalTimeout(DxlrunError, TimeoutError):
-    """A goal has not ended in the time that was given; it goes on."""
+    """A goal did not end within its timeout; it continues."""
 
 
 class StartUpError(DxlrunError, RuntimeError):
     """A servo differs from the robot file; torque stayed off, or was switched off again.
 
-    `for_replies`: replies came late or not at all, which a machine that was too busy may have caused.
+    `for_replies` is True if replies were late or missing, which a machine that was too busy may have caused.
     """
 
     def __init__(self, sentences: str, *, for_replies: bool = False) -> None:
@@ -133,9 +135,14 @@ class LogError(DxlrunError, ValueError):
 
 
 def missing_extra(what: str, extra: str, *libraries: str) -> str:
-    """Return what needs libraries that are not installed, and the line that installs the extra with them.
+    """Return a sentence about libraries that are not installed, with the command that installs them.
 
-    Empty: they are all there.
+    Returns an empty text if all of them are installed.
+
+    Args:
+        what: Feature that needs the libraries.
+        extra: Extra of dxlrun with the libraries.
+        libraries: Names of the modules.
     """
     missing = [name for name in libraries if find_spec(name) is None]
     if not missing:

@@ -1,6 +1,6 @@
-"""Files: forms of YAML files of a package's own and of its section of the robot file.
+"""Files: forms of a package's own YAML files and of its section of the robot file.
 
-A model says which keys there are. Everything that is wrong with a file is reported at once, with its place.
+A model defines the keys. All mistakes in a file are reported at once, each with its place.
 
     from pathlib import Path
 

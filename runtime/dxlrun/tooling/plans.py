@@ -1,6 +1,6 @@
-"""Plans: the compiled robot, as a run executes it and as each log has it.
+"""Plans: the compiled robot, as executed by a run and stored in each log.
 
-Plans are frozen structs in SI units. What a bus sends is in `dxlwire.BusPlan`.
+Plans are frozen structs in SI units. `dxlwire.BusPlan` describes the packets of a bus.
 
     from dxlrun import open_log
     from dxlrun.tooling.plans import Plan, from_json

@@ -1,6 +1,6 @@
-"""Real time: what the operating system grants a process, and deadlines as the loop of a run waits for them.
+"""Real time: settings that the operating system grants a process, and deadlines like those of a run's loop.
 
-How late this machine wakes a process, which `apply` would prepare as the process of a loop:
+This example prints how late the machine wakes a process. `apply` would first give it the settings of a loop:
 
     from dxlrun.tooling.realtime import Deadlines
 

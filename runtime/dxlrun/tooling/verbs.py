@@ -1,7 +1,7 @@
-"""Verbs: the options that the commands of dxlrun share, and what a command refuses.
+"""Verbs: options that the commands of dxlrun share, and their errors.
 
-A verb is a function that a plug-in registers by the hook `dxlrun_commands`. It returns the exit code: 0 good,
-1 the robot or the run failed, 2 wrong input. `InputError` is printed and becomes 2.
+A verb is a function that a plug-in registers with the hook `dxlrun_commands`. It returns the exit code: 0
+success, 1 the robot or the run failed, 2 wrong input. `InputError` is printed and becomes 2.
 
     from dxlrun.tooling.verbs import Assignment, RobotPath, compiled
 
