@@ -14,7 +14,7 @@ Exception
     ├── ProcessFault               a process of the run ended or hung
     ├── RunGone                    the run ended while a client steered it
     ├── Refused                    a running robot refused a request; exit code 2: the request was wrong
-    ├── GoalTimeout (TimeoutError) a goal has not ended in the time that was given
+    ├── GoalTimeout (TimeoutError) a goal did not end within its timeout
     └── LogError (ValueError)      a log cannot be read; exit code 2
 ```
 """

@@ -174,7 +174,6 @@ def _check_graph(
     compiled: Collection[str],
     contributions: Collection[Contribution],
 ) -> None:
-    """Check the controllers against each other."""
     sources = [source for each in contributions for source in each.sources]
     known = {*compiled, *(source.name for source in sources)}
     named = {*(plan.name for plan in plans), *(name for each in contributions for name in each.names)}

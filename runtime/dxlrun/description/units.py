@@ -129,7 +129,7 @@ class Either(Quantity):
 
     def __call__(self, text: object) -> Measure:
         """Return the value in SI, with its unit."""
-        if isinstance(text, Measure):  # as it was read before
+        if isinstance(text, Measure):  # was read before
             return text
         number, unit = split(text, self.what, self.units, self.examples)
         value = float(number) * self.units[unit]
@@ -480,7 +480,7 @@ def size(text: str) -> int:
 
 
 def _part(value: object) -> object:
-    if isinstance(value, tuple):  # as it was read before
+    if isinstance(value, tuple):  # was read before
         return value
     units = {**_SIZE_BYTES, **DURATION_NS}
     number, unit = split(value, "a size or a duration", units, "100 MB or 10 min")

@@ -1,11 +1,11 @@
-"""Features: the names for a section or a key that a package adds to the robot file.
+"""Features: public names for a section or a key that a package adds to the robot file.
 
 A feature is a package with files of fixed names. Each has an object `STAGE` of a class of this page:
 `Section` in `form.py`, `JointKey` in `joint_key.py`, `ServoKey` in `servo_key.py`, `PolicyKey` in
 `policy_key.py`, `CompileStage` in `compile.py`, `SettingsStage` in `settings.py`, `LayerStage` in `layer.py`,
 `BusStage` in `runtime.py`, `MonitorStage` in `monitor.py`, `SafeStage` in `safe.py`, `ProcessStage` in
 `process.py`, `ReaderStage` in `reader.py`, `TableStage` in `table.py`. One of the first four is required.
-Forms are made of the names of `dxlrun.tooling.files`. The hook `dxlrun_features` registers the feature:
+Forms use the names of `dxlrun.tooling.files`. The hook `dxlrun_features` registers the feature:
 
     from dxlrun import hookimpl
     from dxlrun.tooling.features import Feature

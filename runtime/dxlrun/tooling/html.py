@@ -1,4 +1,4 @@
-"""HTML: the parts of a report, as one file that loads nothing from elsewhere.
+"""HTML: the elements of a report in one self-contained file.
 
 Each function returns an element of `xml.etree`; `document` joins them.
 

@@ -1,4 +1,4 @@
-"""Live: robots that run, here or over the network.
+"""Live: running robots, local or over the network.
 
 `dxlrun.connect` steers one robot. These names are for programs that serve others, or watch several robots.
 

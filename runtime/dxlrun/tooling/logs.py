@@ -1,4 +1,4 @@
-"""Logs: finding, reading and following the files that runs leave.
+"""Logs: finding, reading and following the log files of runs.
 
 `dxlrun.open_log` returns a `dxlrun.LogReader`, which reads a log slice by slice; `read_log` reads a whole log
 at once. A damaged log is read as far as possible, and its damage is described.

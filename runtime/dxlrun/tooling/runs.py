@@ -1,4 +1,4 @@
-"""Runs: running a robot, in processes of its own, on virtual time, or its controllers on a recorded run.
+"""Runs: a robot in its own processes or on virtual time, or its controllers on a recorded run.
 
 `dxlrun.testing.simulated_robot` makes a virtual run of a robot file in one call.
 

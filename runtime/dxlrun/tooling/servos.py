@@ -1,6 +1,6 @@
 """Servos: single servos on a line that no run uses: scanning, registers, ID and rate.
 
-A line is opened for this process alone. Everything that is written is read back.
+A line is opened exclusively. Every write is read back.
 
     from dxlrun.tooling.servos import OneServo, ToolLine, TunablePort, scan
 

@@ -1,6 +1,6 @@
 """Topics: the names of a log's topics, and the messages in them as bytes.
 
-Own messages are dataclasses or msgspec structs; `dxlrun.messages` has those of ROS 2.
+Custom messages are dataclasses or msgspec structs; `dxlrun.messages` has those of ROS 2.
 
     from dxlrun.messages import Header
     from dxlrun.tooling.topics import Codec, declared_message

@@ -105,7 +105,6 @@ def first_joints(description: Description) -> dict[str, str]:
 
 
 def _of_joint(name: str, joint: ServoJoint) -> Iterator[DescribedServo]:
-    """Yield the servos of a joint."""
     place: KeyPath = ("joints", name)
     servos = joint.servos if isinstance(joint, SharedJoint) else ()
     for index in range(max(len(servos), 1)):

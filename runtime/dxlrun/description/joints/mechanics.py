@@ -76,7 +76,6 @@ class GoalTolerance(Form):
     @model_validator(mode="before")
     @classmethod
     def _from_one_value(cls, data: object) -> object:
-        """Accept a single value."""
         return {cls.alone: data} if isinstance(data, str | int | float) else data
 
     @classmethod

@@ -37,7 +37,7 @@ from dxlwire.transaction import Outcome, Program, Reply
 from dxlwire.wire.protocol1 import describe_error
 
 RETURN_ALL = 2  # Status Return Level: the servo answers every instruction
-PINGS = 3  # Two servos of one ID collide in most of three answers
+PINGS = 3  # two servos with one ID collide in most of three answers
 LISTEN_NS = 2_000_000
 """Listening time after a ping. A second servo with the same ID may answer with another return delay, at most
 0.508 ms."""

@@ -327,7 +327,7 @@ class Life:
         return self.idle.now_ns()
 
     def reach(self, index: int) -> Access:
-        """Return the access to a servo."""
+        """Return access to a servo."""
         return reach(self.plan, self.plan.servos[index])
 
     def name(self, index: int) -> str:

@@ -56,10 +56,10 @@ class RebootCount:
 
     def __init__(self) -> None:
         self._times: deque[int] = deque(maxlen=TOO_MANY_REBOOTS)
-        self.exhausted = False  # It rebooted TOO_MANY_REBOOTS times within a minute, ever
+        self.exhausted = False  # it has rebooted TOO_MANY_REBOOTS times within a minute
 
     def add(self, now_ns: int) -> bool:
-        """Count a reboot; return whether it is the one too many."""
+        """Count a reboot; return True once, when the limit is reached."""
         times = self._times
         times.append(now_ns)
         if self.exhausted or len(times) < TOO_MANY_REBOOTS or now_ns - times[0] > WITHIN_NS:

@@ -186,7 +186,7 @@ class OneServo(OneNode):
             self.write([self.register(name, value) for name, value in before.items()])
         return f"blinked {times} times"
 
-    # Inside
+    # Mode and plan
 
     def _mode(self) -> Mode:
         """Return the present mode and plan for it; raise ServoFault if the mode is not known."""

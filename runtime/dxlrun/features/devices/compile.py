@@ -101,7 +101,6 @@ STAGE = CompileStage(compile_devices)
 
 
 def _check_place(file: RobotFile, name: str, device: Device) -> None:
-    """Check bus and ID."""
     robot, marks = file.robot, file.marks
     check_bus(file, device, name, partial(marks.value, "devices", name), "ID")
     others = {(servo.bus, servo.id): servo.title for servo in described_servos(file.description)}

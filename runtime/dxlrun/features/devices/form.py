@@ -67,7 +67,6 @@ Items = Annotated[
 
 
 def _numbers(value: object) -> dict[str, float]:
-    """Return numbers by the names of states."""
     if not isinstance(value, dict):
         raise refuse("this gives no values of states", "write STATE: NUMBER for each, in SI units")
     for name, number in value.items():
