@@ -12,8 +12,8 @@ Numbers = NDArray[np.int64]
 
 _GROUP = 40  # Low bits of a key hold the value, shifted to be non-negative; the bits above hold its group
 _ZERO = 1 << (_GROUP - 1)
-_MOST_PENDING = 1 << 18
-_FEWEST = 10
+_MOST_PENDING = 1 << 18  # Values that are merged at once
+_FEWEST = 10  # Fewer occurrences can be a coincidence
 _TIMES_MORE = 10
 
 
@@ -78,7 +78,7 @@ def quantile(values: Numbers, counts: Numbers, share: float) -> float:
     seen = np.cumsum(counts)
     if not len(seen):
         return 0.0
-    # The factor keeps a product such as 0.99 * 100 from rounding up to the next rank.
+    # The factor keeps a product such as 0.07 * 100 from rounding up to the next rank.
     return float(values[np.searchsorted(seen, share * seen[-1] * (1 - 1e-12))])
 
 

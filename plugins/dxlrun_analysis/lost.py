@@ -43,8 +43,8 @@ _REFUSED = (
     "`dxlrun servo PORT ID get` prints what it has; it takes part again when that is as in the robot file."
 )
 _CABLES = re.compile(r"\?.*")
-_FEWEST_OF_BUS = 2
-_AT_ONCE_NS = 500_000_000
+_FEWEST_OF_BUS = 2  # A single servo does not show a common cause
+_AT_ONCE_NS = 500_000_000  # Failures within half a second are simultaneous
 
 
 def lost_servos(totals: RunTotals) -> Iterable[Finding]:

@@ -19,7 +19,7 @@ from dxlrun_analysis.tally import RunTotals
 
 _MOST_NAMED = 3
 _AT_ONCE_NS = 500_000_000  # Events of several joints within 0.5 s are reported with one time
-_NOTICED_RAD = math.radians(0.05)
+_NOTICED_RAD = math.radians(0.05)  # Smaller errors are not worth mentioning
 _FAILED = {
     EventCode.SERVO_LIMP: "went limp",
     EventCode.SERVO_LOST: "was lost",
@@ -43,7 +43,7 @@ _REASONS = {
 their own."""
 _RELEASED = "torque off: "
 _FACTS = (Rank.NEVER_RAN, Rank.LINE, Rank.SERVO, Rank.SHARE, Rank.ERROR, Rank.LOG)
-_LONGEST = 100
+_LONGEST = 100  # Characters of a reason
 
 
 def robot_line(totals: RunTotals, word: str, found: Sequence[Finding]) -> Finding:

@@ -23,7 +23,7 @@ from dxlrun_fleet.fleet_file import Agent
 
 START = "/robots/"
 """Path prefix before a robot's name. POST starts the robot; GET returns 200 if it runs."""
-_MOST_TOLD, _LINES_TOLD = 4096, 6
+_MOST_TOLD, _LINES_TOLD = 4096, 6  # Bytes and lines of a run's output in an answer
 _MAIN = "from dxlrun.cli import main; raise SystemExit(main())"
 
 
@@ -50,6 +50,7 @@ class Starter:
         path_out = self._directory / f"{name.replace('/', '_')}.out"
         with os.fdopen(os.open(path_out, os.O_RDWR | os.O_CREAT, 0o600), "r+b") as output:
             try:
+                # The run inherits this file as its output, and with it the lock, which outlives the agent.
                 fcntl.flock(output, fcntl.LOCK_EX | fcntl.LOCK_NB)
             except BlockingIOError:
                 return (409, "it runs already") if method == "POST" else (200, "it runs")
@@ -61,11 +62,13 @@ class Starter:
             output.truncate(0)
             self._runs.append(
                 subprocess.Popen(
+                    # -P keeps modules in the fleet's directory from shadowing installed ones.
                     [sys.executable, "-P", "-c", _MAIN, *self._agent.starts[name]],
                     stdin=subprocess.DEVNULL,
                     stdout=output,
                     stderr=output,
                     cwd=self._directory,
+                    # Ctrl-C at the agent's terminal must not stop the robot.
                     start_new_session=True,
                 )
             )

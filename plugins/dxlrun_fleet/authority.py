@@ -28,7 +28,7 @@ from dxlrun import InputError
 from dxlrun.tooling.live import CLIENT, Role, keys_place, revoked
 from dxlrun.tooling.output import unwritable
 
-_AUTHORITY_DAYS = 3650
+_AUTHORITY_DAYS = 3650  # A new authority requires new certificates for all robots
 _EARLIER = timedelta(minutes=5)
 """Certificates are valid from this long before their creation, because clocks of computers differ."""
 

@@ -13,7 +13,7 @@ from dxlrun import DxlrunError, Refused, RemoteRobot
 from dxlrun.tooling.live import Address, Events, NetworkLink, RobotInfo
 from dxlrun.tooling.output import Cell, Column, Columns, Table
 
-LOOK_S = 0.5
+LOOK_S = 0.5  # Polling interval
 SILENT_S = 1.5
 """A robot that has not replied for this time is unreachable."""
 _ERROR = 40

@@ -21,7 +21,7 @@ if TYPE_CHECKING:
     from dxlrun.tooling.live import Listener
     from dxlrun_foxglove.server import FoxgloveServer
 
-PORT = 8765
+PORT = 8765  # Default port of Foxglove's WebSocket connections
 NICENESS = 10
 """As the gateway: viewers use processor time that the robot leaves."""
 APP = "https://app.foxglove.dev"

@@ -33,12 +33,12 @@ from dxlrun_foxglove.viewed_run import ENCODING, HALT, ViewedRun, advertised, ad
 from dxlrun_foxglove.viewer import MOST_REQUESTS, Channel, Viewer
 
 MOST_VIEWERS = 8
-OPENING_S = 5.0
+OPENING_S = 5.0  # Time for TLS and WebSocket handshakes
 PING_S = 10.0
 """Interval between pings; a viewer that does not answer for twice as long is disconnected."""
 MOST_BYTES = 1 << 16
 """Largest frame from a viewer."""
-GOING_AWAY, TRY_AGAIN = 1001, 1013
+GOING_AWAY, TRY_AGAIN = 1001, 1013  # Close codes of RFC 6455 and its IANA registry
 ONLY_SHOWN = "this only shows the robot: start `dxlrun foxglove --control` to change it"
 _SILENT = logging.Logger("dxlrun foxglove", logging.CRITICAL)
 
@@ -91,6 +91,7 @@ class FoxgloveServer:
     def _let_in(self, connection: ServerConnection, request: Request) -> Response | None:
         """Return the refusal of a request without the token, or None. The origin is checked separately."""
         given = parse_qs(urlsplit(request.path).query).get("token", [""])[0]
+        # A constant-time comparison does not reveal a partly correct token.
         if not secrets.compare_digest(given.encode(), self.token.encode()):
             why = "open the address that `dxlrun foxglove` printed: it has the token\n"
             return connection.respond(HTTPStatus.UNAUTHORIZED, why)

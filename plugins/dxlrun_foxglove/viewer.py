@@ -53,6 +53,7 @@ class Viewer:
     def reply(self, frame: str | bytes) -> None:
         """Queue a frame. These frames are all delivered, in the order in which they were queued."""
         if len(self._replies) == MOST_REPLIES:
+            # A regular close would wait for a viewer that does not receive.
             self.connection.transport.abort()
             return
         self._replies.append(frame)

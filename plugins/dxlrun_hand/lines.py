@@ -13,7 +13,7 @@ from dxlrun.tooling.servos import ToolLine, TunablePort
 from dxlrun_hand.dialogue import Dialogue
 from dxlwire import lasting_name
 
-TRIES = 3
+TRIES = 3  # Attempts of the user to plug in one adapter
 Opened = Callable[[str], TunablePort]
 """Function that opens a port by its path."""
 Devices = Callable[[], Iterable[str]]

@@ -103,6 +103,7 @@ class RobotText:
         for place, path in changed.items():
             if place.read_bytes() != self._before[path]:
                 raise InputError(f"{path} was changed meanwhile, so nothing was written; begin again")
+        # Complete all new files before the first old one is replaced.
         besides = {place: place.with_name(f".{place.name}.{os.getpid()}") for place in changed}
         try:
             for place, beside in besides.items():

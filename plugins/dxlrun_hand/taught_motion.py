@@ -22,8 +22,8 @@ REST_S = 0.2
 WINDOW_S = 0.2
 """Averaging window of positions: a hand trembles at 8 to 12 Hz (R. J. Elble, "Physiologic and essential
 tremor", Neurology 36, 1986)."""
-LEAST_WAY_S = 0.5
-_STEP_S = 0.01
+LEAST_WAY_S = 0.5  # Shortest transition between two parts
+_STEP_S = 0.01  # Sampling interval of a smoothed motion
 _SPARE = 0.9
 """Share of a joint's top speed that a motion uses."""
 

@@ -104,6 +104,7 @@ class Account:
             if one.bus != slowest:
                 continue
             took = max(0, min(one.end(read), read) - one.asked)
+            # A second request to a servo within one read is a retry.
             again = len(one.servo_ids) == 1 and one.servo_ids[0] in asked
             asked.update(one.servo_ids)
             sums[1] += took

@@ -14,8 +14,8 @@ from dxlrun_analysis.causes.causes import Causes
 from dxlrun_analysis.cycles.worst import Cause, CauseKind
 from dxlrun_analysis.finding import Finding, Rank
 
-_LEAST_CYCLES = 3
-_MOST_OF_IT = 0.5
+_LEAST_CYCLES = 3  # One stall of a machine is not evidence
+_MOST_OF_IT = 0.5  # Share of the excess of all long cycles
 _OWN: dict[CauseKind, str] = {
     "controller": "Controller {} made cycles too long: its update took {}.",
     "own work": "The loop's own work, or what interrupted it, took {1}.",

@@ -23,7 +23,7 @@ from dxlrun.tooling.records import Event, EventCode, GoalHistory, GoalReport, Go
 from dxlrun_analysis.cycles.latency import begins, first_deadline_ns
 from dxlrun_analysis.plan import LoggedPlan, plan_of
 
-_FALLEN_RAD = math.radians(60.0)
+_FALLEN_RAD = math.radians(60.0)  # Tilt of gravity from which the robot is down
 _SOME = 50  # Cycles at the start and at the end whose median gravity is compared
 _MOST_KEPT = 100  # Takeovers that are kept
 _GOALS = (EventCode.GOAL_ACCEPTED, EventCode.GOAL_ENDED)
@@ -93,8 +93,7 @@ class ConductHistory:
         self._last = np.concatenate([self._last, gravity[-_SOME:]])[-_SOME:]
 
     def _activated(self, event: Event, plan: LoggedPlan) -> None:
-        """Record a takeover by the fallback of the failed controller, or by that of a later one in the
-        chain."""
+        """Record a takeover by the fallback of the failed controller, or by that of one above it."""
         fallbacks = {one.fallback for one in plan.loop.controllers}
         for failed in self._pending:
             own = plan.controller(failed.source).fallback
@@ -113,6 +112,7 @@ class ConductHistory:
         turned, lies = None, any(one.fell for one in self._takeovers)
         if len(self._first) and len(self._last):
             begin, end = (_unit(np.median(rows, axis=0)) for rows in (self._first, self._last))
+            # Clamp because rounding can exceed the domain of acos.
             turned = math.acos(max(-1.0, min(1.0, float(begin @ end))))
             upright = math.cos(_FALLEN_RAD)
             got_up = abs(begin[2]) < upright <= end[2]

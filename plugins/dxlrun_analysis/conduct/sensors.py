@@ -28,7 +28,7 @@ _TIMES_LONGER = 10
 """Required ratio to the longest standstill before. A switch rarely changes, and neither does a simulated
 sensor without noise at rest."""
 _MOVED_RAD = 0.1  # At rest, a simulated sensor can measure a constant value
-_RESTED_RAD = 0.02
+_RESTED_RAD = 0.02  # Joints that move less are at rest
 _CHANGES = 40
 """Number of the last changes that show whether a value trembles."""
 _REVERSALS = 16

@@ -14,7 +14,7 @@ from dxlrun.tooling.records import ClientCommand, Event, EventCode, TakenCommand
 from dxlrun_analysis.conduct.client_commands import client_commands, policy_begun
 from dxlrun_analysis.cycles.latency import DISORDER_NS, begins, first_deadline_ns
 
-_LONGEST = 80
+_LONGEST = 80  # Characters of unreadable data that are shown
 _ANSWERS = frozenset((EventCode.STEERED, EventCode.COMMAND_REFUSED))
 _HELD = "its joints are held"
 _CYCLE = np.dtype([(name, "i8") for name in ("cycle", "scheduled_ns", "woken_ns", "updated_ns")])

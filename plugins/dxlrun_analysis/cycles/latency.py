@@ -22,7 +22,7 @@ DISORDER_NS = RING_SECONDS * 1_000_000_000
 holds at most this time."""
 _MS = 1_000_000
 LATE_BINS_US = 100_000  # Wake-ups are counted in bins of 1 us; the last bin has all later ones
-_TENTH_NS = 100
+_TENTH_NS = 100  # Resolution of counted times: 0.1 us
 _MOST_RATES = 4  # A longer list of rates is shown as a range
 _MOST_KEPT = 1000  # Number of distinct rates that are kept
 _LATEST_NS = 1 << 43  # Clip for lateness from damaged times: more than two hours
@@ -252,6 +252,7 @@ class Punctuality:
         if len(self._rates) < _MOST_KEPT:
             self._rates.update(dict.fromkeys(rates[np.argsort(first)][:_MOST_KEPT].tolist()))
         late = np.minimum(cycles["woken_ns"] - cycles["scheduled_ns"], _LATEST_NS)
+        # Exact integer sums avoid the cancellation in count * squares - sum^2.
         high, low = np.abs(late) >> _LOW, np.abs(late) & ((1 << _LOW) - 1)
         self._sum += int(late.sum())
         parts = (int((high * high).sum()), int((high * low).sum()), int((low * low).sum()))

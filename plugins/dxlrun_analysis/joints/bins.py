@@ -7,7 +7,7 @@ from numpy.typing import NDArray
 
 from dxlrun import Floats
 
-_BINS = 512
+_BINS = 512  # Even, because bins are merged in pairs
 _FIRST_BIN_NS = 100_000_000
 
 

@@ -16,9 +16,9 @@ import numpy as np
 
 from dxlrun import Floats
 
-_LONGEST_S = 0.3
+_LONGEST_S = 0.3  # Longest delay of the search, or 24 cycles if those take longer
 _DELAYS = 24
-_EXPLAINED = 0.25
+_EXPLAINED = 0.25  # Largest remaining share of the worst mean square
 
 
 @dataclass(slots=True)
@@ -70,6 +70,7 @@ class DelayFit:
             return None
         offset = 0.0
         if best:
+            # The vertex of the parabola refines the delay.
             left, middle, right = mean[best - 1 : best + 2]
             bend = left - 2 * middle + right
             offset = 0.5 * float(left - right) / float(bend) if bend > 0 else 0.0

@@ -34,10 +34,10 @@ the error less those of the trajectory (1/s), and swings of the goal (1/s)."""
 MOVED_RAD = 0.16
 """9 deg: least movement of the trajectory, and least error, of a joint that stands still."""
 AWAY_RAD = 0.08  # 4.6 deg: a joint that follows is nearer
-WORSE = 3.0
+WORSE = 3.0  # Required ratio to the worst error of any earlier time
 BAD_S = 1.0  # From this duration on, a failure makes a run not good
 _STILL_RAD, _STILL_S = 0.01, 0.5
-_MOSTLY = 0.8
+_MOSTLY = 0.8  # Share of windows with an identical position that allows "to the tick"
 _DOUBTFUL = 1.5  # A window this much worse than before is not a reference: it may be the start of the failure
 _FASTER = 1.5  # Up to this speed ratio the error is comparable; beyond it, a larger error is expected
 _FEWEST = 4  # Windows with torque that are needed as reference

@@ -30,30 +30,30 @@ from dxlrun_analysis.joints.trail import Samples
 
 STROKE_RAD = 0.1  # 6 deg: least amplitude of a reversal
 _LAGS_S = np.arange(0.0, 0.31, 0.01)
-_MOVES_RAD_S = 0.05
+_MOVES_RAD_S = 0.05  # Slower samples say little about a lag
 _FEWEST = 20  # Moving samples that are needed for a lag
 # Skip joints with a greater share of missing samples: goals are missing too, so the error says nothing about
 # the joint.
 _LOST = 0.02
 _QUICK = 0.6  # Share of the model's top speed above which a servo cannot follow closely
-_SETTLES_S = 0.3
+_SETTLES_S = 0.3  # Time after fast movement in which the error does not count
 _GONE_S = 0.16
 """Positions missing for longer are not lost replies: the joint had no torque."""
 _NEAR_AGAIN_RAD = 0.035
 """Distance from the trajectory at which a joint has caught up after that."""
-_PLACE_RAD = 0.05
+_PLACE_RAD = 0.05  # Width of a place: about 3 deg
 _AGAIN_S = 0.5  # Least time between a stay and a visit
 _CREEPS_RAD_S = 0.1  # Below this speed friction can act in either direction
-_FASTER = 1.5
+_FASTER = 1.5  # Speeds within this ratio are similar
 _MOST_BEFORE = 12  # Stays kept as reference per place, the first of the run
 _BENDS_RAD_S = 0.6
 """Change of speed within 0.2 s, at least by half, that causes an error in a healthy joint."""
 _BENDS_S = 0.1  # Interval before and after, over which the change is measured
 _SWING_RAD, _SWING_TICKS = 0.01, 4  # 0.6 deg, or this number of ticks
-_SWING_S = 0.2
+_SWING_S = 0.2  # Longest time between reversals of a series
 _UNEVEN = 0.4  # Self-excited swings are even: bound for the relative deviation of their periods
 _OTHERS = 3.0  # Required ratio to any other joint
-_FEWEST_OTHERS = 4
+_FEWEST_OTHERS = 4  # With fewer joints, the greatest value is not skipped
 _SIDE = re.compile("left|right|(?<![a-z])[lr](?![a-z])", re.IGNORECASE)
 _OFF_RAD = 0.035  # 2 deg
 _LOAD = 0.12  # Share of its torque
@@ -223,6 +223,7 @@ def _followed(row: int, joint: PlannedJoint, alike: int, lag_s: float, samples: 
     speed = np.gradient(goal, at_s)
     top = math.inf if joint.logged.top_speed is None else joint.logged.top_speed / joint.share
     off = position - goal
+    # Near top speed, and shortly afterwards, the error says nothing about load or friction.
     off[_lasting(~(np.abs(speed) < _QUICK * top), _samples(_SETTLES_S, samples.step_s))] = np.nan
     gone = _gone(position, samples.step_s)
     for begin in np.flatnonzero(gone[:-1] & ~gone[1:]).tolist():

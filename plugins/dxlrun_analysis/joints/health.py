@@ -26,13 +26,13 @@ Numbers = NDArray[np.int64]
 
 _QUANTITIES = ("temperature", "voltage")
 
-_NONSENSE_C = 120.0
+_NONSENSE_C = 120.0  # Higher readings, or a greater range, are not real
 _NEAR_LIMIT_C = 10.0  # The run also warns at this distance from Temperature Limit
 _SAG = 0.03  # Relative drop of a voltage from which a supply sags
 _STEP_V = 0.1  # Resolution of Present Input Voltage in the control tables
-_LEAST_V = 0.3
-_FEWEST_VOLTAGES = 6
-_FEWEST_OTHERS = 2
+_LEAST_V = 0.3  # Three steps of the resolution
+_FEWEST_VOLTAGES = 6  # Readings that a comparison with the load needs
+_FEWEST_OTHERS = 2  # Servos to compare a voltage with
 _DIPS_S = 1.5  # Each voltage is read about once a second, so a dip must last longer than one reading
 _MOST_SAMPLES = 100_000  # Number of voltages that are kept
 

@@ -32,7 +32,7 @@ from dxlrun_analysis.joints.planned import PlannedJoint
 from dxlrun_analysis.joints.trail import Trail
 
 _NONE: Mapping[str, float] = {}
-_WINDOW_S = 0.5
+_WINDOW_S = 0.5  # Length of the long windows
 _JUMP_S = 0.5  # Positions further apart are not compared: the joint may have been moved by hand
 _TOO_FAST = 1.25  # A supply at its limit and a pulling load make a servo slightly faster than its model
 _SWING_RAD = 0.035  # 2 deg: smallest swing that counts
@@ -105,6 +105,7 @@ class Movement:
         cycles, way, speed, moved = cycles[known:], way[known:], speed[known:], moved[known:]
         if not len(cycles):
             return
+        # A joint with an effort goal has no reachable trajectory.
         driven = (cycles["torque"] == Torque.ON) & cycles["valid"] & ~np.isfinite(cycles["goal_effort"])
         at_ns = cycles["read_ns"][:, None] - cycles["age_ns"]
         for row, joint in enumerate(self._joints):
@@ -119,6 +120,7 @@ class Movement:
         fastest = np.maximum(
             fastest, [_SLOWEST_TOP * (joint.logged.top_speed or 0) for joint in self._joints]
         )
+        # A joint that approaches its goal at full speed is not at fault for its error.
         hurries = (velocity * error < 0) & (np.abs(velocity) >= _FULL_SPEED * fastest)
         hurries &= moved >= _FULL_SPEED / 2 * np.abs(velocity)
         unknown = np.isnan(error)

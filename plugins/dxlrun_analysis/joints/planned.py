@@ -21,7 +21,7 @@ _NEAREST = (
 )
 """Limits of a joint: the first that one of its servos reaches."""
 _GAINS = ("position_p_gain", "p_gain")
-_SOFTEST = 3.0
+_SOFTEST = 3.0  # Bounds the influence of a very low gain
 _ACCELERATIONS = ("profile_acceleration", "goal_acceleration")
 
 
@@ -39,7 +39,7 @@ class PlannedJoint:
     speed: float = math.inf  # rad/s
     acceleration: float = math.inf  # rad/s^2, of the profile that the robot file declares in its `registers`
     tick: float = _TICK_RAD  # rad
-    # rad/s: one tick of Goal Velocity. A goal of 0 does not mean standstill but no limit.
+    # rad/s of one tick; a raw speed of 0 would mean no limit.
     slowest: float = 0.0
     share: float = 1.0  # m of a linear joint per rad of its servo; 1 for a rotary joint
     softness: float = 1.0  # Ratio of the model's default gain to the gain in the robot file, 1 to 3

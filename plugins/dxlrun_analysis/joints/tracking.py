@@ -113,6 +113,7 @@ def _reachable(sent: _Sent, acceleration: float, begun: _Way) -> Floats:
     way[1:] = goal[:-1]
     way[:known] = begun.last
     jumps = np.zeros(len(goal), dtype=bool)
+    # Step through cycles in Python only where a goal cannot be reached within one cycle.
     jumps[2:] = ~(np.abs(np.diff(goal[:-1])) <= speed[1:-1] * steps[2:] * (1 + 1e-9))
     jumps[:2] = True
     jumps[:known] = False
@@ -233,6 +234,7 @@ class _OpenRest:
             known = np.flatnonzero(np.isfinite(left))
             if not len(known):
                 continue
+            # The joint has settled in the last quarter, whose median is the rest position.
             rest_rad = float(np.median(left[known[-(len(known) // 4 + 1) :]]))
             near = max(_SETTLED_PART * moved, _SETTLED_TICKS * tick)
             outside = known[np.abs(left[known] - rest_rad) > near]

@@ -9,7 +9,7 @@ from numpy.typing import NDArray
 
 from dxlrun import Floats
 
-STEP_S = 0.02
+STEP_S = 0.02  # 50 samples a second
 _MOST = 8_192  # Samples kept, nearly three minutes. A longer run keeps the first and the newest half
 
 

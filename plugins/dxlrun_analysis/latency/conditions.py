@@ -22,7 +22,7 @@ REAL_TIME: Policy = "round_robin"
 SHORTEST_NS, LONGEST_NS = 10_000, 1_000_000_000
 """Range of a period: from the highest rate of a robot file, 100 kHz, to the lowest that a run accepts."""
 MOST_ITERATIONS = 10_000_000  # Per condition; 16 bytes each
-LONGEST_S = 24 * 3600.0
+LONGEST_S = 24 * 3600.0  # One day
 MOST_BLOCKS = 1000
 
 

@@ -18,7 +18,7 @@ from dxlrun_analysis.page.envelope import Envelope, Rows, Samples, Times
 BYTES_OF_CURVES = 7_000_000
 """Size of all curves of cycles in a page before conversion to text: 4 bytes a number, two numbers a row."""
 _FEWEST_ROWS, _MOST_ROWS = 100, 6000
-_BYTES_A_VALUE = 8
+_BYTES_A_VALUE = 8  # Smallest and largest value, float32 each
 _PART_OF_WINDOWS = 2 / 3  # Share of the rows for windows; the rest are bins of the whole run
 _AT_ONCE = 4096  # Cycles that are binned together
 _GAP_NS = 500_000_000

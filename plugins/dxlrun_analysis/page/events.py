@@ -11,13 +11,13 @@ from dxlrun.tooling.records import Event, Severity
 from dxlrun_analysis.page.canvas import BLUE, ERROR, WARNING, Canvas, Plot
 
 MOST_EVENTS = 1500  # The first events of each grade are kept
-_LONGEST = 200
+_LONGEST = 200  # Characters of a tooltip
 _GRADES = (
     ("information", "circle", BLUE, 5),
     ("warning", "triangle", WARNING, 8),
     ("error", "x", ERROR, 9),
 )
-_ROW = 17
+_ROW = 17  # Pixels per row
 
 
 class EventCollector:

@@ -17,8 +17,8 @@ from dxlrun_analysis.page.envelope import Envelope
 
 MOST_ROWS = 600
 MOST_CORES = 10  # Cores in a plot: the loop's, then the busiest
-_BIN_NS = 1_000_000_000
-_GAP_NS = 5_000_000_000
+_BIN_NS = 1_000_000_000  # Interval of the samples
+_GAP_NS = 5_000_000_000  # A longer interval without samples is a gap in the curves
 _OF_A_CORE = ("busy", "interrupts", "steal", "frequency")
 _OF_ALL = ("waiting", "temperature")
 _CORES = (

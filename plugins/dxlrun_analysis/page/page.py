@@ -26,8 +26,8 @@ from dxlrun_analysis.parts.history import EVENTS, tone_of
 from dxlrun_analysis.parts.part import Report
 from dxlrun_analysis.report import analyze, began, facts, tables
 
-_MOST_EVENTS = 100
-_MARKED = ("switch", "rate", "load", "unload", "policy")
+_MOST_EVENTS = 100  # Above this number the table has only warnings and errors
+_MARKED = ("switch", "rate", "load", "unload", "policy")  # Kinds of commands that the plots mark
 _FEW_CHANGES = 60  # More lines would hide the curves
 _PLOTS = {
     "machine-busy": "busy_machine",

@@ -15,7 +15,7 @@ from dxlrun_analysis.servos.requests import IDS
 # Size in a page before conversion to text: 4 bytes a number, two numbers per row and curve.
 BYTES_OF_REPLIES = 1_000_000
 _FEWEST_ROWS, _MOST_ROWS = 50, 1500
-_BYTES_A_VALUE = 8
+_BYTES_A_VALUE = 8  # Smallest and largest value, float32 each
 _BIN_NS = 1_000_000  # Initial width of a bin
 
 

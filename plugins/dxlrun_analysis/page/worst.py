@@ -12,7 +12,7 @@ from dxlrun_analysis.cycles.worst import TimelinePacket, WorstCycle
 from dxlrun_analysis.page.canvas import BLUE, ERROR, GREEN, INK, MUTED, ORANGE, WARNING, Canvas, Plot
 from dxlwire import BROADCAST_ID
 
-MOST_CYCLES = 5
+MOST_CYCLES = 5  # Number of cycles with a plot
 MOST_PACKETS = 400  # Per cycle, because the number of noise packets is unlimited
 _ROW = 17  # Pixels per row
 _MS = 10_000  # us; longer cycles are drawn in ms

@@ -42,7 +42,7 @@ _TYPES: Mapping[str, tuple[What, Codec]] = {
 }
 BAG_FILE = "metadata.yaml"
 _MCAP, _SQLITE = b"\x89MCAP0\r\n", b"SQLite format 3\0"
-_JUST_BEFORE_S = 1e-6
+_JUST_BEFORE_S = 1e-6  # Keeps times ascending where a trajectory replaces another
 _CDR = b"\x00\x01"  # CDR, little-endian; the next two bytes are the number of padding bytes at the end
 
 

@@ -26,7 +26,7 @@ _WHAT = {
     },
 }
 _Words = NDArray[np.uint64]
-_MASK = 0xFFFFFFFFFFFFFFFF
+_MASK = 0xFFFFFFFFFFFFFFFF  # Width of the mask in the log
 
 
 class JointDifferences(msgspec.Struct, frozen=True):

@@ -27,7 +27,7 @@ from dxlrun.tooling.robots import PlugIns
 from dxlrun_analysis.replay.comparison import shown_bits
 from dxlrun_analysis.replay.recorded import RecordedInputs, ReplayDifference
 
-_LONGEST_REASON = 200
+_LONGEST_REASON = 200  # Characters
 
 
 class PreparedComparison:

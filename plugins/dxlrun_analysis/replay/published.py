@@ -19,7 +19,7 @@ from dxlrun_analysis.replay.recorded import RecordedInputs, ReplayDifference
 RING = "loop/messages"
 _NOT_COMPARED = frozenset((LogTopic.MACHINE, "/snapshots"))
 """Topics that a replay does not publish. Only logs of earlier versions have /snapshots."""
-_LONGEST_SHOWN = 120
+_LONGEST_SHOWN = 120  # Characters
 
 
 @dataclass(slots=True)

@@ -55,7 +55,7 @@ class ReplayDifference(msgspec.Struct, frozen=True):
 
 
 class RecordedInputs(RunInputs, frozen=True, eq=False):
-    """Inputs of one run, with the number of cycles that a replay can compare."""
+    """Inputs of one run, with its plan and the reason why some cycles cannot be compared."""
 
     plan: RecordedPlan
     stopped: str  # Reason why some cycles cannot be compared; empty if all can

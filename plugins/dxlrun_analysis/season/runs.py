@@ -253,6 +253,7 @@ def kept_table(
         OSError: The table cannot be kept for the next time.
     """
     name = blake2b(place, digest_size=16).hexdigest()
+    # Another version of the code can compute other values, so it keeps tables of its own.
     kept_at = cache_directory() / runtime_hash()[:16] / f"{name}.parquet"
     kept_at.parent.mkdir(parents=True, exist_ok=True)
     known: dict[str, Row] = {}
@@ -268,6 +269,7 @@ def kept_table(
     rows = [known[log.name] | {"stamp": stamps[log.name]} for log in logs]
     table = pa.Table.from_pylist(rows, _KEPT)
     if missing:
+        # Rename a complete file, so that another process never reads a partial table.
         beside = kept_at.with_suffix(f".{os.getpid()}")
         parquet.write_table(table, beside)
         beside.replace(kept_at)

@@ -141,6 +141,7 @@ def upload(folder: Folder, url: str, progress: Progress) -> Upload:
         progress(log.name, done / len(rows))
         before = known.get(log.name, {"unreadable": UNFINISHED})
         if before["unreadable"] not in (UNFINISHED, DAMAGED):
+            # Logs of several robots can have the same name; these columns identify the run.
             same = all(before[each] == row[each] for each in ("robot", "began", "host"))
             if not same or (row["began"] is None and before["bytes"] != row["bytes"]):
                 others.append(log.name)
@@ -150,6 +151,7 @@ def upload(folder: Folder, url: str, progress: Progress) -> Upload:
                 continue
         with _reached(url):
             size = sum(_put(store, file, log) for file in log.files)
+            # The log changed during the upload, so a run is writing it.
             if size != row["bytes"]:
                 written.append(log.name)
                 continue

@@ -14,7 +14,7 @@ from dxlrun_analysis.servos.exchanges import Exchanges, Loss
 from dxlrun_analysis.servos.losses import ServoLosses
 from dxlrun_analysis.servos.requests import IDS
 
-_FEWEST = 5
+_FEWEST = 5  # Fewer broken replies can be a coincidence
 # Fewer exchanges, or a smaller share, can come from a plug that is moved.
 _FEWEST_NOISY, _NOISY_SHARE = 10, 0.005
 _BESIDE = 12  # Largest overhead of a status packet, bytes; with more, another sender is involved

@@ -168,6 +168,8 @@ class Pairing:
         count, kind = len(self.buses), packets.kind
         bus = packets.bus.astype(np.int64)
         instructs = kind == PacketKind.INSTRUCTION
+        # Packets are sorted by bus, and each bus begins with an exchange without an instruction. Adding the
+        # index of the bus therefore numbers all exchanges.
         exchange, rows = np.cumsum(instructs) + bus, np.flatnonzero(instructs)
         at, size = exchange[rows], len(rows) + count
         heads = np.searchsorted(bus[rows], np.arange(count)) + np.arange(count)
@@ -199,6 +201,7 @@ class Pairing:
         ids = np.append(packets.servo_id[late[: len(late) - len(blocks)]], block_ids)
         to = np.full(size, -1, np.int64)
         to[at] = packets.servo_id[rows]
+        # Any servo may answer a broadcast ping.
         to[at[(to[at] == BROADCAST_ID) & (requests.instruction_of(packets.take(rows)) == requests.PING)]] = -1
         others = np.flatnonzero(kind == PacketKind.OTHER_HOST)
         back = _came_back(packets, others, rows, exchange - bus)
@@ -236,6 +239,8 @@ class Pairing:
         rows = np.flatnonzero((packets.kind == PacketKind.STATUS) | late)
         status = packets.take(rows)
         of, wire, last_ns = exchange[rows], wire_ns[rows], status.last_ns
+        # Replies of a chain follow one another: each is due its return delay and its wire time after the
+        # preceding one.
         took = wire + delays[rows]
         spent = np.cumsum(took)
         begins = np.flatnonzero(np.diff(of, prepend=-1))
@@ -298,6 +303,7 @@ class Pairing:
         replies.answers[:] = False
         replies.answers[reply[reply >= 0]] = True
         loss, missing = np.full(len(exchange), Loss.NONE, np.int64), np.flatnonzero(reply < 0)
+        # Only the first missing reply of an exchange is the servo's own: the next ones wait for it in vain.
         loss[missing] = np.where(np.diff(exchange[missing], prepend=-1) > 0, Loss.OWN, Loss.BEHIND)
         silent = (np.bincount(exchange[missing], minlength=len(request)) == count) & (count > 1)
         loss[silent[exchange]] = Loss.LINE

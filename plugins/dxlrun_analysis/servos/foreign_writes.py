@@ -16,7 +16,7 @@ from dxlrun_analysis.plan import LoggedBus, LoggedServo
 from dxlwire import BROADCAST_ID, find_table, protocol1, protocol2
 
 _AFTER_NS = 2_000_000_000  # A failure within this time after a write is attributed to the write
-_MOST_KEPT = 1000
+_MOST_KEPT = 1000  # Bounds memory
 _MOST_NAMED = 3
 _HEADER_2 = b"\xff\xff\xfd\x00"
 _WRITES = (protocol1.Instruction.WRITE, protocol1.Instruction.REG_WRITE)

@@ -16,7 +16,7 @@ from dxlrun_analysis.plan import LoggedPlan
 Numbers = NDArray[np.int64]
 
 _IDS = 256
-BINS = 200
+BINS = 200  # Angles of -500 to 500 deg, speeds to 20 rad/s, temperatures to 200 deg C
 QUANTITIES = ANGLE, SPEED, TEMPERATURE = range(3)
 _STEPS = np.array([math.radians(5), 0.1, 1.0])  # rad, rad/s, deg C: width of a bin
 _FIRST = np.array([-BINS // 2, 0, 0])  # Lower edge of the first bin, in bin widths

@@ -176,6 +176,7 @@ class Losses:
         outages = sorted((*self._outages, *late), key=lambda one: one.cycle)
         begin, end = 0, -(1 << 62)
         for at, one in enumerate(outages):
+            # A cycle after the end of all open outages begins a new occasion.
             if one.cycle > end and at:
                 found.add(outages[begin:at])
                 begin = at
@@ -224,6 +225,7 @@ class Occasions:
         if not lost:
             return
         own = len({one.servo for one in lost}) == 1 and (not lost[0].line or lost[0].servo in self._heads)
+        # No reply came on the bus between the first and the last loss, so the bus failed.
         if not own and max(one.last_answers for one in lost) <= min(one.answers for one in lost):
             self._bus.setdefault(lost[0].servo // IDS, _Count()).add(begin.at_ns, [])
             return

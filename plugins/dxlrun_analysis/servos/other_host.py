@@ -32,7 +32,7 @@ _FEWEST_UNASKED = 10
 """Fewer unrequested replies can come from a servo that is late once, or from a corrupted ID."""
 _MOST_NAMED = 3
 _ALL = 0.9  # Share of echoed instructions from which the adapter always echoes, which is permitted
-_LONGEST = 48
+_LONGEST = 48  # Bytes after the length field; longer instructions are not searched for
 _PIECES = 0.1  # Share of the stray bytes from which ends of instructions are not a coincidence
 _PING, _READ, _WRITE, _SYNC_WRITE, _BULK_READ = 0x01, 0x02, 0x03, 0x83, 0x92
 

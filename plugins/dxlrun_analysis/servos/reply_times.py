@@ -34,10 +34,10 @@ from dxlwire import BROADCAST_ID
 _KINDS = _CHAINED, _FIRST, _RESTED, _NEXT = range(4)
 """Kinds of replies: after others in a chain; first of a chain or of a cycle, not compared; asked alone after
 a rest of the line; asked alone right after an exchange."""
-_REST_NS = 1_000_000
+_REST_NS = 1_000_000  # A longer pause of the line is a rest
 _FEWEST = 20  # Replies from which a servo or a bus is judged
 _ODD_US = 100  # Threshold for a servo: clocks of servos and hosts differ by some 10 us [i]
-_MOST = 0.75
+_MOST = 0.75  # Share of the replies that must be later
 _FEWEST_LATE, _TIMES_MORE = 5, 10  # Late replies of a servo, and their ratio to those of all others
 _CHANCE = 1e-3  # Probability that all late replies of a bus come from one servo by chance
 _LATE_US = 300  # Threshold of a late reply over the usual time on its bus
@@ -74,6 +74,7 @@ class ReplyTimes:
         asked = np.where(requests.fast, 0, requests.servos)[exchanges.request]
         kinds = np.where(asked == 1, np.where(_rested(exchanges), _RESTED, _NEXT), _FIRST)
         kinds[np.diff(exchanges.cycle, prepend=-2) != 0] = _FIRST
+        # A reply that took less than half its wire time was delivered together with the preceding one.
         together = (number > 0) & (own_ns < -(replies.wire_ns // 2))
         followed = np.append(together[1:], False) if count else together
         in_turn = replies.answers & (replies.place == number)
@@ -190,7 +191,7 @@ def _rested(exchanges: Exchanges) -> Flags:
 
 
 def _in_time(exchanges: Exchanges) -> Flags:
-    """Return which late replies came within the longest waiting time of the same request.
+    """Return which late replies took no longer than the slowest timely reply to the same request.
 
     They were given up for another reason, such as lost bytes before them.
     """

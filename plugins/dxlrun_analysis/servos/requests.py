@@ -16,7 +16,7 @@ from dxlwire import BROADCAST_ID
 IDS = 256  # Servos are numbered by index of the bus times this, plus ID
 _HEADER_2 = b"\xff\xff\xfd\x00"
 _STUFFED, _PLAIN = b"\xff\xff\xfd\xfd", b"\xff\xff\xfd"
-PING, _READ = 0x01, 0x02
+PING, _READ = 0x01, 0x02  # Instruction codes of both protocols
 _SYNC_READ, _FAST_SYNC_READ, _BULK_READ, _FAST_BULK_READ = 0x82, 0x8A, 0x92, 0x9A
 _FAST = (_FAST_SYNC_READ, _FAST_BULK_READ)
 _MIXED = np.random.default_rng(15).integers(1, 2**63, 1 << 17, dtype=np.uint64) | np.uint64(1)

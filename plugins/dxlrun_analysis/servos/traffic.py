@@ -20,7 +20,7 @@ from dxlrun_analysis.servos.reply_times import ReplyTimes
 from dxlrun_analysis.servos.requests import IDS, Numbers
 from dxlwire import BROADCAST_ID, PacketKind, protocol1, protocol2
 
-_BYTES = 256
+_BYTES = 256  # Values of an error byte
 _KINDS = max(PacketKind) + 1
 
 
