@@ -337,7 +337,7 @@ def test_a_policy_of_which_the_log_has_lost_the_beginning(
 
 def test_a_bus_that_is_gone_before_the_policy(steer: Callable[..., Path]) -> None:
     def pull(robot: VirtualRobot) -> None:
-        (port,) = robot.robot.hardware._ports.ports  # no face of a run pulls adapters
+        (port,) = robot.robot.hardware._lines.ports.ports  # no face of a run pulls adapters
         robot.buses[0].at(500 * MS, port.unplug)
 
     policies = "policies: {exit_timeout: 4 s, on_lost_servo: [{pose: home, speed: 60 deg/s}, limp]}\n"
