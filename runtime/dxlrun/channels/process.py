@@ -1,4 +1,4 @@
-"""Processes of a run: how one starts another, the memory they share, and the typed messages between them."""
+"""Processes of a run: start of child processes, shared memory, and typed messages between processes."""
 
 from __future__ import annotations
 
@@ -22,18 +22,18 @@ import msgspec
 from dxlrun.errors import PortError, ProcessFault
 
 START_TIMEOUT_S = 20.0
-"""For a child's first message; a cold import of numpy takes a second."""
+"""Timeout for a child's first message. A cold import of numpy takes a second."""
 END_TIMEOUT_S = 10.0
-"""Also for a recorder on a slow disk, which reports after each step that it is at work."""
+"""Timeout for the exit of a child. A recorder on a slow disk restarts it with a message after each step."""
 
 _ONE_THREAD = dict.fromkeys(("OPENBLAS_NUM_THREADS", "OMP_NUM_THREADS", "MKL_NUM_THREADS"), "1")
-"""Importing numpy alone starts a thread for each core otherwise."""
+"""Environment that stops numpy from starting a thread for each core on import."""
 _LINE_LIMIT = 1 << 20
 _MOST_DESCRIPTORS = 64
 
 
 def spare_core(taken: Collection[int]) -> int:
-    """Return the last core that this process may use and that is not taken; the last one if all are."""
+    """Return the last permitted core of this process that is not taken, or the last one if all are taken."""
     allowed = os.sched_getaffinity(0)
     return max(allowed.difference(taken) or allowed)
 
@@ -43,9 +43,14 @@ def start_module(
 ) -> subprocess.Popen[bytes]:
     """Execute `python -m module` in a session of its own, so that a terminal's Ctrl-C does not reach it.
 
-    `descriptors` are inherited; `errors` takes what it prints, which only --debug shows. `-P` keeps the
-    working directory out of the import path: a student's `numpy.py` beside the robot file must not be
+    `-P` keeps the working directory out of the import path: a `numpy.py` next to the robot file must not be
     imported.
+
+    Args:
+        module: The module.
+        arguments: Command line arguments.
+        descriptors: File descriptors that the process inherits.
+        errors: Descriptor for stdout and stderr, which only --debug shows.
     """
     return subprocess.Popen(
         [sys.executable, "-P", "-m", module, *arguments],
@@ -59,21 +64,23 @@ def start_module(
 
 
 def memory_file(name: str, content: bytes = b"") -> int:
-    """Return the descriptor of a nameless file (memfd) with `content`."""
+    """Return the descriptor of an anonymous file (memfd) with `content`."""
     descriptor = os.memfd_create(name)
     os.pwrite(descriptor, content, 0)
     return descriptor
 
 
 def whole(descriptor: int) -> bytes:
-    """Return everything in a nameless file, wherever its offset is."""
+    """Return the whole content of an anonymous file, regardless of its offset."""
     return os.pread(descriptor, os.fstat(descriptor).st_size, 0)
 
 
 class Printed(io.TextIOBase):
-    """Takes what plug-ins print, unbuffered and bounded: a controller that prints each cycle fills no memory.
+    """Unbuffered text stream with a size limit, so that a plug-in that prints in each cycle fills no memory.
 
-    `descriptor` is the nameless file that `start_module` made the process' output; --debug shows it.
+    Args:
+        descriptor: Anonymous file with the process' output, see `start_module`; --debug shows it.
+        most: Size limit, bytes.
     """
 
     def __init__(self, descriptor: int, most: int = 1 << 20) -> None:
@@ -86,11 +93,11 @@ class Printed(io.TextIOBase):
         return True
 
     def fileno(self) -> int:
-        """Return the descriptor behind it."""
+        """Return the descriptor of the file."""
         return self._descriptor
 
     def write(self, text: str, /) -> int:
-        """Keep the text, as long as there is room; never raises."""
+        """Write the text as far as the limit allows. Never raises."""
         data = text.encode(errors="replace")[: self._room]
         self._room -= len(data)
         with suppress(OSError):
@@ -102,41 +109,41 @@ class Printed(io.TextIOBase):
 
 @dataclass(frozen=True, slots=True)
 class RunMemory:
-    """Descriptors of everything that the processes of a run share; nameless, gone with the last of them."""
+    """Descriptors of the memory that the processes of a run share; freed when the last process exits."""
 
     plan: int
     heartbeat: int
     cycles: int
     packets: int
     desk: int
-    """The packets of the unfinished cycle."""
+    """Packets of the unfinished cycle."""
     events: int
-    """Of the loop, and the commands that its cycles took."""
+    """Ring with the loop's events and executed commands."""
     messages: int
-    """Topics of the loop."""
+    """Ring with the loop's topics."""
     guardian: int
-    """Packets and events of the guardian."""
+    """Ring with packets and events of the guardian."""
     result: int
-    """How the loop ended."""
+    """Result of the loop."""
     mailbox: int
     answers: int
     grants: int
-    """What the operating system granted to the loop."""
+    """Grants of the operating system to the loop."""
     stderr: int
     kept: int
-    """What controllers kept in earlier runs."""
+    """States that controllers kept in earlier runs."""
     span: int
-    """Which cycles the log has on the disk, written by the recorder at each flush."""
+    """Range of cycles that the log has on the disk, updated by the recorder at each flush."""
     slots: dict[str, tuple[int, ...]] = field(default_factory=dict)
-    """Slots of the processes of each feature, by its name."""
+    """Slots of the processes of each feature, by name of the feature."""
     shafts: int = -1
-    """Slot of the shafts of simulated servos, for processes that sense the simulated body; -1: none does."""
+    """Slot of the shafts of simulated servos, for processes that sense the simulated body; -1: none."""
     simulation: int = -1
     """Progress of the simulation; -1: no bus is simulated."""
 
     @property
     def of_loop(self) -> tuple[int, ...]:
-        """Those that the loop's process inherits."""
+        """Descriptors that the loop's process inherits."""
         rings = (self.cycles, self.packets, self.desk, self.events, self.messages, self.mailbox, self.answers)
         simulated = (self.simulation,) if self.simulation >= 0 else ()
         own = (self.result, self.grants, self.kept, *chain(*self.slots.values()), *simulated)
@@ -144,7 +151,7 @@ class RunMemory:
 
     @property
     def recorded(self) -> dict[str, int]:
-        """The rings that the recorder reads, by the name under which it reports missing records."""
+        """Rings that the recorder reads, by their name in reports of missing records."""
         return {
             "loop/cycles": self.cycles,
             "loop/packets": self.packets,
@@ -155,13 +162,13 @@ class RunMemory:
 
 
 class Failed(msgspec.Struct, frozen=True, tag=True):
-    """A process does not start, or cannot do its work any more."""
+    """A process cannot start or continue."""
 
     sentence: str
 
 
 class Stop(msgspec.Struct, frozen=True, tag=True):
-    """Terminal to guardian: stop the robot in order."""
+    """Terminal to guardian: stop the robot by its policy."""
 
 
 class Cut(msgspec.Struct, frozen=True, tag=True):
@@ -169,14 +176,14 @@ class Cut(msgspec.Struct, frozen=True, tag=True):
 
 
 class LineLost(msgspec.Struct, frozen=True, tag=True):
-    """Loop to guardian, and on to the terminal: the port of a bus is gone; let go of it."""
+    """Loop to guardian, which forwards it to the terminal: the port of a bus is gone; close it."""
 
     bus: int
     """Index in the plan's buses."""
 
 
 class LineReturned(msgspec.Struct, frozen=True, tag=True):
-    """Guardian to loop and terminal: the port of a bus is open again; its descriptor is sent with it."""
+    """Guardian to loop and terminal: the port of a bus is open again. Its descriptor is attached."""
 
     bus: int
 
@@ -186,13 +193,13 @@ class Finish(msgspec.Struct, frozen=True, tag=True):
 
 
 class LateMetadata(msgspec.Struct, frozen=True, tag=True):
-    """Supervisor to recorder: what became known in the run, for the end of the log."""
+    """Supervisor to recorder: metadata for the end of the log."""
 
     records: dict[str, dict[str, str]]
 
 
 class LoopRuns(msgspec.Struct, frozen=True, tag=True):
-    """Supervisor to recorder: the loop has a process; what it gets of the machine belongs into the log."""
+    """Supervisor to recorder: process ID of the loop, whose processor load is logged."""
 
     pid: int
 
@@ -202,39 +209,39 @@ class Ready(msgspec.Struct, frozen=True, tag=True):
 
 
 class Draining(msgspec.Struct, frozen=True, tag=True):
-    """Recorder to supervisor: still at work on what the rings hold."""
+    """Recorder to supervisor: still draining the rings."""
 
 
 class Listening(msgspec.Struct, frozen=True, tag=True):
     """Gateway to supervisor: clients can connect."""
 
     socket: str
-    """Path."""
+    """Path of the socket."""
 
 
 Received = TypeVar("Received")
 
 
 class MessageChannel(Generic[Received]):
-    """One end of a conversation between two processes: JSON, one message a line."""
+    """One end of a message channel between two processes: JSON, one message a line."""
 
     def __init__(self, end: socket.socket, received: msgspec.json.Decoder[Received]) -> None:
         self._socket = end
         self._decoder = received
         self._pending = b""
         self.closed = False
-        """True after the end of what the other end sent was read."""
+        """True after the end of the stream was read."""
         self.descriptors: list[int] = []
-        """What the other end handed over."""
+        """Received descriptors."""
 
     def fileno(self) -> int:
-        """Return the descriptor, for select."""
+        """Return the socket's descriptor for select."""
         return self._socket.fileno()
 
     def send(self, message: object, descriptors: Sequence[int] = ()) -> None:
-        """Send one message, and open descriptors with it; never raises.
+        """Send a message with open descriptors. Never raises.
 
-        An end that is gone is noticed by the next receive, not here: its last messages are still to be read.
+        `receive` detects a closed channel, after it has returned the last messages of the other end.
         """
         data = msgspec.json.encode(message) + b"\n"
         with suppress(OSError):
@@ -244,7 +251,7 @@ class MessageChannel(Generic[Received]):
                 self._socket.sendall(data)
 
     def receive(self) -> list[Received]:
-        """Return the messages that arrive in one read; waits for one read, sets `closed` at its end."""
+        """Wait for data, and return the complete messages of one read. Sets `closed` after the last one."""
         try:
             chunk, descriptors, _, _ = socket.recv_fds(self._socket, 65536, _MOST_DESCRIPTORS)
             self.descriptors += descriptors
@@ -263,7 +270,7 @@ class MessageChannel(Generic[Received]):
 def message_channel(
     received: msgspec.json.Decoder[Received],
 ) -> tuple[MessageChannel[Received], socket.socket]:
-    """Return our end, and the other one to be inherited by a child (close it here after the start)."""
+    """Return our end and the child's end of a new channel. Close the child's end here after its start."""
     ours, theirs = socket.socketpair()
     return MessageChannel(ours, received), theirs
 
@@ -273,21 +280,30 @@ _PR_SET_PDEATHSIG = 1
 
 
 def begun(job: type[Job], received: msgspec.json.Decoder[Received]) -> tuple[Job, MessageChannel[Received]]:
-    """Begin a process that is a `Child`, executed with `--job-fd N --control-fd M`: only the supervisor takes
-    Ctrl-C. Return what it is to do, and its end of the channel."""
+    """Set up this process as a `Child` with the arguments `--job-fd N --control-fd M`.
+
+    SIGINT is ignored: only the supervisor handles Ctrl-C.
+
+    Args:
+        job: Type of the job, which is JSON in the file N.
+        received: Decoder for messages from the parent.
+
+    Returns:
+        The job, and this end of the channel M.
+    """
     signal.signal(signal.SIGINT, signal.SIG_IGN)
     found = msgspec.json.decode(whole(int(sys.argv[2])), type=job)
     return found, MessageChannel(socket.socket(fileno=int(sys.argv[4])), received)
 
 
 def hold_foreign_code(number: signal.Signals) -> None:
-    """Bound what plug-ins print, and have Linux send this signal when the parent dies (prctl(2))."""
+    """Limit the output of plug-ins, and request this signal when the parent exits (prctl(2))."""
     sys.stdout = sys.stderr = Printed(sys.stderr.fileno())
     ctypes.CDLL(None).prctl(_PR_SET_PDEATHSIG, number)
 
 
 class Child(Generic[Received]):
-    """One process that this one started, and the channel to it."""
+    """A child process and the channel to it."""
 
     def __init__(  # noqa: PLR0917  how it is called, what is executed, and what it inherits
         self,
@@ -308,9 +324,10 @@ class Child(Generic[Received]):
         self._messages: deque[Received] = deque()
 
     def message(self, timeout_s: float) -> Received | None:
-        """Return its next message; None when its end of the channel is closed.
+        """Return the next message; None if the child has closed its end of the channel.
 
-        Raises ProcessFault when none comes in time.
+        Raises:
+            ProcessFault: No message arrived within the timeout.
         """
         while not self._messages and not self.channel.closed:
             ready, _, _ = select.select([self.channel], [], [], timeout_s)
@@ -320,9 +337,11 @@ class Child(Generic[Received]):
         return self._messages.popleft() if self._messages else None
 
     def poll(self, timeout_s: float, *others: int) -> Received | None:
-        """Return the message that comes within `timeout_s`; None when none does, or one of `others` is ready.
+        """Return a message that arrives within a timeout, or None.
 
-        `others`: descriptors.
+        Args:
+            timeout_s: Timeout.
+            others: Descriptors that end the wait when they are ready.
         """
         if not self._messages:
             ready, _, _ = select.select([self.channel.fileno(), *others], [], [], timeout_s)
@@ -331,7 +350,12 @@ class Child(Generic[Received]):
         return self._messages.popleft() if self._messages else None
 
     def ready(self) -> Received:
-        """Return its first message. Raises ProcessFault when it ends before it, PortError for Failed."""
+        """Return the first message.
+
+        Raises:
+            ProcessFault: The child exited, or sent no message in time.
+            PortError: The message is `Failed`.
+        """
         message = self.message(START_TIMEOUT_S)
         if message is None:
             code = self.process.wait(END_TIMEOUT_S)
@@ -341,7 +365,7 @@ class Child(Generic[Received]):
         return message
 
     def exited(self, timeout_s: float = 0.0) -> bool:
-        """Return whether it ends within a time; it is not reaped, so that its number stays its own."""
+        """Return whether the child exits within a timeout. It is not reaped, so its PID is not used again."""
         if self.process.returncode is not None:
             return True
         descriptor = os.pidfd_open(self.process.pid)
@@ -351,7 +375,7 @@ class Child(Generic[Received]):
             os.close(descriptor)
 
     def kill(self) -> None:
-        """End it at once, whatever it does, and what it has started and left in its session's group."""
+        """Kill the child and the processes of its group, and reap the child."""
         if self.process.returncode is None:
             with suppress(ProcessLookupError):
                 os.killpg(self.process.pid, signal.SIGKILL)
@@ -359,7 +383,7 @@ class Child(Generic[Received]):
         self.channel.close()
 
     def end(self) -> None:
-        """Close the channel, which asks it to end in order; kill it when it does not."""
+        """Close the channel, which requests an orderly exit; kill the child after a timeout."""
         self.channel.close()
         try:
             self.process.wait(END_TIMEOUT_S)

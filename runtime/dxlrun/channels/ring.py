@@ -1,22 +1,22 @@
-"""Rings: how records leave a process; shared memory, one writer that never waits and never looks at readers.
+"""Rings: buffers of records in shared memory. The one writer never waits and never reads the readers' state.
 
-A record has a kind and any length up to the ring's longest. It lies in one piece: the memory runs on behind
-the ring for as long as the longest record, so that none has to be cut, and none wraps. Positions count the
-bytes that were ever appended; a record lies at its position modulo the ring's capacity.
+A record has a kind and any length up to the ring's longest. Records are contiguous and never wrap: the memory
+extends beyond the capacity by the longest record. Positions count all bytes ever appended. The offset of a
+record is its position modulo the capacity.
 
 Layout of the memory, little-endian, everything aligned to 8 bytes:
 
-    header  magic u64, capacity u64, longest record u64, head u64 (end of the last whole record), intent u64
-            (end of the record that is being written, or was last), latest u64 (start of the last record),
-            taken u64 (for a reader that lets the writer know how far it is), number u64 (of the next record)
+    header  magic u64, capacity u64, longest record u64, head u64 (end of the last complete record),
+            intent u64 (end of the record that is being written, or was written last), latest u64 (start of
+            the last record), taken u64 (position that a reader has reported), number u64 (of the next record)
     record  mark u64 (its position + 1), number u32 (counted from 0, modulo 2^32), length u32, kind u32,
             CRC-32 u32 of these fields and of the payload (zlib, polynomial 0xEDB88320), payload
 
-The writer raises `intent` before it overwrites a byte. A reader copies a record, and then looks at `intent`:
-what it copied is good if nothing of it can have been overwritten by then, and if the CRC-32 agrees. A reader
-that was overtaken, or finds damage, looks for the next mark that is one, and declares by the numbers how many
-records it missed; where none is left, by the number of the next record. All of that is in C, in an order that
-every processor keeps: `shared_memory.c`; `ring_model.c` of the tests runs it in every order that C11 allows.
+The writer raises `intent` before it overwrites a byte. A reader copies a record and then reads `intent`. The
+copy is valid if the record cannot have been overwritten by then and the CRC-32 matches. A reader that was
+overtaken, or that finds damage, searches for the next valid mark. The numbers of the records, or the number
+of the next one, show how many were lost. This is implemented in C with the required memory order:
+`shared_memory.c`. `ring_model.c` of the tests executes it in every order that C11 allows.
 """
 
 from __future__ import annotations
@@ -34,7 +34,7 @@ from dxlrun.channels.shared_memory import library, load, mapped, store
 from dxlwire.compiled import array_of
 
 RING_SECONDS = 10
-"""How long a reader may be away before records are lost, at the rates that the sizes are computed for."""
+"""Time for which a reader may pause without loss, at the rates for which capacities are computed."""
 
 _HEADER = 64
 _MAGIC = int.from_bytes(b"dxlring2", "little")
@@ -46,63 +46,63 @@ _FIXED = struct.Struct("=QQQ")
 RECORD_HEADER = 24
 
 Payload = bytes | bytearray | memoryview
-"""Bytes of one record; a memoryview must be contiguous and of format B."""
+"""Bytes of a record. A memoryview must be contiguous and of format B."""
 
 
 @unique
 class RecordKind(IntEnum):
-    """What the payload of a record is; the module named here declares its layout."""
+    """Kind of a record's payload, with the module that declares its layout."""
 
     CYCLE = 1
     """cycle.py"""
     PACKETS = 2
-    """packets.py: the packets of about one cycle"""
+    """packets.py: packets of about one cycle"""
     TAGGED = 3
-    """tagged.py: anything else"""
+    """tagged.py: all other records"""
 
 
 class Record(NamedTuple):
-    """One record as a reader gets it; `kind` is a plain number, because memory may be damaged."""
+    """A record that was read. `kind` is an int, because damaged memory may have any value."""
 
     kind: int
     payload: bytes
 
 
 class Gap(NamedTuple):
-    """Records that a reader did not get: overwritten before it came, or damaged."""
+    """Number of records that a reader missed because they were overwritten or damaged."""
 
     lost: int
 
 
 class Appender(Protocol):
-    """Where records go: a ring, or straight to a reader in the same process."""
+    """Destination of records: a ring, or a function in the same process."""
 
     @property
     def head(self) -> int:
-        """The position that the next record gets."""
+        """Position of the next record."""
         ...
 
     def append(self, kind: RecordKind, payload: Payload) -> int:
-        """Take one record; return the position behind it."""
+        """Append a record; return its end position."""
         ...
 
     def repeat(self, kind: RecordKind, memory: memoryview) -> Callable[[], object]:
-        """Return what appends the present content of some memory, each time it is called."""
+        """Return a function that appends the current content of a memoryview at each call."""
         ...
 
 
 def record_size(length: int) -> int:
-    """Return how many bytes of a ring a record takes whose payload has this length."""
+    """Return the size of a record in a ring for a payload of `length` bytes."""
     return -(-(RECORD_HEADER + length) // _WORD) * _WORD
 
 
 def memory_size(capacity: int, longest: int) -> int:
-    """Return how many bytes a ring needs: its header, its capacity, and what a record may run on behind."""
+    """Return the size of a ring's memory: header, capacity, and room for the longest record after it."""
     return _HEADER + capacity + record_size(longest)
 
 
 def lay_out(memory: memoryview, capacity: int, longest: int) -> None:
-    """Make an empty ring of zeroed memory. Raises ValueError when it cannot hold its longest record."""
+    """Initialize an empty ring in zeroed memory. Raises ValueError if it cannot hold its longest record."""
     if longest < 1 or capacity % _WORD or capacity < record_size(longest):
         raise ValueError(f"a ring of {capacity} bytes cannot hold a record of {longest} bytes")
     _FIXED.pack_into(memory, 0, _MAGIC, capacity, longest)
@@ -111,8 +111,10 @@ def lay_out(memory: memoryview, capacity: int, longest: int) -> None:
 def create(name: str, capacity: int, longest: int) -> int:
     """Create a ring and return the descriptor of its memory.
 
-    `capacity`: bytes of records that are kept (rounded up to whole words); `longest`: payload of the longest
-    record, bytes.
+    Args:
+        name: Name for diagnostics.
+        capacity: Room for records, bytes; rounded up to whole words.
+        longest: Longest payload, bytes.
     """
     capacity = -(-capacity // _WORD) * _WORD
     fixed = bytearray(_HEADER)
@@ -123,7 +125,7 @@ def create(name: str, capacity: int, longest: int) -> int:
 
 
 class _Ring:
-    """The memory of a ring: a descriptor to be mapped, or a part of memory that is mapped already."""
+    """Memory of a ring, from a descriptor or from mapped memory."""
 
     __slots__ = ("_bytes", "_place", "_words", "longest")
 
@@ -140,16 +142,22 @@ class _Ring:
 
     @property
     def head(self) -> int:
-        """The position behind the last whole record; one that the writer left unfinished does not count."""
+        """End position of the last complete record. Records that a writer left unfinished do not count."""
         return self._words[_HEAD]
 
 
 class RingWriter(_Ring):
-    """The one writer of a ring; `append` is made for the loop: no wait, no lock, no look at readers.
+    """The only writer of a ring. `append` is safe in the loop: it never waits or locks.
 
-    The pages are touched when it is built, so that the loop does not meet their first use. Continues after
-    the last record when the ring was written before. Raises ValueError when the memory is no ring,
-    NotCompiled where what writes was not compiled.
+    The constructor touches all pages, so that the loop has no page faults. A writer continues after the last
+    record of an earlier writer.
+
+    Args:
+        memory: Descriptor of the ring, or its mapped memory.
+
+    Raises:
+        ValueError: The memory does not hold a ring.
+        NotCompiled: The compiled writer is missing.
     """
 
     __slots__ = ("_append",)
@@ -159,18 +167,18 @@ class RingWriter(_Ring):
         self._append = partial(library().dxl_append, *self._place, self.longest)
 
     def append(self, kind: RecordKind, payload: Payload) -> int:
-        """Copy one record behind the last; return the position behind it. Raises ValueError when too long."""
+        """Append a record; return its end position. Raises ValueError if it is too long."""
         self._require(len(payload))
         end: int = self._append(kind, bytes(payload), len(payload))
         return end
 
     def repeat(self, kind: RecordKind, memory: memoryview) -> Callable[[], object]:
-        """Return what appends the present content of some memory, each time it is called."""
+        """Return a function that appends the current content of a memoryview at each call."""
         self._require(len(memory))
         return partial(self._append, kind, array_of(memory), len(memory))
 
     def commits(self, desk: memoryview, most: int) -> Callable[[], object]:
-        """Return what appends the batch on a desk, see `PacketBatch`, of at most so many bytes."""
+        """Return a function that appends the batch on a desk, of at most `most` bytes; see `PacketBatch`."""
         self._require(most)
         return partial(library().dxl_commit, *self._place, most, array_of(desk))
 
@@ -182,15 +190,21 @@ class RingWriter(_Ring):
 
     @property
     def taken(self) -> int:
-        """The position that a reader has reported with `report_taken`; `append` does not care for it."""
+        """Position that a reader has reported with `report_taken`; `append` ignores it."""
         return load(self._words, _TAKEN)
 
 
 class RingReader(_Ring):
-    """One reader of a ring, at its own pace. Raises ValueError if the memory does not hold a ring, and
-    NotCompiled if the compiled reader is missing.
+    """Reader of a ring. A ring may have several readers, each with its own position.
 
-    Whatever the memory holds, no method raises, and each takes a time that the longest record bounds.
+    No method raises for damaged memory, and the time of a call is bounded by the longest record.
+
+    Args:
+        memory: Descriptor of the ring, or its mapped memory.
+
+    Raises:
+        ValueError: The memory does not hold a ring.
+        NotCompiled: The compiled reader is missing.
     """
 
     __slots__ = ("_newest", "_next", "_payload", "_reader")
@@ -200,7 +214,7 @@ class RingReader(_Ring):
         self._reader = memoryview(bytearray(4 * _WORD)).cast("Q")
         copy = memoryview(
             mmap.mmap(-1, record_size(self.longest))
-        )  # pages that no record needs are never used
+        )  # unused pages of a long buffer take no memory
         self._payload = copy[RECORD_HEADER:]
         place = *self._place, self.longest, array_of(self._reader.cast("B")), array_of(copy)
         self._next = partial(library().dxl_read_next, *place)
@@ -208,7 +222,7 @@ class RingReader(_Ring):
 
     @property
     def position(self) -> int:
-        """Where the next record is expected."""
+        """Position of the next record to read."""
         return self._reader[_POSITION]
 
     @position.setter
@@ -217,20 +231,20 @@ class RingReader(_Ring):
 
     @property
     def passed(self) -> int:
-        """How many records were appended before `position`, as the last one shows; modulo 2^32."""
+        """Number of records before `position`, according to the last one read; modulo 2^32."""
         return self._reader[_PASSED]
 
     def read(self) -> Record | Gap | None:
-        """Return the next record, a Gap where records were lost, or None when there is nothing new."""
+        """Return the next record, a Gap if records were lost, or None if nothing is new."""
         found = self._next()
         return Gap(self._reader[_LOST]) if found == _GAP else self._record(found)
 
     def newest(self) -> Record | None:
-        """Return the newest record and go on behind it; None when there is nothing new, or it is damaged."""
+        """Return the newest record and skip to its end; None if nothing is new or the record is damaged."""
         return self._record(self._newest())
 
     def report_taken(self) -> None:
-        """Let the writer know how far this reader is: for a queue whose writer refuses what has no room."""
+        """Publish the reader's position for a queue whose writer must not overwrite unread records."""
         store(self._words, _TAKEN, self.position)
 
     def _record(self, length: int) -> Record | None:
@@ -238,21 +252,21 @@ class RingReader(_Ring):
 
 
 class Handover:
-    """A ring of length zero: hands each record straight to `take`, in the same process, on virtual time."""
+    """Appender that passes each record to the function `take`, in the same process, on virtual time."""
 
     __slots__ = ("_take", "head")
 
     def __init__(self, take: Callable[[RecordKind, Payload], None]) -> None:
         self._take = take
         self.head = 0
-        """Records handed over so far."""
+        """Number of records so far."""
 
     def append(self, kind: RecordKind, payload: Payload) -> int:
-        """Hand over one record; it is valid only during the call."""
+        """Pass a record to the function. The payload is valid only during the call."""
         self._take(kind, payload)
         self.head += 1
         return self.head
 
     def repeat(self, kind: RecordKind, memory: memoryview) -> Callable[[], object]:
-        """Return what hands over the present content of some memory, each time it is called."""
+        """Return a function that passes the current content of a memoryview at each call."""
         return partial(self.append, kind, memory)

@@ -1,9 +1,9 @@
-/* Shared memory: what several processes read and write without a lock, in an order that every processor keeps.
+/* Shared memory: lock-free access by several processes, with the memory order that all processors require.
  *
- * ring.py has the layout of a ring, packets.py that of a batch. Words that are shared are atomic (C11): a record
- * is published by storing the head behind it with release, and read behind loading the head with acquire; the
- * intent is published before a record is overwritten, and loaded behind the copy. A reader trusts nothing that it
- * finds: every place and length is bounded by what comes with the call.
+ * ring.py has the layout of a ring, packets.py that of a batch. Shared words are atomic (C11). The writer publishes
+ * a record by storing the head with release order, and a reader loads the head with acquire order before it reads
+ * the record. The writer publishes the intent before it overwrites a record, and a reader loads the intent after
+ * its copy. The memory may be damaged, so a reader bounds every offset and length by the arguments of the call.
  */
 
 #include <stdatomic.h>
@@ -11,15 +11,15 @@
 #include <string.h>
 
 #ifndef SOURCE_CRC
-#define SOURCE_CRC 0 /* CRC-32 of this file: compiled.py */
+#define SOURCE_CRC 0 /* CRC-32 of this file: compiled.py refuses an object of another version */
 #endif
-#ifndef LOAD /* tests/run/channels/ring_model.c has a memory of its own */
+#ifndef LOAD /* tests/run/channels/ring_model.c replaces these with a model of the memory */
 typedef _Atomic uint64_t Word;
 #define LOAD(word, order) atomic_load_explicit(word, memory_order_##order)
 #define STORE(word, value, order) atomic_store_explicit(word, value, memory_order_##order)
 #define FENCE(order) atomic_thread_fence(memory_order_##order)
 #define IS_WHOLE(crc, expected) ((crc) == (expected))
-#define MOST_LOOKS 8 /* at a ring that is written meanwhile */
+#define MOST_LOOKS 8 /* bounds the retries of a reader that the writer overtakes */
 #endif
 #define RING_HEADER 8 /* words */
 #define ENTRY_HEADER 3
@@ -45,11 +45,11 @@ __attribute__((constructor)) static void fill_crc32_table(void)
             crc32_table[n][i] = crc32_table[n - 1][i] >> 8 ^ crc32_table[0][crc32_table[n - 1][i] & 0xff];
 }
 
-/* CRC-32 as zlib's, sixteen bytes at a time; begun and ended with all bits inverted. */
+/* Update a CRC-32 (zlib's polynomial) sixteen bytes at a time. The caller inverts all bits before and after. */
 static uint32_t crc32(uint32_t crc, const uint8_t *data, uint64_t size)
 {
     for (; size >= 16; size -= 16, data += 16) {
-        uint64_t words[2]; /* little-endian, as all that processes share */
+        uint64_t words[2]; /* little-endian, as all shared data */
         memcpy(words, data, 16);
         words[0] ^= crc;
         crc = 0;
@@ -62,7 +62,7 @@ static uint32_t crc32(uint32_t crc, const uint8_t *data, uint64_t size)
     return crc;
 }
 
-/* CRC-32 of an entry's mark, number, length and kind, and of its payload. */
+/* Return the CRC-32 of an entry's mark, number, length and kind, and of its payload. */
 static uint32_t crc_of(const uint64_t *header, const uint8_t *payload, uint64_t size)
 {
     return ~crc32(crc32(~0u, (const uint8_t *)header, 20), payload, size);
@@ -75,7 +75,7 @@ static Word *entry_at(Word *ring, uint64_t capacity, uint64_t position)
     return ring + RING_HEADER + position % capacity / 8;
 }
 
-/* Copies one record behind the last of a ring; returns the position behind it, -1 when it is too long. */
+/* Append a record to a ring; return its end position, or -1 if it is too long. */
 int64_t dxl_append(Word *ring, uint64_t capacity, uint64_t longest, uint32_t kind, const uint8_t *payload,
                    uint64_t size)
 {
@@ -84,13 +84,13 @@ int64_t dxl_append(Word *ring, uint64_t capacity, uint64_t longest, uint32_t kin
     uint64_t position = LOAD(&ring[HEAD], relaxed), end = position + entry_size(size);
     uint64_t intent = LOAD(&ring[INTENT], relaxed);
     if (intent < end || intent > position + entry_size(longest))
-        intent = end; /* else a writer died here, in a longer record */
+        intent = end; /* otherwise a writer died here in a longer record, whose intent must stay */
     uint32_t number = (uint32_t)LOAD(&ring[NUMBER], relaxed);
     uint64_t header[ENTRY_HEADER] = {position + 1, number | size << 32, kind};
     Word *entry = entry_at(ring, capacity, position);
     header[2] |= (uint64_t)crc_of(header, payload, size) << 32;
     STORE(&ring[INTENT], intent, relaxed);
-    FENCE(release); /* a reader of what is overwritten now sees the intent before the first word changes */
+    FENCE(release); /* a reader of the overwritten record sees the intent before the first changed word */
     for (int i = 0; i < ENTRY_HEADER; i++)
         STORE(entry++, header[i], relaxed);
     for (; size; entry++) {
@@ -101,34 +101,35 @@ int64_t dxl_append(Word *ring, uint64_t capacity, uint64_t longest, uint32_t kin
         size -= part;
     }
     STORE(&ring[LATEST], position, relaxed);
-    STORE(&ring[NUMBER], number + 1u, release); /* behind that: see dxl_read_next */
-    STORE(&ring[HEAD], end, release);           /* and the whole record before the head behind it */
+    STORE(&ring[NUMBER], number + 1u, release); /* after `latest`: see dxl_read_next */
+    STORE(&ring[HEAD], end, release);           /* after the whole record */
     return (int64_t)end;
 }
 
-/* Hands on the batch of packets that was collected. */
+/* Append the batch of packets on a desk to a ring, and clear the desk. */
 void dxl_commit(Word *ring, uint64_t capacity, uint64_t longest, volatile uint64_t *desk)
 {
     if (desk[USED]) {
         const uint8_t *batch = (const uint8_t *)(uintptr_t)(desk + EARLIER);
         int64_t position = dxl_append(ring, capacity, longest, PACKETS, batch, 16 + desk[USED]);
-        atomic_signal_fence(memory_order_seq_cst); /* behind the head: where this process dies between, `salvage` sees it */
-        desk[USED] = 0; /* first: nothing is found twice where this process dies here */
+        /* If this process dies before the next store, `salvage` recognizes the batch by the ring's head. */
+        atomic_signal_fence(memory_order_seq_cst);
+        desk[USED] = 0; /* before the position, so that `salvage` never appends a batch twice */
         desk[BATCH_POSITION] = (uint64_t)position;
     }
     uint64_t number = desk[CYCLE] >> MARK_BITS;
-    desk[CYCLE] = number << MARK_BITS; /* from here on the earlier one means nothing */
+    desk[CYCLE] = number << MARK_BITS; /* offset 0: the earlier cycle is unused */
     desk[EARLIER] = number;
 }
 
-/* Whether the writer may have begun to overwrite what lies from here on; asked behind the copy. */
+/* Return 1 if the writer may have begun to overwrite the record at a position. Must be called after the copy. */
 static int is_overwritten(Word *ring, uint64_t capacity, uint64_t position)
 {
     FENCE(acquire);
     return LOAD(&ring[INTENT], relaxed) > position + capacity;
 }
 
-/* Copies the record that begins here; false when none does that is whole. */
+/* Copy the record at a position; return 0 if there is no complete one. */
 static int copy_record(Word *ring, uint64_t capacity, uint64_t longest, uint64_t position, uint64_t *copy)
 {
     Word *entry = entry_at(ring, capacity, position);
@@ -143,7 +144,7 @@ static int copy_record(Word *ring, uint64_t capacity, uint64_t longest, uint64_t
            IS_WHOLE(crc_of(copy, (const uint8_t *)(copy + ENTRY_HEADER), size), copy[2] >> 32);
 }
 
-/* Goes on behind the record that was copied from here; returns the bytes of its payload. */
+/* Move the reader to the end of a copied record; return the size of its payload. */
 static int64_t deliver(uint64_t *reader, uint64_t position, const uint64_t *copy)
 {
     uint64_t size = copy[1] >> 32;
@@ -153,7 +154,7 @@ static int64_t deliver(uint64_t *reader, uint64_t position, const uint64_t *copy
     return (int64_t)size;
 }
 
-/* Returns how many records were lost, and goes on at the one of this number. */
+/* Store the number of lost records, and move the reader to a record with a given number; return GAP. */
 static int64_t declare(uint64_t *reader, uint64_t position, uint32_t number)
 {
     uint32_t lost = number - (uint32_t)reader[PASSED];
@@ -163,8 +164,8 @@ static int64_t declare(uint64_t *reader, uint64_t position, uint32_t number)
     return GAP;
 }
 
-/* Copies the next record: returns the bytes of its payload, NOTHING, or GAP. The way to the next whole one, and what
- * is copied on it, are bounded by the longest record. */
+/* Copy the next record; return the size of its payload, NOTHING, or GAP. The search for the next complete record is
+ * bounded by the longest record, both in distance and in copied bytes, so that a call has a bounded time. */
 int64_t dxl_read_next(Word *ring, uint64_t capacity, uint64_t longest, uint64_t *reader, uint64_t *copy)
 {
     if (LOAD(&ring[HEAD], acquire) <= reader[POSITION])
@@ -186,14 +187,14 @@ int64_t dxl_read_next(Word *ring, uint64_t capacity, uint64_t longest, uint64_t 
             }
             copied += copy[1] >> 32 <= longest ? copy[1] >> 32 : 0;
         }
-        uint64_t number = LOAD(&ring[NUMBER], relaxed); /* of the head, unless `latest` says that it is of a later one */
+        uint64_t number = LOAD(&ring[NUMBER], relaxed); /* that of the head, unless `latest` is beyond the head */
         if (!is_overwritten(ring, capacity, oldest) && LOAD(&ring[LATEST], relaxed) < head)
             return declare(reader, head, (uint32_t)number);
     }
-    return NOTHING; /* the writer is faster: what it overwrote is declared at the next look */
+    return NOTHING; /* the writer is faster: the next call reports the gap */
 }
 
-/* Copies the newest record, and goes on behind it: returns the bytes of its payload, or NOTHING. */
+/* Copy the newest record, and move the reader to its end; return the size of its payload, or NOTHING. */
 int64_t dxl_read_newest(Word *ring, uint64_t capacity, uint64_t longest, uint64_t *reader, uint64_t *copy)
 {
     for (int looks = 0; looks < MOST_LOOKS; looks++) {
@@ -206,11 +207,11 @@ int64_t dxl_read_newest(Word *ring, uint64_t capacity, uint64_t longest, uint64_
     return NOTHING;
 }
 
-/* Returns a word; what is read after it is no older. */
+/* Load a word with acquire order: later reads are at least as new. */
 uint64_t dxl_load(Word *word) { return LOAD(word, acquire); }
 
-/* Publishes a word; what was written before it is seen before it. */
+/* Store a word with release order: earlier writes become visible before it. */
 void dxl_store(Word *word, uint64_t value) { STORE(word, value, release); }
 
-/* Checksum of this source: compiled.py. */
+/* Return the checksum of this source, which compiled.py compares. */
 uint32_t dxl_source(void) { return SOURCE_CRC; }

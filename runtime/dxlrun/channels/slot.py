@@ -1,14 +1,14 @@
-"""Slot: the newest sample of a sensor; shared memory of fixed size, one writer, readers that never wait.
+"""Slot: shared memory with the newest sample of a sensor, for one writer and readers that never wait.
 
 Layout of the memory, little-endian, everything aligned to 8 bytes:
 
-    header    samples ever written u64, state u64, texts ever written u64
+    header    number of samples written u64, state u64, number of texts written u64
     2 samples number u64 (counted from 1), time i64 (ns), values f64, CRC-32 of these u64
     text      number u64, length u64, CRC-32 of the bytes u64, bytes
 
-The writer fills the sample that is not the newest, and counts it when it is whole: so a reader finds the
-newest one untouched unless two more come while it copies, which the number and the CRC-32 show. It then keeps
-what it had, and looks again in the next cycle.
+The writer overwrites the older sample and increments the count afterwards. So the newest sample changes
+during a reader's copy only if two samples are written in that time. The reader detects that by the number and
+the CRC-32, keeps its last sample, and tries again in the next cycle.
 """
 
 from __future__ import annotations
@@ -24,7 +24,7 @@ from dxlrun.channels.shared_memory import load, store
 
 Floats = NDArray[np.float64]
 LONGEST_TEXT = 480
-"""Bytes; a longer one is cut."""
+"""Bytes; longer texts are cut."""
 
 _SAMPLES, _STATE, _TEXTS = range(3)
 _HEADER_WORDS = 3
@@ -35,34 +35,34 @@ _LAST = (1 << 64) - 1
 
 @unique
 class SlotState(IntEnum):
-    """What the writer does."""
+    """State of the writer."""
 
     STARTING = 0
     OPEN = 1
-    """It samples."""
+    """The device is open, and samples are written."""
     FAILED = 2
-    """Its device is not there; it tries again."""
+    """The device is not available; the writer tries again."""
     ENDED = 3
-    """Its process is gone."""
+    """The writer's process has exited."""
 
 
 def size(values: int) -> int:
-    """Return how many bytes a slot needs for samples of so many values."""
+    """Return the size of a slot for samples with this number of values, bytes."""
     return _WORD * (_HEADER_WORDS + 2 * (values + 3) + _TEXT_WORDS) + LONGEST_TEXT
 
 
 def create(name: str, values: int) -> int:
-    """Return the descriptor of a fresh slot."""
+    """Return the descriptor of a new slot."""
     return shared_memory.create(name, size(values))
 
 
 def private(values: int) -> memoryview:
-    """Return a fresh slot in the memory of this process."""
+    """Return a new slot in private memory."""
     return memoryview(bytearray(size(values)))
 
 
 class _Slot:
-    """The memory, cut into its parts by its size: what is in it may have been overwritten by a driver."""
+    """Memory of a slot. Its size defines the layout, because a faulty driver may overwrite the content."""
 
     __slots__ = ("_places", "_text", "_text_words", "_words", "values")
 
@@ -78,7 +78,7 @@ class _Slot:
 
 
 class SlotWriter(_Slot):
-    """The writer's end; one process at a time has it, a later one goes on counting."""
+    """Writer of a slot. There is one at a time; a later writer continues the numbers."""
 
     __slots__ = ("_bytes", "_floats", "_sample")
 
@@ -89,17 +89,17 @@ class SlotWriter(_Slot):
         self._bytes = memoryview(self._sample.data).cast("B")[:-_WORD]
 
     def write(self, t_ns: int, values: Floats) -> None:
-        """Leave a sample that was true at `t_ns`; never waits."""
+        """Write a sample that was measured at `t_ns`. Never waits."""
         number = (self._words[_SAMPLES] + 1 & _LAST) or 1
         sample = self._sample
         sample[0], sample[1] = number, max(0, t_ns)
         np.copyto(self._floats, values)
         sample[-1] = crc32(self._bytes)
         np.copyto(self._places[number & 1], sample)
-        store(self._words, _SAMPLES, number)  # the whole sample is seen before its count
+        store(self._words, _SAMPLES, number)  # release: the sample becomes visible before its number
 
     def say(self, state: SlotState, text: str) -> None:
-        """Leave what the writer does now, and a sentence, in place of the one before."""
+        """Replace the state and the text of the writer."""
         data = text.encode(errors="replace")[:LONGEST_TEXT]
         words, number = self._text_words, (self._words[_TEXTS] + 1 & _LAST) or 1
         words[0], words[1], words[2] = number, len(data), crc32(data)
@@ -109,7 +109,7 @@ class SlotWriter(_Slot):
 
 
 class SlotReader(_Slot):
-    """A reader's end; nothing that it does waits, and `read` allocates nothing that stays."""
+    """Reader of a slot. No method waits, and `read` does not allocate memory that stays."""
 
     __slots__ = ("_bytes", "_sample", "_seen", "_spoken", "sample")
 
@@ -119,32 +119,32 @@ class SlotReader(_Slot):
         self._bytes = memoryview(self._sample.data).cast("B")[:-_WORD]
         self._seen = self._spoken = 0
         self.sample: Floats = self._sample[2:-1].view(np.float64)
-        """The values that `read` copied; to be used only after it returned True."""
+        """Values of the last sample; valid only if `read` returned a time."""
 
     @property
     def samples(self) -> int:
-        """How many samples were ever written."""
+        """Number of samples written."""
         return self._words[_SAMPLES]
 
     @property
     def state(self) -> SlotState:
-        """What the writer does; FAILED where that was overwritten."""
+        """State of the writer; FAILED if the memory is damaged."""
         word = self._words[_STATE]
         return SlotState(word) if word < len(SlotState) else SlotState.FAILED
 
     def read(self) -> int | None:
-        """Copy the newest sample; return its time, ns, or None where there is no newer one, or it is torn."""
+        """Copy the newest sample; return its time, ns, or None if it is not new or was torn."""
         if self._words[_SAMPLES] == self._seen:
             return None
-        number, sample = load(self._words, _SAMPLES), self._sample  # which is no older than its count
+        number, sample = load(self._words, _SAMPLES), self._sample  # at least as new as its count
         np.copyto(sample, self._places[number & 1])
         if sample.item(0) != number or sample.item(-1) != crc32(self._bytes):
-            return None  # two more came meanwhile: they are there for the next look
+            return None  # overwritten during the copy: the next call reads the newer sample
         self._seen = number
         return sample.item(1)
 
     def hear(self) -> str:
-        """Return the newest sentence if it was not returned before; empty where there is none."""
+        """Return the newest text if it was not returned before, or an empty string."""
         number, words = load(self._words, _TEXTS), self._text_words
         if number == self._spoken:
             return ""

@@ -1,5 +1,4 @@
-"""Plan: frozen structs that leave the compiler, for loop, mechanics, policies and recording.
+"""Plan: frozen structs that the compiler produces, for loop, mechanics, policies and recording.
 
-They are data and have no logic. How a plan is made belongs in `compile`; the part of a bus is
-in `dxlwire`.
+They are data without logic. Code that creates plans belongs in `compile`. The plan of a bus is in `dxlwire`.
 """

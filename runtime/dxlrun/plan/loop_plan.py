@@ -1,4 +1,4 @@
-"""What the loop executes: period, scheduler requests, controllers, commands by time; JSON in the log."""
+"""Loop plan: period, scheduler requests, joints, controllers and timed commands; JSON in the log."""
 
 from __future__ import annotations
 
@@ -23,26 +23,26 @@ if TYPE_CHECKING:
     from dxlrun.channels.cycle import CycleLayout
 
 TOLERATED_SKIPS = 0.1
-"""As the robot file's default. Measured: 50 Hz, simulated servos, no real-time rights, two cores that five
-programs want, skipped 2.6 %."""
+"""Default of the robot file. A loop at 50 Hz with simulated servos, without real-time rights and with five
+busy programs on two cores, skipped 2.6 % [measured]."""
 
 Policy = Literal["other", "fifo", "round_robin"]
 OverrunPolicy = Literal["skip", "catch_up", "stop"]
-"""What becomes of deadlines that passed while a cycle was late."""
+"""Handling of deadlines that passed during a late cycle."""
 ScheduleName = Literal["absolute", "sequential"]
-"""When cycles are due, see `control/schedule.py`. `sequential` has no key in the robot file: it is the
-yardstick of `dxlrun experiment tracking`."""
+"""Rule for deadlines, see `control/schedule.py`. `sequential` is not a key of the robot file. It is the
+baseline of `dxlrun experiment tracking`."""
 
 GOAL_TOLERANCES: Mapping[JointUnit, float] = {ROTARY: math.radians(5.0), LINEAR: 0.005}
-"""Default distance from a goal within which a joint has reached it, rad or m; within the same distance a
-second it is at rest."""
+"""Default tolerance of a goal, rad or m. The same number is the default speed below which a joint is at rest,
+rad/s or m/s."""
 SETTLE_NS = 1_000_000_000
-"""Default time after the end of a motion in which its goal may still be reached."""
+"""Default settling time: a goal may still be reached so long after the end of its motion."""
 UNLIMITED = 1e300
-"""Stands for an infinite tolerance: JSON has no infinity."""
+"""Replaces an infinite tolerance, because JSON does not have infinity."""
 
 MOST_SHARE = 2
-"""One part in so many of the period is the most that the clock is polled: the rest is left to others."""
+"""Divider of the period for the longest polling of the clock. Other processes need the rest of the core."""
 
 
 class SchedulerPlan(msgspec.Struct, frozen=True):
@@ -51,12 +51,12 @@ class SchedulerPlan(msgspec.Struct, frozen=True):
     policy: Policy
     priority: int
     lock_memory: bool
-    cores: tuple[int, ...] = ()  # Where the loop may run; empty: anywhere
+    cores: tuple[int, ...] = ()  # Cores of the loop; empty: all
     polling_ns: int | None = None
-    """Longest time that the clock is polled before a deadline; None: a tenth of the period."""
+    """Longest polling of the clock before a deadline; None: a tenth of the period."""
     reply_polling_ns: int | None = None
-    """Longest time that a reply is polled for, 0: never; None: as a tenth of a core allows."""
-    idle_latency: bool = False  # Keep the cores from deep idle states
+    """Longest polling for a reply, 0: none; None: a tenth of a core."""
+    idle_latency: bool = False  # Keep the cores out of deep idle states
 
 
 LimitedInterface: TypeAlias = Literal["velocity", "effort", "pwm"]
@@ -64,108 +64,108 @@ LimitedInterface: TypeAlias = Literal["velocity", "effort", "pwm"]
 
 
 class ServoLimit(msgspec.Struct, frozen=True):
-    """A register that limits the goals of a joint's servo, as read at the start or when it returned."""
+    """A register that limits the goals of a joint's servo, read at start-up or when the servo returned."""
 
     interface: LimitedInterface
-    value: float  # Highest goal without its sign: rad/s or m/s, the unit of the effort, share of the voltage
-    text: str  # The register and its value: `Current Limit (38) = 20, 0.0538 A`
+    value: float  # Highest magnitude of a goal: rad/s or m/s, the unit of the effort, share of the voltage
+    text: str  # Register and value: `Current Limit (38) = 20, 0.0538 A`
 
 
 class JointPlan(msgspec.Struct, frozen=True):
-    """One joint as the loop and the gate see it; rows of all arrays are in the order of the plan's joints."""
+    """A joint with its limits. All arrays have one element a joint, in the order of the plan's joints."""
 
     name: str
-    lower: float  # rad, or m of a linear joint; the tighter one of the file's limit and the servo's reach
+    lower: float  # rad or m; the tighter one of the file's limit and the servo's range
     upper: float
     velocity: float | None
-    """rad/s; the servo's top speed where the file gives none; None: not known either, or a log of the time
-    before acceleration limits, which replays without one"""
+    """rad/s or m/s; the servo's top speed if the file has no limit. None: not known, or a log from before
+    acceleration limits, which is replayed without a limit."""
     effort: float | None = None
-    """Nm, A or the fraction of maximum, as the model measures it; None: no limit in the file"""
-    continuous: bool = False  # A wheel, or a joint of many turns
+    """Nm, A or the fraction of maximum, in the unit that the model measures; None: no limit in the file."""
+    continuous: bool = False  # A wheel, or a joint of several turns
     bounded: bool = True
-    """`lower` and `upper` bind velocity, effort and PWM too; not those of a continuous joint whose limits the
-    file does not give: a wheel turns for ever."""
-    top_speed: float | None = None  # The servo's own, rad/s; None: not known
+    """True if `lower` and `upper` also limit velocity, effort and PWM. False for a continuous joint without
+    limits in the file: a wheel."""
+    top_speed: float | None = None  # Top speed of the servo, rad/s or m/s; None: not known
     top_effort: float | None = None
-    """The highest goal that the servo has, in the unit of `effort`; None: it has none, or it is not known."""
+    """Highest effort goal of the servo, in the unit of `effort`; None: not known, or no effort goals."""
     acceleration: float | None = None
-    """rad/s^2, by which goals may become faster and slower; None: no limit in the file"""
-    servo: str = ""  # ID and bus, for sentences
+    """Acceleration limit of goals, rad/s^2 or m/s^2; None: no limit in the file."""
+    servo: str = ""  # ID and bus, for messages
     motor: MotorModel | None = None
-    """Its servo's motor, of the motor file that the robot file names; None: it names none"""
-    servo_model: ServoModel | None = None  # Its servo by the manual; None: several servos move it
+    """Motor of its servo, from the motor file in the robot file; None: the robot file has none."""
+    servo_model: ServoModel | None = None  # Data of its servo from the manual; None: several servos move it
 
     unit: JointUnit = ROTARY
-    """Of its positions; those of its speeds, accelerations and torques follow from it."""
+    """Unit of positions. The units of speeds, accelerations and torques follow from it."""
     coupled: tuple[str, ...] = ()
-    """The joints that the same servos move, itself among them; empty: none but itself."""
+    """Joints that the same servos move, including this one; empty: only this one."""
     tolerance: float | None = None
-    """Distance within which a goal is reached, rad or m, UNLIMITED: any; None: the default"""
+    """Tolerance of goals, rad or m; UNLIMITED: not checked; None: the default."""
     rest_speed: float | None = None
-    """Speed below which the joint is at rest, rad/s or m/s, UNLIMITED: any; None: the default"""
+    """Speed below which the joint is at rest, rad/s or m/s; UNLIMITED: not checked; None: the default."""
     settle_ns: int = SETTLE_NS
-    """How long after the end of a motion its goal may still be reached"""
-    wrap: bool = False  # A continuous joint to which a turn more is the same place
+    """Settling time of goals after the end of a motion."""
+    wrap: bool = False  # A continuous joint whose position is the same after a full turn
     servo_limits: tuple[ServoLimit, ...] = ()
-    """Registers of its servos that limit goals; empty in the plan, as they are read at the start."""
+    """Registers of its servos that limit goals; empty in the plan, because they are read at start-up."""
     keys: dict[str, object] = {}
-    """Keys of features that the file gives it, in SI units; `JointKey.of` returns one with its type."""
+    """Keys of features with their values in SI units; `JointKey.of` returns a value with its type."""
 
     @property
     def label(self) -> str:
-        """The joint with its servo, as sentences name it."""
+        """Name of the joint with its servo, for messages."""
         return f"{self.name} ({self.servo})" if self.servo else self.name
 
     @property
     def highest_speed(self) -> float:
-        """The lowest of the file's limit, the servo's top speed and its registers, rad/s."""
+        """Minimum of the file's limit, the servo's top speed and its registers, rad/s or m/s."""
         return self._highest("velocity")
 
     @property
     def step_speed(self) -> float:
-        """The speed to which the steps between goals are held, rad/s.
+        """Speed limit for the steps between goals, rad/s or m/s.
 
-        Where the file limits the speed, it is sent with each goal, so a register of the servo binds the steps
-        too. Without a limit in the file a servo goes to a position as fast as it can.
+        If the file limits the speed, the speed is sent with each goal, so a register of the servo limits the
+        steps too. Without a limit in the file, a servo moves to a position as fast as it can.
         """
         speed = _or_inf(self.velocity)
         return min(speed, self.highest_speed) if speed < _or_inf(self.top_speed) else speed
 
     @property
     def highest_effort(self) -> float:
-        """The lowest of the file's limit, the servo's highest goal and its registers; unit as `effort`."""
+        """Minimum of the file's limit, the servo's highest goal and its registers; unit as `effort`."""
         return self._highest("effort")
 
     @property
     def highest_pwm(self) -> float:
-        """The full voltage, 1, or less where a register of the servo limits it."""
+        """Highest PWM: 1, the full voltage, or less if a register of the servo limits it."""
         return self._highest("pwm")
 
     @property
     def immovable(self) -> str:
-        """Why the joint cannot move to a position: a register of its servo; empty: it can."""
+        """Sentence about a register that prevents motion to a position; empty: the joint can move."""
         own = self.find_servo_limit("velocity")
         return "" if own is None or own.value else f"{self.label} cannot move, as its servo has {own.text}"
 
     def find_servo_limit(self, interface: LimitedInterface) -> ServoLimit | None:
-        """Return the register that is tighter than the file and the manual; None where none is."""
+        """Return the register that is tighter than the file and the manual, or None."""
         own = next((one for one in self.servo_limits if one.interface == interface), None)
         return None if own is None or own.value >= self._planned_limit(interface) else own
 
     @property
     def binding_servo_limits(self) -> tuple[ServoLimit, ...]:
-        """The registers that are tighter than the file and the manual."""
+        """Registers that are tighter than the file and the manual."""
         return tuple(own for own in self.servo_limits if self.find_servo_limit(own.interface))
 
     def exceeds_file_limit(self, interface: LimitedInterface) -> bool:
-        """Check whether the file's limit allows more than a register of the servo."""
+        """Return whether the file has a limit and a register of the servo is tighter."""
         given = self.velocity != self.top_speed and not self.coupled if interface == "velocity" else True
         limits = {"velocity": self.velocity, "effort": self.effort, "pwm": None}
         return given and limits[interface] is not None and self.find_servo_limit(interface) is not None
 
     def describe_servo_limit(self, own: ServoLimit) -> str:
-        """Return what a register of the servo does to goals, and a remedy where the file allows more."""
+        """Return a text about the effect of a register, with a remedy if the file allows more."""
         held = f"goals of {own.interface} are held to {own.text}"
         if not self.exceeds_file_limit(own.interface):
             return held
@@ -183,7 +183,7 @@ class JointPlan(msgspec.Struct, frozen=True):
 
     @property
     def goal_tolerance(self) -> float:
-        """Distance within which a goal of the joint is reached, rad or m."""
+        """Tolerance of the joint's goals, rad or m."""
         return GOAL_TOLERANCES[self.unit] if self.tolerance is None else self.tolerance
 
     @property
@@ -192,17 +192,17 @@ class JointPlan(msgspec.Struct, frozen=True):
         return GOAL_TOLERANCES[self.unit] if self.rest_speed is None else self.rest_speed
 
     def way(self, begin: float, end: float) -> float:
-        """Return the signed way from one position to another, the shorter one of a joint that wraps."""
+        """Return the signed distance from one position to another; the shorter one if the joint wraps."""
         return (nearest_turn(end, begin) if self.wrap else end) - begin
 
     @property
     def slow_speed(self) -> float:
-        """How fast its goals move at most in the first second after torque was switched on."""
+        """Speed limit of its goals in the first second after torque was enabled, rad/s or m/s."""
         return SLOW_SPEEDS[self.unit]
 
     @property
     def rest(self) -> Mode:
-        """The mode into which a joint without a command is brought where it would not hold still."""
+        """Mode that the joint enters without a command if it would not hold still in its current mode."""
         return Mode.VELOCITY if self.continuous else Mode.POSITION
 
 
@@ -210,14 +210,14 @@ class JointProperty(msgspec.Struct, frozen=True):
     """A property of joints that `dxlrun check` or a running robot shows."""
 
     name: str  # Key in the JSON of `check`, and heading of its column
-    value: Callable[[JointPlan], object]  # In SI units; None: the joint has none
+    value: Callable[[JointPlan], object]  # Returns the value in SI units; None: not known
     column: str | None = None
-    """`check` shows the number in the unit of positions followed by this, such as `/s`; None: it does not."""
+    """Unit in the table of `check`, a suffix to that of positions: `/s`. None: not in the table."""
     limit: bool = False
-    """A joint has it in its `limits` in the robot file; without it, the number is the servo's own."""
-    listed: str = ""  # Field of `JointValues` that has it; empty: none
+    """True for a key of `limits` in the robot file, whose default is the servo's own value."""
+    listed: str = ""  # Field of `JointValues` with the property; empty: none
     text: Callable[[object, JointUnit], str] | None = None
-    """Writes a value that is not in a unit of positions or speeds; None: it is."""
+    """Formats a value without a unit of positions or speeds; None: the value has one."""
 
 
 JOINT_PROPERTIES: tuple[JointProperty, ...] = (
@@ -229,7 +229,7 @@ JOINT_PROPERTIES: tuple[JointProperty, ...] = (
     JointProperty("velocity", lambda joint: joint.velocity, column="/s", limit=True),
     JointProperty("acceleration", lambda joint: joint.acceleration, column="/s^2"),
 )
-"""In the order of the columns of `check`, which shows the keys of features after them."""
+"""Properties in the order of the columns of `check`; the keys of features follow."""
 
 
 @dataclass(frozen=True)
@@ -237,18 +237,18 @@ class JointValues:
     """Properties of all joints by name, as clients of a running robot get them."""
 
     units: dict[str, str]
-    """Of each joint's positions."""
+    """Unit of each joint's positions."""
     effort_units: dict[str, str]
     limits: dict[str, tuple[float, float]]
-    """Lowest and highest position of the joints that have limits."""
+    """Lowest and highest position of each joint with limits."""
     speeds: dict[str, float | None]
-    """Highest one of each joint; null: without a limit."""
+    """Highest speed of each joint; null: no limit."""
     joint_keys: dict[str, dict[str, object]]
-    """Keys of features: the value of each joint that has the key in the robot file, by key and joint."""
+    """Values of the keys of features in the robot file, by key and joint."""
 
     @classmethod
     def collect(cls, joints: Sequence[JointPlan], effort_units: dict[str, str]) -> JointValues:
-        """Return the properties of these joints; their units of effort follow from the models of servos."""
+        """Return the properties of joints. Units of effort depend on the servo models."""
         values: dict[str, object] = {
             one.listed: {joint.name: value for joint in joints if (value := one.value(joint)) is not None}
             for one in JOINT_PROPERTIES
@@ -266,19 +266,19 @@ def _or_inf(limit: float | None) -> float:
 
 
 class SourcePlan(msgspec.Struct, frozen=True):
-    """Something that is not a joint and has states or commands: an entry of a feature's section."""
+    """A source of states or commands that is not a joint: an entry of a feature's section."""
 
     name: str
-    kind: str  # Word for it in sentences: `device`
+    kind: str  # Noun for messages: `device`
     states: tuple[str, ...]  # Names of its states: `angular_velocity.x`
-    commands: tuple[str, ...] = ()  # Names of what may be commanded, of a device: `led`
+    commands: tuple[str, ...] = ()  # Names of its commands: `led`
     ranges: tuple[tuple[float, float], ...] = ()  # Lowest and highest value of each command, SI units
-    label: str = ""  # As sentences name it: `imu (ID 241 on bus main)`
+    label: str = ""  # Name in messages: `imu (ID 241 on bus main)`
     commandable: bool = False  # Its entry in the file may name commands
     units: dict[str, str] = {}
-    """SI unit of each state that has one, by its name; logs of earlier versions have none."""
+    """SI units of states by name; empty in logs of earlier versions."""
     command_units: dict[str, str] = {}
-    """SI unit of each command that has one, by its name."""
+    """SI units of commands by name."""
 
 
 class ControllerPlan(msgspec.Struct, frozen=True):
@@ -293,30 +293,31 @@ class ControllerPlan(msgspec.Struct, frozen=True):
     publishes: tuple[str, ...]
     active: bool
     every: int  # Updated every n-th cycle
-    rate: float | None = None  # Updates per second that the file asks for, Hz; None: the loop's
+    rate: float | None = None  # Rate of updates in the robot file, Hz; None: the loop's rate
     fallback: str = ""
-    """Name of the controller that takes over when this one breaks its contract; empty: none."""
+    """Controller that takes over when this one breaks its contract; empty: none."""
     into: tuple[str, ...] = ()  # Controllers whose references it commands; empty: it commands the servos
     reference: tuple[str, ...] = ()
-    """Interfaces that it exports on each of its joints, for controllers that are `into` it."""
+    """Interfaces that it exports for each of its joints, for controllers that are `into` this one."""
     reads: tuple[str, ...] = ()
     """Interfaces that it reads without a claim: `JOINT/position`, `CONTROLLER/JOINT/position`."""
     topics: tuple[str, ...] = ()  # Its own topics: `/arm/state`
-    provides: tuple[str, ...] = ()  # States that it provides to others: `orientation.x`
+    provides: tuple[str, ...] = ()  # States that it provides: `orientation.x`
     source_commands: tuple[str, ...] = msgspec.field(default=(), name=SOURCE_COMMANDS)
-    """Commands of sources that it claims: `light/led`; logs have the name of the first kind of source."""
-    takeovers: tuple[str, ...] = ()  # Controllers that it may let take over
-    partial: bool = False  # It goes on with its other joints while some have no torque
+    """Commands of sources that it claims: `light/led`. Logs have the name of the first kind of source."""
+    takeovers: tuple[str, ...] = ()  # Controllers whose takeover it may request
+    partial: bool = False  # It continues with the other joints while some have no torque
 
     @property
     def commands_servos(self) -> bool:
-        """True when its claims are the servos' and not references of other controllers."""
+        """True if it claims servos instead of references."""
         return bool(self.command) and not self.into
 
     def split_group(self, joints: Iterable[JointPlan]) -> tuple[str, tuple[str, ...]] | None:
-        """Return a joint that it would bring into a mode without the others that the same servos move.
+        """Return a joint whose mode would differ from that of joints with the same servos, and those joints.
 
-        Those stay in the mode in which they rest, and a servo has one mode. None: there is no such joint.
+        The controller does not claim them, so they stay in their rest mode, but a servo has only one mode.
+        None: there is not any such joint.
         """
         if not self.commands_servos:
             return None
@@ -336,47 +337,49 @@ class ControllerPlan(msgspec.Struct, frozen=True):
 
 
 class ScheduledGoal(msgspec.Struct, frozen=True):
-    """The goal of a played motion, for one controller."""
+    """Goal of a played motion for one controller."""
 
-    end_ns: int  # End of the motion since the loop's first deadline; from then on the goal is judged
+    end_ns: int  # End of the motion since the loop's first deadline, when the goal is judged
     positions: tuple[float | None, ...] = ()
-    """Goal of each joint of the controller, rad or m, None: it has to be at rest; empty: not even that"""
+    """Target of each joint of the controller, rad or m; None: it must only be at rest. Empty: neither is
+    checked."""
 
 
 class ScheduledCommand(msgspec.Struct, frozen=True):
-    """A prepared command that the loop hands to a controller at a time."""
+    """A prepared command for a controller with its time."""
 
-    at_ns: int  # Since the loop's first deadline
+    at_ns: int  # Time since the loop's first deadline
     controller: str
     kind: str
     data: bytes  # Little-endian float64
-    origin: str  # Its source: `three_parts.yaml:7:5`
-    request: str = ""  # The command that `data` was prepared from, as JSON
+    origin: str  # Source position: `three_parts.yaml:7:5`
+    request: str = ""  # Input of `prepare` as JSON
     goal: ScheduledGoal | None = None
-    """Begins with this command; the runtime pursues it where the controller takes no such goal."""
+    """Goal that starts with this command. The runtime pursues it if the command is not a goal of the
+    controller."""
 
 
 class LoopPlan(msgspec.Struct, frozen=True):
-    """Everything the loop needs beside hardware."""
+    """Data of the loop, without the hardware."""
 
     period_ns: int
     scheduler: SchedulerPlan
     joints: tuple[JointPlan, ...]
     controllers: tuple[ControllerPlan, ...]
     commands: tuple[ScheduledCommand, ...]  # Sorted by time
-    end_ns: int | None  # Stop by itself at this time since the first deadline; None: run until a stop
+    end_ns: int | None  # End of the run since the first deadline; None: run until a stop request
     overrun: OverrunPolicy = "skip"
-    tolerated_skips: float = TOLERATED_SKIPS  # Share of its periods that a run may skip and still be good
-    least_period_ns: int = 0  # The shortest period that the buses allow, by the time budget; 0: not computed
-    slowest_period_ns: int = 0  # The longest period in which no Bus Watchdog stops its servos; 0: any
+    tolerated_skips: float = TOLERATED_SKIPS  # Share of skipped periods up to which a run counts as good
+    least_period_ns: int = 0  # Shortest period for the time budget of the buses; 0: not computed
+    slowest_period_ns: int = 0  # Longest period for the Bus Watchdog; 0: unlimited
     policies: PolicyPlan = PolicyPlan()
     schedule: ScheduleName = "absolute"
     sources: tuple[SourcePlan, ...] = ()  # Devices, then sensors
-    urdf: str | None = None  # The robot's URDF as it was read; None: the robot file names none
+    urdf: str | None = None  # Text of the robot's URDF; None: the robot file does not name one
     features: tuple[Feature, ...] = FEATURES
     """Features that take part in the run."""
     feature_plans: dict[str, bytes] = {}
-    """What a feature compiled for its own part in the run, by its name."""
+    """Compiled data of features, by name of the feature."""
 
     @property
     def origins(self) -> frozenset[str]:
@@ -390,7 +393,7 @@ class LoopPlan(msgspec.Struct, frozen=True):
 
     @property
     def layout(self) -> CycleLayout:
-        """Of the cycles' records."""
+        """Layout of the cycle records."""
         from dxlrun.channels.cycle import CycleLayout  # not above: the doctor reads plans without numpy
 
         return CycleLayout(
@@ -403,19 +406,19 @@ class LoopPlan(msgspec.Struct, frozen=True):
 
     @property
     def source_states(self) -> dict[str, tuple[str, ...]]:
-        """States of devices, sensors and controllers, by name, in the order of the cycle's record."""
+        """Names of the states of devices, sensors and controllers, in the order of the cycle's record."""
         return {one.name: one.states for one in self.sources} | {
             one.name: one.provides for one in self.controllers if one.provides
         }
 
     @property
     def source_units(self) -> dict[str, str]:
-        """SI units of the states that have one: `imu/angular_velocity.x` -> `rad/s`."""
+        """SI units of states: `imu/angular_velocity.x` -> `rad/s`."""
         return {f"{one.name}/{state}": unit for one in self.sources for state, unit in one.units.items()}
 
     @property
     def command_units(self) -> dict[str, str]:
-        """SI units of the commands of sources that have one, by `light/brightness`."""
+        """SI units of the commands of sources, by `light/brightness`."""
         return {
             f"{one.name}/{command}": unit
             for one in self.sources

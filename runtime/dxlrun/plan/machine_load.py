@@ -1,7 +1,7 @@
-"""Load of the machine: whether it was too busy for a run, out of the recorder's samples.
+"""Machine load: decide from the recorder's samples whether the machine was too busy for a run.
 
-A sample says what the cores and the loop's process did over an interval; dxlrun/log/machine.py makes one a
-second. The recorder, the end of a run and the analysis of a log judge by this module.
+A sample has the load of the cores and of the loop's process in an interval; dxlrun/log/machine.py takes one a
+second. The recorder, the run summary and the analysis of a log use this module.
 """
 
 from __future__ import annotations
@@ -13,32 +13,32 @@ from dxlrun.errors import counted
 SAMPLE_PERIOD_NS = 1_000_000_000
 """Time between two samples."""
 _SILENT_NS = 2 * SAMPLE_PERIOD_NS
-"""The sampler missed at least one whole sample; it runs at ordinary priority, next to the loop."""
-_IDLE_SHARE = 0.05  # /proc/stat counts in steps of 10 ms, so a core that is idle for less counts as busy
+"""Interval after which at least one sample is missing. The sampler has ordinary priority, unlike the loop."""
+_IDLE_SHARE = 0.05  # /proc/stat counts in steps of 10 ms; a core with less idle time counts as busy
 _STOLEN_SHARE = 0.05
-_WAITED_SHARE = 0.01  # of a second; a loop at 1 kHz misses ten cycles in it
-_SPARE_SHARE = 0.5  # a core that is idle for so much of a long sample: the sampler waited for something else
-_SHORTEST_NS = 100_000_000  # ten steps of /proc/stat; a shorter sample is not judged
+_WAITED_SHARE = 0.01  # of a second: ten cycles of a loop at 1 kHz
+_SPARE_SHARE = 0.5  # with so much idle time, a late sampler did not wait for a core
+_SHORTEST_NS = 100_000_000  # ten steps of /proc/stat; shorter samples are too coarse
 _FEWEST_BUSY_S = 3.0
 _BUSY_PART = 0.1
 _MOST_PART = 0.5
 
 
 class LoadSample(msgspec.Struct, frozen=True):
-    """Work of the cores in one interval, ns of the run's clock; NaN: the system does not report it."""
+    """Load of the cores in an interval, ns of the run's clock; NaN: the system does not report it."""
 
     begin_ns: int
     end_ns: int
     most_idle: float
     """Share of the interval in which the idlest core was idle."""
     most_stolen: float
-    """Share of the interval that the host of a virtual machine withheld, of the core with the most."""
+    """Largest share of the interval that the host of a virtual machine withheld from a core."""
     loop_waiting: float
-    """Share of the interval in which the loop's process was runnable without a core."""
+    """Share of the interval in which the loop's process was ready to run but had no core."""
 
 
 class MachineLoad(msgspec.Struct, frozen=True):
-    """Seconds of an interval in which the machine was too busy; samples count by their overlap with it.
+    """Seconds of an interval in which the machine was too busy. Samples count by their overlap.
 
     Example:
         >>> MachineLoad(seconds=6.0, busy_s=5.2, no_idle_core_s=5.2).text
@@ -46,31 +46,31 @@ class MachineLoad(msgspec.Struct, frozen=True):
     """
 
     seconds: float = 0.0
-    """Of the interval, as far as it was sampled or the sampler was silent."""
+    """Length of the interval, as far as there are samples or long gaps between them."""
     busy_s: float = 0.0
-    """In which any of the following was true."""
+    """Time with any of the following conditions."""
     no_idle_core_s: float = 0.0
     waited_s: float = 0.0
-    """The loop was runnable without a core for more than 1 % of the sample."""
+    """Time of samples in which the loop was ready to run without a core for more than 1 %."""
     stolen_s: float = 0.0
-    """The host withheld more than 5 % of a core."""
+    """Time of samples in which the host withheld more than 5 % of a core."""
     silent_s: float = 0.0
-    """The recorder, which takes the samples, took none for 2 s or longer."""
+    """Time of gaps of 2 s or longer between the recorder's samples."""
 
     @property
     def share(self) -> float:
-        """Share of the interval in which the machine was too busy; 0 unless it was `too_busy`."""
+        """Share of the interval in which the machine was busy; 0 unless `too_busy`."""
         return self.busy_s / self.seconds if self.too_busy else 0.0
 
     @property
     def too_busy(self) -> bool:
-        """Whether the machine was busy for a tenth of the interval, and for 3 s or half of the interval."""
+        """True if the machine was busy for a tenth of the interval, and for 3 s or half of the interval."""
         lasting = self.busy_s >= min(_FEWEST_BUSY_S, _MOST_PART * self.seconds)
         return self.busy_s > 0 and lasting and self.busy_s >= _BUSY_PART * self.seconds
 
     @property
     def text(self) -> str:
-        """Observations without a full stop, for a sentence; empty when the machine was never busy."""
+        """Observations as a clause; empty if the machine was never busy."""
         observed = (
             (self.no_idle_core_s, "no core was idle in"),
             (self.waited_s, "the loop waited for a core in"),
@@ -82,14 +82,14 @@ class MachineLoad(msgspec.Struct, frozen=True):
 
 
 class SimulationWait(msgspec.Struct, frozen=True):
-    """Time for which the loop awaited replies beyond their deadlines, as the simulation did not run."""
+    """Time for which the loop waited for late replies because the simulation did not run."""
 
     waited_ns: int = 0
     times: int = 0
 
     @property
     def text(self) -> str:
-        """Observation without a full stop, for a sentence; empty when there was no wait."""
+        """Observation as a clause; empty without a wait."""
         if not self.times:
             return ""
         times = counted(self.times, "time", "times")
@@ -103,7 +103,7 @@ NO_WAIT = SimulationWait()
 
 
 def describe_busy_machine(load: MachineLoad, wait: SimulationWait = NO_WAIT) -> str:
-    """Return the sentence about a machine that was too busy; empty when it was not."""
+    """Return a sentence about a machine that was too busy; empty if it was not."""
     observed = ", ".join(filter(None, (load.text if load.too_busy else "", wait.text)))
     return f"The machine was too busy: {observed}." if observed else ""
 
@@ -124,7 +124,7 @@ class LoadMeter:
         self._ns = dict.fromkeys(("sampled", "busy", "no_idle_core", "waited", "stolen", "silent"), 0)
 
     def add(self, sample: LoadSample) -> None:
-        """Count the part of a sample that overlaps the interval; samples come in the order of their times."""
+        """Add the part of a sample that overlaps the interval. Samples must be sorted by time."""
         end_ns = sample.end_ns if self.end_ns is None else min(sample.end_ns, self.end_ns)
         begin_ns = max(sample.begin_ns, self._begin_ns)
         if begin_ns >= end_ns:
@@ -148,8 +148,8 @@ class LoadMeter:
     def load(self) -> MachineLoad:
         """Return the load of the interval.
 
-        Seconds before the first and after the last sample count as busy when the sampler was silent for 2 s
-        or longer. An interval without any sample says nothing.
+        Gaps of 2 s or longer before the first and after the last sample count as busy. An interval without
+        samples has no load.
         """
         silent_ns = 0
         if self._first_ns is not None:
@@ -168,5 +168,5 @@ class LoadMeter:
 
 
 def _seconds(value: float) -> str:
-    """Return seconds to a tenth, without a trailing zero."""
+    """Format seconds with one decimal, without a trailing zero."""
     return f"{value:.1f}".removesuffix(".0")

@@ -1,4 +1,4 @@
-"""Which servos move which joints, where that is more than one servo a joint; JSON in the log."""
+"""Mechanics plan: servos that move joints together, for joints with more than one servo; JSON in the log."""
 
 from __future__ import annotations
 
@@ -8,44 +8,48 @@ import msgspec
 class CouplingPlan(msgspec.Struct, frozen=True):
     """Servos that move joints together: q = M s, s = M^+ q, efforts of the joints (M^+)^T of the servos'.
 
-    s is what a servo does at the joint or at the transmission's input: direction * (theta - reference) *
-    ratio, in rad, or in m where the joint is linear. (ros2_control, DifferentialTransmission, has the same
-    matrix of a differential: half of the sum and half of the difference of the inputs.)
+    s is the position of a servo at the joint or at the input of the transmission: direction * (theta -
+    reference) * ratio, in rad, or in m for a linear joint. (DifferentialTransmission of ros2_control has the
+    same matrix for a differential: half of the sum and half of the difference of the inputs.)
     """
 
-    name: str  # Of its joint or its transmission
+    name: str  # Name of the joint or of the transmission
     joints: tuple[int, ...]  # Rows of its joints in the arrays of the joints
     servos: tuple[int, ...]  # Rows of its servos in the arrays of the servos
     matrix: tuple[tuple[float, ...], ...]  # M: a row for each joint, a column for each servo
     inverse: tuple[tuple[float, ...], ...]
-    """M^+, its pseudo-inverse: a row for each servo, a column for each joint."""
+    """M^+, the pseudo-inverse of M: a row for each servo, a column for each joint."""
     tolerance: float = 0.0
-    """By how much a servo's s may differ from what the others say, rad or m; 0: none can, there are as many
-    joints as servos."""
+    """Largest difference between a servo's s and the value from the other servos, rad or m. 0: not checked,
+    because there are as many joints as servos."""
 
     @property
     def own(self) -> bool:
-        """True when it is a servo with a joint of its own."""
+        """True for a single servo that moves a single joint."""
         return not self.name
 
 
 class MechanicsPlan(msgspec.Struct, frozen=True):
-    """How joints and servos belong together where a servo is not a joint; empty: each servo is one.
+    """Assignment of servos to joints. Empty: each joint has one servo, with the same row.
 
-    With it the arrays of the servos are others than those of the joints: `ServoPlan.row` counts in them.
+    Otherwise servos and joints have separate arrays, and `ServoPlan.row` is an index of the servos' arrays.
     """
 
     couplings: tuple[CouplingPlan, ...] = ()
-    direct: tuple[tuple[int, int], ...] = ()  # Row of each joint with one servo, and the row of that servo
-    servos: tuple[str, ...] = ()  # Names of all servos, by their rows: `head`, `hip/1`, `wrist/left`
+    direct: tuple[tuple[int, int], ...] = ()  # Rows of joint and servo, for each joint with one servo
+    servos: tuple[str, ...] = ()  # Names of all servos by row: `head`, `hip/1`, `wrist/left`
 
     @property
     def coupled(self) -> bool:
-        """True when there are joints that one servo alone does not move."""
+        """True if any joints share servos or have several."""
         return bool(self.couplings)
 
     def mechanisms(self, joints: int) -> tuple[CouplingPlan, ...]:
-        """Return all servos with what they move, by the number of joints: a servo's own joint is 1 x 1."""
+        """Return the couplings of all joints. A joint with one servo has a 1 x 1 matrix.
+
+        Args:
+            joints: Number of joints.
+        """
         alone = tuple(
             CouplingPlan("", (joint,), (servo,), ((1.0,),), ((1.0,),))
             for joint, servo in self.own_servos(joints)
@@ -53,15 +57,19 @@ class MechanicsPlan(msgspec.Struct, frozen=True):
         return alone + self.couplings
 
     def own_servos(self, joints: int) -> tuple[tuple[int, int], ...]:
-        """Return the rows of each joint with a servo of its own and of that servo."""
+        """Return the rows of joint and servo for each joint with one servo.
+
+        Args:
+            joints: Number of joints.
+        """
         return self.direct if self.coupled else tuple((row, row) for row in range(joints))
 
     def moving(self, joint: int) -> list[CouplingPlan]:
-        """Return what moves a joint that has no servo of its own, by its row; empty: it has one."""
+        """Return the couplings of a joint, by its row; empty if it has its own servo."""
         return [one for one in self.couplings if joint in one.joints]
 
     def servo_rows(self, joint: int) -> tuple[int, ...]:
-        """Return the rows of the servos that move a joint, which is the servo's own row in an empty plan."""
+        """Return the rows of the servos that move a joint; in an empty plan, the row of the joint."""
         for one in self.moving(joint):
             return one.servos
         return tuple(servo for row, servo in self.direct if row == joint) or (joint,)

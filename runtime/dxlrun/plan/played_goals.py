@@ -1,4 +1,4 @@
-"""Goals of played motions that a run did not reach: the one rule of run summary, exit code and analysis."""
+"""Played goals: find those that a run did not reach, for the run summary, the exit code and the analysis."""
 
 from __future__ import annotations
 
@@ -16,23 +16,28 @@ class UnreachedGoal(NamedTuple):
 
     controller: str
     name: str
-    """`wave of arm`"""
+    """Motion and controller: `wave of arm`."""
     sentence: str
-    """Without its full stop."""
+    """Reason as a sentence, without its full stop."""
     remedy: str = ""
     report: GoalReport | None = None
-    """How it ended; None: it never began."""
+    """Report of its outcome; None: it never began."""
 
     @property
     def failed(self) -> bool:
-        """True for a goal that was missed or aborted, but not because the run ended."""
+        """True if the goal was missed, or aborted for another reason than the end of the run."""
         return self.report is not None and self.report.failed
 
 
 def find_unreached_goals(loop: LoopPlan, goals: GoalTotals, ran_ns: int) -> Iterator[UnreachedGoal]:
-    """Yield the goals of played motions that a run of `ran_ns` did not reach.
+    """Yield the goals of played motions that a run did not reach.
 
-    A goal that a client cancelled, or replaced by another one, does not count.
+    A goal that a client cancelled or replaced does not count.
+
+    Args:
+        loop: Plan of the loop.
+        goals: Totals of the run.
+        ran_ns: Duration of the run.
     """
     starts = [command for command in loop.commands if command.goal is not None]
     origins, by_origin = loop.origins, {command.origin: command for command in starts}
@@ -57,7 +62,7 @@ def find_unreached_goals(loop: LoopPlan, goals: GoalTotals, ran_ns: int) -> Iter
 def _describe_end(
     loop: LoopPlan, name: str, command: ScheduledCommand | None, ran_ns: int
 ) -> tuple[str, str]:
-    """Return a sentence about a run that ended before a motion did, and the remedy."""
+    """Return a sentence about a run that ended before a motion, and the remedy."""
     end_ns = None if command is None or command.goal is None else command.goal.end_ns
     end = "" if end_ns is None else f" at {end_ns / 1e9:.4g} s"
     duration_ns = loop.end_ns
@@ -68,11 +73,11 @@ def _describe_end(
 
 
 def played_name(origin: str, controller: str) -> str:
-    """Return the name of a played goal: `wave of arm`; of a goal of a client that of its controller."""
+    """Return the name of a goal: `wave of arm` for a played one, else the name of the controller."""
     return f"{motion} of {controller}" if (motion := motion_name(origin)) else controller
 
 
 def motion_name(origin: str) -> str:
-    """Return the name of the motion file that a command comes from; empty: it comes from none."""
+    """Return the name of the motion file in an origin; empty for other origins."""
     path, *place = origin.rsplit(":", 2)
     return Path(path).stem if len(place) == 2 and all(part.isdigit() for part in place) else ""

@@ -1,4 +1,4 @@
-"""Policies as data: what a robot does when a run ends, or when something does not go on as planned."""
+"""Policy plan: actions of a robot at the end of a run, after faults, and after lost servos or commands."""
 
 from __future__ import annotations
 
@@ -11,25 +11,25 @@ from msgspec.structs import replace
 
 from dxlwire.joint_unit import LINEAR, ROTARY, JointUnit
 
-Last = Literal["limp", "hold"]  # How a robot is left: torque off, or torque on where it stands
+Last = Literal["limp", "hold"]  # Final state of a robot: torque off, or torque on at its position
 TORQUE_STAYS = (
     "torque stays on, as the policy says: the robot holds until its power is off; "
     "the next run needs --take-over"
 )
-"""The remark of a run that ends with `hold`."""
+"""Remark at the end of a run with `hold`."""
 
 SLOW_SPEED = 1.5
-"""rad/s; a goal moves no faster in the first second after torque was switched on. A quarter of an AX-12's
-full speed: a person beside the robot can step back, and the thesis' motions still begin on time."""
+"""Speed limit of goals in the first second after torque was enabled, rad/s. A quarter of an AX-12's full
+speed: a person next to the robot can step back, and the thesis' motions still begin on time."""
 SLOW_SPEEDS: Mapping[JointUnit, float] = {
     ROTARY: SLOW_SPEED,
     LINEAR: 0.05,  # a gripper's fingers close in a second [i]
 }
-"""The same for each unit of joints, rad/s or m/s."""
-SLOW_START_NS = 1_000_000_000  # How long after `ease_in` the slow speed holds (failures: limit violation)
-_NEVER_S = 1e9  # What takes longer is as good as endless, and still a whole number of ns
+"""SLOW_SPEED for each unit of joints, rad/s or m/s."""
+SLOW_START_NS = 1_000_000_000  # Duration of the slow speed after `ease_in` (failures: limit violation)
+_NEVER_S = 1e9  # Upper bound of durations, so that they fit an int of ns
 SETTLE_NS = 300_000_000
-"""A joint that has had its pose as goal for so long and is not there is blocked, too weak, or lost."""
+"""Settling time of a pose. A joint that arrives later is blocked, too weak, or lost."""
 
 
 def longest_pose_ns(
@@ -39,11 +39,18 @@ def longest_pose_ns(
     highest_speed: float = 0.0,
     slow_speed: float = SLOW_SPEED,
 ) -> int:
-    """Return how long a pose takes at the most from `distance` rad away at `speed` rad/s, ns; or m and m/s.
+    """Return the longest duration of a pose, ns.
 
-    The gate lets nothing go faster than `slow_speed` in the first second, and a run may be stopped in it.
-    With a finite acceleration, rad/s^2, a goal of `highest_speed` comes to rest first, which takes v / a; its
-    way then takes at most distance / v + v / a, whether it reaches its speed or not.
+    The slow start of the gate is included, because a run may be stopped in its first second. With a finite
+    acceleration, a goal that moves at `highest_speed` first comes to rest, which takes v / a. Its way then
+    takes at most distance / v + v / a, even if it does not reach its speed.
+
+    Args:
+        distance: Distance to the pose, rad or m.
+        speed: Speed toward the pose, rad/s or m/s.
+        acceleration: Acceleration limit, rad/s^2 or m/s^2.
+        highest_speed: Highest speed of the goal at the begin, rad/s or m/s.
+        slow_speed: Speed limit in the first second, rad/s or m/s.
     """
     slow_s = SLOW_START_NS * 1e-9
     slow = min(speed, slow_speed)
@@ -54,41 +61,41 @@ def longest_pose_ns(
 
 
 class Step(msgspec.Struct, frozen=True):
-    """One thing that is done, cycle by cycle, before the robot is left: a pose, or less torque."""
+    """Step of a policy: a pose, or a reduction of torque."""
 
-    text: str  # As a person reads it: `pose home at 60 deg/s`
-    longest_ns: int  # How long it takes at the most
+    text: str  # Text for people: `pose home at 60 deg/s`
+    longest_ns: int  # Longest duration
     targets: tuple[float | None, ...] = ()
-    """rad, one a joint, None where the pose says nothing; empty: this step is no pose."""
-    speed: float = 0.0  # rad/s, toward the pose
-    linear_speed: float | None = None  # m/s, of linear joints; None: the pose has none
-    fraction: float = 1.0  # Of each servo's own torque limit, at the end of the step
-    levels: int = 0  # In how many steps the torque becomes less; 0: it stays
+    """Target of each joint, rad or m; None: not in the pose. Empty: the step does not have a pose."""
+    speed: float = 0.0  # Speed toward the pose, rad/s
+    linear_speed: float | None = None  # Speed of linear joints, m/s; None: not in the pose
+    fraction: float = 1.0  # Torque limit at the end of the step, as a share of each servo's own limit
+    levels: int = 0  # Number of reductions of the torque limit; 0: none
 
     def speed_of(self, unit: JointUnit) -> float:
-        """Return the speed toward the pose of a joint with this unit, rad/s or m/s."""
+        """Return the speed toward the pose for joints with this unit, rad/s or m/s."""
         return (self.linear_speed or 0.0) if unit is LINEAR else self.speed
 
 
 class Policy(msgspec.Struct, frozen=True):
-    """Steps in order, and how the robot is left."""
+    """Sequence of steps, and the final state of the robot."""
 
     steps: tuple[Step, ...] = ()
     last: Last = "limp"
 
     @property
     def text(self) -> str:
-        """The policy in words."""
+        """The policy as text."""
         return ", then ".join([*(step.text for step in self.steps), self.last])
 
     @property
     def goes_on(self) -> bool:
-        """True when it does nothing but hold: where the run need not end for that, it does not."""
+        """True if the policy only holds. A run continues if the cause does not require its end."""
         return not self.steps and self.last == "hold"
 
     @property
     def longest_ns(self) -> int:
-        """How long the steps take at the most, ns."""
+        """Longest duration of all steps, ns."""
         return sum(step.longest_ns for step in self.steps)
 
 
@@ -97,39 +104,39 @@ HOLD = Policy(last="hold")
 
 
 class GroupPolicy(msgspec.Struct, frozen=True):
-    """What happens when a servo of a group of joints is lost."""
+    """Policy for the loss of a servo in a group of joints."""
 
     name: str
     rows: frozenset[int]  # Rows of its joints
     on_lost_servo: Literal["hold", "limp", "stop"]
-    """Its controllers wait, the group loses its torque, or the run ends."""
+    """`hold`: its controllers are held; `limp`: the group's torque is disabled; `stop`: the run ends."""
 
 
 class PolicyPlan(msgspec.Struct, frozen=True):
-    """The policies of a robot whose steps may end a run."""
+    """Policies of a robot."""
 
-    on_exit: Policy = LIMP  # When a run was asked to stop, or came to its end
-    on_fault: Policy = LIMP  # When the loop or a bus failed, or a controller whose fallback did not take over
+    on_exit: Policy = LIMP  # After a stop request, or at the end of the plan
+    on_fault: Policy = LIMP  # After a fault of the loop, a bus, or a controller without an available fallback
     on_lost_servo: Policy = HOLD
     on_stale_command: Policy = HOLD
-    groups: tuple[GroupPolicy, ...] = ()  # For joints that stand in one of them, in place of `on_lost_servo`
+    groups: tuple[GroupPolicy, ...] = ()  # Replace `on_lost_servo` for the joints of a group
     limit_ns: int = 1_500_000_000
-    """The steps are cut short after this time: what is left of the exit timeout is for torque off."""
+    """Time limit of the steps. The rest of the exit timeout is reserved for torque off."""
     others: dict[str, Policy] = {}
-    """Policies of features that have no field above."""
+    """Policies of features without a field above, by name."""
 
     @classmethod
     def collect(
         cls, policies: Mapping[str, Policy], groups: tuple[GroupPolicy, ...], limit_ns: int
     ) -> PolicyPlan:
-        """Return the plan of these policies by their names."""
+        """Return a plan with policies by name."""
         own = {name: policies[name] for name in cls().by_name if name in policies}
         others = {name: policy for name, policy in policies.items() if name not in own}
         return replace(cls(groups=groups, limit_ns=limit_ns, others=others), **own)
 
     @property
     def by_name(self) -> dict[str, Policy]:
-        """All policies by their names."""
+        """All policies by name."""
         return {
             "on_exit": self.on_exit,
             "on_fault": self.on_fault,
@@ -139,15 +146,18 @@ class PolicyPlan(msgspec.Struct, frozen=True):
         }
 
     def slowest_period_ns(self, planned_ns: int) -> int:
-        """Return the longest period in which a run ends within its exit timeout; `planned_ns` is the plan's.
+        """Return the longest period with which a run ends within its exit timeout.
 
-        A request to stop is seen a period later, and the first step begins one after that; two planned
-        periods are kept free for it beside the limit.
+        The loop sees a stop request up to a period later, and the first step begins in the cycle after that.
+        Two planned periods are reserved for that in addition to the limit.
+
+        Args:
+            planned_ns: Period of the plan.
         """
         longest_ns = max(policy.longest_ns for policy in self.by_name.values())
         left_ns = max(0, self.limit_ns - longest_ns)
         return planned_ns + (left_ns // 2 if longest_ns else planned_ns + left_ns)
 
     def named(self, name: str) -> Policy:
-        """Return one policy; raises KeyError if there is none of this name."""
+        """Return a policy by name. Raises KeyError for an unknown name."""
         return self.by_name[name]

@@ -1,28 +1,28 @@
-"""Recording: where a run's log is written, in how many files, and which of these are kept."""
+"""Recording plan: directory of the log, its split into files, and their deletion."""
 
 from __future__ import annotations
 
 import msgspec
 
 PART_NAME, PART_END_NAME = "part", "part_end"
-"""Metadata records of a part: the first is written at its begin, the second at its end."""
+"""Metadata records at the begin and at the end of each part."""
 PART_PATTERN = "part_[0-9][0-9][0-9][0-9]*.mcap"
 
 
 class RecordingPlan(msgspec.Struct, frozen=True):
-    """What the robot file says about the log."""
+    """Settings of the log in the robot file."""
 
     directory: str = "logs"
-    split_bytes: int | None = None  # A part that is so long ends
-    split_ns: int | None = None  # A part that is so old ends
+    split_bytes: int | None = None  # Size at which a new part begins
+    split_ns: int | None = None  # Duration after which a new part begins
     keep_ns: int | None = None
-    """A part whose newest record is older than this is deleted; None: every part is kept."""
+    """Age of its newest record after which a part is deleted; None: never."""
     keep_bytes: int | None = None
-    """At the end of a run the oldest logs of the directory beyond this are deleted; None: all are kept."""
+    """Size limit of the directory; the oldest logs are deleted at the end of a run. None: unlimited."""
 
     @property
     def in_parts(self) -> bool:
-        """The log is a directory of parts."""
+        """True if the log is a directory of parts."""
         return self.split_bytes is not None or self.split_ns is not None
 
 

@@ -1,4 +1,4 @@
-"""The plan: everything that a run needs, in one frozen tree that is also JSON in the log."""
+"""Robot plan: all data of a run in one frozen tree, which is JSON in the log."""
 
 from __future__ import annotations
 
@@ -21,20 +21,20 @@ Parts = TypeVar("Parts")
 
 
 class SimulationPlan(msgspec.Struct, frozen=True):
-    """What only simulated servos and buses need."""
+    """Data for simulated servos and buses only."""
 
-    loads: dict[str, Load] = {}  # By joint, as it is felt there; one that is missing moves nothing but itself
-    adapters: dict[str, AdapterConfig] = {}  # By bus
+    loads: dict[str, Load] = {}  # Load at each joint, by joint; default: no load
+    adapters: dict[str, AdapterConfig] = {}  # Adapters by bus
     times: dict[str, ServoTimes] = {}
-    """By servo (`own_name`); one that is missing is as quick as a servo can be."""
+    """Delays by servo (`own_name`); default: the shortest delays of a servo."""
     physics: Literal["independent", "mujoco"] = "independent"
     motors: dict[str, MotorModel] = {}
-    """By servo (`own_name`); one that is missing has the motor that the simulation knows of its model."""
-    devices: dict[str, Shown] = {}  # By device
+    """Motors by servo (`own_name`); default: the simulation's motor for the model."""
+    devices: dict[str, Shown] = {}  # Simulated states by device
 
 
 class Plan(msgspec.Struct, frozen=True):
-    """A robot, ready to be executed; nothing in it needs the robot file any more."""
+    """Plan of a robot, complete without the robot file."""
 
     robot: str
     loop: LoopPlan
@@ -42,23 +42,23 @@ class Plan(msgspec.Struct, frozen=True):
     exit_timeout_ns: int
     recording: RecordingPlan
     source_file: str
-    source_text: str  # The robot file as it was read
-    arguments: dict[str, str]  # The arguments of the robot file as this run took them
+    source_text: str  # Text of the robot file
+    arguments: dict[str, str]  # Values of the robot file's arguments in this run
     included: dict[str, str] = {}
-    """Text of each file that the robot file includes, or names as a motor or a controller, by its name seen
-    from there."""
+    """Text of each file that the robot file includes, or names as a motor or a controller, by path relative
+    to the robot file."""
     played: dict[str, str] = {}
-    """Text of each motion file that is played, by its name seen from the robot file."""
+    """Text of each played motion file, by path relative to the robot file."""
     frames: FramesPlan | None = None
-    """What moves the robot's frames, and how they are logged; None: it has no URDF."""
+    """Kinematics and logging of the robot's frames; None: no URDF."""
     simulation: SimulationPlan = SimulationPlan()
-    groups: dict[str, tuple[str, ...]] = {}  # Names that stand for some joints
-    gateway: bool = True  # Others may steer the run, over a Unix socket
+    groups: dict[str, tuple[str, ...]] = {}  # Joints of named groups
+    gateway: bool = True  # True if clients may connect over a Unix socket
     packages: dict[str, str] = {}
-    """Packages of plug-ins that run in this robot, with their distributions: those of its controllers,
-    sensors, servo models, physics and hooks of the loop."""
+    """Distributions of the plug-in packages that run in this robot, by package: controllers, sensors, servo
+    models, physics and hooks of the loop."""
     mechanics: MechanicsPlan = MechanicsPlan()
-    """Which servos move which joints; empty: each joint has one servo."""
+    """Assignment of servos to joints; empty: each joint has one servo."""
 
     @property
     def features(self) -> tuple[Feature, ...]:
@@ -67,17 +67,17 @@ class Plan(msgspec.Struct, frozen=True):
 
     @property
     def feature_plans(self) -> dict[str, bytes]:
-        """What a feature compiled for its own part in the run, by its name."""
+        """Compiled data of features, by name of the feature."""
         return self.loop.feature_plans
 
     @property
     def urdf(self) -> str | None:
-        """The robot's URDF as it was read; None: the robot file names none."""
+        """Text of the robot's URDF; None: the robot file does not name one."""
         return self.loop.urdf
 
     @property
     def servos_by_joint(self) -> dict[str, tuple[tuple[BusPlan, ServoPlan], ...]]:
-        """The servos that move each joint, with their buses, by its name."""
+        """Servos of each joint with their buses, by joint name."""
         servos = {servo.row: (bus, servo) for bus in self.buses for servo in bus.servos}
         return {
             joint.name: tuple(servos[each] for each in self.mechanics.servo_rows(row) if each in servos)
@@ -86,12 +86,12 @@ class Plan(msgspec.Struct, frozen=True):
 
     @property
     def simulated(self) -> bool:
-        """True when any bus is simulated."""
+        """True if any bus is simulated."""
         return any(bus.port == "sim" for bus in self.buses)
 
 
 class MotionPart(msgspec.Struct, frozen=True):
-    """One part of a motion, ready for the loop; times since the loop's first deadline."""
+    """Compiled part of a motion. Times are since the loop's first deadline."""
 
     file: str
     controller: str
@@ -103,28 +103,28 @@ class MotionPart(msgspec.Struct, frozen=True):
 
     @property
     def motion_end_ns(self) -> int:
-        """End of its way, from which on its goal is judged; at the latest at `end_ns`."""
+        """End of the motion, when its goal is judged; at most `end_ns`."""
         goal = self.commands[0].goal
         return self.end_ns if goal is None else goal.end_ns
 
 
 def to_json(plan: Plan) -> bytes:
-    """Encode a plan; bytes are base64."""
+    """Encode a plan as JSON, with bytes as base64."""
     import msgspec  # not above: to check a robot needs no JSON
 
     return msgspec.json.encode(plan)
 
 
 def from_json(data: bytes) -> Plan:
-    """Decode a plan; raises msgspec.ValidationError when it is not one."""
+    """Decode a plan. Raises msgspec.ValidationError for other data."""
     return decode_plan(data, Plan)
 
 
 def decode_plan(data: bytes, parts: type[Parts]) -> Parts:
-    """Decode those parts of a plan that a struct has; raises msgspec.MsgspecError when it is not a plan.
+    """Decode the fields of a plan that a struct declares. Raises msgspec.MsgspecError for other data.
 
-    Logs of format 8 say `linear`, a boolean, of joints and servos, in place of their unit. Quotes inside a
-    string are escaped in JSON, so only a key matches.
+    Logs of format 8 have the boolean `linear` of joints and servos instead of their unit. Quotes in a JSON
+    string are escaped, so the replacement matches only keys.
     """
     import msgspec  # not above: to check a robot needs no JSON
 
@@ -132,7 +132,7 @@ def decode_plan(data: bytes, parts: type[Parts]) -> Parts:
 
 
 def _move_sensors(data: bytes) -> bytes:
-    """Return a plan with its sensors where they are today; logs of earlier versions have them in the loop."""
+    """Move the sensors in plans of earlier versions from the loop to the feature plans."""
     if b'"sensors":[{' not in data:
         return data
     tree = msgspec.json.decode(data, type=dict[str, Any])
