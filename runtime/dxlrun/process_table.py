@@ -1,4 +1,4 @@
-"""Linux' table of processes: the state of one, and the runs on this computer with their processes."""
+"""Process table: state of a Linux process, and the runs on this computer with their processes."""
 
 from __future__ import annotations
 
@@ -10,9 +10,10 @@ from pathlib import Path
 from typing import NamedTuple
 
 PROC = Path("/proc")
-_ROBOT = re.compile(rb'\{"robot":"([^"\\]+)"')  # the beginning of a plan as JSON
+# Beginning of a plan as JSON.
+_ROBOT = re.compile(rb'\{"robot":"([^"\\]+)"')
 UNKNOWN = "?"
-"""State of a process whose entry cannot be read: it may well be alive."""
+"""State of a process whose entry cannot be read; it may be alive."""
 _DEAD = "ZXx"
 _STOPPED = "Tt"
 SUPERVISOR = "supervisor"
@@ -29,30 +30,30 @@ class ProcessStat(NamedTuple):
     """An entry of the process table (proc_pid_stat(5))."""
 
     state: str
-    """A letter: R running, S and D waiting, T stopped by a signal, t by a debugger, Z and X dead."""
+    """One letter: R running, S and D waiting, T stopped by a signal, t by a debugger, Z and X dead."""
     parent: int
     start_ticks: int
-    """Time of its start: a process ID is used again, with another time."""
+    """Start time. It distinguishes processes that reuse an ID."""
 
     @property
     def is_dead(self) -> bool:
-        """True when it has ended, whether its parent has noticed or not."""
+        """True when the process has exited, even if its parent has not reaped it."""
         return self.state in _DEAD
 
     @property
     def is_stopped(self) -> bool:
-        """True when a signal or a debugger has stopped it: it does nothing until it is continued."""
+        """True when a signal or a debugger has stopped the process until it is continued."""
         return self.state in _STOPPED
 
     def has_ended(self, start_ticks: int) -> bool:
-        """Return whether the process that started at this time is dead, or this is another one."""
+        """Return whether the process with this start time has exited, or its ID belongs to another one."""
         return self.state != UNKNOWN and (self.is_dead or self.start_ticks != start_ticks)
 
 
 def read_stat(folder: Path) -> ProcessStat | None:
-    """Return the entry of a process by its folder in /proc; None when there is no such process.
+    """Return the entry of a process by its folder in /proc; None when the process does not exist.
 
-    Only ENOENT and ESRCH prove that. After any other error, such as EMFILE, its state is `UNKNOWN`.
+    Only ENOENT and ESRCH prove that. After any other error, such as EMFILE, the state is `UNKNOWN`.
     """
     try:
         words = (folder / "stat").read_text(errors="replace").rpartition(")")[2].split()
@@ -75,39 +76,40 @@ class RunProcess(NamedTuple):
 
 
 class FoundRun(NamedTuple):
-    """A run on this computer, with the processes that are alive; they share the memory of its plan."""
+    """A run on this computer with its living processes, which share the memory of its plan."""
 
     robot: str
     processes: tuple[RunProcess, ...]
     runtime_directory: str
-    """XDG_RUNTIME_DIR in its environment, where its gateway listens; empty without one."""
+    """XDG_RUNTIME_DIR in the run's environment, where its gateway listens; empty when unset."""
 
     def process(self, role: str) -> RunProcess | None:
-        """Return its process of this role; None when it is gone."""
+        """Return the run's process of this role; None when it has exited."""
         return next((one for one in self.processes if one.role == role), None)
 
     def memory(self, name: str) -> Path | None:
-        """Return the path of its shared memory of this name; None when no process has it open."""
+        """Return the path of the run's shared memory of this name; None when no process has it open."""
         found = (_memory_path(PROC / str(one.pid), name) for one in self.processes)
         return next((path for path in found if path is not None), None)
 
 
 def is_alive(process: RunProcess) -> bool:
-    """Return whether a process of a run has not ended; its ID may belong to another one by now."""
+    """Return whether a process of a run is alive; its ID may belong to another process now."""
     stat, found = read_stat(PROC / str(process.pid)), process.stat
-    if stat is None or found.state == UNKNOWN:  # without its time, the ID alone identifies it
+    # Without a start time, only the ID identifies the process.
+    if stat is None or found.state == UNKNOWN:
         return stat is not None and not stat.is_dead
     return not stat.has_ended(found.start_ticks)
 
 
 def robot_of(process: Path) -> str | None:
-    """Return the name of the robot that a process runs, by its folder in /proc; None when it runs none."""
+    """Return the name of the robot that a process runs, by its folder in /proc; None for other processes."""
     found = _plan_memory(process)
     return found[1] if found else None
 
 
 def describe_run(process: Path) -> str:
-    """Name the run that a process is part of, and how to stop it, by its folder in /proc; empty: of none."""
+    """Return a text about the run of a process and how to stop it, by its folder in /proc; empty: no run."""
     robot = robot_of(process)
     if robot is None:
         return ""
@@ -115,7 +117,7 @@ def describe_run(process: Path) -> str:
 
 
 def found_runs() -> list[FoundRun]:
-    """Return the runs of this user (root: of all) on this computer, whatever state their processes are in."""
+    """Return the runs of this user (root: all users) on this computer, in any state."""
     runs: dict[tuple[int, int], tuple[str, list[RunProcess]]] = {}
     for folder in PROC.iterdir():
         if not folder.name.isdigit():
@@ -130,7 +132,7 @@ def found_runs() -> list[FoundRun]:
 
 
 def _members(processes: list[RunProcess]) -> Iterator[RunProcess]:
-    """Return those that belong to the run: a supervisor has children of it, or executes dxlrun."""
+    """Yield the members of a run. A supervisor is the parent of members, or executes dxlrun."""
     parents = {one.stat.parent for one in processes}
     for one in sorted(processes):
         if one.role:
@@ -140,8 +142,9 @@ def _members(processes: list[RunProcess]) -> Iterator[RunProcess]:
 
 
 def _plan_memory(process: Path) -> tuple[tuple[int, int], str] | None:
-    """Return what identifies the plan's memory that a process has open, and the robot of the plan."""
-    with suppress(OSError, UnicodeDecodeError):  # it has just ended
+    """Return device and inode of the plan's memory that a process has open, and the robot of the plan."""
+    # The process may just have exited, or belong to another user.
+    with suppress(OSError, UnicodeDecodeError):
         if descriptor := _memory_path(process, "plan"):
             match = _ROBOT.match(descriptor.read_bytes())
             inode = descriptor.stat()
@@ -150,8 +153,9 @@ def _plan_memory(process: Path) -> tuple[tuple[int, int], str] | None:
 
 
 def _memory_path(process: Path, name: str) -> Path | None:
-    """Return where a process has shared memory of this name open."""
-    with suppress(OSError):  # it has just ended, or belongs to another user
+    """Return the path of a process' shared memory with this name; None without one."""
+    # The process may just have exited, or belong to another user.
+    with suppress(OSError):
         for descriptor in (process / "fd").iterdir():
             if os.readlink(descriptor).startswith(f"/memfd:dxlrun-{name} "):
                 return descriptor

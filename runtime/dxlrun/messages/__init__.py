@@ -1,4 +1,4 @@
-"""Messages of ROS 2 for the topics of controllers, and what own messages are made of.
+"""Messages of ROS 2: types for the topics of controllers, and parts for custom messages.
 
     from dataclasses import dataclass
 
@@ -14,7 +14,7 @@
     class Wave(dxlrun.Controller[WaveParameters]):
         Topics = {"state": WaveState}
 
-Each is the published definition, field by field (common_interfaces, control_msgs); units: REP 103.
+Each type has the fields of the published definition (common_interfaces, control_msgs); units: REP 103.
 """
 
 from __future__ import annotations
@@ -32,9 +32,10 @@ from dxlrun.messages.declared import Number as Number
 
 Floats = NDArray[np.float64]
 Covariance = Annotated[Floats, Length(36)]
-"""6 x 6, row by row: x, y, z, and rotation about X, Y, Z."""
+"""6 x 6 covariance in row-major order: x, y, z, and rotation about X, Y, Z."""
 Covariance3 = Annotated[Floats, Length(9)]
-"""3 x 3, row by row, about x, y, z; all 0: not known; -1 in its first element: there is no value."""
+"""3 x 3 covariance in row-major order, about x, y, z. All 0: unknown; first element -1: the quantity is
+not measured."""
 Float32 = Annotated[float, Number("float32")]
 Unsigned8 = Annotated[int, Number("uint8")]
 Signed32 = Annotated[int, Number("int32")]
@@ -50,7 +51,7 @@ def _no_cells() -> NDArray[np.float32]:
 
 
 class Time(msgspec.Struct):
-    """A point in time: seconds since 1970 and the nanoseconds behind them."""
+    """A point in time: seconds since 1970 and the remaining nanoseconds."""
 
     ros_type: ClassVar[str] = "builtin_interfaces/msg/Time"
     sec: Signed32 = 0
@@ -66,7 +67,7 @@ class Duration(msgspec.Struct):
 
 
 class Header(msgspec.Struct):
-    """Time and frame of a message; as its first field `header`, the runtime sets the stamp."""
+    """Time and frame of a message. The runtime sets the stamp of a first field `header`."""
 
     ros_type: ClassVar[str] = "std_msgs/msg/Header"
     stamp: Time = msgspec.field(default_factory=Time)
@@ -128,7 +129,7 @@ class MultiArrayDimension(msgspec.Struct):
 
 
 class MultiArrayLayout(msgspec.Struct):
-    """How the dimensions of an array lie in its numbers."""
+    """Layout of the dimensions of an array in its data."""
 
     ros_type: ClassVar[str] = "std_msgs/msg/MultiArrayLayout"
     dim: tuple[MultiArrayDimension, ...] = ()
@@ -136,7 +137,7 @@ class MultiArrayLayout(msgspec.Struct):
 
 
 class Float64MultiArray(msgspec.Struct):
-    """Numbers."""
+    """Array of numbers with a layout."""
 
     ros_type: ClassVar[str] = "std_msgs/msg/Float64MultiArray"
     layout: MultiArrayLayout = msgspec.field(default_factory=MultiArrayLayout)
@@ -147,7 +148,7 @@ class Float64MultiArray(msgspec.Struct):
 
 
 class Vector3(msgspec.Struct):
-    """A vector; m, m/s, N or what the message around it says."""
+    """A vector in m, m/s, N or the unit of the enclosing message."""
 
     ros_type: ClassVar[str] = "geometry_msgs/msg/Vector3"
     x: float = 0.0
@@ -183,7 +184,7 @@ class Pose(msgspec.Struct):
 
 
 class PoseWithCovariance(msgspec.Struct):
-    """A pose and how sure it is."""
+    """A pose and its covariance."""
 
     ros_type: ClassVar[str] = "geometry_msgs/msg/PoseWithCovariance"
     pose: Pose = msgspec.field(default_factory=Pose)
@@ -191,7 +192,7 @@ class PoseWithCovariance(msgspec.Struct):
 
 
 class Twist(msgspec.Struct):
-    """Velocities: m/s and rad/s."""
+    """Linear and angular velocity: m/s and rad/s."""
 
     ros_type: ClassVar[str] = "geometry_msgs/msg/Twist"
     linear: Vector3 = msgspec.field(default_factory=Vector3)
@@ -199,7 +200,7 @@ class Twist(msgspec.Struct):
 
 
 class TwistWithCovariance(msgspec.Struct):
-    """Velocities and how sure they are."""
+    """Linear and angular velocity and their covariance."""
 
     ros_type: ClassVar[str] = "geometry_msgs/msg/TwistWithCovariance"
     twist: Twist = msgspec.field(default_factory=Twist)
@@ -226,7 +227,7 @@ class WrenchStamped(msgspec.Struct):
 
 
 class Odometry(msgspec.Struct):
-    """Pose in the frame of the header, and velocities in that of the child."""
+    """Pose in the frame of the header, and velocities in the child frame."""
 
     ros_type: ClassVar[str] = "nav_msgs/msg/Odometry"
     header: Header = msgspec.field(default_factory=Header)
@@ -236,7 +237,7 @@ class Odometry(msgspec.Struct):
 
 
 class JointState(msgspec.Struct):
-    """States of joints: rad, rad/s, Nm; one row a name, or an empty array."""
+    """States of joints: rad, rad/s, Nm; one row per name, or an empty array."""
 
     ros_type: ClassVar[str] = "sensor_msgs/msg/JointState"
     header: Header = msgspec.field(default_factory=Header)
@@ -269,7 +270,7 @@ class MagneticField(msgspec.Struct):
 
 
 class Range(msgspec.Struct):
-    """One distance, m, within a cone of `field_of_view` rad; of ROS 2 Humble, without a variance."""
+    """A distance, m, within a cone of `field_of_view` rad; as in ROS 2 Humble, without a variance."""
 
     ros_type: ClassVar[str] = "sensor_msgs/msg/Range"
     header: Header = msgspec.field(default_factory=Header)
@@ -282,7 +283,7 @@ class Range(msgspec.Struct):
 
 
 class FluidPressure(msgspec.Struct):
-    """An absolute pressure, Pa; variance 0: not known."""
+    """An absolute pressure, Pa; variance 0 is unknown."""
 
     ros_type: ClassVar[str] = "sensor_msgs/msg/FluidPressure"
     header: Header = msgspec.field(default_factory=Header)
@@ -291,7 +292,7 @@ class FluidPressure(msgspec.Struct):
 
 
 class Temperature(msgspec.Struct):
-    """A temperature, degC; variance 0: not known."""
+    """A temperature, degC; variance 0 is unknown."""
 
     ros_type: ClassVar[str] = "sensor_msgs/msg/Temperature"
     header: Header = msgspec.field(default_factory=Header)
@@ -325,7 +326,7 @@ class BatteryState(msgspec.Struct):
 
 
 class JointTrajectoryPoint(msgspec.Struct):
-    """A point of a trajectory: one row a joint, or an empty array."""
+    """A point of a trajectory: one row per joint, or an empty array."""
 
     ros_type: ClassVar[str] = "trajectory_msgs/msg/JointTrajectoryPoint"
     positions: Floats = msgspec.field(default_factory=_zeros(0))

@@ -1,7 +1,8 @@
-"""CDR in columns: a field of many messages in one go, by the messages' definition; layout as in cdr.py.
+"""CDR columns: reads a field of many messages at once, by the message's definition; layout as in cdr.py.
 
-Each message has a cursor; a field is read for all of them with a few calls of numpy. So it costs by fields
-and not by messages, except for texts, and for sequences of messages, which are gone through by elements.
+Each message has a cursor, and a field is read for all messages with a few calls of NumPy. The cost therefore
+depends on the number of fields, not of messages. Exceptions are texts, and sequences of messages, which are
+read element by element.
 """
 
 from __future__ import annotations
@@ -26,26 +27,26 @@ Indices = NDArray[np.int64]
 Flags = NDArray[np.bool_]
 _HEAD = len(ENCAPSULATION)
 _SPARE = 16
-"""Zero bytes behind the messages: a cursor that left its message finds something to read."""
+"""Zero bytes after the messages, which a cursor reads that has left its message."""
 _DEEPEST = 32
-"""Messages inside messages: a definition that contains itself has no end."""
+"""Upper limit of nested messages: a definition that contains itself would not end."""
 
 
 @dataclass(slots=True)
 class Column:
-    """One field of many messages: values; elements, of which a row has some; or fields of a message."""
+    """One field of many messages: values, sequences of elements, or the fields of nested messages."""
 
     values: NDArray[np.generic] | None = None
     """Shape (rows,): numbers, or texts as objects."""
     counts: Indices | None = None
-    """Shape (rows,): how many elements each row has."""
+    """Shape (rows,): number of elements in each row."""
     elements: Column | None = None
-    """The elements of all rows, one behind the other."""
+    """Concatenated elements of all rows."""
     fields: dict[str, Column] = field(default_factory=dict)
 
     @property
     def leaves(self) -> tuple[str, ...]:
-        """Places of all values: `header.stamp.sec`; those in sequences of messages too."""
+        """Paths of all values, including those in sequences of messages: `header.stamp.sec`."""
         inside = self.elements if self.elements is not None else self
         return tuple(
             f"{name}.{leaf}" if leaf else name
@@ -54,7 +55,7 @@ class Column:
         )
 
     def leaf(self, place: str) -> Column:
-        """Return the column at a place. Raises KeyError when there is none."""
+        """Return the column at a path. Raises KeyError for an unknown path."""
         if not place:
             return self
         if self.elements is not None:
@@ -63,9 +64,9 @@ class Column:
         return self.fields[name].leaf(rest)
 
     def array(self) -> NDArray[np.generic]:
-        """Return values as one array, a row a message; rows that differ in length as objects.
+        """Return the values as one array with one row per message; rows of different lengths become objects.
 
-        Raises ValueError for a message, which has fields.
+        Raises ValueError for a nested message, which has fields.
         """
         if self.values is not None:
             return self.values
@@ -80,14 +81,14 @@ class Column:
 
     @property
     def flat(self) -> tuple[Indices, NDArray[np.generic]]:
-        """How many elements each row has, and those of all rows; of what is no sequence of values nothing."""
+        """Number of elements in each row, and the elements of all rows; empty unless a sequence of values."""
         inside = None if self.elements is None else self.elements.values
         if self.counts is None or inside is None:
             return np.zeros(0, np.int64), np.zeros(0)
         return self.counts, inside
 
     def take(self, rows: Indices) -> Column:
-        """Return some rows."""
+        """Return the column of some rows."""
         if self.values is not None:
             return Column(values=self.values[rows])
         if self.counts is not None and self.elements is not None:
@@ -102,7 +103,7 @@ class Column:
 
     @classmethod
     def joined(cls, parts: Sequence[Column]) -> Column:
-        """Return the rows of several columns of one kind, one behind the other."""
+        """Return the concatenated rows of columns of one kind."""
         first = parts[0]
         if first.values is not None:
             return cls(values=np.concatenate([part.values for part in parts if part.values is not None]))
@@ -116,21 +117,21 @@ class Column:
 
 @dataclass(slots=True)
 class _Cursors:
-    """How far each message was read."""
+    """Read positions of all messages."""
 
     data: NDArray[np.uint8]
     at: Indices
     end: Indices
     origin: Indices
-    """From which alignment counts."""
+    """Origin of the alignment of each message."""
     good: Flags
-    """False where a message ended before its fields."""
+    """False for a message that ended before its fields."""
 
     def align(self, size: int) -> None:
         self.at += (self.origin - self.at) % size
 
     def ahead(self, sizes: Indices | int) -> Indices:
-        """Go on by so many bytes; return where they begin. A message that has fewer ends, and is bad."""
+        """Advance by `sizes` bytes and return the previous positions. A message without as many is bad."""
         fits = self.at + sizes <= self.end
         self.good &= fits
         begin = np.where(fits, self.at, len(self.data) - _SPARE)
@@ -144,7 +145,7 @@ class _Cursors:
         return found
 
     def counted(self, least: int) -> Indices:
-        """Read lengths; one that the message has no room for, at `least` bytes an element, is 0, and bad."""
+        """Read lengths of sequences. One beyond the message, at `least` bytes per element, is 0 and bad."""
         self.align(4)
         begin = self.ahead(4)
         counts = self.numbers(begin, "uint32").astype(np.int64)
@@ -157,13 +158,13 @@ class _Cursors:
 
 
 Read = Callable[[_Cursors, bool], Column]
-"""Reads one field, or only goes past it and returns nothing that counts."""
+"""Function that reads one field, or skips it and returns an empty column."""
 
 
 class ColumnReader:
-    """Reads messages of one type as columns; made once from the definition.
+    """Reader of messages of one type as columns, made once from the definition.
 
-    Raises ValueError for a definition that cannot be laid out.
+    Raises ValueError for an invalid definition.
     """
 
     def __init__(self, message: MessageType) -> None:
@@ -173,7 +174,7 @@ class ColumnReader:
         if self._top not in self.definitions:
             raise ValueError(f"the definition of {message.name} is empty")
         self.leaves = tuple(self._leaves(self._top, 0))
-        """Places of all values."""
+        """Paths of all values."""
 
     def _leaves(self, name: str, depth: int) -> list[str]:
         if depth > _DEEPEST:
@@ -187,7 +188,7 @@ class ColumnReader:
         return found
 
     def check(self, fields: Sequence[str]) -> str | None:
-        """Return the first of these places that no message has; None when all of them exist."""
+        """Return the first unknown path; None when all exist."""
         return next((place for place in fields if place not in self.leaves), None)
 
     def read(
@@ -197,9 +198,16 @@ class ColumnReader:
         size: Indices,
         fields: Sequence[str] | None = None,
     ) -> tuple[Indices, Column]:
-        """Return which of the messages in `data` are whole, and their fields; of other fields nothing.
+        """Return the indices of intact messages in `data`, and their columns.
 
-        Raises ValueError when none is CDR, little-endian.
+        Args:
+            data: Bytes that contain the messages.
+            start: Index of each message's encapsulation header.
+            size: Length of each message, bytes.
+            fields: Paths to read; other fields are skipped. None reads all.
+
+        Raises:
+            ValueError: No message is little-endian CDR.
         """
         rows = np.flatnonzero(size >= _HEAD)
         padded = np.concatenate((data, np.zeros(_SPARE, np.uint8)))
@@ -214,12 +222,14 @@ class ColumnReader:
             column = self._message(self._top, cursors, "", wanted)
             if cursors.good.all():
                 return rows, column
-            rows = rows[cursors.good]  # rare: read again without those that are damaged
+            # Rare: read again without the damaged messages.
+            rows = rows[cursors.good]
 
     def _message(self, name: str, cursors: _Cursors, place: str, wanted: frozenset[str] | None) -> Column:
         fields = self.definitions[name]
         if not fields:
-            cursors.ahead(1)  # ROS 2 gives a message without fields one byte
+            # ROS 2 gives a message without fields one byte.
+            cursors.ahead(1)
         found: dict[str, Column] = {}
         for one in fields:
             inner = f"{place}{one.name}"
@@ -276,7 +286,7 @@ def _many_numbers(one: MessageField, cursors: _Cursors, *, asked: bool) -> Colum
 
 
 def pieces(data: NDArray[np.uint8], begin: Indices, size: Indices) -> NDArray[np.uint8]:
-    """Return pieces of `data` one behind the other; it is copied by pieces of one size, not by bytes."""
+    """Return concatenated pieces of `data`; all pieces of one size are copied at once."""
     into, found = np.cumsum(size) - size, np.empty(int(size.sum()), np.uint8)
     for one in np.unique(size[size > 0]).tolist():
         rows = np.flatnonzero(size == one)
@@ -285,7 +295,7 @@ def pieces(data: NDArray[np.uint8], begin: Indices, size: Indices) -> NDArray[np
 
 
 def _windows(data: NDArray[np.uint8], size: int) -> NDArray[np.void]:
-    """Return what lies from each byte on, that many bytes each, without a copy."""
+    """Return overlapping windows of `size` bytes, one from each byte, without a copy."""
     return np.ndarray((len(data) - size + 1,), f"V{size}", data, 0, (1,))
 
 
@@ -319,7 +329,8 @@ def _elements(cursors: _Cursors, counts: Indices, element: Callable[[_Cursors], 
         number += 1
         live = live[(counts[live] > number) & cursors.good[live]]
     if not parts:
-        parts.append(element(cursors.some(live)))  # no row has any: the kind of the column alone
+        # No row has an element; only the column's kind is needed.
+        parts.append(element(cursors.some(live)))
         order.append(live)
     inside = Column.joined(parts).take(np.argsort(np.concatenate(order), kind="stable"))
     return Column(counts=counts, elements=inside)

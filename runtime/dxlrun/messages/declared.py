@@ -1,12 +1,12 @@
-"""Declared messages: dataclasses whose annotations are the fields of a ROS 2 message.
+"""Declared messages: dataclasses whose annotations define the fields of a ROS 2 message.
 
     float -> float64, int -> int64, bool -> bool, str -> string, another dataclass -> its message
     Floats, NDArray[np.float64] -> float64[], and so for the other numbers of numpy
     tuple[X, ...], list[X] -> X[]
     Annotated[Floats, Length(9)] -> float64[9], Annotated[int, Number("uint8")] -> uint8
 
-The message is called PACKAGE/msg/CLASS; a class variable `ros_type` gives it another name, as those of
-dxlrun.messages have it.
+The message's name is PACKAGE/msg/CLASS, unless a class variable `ros_type` gives another name, as in
+dxlrun.messages.
 """
 
 from __future__ import annotations
@@ -32,24 +32,24 @@ from dxlrun.messages.definition import (
 )
 
 HEADER = "std_msgs/msg/Header"
-"""A field `header` of this message gets the time of the cycle as its stamp."""
+"""Type of a field `header` whose stamp is set to the time of the cycle."""
 
 _PLAIN: Mapping[object, str] = {float: "float64", int: "int64", bool: "bool", str: "string"}
 _ARRAYS: Mapping[object, str] = {
     np.dtype(kind).type: kind for kind in PRIMITIVES if kind not in {"byte", "char"}
 }
 _NAME = re.compile(r"[a-z][a-z0-9]*(_[a-z0-9]+)*")
-"""Of a field, by the page "Interfaces" of ROS 2's documentation."""
+"""Pattern of field names, from the page "Interfaces" of ROS 2's documentation."""
 _CLASS = re.compile(r"[A-Z][A-Za-z0-9]*")
 _ROS_TYPE = re.compile(r"[a-z][a-z0-9_]*/msg/[A-Z][A-Za-z0-9]*")
 _DEEPEST = 16
 
 Plain: TypeAlias = "Callable[[object], Value]"
-"""Returns a value of a field as `Codec.pack` takes it."""
+"""Function that converts a field's value for `Codec.pack`."""
 
 
 def _unaliased(annotation: object) -> object:
-    """Return what a `type` alias stands for (Python 3.12); NDArray is one since numpy 2.5."""
+    """Return the value of a `type` alias (Python 3.12); NDArray is an alias since numpy 2.5."""
     alias = get_origin(annotation) or annotation
     if not hasattr(alias, "__value__"):
         return annotation
@@ -58,7 +58,7 @@ def _unaliased(annotation: object) -> object:
 
 
 class WrongMessage(ValueError):
-    """A class that is no message, with how to fix it; or a value that does not fit its message."""
+    """A class that is not a valid message, with a fix; or a value that does not fit its message."""
 
     def __init__(self, what: str, fix: str = "") -> None:
         super().__init__(what)
@@ -67,37 +67,37 @@ class WrongMessage(ValueError):
 
 
 class Number(msgspec.Struct, frozen=True):
-    """Mark of an annotation: a number of this type of ROS 2, such as `Annotated[int, Number("uint8")]`."""
+    """Annotation of a number of this ROS 2 type: `Annotated[int, Number("uint8")]`."""
 
     kind: str
 
 
 class Length(msgspec.Struct, frozen=True):
-    """Mark of an annotation: an array of a fixed length, such as `Annotated[Floats, Length(9)]`."""
+    """Annotation of an array of fixed length: `Annotated[Floats, Length(9)]`."""
 
     length: int
 
 
 @dataclass(frozen=True, slots=True)
 class DeclaredMessage:
-    """A dataclass as a message: its definition, and how one of its objects becomes bytes."""
+    """Message type declared by a dataclass: definition, and conversion of its objects to bytes."""
 
     cls: type
     type: MessageType
     stamped: bool
-    """True with a field `header` whose stamp is set when it is packed."""
+    """True when the stamp of a field `header` is set on packing."""
     _codec: Codec
     _plain: tuple[tuple[str, Plain | None], ...]
-    """Of each field how it becomes plain; None: it is."""
+    """Conversion of each field; None: not needed."""
     _row: Callable[[object], tuple[Value, ...]]
-    """Returns all values that a message is made of."""
+    """Function that returns all values of a message."""
     _converted: tuple[tuple[int, Plain], ...]
-    """Those of them that become plain."""
+    """Index and conversion of the values in the row that need one."""
 
     def pack(self, message: object, stamp: tuple[int, int]) -> bytes:
         """Return a message as CDR; `stamp`: seconds and nanoseconds for its header.
 
-        Raises WrongMessage, with one sentence that names the field, when it does not fit.
+        Raises WrongMessage, with one sentence that names the field, when a value does not fit.
         """
         if not isinstance(message, self.cls):
             raise WrongMessage(f"takes {self.cls.__name__}, not {type(message).__name__}")
@@ -114,7 +114,7 @@ class DeclaredMessage:
             raise WrongMessage(self._fault(message)) from None
 
     def _fault(self, message: object) -> str:
-        """Return which field of a message does not fit, and why."""
+        """Return a sentence about the field that does not fit, and the reason."""
         for name, plain in self._plain:
             field = f"{self.cls.__name__}.{name}"
             try:
@@ -126,7 +126,10 @@ class DeclaredMessage:
 
 
 def declared_message(cls: object, package: str) -> DeclaredMessage:
-    """Return a dataclass as a message of this package. Raises WrongMessage for what ROS 2 has nothing for."""
+    """Return the message type of a dataclass, in this package.
+
+    Raises WrongMessage for types without a ROS 2 equivalent.
+    """
     reader = _Annotations(package)
     name = reader.message(cls, ())
     kind = message_type(name, reader.definitions)
@@ -146,14 +149,14 @@ def _alone(place: str) -> Callable[[object], tuple[Value, ...]]:
 
 
 def package_of(distribution: str) -> str:
-    """Return the name of a package for messages of a distribution: `my_robotics` of `My-Robotics 0.1.0`."""
+    """Return the ROS 2 package of a distribution: `my_robotics` for `My-Robotics 0.1.0`."""
     words = re.findall(r"[a-z0-9]+", distribution.rpartition(" ")[0].lower() or distribution.lower())
     name = "_".join(words)
     return name if name[:1].isalpha() else f"package_{name}".rstrip("_")
 
 
 class _Annotations:
-    """Collects definitions, and how values become plain, from a dataclass and all that it contains."""
+    """Definitions and conversions, collected from a dataclass and all nested ones."""
 
     def __init__(self, package: str) -> None:
         self.definitions: dict[str, tuple[MessageField, ...]] = {}
@@ -162,7 +165,7 @@ class _Annotations:
         self._package = package
 
     def message(self, cls: object, inside: tuple[object, ...]) -> str:
-        """Return the full name of the message of a dataclass, whose fields are known then."""
+        """Return the full name of a dataclass's message, and add its definition."""
         shown = getattr(cls, "__name__", repr(cls))
         if not (isinstance(cls, type) and _is_message(cls)):
             raise WrongMessage(f"{shown} is no dataclass", "put @dataclass above the class of the message")
@@ -173,14 +176,15 @@ class _Annotations:
         if self._classes.setdefault(short, cls) is not cls:
             raise WrongMessage(f"two classes are the message {name}", "give one of them another name")
         if short not in self.definitions:
-            self.definitions[short] = ()  # its place: before all that it depends on
+            # The entry keeps the place before its dependencies.
+            self.definitions[short] = ()
             pairs = [self._field(cls, *pair, (*inside, cls)) for pair in _annotations(cls)]
             self.definitions[short] = tuple(field for field, _ in pairs)
             self.plain[short] = tuple((field.name, plain) for field, plain in pairs)
         return name
 
     def conversions(self, name: str) -> list[tuple[int, Plain]]:
-        """Return which of the values of a message, nested ones in their place, become plain, and how."""
+        """Return index and conversion of the values of a message, with nested messages flattened."""
         found: list[tuple[int, Plain]] = []
         count = 0
         for field, (_, plain) in zip(self.definitions[name], self.plain[name], strict=True):
@@ -235,7 +239,7 @@ class _Annotations:
     def _kind(
         self, annotation: object, inside: tuple[object, ...]
     ) -> tuple[str, bool, int, Plain | None] | None:
-        """Return type, whether it is a sequence, fixed length, and how a value becomes plain; None: none."""
+        """Return type, sequence flag, fixed length and conversion of an annotation; None: not supported."""
         base, *marks = get_args(annotation) if get_origin(annotation) is Annotated else (annotation,)
         base = _unaliased(base)
         number = next((mark.kind for mark in marks if isinstance(mark, Number)), None)
@@ -253,7 +257,7 @@ class _Annotations:
         return many[0], not length, length, many[1]
 
     def _many(self, base: object, inside: tuple[object, ...]) -> tuple[str, Plain | None] | None:
-        """Return the type of an array's or a sequence's elements, and how a value becomes plain."""
+        """Return the element type and the conversion of an array or a sequence; None: not supported."""
         arguments = get_args(base)
         if get_origin(base) is np.ndarray and len(arguments) == 2:
             elements = get_args(arguments[1])
@@ -272,7 +276,7 @@ class _Annotations:
 
 
 def _is_message(cls: type) -> bool:
-    """Return whether a class has fields by its annotations; those of dxlrun.messages are of msgspec."""
+    """Return whether a class is a dataclass, or a msgspec struct as in dxlrun.messages."""
     return dataclasses.is_dataclass(cls) or issubclass(cls, msgspec.Struct)
 
 
@@ -283,7 +287,8 @@ def _annotations(cls: type) -> list[tuple[str, object]]:
         raise WrongMessage(f"{cls.__name__} has no fields", "give it at least one")
     try:
         hints = get_type_hints(cls, include_extras=True)
-    except Exception as error:  # foreign annotations: whatever evaluating them raises
+    # Foreign annotations may raise any exception.
+    except Exception as error:
         raise WrongMessage(
             f"the annotations of {cls.__name__} cannot be read ({type(error).__name__}: {error})",
             "import the names in them at the top of the module, not for type checking only",
@@ -297,7 +302,8 @@ def _nested(cls: type, known: Mapping[str, tuple[tuple[str, Plain | None], ...]]
     def plain(value: object) -> Value:
         if not isinstance(value, cls):
             raise ValueError(f"{type(value).__name__} is given where {cls.__name__} is asked")
-        # of a list: a tuple that grows with a generator ends in CPython's free list, which then fills
+        # A tuple made from a list: one that grows from a generator ends in CPython's free list, which then
+        # fills.
         return tuple(
             [
                 getattr(value, one) if convert is None else convert(getattr(value, one))

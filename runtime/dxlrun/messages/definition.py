@@ -1,4 +1,4 @@
-"""Definitions of messages: their text as ROS 2 writes it (`ros2msg`), its fields, and its RIHS01 hash.
+"""Definition: text of a message in ROS 2 format (`ros2msg`), its fields, and its RIHS01 hash.
 
 Sources: ROS 2's documentation "Interfaces" for the text, REP 2011 and REP 2016 for the hash: SHA-256 of the
 type description as JSON.
@@ -30,10 +30,11 @@ PRIMITIVES: Mapping[str, str] = {
     "float32": "f",
     "float64": "d",
 }
-"""Numbers of a definition, and their codes in `struct`."""
+"""Number types of definitions, with their codes in `struct`."""
 
 _FIELD = re.compile(r"^([A-Za-z0-9_/]+)(?:<=\d+)?(\[(<=)?(\d*)\])?\s+([a-z][a-z0-9_]*)(?:\s+\S.*)?$")
-"""Type, bound of a text, brackets, bound of a sequence, name, default value."""
+"""Groups: type with bound of a text, brackets, bound of a sequence, length, name; the default value
+follows."""
 _CONSTANT = re.compile(r"^[a-z0-9<=]+\s+[A-Z][A-Z0-9_]*\s*=")
 _RULE = re.compile(r"^=+$", re.MULTILINE)
 _NUMBERS = ("int8", "uint8", "int16", "uint16", "int32", "uint32", "int64", "uint64", "float32", "float64")
@@ -43,19 +44,19 @@ _TYPE_IDS = {name: number for number, name in enumerate(_NUMBERS, 2)} | {
     "byte": 16,
     "string": 17,
 }
-"""type_description_interfaces/msg/FieldType: FIELD_TYPE_INT8 and so on; a nested type is 1."""
+"""Values of type_description_interfaces/msg/FieldType: FIELD_TYPE_INT8 and so on; a nested type is 1."""
 _ARRAY, _SEQUENCE = 48, 144
 
 
 class MessageType(msgspec.Struct, frozen=True):
-    """A message: its full name, and its definition with all it depends on."""
+    """A message type: full name, and definition with all its dependencies."""
 
     name: str
     text: str
 
     @property
     def type_hash(self) -> str:
-        """Its RIHS01 hash."""
+        """RIHS01 hash of the type."""
         definitions = parse(self)
         top = short_name(self.name)
         others = sorted(_full_name(other) for other in definitions if other != top)
@@ -73,31 +74,31 @@ class MessageField(msgspec.Struct, frozen=True):
 
     name: str
     kind: str
-    """A number, `string`, or the name of another message, without `msg/`."""
+    """Number type, `string`, or the name of another message, without `msg/`."""
     sequence: bool = False
     length: int = 0
-    """Of an array of fixed length; 0: it is none."""
+    """Length of a fixed-length array; 0 otherwise."""
 
     @property
     def text(self) -> str:
-        """Its line in the definition."""
+        """Line of the field in the definition."""
         many = f"[{self.length}]" if self.length else "[]" if self.sequence else ""
         return f"{self.kind}{many} {self.name}"
 
 
 Definitions = Mapping[str, tuple[MessageField, ...]]
-"""The fields of a message and of all it depends on, by names without `msg/`; its own come first."""
+"""Fields of a message and of its dependencies, by names without `msg/`; its own fields come first."""
 
 
 def short_name(name: str) -> str:
-    """Return `std_msgs/Header` of `std_msgs/msg/Header`."""
+    """Return the name without `msg/`: `std_msgs/Header` for `std_msgs/msg/Header`."""
     return name.replace("/msg/", "/")
 
 
 def parse(message: MessageType) -> dict[str, tuple[MessageField, ...]]:
-    """Return the definitions of a message; constants, default values and bounds are left out.
+    """Return the definitions in a message's text, without constants, default values and bounds.
 
-    Raises ValueError for what cannot be laid out, and for a type that is not defined.
+    Raises ValueError for an invalid line, and for an undefined type.
     """
     definitions: dict[str, tuple[MessageField, ...]] = {}
     name = message.name
@@ -123,14 +124,14 @@ def parse(message: MessageType) -> dict[str, tuple[MessageField, ...]]:
 
 
 def _full_kind(kind: str, inside: str) -> str:
-    """Return the name of a field's type; without a package it is of that of the message around it."""
+    """Return the full name of a field's type; the default package is that of the enclosing message."""
     if kind in PRIMITIVES or kind in ("string", "wstring"):
         return kind
     return short_name(kind) if "/" in kind else f"{inside.partition('/')[0]}/{kind}"
 
 
 def message_type(name: str, definitions: Definitions) -> MessageType:
-    """Return the message of this full name."""
+    """Return the message type of this full name."""
     top = short_name(name)
     blocks = ["".join(f"{field.text}\n" for field in definitions[top])]
     for other, fields in definitions.items():

@@ -1,4 +1,4 @@
-"""Escaping: texts of plug-ins, logs and files as a terminal or a page shows them, without effect on it."""
+"""Escaping: makes texts of plug-ins, logs and files harmless to a terminal or a page."""
 
 from __future__ import annotations
 
@@ -6,7 +6,7 @@ import json
 
 
 def escaped_json(text: str) -> str:
-    """Return JSON with an escape for all that no terminal should get, of which JSON leaves some as it is."""
+    """Return JSON with escapes for all unprintable characters, some of which JSON allows unescaped."""
     if text.isprintable():
         return text
     return "".join(
@@ -15,8 +15,10 @@ def escaped_json(text: str) -> str:
 
 
 def escaped(text: str) -> str:
-    """Return a text of anything, such as a plug-in, as it is shown: control characters and what turns the
-    direction of writing are written out, `\\x1b`, but for the ends of lines."""
+    """Return a text with control characters and changes of the writing direction escaped: `\\x1b`.
+
+    Line ends are kept.
+    """
     if text.isprintable():
         return text
     return "".join(

@@ -1,4 +1,4 @@
-"""A directed graph as data, and where its nodes stand: in layers from left to right, with few crossings."""
+"""Graph: a directed graph as data, and its layout in layers from left to right with few crossings."""
 
 from __future__ import annotations
 
@@ -8,24 +8,24 @@ from itertools import pairwise
 from typing import Literal
 
 _SWEEPS = 6
-"""How often the order in the layers is improved, from the left and from the right in turn."""
+"""Number of passes that improve the order in the layers, alternately from the left and from the right."""
 _LISTED = 40
-"""Characters in a line of names."""
+"""Characters per line of names."""
 
 
 @dataclass(frozen=True, slots=True)
 class Node:
-    """A box: where values come from, a controller, or joints that controllers move."""
+    """A box: a source of values, a controller, or joints that controllers move."""
 
     name: str
     """Unique in its graph."""
     kind: Literal["source", "controller", "joints"]
     lines: tuple[str, ...]
-    """What stands in the box."""
+    """Text in the box."""
     out: str = ""
-    """What leaves it, at its right edge."""
+    """Label of the outgoing edges, at the right edge."""
     about: str = ""
-    """More about it, where there is room."""
+    """Additional text, if it fits."""
     active: bool = True
 
 
@@ -39,7 +39,7 @@ class Edge:
 
 @dataclass(frozen=True, slots=True)
 class Graph:
-    """Nodes and edges; without circles."""
+    """Nodes and edges without cycles."""
 
     title: str
     nodes: tuple[Node, ...]
@@ -48,14 +48,14 @@ class Graph:
 
 @dataclass(frozen=True, slots=True)
 class Placed:
-    """A graph in layers. An edge that passes a layer has a place of its own there, without a node."""
+    """A graph in layers. An edge that crosses a layer occupies a place there, without a node."""
 
     layers: tuple[tuple[str, ...], ...]
-    """Names from left to right, and from top to bottom."""
+    """Names of nodes by layer, from left to right, and within a layer from top to bottom."""
     steps: tuple[Edge, ...]
-    """Each from one layer into the next."""
+    """Edges between adjacent layers."""
     nodes: Mapping[str, Node]
-    """Those of the graph; a name that is not in it is a place that an edge passes."""
+    """Nodes of the graph by name; other names in `layers` are places of crossing edges."""
 
 
 def listed(names: Sequence[str]) -> tuple[str, ...]:
@@ -72,8 +72,8 @@ def listed(names: Sequence[str]) -> tuple[str, ...]:
 def placed(graph: Graph) -> Placed:
     """Return the layers of a graph, after Sugiyama, Tagawa and Toda (IEEE Trans. SMC 11, 1981).
 
-    Sources are left, joints right, and a controller as far right as what it commands allows. The order in a
-    layer follows the middle of the neighbours'.
+    Sources are on the left, joints on the right, and each controller as far right as the nodes that it
+    commands allow. The order in a layer follows the mean position of the neighbours.
     """
     column = _columns(graph)
     layers: list[list[str]] = [[] for _ in range(max(column.values(), default=-1) + 1)]
@@ -91,7 +91,7 @@ def placed(graph: Graph) -> Placed:
 
 
 def _columns(graph: Graph) -> dict[str, int]:
-    """Return the layer of each node; layers that would be empty are left out."""
+    """Return the layer of each node, without empty layers."""
     following: dict[str, list[str]] = {node.name: [] for node in graph.nodes}
     kinds = {node.name: node.kind for node in graph.nodes}
     for edge in graph.edges:
@@ -101,7 +101,8 @@ def _columns(graph: Graph) -> dict[str, int]:
     def high(name: str) -> int:
         if name not in height:
             height[name] = 1 + max((high(each) for each in following[name]), default=0)
-            if kinds[name] == "controller":  # joints stand right of all, also of those that command none
+            # Joints are to the right of all controllers, even those that command none.
+            if kinds[name] == "controller":
                 height[name] = max(height[name], 2)
         return height[name]
 
@@ -109,7 +110,8 @@ def _columns(graph: Graph) -> dict[str, int]:
     commanded = {edge.target for edge in graph.edges if kinds[edge.source] == "controller"}
     for name, kind in kinds.items():
         if kind == "controller" and not following[name] and name not in commanded:
-            height[name] = most  # one that commands nothing stands beside what it reads
+            # A controller without outputs is next to its inputs.
+            height[name] = most
     found = {
         node.name: most
         if node.kind == "joints"
@@ -123,7 +125,7 @@ def _columns(graph: Graph) -> dict[str, int]:
 
 
 def _ordered(layers: list[list[str]], steps: Sequence[Edge]) -> None:
-    """Order each layer by the middle of its neighbours' places, to and fro."""
+    """Order each layer by the mean position of its neighbours, in passes of alternate direction."""
     before: dict[str, list[str]] = {}
     after: dict[str, list[str]] = {}
     for step in steps:

@@ -1,4 +1,4 @@
-"""A graph as a picture: SVG, light and dark as the reader's screen, and the language DOT of Graphviz."""
+"""Graph picture: a graph as SVG, with light and dark theme, and in the language DOT of Graphviz."""
 
 from __future__ import annotations
 
@@ -15,11 +15,11 @@ from dxlrun.output.target import check_target, write_target
 
 _FONT = 'node [fontname="monospace"];'
 _MARKS = {".svg": '<rect class="paper"', ".dot": _FONT}
-"""What a picture of each kind has; only such a file is replaced by a new picture."""
+"""Text that identifies a picture of dxlrun by suffix; other existing files are not replaced."""
 _CHARACTER, _LINE = 7.25, 17.0
-"""Of a monospaced font of 12 px: 0.6 em wide, with some room."""
+"""Size of a character in px: a monospaced font of 12 px is 0.6 em wide, plus some margin."""
 _PAD, _GAP, _ACROSS, _MARGIN = 12.0, 18.0, 74.0, 24.0
-"""Inside a box; between boxes of a layer, between layers, and around all."""
+"""Distances in px: inside a box, between boxes of a layer, between layers, and around the picture."""
 _TITLE = 30.0
 _LIGHT: Mapping[str, str | tuple[str, str]] = {
     "paper": "#ffffff",
@@ -50,7 +50,7 @@ text { font-family: "DejaVu Sans Mono", Menlo, Consolas, monospace; font-size: 1
 
 
 def _colours(theme: Mapping[str, str | tuple[str, str]]) -> str:
-    """Return the rules of one theme; without CSS variables, which many viewers of SVG do not have."""
+    """Return the CSS rules of one theme. Many SVG viewers do not support CSS variables."""
     boxes = ((kind, values) for kind, values in theme.items() if isinstance(values, tuple))
     return "\n".join(
         (
@@ -70,7 +70,7 @@ def _style() -> str:
 
 
 def write_picture(graph: Graph, path: Path) -> None:
-    """Write a graph as `.svg` or `.dot`, also in place of an older one.
+    """Write a graph as `.svg` or `.dot`, possibly in place of an older one.
 
     Raises InputError as `check_picture`.
     """
@@ -79,7 +79,7 @@ def write_picture(graph: Graph, path: Path) -> None:
 
 
 def check_picture(path: Path) -> None:
-    """Raise InputError for a suffix that is not known, and for a file that cannot be written."""
+    """Raise InputError for an unknown suffix, and for a file that cannot be written."""
     suffix = path.suffix.lower()
     if suffix not in _MARKS:
         raise InputError(
@@ -90,10 +90,10 @@ def check_picture(path: Path) -> None:
 
 
 def graph_svg(graph: Graph) -> str:
-    """Return the picture of a graph, a document of its own."""
+    """Return a graph as an SVG document."""
     laid = placed(graph)
     boxes: dict[str, tuple[float, float, float, float]] = {}
-    """By name: left, top, width, height."""
+    """Left, top, width and height by name."""
     left, lowest = _MARGIN, _MARGIN + _TITLE
     columns = [sum(_height(laid.nodes.get(name)) + _GAP for name in layer) for layer in laid.layers]
     for layer, tall in zip(laid.layers, columns, strict=True):
@@ -147,7 +147,8 @@ def graph_dot(graph: Graph) -> str:
 
 
 def _quoted(text: str) -> str:
-    return json.dumps(text, ensure_ascii=False)  # DOT's strings have the same escapes for " and \n
+    # Strings in DOT have the same escapes for " and line ends as JSON.
+    return json.dumps(text, ensure_ascii=False)
 
 
 def _texts(node: Node) -> tuple[str, ...]:
@@ -166,7 +167,7 @@ def _height(node: Node | None) -> float:
 def _curve(
     begin: tuple[float, float, float, float], end: tuple[float, float, float, float], passing: bool
 ) -> str:
-    """Return the way from the right edge of one box to the left edge of another one."""
+    """Return the SVG path from the right edge of one box to the left edge of another box."""
     x, y = begin[0] + begin[2], begin[1] + begin[3] / 2
     to_x, to_y = end[0], end[1] + end[3] / 2
     bend = (to_x - x) / 2

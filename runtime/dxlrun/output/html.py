@@ -1,7 +1,7 @@
-"""HTML pages, built as a tree, so that a page is well-formed and every text is escaped.
+"""HTML: pages built as a tree, so that a page is well-formed and every text is escaped.
 
-A page has style and numbers inside and loads nothing from anywhere; its figures are SVG in the colours that
-`page.css` defines.
+A page contains its style and numbers, and loads no external resources. Its figures are SVG in the colours of
+`page.css`.
 """
 
 from __future__ import annotations
@@ -26,9 +26,9 @@ def document(  # noqa: PLR0917  what the page has, from top to bottom
     numbers: object,
     scripts: Iterable[Element] = (),
 ) -> str:
-    """Return a page: a header, the contents, the sections that have a part, a footer, scripts.
+    """Return a page: header, contents, the sections that are not empty, footer, scripts.
 
-    `numbers` are in it as JSON, in the element with the identifier `report`.
+    `numbers` are embedded as JSON, in the element with the identifier `report`.
     """
     html = Element("html", {"lang": "en"})
     head = ET.SubElement(html, "head")
@@ -49,14 +49,15 @@ def document(  # noqa: PLR0917  what the page has, from top to bottom
 
 
 def data(text: str, name: str) -> Element:
-    """Return JSON as a part of a page, to be found by its identifier."""
+    """Return an element with embedded JSON; `name` is its identifier."""
     element = Element("script", {"type": "application/json", "id": name})
-    element.text = text.replace("<", "\\u003c")  # no text in it ends the element
+    # Escape `<`, so that no text ends the element.
+    element.text = text.replace("<", "\\u003c")
     return element
 
 
 def script(text: str) -> Element:
-    """Return a script of a page. Raises ValueError where its text would end the element."""
+    """Return a script element. Raises ValueError for a text that would end the element."""
     if "</script" in text.lower():
         raise ValueError("a script must not have the end of an element in it")
     element = Element("script")
@@ -72,10 +73,10 @@ def header(  # noqa: PLR0917  what stands there, from top to bottom
     good: bool,
     key_numbers: Iterable[tuple[str, str]],
 ) -> Element:
-    """Return the top of a page: its title, the result in sentences, a few numbers that readers compare.
+    """Return the top of a page: title, verdict in sentences, and a few numbers for comparison.
 
-    A sentence may come with its remedy, which is emphasized behind it, and with the figure that shows it;
-    both may be empty, the verdict, too.
+    A sentence may be a tuple with its remedy, which follows in bold, and the identifier of its figure.
+    Remedy, identifier and verdict may be empty.
     """
     element = Element("header")
     ET.SubElement(element, "h1").text = escaped(title)
@@ -100,7 +101,7 @@ def header(  # noqa: PLR0917  what stands there, from top to bottom
 
 
 def footer(text: str) -> Element:
-    """Return the end of a page: where it comes from."""
+    """Return the end of a page, which states its source."""
     element = Element("footer")
     element.append(paragraph(text))
     return element
@@ -115,7 +116,7 @@ def _contents(sections: Sequence[Element]) -> Element:
 
 
 def section(name: str, title: str, parts: Iterable[Element]) -> Element:
-    """Return a section under a heading."""
+    """Return a section with a heading."""
     element = Element("section", {"id": name})
     ET.SubElement(element, "h2").text = title
     element.extend(parts)
@@ -123,7 +124,7 @@ def section(name: str, title: str, parts: Iterable[Element]) -> Element:
 
 
 def folded(name: str, title: str, parts: Iterable[Element]) -> Element:
-    """Return a section that a click on its heading opens; a link to something in it does, too."""
+    """Return a section that is folded until its heading is clicked, or a link into it is followed."""
     element = section(name, title, ())
     details = ET.SubElement(element, "details")
     ET.SubElement(details, "summary").append(element[0])
@@ -140,7 +141,7 @@ def paragraph(text: str, kind: str = "") -> Element:
 
 
 def figure(name: str, title: str, drawing: Element, caption: str) -> Element:
-    """Return a drawing with its title above and its caption below, where it has them."""
+    """Return a drawing with an optional title above and an optional caption below."""
     element = Element("figure", {"id": name})
     if title:
         ET.SubElement(element, "h3").text = escaped(title)
@@ -151,7 +152,7 @@ def figure(name: str, title: str, drawing: Element, caption: str) -> Element:
 
 
 def table_element(table: Table) -> Element:
-    """Return a table with its title as caption; a table without column names gets names of rows only."""
+    """Return a table with its title as caption; a table without column names has only row names."""
     scroll = Element("div", {"class": "table"})
     element = ET.SubElement(scroll, "table")
     table = table.escaped()

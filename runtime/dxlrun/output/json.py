@@ -1,4 +1,4 @@
-"""JSON: answers of commands as programs read them, see docs/reference/commands.md."""
+"""JSON: answers of commands for programs, see docs/reference/commands.md."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ if TYPE_CHECKING:
     from dxlrun.errors import Problem
 
 Report: TypeAlias = "Sequence[Problem | str]"
-"""Problems with places in files, and sentences `problem; fix` without one."""
+"""Problems with places in files, or sentences `problem; fix` without a place."""
 NO_REASON: Mapping[str, object] = MappingProxyType({})
 
 
@@ -41,8 +41,9 @@ def answer_text(
 
 
 def json_text(value: object, indent: int | None = 2) -> str:
-    """Return a value as JSON: dataclasses by their fields, bytes in hexadecimal, NaN and infinity as null."""
-    import msgspec  # not above: most commands print no JSON
+    """Return a value as JSON: dataclasses by field, bytes in hexadecimal, NaN and infinity as null."""
+    # Imported here because most commands print no JSON.
+    import msgspec
 
     plain = _plain(msgspec.to_builtins(value, builtin_types=(bytes,)))
     return escaped_json(json.dumps(plain, ensure_ascii=False, indent=indent))
@@ -59,7 +60,7 @@ def _plain(value: object) -> object:
 
 
 def _problem(problem: Problem | str) -> dict[str, object]:
-    """Return a problem with all keys of the envelope; a sentence has no place."""
+    """Return a problem with all keys of the envelope; the place of a sentence is null."""
     if isinstance(problem, str):
         what, _, fix = problem.partition("; ")
         place: tuple[object, ...] = None, None, None

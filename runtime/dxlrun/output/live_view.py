@@ -1,4 +1,4 @@
-"""Live view: a table in the terminal that is drawn again and again until the key q is pressed."""
+"""Live view: a table in the terminal that is redrawn until the key q is pressed."""
 
 from __future__ import annotations
 
@@ -21,8 +21,8 @@ def show_live(table: Callable[[], Table], every_s: float) -> None:
     """Draw a table on the whole screen until q or Ctrl-C.
 
     Args:
-        table: Returns the table as it is now.
-        every_s: Time between two drawings, s.
+        table: Returns the present table.
+        every_s: Interval of drawings, s.
     """
     from rich.live import Live
 
@@ -39,7 +39,7 @@ def show_live(table: Callable[[], Table], every_s: float) -> None:
 
 @contextmanager
 def keys_pressed() -> Iterator[Pressed]:
-    """Give what waits for the key q; without a terminal on stdin it only waits."""
+    """Yield a function that waits for the key q; without a terminal on stdin, it only waits."""
     if not sys.stdin.isatty():
         yield Pressed(None)
         return
@@ -57,12 +57,12 @@ def keys_pressed() -> Iterator[Pressed]:
 
 @dataclass(frozen=True, slots=True)
 class Pressed:
-    """Waits for the key q."""
+    """Keyboard that is polled for the key q; None: no terminal."""
 
     keyboard: int | None
 
     def __call__(self, seconds: float) -> bool:
-        """Wait so long; return True as soon as q was pressed, or the terminal is gone."""
+        """Wait up to `seconds`; return True as soon as q was pressed, or the terminal is gone."""
         if self.keyboard is None:
             time.sleep(seconds)
             return False
@@ -75,7 +75,7 @@ class Pressed:
 
 
 def compact(table: Table) -> RenderableType:
-    """Return a table without rules, whose texts give way first where there is no room."""
+    """Return a table without rules; columns of kind `text` are shortened first when space is short."""
     from rich.table import Table as RichTable
     from rich.text import Text
 
@@ -86,7 +86,8 @@ def compact(table: Table) -> RenderableType:
         shown.add_column(
             column.name,
             justify="right" if right else "left",
-            no_wrap=column.kind != "text",  # these give way first
+            # Only these columns shrink when space is short.
+            no_wrap=column.kind != "text",
             overflow="ellipsis",
             min_width=5 if right else None,
         )

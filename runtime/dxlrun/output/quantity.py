@@ -1,4 +1,4 @@
-"""Values of sources as people read them: a number with its SI unit, and names with their units."""
+"""Quantity: values of sources for people: numbers with SI units, and names with their units."""
 
 from __future__ import annotations
 
@@ -6,15 +6,15 @@ from collections.abc import Iterable, Mapping
 from itertools import groupby
 
 _TEXTS = {"degC": "deg C", "1": ""}
-"""Units that people write in another way than control tables; a fraction has none."""
+"""Units with another spelling than in control tables; a fraction has none."""
 
 
 def quantity_text(value: float | None, unit: str = "", *, digits: int = 6) -> str:
-    """Write a number with its unit: `0.25 rad/s`; `-` where it is not known.
+    """Format a number with its unit: `0.25 rad/s`; `-` when unknown.
 
     Args:
-        value: Number in SI; None if it is not known.
-        unit: SI unit; empty if it has none.
+        value: Number in SI; None when unknown.
+        unit: SI unit; empty without one.
         digits: Significant digits.
     """
     if value is None:
@@ -23,16 +23,16 @@ def quantity_text(value: float | None, unit: str = "", *, digits: int = 6) -> st
 
 
 def unit_text(unit: str) -> str:
-    """Write an SI unit: `rad/s`, `deg C`; empty for a fraction."""
+    """Format an SI unit: `rad/s`, `deg C`; empty for a fraction."""
     return _TEXTS.get(unit, unit)
 
 
 def names_with_units(names: Iterable[str], units: Mapping[str, str]) -> str:
-    """Write names of values; those in a row that share a unit have it together: `x, y (rad/s); voltage (V)`.
+    """Format names of values; adjacent ones with a common unit share it: `x, y (rad/s); voltage (V)`.
 
     Args:
         names: Names of values.
-        units: SI unit of each value that has one, by its name.
+        units: SI units by name, for values that have one.
     """
     groups = (
         (unit_text(unit), ", ".join(group))

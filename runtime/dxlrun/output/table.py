@@ -1,4 +1,4 @@
-"""Tables and lines as data: the same numbers for a terminal and for a page."""
+"""Table: tables and lines as data: the same numbers for a terminal and for a page."""
 
 from __future__ import annotations
 
@@ -20,44 +20,44 @@ Tone = Literal["plain", "good", "warning", "error"]
 
 @dataclass(frozen=True, slots=True)
 class Cell:
-    """One cell; its tone draws the eye to what is not as it should be."""
+    """A cell; its tone marks values that need attention."""
 
     text: str
     tone: Tone = "plain"
 
 
 Value = Cell | str | float | None
-"""A cell's content (int included); None: there is none."""
+"""A cell's content (int included); None: empty."""
 
 
 @dataclass(frozen=True, slots=True)
 class Column:
-    """One column, and how its values are written."""
+    """A column and the format of its values."""
 
     name: str
     kind: Kind = "number"
-    """Numbers stand right; only a text may be folded into several lines."""
+    """Numbers are right-aligned; only texts may be wrapped."""
     form: str = "{}"
-    """A format string, with the unit."""
+    """Format string, with the unit."""
     missing: str = ""
-    """In place of None."""
+    """Text in place of None."""
     detail: bool = False
-    """Left out where there is no room for it; of several the last one first."""
+    """True for a column that is omitted when space is short, beginning with the last one."""
 
     def cell(self, value: Value) -> Cell:
-        """Return a value as it is shown."""
+        """Return the formatted cell of a value."""
         if isinstance(value, Cell):
             return value
         return Cell(self.missing if value is None else self.form.format(value))
 
 
 Columns: TypeAlias = Sequence[tuple[Column, str | Callable[[T], Value]]]
-"""Columns of things, each with the name of an attribute or a key, or a function of a thing."""
+"""Columns with the source of their values: the name of an attribute or a key, or a function."""
 
 
 @dataclass(frozen=True, slots=True)
 class Table:
-    """Rows of cells under columns; without any column name the first one names the rows."""
+    """Rows of cells under columns. Without column names, the first column names the rows."""
 
     title: str
     columns: tuple[Column, ...]
@@ -65,31 +65,31 @@ class Table:
 
     @classmethod
     def of(cls, title: str, columns: Iterable[Column], rows: Iterable[Iterable[Value]]) -> Table:
-        """Return the table of rows that have one value a column."""
+        """Return a table of rows with one value per column."""
         columns = tuple(columns)
         cells = (zip(columns, row, strict=True) for row in rows)
         return cls(title, columns, tuple(tuple(column.cell(value) for column, value in row) for row in cells))
 
     @classmethod
     def listing(cls, title: str, columns: Columns[T], things: Iterable[T]) -> Table:
-        """Return a table with a row a thing."""
+        """Return a table with one row per object."""
         rows = ([_value(thing, value) for _, value in columns] for thing in things)
         return cls.of(title, (column for column, _ in columns), rows)
 
     @classmethod
     def facts(cls, title: str, facts: Iterable[tuple[str, Value]]) -> Table:
-        """Return names with their values, those without a value left out."""
+        """Return a table of names and values, without empty values."""
         columns = (Column("", "name"), Column("", "text"))
         return cls.of(title, columns, ((name, value) for name, value in facts if value not in (None, "")))
 
     def escaped(self) -> Table:
-        """Return it with texts that may be shown."""
+        """Return the table with escaped texts."""
         cells = (tuple(replace(cell, text=escaped(cell.text)) for cell in row) for row in self.rows)
         columns = tuple(replace(column, name=escaped(column.name)) for column in self.columns)
         return Table(escaped(self.title), columns, tuple(cells))
 
     def without_constants(self) -> tuple[str, Table]:
-        """Return what is equal in all rows as a sentence, and the other columns, with the first one."""
+        """Return a sentence about columns that are equal in all rows, and the table without them."""
         first = self.rows[0]
         same = [
             index > 0 and all(row[index].text == first[index].text for row in self.rows)
@@ -103,7 +103,7 @@ class Table:
         return ", ".join(said), self._keeping([not constant for constant in same])
 
     def less(self) -> Table | None:
-        """Return it without the last column that may be left out; None: there is none."""
+        """Return the table without its last omissible column; None without one."""
         last = max((index for index, column in enumerate(self.columns) if column.detail), default=None)
         return None if last is None else self._keeping([index != last for index in range(len(self.columns))])
 
@@ -112,13 +112,13 @@ class Table:
         return replace(self, columns=columns, rows=tuple(tuple(compress(row, kept)) for row in self.rows))
 
     def turned(self) -> Table:
-        """Return a table whose rows are alike but for the first column with a row for each of its columns."""
+        """Return a transposed table, for rows that differ only in the first column."""
         names = Cell(", ".join(row[0].text for row in self.rows))
         cells = zip(self.columns, (names, *self.rows[0][1:]), strict=True)
         return Table.facts(self.title, ((column.name, cell) for column, cell in cells if cell.text))
 
     def marked(self, rows: Iterable[bool]) -> Table:
-        """Return it with all cells of these rows as errors."""
+        """Return the table with all cells of these rows marked as errors."""
         pairs = zip(self.rows, rows, strict=True)
         cells = (tuple(Cell(cell.text, "error") for cell in row) if bad else row for row, bad in pairs)
         return replace(self, rows=tuple(cells))
@@ -133,18 +133,18 @@ def _value(thing: T, value: str | Callable[[T], Value]) -> Value:
 
 @dataclass(frozen=True, slots=True)
 class Sentence:
-    """A sentence on a line of its own; never broken, so that what is in it can be copied."""
+    """A sentence on its own line; never wrapped, so that commands in it can be copied."""
 
     text: str
     tone: Tone = "plain"
 
 
 Part: TypeAlias = "Table | Graph | Sentence | str"
-"""What is shown; a string is a plain line."""
+"""A part of the output; a string is a plain line."""
 
 
 def flagged(count: int, text: str = "", tone: Tone = "warning") -> Cell:
-    """Return the cell of a count, of a text about it, with a tone unless it is 0."""
+    """Return a cell with a count or a text about it, with a tone unless the count is 0."""
     return Cell(text or str(count), tone if count else "plain")
 
 
@@ -154,7 +154,7 @@ def numbers(*names: str) -> Sequence[Column]:
 
 
 def microseconds(value: float) -> str:
-    """Return a time in us as a person writes it: us, ms or s."""
+    """Format a time, given in us, in us, ms or s."""
     if value >= 1e6:
         return f"{value / 1e6:.2f} s"
     return f"{value / 1e3:.2f} ms" if value >= 1e4 else f"{value:.0f} us"

@@ -1,7 +1,7 @@
-"""Files and directories that a user names for writing.
+"""Target: files and directories that a user names for writing.
 
-A target appears whole or not at all. It never takes the place of a directory, a pipe, a device, or a file
-that dxlrun did not write.
+A target appears completely or not at all. It never replaces a directory, a pipe, a device, or a file that
+dxlrun did not write.
 """
 
 from __future__ import annotations
@@ -27,7 +27,7 @@ def unwritable(target: Path, reason: OSError | str) -> InputError:
 
 
 def make_folder_of(target: Path) -> None:
-    """Make the directory in which a target will be. Raises InputError where that fails."""
+    """Make the parent directory of a target. Raises InputError on failure."""
     try:
         target.parent.mkdir(parents=True, exist_ok=True)
     except (FileExistsError, NotADirectoryError):
@@ -39,14 +39,14 @@ def make_folder_of(target: Path) -> None:
 def check_target(target: Path, replaces: str | None = None) -> None:
     """Refuse a target that cannot be written, before the work for it begins.
 
-    An empty file may be replaced: nothing in it is lost.
+    An empty file may always be replaced.
 
     Args:
         target: The file or directory that the user named.
-        replaces: A text that every older file of this kind has; such a file is replaced. None: no file is.
+        replaces: A text in every older file of this kind, which may be replaced. None: no file is replaced.
 
     Raises:
-        InputError: It cannot be written.
+        InputError: The target cannot be written.
     """
     try:
         status = target.stat()
@@ -84,11 +84,13 @@ def new_target(target: Path, replaces: str | None = None) -> Iterator[Path]:
         InputError: The target cannot be written.
     """
     check_target(target, replaces)
-    place = target.resolve()  # a link to a file that is replaced stays a link
+    # A link to a replaced file remains a link.
+    place = target.resolve()
     beside = place.with_name(f".{place.name}.{os.getpid()}")
     try:
         yield beside
-        check_target(target, replaces)  # the user may have made one in the meantime
+        # The user may have created one in the meantime of the work.
+        check_target(target, replaces)
         if target.is_file():
             shutil.copymode(place, beside)
         beside.rename(place)
@@ -121,7 +123,7 @@ def open_empty(path: str | Path, mode: int) -> int:
 
     Args:
         path: The file.
-        mode: Its permissions where it is created.
+        mode: Permissions of a new file.
 
     Returns:
         A file descriptor for writing.

@@ -1,6 +1,7 @@
-"""The terminal: results to stdout, errors to stderr; colours only on a terminal, plain text into a pipe.
+"""Terminal: results to stdout, errors to stderr; colours on a terminal only, plain text into a pipe.
 
-What is shown is laid out here, line by line; rich colours lines on a terminal, and a pipe does without it.
+The layout is computed here, line by line. rich only colours lines on a terminal, and is not loaded for a
+pipe.
 """
 
 from __future__ import annotations
@@ -21,48 +22,49 @@ if TYPE_CHECKING:
     from rich.console import Console
 
 Line: TypeAlias = Sequence[tuple[str, str]]
-"""The pieces of a line, each with its style."""
+"""Pieces of a line with their styles."""
 STYLES: dict[Tone, str] = {"plain": "", "good": "green", "warning": "yellow", "error": "red"}
 _PIPE = 200
-"""Columns of a pipe: wide enough not to break a table."""
+"""Columns of a pipe, wide enough for unwrapped tables."""
 _WIDEST = 120
-"""Text is folded here: a longer line is hard to read, however wide the terminal, or in a pipe."""
+"""Columns at which text is wrapped, in a wide terminal or a pipe: longer lines are hard to read."""
 _FOLDED = 28
-"""Columns that are left at least to what may be folded."""
+"""Smallest width of a column of texts that are wrapped."""
 _USUAL = 60
-"""Columns of a terminal in which every table of dxlrun is one."""
+"""Columns of a terminal in which every table of dxlrun fits as a table."""
 _SHORTEST_TEXT = 20
 _SHORTEST_NAME = 14
-"""Columns that are left to what is cut."""
+"""Smallest widths of columns that are truncated."""
 _LONGEST_WORD = 40
-"""A longer one, such as a path, may be broken in a table."""
+"""A longer word, such as a path, may be broken in a table."""
 _LIVE = 77
-"""Columns of a line that changes: a terminal of 80 breaks none, the spinner included."""
+"""Columns of a status line: together with the spinner, it fits into a terminal of 80 columns."""
 _REFRESH_S = 0.25
 _ASCII = str.maketrans({"\N{BOX DRAWINGS LIGHT HORIZONTAL}": "-", "\N{HORIZONTAL ELLIPSIS}": "~"})
 
 
 def out(pipe: int = _PIPE) -> Console:
-    """Return the console for results; a pipe gets plain text, `pipe` columns wide."""
+    """Return the console for results; a pipe receives plain text, `pipe` columns wide."""
     return _console(sys.stdout.isatty(), pipe, stderr=False)
 
 
 def err(pipe: int = _PIPE) -> Console:
-    """Return the console for progress where stdout is for a program, as `out`."""
+    """Return the console for progress when stdout is for a program, as `out`."""
     return _console(sys.stderr.isatty(), pipe, stderr=True)
 
 
 def show(*parts: Part, console: Console | None = None, folded: bool = False) -> None:
-    """Print lines and tables; a table without rows is left out.
+    """Print lines and tables; a table without rows is omitted.
 
-    Lines are not broken, so that a command in them can be copied, unless they are to be `folded`.
+    Lines are wrapped only if `folded`, so that a command in them can be copied.
     """
     console = console or out()
     plain = ascii_only(console)
     for part in parts:
         for line in _lines(part, console, folded=folded):
             _print([(text.translate(_ASCII), style) for text, style in line] if plain else line, console)
-    console.file.flush()  # a reader behind a pipe waits for it
+    # A reader of a pipe waits for it.
+    console.file.flush()
 
 
 def _lines(part: Part, console: Console, *, folded: bool) -> Iterator[Line]:
@@ -93,7 +95,7 @@ def _print(line: Line, console: Console | Pipe) -> None:
 
 
 def ascii_only(console: Console) -> bool:
-    """Return whether nothing but ASCII can be shown."""
+    """Return whether the console can only show ASCII."""
     return not (getattr(console.file, "encoding", None) or "utf-8").lower().startswith("utf")
 
 
@@ -108,33 +110,34 @@ def show_json(
     """Print the answer of a command with --json: one line in a pipe, indented on a terminal.
 
     Args:
-        result: What the command has to say; None: nothing.
-        code: Its exit code; the answer is `ok` where it is 0.
-        errors: What went wrong, problems with places or sentences `problem; fix`.
-        warnings: The same of what does not change the exit code.
+        result: Result of the command; None without one.
+        code: Exit code; `ok` is true for 0.
+        errors: Problems with places, or sentences `problem; fix`.
+        warnings: As `errors`, for problems that do not change the exit code.
         reason: `code` and `fields` of the refusal of a running robot.
     """
     indent = 2 if sys.stdout.isatty() else None
     text = answer_text(result, errors, warnings, reason, ok=code == 0, indent=indent)
     sys.stdout.write(f"{text}\n")
-    sys.stdout.flush()  # a reader behind a pipe waits for it
+    # A reader of a pipe waits for it.
+    sys.stdout.flush()
 
 
 def print_error(line: str) -> None:
-    """Print one error to stderr, unbroken, so that an editor can jump to its `file:line:column`."""
+    """Print one error to stderr, unwrapped, so that an editor can jump to its `file:line:column`."""
     _print_to_stderr(line, "bold red")
 
 
 def print_warning(line: str) -> None:
-    """Print one warning to stderr, unbroken."""
+    """Print one warning to stderr, unwrapped."""
     _print_to_stderr(line, "yellow")
 
 
 @contextmanager
 def progress_bar(*, hidden: bool) -> Iterator[Callable[[str, float], None]]:
-    """Give what shows a text and the share that is done, on a terminal.
+    """Yield a function that shows a text and the completed share on a terminal.
 
-    It has no thread: the bar is drawn when it is called, so a measurement between two calls is undisturbed.
+    It has no thread: the bar is drawn by the call, so a measurement between two calls is not disturbed.
     """
     if hidden or not sys.stderr.isatty():
         yield lambda *_: None
@@ -157,7 +160,7 @@ def progress_bar(*, hidden: bool) -> Iterator[Callable[[str, float], None]]:
 
 
 def live_line(text: str, more: str) -> str:
-    """Return the text of a status line that fits beside its spinner: with more, or without, or cut."""
+    """Return a status line that fits next to its spinner: with `more`, without it, or truncated."""
     if len(text) + len(more) <= _LIVE:
         return text + more
     return text if len(text) <= _LIVE else f"{text[: _LIVE - 1]}…"
@@ -166,9 +169,9 @@ def live_line(text: str, more: str) -> str:
 def fitted(table: Table, width: int) -> list[Line]:
     """Return the lines of a table for a terminal of `width` columns.
 
-    Where it does not fit, its heads are broken at blanks, then what is equal in all rows is said above it,
-    then its details are left out; texts are folded between words. What is still too wide is cut: texts, then
-    names. On a terminal that is narrower than usual nothing is cut, but each row becomes a paragraph.
+    A table that is too wide is narrowed in steps: wrap the heads, move columns that are equal in all rows to
+    a caption, omit details, wrap texts, truncate texts, truncate names. On a terminal narrower than _USUAL,
+    nothing is truncated; each row becomes a paragraph instead.
     """
     table = table.escaped()
     caption, rest = table.without_constants()
@@ -199,7 +202,7 @@ def _caption(said: str, width: int) -> list[Line]:
 
 
 def _cut(table: Table, width: int) -> Table | None:
-    """Return a table with its widest texts, then its widest names, cut; None where that is not enough."""
+    """Return a table with its widest texts, then its widest names, truncated; None if that is not enough."""
     widths = [
         max(map(len, (*column.name.split(" "), *(row[index].text for row in table.rows))))
         for index, column in enumerate(table.columns)
@@ -230,14 +233,14 @@ def _cut(table: Table, width: int) -> Table | None:
 
 
 def _width(table: Table, *, tight: bool) -> int:
-    """Return how many columns a table takes at least."""
+    """Return the smallest width of a table."""
     heads = [column.name.split(" ") if tight else [column.name] for column in table.columns]
     widths = (max(*map(len, head), _least(table, index)) for index, head in enumerate(heads))
     return sum(widths) + (len(heads) - 1) * (1 if tight else 2)
 
 
 def _least(table: Table, index: int) -> int:
-    """Return how many columns the cells of one column take at least: a text may be folded between words."""
+    """Return the smallest width of the cells of one column; texts may be wrapped between words."""
     texts = [row[index].text for row in table.rows]
     longest = max(map(len, texts))
     if table.columns[index].kind != "text":
@@ -247,14 +250,15 @@ def _least(table: Table, index: int) -> int:
 
 
 def _drawn(table: Table, width: int, *, tight: bool) -> Iterator[Line]:
-    """Yield a table in `width` columns, which is as wide as it must be at least: its texts are folded."""
+    """Yield the lines of a table in `width` columns, at least its smallest width; texts are wrapped."""
     names = [column.name.replace(" ", "\n") if tight else column.name for column in table.columns]
     texts = [[name, *(row[index].text for row in table.rows)] for index, name in enumerate(names)]
     widths = [max(len(line) for text in column for line in text.split("\n")) for column in texts]
     foldable = [column.kind == "text" for column in table.columns]
     gap = 1 if tight else 2
     excess = sum(widths) + gap * (len(widths) - 1) - width
-    while excess > 0:  # the widest texts become narrower together
+    # Narrow the widest text columns together.
+    while excess > 0:
         widest = max(each for each, text in zip(widths, foldable, strict=True) if text)
         for index, each in enumerate(widths):
             if excess > 0 and foldable[index] and each == widest:
@@ -282,7 +286,7 @@ def _folded(text: str, width: int) -> list[str]:
 def _row(
     cells: Sequence[Sequence[str]], styles: Sequence[str], widths: Sequence[int], table: Table, gap: int
 ) -> Iterator[Line]:
-    """Yield the lines of a row; `cells`: each with its lines."""
+    """Yield the lines of a row; `cells` has the lines of each cell."""
     for number in range(max(map(len, cells))):
         pieces = []
         for index, (cell, style, width) in enumerate(zip(cells, styles, widths, strict=True)):
@@ -296,7 +300,7 @@ def _row(
 
 
 def _paragraphs(table: Table, width: int) -> Iterator[str]:
-    """Yield each row as `joint: bus main, ID 3, ...`, broken between words."""
+    """Yield each row as `joint: bus main, ID 3, ...`, wrapped between words."""
     names = [column.name for column in table.columns]
     for first, *rest in table.rows:
         subject = f"{names[0]} {first.text}" if first.text.isdigit() else first.text
@@ -307,16 +311,17 @@ def _paragraphs(table: Table, width: int) -> Iterator[str]:
 
 
 def _filled(text: str, width: int) -> list[str]:
-    """Return a text in lines that are broken between words."""
+    """Return the lines of a text, wrapped between words."""
     return textwrap.wrap(
         text, max(width - 1, 20), subsequent_indent="  ", break_on_hyphens=False, break_long_words=False
     )
 
 
 def _print_to_stderr(line: str, style: str) -> None:
-    # a path or a name may hold line breaks or escape sequences; one problem stays one line
+    # A path or a name may contain line breaks or escape sequences; one problem stays one line.
     safe = escaped(line).replace("\n", "\\n")
-    with suppress(OSError):  # full, or gone: the exit code is left
+    # stderr may be full or closed; the exit code still reports the error.
+    with suppress(OSError):
         _print([(safe, style)], err())
 
 
@@ -329,7 +334,7 @@ def _console(terminal: bool, pipe: int, *, stderr: bool) -> Console:
 
 
 class Pipe:
-    """A console that is no terminal: plain lines without blanks at their ends, and no status."""
+    """A console for pipes and files: plain lines without trailing spaces, and no status."""
 
     is_terminal = False
 
@@ -339,13 +344,13 @@ class Pipe:
         self.console = self
 
     def print(self, text: str = "", **_: object) -> None:
-        """Write a line."""
+        """Print a line."""
         self.file.write(f"{text.rstrip(' ')}\n")
 
     @contextmanager
     def status(self, text: str) -> Iterator[Pipe]:
-        """Give a status that nothing shows."""
+        """Yield a status that is not shown."""
         yield self
 
     def update(self, text: str) -> None:
-        """Show no other status."""
+        """Ignore a new status."""

@@ -1,4 +1,4 @@
-"""Output that never waits for its reader: no full pipe or stopped terminal keeps a signal from a robot."""
+"""Unblocked: output that never waits for its reader, so a full pipe or stopped terminal delays no signal."""
 
 from __future__ import annotations
 
@@ -12,26 +12,27 @@ from contextlib import contextmanager, suppress
 from typing import TextIO, cast
 
 MOST_WRITES = 1000
-"""That wait for the reader; the oldest ones are left out for newer ones."""
+"""Upper limit of the waiting writes; above it, the oldest are dropped."""
 LAST_WRITE_S = 3.0
-"""How long the end of a command waits for a reader that takes nothing."""
+"""Timeout of the last writes at the end of a command."""
 
 
 def leave_real_time() -> None:
     """Give up a real-time policy of the terminal (`chrt -r 31 dxlrun`) for the calling thread.
 
-    Loop, guardian and simulated servos request theirs themselves; nothing else of a run may disturb them.
+    Loop, guardian and simulated servos request their own; no other process of a run may disturb them.
     """
-    with suppress(AttributeError, OSError):  # other systems have no such call; musl refuses it
+    # Other systems do not have these calls; musl refuses them.
+    with suppress(AttributeError, OSError):
         if os.sched_getscheduler(0) & ~os.SCHED_RESET_ON_FORK in {os.SCHED_FIFO, os.SCHED_RR}:
             os.sched_setscheduler(0, os.SCHED_OTHER, os.sched_param(0))
 
 
 @contextmanager
 def unblocked() -> Iterator[None]:
-    """Let stdout and stderr take text at once, whatever their readers do; what a reader left is ignored.
+    """Make stdout and stderr accept text at once, whatever their readers do; unread text is dropped.
 
-    A stream without a descriptor (a test's) stays as it is.
+    A stream without a file descriptor (of a test) stays as it is.
     """
     before = sys.stdout, sys.stderr
     writers: dict[tuple[int, int], _Writer] = {}
@@ -40,7 +41,8 @@ def unblocked() -> Iterator[None]:
         yield
     finally:
         sys.stdout, sys.stderr = before
-        with suppress(KeyboardInterrupt):  # that reader is waited for no longer
+        # Ctrl-C ends the wait for a reader.
+        with suppress(KeyboardInterrupt):
             for writer in writers.values():
                 writer.settle()
 
@@ -51,35 +53,35 @@ def _stream(stream: TextIO, writers: dict[tuple[int, int], _Writer]) -> TextIO:
         found = os.fstat(stream.fileno())
     except (OSError, ValueError):
         return stream
-    # of one terminal the lines stay in order
+    # Both streams of one terminal share a writer, which keeps the sequence of lines.
     writer = writers.setdefault((found.st_dev, found.st_ino), _Writer())
     return cast("TextIO", _Unblocked(stream, writer))
 
 
 class _Unblocked:
-    """A stream whose text goes to a writer."""
+    """A stream that passes its text to a writer."""
 
     def __init__(self, stream: TextIO, writer: _Writer) -> None:
         self._stream, self._writer = stream, writer
 
     def write(self, text: str) -> int:
-        """Take text; it is written soon."""
+        """Queue text for the writer."""
         self._writer.write(self._stream.fileno(), text.encode(self._stream.encoding or "utf-8", "replace"))
         return len(text)
 
     def flush(self) -> None:
-        """Do nothing: there is no buffer."""
+        """Do nothing: text is not buffered here."""
 
     def __getattr__(self, name: str) -> object:
         return getattr(self._stream, name)
 
 
 class _Writer:
-    """A thread that is the only one to wait for a reader.
+    """Writer thread, the only one that waits for a reader.
 
-    It runs before anything is written: the first print may be that of a controller, which starts no thread.
-    O_NONBLOCK would be shared with other processes of the same terminal or pipe, and a poll before each write
-    does not tell how much fits.
+    It starts before anything is written: the first print may be that of a controller, which must not start a
+    thread. O_NONBLOCK would also affect other processes of the same terminal or pipe, and a poll before a
+    write does not show how many bytes fit.
     """
 
     def __init__(self) -> None:
@@ -89,13 +91,13 @@ class _Writer:
         threading.Thread(target=self._write_for_ever, daemon=True).start()
 
     def write(self, descriptor: int, data: bytes) -> None:
-        """Take what is to be written."""
+        """Queue bytes for a file descriptor."""
         with self._changed:
             self._waiting.append((descriptor, data))
             self._changed.notify_all()
 
     def settle(self) -> None:
-        """Wait for the reader to take what was written, if it does."""
+        """Wait until the reader has received all writes, up to LAST_WRITE_S."""
         with self._changed:
             self._changed.wait_for(lambda: self._idle and not self._waiting, LAST_WRITE_S)
 
@@ -110,7 +112,9 @@ class _Writer:
             while data:
                 try:
                     data = data[os.write(descriptor, data) :]
-                except BlockingIOError:  # another process made the pipe non-blocking
+                # Another process has made the pipe non-blocking.
+                except BlockingIOError:
                     select.select([], [descriptor], [])
-                except OSError:  # the reader is gone, or the disk is full
+                # The reader is gone, or the disk is full.
+                except OSError:
                     break

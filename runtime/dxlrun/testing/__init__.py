@@ -1,12 +1,11 @@
-"""A robot on virtual time in three lines: for authors of plug-ins, and for dxlrun's own tests.
+"""A robot in virtual time in three lines: for authors of plug-ins, and for dxlrun's own tests.
 
-What only dxlrun's own tests need belongs in `tests/kit`.
+Helpers only for dxlrun's own tests belong in `tests/kit`.
 
 from dxlrun.testing import simulated_robot
 
-robot = simulated_robot("robots/bioloid_torso.yaml", duration_s=2.0)
-robot.run()
-assert robot.record.states.valid.all()
+robot = simulated_robot("robots/bioloid_torso.yaml", duration_s=2.0) robot.run() assert
+robot.record.states.valid.all()
 """
 
 from __future__ import annotations
@@ -48,7 +47,7 @@ def plan_of(
     play: Iterable[str | Path] = (),
     duration_s: float | None = None,
 ) -> Plan:
-    """Compile a robot file with its arguments and motions; raises InputError with every problem."""
+    """Compile a robot file with its arguments and motions; raises InputError with all problems."""
     description = read_robot(Path(robot), arguments or {})
     motions = [read_motion(Path(motion), description.groups) for motion in play]
     duration_ns = None if duration_s is None else round(duration_s * 1e9)
@@ -64,25 +63,25 @@ def simulated_robot(
     log: Path | None = None,
     kept: Path | None = None,
 ) -> VirtualRobot:
-    """Return a robot whose servos are simulated and whose time is virtual, ready to `run()`.
-
-    Without `duration_s` it runs to the end of the motions, and for ever when there are none. What controllers
-    keep is read from the directory `kept` and written there; without one they keep nothing.
-    Raises InputError with every problem of the files.
+    """Return a robot with simulated servos in virtual time, ready to `run()`.
 
         robot = simulated_robot("robots/bioloid_torso.yaml", duration_s=0.5)
         assert robot.run().reason == "ended"
         print(robot.record.states.position)
+
+    Without `duration_s`, the run ends with the motions; without motions, it has no end. The directory `kept`
+    has the kept states of controllers, which are read and written; without it, they are discarded. Raises
+    InputError with all problems of the files.
     """
     plan = plan_of(robot, arguments=arguments, play=play, duration_s=duration_s)
     return VirtualRobot(plan, log=log, kept=kept)
 
 
 def kinematics(robot: str | Path, *, arguments: Mapping[str, str] | None = None) -> FrameTree:
-    """Return the frames of a robot, after the URDF that its file names.
+    """Return the frames of a robot's URDF.
 
-    `kinematics(file).pose("left_hand_link", "base_link", {"left_elbow_joint": 0.5})` is where a link lies.
-    Raises InputError with every problem of the file, or when it names no URDF.
+    `kinematics(file).pose("left_hand_link", "base_link", {"left_elbow_joint": 0.5})` is the pose of a link.
+    Raises InputError with all problems of the file, or when it names no URDF.
     """
     plan = plan_of(robot, arguments=arguments)
     if plan.urdf is None or plan.frames is None:
@@ -94,10 +93,10 @@ def kinematics(robot: str | Path, *, arguments: Mapping[str, str] | None = None)
 
 @contextmanager
 def installed(project: str | Path) -> Iterator[None]:
-    """Let dxlrun find a package while the block runs, as `pip install -e PROJECT` does.
+    """Make a package visible to dxlrun while the block runs, as `pip install -e PROJECT` does.
 
-    For tests of a section of the robot file that run without an installation. What dxlrun reads of
-    `pyproject.toml` are name, version and entry points; the package is in `PROJECT/src`.
+    For tests of a section of the robot file without an installation. dxlrun reads name, version and entry
+    points from `pyproject.toml`; the package is in `PROJECT/src`.
 
         with installed("plugins/lights"):
             plan = plan_of("plugins/lights/lights.yaml")

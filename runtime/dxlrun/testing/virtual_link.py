@@ -1,4 +1,4 @@
-"""A robot on virtual time that answers the client of a running one."""
+"""Virtual link: a robot in virtual time that serves the client of a running robot."""
 
 from __future__ import annotations
 
@@ -35,20 +35,21 @@ from dxlrun.remote.requests.table import Role
 from dxlrun.run.virtual_run import VirtualRobot
 
 _EVENTS_CAPACITY = 1 << 20
-"""Bytes; the gateway looks after each cycle."""
+"""Bytes; small, because the gateway reads the events after each cycle."""
 
 
 class VirtualLink:
-    """Link to a robot whose loop runs in a thread, in turns with its client: one of both waits.
+    """Link to a robot in virtual time. Its loop runs in a thread, alternately with the client.
 
-    `RemoteRobot(plan.robot, VirtualLink(plan))` is a client like any other. The gateway of a run answers, in
-    the client's turn: where it would wait, the robot runs a cycle. So two runs do exactly the same.
+    `RemoteRobot(plan.robot, VirtualLink(plan))` is a client like any other. The gateway of a run replies, in
+    the client's turn. Where the gateway would wait, the robot runs a cycle, so two runs are identical.
 
     Args:
         plan: Plan whose buses are simulated.
-        log: Path of the log; None: there is none.
+        log: Path of the log; None: no log.
         client: Name of the client for the log.
-        each_cycle: Gets the number of each cycle, in the robot's turn, so that tests can inject faults.
+        each_cycle: Called with the number of each cycle, in the robot's turn, so that tests can inject
+            faults.
     """
 
     def __init__(
@@ -89,7 +90,8 @@ class VirtualLink:
             joints, load_plugins(files=plan.included), loop.sources, plan.urdf, plan.groups
         )
         log_path = str(log) if log else None
-        seconds = itertools.count()  # one a request: a client may make as many as it likes
+        # One second per request, so that no rate limit applies.
+        seconds = itertools.count()
         self._gateway = GatewayApp(self.gateways_link, preparation, log_path, lambda: next(seconds)).app()
         self._waiting = _VirtualTime(lambda: self.now_s, self.turn)
         self._closing = False
@@ -107,7 +109,8 @@ class VirtualLink:
     def _run(self) -> None:
         try:
             self.simulated.run()
-        except BaseException as error:  # it is raised in the client's turn
+        # The exception is raised again in the client's turn.
+        except BaseException as error:
             self._error = error
         finally:
             self._our_turn.release()
@@ -122,7 +125,8 @@ class VirtualLink:
         elif kind is RecordKind.CYCLE:
             self._cycle_ring.append(kind, payload)
             cycle = self.simulated.record.cycle
-            if cycle < 0:  # the record before the first cycle
+            # The record before the first cycle is not a cycle.
+            if cycle < 0:
                 return
             self._cycles.append(bytes(payload))
             self._heartbeat.cycle(self.simulated.cycles + 1, self.simulated.skipped)
@@ -139,7 +143,7 @@ class VirtualLink:
         return self.simulated.clock.now_ns() * 1e-9
 
     def turn(self) -> None:
-        """Let the robot run a cycle, and the gateway read what that left. Raises RunGone after its end."""
+        """Run a cycle of the robot, and pass its records to the gateway. Raises RunGone after the run."""
         if not self._thread.is_alive():
             result = self.simulated.result
             detail = str(self._error or (result.detail if result else ""))
@@ -159,7 +163,7 @@ class VirtualLink:
     # What a client asks
 
     def exchange(self, method: str, path: str, body: bytes | None) -> tuple[int, bytes]:
-        """Let the gateway answer a request; raises RunGone where that takes a cycle of a run that ended."""
+        """Pass a request to the gateway; raises RunGone if that needs a cycle after the end of the run."""
         self.gateways_link.collect()
         return self._waiting.run_until_complete(self._answer(method, path, body or b""))
 
@@ -185,16 +189,16 @@ class VirtualLink:
         return answer[0]["status"], b"".join(message["body"] for message in answer[1:])
 
     def stream(self, path: str) -> tuple[int, bytes, socket.socket]:
-        """There are none: messages would come only while a request waits. Raises OSError."""
+        """Raise OSError. Streams are not supported, because messages would arrive only during a request."""
         raise OSError("a run on virtual time has no streams; its log has every message")
 
     @property
     def alive(self) -> bool:
-        """True while it runs."""
+        """True while the run continues."""
         return self._thread.is_alive()
 
     def ends(self) -> bool:
-        """Return whether it has ended."""
+        """Return whether the run has ended."""
         return not self.alive
 
     def close(self) -> None:
@@ -208,7 +212,7 @@ class VirtualLink:
 
 
 class _VirtualTime(asyncio.SelectorEventLoop):
-    """Event loop on virtual time: where it would wait, `turn` lets that pass."""
+    """Event loop in virtual time; `turn` replaces each wait."""
 
     def __init__(self, now_s: Callable[[], float], turn: Callable[[], None]) -> None:
         self._now_s = now_s
@@ -220,14 +224,14 @@ class _VirtualTime(asyncio.SelectorEventLoop):
 
 
 class _Turns(selectors.SelectSelector):
-    """Selector that never waits."""
+    """Selector that never waits, and runs a turn instead."""
 
     def __init__(self, turn: Callable[[], None]) -> None:
         super().__init__()
         self._turn = turn
 
     def select(self, timeout: float | None = None) -> list[tuple[selectors.SelectorKey, int]]:
-        """Return what is ready; where nothing could be yet, after a turn."""
+        """Return the ready descriptors, after a turn if the caller would wait."""
         if timeout is None or timeout > 0:
             self._turn()
         return super().select(0)
