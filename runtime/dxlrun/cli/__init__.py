@@ -1,6 +1,6 @@
-"""Command line: parses words, calls a room below, prints the result, returns the exit code.
+"""Command line: parses arguments, calls a lower room, prints the result, returns the exit code.
 
-Decisions belong in the rooms below. Importing this package loads neither numpy nor pydantic.
+Decisions belong in the lower rooms. Importing this package loads neither numpy nor pydantic.
 """
 
 from __future__ import annotations
@@ -14,25 +14,28 @@ __all__ = ["main"]
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
-    """Run one command line (default: this process' own) and return its exit code.
+    """Run one command line (default: that of this process) and return its exit code.
 
     0 good, 1 the robot or the run failed, 2 the input is wrong, 130 interrupted.
     """
     _open_standard_streams()
     if arguments is not None:
         return _run(tuple(arguments))
-    # A process of our own: a start makes 100,000 to 150,000 objects that stay. One collection among them
-    # takes 30 ms; the default threshold, 700, costs a tenth of the start-up.
+    # Only in our own process: a start creates 100,000 to 150,000 permanent objects. One garbage collection of
+    # them takes 30 ms; the default threshold, 700, costs a tenth of the start-up.
     gc.set_threshold(200_000, 20, 20)
-    os.environ.setdefault("PYDANTIC_DISABLE_PLUGINS", "1")  # it would read all entry points once more
+    # Pydantic's search for plug-ins would read all entry points once more.
+    os.environ.setdefault("PYDANTIC_DISABLE_PLUGINS", "1")
     code = _run(tuple(sys.argv[1:]))
-    gc.freeze()  # the interpreter's end would look through all modules for garbage: a seventh of `check`
+    # Otherwise the interpreter would search all modules for garbage at exit: a seventh of `check`.
+    gc.freeze()
     return code
 
 
 def _run(tokens: tuple[str, ...]) -> int:
     try:
-        if tokens == ("--version",):  # the framework takes longer to import than all that is printed
+        # The framework takes longer to import than the output takes to print.
+        if tokens == ("--version",):
             from dxlrun.cli.help import version
 
             sys.stdout.write(f"{version()}\n")
@@ -42,18 +45,20 @@ def _run(tokens: tuple[str, ...]) -> int:
 
             (print_help if tokens else print_short_help)()
             return 0 if tokens else 2
-        from dxlrun.cli.app import run_tokens  # not above: importing the package must cost nothing
+        # Imported here because importing the package must cost nothing.
+        from dxlrun.cli.app import run_tokens
 
         return run_tokens(tokens)
-    except KeyboardInterrupt:  # while that was being imported, or an error reported
+    # Ctrl-C during an import, or during the report of an error.
+    except KeyboardInterrupt:
         sys.stderr.write("interrupted\n")
         return 130
 
 
 def _open_standard_streams() -> None:
-    """Open /dev/null where the caller closed a standard stream: the next file would take its number.
+    """Open /dev/null in place of a closed standard stream, whose number the next opened file would get.
 
-    A run's shared memory would do so, and then be replaced by the output of the first child.
+    That file would be a run's shared memory, which the output of the first child would overwrite.
     """
     for number, name in enumerate(("stdin", "stdout", "stderr")):
         if getattr(sys, name) is None:

@@ -1,4 +1,4 @@
-"""The application: which commands there are, and how their errors are reported."""
+"""App: the application with its commands, and the reports of their errors."""
 
 from __future__ import annotations
 
@@ -34,12 +34,12 @@ if TYPE_CHECKING:
     from rich.console import Console, ConsoleOptions
 
 INTERRUPTED = 130
-"""128 + SIGINT, as shells have it."""
+"""128 + SIGINT, as in shells."""
 
 _PIPED_HELP = 80
-"""Columns."""
+"""Columns of the help in a pipe."""
 _BEHIND = 100
-"""Sort key of what comes behind the groups of verbs."""
+"""Sort key of the groups after those of verbs."""
 _PARAMETERS = Group("Parameters", sort_key=_BEHIND + 1)
 HELP = """Run a robot of Dynamixel servos from one YAML file.
 
@@ -55,16 +55,18 @@ interrupted."""
 
 
 def build(verb: str = "", *, listed: bool = False) -> App:
-    """Return the application that runs a `verb`; all commands are imported where they are to be `listed`."""
+    """Return the application for a `verb`; `listed` imports all commands, for a list of them."""
     app = App(
         name="dxlrun",
         help=HELP,
         help_epilogue=EPILOGUE,
-        help_format="plaintext",  # rich.markdown takes as long to import as all else together
+        # rich.markdown takes as long to import as everything else together.
+        help_format="plaintext",
         help_formatter=_Help(),
         usage=USAGE,
         version=_version,
-        suppress_keyboard_interrupt=False,  # an interrupt is reported by `run_tokens`, like all else
+        # `run_tokens` reports an interrupt.
+        suppress_keyboard_interrupt=False,
         group_arguments=Group("Arguments", sort_key=_BEHIND),
         group_parameters=_PARAMETERS,
     )
@@ -78,14 +80,16 @@ def build(verb: str = "", *, listed: bool = False) -> App:
     first = [*verbs.GROUPS[verbs.EVERY_DAY], *found]
     for name, (place, group) in found.items():
         heading = headings.setdefault(group, Group(group, sort_key=len(headings)))
-        # those of every day stand in their order, all others by the alphabet
+        # The commands of every day have a fixed order; all others are alphabetical.
         order = first.index(name) if group == verbs.EVERY_DAY else 0
         app.command(place, name=name, group=heading, sort_key=order)
     if listed:
-        from dxlrun.cli.help import in_list  # not above: only a list of all needs it
+        # Imported here because only a list of all commands needs it.
+        from dxlrun.cli.help import in_list
 
         for command in app.resolved_commands().values():
-            command.help = in_list(command.help.partition("\n\n")[0])  # the rest takes time, too
+            # Formatting the rest takes time.
+            command.help = in_list(command.help.partition("\n\n")[0])
     app.command(install_completion, name="--install-completion", version_flags=[])
     for flag in ("--help", "--version", "--install-completion"):
         app[flag].group = _PARAMETERS
@@ -100,13 +104,14 @@ def install_completion(*, shell: Literal["bash", "zsh", "fish"] | None = None) -
     shell
         The shell; without it the one that runs this command.
     """
-    from cyclopts.completion.install import create_install_completion_command  # not above: it takes long
+    # Imported here because the import takes long.
+    from cyclopts.completion.install import create_install_completion_command
 
     create_install_completion_command(build(listed=True).install_completion, add_to_startup=True)(shell=shell)
 
 
 class _Help:
-    """Prints the help with the same tables as all results."""
+    """Formatter that prints the help with the tables of all results."""
 
     def __call__(self, console: Console, options: ConsoleOptions, panel: HelpPanel) -> None:
         """Print the commands or the parameters of one group."""
@@ -114,11 +119,11 @@ class _Help:
         show(Table.facts(str(panel.title), facts), console=out(_PIPED_HELP))
 
     def render_usage(self, console: Console, options: ConsoleOptions, usage: object) -> None:
-        """Print how a command is called."""
+        """Print the usage of a command."""
         show(str(usage) if str(usage).startswith("Usage") else f"Usage: {usage}")
 
     def render_description(self, console: Console, options: ConsoleOptions, description: object) -> None:
-        """Print what a command does."""
+        """Print the description of a command."""
         show(_filled(description), console=out(_PIPED_HELP), folded=True)
 
 
@@ -129,29 +134,31 @@ def _about(entry: HelpEntry) -> str:
 
 
 def _filled(text: object) -> str:
-    """Return a text of a docstring without the line breaks inside its paragraphs."""
+    """Return the text of a docstring without line breaks within paragraphs."""
     plain = str(getattr(text, "primary_renderable", text) or "").strip()
     return re.sub(r"(?<!\n)\n(?!\n)", " ", plain)
 
 
 def _version() -> str:
-    from dxlrun.cli.help import version  # not above: only --version needs it
+    # Imported here because only --version needs it.
+    from dxlrun.cli.help import version
 
     return version()
 
 
 def run_tokens(tokens: Sequence[str]) -> int:
-    """Run one command line and return its exit code; nothing leaves here as a traceback but with --debug."""
+    """Run one command line and return its exit code; prints a traceback only with --debug."""
     app = build(tokens[0] if tokens else "")
     try:
         _refuse_other_words(tokens)
         code = app(list(tokens), exit_on_error=False, print_error=False, result_action="return_value")
-        sys.stdout.flush()  # a reader that went away is noticed here, not when the interpreter ends
+        # Notice a closed reader here, not at the interpreter's exit.
+        sys.stdout.flush()
     except KeyboardInterrupt:
         _refuse(tokens, ("interrupted",))
         return INTERRUPTED
     except BrokenPipeError:
-        # the reader went away (`dxlrun check ... | head`): print nothing more, not even at exit
+        # The reader has closed the pipe (`dxlrun check ... | head`): print nothing more, not even at exit.
         os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
         return 1
     except Exception as error:
@@ -173,11 +180,12 @@ def _refuse(
     problems: Sequence[Problem] = (),
     reason: Mapping[str, object] = MappingProxyType({}),
 ) -> None:
-    """Report why a command was refused: in lines for a person, or with --json in JSON."""
+    """Report the reasons of a refusal: in lines for a person, or with --json as JSON."""
     if "--json" in tokens:
         errors = [one for one in problems if one.severity == "error"]
         warnings = [one for one in problems if one.severity == "warning"]
-        with suppress(OSError):  # the reader is gone; the exit code is left
+        # The reader is gone; the exit code still reports the error.
+        with suppress(OSError):
             show_json(None, code=1, errors=[*errors, *sentences], warnings=warnings, reason=reason)
         return
     for problem in problems:
@@ -187,7 +195,7 @@ def _refuse(
 
 
 def _refuse_other_words(tokens: Sequence[str]) -> None:
-    """Raise InputError for a verb of another program, with the command line that does the same."""
+    """Raise InputError for a verb of another program, with the equivalent command line."""
     word = tokens[0] if tokens else ""
     verb = verbs.verb_for(word)
     if verb is None or word in verbs.names() or Path(word).exists():
@@ -198,16 +206,16 @@ def _refuse_other_words(tokens: Sequence[str]) -> None:
 
 
 def _without_output(tokens: Sequence[str]) -> list[str]:
-    """Return a command line without options that a person who mistyped it does not mean to repeat."""
+    """Return a command line without output options, which a corrected one need not repeat."""
     return [token for token in tokens if token not in ("--json", "--debug")]
 
 
 _OF_ROBOT = ("robot", "file", "config", "f")
-"""Options of other programs for what is written without one here."""
+"""Options of other programs for the robot file, which is positional here."""
 
 
 def _right_form(error: CycloptsError, tokens: Sequence[str]) -> str:
-    """Return the command line that was meant, with the given values; empty: it is not known."""
+    """Return the intended command line with the given values; empty when unknown."""
     verb = list(error.command_chain or ())
     given = _without_output(tokens[len(verb) :])
     if isinstance(error, UnknownOptionError):
@@ -217,7 +225,7 @@ def _right_form(error: CycloptsError, tokens: Sequence[str]) -> str:
     if verb == ["switch"] and isinstance(error, UnusedCliTokensError):
         return shlex.join(("dxlrun", *verb, "--activate", *given))
     if isinstance(error, MissingArgumentError) and verb:
-        # `set base gain=400`, `set base.gain 400`: two words were written as one
+        # `set base gain=400`, `set base.gain 400`: two words were joined to one.
         for sign in (":=", "=", "."):
             words = [part for word in given for part in ([word] if word[:1] == "-" else word.split(sign, 1))]
             if len(words) == len(given) + 1 and all(words):
@@ -229,7 +237,7 @@ def _right_form(error: CycloptsError, tokens: Sequence[str]) -> str:
 
 
 def _without_options(error: UnknownOptionError, verb: Sequence[str], given: Sequence[str]) -> str:
-    """Return a command line with values in place of unknown options; empty: their place is not known."""
+    """Return a command line with values in place of unknown options; empty when their place is unknown."""
     known = error.argument_collection
     places = {place.name.lower() for place in known if place.field_info.is_positional}
     options = {name for each in known for name in each.names}
@@ -257,8 +265,9 @@ def _without_options(error: UnknownOptionError, verb: Sequence[str], given: Sequ
 
 
 def _declared(words: Sequence[str]) -> tuple[str, ...]:
-    """Return the arguments that the robot file of a command line declares; none where it cannot be read."""
-    from dxlrun.description.including import read_sources  # not above: only a wrong command line needs it
+    """Return the arguments that the robot file declares; empty when it cannot be read."""
+    # Imported here because only a wrong command line needs it.
+    from dxlrun.description.including import read_sources
 
     robot = next((word for word in words if word.endswith((".yaml", ".yml"))), None)
     if robot is None:
@@ -271,7 +280,7 @@ def _declared(words: Sequence[str]) -> tuple[str, ...]:
 
 
 def _usage_error(error: CycloptsError, tokens: Sequence[str]) -> str:
-    """Return what is wrong with a command line, and the right one, or where its usage is shown."""
+    """Return the mistake of a command line with the corrected line or a hint to the usage."""
     usage = " ".join(("dxlrun", *(error.command_chain or ()), "--help"))
     what, fix = " ".join(str(error).split()).removesuffix("."), f"`{usage}` shows the usage"
     if isinstance(error, UnknownOptionError):
@@ -292,7 +301,7 @@ def _usage_error(error: CycloptsError, tokens: Sequence[str]) -> str:
 
 
 def _explained(error: Exception, tokens: Sequence[str]) -> tuple[tuple[str, ...], int]:
-    """Return an error without places in files, in one sentence a problem, and the exit code."""
+    """Return an error without places in files, one sentence per problem, and the exit code."""
     verb = tokens[0] if tokens else ""
     if isinstance(error, DxlrunError):
         return tuple(str(error).splitlines()) or (type(error).__name__,), error.exit_code

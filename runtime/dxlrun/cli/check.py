@@ -100,13 +100,15 @@ def check(
 
 
 def _check_picture(file: Path) -> None:
-    from dxlrun.output.graph_picture import check_picture  # not above: most checks draw nothing
+    # Imported here because most checks draw nothing.
+    from dxlrun.output.graph_picture import check_picture
 
     check_picture(file)
 
 
 def _write(result: Compiled, file: Path) -> None:
-    from dxlrun.output.graph_picture import write_picture  # as above
+    # Imported here because most checks draw nothing.
+    from dxlrun.output.graph_picture import write_picture
 
     write_picture(result.drawing, file)
 
@@ -116,7 +118,7 @@ def _asked(packets: BusesLog, buses: Sequence[BusPlan], joints: Sequence[str]) -
 
 
 def _look(result: Compiled, packets: BusesLog) -> Found:
-    """Read the servos on real ports; raises InputError where there are none."""
+    """Read the servos on real ports; raises InputError without a real port."""
     from dxlrun.description.bus import SIMULATED
     from dxlrun.dynamixel.tools.inspection import look
 
@@ -153,7 +155,7 @@ def _verdict(result: Compiled) -> str:
 
 
 def _tables(result: Compiled) -> Iterator[Table]:
-    # not above: the help of the verb needs none of it
+    # Imported here because the help of the verb does not need it.
     from dxlrun.compile.report import TableStage
     from dxlrun.features import stages
 
@@ -176,7 +178,7 @@ def _tables(result: Compiled) -> Iterator[Table]:
 
 
 def _named(kind: Kind, **keys: str) -> Iterator[tuple[Column, str]]:
-    """Yield columns of rows, each with the key of its value."""
+    """Yield columns with the keys of their values."""
     return ((Column(name, kind), key) for name, key in keys.items())
 
 
@@ -250,7 +252,7 @@ def _joints(joints: Sequence[Row]) -> Table:
 
 
 def _servos(servos: Iterable[Row]) -> Table:
-    """Return the servos' side of joints with gears, linear joints and joints of several servos."""
+    """Return the servos of joints with gears, linear joints and joints of several servos."""
     from dxlrun.compile.joints.limits import degrees
 
     def gear(row: Row) -> str:
@@ -309,7 +311,7 @@ def _buses(buses: Sequence[Row], rate: float) -> Table:
 
 
 def _compared(found: Found) -> str:
-    """Return in one line that servos were read, and how many differences there are."""
+    """Return a line with the numbers of compared servos and of differences."""
     differing = sum(row.found not in (None, row.declared) for row in found.registers)
     count = differing + len(found.deviations) + len(found.remarks)
     differences = counted(count, "difference", "differences") if count else "no differences"
@@ -318,7 +320,7 @@ def _compared(found: Found) -> str:
 
 
 def _registers(registers: Sequence[RegisterRow]) -> Table:
-    """Return the declared registers beside those of the servos."""
+    """Return a table of declared registers and the values in the servos."""
     columns = [
         *(Column(name, "name") for name in ("joint", "item", "area")),
         *numbers("address", "declared"),
@@ -334,7 +336,7 @@ def _registers(registers: Sequence[RegisterRow]) -> Table:
 
 
 def _deviations(deviations: Sequence[DeviationRow]) -> Table:
-    """Return the settings that are not the factory's, and that the file does not declare."""
+    """Return a table of settings that differ from the factory's, and that the file does not declare."""
     columns: Columns[DeviationRow] = [
         *_named("name", joint="joint", servo="servo", item="item", area="area"),
         *_named("number", address="address", found="found", factory="factory"),

@@ -1,4 +1,4 @@
-"""`dxlrun doctor`: is this machine fit to run robots?"""
+"""`dxlrun doctor`: a check whether this machine can run robots."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""`dxlrun examples` and `dxlrun schema`: robots to begin with, and what editors need to check their files."""
+"""`dxlrun examples` and `dxlrun schema`: example robots, and JSON Schemas with which editors check files."""
 
 from __future__ import annotations
 
@@ -22,23 +22,24 @@ if TYPE_CHECKING:
 
 _HERE = Path("robots")
 _SCHEMAS = ("robot.schema.json", "motions/motion.schema.json", "motors/motor.schema.json")
-"""What the first line of each file names for editors."""
+"""Schemas to which the first line of each file refers, for editors."""
 
 
 @dataclass(frozen=True, slots=True)
 class Example:
-    """A robot that comes along."""
+    """A robot that is part of dxlrun."""
 
     name: str
-    """Of its file."""
+    """Name of its file without suffix."""
     servos: int
     motions: tuple[str, ...]
-    """Those for its controllers, by the names of their files; first those that can be played at once."""
+    """Names of motion files for its controllers; first those that can be played at once."""
     playable: int
-    """How many can be played at once; the others need a controller that is not active at the start."""
+    """Number of motions that can be played at once; the others need a controller that is inactive at the
+    start."""
     about: str
     files: tuple[str, ...]
-    """All that it needs, its own file first, from the directory of the examples."""
+    """All needed files, the robot file first, relative to the directory of the examples."""
 
 
 def examples(
@@ -130,7 +131,7 @@ def _example(path: Path) -> Example:
 
 
 def _fits(motion: MotionDescription, robot: Robot) -> bool:
-    """Return whether a motion is for controllers and joints that a robot has."""
+    """Return whether a robot has the controllers and joints of a motion."""
     from dxlrun.description.motion import FormulaPart
 
     joints: set[str] = set()
@@ -146,7 +147,8 @@ def _fits(motion: MotionDescription, robot: Robot) -> bool:
 def _about(text: str) -> str:
     """Return the first sentence of the comment at the top of a robot file."""
     comment: list[str] = []
-    for line in text.splitlines()[1:]:  # the first one is for editors
+    # The first line is for editors.
+    for line in text.splitlines()[1:]:
         if not line.startswith("# ") or line.startswith("#  "):
             break
         comment.append(line.removeprefix("# "))
@@ -154,7 +156,7 @@ def _about(text: str) -> str:
 
 
 def _copy(source: Path, directory: Path, files: Sequence[str]) -> None:
-    """Copy files; raises InputError, before any is written, where another one has a name of theirs."""
+    """Copy files; raises InputError before any is written if another file has one of the names."""
     texts = {directory / file: (source / file).read_bytes() for file in files}
     missing = {path: text for path, text in texts.items() if not _holds(path, text)}
     taken = [path for path in missing if os.path.lexists(path)]
@@ -175,7 +177,7 @@ def _holds(path: Path, text: bytes) -> bool:
 
 
 _SCHEMA_MARK = '"$schema": "https://json-schema.org/'
-"""In each JSON Schema; only such a file is replaced by a new one."""
+"""Text in each JSON Schema of dxlrun; other existing files are not replaced."""
 
 
 def schema(
@@ -206,7 +208,7 @@ def schema(
 
 
 def schema_text(kind: Literal["robot", "motion", "motor", "fragment"], *, only: str = "") -> str:
-    """Return a schema as JSON; with `only`, of the types whose distribution's name begins so."""
+    """Return a schema as JSON; `only` restricts it to types of distributions whose names begin with it."""
     from dxlrun.description.json_schema import fragment_schema, motion_schema, motor_schema, robot_schema
 
     if kind == "motion":
@@ -218,7 +220,8 @@ def schema_text(kind: Literal["robot", "motion", "motor", "fragment"], *, only: 
         from dxlrun.control.controllers.plugins import load_plugins
         from dxlrun.features import FEATURES, stages
 
-        found = load_plugins()  # one whose class cannot be imported has no parameters to show
+        # A controller whose class cannot be imported has no parameters to show.
+        found = load_plugins()
         controllers = {
             name: offer.controller.Parameters
             for name in found.controllers

@@ -1,4 +1,4 @@
-"""`dxlrun frames ROBOT.yaml`: the tree of a robot's frames, and where one of them lies."""
+"""`dxlrun frames ROBOT.yaml`: the tree of a robot's frames, and the pose of a frame."""
 
 from __future__ import annotations
 
@@ -23,7 +23,8 @@ _Positions = Annotated[
 ]
 _Branches = tuple[str, str, str, str, str]
 _LINES: _Branches = ("├── ", "├┄┄ ", "└── ", "└┄┄ ", "│   ")
-"""To a frame that moves, one that does not, the same for the last below a frame; and past others."""
+"""Branches to a moving frame, to a fixed frame, the same for the last child, and the line past other
+children."""
 _ASCII: _Branches = ("|-- ", "|.. ", "`-- ", "`.. ", "|   ")
 
 
@@ -59,7 +60,8 @@ def frames(
             "--at and --relative-to are for one frame; name it by --of, without it the tree is drawn"
         )
     for file in graph or ():
-        from dxlrun.output.graph_picture import check_picture  # not above: most draw nothing
+        # Imported here because most calls draw nothing.
+        from dxlrun.output.graph_picture import check_picture
 
         check_picture(file)
     result = compiled(robot, assignments, (), None)
@@ -79,7 +81,8 @@ def frames(
 
 
 def _tree(plan: Plan, robot: Path) -> FrameTree:
-    from dxlrun.description.frames.tree import FrameTree  # as above
+    # Imported here because the help of the verb does not need it.
+    from dxlrun.description.frames.tree import FrameTree
 
     if plan.urdf is None or plan.frames is None:
         raise InputError(f"{robot} names no URDF, so there are no frames; write `model: {{urdf: NAME.urdf}}`")
@@ -105,7 +108,7 @@ def _show_tree(plan: Plan, tree: FrameTree, *, as_json: bool) -> None:
 
 
 def _lines(plan: Plan, tree: FrameTree, branches: _Branches) -> Iterator[str]:
-    """Yield a line a frame, the root first."""
+    """Yield one line per frame, the root first."""
     below: dict[str, list[Frame]] = {}
     for frame in tree.frames:
         below.setdefault(frame.parent, []).append(frame)
@@ -124,7 +127,7 @@ def _lines(plan: Plan, tree: FrameTree, branches: _Branches) -> Iterator[str]:
 
 
 def _what(plan: Plan, tree: FrameTree, frame: Frame) -> str:
-    """Return what moves a frame, in words."""
+    """Return a description of the frame's motion."""
     joint = frame.joint
     if frame.moved_by == "imu":
         return f"turned by the orientation of {tree.imu}"
@@ -196,8 +199,8 @@ def _show_pose(
 
 
 def _pose_lines(pose: Transform) -> Iterator[str]:
-    # rounded first, then + 0.0: a zero has no sign
     def numbers(values: tuple[float, ...], digits: int) -> str:
+        # Adding 0.0 after rounding removes the sign of a zero.
         return " ".join(f"{round(value, digits) + 0.0:.{digits}f}" for value in values)
 
     yield f"  x y z           {numbers(pose.translation, 6)} m"
@@ -224,7 +227,8 @@ def _positions(plan: Plan, tree: FrameTree, words: tuple[str, ...]) -> Mapping[s
 
 
 def _draw(plan: Plan, tree: FrameTree, file: Path) -> None:
-    from dxlrun.output.graph import Edge, Graph, Node  # as above
+    # Imported here because the help of the verb does not need it.
+    from dxlrun.output.graph import Edge, Graph, Node
     from dxlrun.output.graph_picture import write_picture
 
     nodes = tuple(

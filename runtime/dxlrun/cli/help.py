@@ -1,4 +1,4 @@
-"""`dxlrun --help`: a text that is read, as making it would import every command; a test keeps it true."""
+"""`dxlrun --help`: a stored text, because making it would import every command; a test compares both."""
 
 from __future__ import annotations
 
@@ -18,14 +18,15 @@ _COLUMNS = 80
 _EVERY_DAY = "Every day"
 _MORE = "`dxlrun --help` lists all commands, `dxlrun help COMMAND` shows one with examples."
 _BEHIND = "Arguments"
-"""The heading behind those of verbs."""
+"""First heading after those of verbs."""
 
 
 def print_help() -> None:
-    """Print the help, with the verbs of packages that did not come with dxlrun."""
+    """Print the help, including the verbs of packages that are not part of dxlrun."""
     text = TEXT.read_text("utf-8")
     publishers = {distribution_name(each.publisher) for each in installed_plugins()}
-    if publishers - {"dxlrun"}:  # only then is the code of packages imported
+    # Only then import the code of packages.
+    if publishers - {"dxlrun"}:
         from dxlrun.cli.verbs import packaged
 
         for command in packaged().values():
@@ -35,7 +36,7 @@ def print_help() -> None:
 
 
 def print_short_help() -> None:
-    """Print the usage, and the commands of every day."""
+    """Print the usage and the commands of every day."""
     parts = TEXT.read_text("utf-8").split("\n\n")
     (commands,) = (part for part in parts if part.startswith(f"{_EVERY_DAY}\n"))
     lines = [line for line in commands.splitlines() if not line.startswith("help ")]
@@ -43,7 +44,7 @@ def print_short_help() -> None:
 
 
 def _with_verb(text: str, command: Command) -> str:
-    """Return the help with one verb more, at the end of its group, or in a group of its own."""
+    """Return the help with an added verb, at the end of its group or in a new group."""
     parts = text.split("\n\n")
     headings = [part.partition("\n")[0] for part in parts]
     if command.group not in headings:
@@ -59,12 +60,12 @@ def _with_verb(text: str, command: Command) -> str:
 
 
 def in_list(about: str) -> str:
-    """Return what a list of verbs shows of the line about one: the part before a colon or a semicolon."""
+    """Return the entry of a verb in a list: its summary up to a colon or a semicolon."""
     return " ".join(re.split("[:;]", about)[0].split()).removesuffix(".") + "."
 
 
 def version() -> str:
-    """Return the version of dxlrun, and whether what is compiled can be used."""
+    """Return the version of dxlrun, and whether its compiled parts can be used."""
     from importlib import metadata  # not above: only --version needs it
 
     from dxlrun.channels.compiled import missing

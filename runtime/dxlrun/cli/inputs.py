@@ -1,4 +1,4 @@
-"""What the commands have in common: their names, shared options, and a robot file with its arguments."""
+"""Inputs: common parts of the commands: names, shared options, and a robot file with its arguments."""
 
 from __future__ import annotations
 
@@ -26,13 +26,13 @@ Flag = Annotated[bool, Parameter(negative=(), show_default=False)]
 """An option without a value."""
 JsonOfItsOwn = Annotated[Flag, Parameter(name="--json")]
 JsonFlag = Annotated[JsonOfItsOwn, Parameter(help="Print the result as JSON.")]
-"""`--json`; `JsonOfItsOwn` where the docstring of a verb tells more of it."""
+"""`--json`; `JsonOfItsOwn` is for verbs that describe the option in their docstring."""
 DebugFlag = Annotated[Flag, Parameter(help="Print the traceback of an error.")]
 """`--debug`."""
 
 
 def _switch(name: str) -> Parameter:
-    """Return an option with both forms, `--wait` and `--no-wait`; the help shows which is the default."""
+    """Return an option with both forms, `--wait` and `--no-wait`; the help shows the default."""
     return Parameter(
         name=f"--{name}",
         negative=f"--no-{name}",
@@ -48,7 +48,7 @@ PageFlag = Annotated[bool, _switch("page")]
 GraphFile = Annotated[
     tuple[Path, ...] | None, Parameter(negative=(), show_default=False, consume_multiple=(0, 1))
 ]
-"""`--graph`, with a file or without one."""
+"""`--graph`, with or without a file."""
 RobotPath = Annotated[Path, Parameter(help="The robot file.")]
 RobotName = Annotated[str | None, Parameter(help="Name of the robot, where several run.")]
 Motions = Annotated[tuple[Path, ...], Parameter(negative=(), show_default=False)]
@@ -61,15 +61,17 @@ Assignment = Annotated[
 
 
 def _of(quantity: str) -> Parameter:
-    """Return how an option is read that is a quantity of `description.units`, or a number in its SI unit."""
+    """Return the parser of an option: a quantity of `description.units`, or a number in its SI unit."""
 
     def read(_: object, tokens: Sequence[Token]) -> float:
-        from dxlrun.description import units  # not above: help and completion need no pydantic
+        # Imported here because help and completion need no pydantic.
+        from dxlrun.description import units
 
         try:
             value: float = getattr(units, quantity)(tokens[0].value)
         except ValueError as error:
-            raise ValueError(str(error)) from None  # of pydantic's own the parser shows another part
+            # For pydantic's own subclass, the parser shows another part.
+            raise ValueError(str(error)) from None
         return value
 
     return Parameter(converter=read)
@@ -81,9 +83,9 @@ Hertz = Annotated[float, _of("rate")]
 """A rate, Hz: `50`, `50Hz` or `1kHz`."""
 
 REPORT_MARK = '<script type="application/json" id="report">'
-"""In each report that `output.html` makes; only such a page is replaced by a new report."""
+"""Text in each report of `output.html`; other existing files are not replaced."""
 SHORTEST_S, LONGEST_S = 1e-6, 1e9
-"""Of a run, s; 31 years still fit into the log's nanoseconds."""
+"""Limits of the duration of a run, s; 31 years still fit into the log's nanoseconds."""
 
 
 def compiled(
@@ -93,18 +95,20 @@ def compiled(
     duration: float | None,
     ask: Ask | None = None,
 ) -> Compiled:
-    """Read and compile; raises InputError with everything that is wrong with the file, or with the line."""
+    """Read and compile a robot file; raises InputError with all mistakes of file and command line."""
     known_file(robot)
     arguments = parse_assignments(assignments)
     duration_ns = None
     if duration is not None:
-        if not SHORTEST_S <= duration <= LONGEST_S:  # false for nan too
+        # Also refuses NaN.
+        if not SHORTEST_S <= duration <= LONGEST_S:
             raise InputError(
                 f"--duration {duration:g} is no time to run; "
                 f"give a number of seconds from {SHORTEST_S:g} to {LONGEST_S:g}"
             )
         duration_ns = round(duration * 1e9)
-    from dxlrun.compile.robot import compile_files  # not above: a wrong word needs neither numpy nor pydantic
+    # Imported here because a wrong argument needs neither numpy nor pydantic.
+    from dxlrun.compile.robot import compile_files
 
     return compile_files(robot, arguments, play, duration_ns, ask)
 
@@ -112,17 +116,21 @@ def compiled(
 def read_models(
     buses: Sequence[BusPlan], joints: Sequence[str], packets: Mapping[str, PacketSink] | None = None
 ) -> Mapping[str, str]:
-    """Return the models of joints with `model: auto`; most robots have none, so it is imported late."""
+    """Return the models of joints with `model: auto`.
+
+    The module is imported here because most robots have no such joints.
+    """
     from dxlrun.dynamixel.tools import inspection
 
     return inspection.read_models(buses, joints, packets or {})
 
 
 def parse_assignments(assignments: Sequence[str]) -> dict[str, str]:
-    """Return the arguments of `name:=value` words; raises InputError for a word that is none."""
+    """Return the arguments from `name:=value` words; raises InputError for any other word."""
     arguments: dict[str, str] = {}
     if len(assignments) == 3 and assignments[1] in ("=", ":=", ":"):
-        assignments = ["".join(assignments)]  # written with spaces; the sign is judged below
+        # The argument was written with spaces; the sign is checked below.
+        assignments = ["".join(assignments)]
     for word in assignments:
         name, sign, value = word.partition(":=")
         if not sign or not name:
@@ -134,7 +142,7 @@ def parse_assignments(assignments: Sequence[str]) -> dict[str, str]:
 
 
 def _assignment_for(word: str) -> str:
-    """Return how a word is written that was meant as an argument of the robot file, or as an option."""
+    """Return the correct form of a word that was meant as an argument of the robot file, or as an option."""
     if word.endswith((".yaml", ".yml")):
         return f"--play {word.removeprefix('play=').removeprefix('play:')}"
     match = re.fullmatch(r"([A-Za-z_]\w*)\s*[=:]\s*(.*)", word, re.DOTALL)
@@ -143,7 +151,8 @@ def _assignment_for(word: str) -> str:
 
 def parse_size(option: str, text: str) -> int:
     """Return the bytes of a size such as `10GB`; raises InputError with the name of the option."""
-    from dxlrun.description.units import size  # not above: as in `_of`
+    # Imported here for the same reason as in `_of`.
+    from dxlrun.description.units import size
 
     try:
         return size(text)
@@ -152,7 +161,7 @@ def parse_size(option: str, text: str) -> int:
 
 
 def parse_pair(word: str, example: str) -> tuple[str, str]:
-    """Return key and value of a word `key=value`. Raises InputError with an example for another one."""
+    """Return key and value of a word `key=value`. Raises InputError with an example for any other word."""
     key, sign, value = (part.strip() for part in word.partition("="))
     if not sign or not value or not all(part.isidentifier() for part in key.split(".")):
         raise InputError(f"{word!r} is not key=value; write for example {example}")
@@ -160,13 +169,13 @@ def parse_pair(word: str, example: str) -> tuple[str, str]:
 
 
 def pose_text(positions: Mapping[str, str]) -> str:
-    """Return positions by joint as `send` and `frames --at` take them: `elbow=20.0deg jaw=5.00mm`."""
+    """Return positions by joint in the form of `send` and `frames --at`: `elbow=20.0deg jaw=5.00mm`."""
     return " ".join(f"{name}={position.replace(' ', '')}" for name, position in positions.items())
 
 
 @contextmanager
 def terminated_as_interrupted() -> Iterator[None]:
-    """Let SIGTERM do what Ctrl-C does: what was measured is kept and shown."""
+    """Handle SIGTERM like Ctrl-C, so that the results of a measurement are kept and shown."""
     before = signal.signal(signal.SIGTERM, signal.default_int_handler)
     try:
         yield
@@ -175,9 +184,9 @@ def terminated_as_interrupted() -> Iterator[None]:
 
 
 def check_report(target: Path, library: str = "matplotlib") -> None:
-    """Raise InputError with what is wrong with the file of a page, before anything is measured.
+    """Raise InputError for an unusable file of a report, before a measurement begins.
 
-    `library`: by which its plots are drawn.
+    `library`: library that draws the plots.
     """
     if target.suffix.lower() not in {".html", ".htm"}:
         raise InputError(f"a report is an HTML file, so its name ends in .html, not as {target} does")
@@ -187,12 +196,12 @@ def check_report(target: Path, library: str = "matplotlib") -> None:
 
 
 def write_report(target: Path, page: str) -> None:
-    """Write a page, also in place of an older one. Raises InputError where that fails."""
+    """Write a report, possibly in place of an older one. Raises InputError on failure."""
     write_target(target, page, REPORT_MARK)
 
 
 def known_file(robot: Path) -> None:
-    """Refuse a word that is neither a command nor a file with one sentence that helps."""
+    """Raise InputError, with a helpful sentence, for a word that is neither a command nor a file."""
     if robot.is_file():
         return
     word = str(robot)
@@ -216,14 +225,14 @@ def known_file(robot: Path) -> None:
 
 
 def _other_file(robot: Path) -> str:
-    """Return which file may be meant by the name of a robot file that is missing."""
+    """Return a suggestion for the name of a missing robot file."""
     beside = [path.name for path in robot.parent.glob("*.y*ml")] if robot.parent.is_dir() else []
     copies = f"`dxlrun examples {robot.stem}` copies the robot of this name"
     return suggestion(robot.name, beside, copies if is_example(robot.stem) else "check the path")
 
 
 def examples_directory() -> Path:
-    """Return where the examples are: in the installed package, or in the clone that it is edited in."""
+    """Return the directory of the examples: in the installed package, or in an editable clone."""
     package = Path(__file__).parents[1]
     for place in (package / "examples", package.parents[1] / "robots"):
         if place.is_dir():
@@ -232,5 +241,5 @@ def examples_directory() -> Path:
 
 
 def is_example(name: str) -> bool:
-    """Return whether a robot of a name comes with dxlrun."""
+    """Return whether an example of this name exists."""
     return (examples_directory() / f"{name}.yaml").is_file()

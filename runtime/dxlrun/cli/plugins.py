@@ -1,4 +1,4 @@
-"""`dxlrun plugins` and `dxlrun new-plugin`: packages that extend dxlrun, and the beginning of another."""
+"""`dxlrun plugins` and `dxlrun new-plugin`: a list of packages that extend dxlrun, and a template of one."""
 
 from __future__ import annotations
 
@@ -29,10 +29,10 @@ _TEMPLATE = "easing"
 _LEFT_OUT = ("LICENSE",)
 _NOT_COPIED = ("__pycache__", ".pytest_cache", "logs", "dist", "build")
 _OWNED = re.compile(r"^(license|license-files|authors) = .*\n", re.MULTILINE)
-"""Lines of pyproject.toml that are the author's to write."""
+"""Lines of pyproject.toml that the author must write."""
 _LICENCE = re.compile(r"\n## Licence\n.*", re.DOTALL)
 Row = dict[str, Any]
-"""What JSON has of one thing."""
+"""Row of the JSON result."""
 
 
 def plugins(*, as_json: JsonFlag = False, debug: DebugFlag = False) -> int:
@@ -53,7 +53,7 @@ def plugins(*, as_json: JsonFlag = False, debug: DebugFlag = False) -> int:
 
 
 def _row(name: str, distribution: str = "", contract: int | None = None, *, broken: str) -> Row:
-    """Return a plug-in that offers nothing; `broken`: why it cannot be used, empty: it can."""
+    """Return the row of a plug-in without offers; `broken`: reason why it cannot be used, empty if it can."""
     about = {"name": name, "distribution": distribution, "contract": contract}
     offers = {"controllers": (), "servo_models": (), "overrun": False, **_drivers(), "verbs": ()}
     return about | offers | {"broken": broken}
@@ -79,8 +79,9 @@ def _shown(plugin: LoadedPlugIn, found: PlugIns) -> Row:
 
 
 def _offer_stages() -> Iterator[tuple[Feature, OfferStage]]:
-    """Yield the features for whose sections plug-ins offer classes."""
-    from dxlrun.control.controllers.offers import OfferStage  # not above: `--help` loads no pydantic
+    """Yield the features for which plug-ins provide classes."""
+    # Imported here because `--help` loads no pydantic.
+    from dxlrun.control.controllers.offers import OfferStage
     from dxlrun.features import FEATURES, stages
 
     return stages(OfferStage, FEATURES)
@@ -115,12 +116,14 @@ def _live(model: type[BaseModel], prefix: str = "") -> Iterator[str]:
 
 
 def _references(offer: Offer) -> tuple[str, ...]:
-    """Return what a controller exports on one joint by the defaults of its parameters, if they have any."""
+    """Return the references of a controller on one joint with default parameters, if there are any."""
     try:
-        given: dict[str, Any] = {"joints": ("joint",)}  # a model of foreign code: what it has is not known
+        # A model of foreign code, whose fields are unknown.
+        given: dict[str, Any] = {"joints": ("joint",)}
         parameters = offer.controller.Parameters.model_construct(**given)
         return tuple(offer.controller.interfaces(parameters, ("joint",)).reference)
-    except Exception:  # foreign code, and parameters without a default: it decides when it is used
+    # Foreign code may raise any exception, and parameters may have no defaults.
+    except Exception:
         return ()
 
 
@@ -136,7 +139,7 @@ _OFFERS: Columns[Row] = [
 
 
 def _table(row: Row) -> Table:
-    """Return a line for each thing that a plug-in offers."""
+    """Return a table with a line for each offer of a plug-in."""
     others = [
         *(f"{stage.kind} {one['type']}" for feature, stage in _offer_stages() for one in row[feature.name]),
         *(f"servo model {name}" for name in row["servo_models"]),
@@ -181,7 +184,7 @@ def new_plugin(
 
 
 def _module(name: str) -> str:
-    """Return the module's name of a package; raises InputError for what cannot be one."""
+    """Return the module name of a package; raises InputError for an invalid one."""
     module = name.replace("-", "_")
     if not _NAME.fullmatch(name) or len(name) > _LONGEST_NAME:
         raise InputError(
@@ -201,7 +204,7 @@ def _known(module: str) -> bool:
 
 
 def _template() -> Path:
-    """Return where the template is: in the installed package, or in the clone that it is edited in."""
+    """Return the directory of the template: in the installed package, or in an editable clone."""
     package = Path(__file__).parents[1]
     for place in (package / "plugin_template", package.parents[1] / "plugins" / "example"):
         if place.is_dir():
@@ -210,7 +213,7 @@ def _template() -> Path:
 
 
 def _files(template: Path, module: str) -> Iterator[tuple[Path, str]]:
-    """Yield paths and texts of a package: those of the template, with names of its own."""
+    """Yield paths and texts of a package: those of the template with new names."""
     renamed: Mapping[str, str] = {
         f"dxlrun_{_TEMPLATE}": module,
         f"dxlrun-{_TEMPLATE}": module.replace("_", "-"),

@@ -37,14 +37,15 @@ if TYPE_CHECKING:
 
 DEMO = ("bioloid_torso.yaml", "motions/three_parts.yaml")
 """Robot and motion of `dxlrun demo`, in the directory of the examples."""
-_START_S = 60.0  # A run on a busy machine takes some seconds until it can be steered
+# On a busy machine, a run takes some seconds until it can be steered.
+_START_S = 60.0
 _POLL_S = 0.1
 _SHOW_PAGE = (
     "import sys; from dxlrun.cli import main, run; sys.exit(main(['view', run.await_robot(sys.argv[1:])]))"
 )
 _WORDS = {0: "done", 130: "interrupted"}
 _MOST_DELETED = 5
-"""Logs that are named one by one."""
+"""Upper limit of deleted logs that are listed individually."""
 
 
 @unblocked()
@@ -155,7 +156,7 @@ def demo(*, page: PageFlag = True, virtual: Flag = False, debug: DebugFlag = Fal
 
 @contextmanager
 def _page_beside(*, shown: bool) -> Iterator[None]:
-    """Serve the page of the next run from a process of its own while the block runs."""
+    """Serve the page of the next run from another process while the block runs."""
     from dxlrun.cli.verbs import packaged
 
     if not shown:
@@ -165,7 +166,8 @@ def _page_beside(*, shown: bool) -> Iterator[None]:
         show("to see the robot in 3-D install dxlrun-view, the page of `dxlrun view`")
         yield
         return
-    import subprocess  # not above: it takes 5 ms of every command
+    # Imported here because the import takes 5 ms.
+    import subprocess
 
     from dxlrun.remote.sockets import running
 
@@ -178,7 +180,7 @@ def _page_beside(*, shown: bool) -> Iterator[None]:
 
 
 def await_robot(others: Collection[str]) -> str:
-    """Return the first robot that starts, but for `others`, which run already; exit with 1 when none does."""
+    """Wait for a robot other than `others` to start and return its name; exit with 1 when none does."""
     from dxlrun.remote.sockets import running
 
     for _ in range(round(_START_S / _POLL_S)):
@@ -189,7 +191,7 @@ def await_robot(others: Collection[str]) -> str:
 
 
 def _check_listen(text: str, plan: Plan, *, served: bool) -> None:
-    """Raise InputError where clients of other computers could not be served."""
+    """Raise InputError when clients of other computers could not be served."""
     from dxlrun.remote.network.listener import Listener
     from dxlrun.remote.sockets import Address
 
@@ -205,9 +207,9 @@ def _check_listen(text: str, plan: Plan, *, served: bool) -> None:
 
 
 def show_summary(summary: RunSummary, plan: Plan, console: Console) -> int:
-    """Print how the run went: what failed and what was not granted to stderr, the rest to stdout.
+    """Print the result of a run: failures and refused grants to stderr, the rest to stdout.
 
-    Return the exit code: 1 also where the run was not good.
+    Return the exit code; it is 1 also when the verdict is bad.
     """
     robot = plan.robot
     for remark in summary.remarks:
@@ -238,7 +240,7 @@ def _log_line(log: Path, messages: int) -> str:
 
 
 def _disk_lines(log: Path, recording: RecordingPlan) -> list[str]:
-    """Delete the oldest logs if the robot file says so; return what was done, or how much there is."""
+    """Delete the oldest logs if the robot file says so; return lines about deleted logs or the total size."""
     from rich.filesize import decimal
 
     from dxlrun.log.stored import MUCH_BYTES, oldest_beyond, stored_logs

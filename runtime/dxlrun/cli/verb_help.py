@@ -11,7 +11,7 @@ from dxlrun.errors import InputError
 from dxlrun.output.terminal import show
 
 EXAMPLES = Path(__file__).with_name("examples.txt")
-"""Lines to be typed; a test parses them."""
+"""Example command lines; a test parses them."""
 
 
 def show_help(*verb: str) -> int:

@@ -1,4 +1,4 @@
-"""The verbs of the command line: those of the core, and those that installed packages add."""
+"""Verbs: the verbs of the command line, from the core and from installed packages."""
 
 from __future__ import annotations
 
@@ -18,7 +18,8 @@ if TYPE_CHECKING:
 EVERY_DAY = "Every day"
 _CLI, _STEERING, _TOOLS = "dxlrun.cli", "dxlrun.cli.steering", "dxlrun.cli.tools"
 GROUPS: Mapping[str, Mapping[str, str]] = {
-    EVERY_DAY: {  # in the order in which they are needed
+    # In the sequence of their use.
+    EVERY_DAY: {
         "help": f"{_CLI}.verb_help:show_help",
         "demo": f"{_CLI}.run:demo",
         "examples": f"{_CLI}.examples:examples",
@@ -58,8 +59,8 @@ GROUPS: Mapping[str, Mapping[str, str]] = {
         "new-plugin": f"{_CLI}.plugins:new_plugin",
     },
 }
-"""The headings of the help in their order, and `module:function` of each verb of the core, which is imported
-when it is used. Verbs of packages name their heading, see `Command.group`."""
+"""Headings of the help in their order, with `module:function` of each verb of the core, imported on use.
+Verbs of packages name their heading, see `Command.group`."""
 _PACKAGES = {
     "dxlrun_analysis": ("analyze", "export", "logs", "upload"),
     "dxlrun_fleet": ("fleet", "keys"),
@@ -69,7 +70,7 @@ _PACKAGES = {
     "dxlrun_teleop": ("teleop",),
     "dxlrun_view": ("view",),
 }
-"""Verbs of this repository's packages, to name the package where it is not installed."""
+"""Verbs of this repository's packages, to name the package when it is not installed."""
 
 
 _OTHER_WORDS = {
@@ -89,11 +90,11 @@ _OTHER_WORDS = {
     "examples": "init new",
     "teach": "record",
 }
-"""Words of other programs, by the verb of ours that does this; without one: `dxlrun ROBOT.yaml`."""
+"""Words of other programs by the equivalent verb; the empty verb is `dxlrun ROBOT.yaml`."""
 
 
 def verb_for(word: str) -> str | None:
-    """Return the verb, or the beginning of a command line, that a word of other programs means."""
+    """Return the verb, or the beginning of a command line, for a word of other programs."""
     return next((verb for verb, words in _OTHER_WORDS.items() if word in words.split()), None)
 
 
@@ -109,14 +110,14 @@ RENAMED: Mapping[str, Mapping[str, str]] = {
 
 
 def is_verb(word: str) -> bool:
-    """Return whether a word may be a verb, and no path of a robot file."""
+    """Return whether a word can be a verb, rather than the path of a robot file."""
     return re.fullmatch(r"[a-z][a-z0-9-]*", word) is not None
 
 
 def packaged() -> Mapping[str, Command]:
-    """Return the verbs that installed packages add; a verb of the core stays the core's.
+    """Return the verbs of installed packages; verbs of the core take precedence.
 
-    A package that cannot be asked adds none: `dxlrun plugins` says why.
+    A package that fails adds none: `dxlrun plugins` reports the reason.
     """
     return _packaged(installed_plugins())
 
@@ -125,7 +126,8 @@ def packaged() -> Mapping[str, Command]:
 def _packaged(plugins: tuple[InstalledPlugin, ...]) -> Mapping[str, Command]:
     found: dict[str, Command] = {}
     for plugin in plugins:
-        with suppress(Exception, SystemExit):  # foreign code: what it does on import is its fault alone
+        # Foreign code may raise any exception on import.
+        with suppress(Exception, SystemExit):
             hook = getattr(plugin.point.load(), "dxlrun_commands", None)
             for command in hook() if hook is not None else ():
                 found.setdefault(command.name, command)
@@ -133,24 +135,25 @@ def _packaged(plugins: tuple[InstalledPlugin, ...]) -> Mapping[str, Command]:
 
 
 def is_importable(command: Command) -> bool:
-    """Return whether the code of a verb is there; foreign code may be broken."""
+    """Return whether the code of a verb can be imported; foreign code may be broken."""
     try:
         import_module(command.place.partition(":")[0])
-    except (Exception, SystemExit):  # foreign code: what it does on import is its fault alone
+    # Foreign code may raise any exception on import.
+    except (Exception, SystemExit):
         return False
     return True
 
 
 def names() -> list[str]:
-    """Return all verbs, by the alphabet."""
+    """Return all verbs in alphabetical order."""
     return sorted({*chain(*GROUPS.values()), *packaged()})
 
 
 def package_of(verb: str) -> str:
-    """Return which package of this repository has a verb; empty: none has."""
+    """Return the package of this repository that has a verb; empty without one."""
     return next((package for package, verbs in _PACKAGES.items() if verb in verbs), "")
 
 
 def source_of(package: str) -> str:
-    """Return the folder that pip installs a package of this repository from: with the core, or its own."""
+    """Return the folder from which pip installs a package of this repository: the core's or its own."""
     return "./plugins/dxlrun_view" if package == "dxlrun_view" else "."

@@ -138,7 +138,7 @@ class RemoteRobot:
         """Close the connection; the robot keeps running."""
         self.link.close()
 
-    # Looking
+    # State
 
     def info(self) -> dict[str, object]:
         """Return rate, cycles, log, and the controllers with the commands that they accept."""
@@ -463,7 +463,7 @@ class RemoteRobot:
                 raise DxlrunError(f"{self.name} did not end within {_STOP_S:g} s")
             time.sleep(0.05)
 
-    # Inside
+    # Implementation
 
     def _stopping(self) -> bool:
         """Send one stop request; return False when a gateway that is alive closed the connection."""

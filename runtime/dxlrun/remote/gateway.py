@@ -217,7 +217,7 @@ class GatewayApp:
 
         return answer
 
-    # Looking
+    # State
 
     @_answers(requests.ROBOT)
     async def robot(self, asked: Asked[None]) -> RobotInfo:

@@ -110,7 +110,7 @@ class Link:
         if self._mailbox.used:
             self._mailbox.post(Command(0, LOOP, "resume", b"", "loop"))
 
-    # Looking
+    # State
 
     def newest(self) -> CycleRecord | None:
         """Return the newest cycle; None before the first. The next call overwrites the returned record."""
@@ -238,7 +238,7 @@ class Link:
         except TimeoutError:
             raise RefusedRequest(Refusal(Code.NO_ANSWER, {"seconds": timeout_s})) from None
 
-    # What the loop did
+    # Reports of the loop
 
     def loaded(self, plan: ControllerPlan, done: Done) -> None:
         """Record a loaded controller with the place that the loop assigned."""

@@ -160,7 +160,7 @@ class VirtualLink:
         events, self._cycles, self._events = self._events, [], []
         return cycles, events
 
-    # What a client asks
+    # Requests of the client
 
     def exchange(self, method: str, path: str, body: bytes | None) -> tuple[int, bytes]:
         """Pass a request to the gateway; raises RunGone if that needs a cycle after the end of the run."""

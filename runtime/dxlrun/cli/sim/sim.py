@@ -36,8 +36,10 @@ if TYPE_CHECKING:
     from dxlsim.simulation_plan import BusConfig, SimulationConfig
 
 Words = Annotated[tuple[str, ...], Parameter(negative=(), show_default=False, allow_leading_hyphen=False)]
-_ABOVE_LOOP = 2  # The guardian is one above the loop
-_PRIORITY = 31 + _ABOVE_LOOP  # Without a robot file: above a loop with the default priority
+# The guardian's priority is one above the loop's.
+_ABOVE_LOOP = 2
+# Without a robot file: above a loop with the default priority.
+_PRIORITY = 31 + _ABOVE_LOOP
 Seed = Annotated[int, Parameter(show_default=False)]
 
 
@@ -153,13 +155,16 @@ def sim(
 
 
 class _Simulated(msgspec.Struct, frozen=True):
-    """What is to be simulated, by a robot file or by `--servo`."""
+    """Parameters of a simulation, from a robot file or `--servo`."""
 
     title: str
     config: SimulationConfig
-    priority: int = _PRIORITY  # Real-time priority above the loop's
-    loop_cores: tuple[int, ...] = ()  # Where the loop may run; empty: anywhere
-    hint: str | None = None  # A command line that uses it when the port is added
+    # Real-time priority, above the loop's.
+    priority: int = _PRIORITY
+    # Cores of the loop; empty: all.
+    loop_cores: tuple[int, ...] = ()
+    # A command line that uses the simulation when the port is added.
+    hint: str | None = None
 
 
 def _simulated(
@@ -203,7 +208,7 @@ def _simulated(
 
 
 def _recorded(log: Path, others: Sequence[str]) -> _Simulated:
-    """Return the buses of a log, which answer as they did; `others`: options that exclude it.
+    """Return the buses of a log, which answer as recorded; `others`: options that exclude it.
 
     Raises InputError and LogError.
     """
@@ -229,7 +234,7 @@ def _recorded(log: Path, others: Sequence[str]) -> _Simulated:
 def check_simulated(buses: Sequence[BusConfig], faults: Sequence[Fault], seed: int) -> None:
     """Build the buses as their process will, so that mistakes are reported before anything starts.
 
-    Raises InputError for a servo that cannot be simulated, and for each fault that could never happen.
+    Raises InputError for a servo that cannot be simulated, and for each impossible fault.
     """
     from dxlrun.run.simulation_process import read_recordings
     from dxlsim.bus.ledger import Ledger
@@ -254,7 +259,7 @@ def check_simulated(buses: Sequence[BusConfig], faults: Sequence[Fault], seed: i
 def link_of_each(buses: Sequence[BusConfig], link: Path | None) -> dict[str, Path]:
     """Return the link of each bus: LINK itself for one bus, LINK.NAME for several.
 
-    Raises InputError where there is something that is no link, or no link can be made.
+    Raises InputError when a path exists and is not a link, or a link cannot be made.
     """
     if link is None:
         return {}

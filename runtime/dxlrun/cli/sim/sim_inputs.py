@@ -1,4 +1,4 @@
-"""The options of `dxlrun sim`: fault lines and the adapter; from words to buses."""
+"""Inputs of `dxlrun sim`: parses fault lines and adapter options into buses."""
 
 from __future__ import annotations
 
@@ -28,14 +28,14 @@ class Mistakes:
 
     @contextmanager
     def collected(self) -> Iterator[None]:
-        """Keep the InputError of a part."""
+        """Store the InputError of a part."""
         try:
             yield
         except InputError as error:
             self._errors.append(error)
 
     def refuse(self) -> None:
-        """Raise what was kept as one InputError, if anything was."""
+        """Raise the stored errors as one InputError."""
         if len(self._errors) == 1:
             raise self._errors[0]
         if self._errors:
@@ -43,7 +43,7 @@ class Mistakes:
 
 
 def servo_bus(words: Sequence[str], baud_rate: int | None, protocol: float | None) -> BusConfig:
-    """Return the bus of `--servo MODEL:IDS` words; models of plug-ins are known. Raises InputError."""
+    """Return the bus of `--servo MODEL:IDS` words, including models of plug-ins. Raises InputError."""
     from dxlrun.control.controllers.plugins import load_plugins
     from dxlsim.texts.servo_words import bus_of_servos
 
@@ -52,7 +52,7 @@ def servo_bus(words: Sequence[str], baud_rate: int | None, protocol: float | Non
 
 
 def read_latency(text: str | None) -> int | None:
-    """Return the time of `--latency-timer` in ns; raises InputError for one that is none."""
+    """Return the time of `--latency-timer` in ns; raises InputError for an invalid one."""
     from dxlrun.description.units import duration
 
     try:
@@ -62,16 +62,16 @@ def read_latency(text: str | None) -> int | None:
 
 
 def with_adapter(bus: BusConfig, given: Mapping[str, object], absent: Absent | None, seed: int) -> BusConfig:
-    """Return a bus behind an adapter with the keys that are `given`; of None the bus has its own."""
+    """Return a bus with the `given` options of its adapter; None keeps the bus' own."""
     keys = {name: value for name, value in given.items() if value is not None}
     absent = absent or bus.adapter.absent
     return replace(bus, adapter=replace(bus.adapter, seed=seed, absent=absent, **keys))
 
 
 def read_faults(lines: Sequence[str], file: Path | None) -> tuple[Fault, ...]:
-    """Return the faults of `--fault` and of a file; raises InputError with all lines that are wrong.
+    """Return the faults of `--fault` and of a file; raises InputError with all wrong lines.
 
-    In a file, empty lines and what follows a # are left out.
+    In a file, empty lines and comments after # are ignored.
     """
     from dxlsim.faults.fault import parse_fault
 
@@ -84,7 +84,8 @@ def read_faults(lines: Sequence[str], file: Path | None) -> tuple[Fault, ...]:
             wrong.append(f"--fault {line!r}: {error}")
     placed, problems = ([], []) if file is None else _faults_of(file)
     if problems and not wrong:
-        raise InputError(problems)  # each with its place, for an editor
+        # Problems with places, for an editor.
+        raise InputError(problems)
     if wrong:
         raise InputError("\n".join([*wrong, *map(str, problems)]))
     return (*faults, *placed)

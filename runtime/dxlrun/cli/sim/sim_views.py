@@ -1,4 +1,4 @@
-"""The outputs of `dxlrun sim`: lines in a pipe, one JSON object a line, or a live table on a terminal."""
+"""Views of `dxlrun sim`: lines in a pipe, one JSON object per line, or a live table on a terminal."""
 
 from __future__ import annotations
 
@@ -28,23 +28,25 @@ if TYPE_CHECKING:
 
 _LOOK_S = 0.25
 _AROUND = 7
-"""Lines of the screen that are not servos: head and rule of the table, lateness, prompt, events."""
+"""Lines of the screen for other parts than servos: head and rule of the table, lateness, prompt, events."""
 
 
 class Shown(msgspec.Struct, frozen=True):
-    """What is simulated, and the names of its ports."""
+    """Simulated buses and the names of their ports."""
 
     title: str
     buses: tuple[BusConfig, ...]
-    links: Mapping[str, Path]  # Link of each bus that has one
-    hint: str | None = None  # A command line that uses the simulation when the port is added
+    # Link by bus, for buses with one.
+    links: Mapping[str, Path]
+    # A command line that uses the simulation when the port is added.
+    hint: str | None = None
 
     def port(self, bus: str, ports: Mapping[str, str]) -> str:
-        """Return the name under which another program opens a bus: it stays when an adapter is pulled."""
+        """Return the name by which another program opens a bus. A link stays when an adapter is pulled."""
         return str(self.links.get(bus, ports[bus]))
 
     def lines(self, ports: Mapping[str, str], real_time: str) -> list[str]:
-        """Return the first lines: what is simulated, where, and how punctual it can be."""
+        """Return the first lines: simulated servos, ports, and grants of real time."""
         count = sum(len(bus.servos) for bus in self.buses)
         servos, buses = counted(count, "servo", "servos"), counted(len(self.buses), "bus", "buses")
         what = f"{servos} simulated on {buses}" if count else f"{buses}, answering as recorded"
@@ -64,7 +66,7 @@ class Shown(msgspec.Struct, frozen=True):
         return lines
 
     def moves(self, ports: Mapping[str, str]) -> list[str]:
-        """Return a line for each adapter that was pulled, or came back under another name."""
+        """Return a line for each adapter that was pulled, or came back with another name."""
         return [
             f"{bus}: the adapter is back as {port}{self._link(bus)}"
             if port
@@ -86,18 +88,19 @@ class PlainView:
         self._console: Console = out()
 
     def opened(self, ports: Mapping[str, str], real_time: str) -> None:
-        """Print where the buses are."""
+        """Print the ports of the buses."""
         for line in self._shown.lines(ports, real_time):
             self._print(line)
 
     def take(self, message: SimulationMessage) -> None:
-        """Print where buses are now, a fault that happened, or how a typed line was understood."""
+        """Print changed ports, a fault that happened, or the interpretation of a typed line."""
         for line in self._shown.moves(message.ports or {}):
             self._print(line)
         if message.happened is not None:
             self._print(f"fault: {message.happened}", "warning")
         if message.fault is not None:
-            self._print(f"understood: {message.fault}")  # it may be planned for later
+            # The fault may be planned for a later time.
+            self._print(f"understood: {message.fault}")
         if message.error is not None:
             self._refuse(message.error)
 
@@ -110,14 +113,14 @@ class PlainView:
             self._print(line)
 
     def look(self, look: SimulationMessage, typed: str) -> None:
-        """Print nothing: a table in lines would scroll the faults away."""
+        """Print nothing, because a table in lines would scroll the faults away."""
 
     def _print(self, line: str, tone: Tone = "plain") -> None:
         show(Sentence(line, tone), console=self._console)
 
 
 class TableView(PlainView):
-    """A table that is drawn again four times a second; events scroll away above it, input is below."""
+    """Table that is redrawn four times a second, with events above and input below."""
 
     look_every_s: float | None = _LOOK_S
 
@@ -131,16 +134,17 @@ class TableView(PlainView):
 
     @contextmanager
     def showing(self) -> Iterator[None]:
-        """Show it; meanwhile the terminal hands letters over one by one, and does not show them itself."""
+        """Show the table. The terminal passes on single characters without echo while the block runs."""
         with _letters(), self._live:
             yield
-            self._draw(None)  # what was being typed is of no use any more
+            # Pending input is obsolete now.
+            self._draw(None)
 
     def _refuse(self, sentence: str) -> None:
         self._print(sentence, "error")
 
     def look(self, look: SimulationMessage, typed: str) -> None:
-        """Draw the servos, and what was typed so far."""
+        """Draw the servos and the pending input."""
         self._newest = look
         self._draw(typed)
 
@@ -155,12 +159,13 @@ class TableView(PlainView):
 
         from dxlrun.output.terminal import STYLES
 
-        # folded, not as `show` does: rich does not draw the table again below a line wider than the window
+        # Wrapped, unlike in `show`: rich does not redraw the table below a line that is wider than the
+        # window.
         self._console.print(Text(line, style=STYLES[tone]))
 
 
 class JsonView:
-    """One JSON answer a line on stdout: the ports, then each fault as it happens."""
+    """One JSON answer per line on stdout: the ports, then each fault as it happens."""
 
     look_every_s: float | None = None
 
@@ -168,12 +173,12 @@ class JsonView:
         self._shown = shown
 
     def opened(self, ports: Mapping[str, str], real_time: str) -> None:
-        """Write where the buses are."""
+        """Write the ports of the buses."""
         named = {bus: self._shown.port(bus, ports) for bus in ports}
         show_json({"ports": named, "devices": dict(ports), "real_time": real_time})
 
     def take(self, message: SimulationMessage) -> None:
-        """Write where buses are now, a fault that happened, or how a typed line was understood."""
+        """Write changed ports, a fault that happened, or the interpretation of a typed line."""
         given = {
             "devices": message.ports,
             "fault": message.happened,
@@ -184,7 +189,7 @@ class JsonView:
         show_json(found, code=len(wrong), errors=wrong)
 
     def help(self) -> None:
-        """Write the faults there are."""
+        """Write the available faults."""
         show_json({"faults": list(fault_lines())})
 
     def look(self, look: SimulationMessage, typed: str) -> None:
@@ -192,14 +197,14 @@ class JsonView:
 
 
 def fault_lines() -> Sequence[str]:
-    """Return what can be typed: a line for each kind of fault."""
+    """Return the input lines for each kind of fault."""
     from dxlsim.faults.fault import fault_help
 
     return fault_help()
 
 
 def ending(title: str, elapsed_s: float, look: SimulationMessage) -> str:
-    """Return the last line: how long it ran, and what passed."""
+    """Return the last line: duration and packet counts."""
     heard = sum(servo.heard for servo in look.servos or ())
     answered = sum(servo.answered for servo in look.servos or ())
     late = ", ".join(f"{name} {value:.0f} us" for name, value in look.lateness_us.items())
@@ -210,7 +215,7 @@ def ending(title: str, elapsed_s: float, look: SimulationMessage) -> str:
 
 
 def _models(bus: BusConfig) -> str:
-    """Return the servos and devices of a bus in short: `XL430-W250 1-3; AX-12A 7; OpenCR 200`."""
+    """Return a short text of a bus' servos and devices: `XL430-W250 1-3; AX-12A 7; OpenCR 200`."""
     ids: dict[str, list[int]] = {}
     named = [(each.model, each.servo_id) for each in bus.servos]
     for model, servo_id in named + [(each.model, each.servo_id) for each in bus.devices]:
@@ -232,9 +237,9 @@ def _ranges(ids: Sequence[int]) -> str:
 
 
 def page(look: SimulationMessage, typed: str | None, width: int, height: int, *, several: bool) -> Group:
-    """Return the lower part of a screen of `height` lines; `several`: with a column for the bus.
+    """Return the lower part of a screen of `height` lines; `several` adds a column for the bus.
 
-    `typed` is None when nothing more can be typed.
+    `typed` is None after the end of the input.
     """
     from rich.console import Group
     from rich.text import Text
@@ -254,7 +259,7 @@ def page(look: SimulationMessage, typed: str | None, width: int, height: int, *,
 
 
 def servo_table(servos: Sequence[ServoLook], *, several: bool) -> Table:
-    """Return one row a servo; one with an error is marked."""
+    """Return a table with one row per servo; servos with errors are marked."""
     columns = [
         *[Column("bus", "name")] * several,
         Column("ID"),
@@ -289,7 +294,7 @@ def servo_table(servos: Sequence[ServoLook], *, several: bool) -> Table:
 
 @contextmanager
 def _letters() -> Iterator[None]:
-    """Let the terminal of stdin hand over each letter, unseen; Ctrl-C and Ctrl-Z do what they always do."""
+    """Make the terminal of stdin pass on each character without echo; Ctrl-C and Ctrl-Z keep their effect."""
     if not sys.stdin.isatty():
         yield
         return
@@ -299,13 +304,13 @@ def _letters() -> Iterator[None]:
     changed[3] &= ~(termios.ICANON | termios.ECHO)
 
     def set_up(mode: list[int | list[bytes | int]]) -> None:
-        # a job in the background that touches its terminal would be stopped; and the terminal may be gone
+        # A background job that changes its terminal would be stopped, and the terminal may be gone.
         with suppress(termios.error, OSError):
             if os.tcgetpgrp(descriptor) == os.getpgrp():
                 termios.tcsetattr(descriptor, termios.TCSADRAIN, mode)
 
     set_up(changed)
-    # after Ctrl-Z and fg the shell may have set it otherwise
+    # After Ctrl-Z and fg, the shell may have changed the mode.
     continued = signal.signal(signal.SIGCONT, lambda *_: set_up(changed))
     try:
         yield

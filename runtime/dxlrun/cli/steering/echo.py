@@ -1,4 +1,4 @@
-"""`dxlrun echo`: messages of a topic of a running robot, as they come."""
+"""`dxlrun echo`: the messages of a running robot's topic."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ if TYPE_CHECKING:
     from dxlrun.remote.requests.replies import TopicState
 
 _NAMES = ("name", "joint_names")
-"""Fields in which messages of ROS 2 name their joints."""
+"""Fields of ROS 2 messages with the names of joints."""
 
 
 def echo(
@@ -35,7 +35,7 @@ def echo(
     Parameters
     ----------
     topic
-        Name of the topic; the first / may be left out.
+        Name of the topic; the leading / is optional.
     count
         End after this number of messages.
     rate
@@ -43,7 +43,8 @@ def echo(
     """
     if count is not None and count < 1:
         raise InputError(f"--count {count} is no number of messages; give 1 or more")
-    if rate is not None and not 0 < rate < math.inf:  # false for nan too
+    # Also refuses NaN.
+    if rate is not None and not 0 < rate < math.inf:
         raise InputError(f"--rate {rate:g} is no rate; give a number of Hz above 0")
     with connect_robot(chosen.robot, "echo") as robot:
         if topic is None:
@@ -59,12 +60,13 @@ def echo(
                 if number == count:
                     break
         except KeyboardInterrupt:
-            return 0  # how one ends it
+            # Ctrl-C is the normal end.
+            return 0
     return 0
 
 
 def topics(states: Sequence[TopicState]) -> Table:
-    """Return a row for each topic."""
+    """Return a table with a row for each topic."""
     columns: Columns[TopicState] = [
         (Column("topic", "name"), "name"),
         (Column("type", "text"), "type"),
@@ -75,7 +77,7 @@ def topics(states: Sequence[TopicState]) -> Table:
 
 
 def print_message(message: TopicMessage, *, as_json: bool) -> None:
-    """Print one message: JSON in one line, or its fields in lines of their own behind `---`."""
+    """Print a message: JSON in one line, or one line per field after a line with `---`."""
     import msgspec
 
     time = message.time_ns * 1e-9
@@ -97,7 +99,7 @@ def print_message(message: TopicMessage, *, as_json: bool) -> None:
 
 
 def fields(message: Mapping[str, object], joints: Sequence[str]) -> list[str]:
-    """Return the lines of a message; arrays with a row a joint have the joints' names in front."""
+    """Return the lines of a message; arrays with one row per joint show the joints' names."""
     for name in _NAMES:
         named = message.get(name)
         if isinstance(named, list) and named and all(isinstance(one, str) for one in named):

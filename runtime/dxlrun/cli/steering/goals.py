@@ -1,4 +1,4 @@
-"""What a running robot is given to do: `dxlrun send`, `cancel`, and goals until their end."""
+"""Goals of a running robot: `dxlrun send`, `cancel`, and waiting for the end of goals."""
 
 from __future__ import annotations
 
@@ -21,12 +21,12 @@ if TYPE_CHECKING:
     from dxlrun.remote.requests.replies import GoalState
 
 REST_S = 10.0
-"""How long a cancelled goal may take until its joints are at rest."""
+"""Timeout for the joints of a cancelled goal to come to rest."""
 MOST_JOINTS = 3
-"""Named in a result or a list."""
+"""Upper limit of joints that a result or a list names."""
 _PROGRESS_S = 0.1
 _BEGIN_S = 0.5
-"""How long a goal may take to begin that was sent and not answered."""
+"""Timeout for the begin of a goal whose request was interrupted."""
 
 
 def send(
@@ -116,7 +116,8 @@ def cancel(goal: str = "", /, *, wait: WaitFlag = False, chosen: Chosen = ONLY_O
         else:
             wanted = [one.number for one in states if (one.controller, one.status) == (goal, "running")]
         if goal and not wanted:
-            robot.cancel(goal)  # refused, with the reason
+            # The robot refuses this with the reason.
+            robot.cancel(goal)
         cancelled = []
         for number in wanted:
             try:
@@ -124,7 +125,8 @@ def cancel(goal: str = "", /, *, wait: WaitFlag = False, chosen: Chosen = ONLY_O
             except Refused as refused:
                 if goal or refused.code not in (Code.GOAL_ENDED, Code.CANCELLED_ALREADY):
                     raise
-                continue  # of all goals, one that has ended meanwhile is as it is to be
+                # Without a name, a goal that has ended in the meantime needs no cancel.
+                continue
             cancelled.append(number)
         if wait:
             for number in cancelled:
@@ -141,7 +143,7 @@ def cancel(goal: str = "", /, *, wait: WaitFlag = False, chosen: Chosen = ONLY_O
 
 @contextmanager
 def begun_or_cancelled(robot: RemoteRobot, verb: str, *, waited: bool) -> Iterator[None]:
-    """Where goals are waited for: on Ctrl-C before their numbers are known, cancel those that begin."""
+    """Cancel the goals of the block on Ctrl-C, if they are waited for and their numbers are not known yet."""
     last = max((state.number for state in robot.goals()), default=0) if waited else 0
     try:
         yield
@@ -166,9 +168,8 @@ def follow(
 ) -> int:
     """Show the progress of goals until all have ended, print their results, and return the exit code.
 
-    `motion` is what they play.
-
-    Ctrl-C cancels them, waits until their joints are at rest, and is raised again.
+    `motion` is the played motion. Ctrl-C cancels the goals, waits until their joints are at rest, and is
+    raised again.
     """
     try:
         states = _ended(robot, numbers, motion, hidden=chosen.as_json)
@@ -206,7 +207,7 @@ def _joints(robot: RemoteRobot) -> dict[str, Sequence[str]]:
 
 
 def _ended(robot: RemoteRobot, numbers: Sequence[int], motion: str, *, hidden: bool) -> list[GoalState]:
-    """Wait until all goals have ended, with a bar on a terminal."""
+    """Wait until all goals have ended, with a progress bar on a terminal."""
     states = {number: robot.goal_state(number) for number in numbers}
     with progress_bar(hidden=hidden) as draw:
         while running := [state for state in states.values() if state.status == "running"]:
@@ -220,11 +221,12 @@ def _ended(robot: RemoteRobot, numbers: Sequence[int], motion: str, *, hidden: b
 
 
 def cancel_goals(robot: RemoteRobot, numbers: Sequence[int]) -> list[GoalState]:
-    """Cancel goals, and return them once their joints are at rest. A goal that ended before is unchanged."""
+    """Cancel goals, and return their states when their joints are at rest. Ended goals are unchanged."""
     for number in numbers:
         try:
             robot.cancel(number)
-        except Refused:  # it has ended meanwhile, or is being cancelled
+        # The goal has ended in the meantime, or is already being cancelled.
+        except Refused:
             continue
         except DxlrunError as error:
             print_error(f"dxlrun: {error}")

@@ -1,4 +1,4 @@
-"""Joints of a running robot at the terminal: `dxlrun torque`, `reboot`, `get`, `set`."""
+"""Joints of a running robot: `dxlrun torque`, `reboot`, `get`, `set`."""
 
 from __future__ import annotations
 
@@ -35,7 +35,7 @@ _WRITTEN: Mapping[str, tuple[float, int, str]] = MappingProxyType(
         "": (100.0, 0, "%"),
     }
 )
-"""Unit -> factor from SI, digits, and how it is written; others as they are."""
+"""Unit -> factor from SI, digits, and shown unit; other units are shown unchanged."""
 
 
 def torque(
@@ -66,8 +66,8 @@ def torque(
 def reboot(*joints: Joints, release: Flag = False, chosen: Chosen = ONLY_ONE) -> int:
     """Reboot servos of a running robot, which clears a hardware error: `dxlrun reboot elbow_joint`.
 
-    Only servos of Protocol 2.0 know that. Returns when they are in order again; they have torque if they had
-    it before.
+    Only servos of Protocol 2.0 support this. Returns when they are operational again; they have torque if
+    they had it before.
 
     Parameters
     ----------
@@ -115,14 +115,14 @@ def get(joint: str, item: str = "", /, *, chosen: Chosen = ONLY_ONE) -> int:
 
 
 def _meant(info: Mapping[str, Any], name: str) -> Sequence[str]:
-    """Return the joints of a group or controller, or of `all`; none for another name."""
+    """Return the joints of a group, of a controller, or of `all`; empty for another name."""
     controllers = {one["name"]: one["joints"] for one in info["controllers"]}
     known = {**controllers, **info["groups"], "all": info["joints"]}
     return () if name in info["joints"] else known.get(name, ())
 
 
 def _show_pose(robot: RemoteRobot, names: Sequence[str], chosen: Chosen) -> int:
-    """Print the positions of joints; one that was never read is not in the pose."""
+    """Print the positions of joints; joints that were never read are omitted."""
     states = robot.states()
     ways = {name: JointUnit(unit).shown for name, unit in zip(states.joints, states.units, strict=True)}
     found = {name: states.joint(name)["position"] for name in names}
@@ -162,7 +162,7 @@ def set_register(joint: str, item: str, value: str, /, *, chosen: Chosen = ONLY_
 
 
 def source_facts(found: Mapping[str, Any]) -> list[tuple[str, str]]:
-    """Return the states of a device or a sensor, how old they are, and what is commanded of it."""
+    """Return the states of a device or a sensor, their age, and its commands."""
     states, commands = (
         [(name, quantity_text(value, units.get(name, ""))) for name, value in values.items()]
         for values, units in (
@@ -176,7 +176,7 @@ def source_facts(found: Mapping[str, Any]) -> list[tuple[str, str]]:
 
 
 def facts(state: Mapping[str, object]) -> list[tuple[str, str]]:
-    """Return the state of a joint in words, with its units."""
+    """Return the state of a joint as texts with units."""
     unit = state["effort_unit"]
     way = JointUnit(str(state["unit"])).shown
     found = [
@@ -198,7 +198,7 @@ def facts(state: Mapping[str, object]) -> list[tuple[str, str]]:
 
 
 def written(value: object, unit: object) -> str:
-    """Return a number in SI with a unit that people read; empty: it is not known. Without one it is in %."""
+    """Format a number in SI in the unit for people; empty when unknown. The empty unit becomes %."""
     if not isinstance(value, int | float):
         return ""
     factor, digits, shown = _WRITTEN.get(str(unit), (1.0, 3, str(unit)))
@@ -206,7 +206,7 @@ def written(value: object, unit: object) -> str:
 
 
 def _others(done: Executed) -> str:
-    """Return what torque or a reboot did to controllers, and the command that undoes it, for a sentence."""
+    """Return clauses on the deactivated controllers, and on the command that activates them again."""
     found = f"; deactivated {', '.join(done.deactivated)}" if done.deactivated else ""
     back = (
         f"; `dxlrun switch --activate {' '.join(done.offered)}` lets {', '.join(done.offered)} command again"

@@ -1,4 +1,4 @@
-"""`dxlrun parameters`: the parameters of a controller in a run, shown and changed."""
+"""`dxlrun parameters`: shows and changes the parameters of a controller in a run."""
 
 from __future__ import annotations
 
@@ -72,7 +72,7 @@ def _table(rows: Sequence[Parameter]) -> Table:
 
 
 def written(value: object) -> str:
-    """Return a value as a person writes it: numbers with six digits, quantities with their units."""
+    """Format a value for people: numbers with six digits, quantities with their units."""
     if isinstance(value, bool):
         return "true" if value else "false"
     if isinstance(value, list):

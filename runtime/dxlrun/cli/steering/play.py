@@ -1,4 +1,4 @@
-"""`dxlrun play`: motions of a running robot, one after the other, and a list of them."""
+"""`dxlrun play`: plays motions on a running robot one after the other, or lists them."""
 
 from __future__ import annotations
 
@@ -19,31 +19,31 @@ if TYPE_CHECKING:
     from dxlrun.remote.client import RemoteRobot
 
 PLAY = "play"
-"""The command of a controller that has motions of its own."""
+"""Name of the command of a controller that has motions."""
 MOST_LOOPS = 10_000
 _FOLDER = "motions"
-"""Beside the robot file."""
+"""Name of the folder of motions next to the robot file."""
 
 
 class Found(NamedTuple):
-    """Where a motion is that was asked for."""
+    """Source of a requested motion."""
 
     motion: str
     path: Path
     player: str = ""
-    """The controller that has it; empty: it is in the file."""
+    """Controller that has the motion; empty: the motion is in the file."""
 
 
 class Playable(NamedTuple):
-    """A motion that a robot has by name."""
+    """A motion that can be played by its name."""
 
     motion: str
     controllers: Sequence[str]
     joints: Sequence[str]
     seconds: float | None
-    """At speed 1, from its first pose on; None: its file cannot be read."""
+    """Duration at speed 1 from the first pose on, s; None when its file cannot be read."""
     file: str = ""
-    """Empty: the controller has it."""
+    """Motion file; empty: the controller has the motion."""
 
 
 def play(
@@ -62,8 +62,8 @@ def play(
     Parameters
     ----------
     motions
-        A motion file, or the name of one beside the robot file or in motions beside it, or of a motion that a
-        keyframe_player has; its controllers must be active.
+        A motion file; or the name of a file next to the robot file or in its folder motions; or the name of a
+        motion of a keyframe_player. Its controllers must be active.
     speed
         Factor of the speed: 0.5 takes twice as long.
     loop
@@ -122,11 +122,11 @@ def _play(robot: RemoteRobot, found: Found, speed: float, chosen: Chosen, *, wai
     return follow(robot, chosen, done, numbers, motion)
 
 
-# Which there are
+# Lookup of motions
 
 
 def _found(robot: RemoteRobot, name: str) -> Found:
-    """Return the motion file, or the controller, that has a motion of this name; raises InputError."""
+    """Return the file or the controller of the motion with this name; raises InputError."""
     if (path := Path(name)).is_file():
         return Found(name, path)
     info = robot.info()
@@ -147,20 +147,20 @@ def _found(robot: RemoteRobot, name: str) -> Found:
 
 
 def _players(info: Mapping[str, object]) -> dict[str, Mapping[str, float]]:
-    """Return the motions that each controller has of its own, with their lengths."""
+    """Return the motions of each controller with their durations, s."""
     rows = cast("Sequence[Mapping[str, object]]", info["controllers"])
     return {str(row["name"]): cast("Mapping[str, float]", row["motions"]) for row in rows}
 
 
 def _files(info: Mapping[str, object]) -> list[Path]:
-    """Return the files beside the robot file, and those of its folder of motions."""
+    """Return the YAML files next to the robot file and in its folder of motions."""
     robot = Path(str(info["file"]))
     folders = robot.parent, robot.parent / _FOLDER
     return [file for folder in folders for file in sorted(folder.glob("*.yaml")) if file != robot]
 
 
 def _has_motions(file: Path) -> bool:
-    """Return whether a file has motions, as far as its lines tell; playing it tells what is wrong with it."""
+    """Return whether a file looks like a motion file; playing it reports its mistakes."""
     from dxlrun.description.document import read_text
 
     try:
@@ -170,7 +170,7 @@ def _has_motions(file: Path) -> bool:
 
 
 def _check_forms(robot: RemoteRobot, files: Sequence[Path]) -> None:
-    """Read all files before the first is played; raises InputError with the mistakes of one."""
+    """Read all files before the first is played; raises InputError with the mistakes of a file."""
     from dxlrun.description.motion import read_motion
 
     groups = cast("Groups", robot.info()["groups"])
@@ -201,7 +201,7 @@ def _few(joints: Sequence[str]) -> str:
 
 
 def _playable(info: Mapping[str, object]) -> Iterator[Playable]:
-    """Yield the motions that the robot has by name; files that are for other robots are left out."""
+    """Yield the motions that can be played by name; files for other robots are omitted."""
     from dxlrun.description.motion import read_motion
 
     rows = cast("Sequence[Mapping[str, object]]", info["controllers"])

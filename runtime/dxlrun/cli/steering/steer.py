@@ -1,6 +1,7 @@
-"""Commands to a robot while it runs: `dxlrun list`, `send`, `switch`, `set`, `rate`, `pause`, `stop` ...
+"""Commands to a running robot: `dxlrun list`, `switch`, `rate`, `pause`, `stop` ...
 
-Each is one request to the gateway of the run: executed after the read of a cycle, or refused with the reason.
+Each command is one request to the gateway of the run: executed after the read phase of a cycle, or refused
+with the reason.
 """
 
 from __future__ import annotations
@@ -25,10 +26,10 @@ if TYPE_CHECKING:
     from dxlrun.run.unsteered import UnsteeredRun
 
 Names = Annotated[tuple[str, ...], Parameter(negative=(), show_default=False, consume_multiple=True)]
-"""Names of controllers, one or several behind the option."""
+"""Names of one or several controllers after the option."""
 Words = Annotated[str, Parameter(name="key=value")]
 Row = Mapping[str, Any]
-"""What the gateway returns of one thing, as JSON has it."""
+"""Row of a JSON reply of the gateway."""
 
 
 @Parameter(name="*")
@@ -48,7 +49,7 @@ class Chosen:
 
 
 ONLY_ONE = Chosen()
-"""The one robot that runs."""
+"""The only running robot."""
 
 
 def list_robots(
@@ -85,7 +86,8 @@ def list_robots(
         try:
             with connect(name, "dxlrun list") as one:
                 found.append({**one.info(), "name": name})
-        except DxlrunError as error:  # it may have ended meanwhile; the others are listed
+        # The robot may have ended in the meantime; the others are still listed.
+        except DxlrunError as error:
             failures.append(str(error))
             code |= robot is not None or name in here
     for info in found:
@@ -103,8 +105,9 @@ def list_robots(
 
 
 def _check_graph(files: Sequence[Path], names: Sequence[str]) -> None:
-    """Raise InputError for files that hold no graph, or more robots than one file holds."""
-    from dxlrun.output.graph_picture import check_picture  # not above: most lists draw nothing
+    """Raise InputError for files without a suffix of a graph, and for several robots."""
+    # Imported here because most lists draw nothing.
+    from dxlrun.output.graph_picture import check_picture
 
     for file in files:
         check_picture(file)
@@ -112,7 +115,8 @@ def _check_graph(files: Sequence[Path], names: Sequence[str]) -> None:
 
 
 def _write_graphs(info: Row, files: Sequence[Path]) -> None:
-    from dxlrun.output.graph_picture import write_picture  # as above
+    # Imported here because most lists draw nothing.
+    from dxlrun.output.graph_picture import write_picture
 
     for file in files:
         write_picture(drawing(info), file)
@@ -158,7 +162,8 @@ def rate(hz: Hertz, /, *, chosen: Chosen = ONLY_ONE) -> int:
     hz
         Cycles per second, Hz.
     """
-    if not 0 < hz < float("inf"):  # false for nan too
+    # Also refuses NaN.
+    if not 0 < hz < float("inf"):
         raise InputError(f"{hz:g} is no rate; give a number of Hz above 0")
     with connect_robot(chosen.robot, "rate") as robot:
         done = robot.rate(hz)
@@ -166,7 +171,7 @@ def rate(hz: Hertz, /, *, chosen: Chosen = ONLY_ONE) -> int:
 
 
 def halt(*, chosen: Chosen = ONLY_ONE) -> int:
-    """Let every joint come to a stop within its limits, and hold: the run goes on."""
+    """Let every joint come to a stop within its limits, and hold: the run continues."""
     with connect_robot(chosen.robot, "halt") as robot:
         done = robot.halt()
         text = f"{robot.name} stands still"
@@ -234,7 +239,7 @@ def unload(name: str, /, *, chosen: Chosen = ONLY_ONE) -> int:
 
 
 def stop(*, wait: WaitFlag = True, chosen: Chosen = ONLY_ONE) -> int:
-    """End a running robot in order, by its policy on_exit.
+    """Stop a running robot by its policy on_exit.
 
     Parameters
     ----------
@@ -307,7 +312,7 @@ def _require_one(names: Sequence[str]) -> None:
 
 
 def _require_known(robot: str | None, names: Collection[str]) -> None:
-    """Raise InputError for a name that is no robot's; an address, NAME@HOST:PORT, is known to be one."""
+    """Raise InputError for an unknown robot; an address, NAME@HOST:PORT, always counts as known."""
     if robot is not None and robot not in names and "@" not in robot:
         raise InputError(f"no robot {robot} runs; {suggestion(robot, names)}")
 
@@ -332,7 +337,7 @@ def report_done(robot: RemoteRobot, chosen: Chosen, done: Executed | None, sente
 
 
 def headline(info: Row) -> str:
-    """Return the state of a robot in one line."""
+    """Return the state of a robot as one line."""
     paused = ", paused" if info["paused"] else ""
     periods = f"{info['skipped']} {'period' if info['skipped'] == 1 else 'periods'} skipped"
     log = f"log {info['log']}" if info["log"] else "no log"
@@ -340,20 +345,20 @@ def headline(info: Row) -> str:
 
 
 def controllers(info: Row) -> Table:
-    """Return a row for each controller, with the commands that it takes and its joints in their order."""
+    """Return a table of controllers with the commands that they accept and their joints."""
     columns: Columns[Row] = [
         (Column("controller", "name"), "name"),
         (Column("state", "name"), state),
         (Column("rate", form="{:g} Hz"), "rate"),
         (Column("takes", "text"), lambda one: "; ".join(starmap(command, one["takes"].items()))),
-        # a broadcaster has no joints of its own
+        # A broadcaster moves no joints.
         (Column("moves", "text"), lambda one: ", ".join(one["joints"]) if one["command"] else ""),
     ]
     return Table.listing("", columns, info["controllers"])
 
 
 def sources(info: Row) -> Table:
-    """Return a row for each device and sensor, with its states and the commands that it takes."""
+    """Return a table of devices and sensors with their states and the commands that they accept."""
     columns: Columns[Row] = [
         (Column("source", "name"), "name"),
         (Column("kind", "name"), "kind"),
@@ -364,7 +369,7 @@ def sources(info: Row) -> Table:
 
 
 def groups(info: Row) -> Table:
-    """Return a row for each group, whose name stands for its joints."""
+    """Return a table of groups with their joints."""
     rows = [(name, ", ".join(joints)) for name, joints in info.get("groups", {}).items()]
     return Table.of("", [Column("group", "name"), Column("joints", "text")], rows)
 
@@ -379,10 +384,11 @@ def _source_commands(source: Row) -> str:
 
 
 def drawing(info: Row) -> Graph:
-    """Return the controller graph of a running robot as it is drawn."""
+    """Return the controller graph of a running robot for drawing."""
     from msgspec import convert
 
-    from dxlrun.compile.graph import ControllerGraph  # not above: most commands draw none
+    # Imported here because most commands draw nothing.
+    from dxlrun.compile.graph import ControllerGraph
     from dxlrun.plan.loop_plan import ControllerPlan
 
     unknown = {"distribution": "", "parameters": "{}", "publishes": (), "rate": None}
@@ -394,14 +400,14 @@ def drawing(info: Row) -> Graph:
 
 
 def state(controller: Row) -> str:
-    """Return what a controller does, in one word."""
+    """Return the state of a controller in one word."""
     if not controller["active"]:
         return "inactive"
     return "held" if controller["held"] else "active"
 
 
 def command(kind: str, schema: Row) -> str:
-    """Return the keys of a command by its JSON Schema; those that may be left out are in brackets."""
+    """Return the keys of a command from its JSON Schema, with optional keys in brackets."""
     names, needed = schema.get("properties", {}), schema.get("required", ())
     keys = (name if name in needed else f"[{name}]" for name in names)
     return f"{kind}: {', '.join(keys)}" if names else kind

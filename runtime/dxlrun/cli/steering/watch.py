@@ -1,4 +1,4 @@
-"""`dxlrun watch`: a live view of a running robot in the terminal, or one snapshot of it into a pipe."""
+"""`dxlrun watch`: a live view of a running robot in the terminal, or a snapshot in a pipe."""
 
 from __future__ import annotations
 
@@ -28,34 +28,35 @@ if TYPE_CHECKING:
 
 REFRESH_S = 0.2
 _RATE_S = 1.0
-"""The rate is measured over this time."""
+"""Time over which the rate is measured."""
 _LONGEST_EVENTS = 200
 _TONES: Mapping[str, Tone] = {"on": "good", "doubt": "warning", "lost": "error", "limp": "warning"}
 
 
 @dataclass(slots=True)
 class Watched:
-    """What is known of a running robot: newest states, controllers and events."""
+    """Newest states, controllers and events of a running robot."""
 
     robot: RemoteRobot
     states: RobotStates = field(init=False)
     info: Row = field(default_factory=dict)
     events: list[Row] = field(default_factory=list)
     rate: float | None = None
-    """Cycles per second, measured."""
+    """Measured rate, Hz."""
     latest: float = 0.0
-    """The latest wake-up that was seen, s."""
+    """Largest delay of a wake-up so far, s."""
     _last: int = 0
     _cycle: tuple[int, float] = (0, 0.0)
 
     def look(self) -> None:
-        """Ask the robot; raises DxlrunError when it is gone."""
+        """Request the newest data; raises DxlrunError when the robot is gone."""
         self.info = cast("Row", self.robot.info())
         self.states = self.robot.states()
         found = cast("Row", self.robot.events(self._last))
         self._last = found["last"]
         self.events += found["events"]
-        self.events.sort(key=lambda event: event["time"])  # those of the guardian come later
+        # Events of the guardian arrive later.
+        self.events.sort(key=lambda event: event["time"])
         del self.events[:-_LONGEST_EVENTS]
         cycle, now = self.states.cycle, self.states.time_ns * 1e-9
         self.latest = max(self.latest, self.states.late_ns * 1e-9)
@@ -66,7 +67,7 @@ class Watched:
             self._cycle = cycle, now
 
     def json(self) -> Row:
-        """Return what one line of JSON has."""
+        """Return the data of one line of JSON."""
         from dxlrun.remote.live.states import encoded
 
         kept = ("name", "active", "held", "rate", "joints")
@@ -117,7 +118,7 @@ def watch(*, once: Flag = False, chosen: Chosen = ONLY_ONE) -> int:
 
 
 def _first_look(watched: Watched) -> None:
-    """Look once; a run that begins has no cycle yet."""
+    """Request data until the run has its first cycle."""
     from dxlrun.channels.answers import Code
 
     for _ in range(50):
@@ -148,17 +149,18 @@ def _show_live(watched: Watched) -> None:
     with keys_pressed() as pressed, Live(console=console, screen=True, auto_refresh=False) as live:
         while True:
             width, height = console.size
-            live.update(view(watched, width - 1, height), refresh=True)  # a full line may wrap
+            # A line of full width may wrap.
+            live.update(view(watched, width - 1, height), refresh=True)
             if pressed(REFRESH_S):
                 return
             watched.look()
 
 
-# What is shown
+# Tables and lines
 
 
 def headline(watched: Watched) -> Sentence:
-    """Return the state of the run in one line."""
+    """Return the state of the run as one line."""
     info, late = watched.info, watched.states.late_ns * 1e-9
     rate = "" if watched.rate is None else f" ({watched.rate:.1f})"
     paused = ", paused" if info["paused"] else ""
@@ -171,7 +173,7 @@ def headline(watched: Watched) -> Sentence:
 
 
 def joints(watched: Watched) -> Table:
-    """Return a row for each joint: goal, position, velocity, effort, temperature, voltage, what is wrong."""
+    """Return a table of joints: goal, position, velocity, effort, temperature, voltage, torque or error."""
     numbers = (Column(name) for name in ("goal", "deg", "deg/s", "effort", "deg C", "V"))
     columns = [Column("joint", "name"), *numbers, Column("torque", "name")]
     states = watched.states
@@ -210,7 +212,7 @@ def _number(value: object, factor: float, digits: int, unit: str = "") -> str:
 
 
 def sources(watched: Watched) -> Table:
-    """Return a row for each device, sensor, and controller that provides states: these, and their age."""
+    """Return a table of devices, sensors and controllers that provide states, with states and age."""
     columns = [Column("source", "name"), Column("age"), Column("states", "text")]
     rows = []
     for name in watched.states.sources:
@@ -229,11 +231,12 @@ def _age(row: Row) -> Cell:
     if not isinstance(age, int | float):
         return Cell("none came", "warning")
     text = f"{age * 1e3:.0f} ms"
-    return Cell(text) if row["valid"] else Cell(f"{text}, not valid", "warning")  # as `dxlrun get` has it
+    # The same text as in `dxlrun get`.
+    return Cell(text) if row["valid"] else Cell(f"{text}, not valid", "warning")
 
 
 def controllers(watched: Watched) -> Table:
-    """Return a row for each controller: what it does, its rate, and how long its update took."""
+    """Return a table of controllers: state, rate, and duration of the last update."""
     updates = dict(zip(watched.states.controllers, watched.states.controller_ns.tolist(), strict=True))
     columns: Columns[Row] = [
         (Column("controller", "name"), "name"),
@@ -246,7 +249,7 @@ def controllers(watched: Watched) -> Table:
 
 
 def event_lines(watched: Watched, most: int) -> list[Sentence]:
-    """Return the newest events, the newest one last."""
+    """Return the newest events, with the newest one last."""
     lines = []
     for event in watched.events[-most:] if most > 0 else []:
         severity = event["severity"]
@@ -258,7 +261,7 @@ def event_lines(watched: Watched, most: int) -> list[Sentence]:
 
 
 def snapshot(watched: Watched) -> tuple[Table | Sentence, ...]:
-    """Return everything once, for a pipe."""
+    """Return all tables and events once, for a pipe."""
     others = sources(watched)
     between = (others,) if others.rows else ()
     return (
@@ -271,7 +274,7 @@ def snapshot(watched: Watched) -> tuple[Table | Sentence, ...]:
 
 
 def view(watched: Watched, width: int, height: int) -> Group:
-    """Return the view for a terminal: the joints first, then as much of the rest as there is room for."""
+    """Return the view for a terminal: the joints first, then as much of the rest as fits."""
     from rich.console import Group
 
     head, rows, other = headline(watched), joints(watched), controllers(watched)

@@ -1,7 +1,7 @@
-"""A command as a person writes it, `key=value` words or a YAML file, read into what the gateway takes.
+"""Written: reads a command in `key=value` words or a YAML file, and converts it for the gateway.
 
-Values are YAML, and quantities are texts with their units: the gateway, which knows what the command is made
-of, makes numbers of them, because `positions=[60]` may be meant in deg or in rad.
+Values are YAML, and quantities are texts with units. The gateway, which knows the command's fields, converts
+them to numbers, because `positions=[60]` may be meant in deg or in rad.
 """
 
 from __future__ import annotations
@@ -19,14 +19,14 @@ _WORDS = "command line"
 
 @dataclass(frozen=True, slots=True)
 class Written:
-    """A command or a controller's entry, as it was written; raises InputError with all that is wrong."""
+    """A command or a controller's entry as written; raises InputError with all mistakes."""
 
     grown: Grown
     in_words: bool
 
     @classmethod
     def read(cls, words: Sequence[str], file: Path | None) -> Written:
-        """Read `key=value` words, or a file; raises InputError for both, and for what is no YAML."""
+        """Read `key=value` words, or a file; raises InputError if both are given, and for invalid YAML."""
         if file is not None and words:
             raise InputError(f"{words[0]!r} and --file exclude each other; give the words, or the file")
         if file is not None:
@@ -43,11 +43,11 @@ class Written:
 
     @property
     def data(self) -> dict[str, object]:
-        """As it was written."""
+        """Data as written."""
         return self.grown.data
 
     def located(self, refused: Refused) -> DxlrunError:
-        """Return a refusal with one line for each wrong quantity, and with their places in the file."""
+        """Return a refusal with one line for each wrong quantity, and with places in the file."""
         from dxlrun.channels.answers import Code
 
         paths, problems = refused.fields.get("paths"), refused.fields.get("problems")
@@ -75,7 +75,7 @@ def _line(word: str) -> str:
 
 
 def _input_error(problems: Sequence[Problem], in_words: bool) -> InputError:
-    """Return the error: with places for a file, without for words, which have no lines and columns."""
+    """Return the error, with places only for a file: words have no lines and columns."""
     if not in_words:
         return InputError(problems)
     return InputError("\n".join(f"{problem.what}; {problem.fix}" for problem in problems))

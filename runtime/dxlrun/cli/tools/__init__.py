@@ -1,4 +1,4 @@
 """Commands for servos and devices on a port that no run uses: `scan`, `servo`, `models`.
 
-What they do on the bus is in `dynamixel/tools`.
+Their operations on the bus are in `dynamixel/tools`.
 """

@@ -1,4 +1,4 @@
-"""`dxlrun models`: the servo models and other devices that dxlrun knows, and their control tables."""
+"""`dxlrun models`: the known models of servos and devices, and their control tables."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ if TYPE_CHECKING:
     from dxlwire.control_table.device_table import DeviceTable
 
 _DEVICES_ALONE = ("offset", "state", "safe", "bit")
-"""Fields of items that say nothing about servos."""
+"""Fields of items that apply to devices only."""
 _PER_SI = {
     "rad": ("deg", 180 / math.pi),
     "rad/s": ("rpm", 30 / math.pi),
@@ -30,7 +30,7 @@ _PER_SI = {
     "A": ("mA", 1e3),
     "1": ("%", 100.0),
 }
-"""SI unit -> the unit that people read, and its factor; the others stay as they are."""
+"""SI unit -> unit for people, and its factor; other units are unchanged."""
 
 
 def models(
@@ -52,7 +52,8 @@ def models(
     """
     from dxlrun.control.controllers.plugins import load_plugins
 
-    load_plugins()  # they may bring servo models along
+    # Plug-ins may add servo models.
+    load_plugins()
     tables, devices = _tables(name, protocol)
     if as_json:
         found = [_as_json(table, items=name is not None) for table in tables]
@@ -70,7 +71,7 @@ def models(
 
 
 def _tables(name: str | None, protocol: float | None) -> tuple[list[ControlTable], list[DeviceTable]]:
-    """Return the tables that were requested, of servos and devices; raises InputError when there is none."""
+    """Return the requested tables of servos and devices; raises InputError without one."""
     from dxlwire.control_table import all_tables, find_table, perhaps_meant, protocols_of
     from dxlwire.control_table.devices import device_table, device_tables, perhaps_meant_device
 
@@ -132,7 +133,7 @@ def _known(table: ControlTable | DeviceTable, names: str) -> dict[str, object]:
 def _ends(
     table: ControlTable | DeviceTable, without: Collection[str] = (), *, items: bool
 ) -> dict[str, object]:
-    """Return what the JSON of a table ends with; `without`: fields of items that it omits."""
+    """Return the last keys of a table's JSON; `without`: omitted fields of items."""
     known = {"capabilities": sorted(table.capabilities), "baud_rates": dict(table.baud_rates)}
     if not items:
         return {**known}
@@ -144,7 +145,7 @@ def _ends(
 
 
 def _overview(tables: Sequence[ControlTable]) -> Table:
-    """Return one row a model."""
+    """Return a table with one row per model."""
     columns: Columns[ControlTable] = [
         (Column("model", "name"), "model"),
         (Column("also named", "text", detail=True), _also),
@@ -164,7 +165,7 @@ def _also(table: ControlTable | DeviceTable) -> str:
 
 
 def _devices(tables: Sequence[DeviceTable]) -> Table:
-    """Return one row a device."""
+    """Return a table with one row per device."""
     columns: Columns[DeviceTable] = [
         (Column("model", "name"), "model"),
         (Column("also named", "text", detail=True), _also),
@@ -181,7 +182,7 @@ def _commands(table: DeviceTable) -> list[str]:
 
 
 def _device_facts(table: DeviceTable) -> Table:
-    """Return what holds for the whole model of a device."""
+    """Return the properties of a device model."""
     from dxlwire.control_table.device_table import CAPABILITIES
 
     known = ("ping, read and write", *(CAPABILITIES[name] for name in sorted(table.capabilities)))
@@ -195,7 +196,7 @@ def _device_facts(table: DeviceTable) -> Table:
 
 
 def _device_items(table: DeviceTable) -> Table:
-    """Return one row an item of a device."""
+    """Return a table with one row per item of a device."""
     columns: Columns[ControlItem] = [
         (Column("item", "name"), "name"),
         (Column("address"), "address"),
@@ -214,7 +215,7 @@ def _device_items(table: DeviceTable) -> Table:
 
 
 def _measure(item: ControlItem) -> tuple[str, str]:
-    """Return what a tick of a device's item is, and what tick 0 is; gyroscopes are in deg/s, not rpm."""
+    """Return the value of one tick of a device's item and of tick 0. Gyroscopes use deg/s, not rpm."""
     unit, factor = (
         ("deg/s", 180 / math.pi) if item.unit == "rad/s" else _PER_SI.get(item.unit, (item.unit, 1.0))
     )
@@ -238,7 +239,7 @@ def _title(table: ControlTable | DeviceTable) -> str:
 
 
 def _facts(table: ControlTable) -> Table:
-    """Return what holds for the whole model."""
+    """Return the properties of a servo model."""
     from dxlsim.motion.motor import motor_of
     from dxlwire.control_table import CAPABILITIES
 
@@ -254,7 +255,7 @@ def _facts(table: ControlTable) -> Table:
 
 
 def _items(table: ControlTable) -> Table:
-    """Return one row an item; items that repeat themselves share one."""
+    """Return a table with one row per item; numbered items share a row."""
     columns: Columns[Sequence[ControlItem]] = [
         (Column("item", "name"), _name),
         (Column("address"), lambda run: "..".join(dict.fromkeys(str(run[end].address) for end in (0, -1)))),
@@ -285,7 +286,7 @@ def _section(run: Sequence[ControlItem]) -> str:
 
 
 def runs(items: Sequence[ControlItem]) -> Iterator[list[ControlItem]]:
-    """Yield the items in groups: `name_1`, `name_2`, ... side by side are one group."""
+    """Yield groups of items: adjacent items `name_1`, `name_2`, ... form a group."""
     group: list[ControlItem] = []
     for item in items:
         if group and not _continues(group[-1], item):
@@ -307,7 +308,7 @@ def _continues(before: ControlItem, item: ControlItem) -> bool:
 
 
 def unit_of(item: ControlItem) -> str:
-    """Return what a tick is, in the units that people read."""
+    """Return the value of one tick in the unit for people."""
     if not item.unit:
         return ""
     unit, factor = _PER_SI.get(item.unit, (item.unit, 1.0))
@@ -328,7 +329,7 @@ def _torque(table: ControlTable) -> str:
 
 
 def _motor(table: ControlTable) -> str:
-    """Return what the motor does at its nominal voltage, as far as the manual gives it."""
+    """Return the motor's data at nominal voltage, as far as the manual has them."""
     known = [f"no-load speed {_speed(table)}"]
     if table.nominal_voltage:
         known[0] += f" at {table.nominal_voltage:.3g} V"
@@ -341,7 +342,7 @@ def _motor(table: ControlTable) -> str:
 
 
 def _simulated(motor: Motor) -> Iterator[tuple[str, str]]:
-    """Yield how the simulated servo's motor moves, and the source of these figures."""
+    """Yield the data of the simulated servo's motor and their source."""
     known = [
         f"no-load speed {motor.no_load_speed * 30 / math.pi:.4g} rpm",
         f"time constant {motor.time_constant * 1e3:.1f} ms",

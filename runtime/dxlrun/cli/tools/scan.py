@@ -1,4 +1,4 @@
-"""`dxlrun scan PORT`: the servos and devices that answer on a serial port, and a draft of a robot file."""
+"""`dxlrun scan PORT`: finds the servos and devices on a serial port, and drafts a robot file."""
 
 from __future__ import annotations
 
@@ -27,14 +27,15 @@ Rates = Annotated[tuple[int, ...], Parameter(negative=(), show_default=False)]
 HIGHEST_ID = 253
 _FASTEST = 10_500_000
 _SLOW = 30
-"""deg/s, the velocity limit of each drafted joint: slow enough to step back from."""
+"""deg/s; velocity limit of each drafted joint, slow enough to step back from."""
 _LONGEST_STEP = 3
-"""deg; at low rates a goal moves no further in one cycle, as a servo takes each step at its full speed."""
+"""deg; longest step of a goal per cycle. At low rates it lowers the limit, as a servo takes each step at
+full speed."""
 _RATES = (100, 50, 25, 20, 10, 5, 2, 1)
 _SHARE = 0.5
-"""Of the period, at most, that a cycle takes on the bus."""
+"""Largest share of the period that a cycle may take on the bus."""
 _LONGEST_DELAY_NS = 500_000
-"""Where no servo reported its own: as they are shipped (protocol.md, Line)."""
+"""Default return delay when no servo reported its own: the factory's (protocol.md, Line)."""
 
 
 def scan(
@@ -93,7 +94,7 @@ def scan(
 
 
 def read_search(protocol: float | None, baud: Sequence[int], ids: str | None) -> Search:
-    """Return where to look; raises InputError with everything that is wrong."""
+    """Return the search range; raises InputError with all mistakes."""
     from dxlrun.dynamixel.tools.scanning import Search
 
     wrong = []
@@ -129,14 +130,14 @@ def read_ids(text: str) -> tuple[int, ...]:
 
 
 def load_models() -> None:
-    """Add the models of plug-ins."""
+    """Add the servo models of plug-ins."""
     from dxlrun.control.controllers.plugins import load_plugins
 
     load_plugins()
 
 
 def _show(port: str, scanned: Scanned, rates: Mapping[int, int], *, narrowed: bool, as_json: bool) -> None:
-    """Show what was found; `rates`: those that the driver did not set as asked, and what it set."""
+    """Show the result; `rates`: requested rate -> rate that the driver set instead."""
     from dxlwire.port.adapters import warnings_for
 
     nothing = (
@@ -198,17 +199,15 @@ def _table(servos: Sequence[FoundServo]) -> Table:
     return Table.of("", columns, rows)
 
 
-# The draft of a robot file
-#
-# What cannot be read from a servo (the name of its joint, where its zero is, which way it turns) is assumed,
-# and marked by a comment beside it.
+# The draft of a robot file. Unknown properties (names of joints, zero positions, directions) are assumed, and
+# marked by a comment in the draft.
 
 
 def draft_file(path: Path, port: str, servos: Sequence[FoundServo], latency_ns: int) -> str:
-    """Write a robot file that is not there yet; return its text, which `dxlrun check` accepts.
+    """Write a new robot file and return its text, which `dxlrun check` accepts.
 
-    Raises InputError where it is there or cannot be written, ServoFault where these servos cannot be one bus:
-    one port is one bus, of one protocol and one rate.
+    Raises InputError when the file exists or cannot be written, ServoFault when these servos cannot share a
+    bus: a port is one bus with one protocol and one rate.
     """
     check_draft(path)
     text = draft(path.stem, port, servos, latency_ns)
@@ -217,7 +216,7 @@ def draft_file(path: Path, port: str, servos: Sequence[FoundServo], latency_ns: 
 
 
 def check_draft(path: Path) -> None:
-    """Raise InputError where `draft_file` would write nothing, whatever the servos are."""
+    """Raise InputError when `draft_file` could not write the file."""
     check_target(path)
     if path.suffix not in (".yaml", ".yml"):
         raise InputError(f"{path} is no name for a robot file; end it in .yaml")
@@ -341,5 +340,5 @@ def _name(servo: FoundServo) -> str:
 
 
 def _middle(table: ControlTable) -> int:
-    """Return the middle of a model's travel, whole degrees."""
+    """Return the middle of a model's travel, in whole degrees."""
     return round(math.degrees((table.min_tick + table.max_tick) / 2 * table.rad_per_tick))

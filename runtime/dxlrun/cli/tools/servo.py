@@ -1,4 +1,4 @@
-"""`dxlrun servo PORT ID VERB`: one servo, its registers, its address, its state."""
+"""`dxlrun servo PORT ID VERB`: reads or changes registers, address and state of one servo."""
 
 from __future__ import annotations
 
@@ -48,9 +48,9 @@ def servo(
     """Read or change one servo on a port that no run uses: its registers, ID, baud rate, torque.
 
     VERB is one of: get [ITEM...], set ITEM VALUE, id NEW, baud RATE, reboot, factory-reset, backup [FILE],
-    restore [FILE], blink [TIMES], torque on|off; of a device that is no servo, get and set. What changes the
-    EEPROM is asked for first, needs the torque off, and is looked at afterwards. Without FILE the servo's own
-    backup is meant.
+    restore [FILE], blink [TIMES], torque on|off; of a device that is not a servo, get and set. A change of
+    the EEPROM asks for confirmation, needs the torque off, and is verified afterwards. Without FILE the
+    servo's own backup is meant.
 
     Parameters
     ----------
@@ -101,7 +101,7 @@ def servo(
 
 
 def _check(servo_id: int, verb: str, asked: Asked) -> None:
-    """Refuse words that mean nothing before the port is opened; raises InputError."""
+    """Refuse invalid words before the port is opened; raises InputError."""
     if not 0 <= servo_id <= HIGHEST_ID:
         raise InputError(f"{servo_id} is no ID of a servo; they are 0..{HIGHEST_ID}")
     found = VERBS.get(verb)
@@ -118,7 +118,7 @@ def _check(servo_id: int, verb: str, asked: Asked) -> None:
 
 
 def _find(tool: ToolLine, servo_id: int, search: Search) -> FoundServo:
-    """Look for the servo; raises ServoFault where it is not there, or is there more than once."""
+    """Find the servo; raises ServoFault when it does not answer, or answers more than once."""
     from dxlrun.dynamixel.tools.scanning import find_servo
 
     port, found = tool.port.name, find_servo(tool, servo_id, search)
@@ -190,22 +190,22 @@ def _registers(values: Mapping[str, int], table: ControlTable, deviations: Seque
     return Table.of("", columns, rows)
 
 
-# The verbs: each passes its words on, and returns what was done, one sentence each
+# The verbs. Each passes its words on, and returns its actions, one sentence each.
 
 
 @dataclass(slots=True)
 class Asked:
-    """A verb with its words, and what came of it."""
+    """Words and options of a verb, and its results."""
 
     words: tuple[str, ...]
     keep: Keep | None
     yes: bool
     done: list[str] = field(default_factory=list)
-    """What was done, one sentence each."""
+    """Actions, one sentence each."""
     registers: dict[str, int] = field(default_factory=dict)
-    """What was read, by item."""
+    """Values read, by item."""
     deviations: Sequence[FoundDeviation] = ()
-    """What of it is not the factory's and matters to a run."""
+    """Values that differ from the factory's and affect a run."""
     declined: bool = False
 
     def confirmed(self, question: str) -> bool:
@@ -224,15 +224,15 @@ class Asked:
 
 @dataclass(frozen=True, slots=True)
 class Verb:
-    """What one verb takes and does."""
+    """Definition of a verb."""
 
     usage: str
-    """Its words."""
+    """Usage of its words."""
     fewest: int
     most: int
     do: Callable[[OneServo, Asked], Iterable[str]]
     check: Callable[[Asked], None] = lambda _: None
-    """Looks at the words before the port is opened; raises InputError."""
+    """Checks the words before the port is opened; raises InputError."""
 
 
 def _get(one: OneNode, asked: Asked) -> Iterable[str]:
@@ -260,7 +260,8 @@ def _set(one: OneNode, asked: Asked) -> Iterable[str]:
         raise InputError(f"{one.table.items[name].title} can only be read; `get` shows it")
     try:
         target = any_value(one.table, name, _value(text))
-    except ValueError as error:  # also an UnfitRegister
+    # This includes UnfitRegister.
+    except ValueError as error:
         raise InputError(str(error)) from None
     return one.set_register(target, asked.confirmed)
 
@@ -332,7 +333,7 @@ def _on_or_off(asked: Asked) -> None:
 
 
 _OF_DEVICES: Mapping[str, Callable[[OneNode, Asked], Iterable[str]]] = {"get": _get, "set": _set}
-"""What can be done to a device that is not a servo, too."""
+"""Verbs for devices that are not servos."""
 VERBS: Mapping[str, Verb] = MappingProxyType(
     {
         "get": Verb("[ITEM...]", 0, 1000, _get),

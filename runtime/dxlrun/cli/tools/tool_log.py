@@ -1,4 +1,4 @@
-"""The traffic of a tool as a log: `--log FILE` of commands that talk to servos without a run."""
+"""Tool log: the traffic of a tool, for `--log FILE` of commands that access servos without a run."""
 
 from __future__ import annotations
 
@@ -16,14 +16,14 @@ if TYPE_CHECKING:
     from dxlwire.packets import PacketSink
 
 TOOL_NAME = "tool"
-"""The metadata record of a log that a tool wrote: its `command`."""
+"""Name of the metadata record of a tool's log, which has its `command`."""
 
 
 @contextmanager
 def tool_log(
     path: Path | None, command: str, buses: Sequence[str] = ("line",)
 ) -> Iterator[PacketSink | None]:
-    """Give what takes the packets of a tool's lines into a new log; None without a path.
+    """Yield a sink for the packets of a tool's lines, which go to a new log; None without a path.
 
     Raises InputError when the file exists or cannot be written.
     """
@@ -54,7 +54,7 @@ def tool_log(
 
 
 class BusesLog:
-    """The packets of a robot's buses in a new log, once its buses are known; a context manager."""
+    """Context manager for a new log of the packets of a robot's buses, which may become known later."""
 
     def __init__(self, path: Path | None, command: str) -> None:
         self._path = path
@@ -69,7 +69,7 @@ class BusesLog:
         self._open.close()
 
     def of(self, buses: Sequence[BusPlan]) -> Mapping[str, PacketSink]:
-        """Return by bus what takes its packets; `buses`: all of the robot's. Raises InputError."""
+        """Return the packet sink of each bus; `buses`: all buses of the robot. Raises InputError."""
         if self._sinks is None:
             from dxlrun.dynamixel.tools.tool_line import OnBus
 
