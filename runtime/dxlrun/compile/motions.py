@@ -292,6 +292,7 @@ def warn_of_turns(
             if target.position is None:
                 continue
             step = abs(target.position - before.get(joint, target.position))
+            # Exactly half a turn has no shorter way; 1e-9 allows for rounding.
             if step > longest.get(joint, (math.pi * (1 + 1e-9), target.mark))[0]:
                 longest[joint] = step, target.mark
             before[joint] = target.position
@@ -349,6 +350,7 @@ def last_arrival_ns(samples: Sequence[Sample], joints: Mapping[str, JointPlan]) 
             speed = min(joint.highest_speed, abs(target.velocity or math.inf))
             if 0 < speed < math.inf:
                 way_s = abs(joint.way(held.get(name, target.position), target.position)) / speed
+                # Acceleration and braking each add half of speed / acceleration.
                 starting_s = 0.0 if joint.acceleration is None else speed / joint.acceleration
                 arrival_ns = max(arrival_ns, sample.t_ns + round((way_s + starting_s) * 1e9))
             held[name] = target.position

@@ -84,6 +84,7 @@ def _turn(urdf: Urdf, link: str, other: str, expected: Quaternion = NO_TURN) -> 
     if above != other_above:
         return "which moves against it"
     found = product(conjugate(place.rotation), other_place.rotation)
+    # abs(): q and -q are the same rotation. min(): rounding may lead to more than 1.
     angle = 2 * math.acos(min(1.0, abs(product(conjugate(expected), found)[3])))
     if angle <= _ALIKE_RAD:
         return ""

@@ -118,6 +118,7 @@ def _pose(step: PoseStep, positions: Mapping[str, float], joints: Mapping[str, C
             plan = joints[name].plan
             asked = (step.linear_speed or math.inf) if plan.unit is LINEAR else step.speed
             speed = asked if plan.velocity is None else min(asked, plan.velocity)
+            # Assume that the joint starts at its farthest limit.
             way = max(plan.upper - position, position - plan.lower)
             ramps = (math.inf, 0.0) if plan.acceleration is None else (plan.acceleration, plan.highest_speed)
             longest = max(longest, longest_pose_ns(way, speed, *ramps, plan.slow_speed))

@@ -286,6 +286,7 @@ def _felt(servo: ServoPlan, load: Load | None) -> Load:
     """Return the load of a joint at its single servo, through the ratio."""
     if load is None:
         return NO_LOAD
+    # Through a gear an inertia scales with the square of the ratio, a torque with the ratio.
     inertia, friction = load.inertia * servo.ratio**2, load.friction * servo.ratio
     if servo.unit is LINEAR:
         return Load(inertia, friction, steady=servo.direction * (load.steady * servo.ratio))

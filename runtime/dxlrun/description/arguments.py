@@ -80,6 +80,7 @@ class Arguments:
             return
         if name in self._given:
             text = self._given[name]
+            # With a text as the default the value stays text, even if it looks like a number.
             self._values[name] = text if isinstance(default, str) else plain_value(text)
             self.texts[name] = text
         elif default is not None:

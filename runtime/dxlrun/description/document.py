@@ -103,6 +103,7 @@ def read_file(path: Path) -> bytes:
     if folder is not None and not path.resolve().is_relative_to(folder):
         raise PermissionError(errno.EACCES, "it is outside of the folder that may be read", str(path))
     with open(path, "rb", opener=_opened) as stream:
+        # One byte more shows that a file is too large, without reading the rest.
         data = stream.read(LARGEST_FILE + 1)
     if len(data) > LARGEST_FILE:
         raise OSError(errno.EFBIG, f"the file is larger than {LARGEST_FILE // 1024} KiB", str(path))
@@ -165,6 +166,7 @@ def read_text(path: Path, language: str = "YAML") -> str:
 
 def _decoded(data: bytes, file: str, language: str) -> str:
     try:
+        # utf-8-sig also accepts the byte order mark that some editors write.
         text = data.decode("utf-8-sig")
     except UnicodeDecodeError as error:
         before = error.object[: error.start].decode("utf-8")

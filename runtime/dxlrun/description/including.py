@@ -72,6 +72,7 @@ class _Collector:
     def take(self, path: Path, text: str, tree: Tree, above: tuple[Path, ...]) -> None:
         """Add the fragments of a file, then the file; `above` are the files that led to it."""
         declared = grow(tree, str(path), literal)
+        # Mark the file before its fragments, so that a second path to it does not read it again.
         self._done.add(path.resolve())
         self._characters += len(text)
         for entry, mark in self._entries(declared):

@@ -415,8 +415,7 @@ class DynamixelHardware:
         return failures
 
     def release(self) -> None:
-        """Leave the robot with its torque on: stop sending, and keep every servo from stopping because of
-        that.
+        """Leave the robot with its torque on: disarm the Bus Watchdogs, then stop sending.
 
         Features make their outputs safe. A servo that its Bus Watchdog has already stopped stays stopped.
         """

@@ -89,6 +89,7 @@ def compile_joints(file: RobotFile, models: Mapping[str, str], motors: Motors) -
         drive = drives.get(name)
         if drive is None:
             continue
+        # A mistake with an assumed model may not be one with the real model, so it is not reported yet.
         certain = all(servo.certain for servo in drive.servos)
         effort = _effort(file if certain else RobotFile(file.description), name, joint, drive.servos[0])
         if drive.allowed is None or not all(servo.known_bus for servo in drive.servos):

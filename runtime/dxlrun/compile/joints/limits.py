@@ -162,6 +162,7 @@ def _worst(
     times = [sample.t_ns for sample in samples]
     for peak in peaks:
         t_ns = round(peak.time * 1e9)
+        # Report a peak at the target toward which the joint moves.
         aimed = samples[min(bisect_left(times, t_ns), len(times) - 1)].targets.get(peak.joint)
         if peak.joint in joints and aimed is not None:
             note(peak.joint, peak.speed, t_ns, aimed.mark)

@@ -169,6 +169,7 @@ class FrameTree:
             return None
         if frame.joint is not None:
             return Transform(frame.joint.xyz, orientation)
+        # The IMU measures its link's orientation, so remove the rotation of the link in the body.
         inside = self._below(self.imu_link, frame.name, positions)
         return inside and Transform(rotation=product(orientation, conjugate(inside.rotation)))
 

@@ -39,6 +39,7 @@ def with_groups(grown: Grown) -> Grown:
         return grown
     groups = _groups(data)
     grown = replace(grown, problems=(*grown.problems, *_mistakes(grown)))
+    # Lowest precedence first: defaults, then groups, then the joints' own keys.
     layers = [_layer(grown, (DEFAULTS,), tuple(_mapping(data.get("joints"))), groups)]
     layers += [_layer(grown, (GROUPS, name), joints, groups) for name, joints in groups.items()]
     grown = replace(grown, problems=(*grown.problems, *_disagreements(grown, groups, layers[1:])))

@@ -163,6 +163,7 @@ def read_motor(path: Path) -> MotorDescription:
         raise refusal(Mark(file), what, "name a file as `dxlrun identify` writes it")
     form = read_form(grown, MotorForm)
     found = {name: float(value) for name, value in form.uncertainty if value is not None}
+    # The form holds the delay in ns, the description in s.
     if "delay" in found:
         found["delay"] *= 1e-9
     return MotorDescription(form.motor(), grown.marks, path, text, found)

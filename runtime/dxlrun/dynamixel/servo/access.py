@@ -106,6 +106,7 @@ class ItemAccess:
             if last.answered:
                 found |= decoded(block, start, last.parameters)
             elif last.outcome is Outcome.REFUSED and len(block) > 1:
+                # First without the gaps, which the servo may refuse; then item by item.
                 blocks = [list(each) for each in side_by_side(block)]
                 left[:0] = blocks if len(blocks) > 1 else [[item] for item in block]
                 continue

@@ -285,7 +285,7 @@ class Life:
         return loss
 
     def reboot(self, index: int, request: RequestedReboot, probe_after_ns: int) -> Loss:
-        """Take a servo out of the exchange for a requested reboot, until it is back or has `answered`."""
+        """Take a servo out of the exchange for a requested reboot, until its return or `answered`."""
         loss = self.lose(index, probe_after_ns)
         loss.reboot = request
         self._show(index, Torque.REBOOTING)

@@ -95,6 +95,7 @@ class Offline:
         """
         one = self.life.reach(index)
         for _ in range(ATTEMPTS):
+            # The read-back decides, so the acknowledgement is not worth a long wait.
             yield replace(one.writing(one.servo.torque_address, b"\0"), patience_ns=0)
             back = yield one.reading(one.servo.torque_address, 1)
             if back.answered and back.parameters[0] == 0:

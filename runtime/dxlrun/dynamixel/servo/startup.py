@@ -88,6 +88,7 @@ class StartUp:
         for _, stage in stages(BusStage, self._features):
             self._run(stage.inspect, found)
         self._judge(found)
+        # Refuse before any register is written.
         _refuse(self._late_replies(), for_replies=True)
         self.stage(settle_bus)
         settled = self.stage(modes.settle_modes)
@@ -219,6 +220,7 @@ def _engage(plan: BusPlan, found: Findings) -> Program[list[int | None]]:
     for servo in plan.servos:
         one = reach(plan, servo)
         if servo.torque_at_start:
+            # Let the supply recover from the inrush of one group before the next.
             if given and given % GROUP == 0:
                 yield listen(GROUP_PAUSE_NS)
             held = yield from modes.hold(one, servo.start_mode)

@@ -242,6 +242,7 @@ class OneServo(OneNode):
             return ""
         self.writable([self.register("id", new)])
         old, line = self.servo_id, self.tool.line
+        # Two servos with one ID would both be unreachable.
         self._free(new)
         item = self.table.items["id"]
         self._written(line.write(old, item.address, bytes((new,))), f"{item.title} = {new}")
@@ -270,6 +271,7 @@ class OneServo(OneNode):
         if not confirm(f"{self.called}: its baud rate becomes {new} bit/s (EEPROM)"):
             return ""
         self.writable([self.register(self.rate_item(), value)])
+        # Try the adapter first: at a rate that it lacks, the servo would be unreachable.
         if not self.tool.can_run_at(new):
             raise self.fail(
                 f"the adapter at {self.tool.port.name} cannot run at {new} bit/s; nothing was changed"

@@ -168,6 +168,7 @@ def _search(tool: ToolLine, ids: Sequence[int], beat: Callable[[float], None]) -
             there |= yield from _one_by_one(tool, rest, SHORT_TIMEOUT_NS, beat)
     else:
         there = yield from _one_by_one(tool, ids, SHORT_TIMEOUT_NS, beat)
+    # Noise may be replies that collided: ping every ID with full timeouts.
     if heard.noise:
         there |= yield from _one_by_one(tool, ids, None, beat)
     found: list[FoundServo] = []

@@ -86,6 +86,7 @@ class MissedReplies:
         self._missed += 1
         self._missed[valid | (states.torque == Torque.REBOOTING)] = 0
         self.none = not self._missed.any()
+        # A negative age means that no state was read yet.
         lost = (self._missed >= LOST_CYCLES) & ((age_ns >= LOST_AGE_NS) | (age_ns < 0))
         rows = frozenset(np.flatnonzero(lost).tolist())
         changed = rows != self.lost

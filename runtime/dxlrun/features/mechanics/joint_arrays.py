@@ -91,6 +91,7 @@ class JointArrays:
         found = self._times(self._matrix, given)
         self.goals.values[:, self._rows] = found[:, self._coupling, self._column]
         self._offset[:] = given[0] - self._times(self._inverse, found[0])
+        # A servo without a position goal (NaN) has no offset.
         self._offset[~np.isfinite(self._offset)] = 0.0
         self._fade.fill(1.0)
 
@@ -124,6 +125,7 @@ class JointArrays:
     def _read_coupled(self, to: States, of: States) -> None:
         rows, absent, coupling = self._servo_rows, self._no_servo, self._coupling
         motion = of.motion[:, rows]
+        # The matrices have zeros in the padding, but NaN * 0 is NaN.
         motion[:, absent] = 0.0
         valid = np.all(of.valid[rows] | absent, axis=1)
         moved = self._times(self._matrix, motion[:2])
@@ -161,6 +163,7 @@ class JointArrays:
         to, of = self.servo_goals, self.goals
         to.values[:, self._direct_servos] = of.values[:, self._direct_joints]
         wanted = of.values[:, self._joint_rows]
+        # NaN * 0 is NaN, as in `_read_coupled`.
         wanted[:, self._no_joint] = 0.0
         position, velocity, effort, pwm = wanted
         here, rows = ~self._no_servo, self._servo_rows

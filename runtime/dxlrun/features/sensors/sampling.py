@@ -64,6 +64,7 @@ class SampledSensor:
         """Take one sample, or reopen the device if that is due; return True if there was a sample."""
         if not self._open and not self._reopen():
             return False
+        # A value that the driver does not set must be invalid, not old.
         self._values.fill(np.nan)
         try:
             t_ns = self.driver.read(self._values)
@@ -74,6 +75,7 @@ class SampledSensor:
             if ahead_ns > self.plan.period_ns and not self._ahead:
                 self._ahead = True
                 self._say(f"its times are {ahead_ns / 1e6:.0f} ms in the future: times of arrival are used")
+            # A time in the future would make the sample younger than it is.
             self._writer.write(min(int(t_ns), now_ns), self._values)
         except Exception as error:  # every error of a driver becomes an event
             self.fail(error)
