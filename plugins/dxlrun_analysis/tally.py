@@ -70,9 +70,8 @@ class RunTotals:
     acts: tuple[Act, ...] = ()
     pauses: tuple[Pause, ...] = ()
     failures: tuple[str, ...] = ()  # Failures outside the loop, one sentence each
-    wait: SimulationWait = field(
-        default_factory=SimulationWait
-    )  # Waits of the loop for simulated servos whose process was not scheduled
+    # Waits of the loop for simulated servos whose process was not scheduled.
+    wait: SimulationWait = field(default_factory=SimulationWait)
     gaps: int = 0  # Records that the recorder did not receive
     damage: tuple[str, ...] = ()
     tracking: tuple[JointTracking, ...] = ()  # Tracking of each joint, in the order of `joints`
@@ -102,9 +101,8 @@ class RunTotals:
 
     def bus_of(self, subject: str) -> str:
         """Return the bus of an accused servo or joint, or `subject` itself if it is neither."""
-        movers = (
-            mover.bus.name for mover in self.plan.movers.get(subject, ())
-        )  # The joint has several servos
+        # A joint of several servos is not the subject of any one of them.
+        movers = (mover.bus.name for mover in self.plan.movers.get(subject, ()))
         return next((servo.bus for servo in self.servos if servo.subject == subject), next(movers, subject))
 
 

@@ -141,9 +141,8 @@ class PreparedComparison:
                 return recorded
             made = made or now
         self.different += 1
-        if (
-            self.first is None or cycle < self.first.cycle
-        ):  # The commands of the plan were prepared before all others
+        # The commands of the plan are prepared before all others, also those of later cycles.
+        if self.first is None or cycle < self.first.cycle:
             numbers = self._inputs.log.cycles["cycle"]
             index = min(int(np.searchsorted(numbers, cycle)), len(numbers) - 1)
             what, then, now = _where(kind, recorded, made)
