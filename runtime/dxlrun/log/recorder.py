@@ -33,8 +33,11 @@ from dxlrun.log.schemas import MACHINE, LogClosed, RecorderJob
 from dxlrun.messages.cdr import Codec
 from dxlrun.plan.machine_load import SAMPLE_PERIOD_NS, LoadMeter, MachineLoad
 
+# s; polling interval of empty rings, short against the RING_SECONDS that they hold.
 POLL_S = 0.005
+# s; about this time of records is lost when the recorder is killed.
 FLUSH_S = 0.5
+# s; about this time of records is lost when the power fails.
 SYNC_S = 2.0
 # Records of one ring per turn, so that no ring waits long for another one.
 _MOST_PER_TURN = 100

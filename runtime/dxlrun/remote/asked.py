@@ -26,6 +26,7 @@ BODY_S = 10.0
 """Timeout for receiving a body."""
 LONGEST_WAIT_S = 5.0
 """Longest wait for the end of a goal in one request; a client that waits longer repeats the request."""
+# Characters; a client chooses its name freely, so it must not fill the log.
 LONGEST_ORIGIN = 64
 
 

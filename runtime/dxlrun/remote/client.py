@@ -39,7 +39,10 @@ if TYPE_CHECKING:
     from dxlrun.remote.live.states import RobotStates
     from dxlsim.geometry.transform import Transform
 
+# s; default lease of a stream's set-points, as in the gateway. A client that streams at 10 Hz or more stays
+# within it.
 LEASE_S = 0.2
+# s; timeout of `stop`, which includes the steps of on_exit and the end of the recorder.
 _STOP_S = 30.0
 _POLL_S = 2.0
 _FEEDBACK_S = 0.1

@@ -43,6 +43,8 @@ LONGEST_DATA = LONGEST_COMMAND - 1024
 """Bytes; the mailbox's longest operation minus room for names."""
 ENTER_S = 6.0
 """Timeout for a mode change; the loop's own timeout is five seconds."""
+# s; polling interval while a command is pending; ten times as long otherwise. The rings are shared memory
+# without a wake-up.
 _LOOK_S = 0.002
 _HELD = {
     EventCode.STALE_COMMAND: True,

@@ -43,6 +43,7 @@ _LEAST_NS = 200_000_000
 """Shortest duration of an approach."""
 _SLOWEST = 0.05
 """rad/s; lowest speed of an approach: a servo at 0 rad/s, which is unlimited, would not come to rest."""
+# ns; shortest step between two position commands of an approach (50 Hz).
 _RAMP_NS = 20_000_000
 _MOST_STEPS = 500
 """Upper limit of the position commands of an approach."""

@@ -36,6 +36,7 @@ INVALID_SHARE = 0.01
 SHORT_RUN_NS = 2_000_000_000
 """ns; a shorter run may skip as many periods as a run of this length: one stall of the machine is not an
 overload."""
+# Names or sentences of one kind in a summary, which must fit on a screen.
 _MOST = 3
 _LOSSES = {
     EventCode.PORT_LOST: "lost",

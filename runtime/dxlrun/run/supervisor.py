@@ -87,6 +87,8 @@ from dxlwire.port.serial_open import let_go
 if TYPE_CHECKING:
     from rich.console import Console
 
+# s; longest wait for a message of the guardian. Each turn is also a heartbeat: two must take less than
+# HALTED_NS.
 _POLL_S = 0.1
 _RESTART_S = 2.0
 """Delay between the end of a source's process and its restart."""

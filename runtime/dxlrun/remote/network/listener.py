@@ -24,6 +24,7 @@ from dxlrun.remote.sockets import Address
 LOOPBACK = "127.0.0.1"
 MOST_UNPROVED = 64
 """Upper limit of unproved connections; one more closes the oldest one of the host that has the most."""
+# s; timeout of a TLS handshake or shutdown, after which a half-open connection frees its memory.
 HANDSHAKE_S = 5.0
 
 

@@ -11,6 +11,8 @@ from pathlib import Path
 from dxlrun.remote.network.certificates import CLIENT, client_context, keys_place, settings
 from dxlrun.remote.sockets import TIMEOUT_S, Address, SocketLink
 
+# s; timeout of a TCP connection, shorter than that of a reply: a gateway in the local network accepts at
+# once.
 _CONNECT_S = 3.0
 _CHUNK = 1 << 16
 
