@@ -1,5 +1,4 @@
-"""Contract: base classes of controllers and sensors, the hooks, and the interface of the loop's hardware.
+"""Contract: base classes of controllers and sensors, hooks, and the interface of the loop's hardware.
 
-Implementations do not belong here: controllers are in plugins/dxlrun_controllers, the hardware is in
-`dynamixel`.
+Implementations belong elsewhere: controllers in plugins/dxlrun_controllers, the hardware in `dynamixel`.
 """

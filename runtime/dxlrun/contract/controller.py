@@ -1,4 +1,4 @@
-"""Controller: the contract between dxlrun and the author of a law of motion."""
+"""Controller: base class of controllers and the types of its interface."""
 
 from __future__ import annotations
 
@@ -22,7 +22,7 @@ from dxlwire.modes import CommandName
 
 
 class CommandModel(BaseModel):
-    """Base of a typed command: frozen, unknown keys refused, finite numbers only."""
+    """Base class of typed commands: frozen, without unknown keys, with finite numbers only."""
 
     model_config = ConfigDict(frozen=True, extra="forbid", allow_inf_nan=False, defer_build=True)
 
@@ -31,43 +31,44 @@ P = TypeVar("P", bound=ParametersModel)
 
 
 class Live(msgspec.Struct, frozen=True):
-    """Mark of a parameter that may be changed in a run: `p: Annotated[float, LIVE]`; a number or a bool, or a
-    mapping of names to them, each of which can be changed."""
+    """Marker of a parameter that may change in a run: `p: Annotated[float, LIVE]`.
+
+    The parameter is a number, a bool, or a mapping from names to numbers or bools, which change separately.
+    """
 
 
 LIVE: Final = Live()
 
 
 class Interfaces(msgspec.Struct, frozen=True):
-    """What a controller asks of the robot and offers to other controllers, decided by its parameters.
+    """Interfaces that a controller requires and offers, depending on its parameters.
 
-    `command` interfaces are claimed on every joint of `joints`: no other active controller may have one of
-    the same joint. They determine the mode in which the joints are driven (`interfaces.mode_of`): `position`
-    alone or with `velocity` (the speed toward it); `velocity`, `effort` or `pwm` alone; or `position` with
-    `effort` (the most that the servo may exert). A controller that the robot file puts `into` others claims
-    their reference interfaces of these joints instead.
-
-    `reference` interfaces are exported on every joint of `joints`, as `NAME/JOINT/position`: controllers that
-    are `into` this one command them, each of them at most one. `reads` are interfaces that it reads without a
-    claim, in the order of `Context.reads`: `JOINT/position`, `NAME/JOINT/position` (a reference of another
-    controller), `SOURCE/STATE` of a device, a sensor, or a controller that provides it, and `SOURCE/age`. The
-    states of its own joints need no such name.
-
-    `provides` are states that it has for others, as `NAME/orientation.x`, in the order of `Context.provided`;
-    a controller that reads them is updated after it. `device_commands` are commands of devices, `light/led`,
-    that it claims: no other active controller may have one of them. `takeovers` are controllers that it may
-    let take over by `Context.take_over`.
-
-    `motors` are figures of `MotorModel` without which it cannot work: `resistance`, which each motor file
-    has, stands for any motor file, `position_gain` for one that has that. A robot is refused when one of
-    `joints` lacks them.
-
-    `asked_by` names for a command interface the key of the parameters because of which it is claimed, where
-    that is not always so: `{"effort": ("motions", "curl", "steps", 0, "torque")}`. A robot that cannot have
-    it is refused there.
-
-    `partial`: it goes on with its other joints when clients switch the torque of some off, and it may be
-    activated without them. What it commands for those goes nowhere; `states.unable` names them.
+    Attributes:
+        joints: Joints that the controller moves.
+        command: Command interfaces that are claimed for every joint. No other active controller may claim an
+            interface of the same joint. They determine the mode of the joints (`dxlwire.modes.mode_of`):
+            `position` alone or with `velocity` (speed toward the position); `velocity`, `effort` or `pwm`
+            alone; or `position` with `effort` (effort limit of the servo). If the robot file puts the
+            controller `into` others, it claims their reference interfaces of these joints instead.
+        reference: Interfaces that are exported for every joint, as `NAME/JOINT/position`. Controllers that
+            are `into` this one command them; each has at most one commander.
+        reads: Interfaces that are read without a claim, in the order of `Context.reads`: `JOINT/position`,
+            `NAME/JOINT/position` (a reference of another controller), `SOURCE/STATE` of a device, a sensor or
+            a providing controller, and `SOURCE/age`. States of the controller's own joints need not be
+            listed.
+        motors: Required figures of `MotorModel`. `resistance`, which is in every motor file, requires any
+            motor file; `position_gain` requires one with that figure. A robot without them is refused.
+        provides: States that the controller provides, as `NAME/orientation.x`, in the order of
+            `Context.provided`. Their readers are updated after it.
+        device_commands: Commands of devices that are claimed, `light/led`. No other active controller may
+            claim them.
+        takeovers: Controllers whose takeover it may request with `Context.take_over`.
+        asked_by: Key of the parameters that causes the claim of a command interface, if the claim depends on
+            parameters: `{"effort": ("motions", "curl", "steps", 0, "torque")}`. Errors about the interface
+            refer to that key.
+        partial: True if the controller continues with its other joints after clients have disabled the torque
+            of some, and if it may be activated without them. Commands for joints without torque have no
+            effect; `states.unable` returns them.
     """
 
     joints: tuple[str, ...]
@@ -83,13 +84,13 @@ class Interfaces(msgspec.Struct, frozen=True):
 
     @property
     def source_commands(self) -> tuple[str, ...]:
-        """The same as `device_commands`: commands of devices and other sources."""
+        """Alias of `device_commands`: commands of devices and other sources."""
         return self.device_commands
 
 
 class JointLimits(msgspec.Struct, frozen=True):
-    """Limits of the controller's joints, shape (joints,): positions are infinite, others NaN where there is
-    none."""
+    """Limits of the controller's joints, shape (joints,). Without a limit, positions are infinite and others
+    NaN."""
 
     lower: Floats
     upper: Floats
@@ -99,87 +100,92 @@ class JointLimits(msgspec.Struct, frozen=True):
 
 
 class RobotModel(msgspec.Struct, frozen=True):
-    """What is known of a controller's robot before it runs; rows in the order of the controller's joints."""
+    """Static data of a controller's robot, in the order of the controller's joints."""
 
     joints: tuple[str, ...]
     servos: tuple[ServoModel | None, ...]
-    """None: several servos move the joint"""
+    """Servo of each joint; None: several servos move the joint."""
     motors: tuple[MotorModel | None, ...]
-    """None: the robot file names no motor file"""
+    """Motor of each joint; None: the robot file does not name a motor file."""
     units: tuple[JointUnit, ...]
-    """Units of positions"""
+    """Unit of each joint's position."""
     urdf: str | None
-    """Text of the URDF that the robot file names"""
+    """Text of the robot's URDF; None: the robot file does not name one."""
 
 
 class Mismatch(msgspec.Struct, frozen=True):
-    """Something of the robot that does not fit a controller."""
+    """A mismatch between a robot and a controller."""
 
     what: str
-    """Behind the controller's name: `needs the robot's URDF`"""
+    """Problem, which follows the controller's name in a message: `needs the robot's URDF`."""
     fix: str
     at: str = ""
-    """A joint, or a key of the controller: `payload.link`; empty: the controller itself"""
+    """Joint, or key of the controller: `payload.link`; empty: the controller itself."""
 
 
 class SpeedPeak(msgspec.Struct, frozen=True):
-    """The highest speed of a joint on the way that a command describes."""
+    """Highest speed of a joint on the path of a command."""
 
     joint: str
     speed: float
-    """rad/s, of a linear joint m/s, with its sign"""
+    """Signed speed, rad/s or m/s."""
     time: float
-    """s, in the time of the command: that of its points"""
+    """Time of the peak in the time of the command's points, s."""
     where: str
-    """The part of the way: `from point 1 to 2`"""
+    """Segment of the path: `from point 1 to 2`."""
     at: str = ""
-    """The key of the controller that describes the way: `motions.curl`; empty: the command does"""
+    """Key of the controller that defines the path: `motions.curl`; empty: the command defines it."""
 
 
 @unique
 class Outcome(StrEnum):
-    """How a goal ended."""
+    """Outcome of a goal."""
 
     REACHED = "reached"
-    """Every joint answered, had torque, was within tolerance of its goal and at rest."""
+    """Every joint replied, had torque, was within its tolerance and at rest."""
     MISSED = "missed"
-    """A joint was off, or moved still, after the settling time."""
+    """A joint was out of tolerance or still moved after the settling time."""
     ABORTED = "aborted"
-    """The controller gave it up, was deactivated, or broke its contract."""
+    """The controller aborted the goal, was deactivated, or had a fault, or a joint was lost or limp."""
     CANCELLED = "cancelled"
     PREEMPTED = "preempted"
-    """Another goal took its place."""
+    """Another goal or command replaced it."""
 
 
 class GoalTolerances(msgspec.Struct, frozen=True):
-    """How near the joints of a goal must come, shape (joints,) in the order of the controller's joints.
+    """Tolerances of a goal, shape (joints,), in the order of the controller's joints.
 
-    NaN: the tolerance of the joint, by the robot file or its default; infinite: not checked.
+    NaN: tolerance of the joint in the robot file, or its default. Infinite: not checked.
     """
 
     position: Floats
-    """Distance from the goal, rad or m."""
+    """Distance from the target, rad or m."""
     velocity: Floats
     """Speed below which a joint is at rest, rad/s or m/s."""
     settle_ns: int | None = None
-    """How long after the end of the motion the goal may still be reached, ns; None: the joints' own."""
+    """Settling time after the end of the motion; None: the settling times of the joints."""
     left_ns: int | None = None
-    """How long the goal may take from now on in any case, ns; None: it has no time-out."""
+    """Remaining time until the goal's timeout; None: no timeout."""
 
 
 class Goal(Protocol):
-    """A goal that a controller works on, one at a time, until it calls `judge` or `end`."""
+    """A goal of a controller. The controller pursues one goal at a time until it calls `judge` or `end`."""
 
     @property
     def number(self) -> int:
-        """Its identity in this run, from 1."""
+        """Number of the goal in this run, from 1."""
 
     @property
     def kind(self) -> str:
-        """Name of the command that it came with."""
+        """Kind of its command."""
 
     def feedback(self, progress: float, error: float = float("nan")) -> None:
-        """Report progress, 0..1, and the largest distance from the desired state; the runtime thins it."""
+        """Report progress. It may be called in each cycle: the runtime publishes at a lower rate.
+
+        Args:
+            progress: 0..1.
+            error: Largest distance of a joint from the desired state, rad or m.
+        """
 
     def judge(
         self,
@@ -189,19 +195,19 @@ class Goal(Protocol):
         tolerances: GoalTolerances | None = None,
         text: str = "",
     ) -> None:
-        """Hand the goal over to the runtime: its motion has ended, and the runtime decides how the goal did.
+        """Let the runtime decide the outcome. Call it when the goal's motion has ended.
 
-        The goal is reached when each of its joints has answered, has torque, is within tolerance of its
-        position and is at rest. It is aborted when a joint is lost or has no torque, and missed when a joint
-        is still off after its settling time. Until then the goal runs, and the controller holds its joints.
+        The goal is reached when all of its joints have replied, have torque, are within their tolerances and
+        are at rest. It is aborted if a joint is lost or has no torque, and missed if a joint is still out of
+        tolerance after its settling time. Until then the goal runs, and the controller holds its joints.
 
         Args:
-            positions: Goal of each joint of the controller as it was asked, before any limit, rad or m; NaN:
-                the joint has only to be at rest. None: the goal has no positions, such as one of efforts; its
-                joints have only to answer and to have torque.
+            positions: Requested position of each joint of the controller, before any limit, rad or m. NaN:
+                the joint must only be at rest. None: a goal without positions, such as one of efforts, whose
+                joints must only reply and have torque.
             joints: Joints that the goal moves; None: all joints of the controller.
             tolerances: Tolerances of this goal; None: those of the joints.
-            text: What the report of the result adds; empty: the time that the goal took.
+            text: Text for the report of the outcome; empty: the duration of the goal.
         """
 
     def end(
@@ -212,21 +218,29 @@ class Goal(Protocol):
         error: float = float("nan"),
         joints: Sequence[str] | None = None,
     ) -> None:
-        """Report the result, once; `joint` is the worst one, `error` its distance from the goal, SI units.
+        """End the goal. Only the first call has an effect.
 
-        `joints` are those that the goal moves, None: all that the controller commands. Reached is judged as
-        by `judge`, with the positions that the controller commands now. A goal is aborted instead of missed
-        when one of its joints is lost or has no torque.
+        For `REACHED`, the runtime decides as in `judge`, with the current position commands of the
+        controller. `MISSED` becomes `ABORTED` if a joint is lost or has no torque.
+
+        Args:
+            outcome: Outcome.
+            text: Text for the report.
+            joint: Joint with the largest error; empty: none.
+            error: Distance of that joint from its target, rad or m.
+            joints: Joints that the goal moves; None: all joints that the controller commands.
         """
 
 
 class Publish(Protocol):
-    """Publishes a message on one of the controller's own topics."""
+    """Function that publishes messages on the controller's own topics."""
 
     def __call__(self, topic: str = "", message: object = None) -> None:
-        """Publish `message`, of the type declared in `Topics`, as `/CONTROLLER/topic`, at this cycle.
+        """Publish a message on `/CONTROLLER/topic` in this cycle.
 
-        Without a topic: mark this cycle for the topics of `publishes`.
+        Args:
+            topic: Topic in `Topics`; empty: mark this cycle for the topics of `publishes`.
+            message: Message of the type that `Topics` declares.
         """
 
 
@@ -247,88 +261,92 @@ def _keep_nothing(state: bytes) -> None:
 
 
 class Context(msgspec.Struct, frozen=True):
-    """What a controller gets when it is configured; the arrays are in the order of its joints.
+    """Data and functions that a controller gets in `on_configure`. Arrays are in the order of its joints.
 
-    `commands` is its own; states and goals are to be read only, and a copy must be made of what is to be
-    compared with a later cycle.
+    The controller writes `commands`; states and goals are read-only. Each cycle overwrites the arrays, so
+    copy values that are compared with a later cycle.
     """
 
     name: str
     joints: tuple[str, ...]
     period_ns: int
-    """The nominal period of this controller, ns."""
+    """Nominal period of this controller."""
     limits: JointLimits
     states: States
-    """Gathered by the manager before each update."""
+    """States of the joints, gathered before each update."""
     goals: Commands
-    """What was last sent to the servos, gathered before each update and before on_activate."""
+    """Goals that were last sent to the servos, gathered before each update and before `on_activate`."""
     commands: Commands
-    """To be written by update; the manager takes only the claimed interfaces, NaN = not yet commanded.
+    """Commands, written in `update`; NaN = not commanded yet. Only claimed interfaces are used.
 
-    All NaN before on_activate; what is not written keeps its value. A joint's interface that was once finite
-    and is NaN again, or is ever infinite, is the controller's fault.
+    All are NaN before `on_activate`, and keep their values until the next write. Infinity, or NaN after a
+    finite value, is a fault of the controller.
     """
     say: Callable[[str], None]
-    """Leave a sentence in the log (event CONTROLLER_SAYS); for rare things."""
+    """Log a sentence as an event (CONTROLLER_SAYS). Not for use in every cycle."""
     warn: Callable[[str], None]
-    """The same, as a warning."""
+    """Log a sentence as a warning."""
     publish: Publish
     references: Commands
-    """What the controllers that are `into` this one command, in the order of its joints; NaN = not commanded.
+    """Commands of the controllers that are `into` this one, in the order of its joints; NaN = not commanded.
 
-    Only the exported interfaces are ever commanded. As fresh as this cycle: those above are updated before.
+    Only exported interfaces are commanded. The commands are those of this cycle, because upper controllers
+    are updated first.
     """
     reads: Floats
-    """Values of `Interfaces.reads`, shape (reads,), gathered before each update and before on_activate; NaN
-    where there is none yet."""
+    """Values of `Interfaces.reads`, shape (reads,), gathered before each update and before `on_activate`; NaN
+    until first known."""
     read_names: tuple[str, ...] = ()
-    """What they are values of."""
+    """Names of the interfaces in `reads`."""
     into: tuple[str, ...] = ()
     """Controllers whose references this one commands; empty: it commands the servos."""
     motors: tuple[MotorModel | None, ...] = ()
-    """The motors of its joints' servos, by the motor files that the robot file names; None: it names none."""
+    """Motors of its joints, from the motor files in the robot file; None: the robot file has none."""
     servos: tuple[ServoModel | None, ...] = ()
-    """Its joints' servos, by the manual; None: several servos move the joint."""
+    """Data of its joints' servos from the manual; None: several servos move the joint."""
     wrap: tuple[bool, ...] = ()
-    """True: a continuous joint to which a turn more is the same place; goals take the shorter way"""
+    """True for a continuous joint that is at the same place after a full turn; goals take the shorter way."""
     units: tuple[JointUnit, ...] = ()
     """Units of the positions of its joints."""
     urdf: str | None = None
-    """Text of the URDF that the robot file names; None: it names none."""
+    """Text of the robot's URDF; None: the robot file does not name one."""
     provided: Floats = msgspec.field(default_factory=_none)
-    """What it provides, shape (provides,), to be written by update; NaN = not known. Valid in the cycles in
-    which it is updated and all of them are finite; all NaN: nothing new, what is shown grows older."""
+    """Provided states, shape (provides,), written in `update`; NaN = not known. They are valid in cycles with
+    an update if all are finite. If all are NaN, the last states stay published and grow older."""
     device_commands: Floats = msgspec.field(default_factory=_none)
-    """Its commands of devices and other sources, shape (device_commands,), to be written by update, NaN = not
-    commanded: the source keeps what it has."""
+    """Commands of devices and other sources, shape (device_commands,), written in `update`. NaN = not
+    commanded: the source keeps its last command."""
     kept: bytes = b""
-    """What the controller kept last, in this run or an earlier one; empty where there is nothing, or where it
-    was made with other servos, with other controllers below, or in simulation instead of on servos."""
+    """Last state that the controller kept, in this or an earlier run. Empty: none, or it was kept with other
+    servos, with other controllers below, or in simulation instead of on servos."""
     keep: Callable[[bytes], None] = _keep_nothing
-    """Keep a state for later runs, 1 MiB at most, in place of the one before. It leaves the loop in pieces,
-    one a cycle, and another process writes the file; one that has not begun to leave is replaced by a newer
-    one."""
+    """Keep a state for later runs, at most 1 MiB, which replaces the last one. The loop publishes it in
+    pieces, one a cycle, and another process writes the file. A newer state replaces a state whose publication
+    has not begun."""
     take_over: Callable[[Sequence[str], str], None] = _take_nothing_over
-    """Request that controllers of `Interfaces.takeovers` take over, with those below them, and why, in words.
+    """Request that controllers of `Interfaces.takeovers` take over, with a reason as text.
 
-    Done behind the updates of this cycle: those that claim what they claim leave, with those above them;
-    those that enter are updated in the same cycle, unless their joints must change their modes first. What
-    is active already stays as it is. An event says what was done, or why it was refused."""
+    The takeover follows the updates of this cycle. The controllers and the ones below them enter. Controllers
+    with conflicting claims leave, and so do the ones above these. Controllers that enter are updated in the
+    same cycle, unless their joints must change their modes first. Active ones stay active. An event reports
+    the takeover or its refusal."""
     end_run: Callable[[str], None] = _end_nothing
-    """Request that the run ends behind this cycle, by the policy `on_fault`, and why, in words."""
+    """Request the end of the run after this cycle by the policy `on_fault`, with a reason as text."""
 
     @property
     def source_commands(self) -> Floats:
-        """The same as `device_commands`: devices were the first sources with commands."""
+        """Alias of `device_commands`, which also has the commands of other sources."""
         return self.device_commands
 
 
 class Controller(ABC, Generic[P]):
-    """A law of motion: states in, commands out, once a period.
+    """Base class of controllers, which compute commands from states once a period.
 
-    Life: `on_configure` (before real time: may allocate and do I/O) -> `on_activate` -> `update` ... ->
-    `on_deactivate`. All but `on_configure` are in the loop: bounded, no I/O, no lock,
-    no growing allocation. What they raise ends the controller, not the process. A whole one:
+    Life cycle: `on_configure` (before real time: may allocate and do I/O) -> `on_activate` -> `update` ... ->
+    `on_deactivate`. All methods except `on_configure` run in the loop: their time must be bounded, without
+    I/O, locks or growing allocations. An exception ends the controller, not the process.
+
+    Example:
 
         class Wave(Controller[ParametersModel]):
             @classmethod
@@ -344,17 +362,17 @@ class Controller(ABC, Generic[P]):
     """
 
     Parameters: ClassVar[type[ParametersModel]] = ParametersModel
-    """The model of the controller's keys in the robot file (all but type, active, rate and fallback)."""
+    """Model of the controller's keys in the robot file (except type, active, rate and fallback)."""
     Commands: ClassVar[Mapping[str, type[CommandModel]]] = {}
-    """The typed commands it takes, by name."""
+    """Typed commands that it accepts, by kind."""
     Goals: ClassVar[frozenset[str]] = frozenset()
-    """Names of those commands that are goals: they come to `on_goal`, can be cancelled, and have a result."""
+    """Kinds of commands that are goals: passed to `on_goal`, cancellable, with an outcome."""
     Topics: ClassVar[Mapping[str, type]] = {}
-    """Its own topics, by name, with the type of their messages: a dataclass, see dxlrun.messages."""
+    """Types of the messages on its own topics, by topic: dataclasses, see dxlrun.messages."""
     publishes: ClassVar[tuple[str, ...]] = ()
-    """Topics of the log that are written in the cycles it marks: `/joint_states`."""
+    """Topics of the log that are written in the cycles that it marks: `/joint_states`."""
     keeps: ClassVar[bool] = False
-    """It calls `Context.keep`."""
+    """True if it calls `Context.keep`."""
 
     def __init__(self, parameters: P) -> None:
         self.parameters = parameters
@@ -362,35 +380,42 @@ class Controller(ABC, Generic[P]):
     @classmethod
     @abstractmethod
     def interfaces(cls, parameters: P, joints: tuple[str, ...]) -> Interfaces:
-        """Return the joints and command interfaces that it needs; `joints` are all joints of the robot.
+        """Return the joints and interfaces that the controller requires and offers.
 
-        Joints that the robot does not have, and joints named twice, are refused when the robot is compiled.
+        Unknown and repeated joints are refused when the robot is compiled.
+
+        Args:
+            parameters: Parameters of the controller.
+            joints: All joints of the robot.
         """
 
     @classmethod
     def mismatches(cls, parameters: P, robot: RobotModel) -> Iterable[Mismatch]:
-        """Return what of the robot does not fit these parameters, so that it is refused; a pure function.
+        """Return mismatches between the robot and these parameters. Any mismatch refuses the robot.
 
-        Before a run and outside of the loop's process, once joints and interfaces are known to be right.
+        This must be a pure function. It is called before a run, outside of the loop's process, after joints
+        and interfaces were checked.
         """
         return ()
 
     @classmethod
     def topics(cls, parameters: P) -> Mapping[str, type]:
-        """Return its own topics: `Topics`, unless the parameters decide which they are."""
+        """Return its own topics. Override it if they depend on the parameters; the default is `Topics`."""
         return cls.Topics
 
     @classmethod
     def motions(cls, parameters: P) -> Mapping[str, float]:
-        """Return the motions that its goal `play` plays, `{"motion": name}`, and how long each is, s."""
+        """Return the duration of each motion that its goal `play` can play, `{"motion": name}`; s by name."""
         return {}
 
     @classmethod
     def prepare(cls, kind: str, command: CommandModel, parameters: P) -> NDArray[np.float64]:
-        """Turn a typed command into one flat array, outside the loop's process; a pure function.
+        """Convert a typed command to a flat array, outside of the loop's process. Must be a pure function.
 
-        Without one of its own: the command's fields one after the other, each a number or one number a joint.
-        Raises ValueError with one sentence when the command does not fit the parameters.
+        The default concatenates the command's fields, each a number or one number a joint.
+
+        Raises:
+            ValueError: The command does not fit the parameters; with one sentence.
         """
         if kind not in cls.Commands:
             raise ValueError(f"{cls.__name__} takes no command {kind!r}")
@@ -403,57 +428,60 @@ class Controller(ABC, Generic[P]):
 
     @classmethod
     def speed_peaks(cls, kind: str, data: NDArray[np.float64], parameters: P) -> Iterable[SpeedPeak]:
-        """Return the highest speed of each joint on the way of a prepared command; a pure function.
+        """Return the highest speed of each joint on the path of a prepared command. Must be a pure function.
 
-        The runtime compares them with the limits of the joints: in a file before a run, in a command before
-        it is taken. Values that are fields of the command need no peak.
+        The runtime compares the speeds with the limits of the joints before a run (motion files) or before it
+        accepts a command. Speeds that are fields of the command need not be returned.
         """
         return ()
 
     def on_configure(self, context: Context) -> None:
-        """Prepare for real time; keep `context`."""
+        """Prepare for real time, and store `context`."""
         self.context = context
 
     def on_activate(self, time_ns: int) -> None:
-        """Take over the claimed joints; `context.states` and `context.goals` are fresh."""
+        """Take over the claimed joints. `context.states` and `context.goals` are current."""
 
     def on_restart(self, time_ns: int) -> None:
-        """Begin again where the joints are: one of them was given torque, or was moved in a pause.
+        """Start again from the measured positions, after a joint got torque or was moved in a pause.
 
-        Called in place of `on_activate`, after `on_deactivate` in the same cycle. `context.goals` of such a
-        joint are where it is, or 0; those of the others are what was last sent.
+        Called instead of `on_activate`, after `on_deactivate` in the same cycle. `context.goals` of these
+        joints is the measured position, or 0; goals of other joints are the last ones sent.
         """
         self.on_activate(time_ns)
 
     def on_command(self, kind: str, data: NDArray[np.float64], time_ns: int) -> None:
-        """Take a prepared command at the start of a cycle; `data` stays as it is until the run ends."""
+        """Execute a prepared command at the start of a cycle. `data` does not change during the run."""
 
     def on_goal(self, goal: Goal, data: NDArray[np.float64], time_ns: int) -> None:
-        """Take a prepared command that is a goal (`goal.kind`); the one before has ended as preempted."""
+        """Start a goal from a prepared command of `goal.kind`. The previous goal was preempted."""
 
     def on_cancel(self, goal: Goal, time_ns: int) -> None:
-        """Bring the joints to rest; call `goal.end` when they are, in this call or in a later update."""
+        """Bring the joints to rest, and call `goal.end` then, in this call or in a later update."""
         goal.end(Outcome.CANCELLED)
 
     def on_parameters(self, time_ns: int) -> None:
-        """Take changed live parameters: `self.parameters` has them already, all of one request together."""
+        """React to changed live parameters. `self.parameters` already has all values of the request."""
 
     def on_hold(self, time_ns: int) -> None:
-        """Hold the joints by commands until the next command: the stream of commands ended.
+        """Hold the joints until the next command, after the end of a command stream.
 
-        Called as `on_activate` is: `context.commands` is NaN, and a joint whose command stays NaN is held by
-        the gate. A controller without this method is updated, but its commands are withheld: positions stay,
-        velocities, efforts and PWM are 0. Before the next command it is activated again.
+        As in `on_activate`, `context.commands` is NaN, and the gate holds joints whose command stays NaN. A
+        controller without this method is updated, but its commands are withheld: positions stay unchanged;
+        velocities, efforts and PWM are 0. It is activated again before the next command.
         """
 
     @abstractmethod
     def update(self, time_ns: int, period_ns: int) -> None:
         """Write `context.commands` from `context.states`.
 
-        `time_ns`: time of this cycle since the loop started. `period_ns`: since this controller's last
-        update, the true one, capped. While a joint is lost (`states.has_lost`) positions and velocities are
-        held, and nothing is commanded to that joint; efforts and PWM of the others continue.
+        While a joint is lost (`states.has_lost`), positions and velocities are held and the lost joint gets
+        no commands. Efforts and PWM of the other joints continue.
+
+        Args:
+            time_ns: Time of this cycle since the loop started, without pauses.
+            period_ns: Measured time since this controller's last update, at most five nominal periods.
         """
 
     def on_deactivate(self, time_ns: int) -> None:
-        """Let go of the joints; not called for a controller that was ended by a fault."""
+        """Release the joints. Not called after a fault of the controller."""

@@ -1,4 +1,4 @@
-"""What the loop asks of a robot's hardware: servos on buses, joints that share servos, or a replayed log."""
+"""Hardware: interface of the loop to servos on buses, to joints that share servos, or to a replayed log."""
 
 from __future__ import annotations
 
@@ -12,78 +12,99 @@ from dxlrun.plan.loop_plan import ServoLimit
 
 
 class Hardware(Protocol):
-    """Joints that can be read and commanded; the arrays (States, goals) are given when it is built."""
+    """Hardware of a robot's joints. Its constructor gets the arrays for states and goals."""
 
     def start(self, engaging: Callable[[], None] = lambda: None) -> None:
-        """Run the start-up sequence to torque on; the first states and goals (= present) are then filled.
+        """Run the start-up sequence up to torque on, and fill states and goals with the measured positions.
 
-        `engaging` is called before any servo gets torque. Raises StartUpError (a servo is not as planned; all
-        found problems in one message, no torque left on) or PortError.
+        Args:
+            engaging: Called before torque is enabled on any servo.
+
+        Raises:
+            StartUpError: Servos differ from the plan; the message has all problems, and torque is off.
+            PortError: A port failed.
         """
 
     @property
     def servo_limits(self) -> Mapping[int, Sequence[ServoLimit]]:
-        """The registers that limit the goals of each joint's servos, by row; known once it has started.
+        """Registers that limit the goals of each joint's servos, by row; known after `start`.
 
-        Another object when they were read again, of a servo that returned.
+        It is a new object whenever registers were read again after a servo returned.
         """
         ...
 
     def read(self) -> None:
-        """Fill the state arrays; a lost packet makes its row invalid, it is never an exception."""
+        """Read the states. A lost packet makes its row invalid and does not raise."""
 
     def write(self) -> None:
-        """Send the goal arrays."""
+        """Send the goals."""
 
     def set_modes(self, modes: NDArray[np.uint8]) -> None:
-        """Bring joints into these modes (interfaces.Mode, shape (joints,), UNKNOWN = leave it as it is).
+        """Request mode changes, which are executed in idle time. Returns at once.
 
-        Returns at once: it is done in idle time. Meanwhile `states.mode` of such a joint is
-        UNKNOWN and it gets no goal; it becomes the new mode when that was read back, or what it was before
-        when the servo refused, which an event reports. A later call replaces what is still waiting.
+        During the change, `states.mode` of a joint is UNKNOWN and the joint gets no goals. It becomes the new
+        mode after that was read back. If the servo refuses, it becomes the old mode, and an event reports
+        that. A later call replaces requests that have not started.
+
+        Args:
+            modes: Mode of each joint (`dxlwire.modes.Mode`), shape (joints,); UNKNOWN: no change.
         """
 
     def set_register(self, row: int, item: str, value: int, done: Callable[[str, int | None], None]) -> None:
-        """Write a RAM item of a joint's servo in idle time and read it back.
+        """Write a RAM item of a joint's servo in idle time, and read it back. Returns at once.
 
-        `row`: of the joint; where several servos move one joint, the rows of single servos follow those.
-        Returns at once. `done` is called once, here or later: with an empty text when the servo has
-        it, else with what went wrong, and with what it had before. `item` and `value` (the integer on the
-        wire) were checked against the control table. A servo that is reset gets it again, with what the robot
-        file declares.
+        The value is written again if the servo is reset.
+
+        Args:
+            row: Row of the joint. Rows of single servos follow, for joints with several servos.
+            item: Control table item, already checked.
+            value: Raw value, already checked.
+            done: Called once, now or later, with the problem (empty on success) and the previous value.
         """
 
     def read_register(self, row: int, item: str, done: Callable[[str, int | None], None]) -> None:
-        """Read an item of a joint's servo in idle time; `done` takes what went wrong, and what it has."""
+        """Read a control table item of a joint's servo in idle time. Returns at once.
+
+        Args:
+            row: Row of the joint, as in `set_register`.
+            item: Control table item.
+            done: Called once with the problem (empty on success) and the value.
+        """
 
     def switch_torque(self, row: int, on: bool, done: Callable[[str], None]) -> None:
-        """Switch the torque of a joint off in the coming idle time, or on where it stands.
+        """Disable the torque of a joint in idle time, or enable it at the measured position. Returns at once.
 
-        Returns at once. `done` is called once, here or later, with what went wrong, or an empty text. A joint
-        that was switched off gets no goals and no torque until it is switched on; `states.torque` shows it
+        A disabled joint gets no goals and no torque until it is enabled. `states.torque` shows the change
         from the next read on.
+
+        Args:
+            row: Row of the joint.
+            on: True to enable torque.
+            done: Called once, now or later, with the problem; empty on success.
         """
 
     def follow_goals(self, rows: Sequence[int]) -> None:
-        """Let joints that were just given torque (`Torque.GIVEN`) get goals from this cycle's write on.
+        """Send goals to joints in the state `Torque.GIVEN`, from this cycle's write on.
 
-        The loop has set their goals to where the joints are; until this call they get none.
+        They do not get goals before this call. The loop has set their goals to the measured positions.
         """
 
     def reboot(self, row: int, done: Callable[[str], None]) -> None:
-        """Reboot a joint's servo in idle time; `done` is called when it is in order again, or is given up."""
+        """Reboot a joint's servo in idle time. `done` is called after it has recovered or after a timeout."""
 
     def limit_torque(self, fraction: float) -> None:
-        """Let no servo exert more than a fraction of its own limit; the next start-up takes it back."""
+        """Limit the torque of all servos to a fraction of their own limits. The next start-up reverts it."""
 
     def idle(self, until_ns: int, time_ns: int) -> None:
-        """Use the idle time before the next cycle; return before `until_ns` by a margin.
+        """Use the idle time before the next cycle.
 
-        `time_ns`: the controllers' time of that cycle.
+        Args:
+            until_ns: Deadline of the cycle; the call returns earlier by a margin.
+            time_ns: Controllers' time of that cycle.
         """
 
     def stop(self) -> tuple[str, ...]:
-        """Switch torque off on every servo, read it back, raise nothing; return a sentence per failure."""
+        """Disable torque on all servos and read it back; return a sentence for each failure. Never raises."""
 
     def release(self) -> None:
-        """Leave the robot holding with its torque on, in place of `stop`: nothing is sent any more."""
+        """Leave the robot holding with torque on, instead of `stop`. Nothing is sent after this call."""

@@ -1,16 +1,16 @@
-"""Every hook that a plug-in can implement: the whole extension surface of dxlrun in one file.
+"""Hooks: all hooks that a plug-in can implement, which are the extension points of dxlrun.
 
-A package offers a plug-in by an entry point of the group `dxlrun`:
+A package offers a plug-in with an entry point of the group `dxlrun`:
 
     [project.entry-points.dxlrun]
     my_robotics = "my_package.plugin"
 
 The named module implements hooks with `dxlrun.hookimpl`. Hooks are called when a robot is compiled and when
-the loop's process loads its controllers, never in the loop; `dxlrun_overrun` alone is gathered then, and
-called as a plain function by the loop. A class, and the function of a command, may be named by its place
-(`my_package.walk:WalkController`): it is imported when a robot file or a command line uses it.
+the loop's process loads its controllers. They are not called in the loop, except for `dxlrun_overrun`. A
+class, or the function of a command, may be given as an import path (`my_package.walk:WalkController`). It is
+imported when a robot file or a command line uses it.
 
-What moves the bodies of simulated servos is an entry point of the group `dxlrun.physics`.
+Physics of the bodies of simulated servos are entry points of the group `dxlrun.physics`.
 """
 
 from __future__ import annotations
@@ -29,9 +29,9 @@ if TYPE_CHECKING:  # the verbs of a package need neither numpy nor pydantic
     from dxlrun.features.feature import Feature
 
 CONTRACT_VERSION = 4
-"""Grows when what a controller may use grows, or one written for the version before would misbehave: 2 has
-references, reads, topics, goals and live parameters, 3 has motors and kept state, 4 has states of
-devices, sensors and controllers, commands of devices, servos, URDF and mismatches; controllers for 1 to 3
+"""Version of the contract. It increases with additions, and with changes that break existing controllers.
+Version 2 has references, reads, topics, goals and live parameters; 3 has motors and kept state; 4 has states
+of devices, sensors and controllers, commands of devices, servos, URDF and mismatches. Controllers for 1 to 3
 work."""
 
 
@@ -40,20 +40,20 @@ hookimpl = pluggy.HookimplMarker(GROUP)
 
 
 class Command(NamedTuple):
-    """A verb of the command line, as in `dxlrun VERB`."""
+    """A verb of the command line: `dxlrun VERB`."""
 
     name: str
     place: str
-    """`module:function`, or `module:app` of a cyclopts App; imported when the verb is used."""
+    """Import path: `module:function`, or `module:app` for a cyclopts App. Imported when the verb is used."""
     help: str = ""
-    """One line, for `dxlrun --help`; a verb that comes with dxlrun has it in its docstring alone."""
+    """One line for `dxlrun --help`; verbs of dxlrun itself have it in their docstrings."""
     group: str = "Other commands"
-    """The heading under which the help shows it: `Robots that run`, `Robot files`, `Servos`, `Logs`,
-    `Experiments`, `Developing`, or one of its own."""
+    """Heading in the help: `Robots that run`, `Robot files`, `Servos`, `Logs`, `Experiments`, `Developing`,
+    or another one."""
 
 
 class HookSpecs:
-    """The signatures; pluggy checks every implementation against them."""
+    """Signatures of the hooks, against which pluggy checks all implementations."""
 
     @hookspec
     def dxlrun_contract(self) -> int:  # type: ignore[empty-body]  # a signature, never called
@@ -61,42 +61,50 @@ class HookSpecs:
 
     @hookspec
     def dxlrun_controllers(self) -> Mapping[str, type[Controller[Any]] | str]:  # type: ignore[empty-body]  # a signature
-        """Return the controllers that the robot file can name by `type`."""
+        """Return controller classes or their import paths, by `type` in the robot file."""
 
     @hookspec
     def dxlrun_sensors(self) -> Mapping[str, type[Sensor[Any]] | str]:  # type: ignore[empty-body]  # a signature
-        """Return the sensors that the robot file can name by `type`."""
+        """Return sensor classes or their import paths, by `type` in the robot file."""
 
     @hookspec
     def dxlrun_commands(self) -> Sequence[Command]:  # type: ignore[empty-body]  # a signature
-        """Return the verbs that the package adds to the command line; import nothing heavy for it."""
+        """Return the verbs that the package adds to the command line. The hook must be fast to import."""
 
     @hookspec
     def dxlrun_features(self) -> Sequence[Feature]:  # type: ignore[empty-body]  # a signature
-        """Return the features of the package: sections that it adds to the robot file.
+        """Return the features of the package, which add sections to the robot file.
 
-        `Feature("lights", "my_package.lights")` has the files of the section `lights` in that package; see
-        `dxlrun.tooling.features`. Import nothing heavy for it: the stage that needs a file imports it.
+        `Feature("lights", "my_package.lights")` adds the section `lights`, whose files are in that package;
+        see `dxlrun.tooling.features`. The hook must be fast to import: each stage imports the file that it
+        needs.
         """
 
     @hookspec
     def dxlrun_servo_models(self) -> Sequence[str | Path]:  # type: ignore[empty-body]  # a signature
-        """Return control tables of servos and of other devices that dxlrun does not know.
+        """Return control tables of additional servos and devices.
 
-        Each is a TOML text, or the path of a file, in the form of dxlrun's own files
-        (dxlwire/control_table/tables/protocol1, tables/devices), without `extends`; one that describes a
-        device has `kind = "device"`. The robot file then names the model. A name or a model number that is
-        taken already is an error.
+        Each table is a TOML text or the path of a TOML file, in the format of dxlrun's own tables
+        (dxlwire/control_table/tables/protocol1, tables/devices), without `extends`. The table of a device has
+        `kind = "device"`. The robot file refers to a table by its model. Names and model numbers must be
+        unique.
         """
 
     @hookspec
     def dxlrun_overrun(
         self, cycle: int, scheduled_ns: int, actual_ns: int
     ) -> Literal["skip", "catch_up", "stop"] | None:
-        """Decide what becomes of `cycle`, which was due at `scheduled_ns` and can begin at `actual_ns` only.
+        """Return the overrun policy for a late cycle.
 
-        Times in ns of the loop's clock. `skip`, `catch_up` and `stop` mean what they do under
-        `loop: {overrun: ...}`; None leaves the decision to the next plug-in, and at last to the robot file.
-        Called in the loop, once for each late cycle: return at once, and allocate nothing that stays. What it
-        raises, or another answer, becomes an event, and it is not asked again in this run.
+        The loop calls it once for each late cycle, so it must return quickly and not allocate memory that
+        stays. After an exception or an invalid answer, an event is logged and the hook is not called again.
+
+        Args:
+            cycle: Number of the late cycle.
+            scheduled_ns: Its deadline, ns of the loop's clock.
+            actual_ns: Earliest time at which it can begin, ns of the loop's clock.
+
+        Returns:
+            A policy with the meaning of `loop: {overrun: ...}`, or None to leave the decision to the next
+            plug-in and finally to the robot file.
         """

@@ -1,4 +1,4 @@
-"""JointController: the shortest way to write a law of motion: annotated fields, and one method."""
+"""JointController: base class of short controllers with annotated fields and one method."""
 
 from __future__ import annotations
 
@@ -16,37 +16,42 @@ from dxlrun.errors import ControllerFault, counted
 from dxlwire.modes import CommandName
 
 LAWS: dict[str, CommandName] = {"positions": "position", "velocities": "velocity", "efforts": "effort"}
-"""Methods of a JointController, and the command interface that each of them claims."""
+"""Methods of a JointController with the command interface that each method claims."""
 _MOST_SHOWN = 60
 _TAKEN = ("start", "context", "parameters", "type", "active", "rate", "fallback", "into")
-"""Names beside the class's own that no field can have: of each controller, and of each entry of one."""
+"""Names that are not allowed for fields: attributes of controllers, and keys of their entries."""
 
 
 class _Reading(str):
-    """Default of a field that is read: the name of its interface."""
+    """Default of a field that `reading` created: the name of its interface."""
 
     __slots__ = ()
 
 
 def reading(interface: str = "") -> float:
-    """Return a field of a JointController that has the value of an interface: `reading("imu/orientation.y")`.
+    """Declare a field of a JointController with the value of an interface: `reading("imu/orientation.y")`.
 
-    A state of a sensor, a device, another controller or another joint, as `Interfaces.reads` names them; the
-    controller begins when it is first known. The robot file may name another one; it must where this names
-    none.
+    The interface is a state of a sensor, a device, another controller or another joint, named as in
+    `Interfaces.reads`. The controller begins as soon as the value is known.
+
+    Args:
+        interface: Default name. The robot file may have another one; if empty, it must have one.
     """
-    return cast("float", _Reading(interface))  # what the field has; the class makes a property of it
+    # `__init_subclass__` replaces this marker with a property that returns a float.
+    return cast("float", _Reading(interface))
 
 
 class JointParameters(ParametersModel):
-    """Keys that each JointController has."""
+    """Keys of all JointControllers."""
 
     joints: Annotated[tuple[str, ...], Field(min_length=1)]
-    """The joints that it moves, in the order of its arrays."""
+    """Joints that it moves, in the order of its arrays."""
 
 
 class JointController(Controller[JointParameters]):
-    """A controller of some joints, written as a formula. A whole one:
+    """Base class of controllers that are formulas for the commands of some joints.
+
+    Example:
 
         class Wave(JointController):
             amplitude: Angle = 0.3
@@ -55,19 +60,19 @@ class JointController(Controller[JointParameters]):
             def positions(self, time, dt):  # s since it began, s since the last call
                 return self.start + self.amplitude * np.sin(2 * np.pi * self.frequency * time)
 
-    Annotated fields are the keys of its entry in the robot file beside `joints`; numbers and bools of them
-    can be changed in a run. `positions` (rad, or m of a linear joint), `velocities` (rad/s; beside
-    `positions` the magnitude of the speed toward these) and `efforts` (unit of the state's effort) return one
-    number a joint: which of them it has decides what it claims. All else is of Controller.
+    Annotated fields are keys of its entry in the robot file, in addition to `joints`. Numbers and bools can
+    be changed in a run. The methods return one number a joint: `positions` (rad or m), `velocities` (rad/s or
+    m/s; together with `positions`, magnitudes of the speeds toward these) and `efforts` (unit of the state's
+    effort). The controller claims the interfaces whose methods it implements.
     """
 
     Parameters: ClassVar[type[JointParameters]] = JointParameters
     start: Floats
-    """Where its joints were when it began: what was last sent to them, else what was read."""
+    """Positions of its joints when it began: the last goals, or the measured positions without goals."""
     _readings: ClassVar[tuple[str, ...]] = ()
 
     def __init_subclass__(cls) -> None:
-        """Make parameters of the annotated fields. Raises TypeError for one that cannot be a parameter."""
+        """Convert the annotated fields to parameters. Raises TypeError for an invalid field."""
         super().__init_subclass__()
         fields: dict[str, Any] = dict(_fields(cls))
         read = [name for name in fields if isinstance(vars(cls).get(name), _Reading)]
@@ -79,17 +84,25 @@ class JointController(Controller[JointParameters]):
 
     @classmethod
     def interfaces(cls, parameters: JointParameters, joints: tuple[str, ...]) -> Interfaces:
-        """Claim on its joints what it has methods for."""
+        """Claim the interfaces of its joints whose methods are implemented."""
         command = tuple(LAWS[name] for name in laws_of(cls))
         return Interfaces(
             parameters.joints, command, reads=tuple(getattr(parameters, name) for name in cls._readings)
         )
 
     def begin(self) -> None:
-        """Make what is kept from cycle to cycle: called at each activation, as soon as it can begin."""
+        """Initialize state that is kept from cycle to cycle.
+
+        Called after each activation, as soon as all inputs are known.
+        """
 
     def positions(self, time: float, dt: float) -> Floats:
-        """Return a position for each joint, `time` s after it began and `dt` s after the last call."""
+        """Return a position for each joint, rad or m.
+
+        Args:
+            time: Time since the controller began, s.
+            dt: Time since the last call, s.
+        """
         raise NotImplementedError
 
     def velocities(self, time: float, dt: float) -> Floats:
@@ -102,7 +115,7 @@ class JointController(Controller[JointParameters]):
 
     @property
     def position(self) -> Floats:
-        """Measured positions of its joints, rad or m, to be read only; NaN before the first."""
+        """Measured positions of its joints, rad or m, read-only; NaN before the first read."""
         return self.context.states.position
 
     @property
@@ -116,7 +129,7 @@ class JointController(Controller[JointParameters]):
         return self.context.states.effort
 
     def on_configure(self, context: Context) -> None:
-        """Find what each method commands."""
+        """Bind each method to the array that it commands."""
         super().on_configure(context)
         laws, commands = type(self), context.commands
         self._began_ns, self._first = -1, True
@@ -125,25 +138,25 @@ class JointController(Controller[JointParameters]):
         )
 
     def on_activate(self, time_ns: int) -> None:
-        """Begin anew."""
+        """Reset the time, and begin if all inputs are known."""
         self._began_ns = -1
         self._begin(time_ns)
 
     def update(self, time_ns: int, period_ns: int) -> None:
-        """Command what its methods return. Raises ControllerFault where that is not one number a joint."""
+        """Command the values of its methods. Raises ControllerFault unless they are one number a joint."""
         if self._began_ns < 0 and not self._begin(time_ns):
-            return  # nothing is commanded yet: the joints hold
+            return  # without commands, the joints hold
         time, dt = (time_ns - self._began_ns) * 1e-9, period_ns * 1e-9
         for name, law, command in self._laws:
             values = _one_a_joint(law(self, time, dt), name, self.context.joints)
-            if self._first and np.isnan(values).any():  # NaN after a number is found for every controller
+            if self._first and np.isnan(values).any():  # later NaN is a fault for every controller
                 joint = self.context.joints[int(np.argmax(np.isnan(values)))]
                 raise ControllerFault(f"returned NaN for {joint} from {name}; return a number")
             command[:] = values
         self._first = False
 
     def _begin(self, time_ns: int) -> bool:
-        """Begin when its joints and all that it reads are known; return whether they are."""
+        """Begin if the positions of its joints and all readings are known; return whether it has begun."""
         sent, measured = self.context.goals.position, self.context.states.position
         self.start = np.where(np.isnan(sent), measured, sent)
         if np.isnan(self.start).any() or np.isnan(self.context.reads).any():
@@ -154,7 +167,7 @@ class JointController(Controller[JointParameters]):
 
 
 def laws_of(controller: type[JointController]) -> tuple[str, ...]:
-    """Return which of the methods in `LAWS` a class has."""
+    """Return the methods of `LAWS` that a class implements."""
     return tuple(name for name in LAWS if getattr(controller, name) is not getattr(JointController, name))
 
 
@@ -171,7 +184,7 @@ def _one_a_joint(returned: object, name: str, joints: tuple[str, ...]) -> Floats
 
 
 def _shown(name: str, place: int | None) -> property:
-    """Return the property of a field: a parameter, or the value of `Context.reads` in a place."""
+    """Return the property of a field: a parameter, or an element of `Context.reads`."""
 
     def value(self: JointController) -> object:
         return getattr(self.parameters, name) if place is None else float(self.context.reads[place])
@@ -183,7 +196,7 @@ def _shown(name: str, place: int | None) -> property:
 
 
 def _fields(cls: type[JointController]) -> Iterator[tuple[str, tuple[Any, Any]]]:
-    """Yield the fields of a class with their types and defaults. Raises TypeError, with one sentence."""
+    """Yield the fields of a class with types and defaults. Raises TypeError with one sentence."""
     own = vars(cls)
     annotated = own.get("__annotations__", {})
     for name, value in own.items():

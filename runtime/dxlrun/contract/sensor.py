@@ -1,4 +1,4 @@
-"""Sensor: the contract between dxlrun and the author of a sensor's driver."""
+"""Sensor: base class of sensor drivers and the types of its interface."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ P = TypeVar("P", bound=ParametersModel)
 
 
 INERTIAL = ("angular_velocity", "linear_acceleration")
-"""Quantities of an IMU. Their noise is about one unit of the last digit or more: of an MPU-6050 4 and 8."""
+"""Quantities of an IMU. Their noise is at least about one unit of resolution: 4 and 8 for an MPU-6050."""
 
 
 UNITS: Mapping[str, str] = MappingProxyType(
@@ -37,25 +37,28 @@ geometry_msgs: Wrench)."""
 
 
 class SensorContext(msgspec.Struct, frozen=True):
-    """What a sensor gets when it is opened."""
+    """Data and functions that a sensor gets in `open`."""
 
     name: str
     period_ns: int
-    """Between two samples, as the robot file has it by `rate`."""
+    """Time between two samples, from `rate` in the robot file."""
     now_ns: Callable[[], int]
-    """The run's clock: CLOCK_MONOTONIC, or virtual time."""
+    """Clock of the run: CLOCK_MONOTONIC, or virtual time."""
     say: Callable[[str], None]
-    """Leave a sentence in the log (event SENSOR); for rare things: of several in 0.1 s the last is kept."""
+    """Log a sentence as an event (SENSOR). Of several sentences within 0.1 s, only the last one is logged."""
     body: Body | None = None
-    """The simulated body at the time of the sample; None: the sensor names no `links`."""
+    """Simulated body at the time of the sample; None: the sensor has no `links`."""
 
 
 class Sensor(ABC, Generic[P]):
-    """Something that measures beside the buses, in a process of its own: what it does delays no cycle.
+    """Base class of sensors that are not on a servo bus.
 
-    Life: `open` -> `read` ... -> `close`. Whatever `open` or `read` raise becomes an event; the sensor is
-    closed, and opened again after a second. Only the first `open` of a run must not fail: the run does not
-    start then. A whole one:
+    A sensor has its own process, so it cannot delay a cycle.
+
+    Life cycle: `open` -> `read` ... -> `close`. An exception in `open` or `read` is reported as an event. The
+    sensor is then closed, and opened again after a second. If the first `open` fails, the run does not start.
+
+    Example:
 
         class Thermometer(Sensor[ParametersModel]):
             @classmethod
@@ -68,12 +71,12 @@ class Sensor(ABC, Generic[P]):
     """
 
     Parameters: ClassVar[type[ParametersModel]] = ParametersModel
-    """The model of the sensor's keys in the robot file (all but type, rate, timeout and on_lost)."""
+    """Model of the sensor's keys in the robot file (except type, rate, timeout and on_lost)."""
     waits: ClassVar[bool] = False
-    """`read` waits for the device's next sample; False: it is called at the sensor's rate."""
+    """True if `read` waits for the device's next sample; False: `read` is called at the sensor's rate."""
     simulated: ClassVar[bool] = False
-    """It can be stepped on virtual time: `read` never waits, and depends on nothing but the clock, the
-    parameters and the body."""
+    """True if it works on virtual time: `read` never waits, and depends only on the clock, the parameters and
+    the body."""
 
     def __init__(self, parameters: P) -> None:
         self.parameters = parameters
@@ -81,44 +84,50 @@ class Sensor(ABC, Generic[P]):
     @classmethod
     @abstractmethod
     def states(cls, parameters: P) -> tuple[str, ...]:
-        """Return the names of its states, in the order of a sample: `angular_velocity.x`; SI units."""
+        """Return the names of its states in the order of a sample: `angular_velocity.x`. Units are SI."""
 
     @classmethod
     def units(cls, parameters: P) -> Mapping[str, str]:
-        """Return the units of states that have one, by state: `{"illuminance": "lx"}`.
+        """Return the units of states, by state: `{"illuminance": "lx"}`.
 
-        Unless overridden: those of the quantities in messages of ROS 2, such as rad/s of
-        `angular_velocity.x`.
+        The default has the units of quantities in ROS 2 messages, such as rad/s for `angular_velocity.x`.
         """
         known = {state: UNITS.get(state.partition(".")[0], "") for state in cls.states(parameters)}
         return {state: unit for state, unit in known.items() if unit}
 
     @classmethod
     def links(cls, parameters: P) -> tuple[str, ...]:
-        """Return the links of the robot's URDF whose motion it senses: it is then a simulated sensor, and
-        needs simulated servos."""
+        """Return the links of the robot's URDF whose motion it senses.
+
+        A sensor with links is a simulated one, which requires simulated servos.
+        """
         return ()
 
     @classmethod
     def noisy(cls, parameters: P) -> tuple[str, ...]:
-        """Return the states whose noise is above their resolution: a sensor is stuck while all of them stay.
+        """Return the states whose noise exceeds their resolution.
 
-        Unless overridden: the angular velocity and the linear acceleration of an IMU that measures both.
+        A sensor counts as stuck if all of them stay constant. The default has angular velocity and linear
+        acceleration of an IMU that measures both.
         """
         noisy = [state for state in cls.states(parameters) if state.partition(".")[0] in INERTIAL]
         both = {state.partition(".")[0] for state in noisy} == {*INERTIAL}
         return tuple(noisy) if both else ()
 
     def open(self, context: SensorContext) -> None:
-        """Open the device; keep `context`."""
+        """Open the device, and store `context`."""
         self.context = context
 
     @abstractmethod
     def read(self, values: Floats) -> int | None:
-        """Fill `values`, shape (states,), all NaN before; return when they were true, ns of the run's clock.
+        """Read a sample. A sample with values that are not finite is reported and ignored.
 
-        None: there is no sample. One with a value that is not finite is reported and not used.
+        Args:
+            values: Receives the states, shape (states,); NaN before the call.
+
+        Returns:
+            Time of the measurement, ns of the run's clock; None without a sample.
         """
 
     def close(self) -> None:
-        """Close the device, also one whose `open` failed half-way."""
+        """Close the device, also after an incomplete `open`."""
