@@ -1,4 +1,4 @@
-"""Build hooks: the version of the tree, and the ROS 2 message packages without wheels, from interfaces/."""
+"""Build hooks: version of the source tree, and ROS 2 message packages that have no wheels."""
 
 from __future__ import annotations
 
@@ -16,19 +16,19 @@ from hatchling.builders.hooks.plugin.interface import BuildHookInterface
 from hatchling.metadata.plugin.interface import MetadataHookInterface
 
 USED = re.compile(r"__rosidl_(generator|typesupport_\w*c\b)|librosidl|librcutils|librcpputils|fastcdr")
-"""Libraries of other packages."""
+"""Names of the libraries of other packages to link against"""
 SUPPORTS = ("rosidl_typesupport_fastrtps_c", "rosidl_typesupport_introspection_c")
-"""What middleware asks a type for; each is looked for in a library of its own."""
+"""Type supports that the middleware loads. It searches each of them in a separate library."""
 NEEDED = "the compilers gcc and g++ and Python's headers (sudo apt install build-essential python3-dev)"
 
 
 class Interfaces(BuildHookInterface[Any]):
-    """Adds a Python package for each directory of interfaces/, and what ROS's own tools find it by."""
+    """Build hook that adds a Python package for each directory of interfaces/, and the ROS index."""
 
     PLUGIN_NAME = "custom"
 
     def initialize(self, version: str, build_data: dict[str, Any]) -> None:
-        """Generate and compile what is older than its definitions."""
+        """Generate and compile the packages that are older than their definitions."""
         if self.target_name != "wheel":
             return
         root = Path(self.root)
@@ -47,20 +47,21 @@ class Interfaces(BuildHookInterface[Any]):
                 _describe(source, share)
             included[str(package)] = source.name
         build_data["shared_data"][str(made / "share")] = "share"
-        for path in (made / "lib").iterdir():  # one by one: of a folder what .gitignore names is left out
+        # hatchling omits files that .gitignore names from a directory, but not from a list of files.
+        for path in (made / "lib").iterdir():
             build_data["shared_data"][str(path)] = f"lib/{path.name}"
 
 
 class TreeVersion(MetadataHookInterface):
-    """Gives the package the version of the tree that it is built from, and pins dxlrun to it.
+    """Metadata hook that sets the version to that of the source tree, and pins dxlrun to the same version.
 
-    The version has one home, the pyproject.toml of dxlrun. An sdist has both in its PKG-INFO.
+    The version is only defined in the pyproject.toml of dxlrun. An sdist has version and pin in its PKG-INFO.
     """
 
     PLUGIN_NAME = "custom"
 
     def update(self, metadata: dict[str, Any]) -> None:
-        """Set version and dependencies of a build from the tree."""
+        """Set version and dependencies of a build from the source tree."""
         if "version" in metadata:
             return
         core = tomllib.loads((Path(self.root).parents[1] / "pyproject.toml").read_text("utf-8"))
@@ -69,8 +70,14 @@ class TreeVersion(MetadataHookInterface):
 
 
 def make(source: Path, place: Path, library: Path, libraries: Path) -> None:
-    """Generate the sources of a message package in `place`, compile them, and leave them where they are
-    installed from: the module `library` with the package around it, and what it needs in `libraries`."""
+    """Generate and compile the sources of a message package.
+
+    Args:
+        source: Directory of the definitions.
+        place: Directory for the generated sources.
+        library: Extension module to build. The Python package is written next to it.
+        libraries: Directory for the shared libraries that the module needs.
+    """
     import rosidl_cli
     from rosidl_cli.command.hash.api import generate_type_hashes
     from rosidl_cli.command.translate.api import translate
@@ -91,7 +98,7 @@ def make(source: Path, place: Path, library: Path, libraries: Path) -> None:
     ]
     idl = [str(path) for path in written]
     hashes = [*map(Path, generate_type_hashes(interface_files=idl, output_path=out, **form))]
-    for folder in {path.parent.name for path in written}:  # types of two folders may have the same name
+    for folder in {path.parent.name for path in written}:  # types of two folders can have the same name
         own = [[str(path) for path in found if path.parent.name == folder] for found in (written, hashes)]
         GenerateC("c").generate(name, own[0], includes, out, own[1])
     GeneratePython("py", typesupport_implementations=["rosidl_typesupport_c"]).generate(
@@ -109,7 +116,7 @@ def make(source: Path, place: Path, library: Path, libraries: Path) -> None:
 
 
 def _compile(name: str, place: Path, prefix: Path, library: Path, libraries: Path) -> None:
-    """Compile the sources of a package; link what is of Python, and what is not."""
+    """Compile the sources of a package, and link its C libraries and its Python module."""
     include = sysconfig.get_paths()["include"]
     if not (shutil.which("gcc") and shutil.which("g++") and (Path(include) / "Python.h").exists()):
         raise RuntimeError(f"{name} has no wheel and is built here; that needs {NEEDED}")
@@ -118,7 +125,8 @@ def _compile(name: str, place: Path, prefix: Path, library: Path, libraries: Pat
     headers = prefix / "include"
     folders = [place, place / "described", Path(include), Path(np.get_include()), headers, *headers.iterdir()]
     flags = ["-O1", "-fPIC", "-w", f'-DROS_PACKAGE_NAME="{name}"', *(f"-I{folder}" for folder in folders)]
-    whole = place / "whole.cpp"  # a fourth of the time of one by one: each reads the same long headers
+    # One file takes a quarter of the time, because all sources include the same long headers.
+    whole = place / "whole.cpp"
     whole.write_text("".join(f'#include "{path}"\n' for path in sorted(place.rglob("*.cpp"))))
 
     def compiled(source: Path) -> str:
@@ -147,7 +155,7 @@ def _run(*command: str) -> None:
 
 
 def _describe(source: Path, share: Path) -> None:
-    """Leave the definitions, and the index by which tools such as `ros2 interface` find them."""
+    """Copy the definitions, and write the index in which tools such as `ros2 interface` find them."""
     names = [f"{path.parent.name}/{path.name}" for path in sorted(source.glob("*/*"))]
     for name in names:
         copy = share / source.name / name

@@ -1,4 +1,4 @@
-"""Teleoperation: drive a running robot by keyboard or gamepad while a key or a trigger is held.
+"""Teleoperation: drive a running robot by keyboard or gamepad while a key or a button is held.
 
-What the robot makes of the commands is decided by its controllers and its gate.
+The controllers and the gate of the robot check and limit the commands.
 """

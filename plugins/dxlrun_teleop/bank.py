@@ -1,4 +1,4 @@
-"""Banks: which axis moves what, by the controllers that are active in a running robot."""
+"""Banks: assignment of axes to joints or base velocities, from the active controllers of a running robot."""
 
 from __future__ import annotations
 
@@ -14,23 +14,26 @@ from dxlrun import InputError, RemoteRobot
 from dxlrun.tooling.files import suggestion
 
 Row = Mapping[str, Any]
-"""A part of `RemoteRobot.info`."""
+"""Part of `RemoteRobot.info`"""
 USUAL_SPEED = {"rad": 0.5, "m": 0.05}
-"""Of a joint at the end of its axis at factor 1: rad/s and m/s."""
+"""Speed of a joint at full deflection and factor 1, rad/s and m/s"""
 USUAL_TWIST = {"linear": 0.2, "angular": 1.0}
-"""Of a base likewise: m/s and rad/s, or what it stops from in BRAKING_S."""
+"""Speed of a base at full deflection and factor 1, m/s and rad/s. It is lower if the base needs longer than
+BRAKING_S to stop."""
 BRAKING_S = 0.2
+"""Longest time in which a base stops from full deflection, s"""
 HORIZON_S = 0.1
-"""A joint of a trajectory controller is driven by trajectories of this length: each ends by itself."""
+"""Duration of the trajectories that drive a joint of a trajectory controller, s. Each one ends at rest, so
+the joint stops without a further command."""
 _ROOM = 1.5
-"""A trajectory that makes up for what it is behind is faster than its axis by less than this factor."""
+"""Reserve of the speed limit, because a trajectory that catches up is faster than its axis"""
 _LEADING = 1.25
-"""So much faster than its goal moves a servo may be, to stay with it."""
+"""Ratio of the commanded speed of a servo to the speed of its goal, so that the servo keeps up"""
 
 
 @unique
 class Form(Enum):
-    """What a command is made of, and whether an axis is the speed of its numbers, or these themselves."""
+    """Form of a command: its fields, and whether axes are integrated to its numbers."""
 
     POSITIONS = frozenset({"positions"}), True
     POSVEL = frozenset({"positions", "velocities"}), True
@@ -42,39 +45,40 @@ class Form(Enum):
         self.fields, self.integrates = fields, integrates
 
     def fits(self, fields: Collection[str]) -> bool:
-        """Return whether a command with these fields has this form; a trajectory may have others."""
+        """Return True if the fields are those of this form. A trajectory may have additional fields."""
         return self.fields <= set(fields) if self is Form.TRAJECTORY else self.fields == set(fields)
 
 
 class Slot(msgspec.Struct, frozen=True):
-    """A number of a command: the joint, or the field of a twist, that it is for."""
+    """Number of a command"""
 
     name: str
+    """Joint, or field of a twist"""
     unit: str
-    """`rad` or `m`; speeds are these a second"""
+    """`rad` or `m`; speeds are in this unit per second"""
     speed: float
-    """At the end of an axis, at factor 1"""
+    """Speed at full deflection and factor 1"""
     most: float
-    """No factor makes it faster."""
+    """Speed limit, whatever the factor"""
     lower: float = -math.inf
     upper: float = math.inf
 
 
 class Bank(msgspec.Struct, frozen=True):
-    """A controller, and the numbers of its command that axes move together."""
+    """Controller, and the numbers of its command that the axes drive"""
 
     controller: str
     kind: str
     form: Form
     slots: tuple[Slot, ...]
-    """All numbers of the command, in its order."""
+    """Numbers of the command, in the order of the command"""
     driven: tuple[int, ...]
-    """The slot that each axis moves."""
+    """Index of the slot that each axis drives"""
     into: tuple[str, ...] = ()
-    """Controllers whose references it commands, instead of servos."""
+    """Controllers whose references it commands; empty if it commands servos"""
 
     def command(self, values: Sequence[float], factor: float) -> dict[str, object]:
-        """Return the command with these numbers, SI units."""
+        """Return the command with these values (SI units)."""
         match self.form:
             case Form.TWIST:
                 return {slot.name: value for slot, value in zip(self.slots, values, strict=True)}
@@ -92,9 +96,16 @@ class Bank(msgspec.Struct, frozen=True):
 
 
 def banks_of(robot: RemoteRobot, targets: Sequence[str], axes: int) -> list[Bank]:
-    """Return what can be driven by so many axes, in the order of `targets`: controllers, groups, joints.
+    """Return the banks that can be driven, in the order of the targets.
 
-    Without targets it is all that active controllers take commands for. Raises InputError for another one.
+    Args:
+        robot: Running robot.
+        targets: Names of controllers, groups or joints; empty for everything that active controllers accept
+            commands for.
+        axes: Number of axes per bank.
+
+    Raises:
+        InputError: No active controller accepts commands for a target.
     """
     info = cast("Row", robot.info())
     active = [one for one in info["controllers"] if one["active"]]
@@ -123,12 +134,12 @@ def banks_of(robot: RemoteRobot, targets: Sequence[str], axes: int) -> list[Bank
 
 
 def _follows(one: Row, info: Row) -> bool:
-    """Return whether a controller moves its joints by what it reads of other ones."""
+    """Return True if a controller moves its joints according to other joints, such as a leader_follower."""
     return any(read.split("/")[0] in info["units"] for read in one["reads"])
 
 
 def _bank(robot: RemoteRobot, one: Row, info: Row) -> Bank | None:
-    """Return a controller with all that it commands; None where that is not driven."""
+    """Return the bank of a controller with all numbers of its command, or None without a known form."""
     for kind, schema in one["takes"].items():
         for form in (form for form in Form if form.fits(schema.get("properties", ()))):
             twist = form is Form.TWIST
@@ -145,7 +156,7 @@ def _joint(name: str, info: Row, form: Form) -> Slot:
 
 
 def _twist(robot: RemoteRobot, one: Row) -> list[Slot]:
-    """Return drive and turn of a base, at factor 1 as fast as its limits let it stop from in BRAKING_S."""
+    """Return the slots of a base, with speeds from which its limits allow it to stop in BRAKING_S."""
     given, slots = robot.parameters(one["name"]), []
     for field, unit in (("linear", "m"), ("angular", "rad")):
         most, rise, sink, jerk = (
@@ -153,7 +164,7 @@ def _twist(robot: RemoteRobot, one: Row) -> list[Slot]:
             for limit in ("velocity", "acceleration", "deceleration", "jerk")
         )
         braking = rise if math.isinf(sink) else sink
-        # by a jerk limit the deceleration grows and shrinks for so long each
+        # Time in which the deceleration builds up, and again in which it ends, under the jerk limit.
         growth_s = 0.0 if math.isinf(jerk) else min(BRAKING_S / 2, braking / jerk)
         stops_from = (min(braking, jerk * growth_s) if growth_s else braking) * (BRAKING_S - growth_s)
         slots.append(Slot(field, unit, min(USUAL_TWIST[field], most, stops_from), most))

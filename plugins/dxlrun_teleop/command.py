@@ -12,7 +12,7 @@ from dxlrun import InputError
 from dxlrun.tooling.verbs import DebugFlag, Flag, RobotName, connect_robot, terminated_as_interrupted
 
 Targets = Annotated[str, Parameter(name="target", show_default=False)]
-"""Names of controllers, groups or joints."""
+"""Names of controllers, groups or joints"""
 
 
 def teleop(
@@ -49,7 +49,7 @@ def teleop(
     from dxlrun_teleop.source import Press, Source
 
     lowest, highest = FACTORS
-    if not lowest <= speed <= highest:  # false for nan too
+    if not lowest <= speed <= highest:  # also rejects NaN
         raise InputError(f"--speed {speed:g} is no factor from {lowest:g} to {highest:g}")
     with connect_robot(robot, "teleop") as running:
         source: Source = chosen(device) if gamepad or device else TerminalKeyboard()

@@ -1,7 +1,7 @@
-"""Gamepads and keyboards as Linux' input devices, which report releases, too (extra `teleop`: evdev).
+"""Gamepads and keyboards as Linux input devices, which also report releases (extra `teleop`: evdev).
 
-Codes are those of linux/input-event-codes.h, a gamepad's after the kernel's Documentation/input/gamepad.rst.
-A device is asked for its state, so that no event can be missed.
+Codes are those of linux/input-event-codes.h. The layout of a gamepad is that of the kernel's
+Documentation/input/gamepad.rst. The state of a device is polled, so that a lost event has no effect.
 """
 
 from __future__ import annotations
@@ -21,39 +21,41 @@ if TYPE_CHECKING:
 
 EV_KEY, EV_ABS = 1, 3
 SHOULDERS = frozenset((0x136, 0x137))
-"""BTN_TL and BTN_TR: the dead-man's switch of a gamepad."""
+"""BTN_TL and BTN_TR, the dead-man's switch of a gamepad"""
 BUTTONS: Mapping[int, Press] = {0x130: Press.NEXT, 0x13B: Press.QUIT}
 """BTN_SOUTH, BTN_START"""
 _STICKS = "left stick", "right stick", "right stick", "pad"
-STICKS: Mapping[int, str] = {  # ABS_Y, _X, _RY, _RX, of some _RZ, _Z instead, _HAT0Y, _HAT0X
+STICKS: Mapping[int, str] = {  # ABS_Y, _X, _RY, _RX (on some gamepads _RZ, _Z), _HAT0Y, _HAT0X
     code: f"{_STICKS[at // 2]} {('up/down', 'left/right')[at % 2]}"
     for at, code in enumerate((1, 0, 4, 3, 5, 2, 17, 16))
 }
 DEAD_ZONE = 0.1
-"""A stick that is so near to its middle is released; what is left is the whole axis."""
+"""Deflection below which a stick counts as released. The rest of its range is scaled to the whole axis."""
 KEYS: Mapping[int, Press] = {15: Press.NEXT, 13: Press.FASTER, 12: Press.SLOWER, 1: Press.QUIT}
 """KEY_TAB, KEY_EQUAL, KEY_MINUS, KEY_ESC"""
 SIDES: Mapping[int, tuple[int, float]] = {
     first + axis: (axis, side) for first, side in ((16, 1.0), (30, -1.0)) for axis in range(8)
 } | {103: (0, 1.0), 108: (0, -1.0), 105: (1, 1.0), 106: (1, -1.0)}
-"""From KEY_Q and from KEY_A on, by their places whatever is printed on them; up, down, left, right"""
+"""Axis and direction of the keys from KEY_Q and KEY_A on (by position, whatever the layout), and of the
+arrows"""
 
 
 class Gamepad:
-    """Sticks and the pad of directions; a shoulder button that is held is the dead-man's switch."""
+    """Gamepad with sticks and a directional pad. A shoulder button is the dead-man's switch."""
 
     help = "shoulder button held: moves, released: holds; A: next controller; Start: end"
     pressing = BUTTONS
 
     def __init__(self, device: InputDevice[str]) -> None:
-        self._device, self._held = device, frozenset({*BUTTONS, *KEYS})  # what is held at first is no press
+        # A button that is held at the start does not count as pressed.
+        self._device, self._held = device, frozenset({*BUTTONS, *KEYS})
         codes = {*device.capabilities(absinfo=False).get(EV_ABS, ())}
         codes -= {5, 2} if 3 in codes else {code for code in codes & {5, 2} if self._axis(code)}  # triggers
         self._codes = tuple(code for code in STICKS if code in codes)
         self.axes = tuple(STICKS[code] for code in self._codes)
 
     def read(self, now: float) -> Given:
-        """Return what is held at this moment. Raises DxlrunError when the device is gone."""
+        """Return the present state of axes and buttons. Raises DxlrunError if the device is unplugged."""
         try:
             held = frozenset(self._device.active_keys())
             axes, enabled = self._driven(held)
@@ -67,7 +69,7 @@ class Gamepad:
         return tuple(map(self._axis, self._codes)), not SHOULDERS.isdisjoint(held)
 
     def _axis(self, code: int) -> float:
-        """Return where a stick is: up and left are positive, as for a base that drives and turns."""
+        """Return the deflection of a stick, -1..1. Up and left are positive, as in the twist of a base."""
         value, lowest, highest = self._device.absinfo(code)[:3]
         way: float = (lowest + highest - 2 * value) / ((highest - lowest) or 1)
         beyond = min(max(0.0, abs(way) - DEAD_ZONE) / (1.0 - DEAD_ZONE), 1.0)
@@ -79,9 +81,9 @@ class Gamepad:
 
 
 class KeyboardDevice(Gamepad):
-    """A keyboard of its own, whose keys no other program has meanwhile; each is its own dead-man's switch.
+    """Keyboard that is grabbed for exclusive use. Each key is its own dead-man's switch.
 
-    It is taken when all its keys are up: else another program would miss that one of them is released.
+    The keyboard is grabbed once all keys are released. Otherwise another program would miss a release.
     """
 
     help = "held: moves, released: holds; Tab: next controller; = -: speed; Esc: end"
@@ -102,7 +104,7 @@ class KeyboardDevice(Gamepad):
 
 
 def source_of(device: InputDevice[str]) -> Gamepad | None:
-    """Return the source that a device can be: a gamepad, a keyboard, or none."""
+    """Return a device as a gamepad or a keyboard, or None if it is neither."""
     codes = {kind: set(found) for kind, found in device.capabilities(absinfo=False).items()}
     keys = codes.get(EV_KEY, set())
     if codes.get(EV_ABS, set()) >= {0, 1} and not SHOULDERS.isdisjoint(keys):
@@ -111,9 +113,10 @@ def source_of(device: InputDevice[str]) -> Gamepad | None:
 
 
 def chosen(path: str | None) -> Gamepad:
-    """Return the device of a path, without one the only gamepad, and close all others.
+    """Return the device with a path, or the only gamepad without a path. All other devices are closed.
 
-    Raises InputError, with those that there are.
+    Raises:
+        InputError: The device was not found, or there are several gamepads. The message lists them.
     """
     try:
         from evdev import InputDevice
@@ -122,7 +125,7 @@ def chosen(path: str | None) -> Gamepad:
     devices: list[InputDevice[str]] = []
     paths = sorted(glob("/dev/input/event*"))
     for each in paths:
-        with suppress(OSError):  # most of them only for other users
+        with suppress(OSError):  # devices for which this user lacks the permission
             devices.append(InputDevice(each))
     able = {device.path: source for device in devices if (source := source_of(device)) is not None}
     pads = [each for each, source in able.items() if type(source) is Gamepad]

@@ -1,6 +1,7 @@
-"""Drive: what a hand gives becomes set-points of a stream, or short trajectories; released, the robot holds.
+"""Drive: convert the input of a device to setpoints of a stream, or to short trajectories.
 
-It also holds when this program is gone: a set-point counts for LEASE_S, a trajectory ends after HORIZON_S.
+The robot holds when the switch is released, and also when this program has exited: a setpoint expires after
+LEASE_S, and a trajectory ends after HORIZON_S.
 """
 
 from __future__ import annotations
@@ -14,16 +15,17 @@ from dxlrun_teleop.bank import HORIZON_S, Bank, Form
 from dxlrun_teleop.source import Given, Press
 
 PERIOD_S = 0.02
+"""Period of the setpoints, s"""
 LEASE_S = 0.15
-"""Seven set-points; with some periods of the loop behind it joints hold within 250 ms."""
+"""Lease of a setpoint, s: seven periods. With some periods of the loop, joints hold within 250 ms."""
 FACTORS = 0.1, 10.0
 _FASTER = {Press.FASTER: 1.25, Press.SLOWER: 0.8}
 
 
 class Drive:
-    """A running robot that is driven; `step` is called each PERIOD_S.
+    """Teleoperation of a running robot. Call `step` every PERIOD_S.
 
-    After the start and with another bank nothing moves before the dead-man's switch was seen released.
+    After the start and after a change of the bank, nothing moves until the dead-man's switch was released.
     """
 
     def __init__(self, robot: RemoteRobot, banks: Sequence[Bank], factor: float) -> None:
@@ -34,24 +36,29 @@ class Drive:
 
     @property
     def bank(self) -> Bank:
-        """What is driven now."""
+        """Active bank"""
         return self._banks[self._place]
 
     @property
     def values(self) -> Sequence[float]:
-        """What is commanded now, a number a slot; empty: nothing, the robot holds."""
+        """Commanded value of each slot; empty while the robot holds"""
         return () if self._moving is None else self._moving.values
 
     def step(self, given: Given, now: float) -> None:
-        """Do what is given at `now`, s of a monotonic clock.
+        """Apply the input of a device.
 
-        Raises DxlrunError when the robot is gone, or refuses it: a controller is not active any more.
+        Args:
+            given: Input.
+            now: Time of a monotonic clock, s.
+
+        Raises:
+            DxlrunError: The run has ended, or refuses a command because the controller is no longer active.
         """
         for press in given.presses:
             low, high = FACTORS
             self.factor = min(max(self.factor * _FASTER.get(press, 1.0), low), high)
         turned = Press.NEXT in given.presses
-        stalled = self._moving is not None and now - self._moving.moved > LEASE_S  # what it did then is over
+        stalled = self._moving is not None and now - self._moving.moved > LEASE_S  # its lease has expired
         if turned or stalled or not given.enabled:
             self.close()
         self._armed = not turned and (self._armed or not given.enabled)
@@ -61,14 +68,14 @@ class Drive:
             self._moving.move(given.axes, self.factor, now)
 
     def close(self) -> None:
-        """End a stream in order, with a standstill; a trajectory ends by itself."""
+        """End a stream with a command to stand still. A trajectory ends without one."""
         moving, self._moving = self._moving, None
         if moving is not None:
             moving.settle(self.factor)
 
 
 class _Moving:
-    """A bank while the switch is held: its numbers begin where the robot is, at a standstill."""
+    """Motion of a bank while the switch is held, starting from the present goals at rest"""
 
     def __init__(self, robot: RemoteRobot, bank: Bank, now: float) -> None:
         self._robot, self._bank = robot, bank
@@ -79,14 +86,14 @@ class _Moving:
         self._stream: Stream | None = robot.stream(bank.controller, bank.kind, LEASE_S) if as_stream else None
 
     def move(self, axes: Sequence[float], factor: float, now: float) -> None:
-        """Move by the axes since the last time, and send it."""
+        """Integrate the axes since the last call, and send the command."""
         bank, elapsed, self.moved = self._bank, now - self.moved, now
         for axis, index in zip(axes, bank.driven, strict=False):  # a source may have more axes
             slot = bank.slots[index]
             speed = axis * min(slot.speed * factor, slot.most)
             if not bank.form.integrates:
                 self.values[index] = speed
-            elif speed:  # a joint beyond its limits stays where it is until it is driven
+            elif speed:  # a joint beyond its limits is only clamped once it is driven
                 self.values[index] = min(max(self.values[index] + speed * elapsed, slot.lower), slot.upper)
         if self._stream is not None:
             self._stream.send(bank.command(self.values, factor))
@@ -95,16 +102,17 @@ class _Moving:
             self._robot.send(bank.controller, bank.kind, bank.command(self.values, factor))
 
     def settle(self, factor: float) -> None:
-        """End the stream by a command that stands still, and needs no other one behind it."""
+        """End the stream by a single command to stand still, which has no lease."""
         bank = self._bank
         if self._stream is not None:
             values = self.values if bank.form.integrates else [0.0] * len(self.values)
-            with suppress(Refused):  # of a joint that hangs beyond its limits: there the lease ends it
+            # The command is refused for a joint beyond its limits. The stream then ends with its lease.
+            with suppress(Refused):
                 self._robot.send(bank.controller, bank.kind, bank.command(values, factor))
 
 
 def _present(robot: RemoteRobot, bank: Bank) -> list[float]:
-    """Return what joints are commanded, else their positions. Raises Refused where they are not known yet."""
+    """Return the present goals of joints, or else their positions. Raises Refused while they are unknown."""
     states, found = robot.states(), []
     references = dict(zip(states.references, states.reference.tolist(), strict=True))
     for slot in bank.slots:

@@ -1,4 +1,4 @@
-"""The keyboard behind a terminal: it reports that keys go down and repeat, never that they are released."""
+"""Keyboard of a terminal. It reports presses and repeats of keys, but not their release."""
 
 from __future__ import annotations
 
@@ -13,25 +13,25 @@ from dxlrun import InputError
 from dxlrun_teleop.source import Given, Press
 
 HELD_S = 0.13
-"""A key counts as held for so long after it was typed: above 92 ms, in which the Linux console repeats it
-(10.9 Hz, kbdrate(8)); desktops repeat faster."""
+"""Time for which a key counts as held after a press or repeat, s. It must exceed the repeat period, which is
+92 ms on the Linux console (10.9 Hz, kbdrate(8)) and shorter on desktops."""
 AXES: tuple[str, ...] = ("Q/A Up/Down", "W/S Left/Right", "E/D", "R/F", "T/G", "Y/H", "U/J", "I/K")
-"""A column of keys each axis: the upper one is its positive side."""
+"""Keys of each axis, the positive direction first"""
 _ROWS = ("qwertyui", 1.0), ("asdfghjk", -1.0)
 _KEYS = {key: (axis, side) for row, side in _ROWS for axis, key in enumerate(row)}
 _ARROWS = {"A": (0, 1.0), "B": (0, -1.0), "D": (1, 1.0), "C": (1, -1.0)}
-"""Last letters of ESC [ A and the like: up, down, left, right."""
+"""Final letters of the escape sequences ESC [ A and so on: up, down, left, right"""
 _PRESSES = {"\t": Press.NEXT, "+": Press.FASTER, "=": Press.FASTER, "-": Press.SLOWER, "\x04": Press.QUIT}
 _TYPED = re.compile(r"\x1b[\[O](?:[\d;]*)([A-Za-z~])|(.)", re.DOTALL)
 _PART = re.compile(r"\x1b(?:[\[O][\d;]*)?\Z")
-"""The beginning of a sequence whose end comes later."""
+"""Incomplete escape sequence at the end of the input"""
 
 
 class TerminalKeyboard:
-    """Keys that are typed at the terminal, which does not show them until it is closed.
+    """Keyboard of the terminal, without echo until it is closed.
 
-    A key is its own dead-man's switch: it counts as held until HELD_S after it was last typed. Until the
-    keyboard begins to repeat it (after 0.25 s to 0.66 s) a key is one short step.
+    A key is its own dead-man's switch. It counts as held until HELD_S after the last press or repeat. Until
+    the keyboard starts to repeat (after 0.25 s to 0.66 s), a key causes one short step.
     """
 
     axes = AXES
@@ -46,16 +46,16 @@ class TerminalKeyboard:
         self._input = sys.stdin.fileno()
         self._before = termios.tcgetattr(self._input)
         self._typed: dict[int, tuple[float, float]] = {}
-        """Axis -> its side, and when that key was typed last."""
+        """Direction of each axis, and time of the last press or repeat, s"""
         self._rest = ""
         tty.setcbreak(self._input, termios.TCSAFLUSH)
 
     def close(self) -> None:
-        """Make the terminal what it was; what was typed and not read is forgotten."""
+        """Restore the terminal. Input that was not read is discarded."""
         termios.tcsetattr(self._input, termios.TCSAFLUSH, self._before)
 
     def read(self, now: float) -> Given:
-        """Return the axes whose keys were typed just now."""
+        """Return the axes whose keys are held."""
         presses: set[Press] = set()
         while select.select([self._input], [], [], 0.0)[0]:
             if not (data := os.read(self._input, 4096)):

@@ -1,4 +1,4 @@
-"""The verb of teleoperation, by the same hooks as any other package."""
+"""Plug-in with the verb `teleop`. It uses the same hooks as any other package."""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ from dxlrun import CONTRACT_VERSION, Command, hookimpl
 
 @hookimpl
 def dxlrun_contract() -> int:
-    """Return the contract that this package was written for: the one it is published with."""
+    """Return the plug-in contract version. This package is released together with it."""
     return CONTRACT_VERSION
 
 

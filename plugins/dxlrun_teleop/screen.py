@@ -1,4 +1,4 @@
-"""The screen: which key moves what, what is commanded, and where the robot is, live."""
+"""Live view in the terminal: keys, commands and positions."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ _SHOWN = {"rad": (180 / math.pi, "deg"), "m": (1e3, "mm")}
 
 
 def view(robot: RemoteRobot, drive: Drive, source: Source) -> tuple[str, Table]:
-    """Return what is driven and how, and a row an axis: what it moves, its command, where that is."""
+    """Return a headline with the controller, and a table with target, command and position per axis."""
     bank, values, states = drive.bank, drive.values, robot.states()
     positions = dict(zip(states.joints, states.position.tolist(), strict=True))
     rows = []
@@ -34,7 +34,7 @@ def view(robot: RemoteRobot, drive: Drive, source: Source) -> tuple[str, Table]:
 
 @contextmanager
 def screen(robot: RemoteRobot, drive: Drive, source: Source) -> Iterator[Callable[[float], None]]:
-    """Give what draws the view at a time, s, at most each REFRESH_S; nothing where there is no terminal."""
+    """Yield a function that draws the view at a time, s, at most every REFRESH_S. It needs a terminal."""
     console = out()
     if not console.is_terminal:
         yield lambda now: None

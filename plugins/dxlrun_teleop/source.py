@@ -1,4 +1,4 @@
-"""What a hand does at a device: axes, the dead-man's switch, and what is pressed once."""
+"""Input of a device: axes, dead-man's switch, and single presses."""
 
 from __future__ import annotations
 
@@ -8,7 +8,7 @@ from typing import NamedTuple, Protocol
 
 @unique
 class Press(Enum):
-    """What happens once when a key or a button goes down."""
+    """Action that a press of a key or button triggers once"""
 
     NEXT = auto()  # drive the next controller
     FASTER = auto()
@@ -17,28 +17,29 @@ class Press(Enum):
 
 
 class Given(NamedTuple):
-    """What a device is given now."""
+    """Present input of a device"""
 
     axes: tuple[float, ...]
-    """-1 to 1, in the order of `Source.axes`"""
+    """Deflections, -1..1, in the order of `Source.axes`"""
     enabled: bool
-    """True while the dead-man's switch is held: else the robot holds."""
+    """True while the dead-man's switch is held. Otherwise the robot holds."""
     presses: frozenset[Press] = frozenset()
 
 
 class Source(Protocol):
-    """A keyboard, a gamepad, a script."""
+    """Input device: a keyboard, a gamepad, or a script"""
 
     axes: tuple[str, ...]
-    """What moves each axis, its positive side first: `Q/A`."""
+    """Label of each axis, with the positive direction first: `Q/A`"""
     help: str
-    """What the dead-man's switch is, and what else there is to press."""
+    """Description of the dead-man's switch and of the other keys, for the screen"""
 
     def read(self, now: float) -> Given:
-        """Return what the device is given at `now`, s of a monotonic clock; never waits.
+        """Return the input at `now`, s of a monotonic clock, without waiting.
 
-        Raises DxlrunError when the device is gone.
+        Raises:
+            DxlrunError: The device is unplugged.
         """
 
     def close(self) -> None:
-        """Leave the device as it was."""
+        """Restore the device."""

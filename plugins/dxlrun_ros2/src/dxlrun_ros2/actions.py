@@ -1,4 +1,4 @@
-"""Actions: FollowJointTrajectory and GripperCommand as goals of a running robot."""
+"""Action servers FollowJointTrajectory and GripperCommand, which send goals to a running robot."""
 
 from __future__ import annotations
 
@@ -29,26 +29,26 @@ from dxlrun_ros2.trajectories import (
 Result = FollowJointTrajectory.Result
 FEEDBACK_S = 0.05
 STATE_S = 1.0
-"""How long after the end of a goal the state of its gripper is waited for."""
+"""Timeout for the state of a gripper after the end of its goal, s"""
 CLIENT_S = 1.0
-"""A goal none of whose clients is left for so long is cancelled."""
+"""Time without a client of the action after which a goal is cancelled, s"""
 _FAR_S = 10.0
 _CYCLE_S = 0.01
 _MEASURED_S = 5.0
-"""How long a cycle may be on its way here."""
+"""Timeout for the arrival of a cycle, s"""
 _AT_ONCE = 3
-"""Periods."""
+"""Number of periods within which a goal counts as ended at its start"""
 Seen: TypeAlias = tuple[int, float, Floats, Floats]
-"""Time (ns since 1970) and time of the goal (s), desired and measured positions and velocities."""
+"""Time (ns since 1970), time of the goal (s), desired and measured positions and velocities"""
 
 
 class Action:
-    """An action of a controller: each goal is one of the robot, from its acceptance to its end."""
+    """Action server of a controller. Each goal of the action is a goal of the robot."""
 
     kind: type
-    """Of its messages."""
+    """Type of the action"""
     name: str
-    """Behind that of the controller."""
+    """Name of the action, after that of the controller"""
 
     def __init__(self, node: Node, run: PublishedRun, controller: ControllerInfo) -> None:
         self.node, self.run, self.controller = node, run, controller
@@ -65,7 +65,7 @@ class Action:
         self._clients = f"{name}/_action/send_goal"
 
     def check(self, request: FollowJointTrajectory.Goal | GripperCommand.Goal) -> None:
-        """Raise DxlrunError for a goal that is not accepted."""
+        """Check a goal before it is accepted. Raises DxlrunError with the reason to reject it."""
 
     def execute(self, handle: ServerGoalHandle, robot: RemoteRobot) -> object:
         """Execute a goal, end its handle, and return its result. Raises DxlrunError."""
@@ -80,7 +80,7 @@ class Action:
             self.check(request)
             with connect(
                 self.run.address, CLIENT
-            ) as robot:  # a switch just now is not yet in the newest cycle
+            ) as robot:  # ask the run, because the newest cycle may precede a switch
                 active = {one.name for one in info_of(robot).controllers if one.active}
             if self.controller.name not in active:
                 raise Refused(f"{self.controller.name} is not active")
@@ -101,10 +101,18 @@ class Action:
     def wait(
         self, handle: ServerGoalHandle, robot: RemoteRobot, goal: RemoteGoal, look: Callable[[GoalState], str]
     ) -> tuple[GoalState, str]:
-        """Return how a goal ended, and why the bridge cancelled it; empty: it did not.
+        """Wait for the end of a goal.
 
-        `look` gets its state meanwhile, and returns a reason to cancel it. A client that cancels, or
-        is gone, lets the joints come to rest; the goal ends when they are.
+        If a client cancels or has exited, the goal is cancelled. It ends when the joints are at rest.
+
+        Args:
+            handle: Goal of the action.
+            robot: Connection to the robot.
+            goal: Goal of the robot.
+            look: Called with each new state. It returns a reason to cancel the goal, or an empty text.
+
+        Returns:
+            The final state, and the reason why the bridge cancelled the goal (empty if it did not).
         """
         why, cancelled, seen = "", False, time.monotonic()
         while (state := robot.goal_state(goal.number, FEEDBACK_S)).status == "running":
@@ -125,18 +133,18 @@ class Action:
         until = time.monotonic() + _MEASURED_S
         while self.run.time_s < (state.ended or 0.0) and time.monotonic() < until:
             if self.run.ended.is_set():
-                break  # no cycle comes any more, and the bridge waits for results only shortly
-            time.sleep(_CYCLE_S)  # what its result reports was measured at its end
+                break  # there are no more cycles, and the bridge waits only shortly for results
+            time.sleep(_CYCLE_S)  # the result must report measurements from the end of the goal
         return state, why
 
 
 class FollowTrajectory(Action):
-    """control_msgs/FollowJointTrajectory of a trajectory controller, also for some of its joints."""
+    """control_msgs/FollowJointTrajectory of a trajectory controller, also for a subset of its joints"""
 
     kind, name = FollowJointTrajectory, "follow_joint_trajectory"
 
     def check(self, request: FollowJointTrajectory.Goal) -> None:
-        """Raise InputError for a goal that is not accepted."""
+        """Check a goal before it is accepted. Raises InputError with the reason to reject it."""
         if request.multi_dof_trajectory.points:
             raise InputError("it has no joints with several degrees of freedom")
         goal_fields(request, self.controller.joints)
@@ -152,7 +160,7 @@ class FollowTrajectory(Action):
         return Result(error_code=code, error_string=why)
 
     def execute(self, handle: ServerGoalHandle, robot: RemoteRobot) -> object:
-        """Follow a trajectory; without points stop in place."""
+        """Follow a trajectory. A trajectory without points stops the joints."""
         request = handle.request
         if not request.trajectory.points:
             state, _ = self.wait(handle, robot, stopped(robot, self.run, self.controller), lambda _: "")
@@ -161,7 +169,7 @@ class FollowTrajectory(Action):
         try:
             plan = self._wanted(request)
             fields = goal_fields(request, plan.joints)
-        except InputError as error:  # since it was accepted, its last point has passed
+        except InputError as error:  # its last point has passed since it was accepted
             handle.abort()
             return self.failed(str(error), Result.OLD_HEADER_TIMESTAMP)
         watch = Watch(self.run, plan)
@@ -191,24 +199,25 @@ class FollowTrajectory(Action):
             self.run.seen.discard(watch.see)
 
     def _code(self, state: GoalState) -> int:
-        """Return the code of control_msgs for a goal that did not end well."""
+        """Return the error code of control_msgs for a goal that was not reached."""
         if state.status == "missed":
             return int(Result.GOAL_TOLERANCE_VIOLATED)
-        # what cannot be followed from its beginning on ends at once
+        # A goal that is invalid from the start ends within a few periods.
         began = (state.seconds or 0.0) > _AT_ONCE * self.run.header.period_ns * 1e-9
         left = state.status == "aborted" and state.error is not None and began
         return int(Result.PATH_TOLERANCE_VIOLATED if left else Result.INVALID_GOAL)
 
 
 def stopped(robot: RemoteRobot, run: PublishedRun, controller: ControllerInfo) -> RemoteGoal:
-    """Let the joints of a trajectory controller come to rest; return the goal that ends when they are."""
+    """Stop the joints of a trajectory controller. Return the goal that ends when they are at rest."""
     try:
         if goal := robot.cancel(controller.name).goal:
             return goal
     except Refused as refused:
         if refused.code not in ("no_goal", "cancelled_already"):
             raise
-    # of a stream of chunks: a goal takes over with the velocity of now, and is cancelled at once
+    # A stream of chunks has no goal. A new goal replaces it with the present velocity, and is cancelled at
+    # once.
     rows = run.rows(controller.joints)
     place = [{"time": _FAR_S, "positions": run.desired[rows].tolist()}]
     goal = _sent(robot, controller, "trajectory", {"points": place})
@@ -226,7 +235,7 @@ def _sent(
 
 
 class Watch:
-    """Desired and measured state of joints on a trajectory, in each cycle of a run."""
+    """Desired and measured state of the joints of a trajectory, updated in each cycle"""
 
     def __init__(self, run: PublishedRun, plan: Wanted) -> None:
         self.plan = plan
@@ -242,7 +251,7 @@ class Watch:
         self._begin_ns = round(state.accepted * 1e9)
 
     def see(self, record: np.void) -> None:
-        """Take a cycle."""
+        """Update the states from the record of a cycle."""
         if self._begin_ns is None:
             return
         t_ns = int(record["read_ns"])
@@ -262,7 +271,7 @@ class Watch:
 
 
 class Gripper(Action):
-    """control_msgs/GripperCommand of a gripper_controller: the position of its joint, rad or m."""
+    """control_msgs/GripperCommand of a gripper_controller; the position is that of the joint, rad or m"""
 
     kind, name = GripperCommand, "gripper_cmd"
 
@@ -271,7 +280,7 @@ class Gripper(Action):
         return self._report(GripperCommand.Result())
 
     def execute(self, handle: ServerGoalHandle, robot: RemoteRobot) -> object:
-        """Close or open the gripper; it is reached too where it holds something."""
+        """Close or open the gripper. The goal also succeeds if the gripper holds something."""
         command = handle.request.command
         wish: dict[str, object] = {"position": command.position}
         if command.max_effort > 0:
@@ -304,7 +313,7 @@ class Gripper(Action):
         return message
 
     def _stalled(self, robot: RemoteRobot, state: GoalState) -> bool:
-        """Return whether the gripper stood still short of its goal, by its topic after the end."""
+        """Return True if the gripper stalled, according to the first message of its topic after the end."""
         until = time.monotonic() + STATE_S
         while time.monotonic() < until:
             found = robot.newest(f"/{self.controller.name}/state")

@@ -1,4 +1,4 @@
-"""Bridge: the nodes of one run of a robot, from its beginning to its end."""
+"""Bridge: ROS 2 nodes of one run of a robot."""
 
 from __future__ import annotations
 
@@ -19,18 +19,27 @@ from dxlrun_ros2.published_run import PublishedRun
 from dxlrun_ros2.set_points import SetPoints
 
 LOOK_S = 1.0
-"""Between two looks for topics and controllers that are new."""
+"""Polling period for new topics and controllers, s"""
 THREADS = 32
-"""A goal has one until it ends; they are started when they are needed."""
+"""Largest number of threads, which are started on demand. Each goal occupies one until it ends."""
 LAST_S = 1.0
-"""At the end, for the results of goals."""
+"""Time for the results of goals after the end of the run, s"""
 
 
 class Bridge:
-    """One run in ROS 2, in a context of its own: what a run had is gone with it."""
+    """ROS 2 nodes of one run. They have a context of their own, so that they all end with the run."""
 
     def __init__(self, robot: RemoteRobot, address: str, lease: float) -> None:
-        """Open nodes and topics; `address`: what the robot is connected to by. Raises DxlrunError."""
+        """Open nodes and topics.
+
+        Args:
+            robot: Connection to the robot.
+            address: Name or address under which the robot can be connected to.
+            lease: Time for which a setpoint of a publisher is valid, s.
+
+        Raises:
+            DxlrunError: The run has ended, or refuses a request.
+        """
         self._robot = robot
         self._context = Context()
         rclpy.init(context=self._context, signal_handler_options=SignalHandlerOptions.NO)
@@ -53,14 +62,14 @@ class Bridge:
             raise
 
     def node(self, name: str, **more: bool) -> Node:
-        """Return a new node of the bridge."""
+        """Create a node of the bridge."""
         node = Node(name, context=self._context, **more)
         self._nodes[name] = node
         self._executor.add_node(node)
         return node
 
     def spin(self, stopped: threading.Event) -> None:
-        """Serve until the run has ended, or the event is set. Raises DxlrunError."""
+        """Serve requests until the run has ended or the event is set. Raises DxlrunError."""
         looked = 0.0
         while not (stopped.is_set() or self.run.ended.is_set()):
             if time.monotonic() > looked + LOOK_S:
@@ -78,11 +87,11 @@ class Bridge:
     def _serve(self, timeout_s: float) -> None:
         try:
             self._executor.spin_once(timeout_s)
-        except Exception as error:  # the last resort: one request that goes wrong ends nothing else
+        except Exception as error:  # an error in one request must not end the bridge
             self._nodes["dxlrun"].get_logger().error(f"{type(error).__name__}: {error}")
 
     def _look(self) -> None:
-        """Open a node for each new controller, and close those that are unloaded. Raises DxlrunError."""
+        """Open a node for each new controller, and close those of unloaded ones. Raises DxlrunError."""
         found = {one.name: one for one in info_of(self._robot).controllers}
         for name in [name for name in self._controllers if name not in found]:
             self._controllers.pop(name).close()
@@ -98,7 +107,7 @@ class Bridge:
                 self._controllers[name].refresh(self._robot)
 
     def close(self) -> None:
-        """End all nodes."""
+        """Close all nodes."""
         self._points.close()
         self._executor.shutdown(timeout_sec=1.0)
         for node in self._nodes.values():

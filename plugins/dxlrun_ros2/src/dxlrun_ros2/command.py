@@ -1,4 +1,4 @@
-"""`dxlrun-ros2`: a running robot in ROS 2."""
+"""`dxlrun-ros2`: bridge of a running robot to ROS 2."""
 
 from __future__ import annotations
 
@@ -17,12 +17,12 @@ if TYPE_CHECKING:
     from dxlrun_ros2.bridge import Bridge
 
 NICENESS = 10
-"""As the gateway's: ROS gets the processor time that the robot leaves."""
+"""Same niceness as the gateway, so that ROS only gets the processor time that the loop leaves"""
 RETRY_S = 0.2
 
 
 def arguments(words: list[str]) -> argparse.Namespace:
-    """Return what the command line has, without what is for ROS."""
+    """Parse the command line, from which the arguments of ROS have been removed."""
     parser = argparse.ArgumentParser(
         "dxlrun-ros2", description="A running robot in ROS 2, under the names of ros2_control."
     )
@@ -44,7 +44,7 @@ def arguments(words: list[str]) -> argparse.Namespace:
 
 
 def main() -> int:
-    """Bridge one run of the robot after the other, until Ctrl-C or SIGTERM."""
+    """Bridge each run of the robot, until Ctrl-C or SIGTERM."""
     from rclpy.utilities import remove_ros_args
 
     from dxlrun_ros2.bridge import Bridge

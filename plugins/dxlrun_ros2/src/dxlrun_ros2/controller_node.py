@@ -1,4 +1,4 @@
-"""Controller node: a controller of the robot as ros2_control has it: topics, actions, parameters, torque."""
+"""Controller node: topics, actions, parameters and torque services of a controller, as in ros2_control."""
 
 from __future__ import annotations
 
@@ -25,18 +25,18 @@ from dxlrun_ros2.set_points import LONGEST_S, SetPoints
 from dxlrun_ros2.trajectories import point, wanted
 
 GROUP = ("positions", "posvel", "poseffort", "velocities", "efforts", "pwm")
-"""Commands of one number a joint and field."""
+"""Commands with one number per joint and field"""
 STATE_NS = 20_000_000
-"""Between two messages of controller_state."""
+"""Time between two messages of controller_state, ns"""
 
 
 class ControllerNode:
-    """One controller; what it offers follows from the commands that it takes."""
+    """Interface of one controller. Its topics and actions depend on the commands that are accepted."""
 
     def __init__(
         self, node: Node, robot: RemoteRobot, run: PublishedRun, controller: ControllerInfo, points: SetPoints
     ) -> None:
-        """Raises DxlrunError."""
+        """Open the topics and actions. Raises DxlrunError."""
         self.node, self._run, self._controller, self._points = node, run, controller, points
         name, takes = controller.name, controller.takes
         if "trajectory" in takes:
@@ -60,13 +60,13 @@ class ControllerNode:
             offer_torque(node, run.address, controller.name, name)
 
     def close(self) -> None:
-        """Leave the run's cycles alone."""
+        """Stop to process cycles of the run."""
         self._run.seen.discard(getattr(self, "_show", None))
 
     # Topics
 
     def _trajectory(self, message: JointTrajectory, robot: RemoteRobot) -> None:
-        """Follow the newest trajectory of a publisher; without points stop in place."""
+        """Follow the newest trajectory of a publisher. A trajectory without points stops the joints."""
         name = self._controller.name
         if not message.points:
             stopped(robot, self._run, self._controller)
@@ -93,7 +93,7 @@ class ControllerNode:
         self._points.send(robot, self._controller.name, "velocity", command)
 
     def _show(self, record: np.void) -> None:
-        """Publish the state of a trajectory controller, if a subscriber wants it."""
+        """Publish the state of a trajectory controller, if there is a subscriber."""
         t_ns = int(record["read_ns"])
         if t_ns < self._state_ns + STATE_NS or not self._state.get_subscription_count():
             return
@@ -112,7 +112,7 @@ class ControllerNode:
     # Parameters
 
     def _declare(self, robot: RemoteRobot) -> None:
-        """Declare the parameters of the robot file; those that are live can be set."""
+        """Declare the parameters of the robot file. Only live ones can be set."""
         for one in robot.parameter_table(self._controller.name):
             value = list(one.value) if isinstance(one.value, tuple) else one.value
             if not _is_parameter(value):
@@ -134,7 +134,7 @@ class ControllerNode:
         self.node.add_on_set_parameters_callback(self._set)
 
     def refresh(self, robot: RemoteRobot) -> None:
-        """Take over what another client has changed."""
+        """Update the parameters that another client has changed."""
         now = {one.name: one.value for one in robot.parameter_table(self._controller.name) if one.live}
         changed = [name for name, value in now.items() if self._live.get(name) != value]
         self._live |= now
@@ -153,14 +153,14 @@ class ControllerNode:
 
 
 def fields_of(controller: ControllerInfo, kind: str) -> tuple[str, ...]:
-    """Return the fields of a command, each an array with a number for each joint."""
+    """Return the fields of a command. Each is an array with one number per joint."""
     schema = controller.takes[kind]
     properties = schema.get("properties", {}) if isinstance(schema, dict) else {}
     return tuple(properties)
 
 
 def offer_torque(node: Node, robot: str, joints: str, place: str) -> None:
-    """Offer torque and reboot of joints as services; their controllers are deactivated where needed."""
+    """Offer services for torque and reboot of joints. They deactivate the controllers if necessary."""
 
     def switch(connected: RemoteRobot, request: SetBool.Request) -> Executed:
         return connected.torque(joints, request.data, release=not request.data)
@@ -175,7 +175,7 @@ def offer_torque(node: Node, robot: str, joints: str, place: str) -> None:
 def offer(
     node: Node, robot: str, kind: type, name: str, ask: Callable[[RemoteRobot, SetBool.Request], Executed]
 ) -> None:
-    """Offer a service of std_srvs that asks something of the robot; `ask` gets it connected."""
+    """Offer a service of std_srvs. It calls `ask` with a connection to the robot."""
 
     def asked(request: SetBool.Request, response: SetBool.Response) -> SetBool.Response:
         try:
@@ -192,7 +192,7 @@ def offer(
 
 
 def _is_parameter(value: object) -> bool:
-    """Return whether ROS 2 has a type for a value."""
+    """Return True if ROS 2 has a parameter type for a value."""
     if isinstance(value, list):
         return len({type(one) for one in value}) == 1 and isinstance(value[0], bool | int | float | str)
     return isinstance(value, bool | int | float | str)

@@ -1,4 +1,4 @@
-"""Controller manager: the services by which tools of ros2_control list, load and switch controllers."""
+"""Controller manager: services with which ros2_control tools list, load and switch controllers."""
 
 from __future__ import annotations
 
@@ -45,7 +45,7 @@ TYPES = {
     "joint_trajectory_controller": "joint_trajectory_controller/JointTrajectoryController",
     "pid_controller": "pid_controller/PidController",
 }
-"""Types of dxlrun, and what ros2_control calls them; others are dxlrun/TYPE there."""
+"""Types of ros2_control by the type of dxlrun. All other types are named dxlrun/TYPE."""
 STATES = ("position", "velocity", "effort")
 
 
@@ -54,12 +54,12 @@ AnyResponse = TypeVar("AnyResponse")
 
 
 class Manager:
-    """The services of ros2_control's controller_manager, for a running robot."""
+    """Services of ros2_control's controller_manager for a running robot"""
 
     def __init__(self, node: Node, address: str) -> None:
         self._node, self._address = node, address
         self._unloaded: dict[str, dict[str, object]] = {}
-        """Entries of controllers that were unloaded here, to load them again."""
+        """Robot file entries of controllers that were unloaded here, so that they can be loaded again"""
         group = ReentrantCallbackGroup()
         for kind, name, answer in (
             (ListControllers, "list_controllers", self._list),
@@ -79,7 +79,7 @@ class Manager:
         request: AnyRequest,
         response: AnyResponse,
     ) -> AnyResponse:
-        """Answer a request; one that is refused is not ok, and the log of ROS has the reason."""
+        """Answer a request. The response to a refused one is not `ok`, and the reason is logged in ROS."""
         try:
             with connect(self._address, CLIENT) as robot:
                 answer(robot, request, response)
@@ -132,7 +132,7 @@ class Manager:
             robot.switch(entering, leaving)
 
     def _load(self, robot: RemoteRobot, request: LoadController.Request, _: LoadController.Response) -> None:
-        """Load a controller, in a pause of the loop; one that is there already stays."""
+        """Load a controller while the loop is paused. A loaded controller is left unchanged."""
         if request.name in {one.name for one in info_of(robot).controllers}:
             return
         entry = self._entry(request.name)
@@ -150,11 +150,11 @@ class Manager:
     def _configure(
         self, robot: RemoteRobot, request: ConfigureController.Request, _: ConfigureController.Response
     ) -> None:
-        """Do nothing: a controller that is loaded is configured, too."""
+        """Only check the name, because loading also configures a controller."""
         _known(robot, request.name)
 
     def _entry(self, name: str) -> dict[str, object]:
-        """Return what this node's parameters NAME.* have for a controller, or the files NAME.params_file."""
+        """Return the entry of a controller from the parameters NAME.* of this node and NAME.params_file."""
         given = {key: one.value for key, one in self._node.get_parameters_by_prefix(name).items()}
         files = given.pop("params_file", [])
         entry = dict(self._unloaded.get(name, {}))
@@ -173,7 +173,7 @@ class Manager:
 
 
 def _parameters(path: Path, name: str) -> dict[str, object]:
-    """Return the parameters of a controller in a file of parameters. Raises InputError."""
+    """Read the parameters of a controller from a parameter file. Raises InputError."""
     try:
         found = yaml.safe_load(path.read_text(encoding="utf-8"))
         return dict(found[name]["ros__parameters"]) if name in found else {}
@@ -192,12 +192,12 @@ def _paused(robot: RemoteRobot) -> Iterator[None]:
 
 
 def info_of(robot: RemoteRobot) -> RobotInfo:
-    """Return what a robot says of itself and its controllers."""
+    """Return the information about a robot and its controllers."""
     return msgspec.convert(robot.info(), RobotInfo)
 
 
 def ros_type(kind: str) -> str:
-    """Return the type of a controller as ros2_control writes it."""
+    """Return the ros2_control type of a controller."""
     return TYPES.get(kind, f"dxlrun/{kind}")
 
 
@@ -210,7 +210,7 @@ def _known(robot: RemoteRobot, name: str) -> ControllerInfo:
 
 
 def _written(one: ControllerInfo, robot: RemoteRobot) -> dict[str, object]:
-    """Return a controller's entry as in the robot file, inactive."""
+    """Return a controller's entry for the robot file, with `active: false`."""
     entry: dict[str, object] = {"type": one.type, "active": False}
     entry |= {"into": list(one.into)} if one.into else {}
     entry |= {"fallback": one.fallback} if one.fallback else {}
@@ -252,7 +252,7 @@ def _state(one: ControllerInfo, known: Sequence[ControllerInfo]) -> ControllerSt
 
 
 def _hardware(robot: RemoteRobot) -> HardwareComponentState:
-    """Return the robot as the one component of hardware that ros2_control would have."""
+    """Describe the robot as a single hardware component of ros2_control."""
     info = info_of(robot)
     direct = [one for one in info.controllers if not one.into]
     commanded = sorted({f"{joint}/{kind}" for one in direct for joint in one.joints for kind in one.command})

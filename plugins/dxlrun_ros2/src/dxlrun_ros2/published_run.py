@@ -1,4 +1,4 @@
-"""Published run: the messages of a running robot as topics of ROS 2, their bytes as the log has them."""
+"""Published run: messages of a running robot as topics of ROS 2, with the same bytes as in the log."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ from dxlrun.tooling.topics import BUS_PREFIX, LogTopic, MessageType
 from dxlrun_ros2 import CLIENT
 
 STATE = QoSProfile(depth=1)
-"""As broadcasters of ros2_control have it: reliable, the newest message, nothing for late subscribers."""
+"""Quality of service of ros2_control's broadcasters: reliable, depth 1, volatile"""
 LATCHED = QoSProfile(depth=1, durability=DurabilityPolicy.TRANSIENT_LOCAL)
 QUALITIES: Mapping[str, QoSProfile] = {
     LogTopic.FRAMES: QoSProfile(depth=100),
@@ -30,26 +30,35 @@ GLOBAL = {
     LogTopic.ROSOUT,
     LogTopic.DIAGNOSTICS,
 }
-"""Topics that ROS 2 has once, whatever the namespace."""
+"""Topics that are global in ROS 2, whatever the namespace"""
 LOGGED = {LogTopic.CYCLE, LogTopic.ACTIVATION, LogTopic.COMMANDS, LogTopic.EVENT, LogTopic.MACHINE}
-"""Topics whose messages only the log has, as those of buses."""
+"""Topics that are only in the log, like those of buses"""
 
 
 class PublishedRun(LiveMessages):
-    """Publishes one run until it ends: all that the log has, where this environment has its type."""
+    """Publisher of one run. It publishes all topics of the log whose message type is installed."""
 
     def __init__(self, node: Node, robot: RemoteRobot, address: str) -> None:
-        """Open the topics of every run; `address`: what the robot is connected to by. Raises DxlrunError."""
+        """Open the topics that every run has.
+
+        Args:
+            node: Node that publishes.
+            robot: Connection to the robot.
+            address: Name or address under which the robot can be connected to.
+
+        Raises:
+            DxlrunError: The run has ended.
+        """
         super().__init__(robot.log_header())
         self.address, self._node = address, node
         self.ended = threading.Event()
         self.why = ""
         self.seen: set[Callable[[np.void], None]] = set()
-        """Called with the record of each cycle."""
+        """Functions that are called with the record of each cycle"""
         self.newest: np.void | None = None
-        """Record of the newest cycle."""
+        """Record of the newest cycle"""
         self.changed: set[str] = set()
-        """Controllers whose parameters were changed."""
+        """Controllers with changed parameters"""
         self.on_changed = self.changed.add
         self._publishers_of: list[Publisher | None] = []
         self._heard: set[str] = set()
@@ -71,7 +80,7 @@ class PublishedRun(LiveMessages):
             publisher.publish(data)
 
     def hear(self, robot: RemoteRobot) -> None:
-        """Begin to listen to the topics that were opened since. Raises DxlrunError."""
+        """Start to listen to topics that have been opened since the last call. Raises DxlrunError."""
         if new := self.heard(robot.topics()) - self._heard:
             self._heard |= new
             threading.Thread(target=self._listen, args=(new,), daemon=True).start()
@@ -86,13 +95,13 @@ class PublishedRun(LiveMessages):
             self.why = f"the run of {self.header.robot} has ended"
         except DxlrunError as error:
             self.why = str(error)
-        except Exception as error:  # the last resort: without it the topics would fall silent
+        except Exception as error:  # without this, the topics would stop without a reason
             if not self.ended.is_set():
                 self.why = f"{type(error).__name__}: {error}"
         self.ended.set()
 
     def take(self, message: TopicMessage) -> None:
-        """Publish a message, and keep the newest record of a cycle."""
+        """Publish a message, and store the newest record of a cycle."""
         super().take(message)
         if message.topic == LogTopic.CYCLE:
             self.newest = self.read_cycle(message)
@@ -103,7 +112,7 @@ class PublishedRun(LiveMessages):
 
     @property
     def time_s(self) -> float:
-        """When it was measured, on the run's clock; 0: there was none."""
+        """Time of the newest cycle on the clock of the run, s; 0 before the first"""
         return 0.0 if self.newest is None else int(self.newest["read_ns"]) * 1e-9
 
     def rows(self, joints: Sequence[str]) -> NDArray[np.int_]:
@@ -112,7 +121,7 @@ class PublishedRun(LiveMessages):
 
     @property
     def desired(self) -> Floats:
-        """Where each joint is sent, or is where it is sent nowhere; NaN: not known. Shape (joints,)."""
+        """Goal of each joint, or its measured position without a goal; NaN if unknown. Shape (joints,)."""
         if self.newest is None:
             return np.full(len(self.header.joints), np.nan)
         goal, position = self.newest["goal_position"], self.newest["position"]
@@ -121,9 +130,9 @@ class PublishedRun(LiveMessages):
 
 
 def message_class(name: str) -> type | None:
-    """Return the class of a message, `nav_msgs/msg/Odometry`; None where this environment has none."""
+    """Return the class of a message such as `nav_msgs/msg/Odometry`, or None if it is not installed."""
     package, folder, kind = name.split("/")
-    package = "dxlrun_msgs" if package == "dxlrun" else package  # that is a package of Python already
+    package = "dxlrun_msgs" if package == "dxlrun" else package  # `dxlrun` is the Python package
     try:
         found = getattr(import_module(f"{package}.{folder}"), kind, None)
     except ImportError:

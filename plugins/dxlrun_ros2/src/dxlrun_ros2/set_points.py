@@ -1,4 +1,4 @@
-"""Set-points: what publishers of ROS 2 send to controllers, each as a stream of its own."""
+"""Setpoints: messages of ROS 2 publishers to controllers, one stream per publisher."""
 
 from __future__ import annotations
 
@@ -15,25 +15,25 @@ from dxlrun_ros2 import CLIENT
 
 Message = TypeVar("Message")
 LONGEST_S = 60.0
-"""Of a lease, s."""
+"""Longest lease, s"""
 QUIET_S = 2.0
-"""Between two warnings of a topic."""
+"""Shortest time between two warnings of a topic, s"""
 
 
 class SetPoints:
-    """One connection for the streams of all publishers; the log names the node of each."""
+    """Connection for the streams of all publishers. The log names the node of each publisher."""
 
     def __init__(self, address: str, lease: float) -> None:
-        """`lease`: for how long a set-point counts, s."""
+        """Set the lease: the time for which a setpoint is valid, s."""
         self.lease = lease
         self._address = address
         self._robot: RemoteRobot | None = None
         self._lock = threading.Lock()
         self._nodes: dict[bytes, str] = {}
-        """Names of publishers' nodes by what the middleware identifies them with."""
+        """Names of the publishers' nodes by the GID of the publisher"""
 
     def close(self) -> None:
-        """Close the connection; the leases run out."""
+        """Close the connection. The leases then expire."""
         with self._lock:
             if self._robot is not None:
                 self._robot.close()
@@ -41,7 +41,14 @@ class SetPoints:
     def subscribe(
         self, node: Node, kind: type, topic: str, take: Callable[[Message, RemoteRobot], None]
     ) -> None:
-        """Take the messages of a topic; `take` gets each with the robot, in the name of its publisher."""
+        """Subscribe to a topic.
+
+        Args:
+            node: Node that subscribes.
+            kind: Type of the messages.
+            topic: Name of the topic.
+            take: Called with each message and a connection that identifies itself as the publisher.
+        """
 
         def received(message: Message, info: MessageInfo) -> None:
             try:
@@ -63,7 +70,7 @@ class SetPoints:
         command: Mapping[str, object],
         more_s: float = 0.0,
     ) -> None:
-        """Leave a set-point of the publisher that is being served; it counts for the lease and `more_s`."""
+        """Send a setpoint for the present publisher. It is valid for the lease plus `more_s`, s."""
         robot.stream(controller, kind, self.lease + more_s).send(command)
 
     def _connected(self) -> RemoteRobot:

@@ -1,4 +1,4 @@
-"""The program `dxlrun-ros2`, where the versions fit."""
+"""Entry point of `dxlrun-ros2`. It checks that the versions of dxlrun and this package match."""
 
 from __future__ import annotations
 
@@ -8,10 +8,11 @@ from dxlrun_ros2.versions import other_version
 
 
 def main() -> int:
-    """Run the bridge; return 2 where dxlrun has another version."""
+    """Run the bridge, or return 2 if dxlrun has another version."""
     if (wrong := other_version()) is not None:
         print(f"dxlrun-ros2: {wrong}", file=sys.stderr)
         return 2
-    from dxlrun_ros2.command import main as bridge  # not above: another dxlrun may not have what it imports
+    # This import must follow the check, because it fails with another version of dxlrun.
+    from dxlrun_ros2.command import main as bridge
 
     return bridge()

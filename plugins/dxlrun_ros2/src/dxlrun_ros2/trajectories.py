@@ -1,4 +1,4 @@
-"""Trajectories of ROS 2 as dxlrun takes them: checked, sampled by the controllers' splines, compared."""
+"""Conversion of ROS 2 trajectories to commands of dxlrun, and the splines that the controllers play."""
 
 from __future__ import annotations
 
@@ -17,21 +17,22 @@ from dxlrun_controllers.laws.spline import CUBIC, LINEAR, QUINTIC, SplineSample,
 
 @dataclass(frozen=True)
 class Wanted:
-    """What a trajectory wants of its joints: rad, rad/s, rad/s^2, s."""
+    """Validated trajectory: rad, rad/s, rad/s^2, s."""
 
     joints: tuple[str, ...]
     times: Floats
-    """s after the start, growing; shape (points,)"""
+    """Times after the start, s, increasing; shape (points,)"""
     points: Floats
     """Position, velocity, acceleration; shape (points, 3, joints)"""
     orders: tuple[int, ...]
-    """How many coefficients each point has, by what is given of it."""
+    """Order of each point: LINEAR with a position only, CUBIC with a velocity, QUINTIC with an acceleration
+    """
     start_in: float
-    """s"""
+    """Time until the start, s"""
 
     @property
     def seconds(self) -> float:
-        """Until its last point."""
+        """Time until the last point, s"""
         return self.start_in + float(self.times[-1])
 
     def command(self) -> dict[str, object]:
@@ -39,7 +40,7 @@ class Wanted:
         return {"points": self._points(0.0), "joints": list(self.joints), "start_in": self.start_in}
 
     def chunk(self, now: float) -> dict[str, object]:
-        """Return the command `chunk`; `now`: of any clock that goes on, s."""
+        """Return the command `chunk`; `now` is the time of any monotonic clock, s."""
         return {"points": self._points(now + self.start_in), "joints": list(self.joints), "now": now}
 
     def _points(self, begin: float) -> list[dict[str, object]]:
@@ -54,22 +55,30 @@ class Wanted:
         return rows
 
     def spline(self, begin: Floats) -> Trajectory:
-        """Return what its controller plays, from joints that rest at `begin`."""
+        """Return the spline that the controller plays from rest at `begin`."""
         spline, now = Trajectory(len(self.joints)), SplineSample(len(self.joints))
         now.rest_at(begin)
         spline.load(flatten(self.orders, self.times, self.points, self.start_in), now)
         return spline
 
     def index(self, seconds: float) -> int:
-        """Return the point that is next at a time after the goal's beginning."""
+        """Return the index of the next point at a time after the start of the goal, s."""
         return min(int(np.searchsorted(self.times + self.start_in, seconds)), len(self.times) - 1)
 
 
 def wanted(message: JointTrajectory, joints: Sequence[str], now: float) -> Wanted:
-    """Return what a trajectory wants of some of a controller's joints; `now`: s of the clock of its stamp.
+    """Validate a trajectory of joints of a controller.
 
-    A first point at time 0 is where the joints are already, so it is left out where others follow. Raises
-    InputError.
+    Points in the past are omitted, and so is a first point at time 0 if more points follow, because the
+    joints are there already.
+
+    Args:
+        message: Trajectory.
+        joints: Joints of the controller.
+        now: Time of the clock of the stamp, s.
+
+    Raises:
+        InputError: The trajectory is invalid, or all of its points are in the past.
     """
     named = tuple(message.joint_names)
     if unknown := [name for name in named if name not in joints]:
@@ -106,9 +115,13 @@ def wanted(message: JointTrajectory, joints: Sequence[str], now: float) -> Wante
 
 
 def tolerances(given: Sequence[JointTolerance], joints: Sequence[str]) -> dict[str, dict[str, float | str]]:
-    """Return the tolerances of a goal as a trajectory takes them: 0 is left out, below 0 is `inf`.
+    """Convert the tolerances of a goal to those of the command `trajectory`.
 
-    Accelerations are not measured and not checked. Raises InputError.
+    A tolerance of 0 is omitted, and a negative one becomes `inf`. Accelerations are not measured, so they are
+    not checked.
+
+    Raises:
+        InputError: A joint is not moved, or a number is not finite.
     """
     rows: Mapping[str, JointTolerance] = {one.name: one for one in given}
     if unknown := [name for name in rows if name not in joints]:
@@ -124,7 +137,7 @@ def tolerances(given: Sequence[JointTolerance], joints: Sequence[str]) -> dict[s
 
 
 def goal_fields(goal: FollowJointTrajectory.Goal, joints: Sequence[str]) -> dict[str, object]:
-    """Return the tolerances of a FollowJointTrajectory goal as fields of a trajectory. Raises InputError."""
+    """Convert the tolerances of a FollowJointTrajectory goal to fields of a command. Raises InputError."""
     fields: dict[str, object] = {
         "path_tolerance": tolerances(goal.path_tolerance, joints),
         "goal_tolerance": tolerances(goal.goal_tolerance, joints),
@@ -135,12 +148,12 @@ def goal_fields(goal: FollowJointTrajectory.Goal, joints: Sequence[str]) -> dict
 
 
 def point(rows: Floats, seconds: float) -> JointTrajectoryPoint:
-    """Return a point of a message, of positions and velocities of joints, shape (2, joints)."""
+    """Return a message with positions and velocities of joints, given as an array of shape (2, joints)."""
     message = JointTrajectoryPoint(positions=rows[0].tolist(), velocities=rows[1].tolist())
     message.time_from_start = Duration(sec=int(seconds), nanosec=int(seconds % 1 * 1e9))
     return message
 
 
 def seconds_of(message: Time | Duration) -> float:
-    """Return a time or a duration in s."""
+    """Convert a time or a duration to s."""
     return float(message.sec) + float(message.nanosec) * 1e-9

@@ -1,4 +1,4 @@
-"""Messages of the page's buttons and sliders: one type per action, which performs it on a running robot."""
+"""Messages of the page's buttons and sliders. Each type of message is an action on a running robot."""
 
 from __future__ import annotations
 
@@ -12,23 +12,23 @@ from dxlrun_view.live import LiveRobot, info_of
 from dxlrun_view.shown import Source
 
 LEAD_S = 0.3
-"""A trajectory controller leads a joint to where its slider is in this time."""
+"""Time in which a trajectory controller moves a joint to the position of its slider, s"""
 Names = Annotated[tuple[str, ...], msgspec.Meta(min_length=1)]
 
 
 class Done(msgspec.Struct, frozen=True):
-    """Result of an action."""
+    """Result of an action"""
 
     said: str
-    """For the page's line of messages."""
+    """Text for the message line of the page"""
     parameters: tuple[Parameter, ...] = ()
 
 
 class _Message(msgspec.Struct, frozen=True, forbid_unknown_fields=True, tag_field="verb"):
-    """An action; `verb` in the message is the tag of its type."""
+    """Base class of actions. The key `verb` of a message selects the type."""
 
     always: ClassVar[bool] = False
-    """True when a page may send it that may not steer."""
+    """True if the action is allowed without the right to steer"""
 
 
 class Stop(_Message, frozen=True, tag="stop"):
@@ -37,7 +37,7 @@ class Stop(_Message, frozen=True, tag="stop"):
     always = True
 
     def perform(self, robot: RemoteRobot) -> Done:
-        """Where the run refuses that, end the run: its policy disables the torque then."""
+        """Disable the torque. If the run refuses that, end the run, whose policy then disables the torque."""
         try:
             robot.torque("all", on=False, release=True)
         except DxlrunError as error:
@@ -153,7 +153,7 @@ Action = Stop | Halt | Pause | Resume | SetTorque | Switch | Goal | Play | ListP
 
 
 def act(source: Source, action: Action) -> Done:
-    """Perform an action. Raises DxlrunError with the reason when it cannot be done."""
+    """Perform an action. Raises DxlrunError with the reason if it is not possible."""
     if not isinstance(source, LiveRobot):
         raise InputError("this is a log: nothing can be steered in it")
     if isinstance(action, Play) and action.motion not in source.shown().motions:

@@ -1,4 +1,4 @@
-"""The verb `view`, where the versions fit."""
+"""Entry point of the verb `view`. It checks that the versions of dxlrun and this package match."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Curves: what a page draws of a robot, one column a value that changes, one row a moment."""
+"""Curves: values of a robot over time, one column per value and one row per moment."""
 
 from __future__ import annotations
 
@@ -10,51 +10,51 @@ import numpy as np
 from numpy.typing import NDArray
 
 Values = NDArray[np.float64]
-"""Shape (moments,) or (moments, columns); NaN: not known."""
+"""Values of shape (moments,) or (moments, columns); NaN if unknown"""
 
 JOINT_COLUMNS = (
     *("position", "velocity", "effort"),
     *("goal_position", "goal_velocity", "goal_effort", "goal_pwm"),
     *("temperature", "voltage", "hardware_error", "mode", "torque", "valid"),
 )
-"""Of each joint, as `JOINT/position`; the names are those of the log's cycles."""
+"""Columns of each joint, named `JOINT/position` and so on, with the field names of the log's cycles"""
 LATE, CYCLE = "loop/late", "loop/cycle"
-"""Columns of the loop: how late it woke up, s, and the number of its cycle."""
+"""Columns of the loop: lateness of the wake-up, s, and number of the cycle"""
 
 
 MOST_OF_FIELD = 40
-"""Numbers of one field of a message that can be drawn."""
+"""Largest number of elements of an array in a message that are drawn"""
 
 
 class Curve(msgspec.Struct, frozen=True):
-    """One column in a span of time, thinned to what a plot can show."""
+    """Column in a span of time, downsampled for a plot"""
 
     name: str
     time: list[float]
-    """s, as the page has them."""
+    """s"""
     value: list[float | None]
-    """None: not known."""
+    """None if unknown"""
 
 
 class Moment(msgspec.Struct, frozen=True):
-    """All columns at one time."""
+    """Values of all columns at one time"""
 
     time: float
-    """s; NaN is no JSON: a robot without a cycle yet has time 0 and no values."""
+    """s; 0 before the first cycle, because JSON has no NaN"""
     values: list[float | None]
-    """In the order of the columns."""
+    """Values in the order of the columns; empty before the first cycle"""
 
 
 def columns_of(
     joints: Sequence[str], states: Sequence[str], references: Sequence[str] = ()
 ) -> tuple[str, ...]:
-    """Return the names of all columns of a robot, in their order."""
+    """Return the names of all columns of a robot."""
     of_joints = [f"{joint}/{column}" for column in JOINT_COLUMNS for joint in joints]
     return (CYCLE, LATE, *of_joints, *states, *references)
 
 
 class History:
-    """The newest moments of a robot in memory that does not grow, or all moments of a log."""
+    """Ring buffer of the newest moments of a robot, or all moments of a log"""
 
     def __init__(self, columns: Sequence[str], most: int) -> None:
         self.columns = tuple(columns)
@@ -64,14 +64,14 @@ class History:
         self._count = 0
 
     def append(self, time: float, values: Values) -> None:
-        """Add a moment behind the others, whose times are smaller; the oldest leaves."""
+        """Append a moment, with a time later than all others. A full buffer drops the oldest moment."""
         place = self._count % len(self._times)
         self._times[place] = time
         self._values[place] = values
         self._count += 1
 
     def fill(self, times: Values, name: str, values: Values) -> None:
-        """Write one column of all moments at once; every column gets the same times."""
+        """Write one column of all moments. All columns must have the same times."""
         self._count = len(times)
         self._times[: len(times)] = times
         self._values[: len(times), self._place[name]] = values
@@ -84,14 +84,14 @@ class History:
 
     @property
     def span(self) -> tuple[float, float]:
-        """Time of the oldest and of the newest moment, s; both 0 while there is none."""
+        """Times of the oldest and the newest moment, s; both 0 if there are none"""
         if not len(self):
             return 0.0, 0.0
         first, last = self._times[self._rows(np.array([0, len(self) - 1]))]
         return float(first), float(last)
 
     def at(self, time: float | None = None) -> Moment:
-        """Return the last moment until a time, or the first; without a time the newest."""
+        """Return the last moment not after `time`, or the first one. Without a time, return the newest."""
         if not len(self):
             return Moment(0.0, [])
         index = len(self) if time is None else max(self._index(time), 1)
@@ -99,10 +99,12 @@ class History:
         return Moment(float(self._times[row]), plain(self._values[row]))
 
     def curve(self, name: str, begin: float, end: float, points: int) -> Curve:
-        """Return one column between two times, at most about so many points: of each piece its smallest and
-        its largest value, so that no peak is lost.
+        """Return one column between two times, downsampled to about `points` points.
 
-        Raises KeyError for a column that there is not.
+        Downsampling keeps the minimum and the maximum of each piece, so that no peak is lost.
+
+        Raises:
+            KeyError: The column is unknown.
         """
         place = self._place[name]
         first = max(self._index(begin) - 1, 0)
@@ -111,12 +113,12 @@ class History:
         return thinned(name, self._times[rows], self._values[rows, place], points)
 
     def _rows(self, index: NDArray[np.int64]) -> NDArray[np.int64]:
-        """Return where moments are, whose indices count from the oldest."""
+        """Return the rows of moments, whose indices count from the oldest one."""
         oldest = self._count % len(self._times) if self._count > len(self._times) else 0
         return (oldest + index) % len(self._times)
 
     def _index(self, time: float) -> int:
-        """Return how many moments were until a time."""
+        """Return the number of moments not after a time."""
         oldest = self._count % len(self._times) if self._count > len(self._times) else 0
         first, second = self._times[oldest : self._count], self._times[:oldest]
         if len(second) and time >= second[0]:
@@ -125,7 +127,7 @@ class History:
 
 
 def thinned(name: str, times: Values, values: Values, points: int) -> Curve:
-    """Return a curve of at most `points` points: where there are more, the extremes of each piece."""
+    """Return a curve, downsampled to about `points` points by the extremes of pieces."""
     if len(times) > max(points, 2):
         pieces = np.array_split(np.arange(len(times)), max(points // 2, 1))
         kept: list[int] = []
@@ -138,7 +140,10 @@ def thinned(name: str, times: Values, values: Values, points: int) -> Curve:
 
 
 def numbers_in(message: Mapping[str, object], name: str) -> dict[str, float]:
-    """Return the numbers of a message by their curves: `/arm/state:error[0]`; of long arrays none."""
+    """Return the numbers of a message by the names of their curves, such as `/arm/state:error[0]`.
+
+    Arrays with more than MOST_OF_FIELD elements are skipped.
+    """
     found: dict[str, float] = {}
     for field, value in message.items():
         if isinstance(value, Mapping):
@@ -154,5 +159,5 @@ def numbers_in(message: Mapping[str, object], name: str) -> dict[str, float]:
 
 
 def plain(values: Values) -> list[float | None]:
-    """Return numbers of JSON: what is none becomes None."""
+    """Return the values for JSON, with None in place of NaN and infinity."""
     return [value if math.isfinite(value) else None for value in values.tolist()]

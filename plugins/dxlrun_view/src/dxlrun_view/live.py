@@ -1,4 +1,4 @@
-"""A running robot for the page: asked when a page looks, 25 times a second, and not at all otherwise."""
+"""Running robot as a source of the page. It is polled at 25 Hz, and only while a page is open."""
 
 from __future__ import annotations
 
@@ -22,25 +22,26 @@ from dxlrun_view.shown import LiveEvent, RobotInfo, Shown
 from dxlwire import Mode
 
 PERIOD_S = 0.04
-"""Between two looks of a page; what a screen shows need not come more often."""
+"""Polling period of a page, s. A faster rate would not be visible."""
 SLOW_S = 0.5
-"""Between two looks at what changes seldom: controllers, rate, events."""
+"""Polling period of values that rarely change (controllers, rate, events), s"""
 KEPT_S = 300.0
-"""Curves reach back so far."""
+"""Length of the curves, s"""
 _KEPT = round(KEPT_S / PERIOD_S)
 DRAWN_S = 3.0
-"""A topic that no page has drawn for so long is asked for no more."""
+"""Time without a plot of a topic after which the topic is no longer polled, s"""
 GAP_S = 1.0
-"""Between two cycles that a curve does not join: no page looked, or the robot did not run."""
+"""Time between two cycles above which a curve has a gap, s: no page was open, or the robot did not run"""
 _MOST_EVENTS = 400
+"""Number of events that are kept"""
 _TORQUE = {torque.word: torque for torque in reversed(Torque)}
-"""Numbers of the log by their words."""
+"""Torque states of the log by their names"""
 NOT_DRAWN = (LogTopic.EVENT, LogTopic.JOINT_STATES, "/goals")
-"""Topics whose numbers are columns already, or none."""
+"""Topics without numbers, or with numbers that are columns already"""
 
 
 class LiveRobot:
-    """What is known of a running robot. One page at a time asks it; the others get what is known then."""
+    """Cached state of a running robot. One page at a time polls the robot; all other pages read the cache."""
 
     def __init__(self, name: str) -> None:
         self._name = name
@@ -53,26 +54,26 @@ class LiveRobot:
         self._cycle = -1
         self._run = 0
         self._events: deque[LiveEvent] = deque(maxlen=_MOST_EVENTS)
-        """Of all runs, numbered here."""
+        """Events of all runs, with consecutive numbers"""
         self._last_event, self._known_until_s = 0, -1.0
-        """Number of this run's last event; time of the last one before it was connected to."""
+        """Number of the last event in the present run; time of the last event before the connection, s"""
         self._fields: dict[str, tuple[str, ...]] = {}
         self._drawn: dict[str, DrawnTopic] = {}
         self._problem = ""
         self._looked_s = self._looked_slowly_s = -SLOW_S
         self._asking, self._lock = threading.Lock(), threading.Lock()
-        """Held by the page that asks the robot; held while curves are written or read."""
+        """Lock of the page that polls the robot, and lock of the curves"""
         self.at(None)
 
     def close(self) -> None:
-        """Leave the robot alone for good."""
+        """Close the connection to the robot."""
         with self._asking:
             self._gone("")
 
     # What the page asks for
 
     def shown(self) -> Shown:
-        """Return what the page has around the curves."""
+        """Return everything that the page shows in addition to the curves."""
         return Shown(
             info=self._info,
             live=True,
@@ -88,7 +89,7 @@ class LiveRobot:
         )
 
     def at(self, time_s: float | None) -> Moment:
-        """Return all columns at a time, by default the newest, for which the robot is asked."""
+        """Return all columns at a time. Without a time, poll the robot and return the newest values."""
         if time_s is None and self._asking.acquire(blocking=False):
             try:
                 self._look(time.monotonic())
@@ -98,7 +99,7 @@ class LiveRobot:
             return self._history.at(time_s)
 
     def curve(self, name: str, begin: float, end: float, points: int) -> Curve:
-        """Return a part of a curve; raises KeyError for one that there is not."""
+        """Return a span of a curve. Raises KeyError for an unknown curve."""
         topic, of_topic, _ = name.partition(":")
         if of_topic and name not in self._fields.get(topic, ()):
             raise KeyError(name)
@@ -110,26 +111,26 @@ class LiveRobot:
             return drawn.history.curve(name, begin, end, points)
 
     def events(self, after: int) -> tuple[LiveEvent, ...]:
-        """Return the events behind this number."""
+        """Return the events with a number greater than `after`."""
         return tuple(event for event in list(self._events) if event.number > after)
 
     def urdf(self) -> str:
-        """Return the robot's URDF; empty: it has none."""
+        """Return the robot's URDF, or an empty text."""
         return self._urdf
 
     @property
     def folder(self) -> Path | None:
-        """Where its robot file is, from which meshes are looked up."""
+        """Directory of the robot file, in which meshes are searched"""
         return Path(self._info.file).parent if self._info.file else None
 
     def asking(self) -> RemoteRobot:
-        """Return a connection of its own, for a request; raises DxlrunError."""
+        """Open a separate connection for a request. Raises DxlrunError."""
         return connect(self._name, "dxlrun view")
 
     # Asking the robot
 
     def _look(self, now_s: float) -> None:
-        """Note the newest cycle, and twice a second what changes seldom."""
+        """Poll the newest cycle, and every SLOW_S the values that rarely change."""
         slowly = now_s - self._looked_slowly_s > SLOW_S
         if now_s - self._looked_s < PERIOD_S / 2 or not (self._robot or slowly):
             return
@@ -140,7 +141,8 @@ class LiveRobot:
             if slowly:
                 self._looked_slowly_s = now_s
                 self._look_slowly(self._robot)
-            with suppress(Refused):  # before the first cycle, or a topic that has left with its controller
+            # Refused: the first cycle is still to come, or the controller of a topic was unloaded.
+            with suppress(Refused):
                 self._note_cycle(self._robot.states())
                 self._note_topics(self._robot, now_s)
         except DxlrunError as error:
@@ -150,7 +152,7 @@ class LiveRobot:
             self._gone(str(error) if self._name in running() else waits)
 
     def _begun(self) -> RemoteRobot:
-        """Connect to a run, and note what it keeps until its end. Raises DxlrunError."""
+        """Connect to a run, and read what does not change until its end. Raises DxlrunError."""
         robot = self.asking()
         self._info = info_of(robot)
         self._urdf = robot.urdf()
@@ -190,7 +192,7 @@ class LiveRobot:
     def _note_events(self, robot: RemoteRobot) -> None:
         began_s = self._info.began
         if began_s is None:
-            return  # the first cycle comes soon, and their times count from it
+            return  # event times are relative to the first cycle, which is still to come
         found = msgspec.convert(robot.events(self._last_event)["events"], list[LiveEvent])
         for event in found:
             self._last_event = event.number
@@ -200,14 +202,17 @@ class LiveRobot:
                 self._events.append(msgspec.structs.replace(event, number=number, run_time=run_time_s))
 
     def _note_fields(self, robot: RemoteRobot) -> None:
-        """Note what can be drawn of the topics' messages, by the first message that each has."""
+        """Find the fields that can be drawn, from the first message of each topic."""
         for topic in robot.topics():
             if topic.name in self._fields or topic.name in NOT_DRAWN or not topic.count:
                 continue
             message = robot.newest(topic.name)
             if message is not None:
                 numbers = numbers_in(message.message, f"{topic.name}:")
-                self._fields = {**self._fields, topic.name: tuple(numbers)}  # others may read it meanwhile
+                self._fields = {
+                    **self._fields,
+                    topic.name: tuple(numbers),
+                }  # new: it is read in threads
 
     def _note_topics(self, robot: RemoteRobot, now_s: float) -> None:
         """Append the newest messages of the topics that a page draws."""
@@ -230,13 +235,13 @@ class LiveRobot:
 
 
 class DrawnTopic:
-    """Numbers in the messages of one topic, as long as a page draws one of them."""
+    """Numbers in the messages of one topic, kept while a page draws one of them"""
 
     def __init__(self) -> None:
         self.asked_s = time.monotonic()
         self.history = History((), 1)
         self.time_ns = 0
-        """Of the newest message."""
+        """Time of the newest message, ns"""
 
     def append(self, time_ns: int, numbers: Mapping[str, float]) -> None:
         """Append the numbers of a message."""
@@ -247,12 +252,12 @@ class DrawnTopic:
 
 
 def info_of(robot: RemoteRobot) -> RobotInfo:
-    """Return what a robot says of itself, as far as a page uses it. Raises DxlrunError."""
+    """Return the information about a robot that a page uses. Raises DxlrunError."""
     return msgspec.convert(robot.info(), RobotInfo)
 
 
 def _motions(info: RobotInfo) -> Iterator[str]:
-    """Yield the motion files beside the robot file that have no other controllers than this robot's."""
+    """Yield the motion files next to the robot file that only use controllers of this robot."""
     names = {row.name for row in info.controllers}
     for path in sorted(Path(info.file).parent.glob("motions/*.yaml")):
         with suppress(DxlrunError, OSError):
@@ -262,7 +267,7 @@ def _motions(info: RobotInfo) -> Iterator[str]:
 
 
 def _of_joints(states: RobotStates) -> Iterator[Values]:
-    """Yield the joints' columns as the log's cycles have them: mode and torque by their numbers."""
+    """Yield the columns of the joints with the values of the log's cycles: mode and torque as numbers."""
     special = {
         "mode": [Mode[name.upper()] for name in states.mode],
         "torque": [_TORQUE[word] for word in states.torque],

@@ -1,4 +1,4 @@
-"""A log for the page: every column of its cycles in memory, of a long log every second, third ... cycle."""
+"""Log as a source of the page. All columns are kept in memory; the cycles of a long log are downsampled."""
 
 from __future__ import annotations
 
@@ -28,7 +28,7 @@ from dxlrun_view.curves import (
 from dxlrun_view.shown import Controller, LiveEvent, Mark, RobotInfo, Shown
 
 MOST_CYCLES = 100_000
-"""Shown of a log, in some 120 MB for 20 joints."""
+"""Number of cycles of a log that are shown at least, if it has so many. 20 joints take some 120 MB."""
 _IN_COLUMNS = (
     LogTopic.CYCLE,
     LogTopic.ACTIVATION,
@@ -37,17 +37,25 @@ _IN_COLUMNS = (
     LogTopic.JOINT_STATES,
     LogTopic.JOINT_COMMANDS,
 )
-"""Topics whose numbers are columns of the cycles, or nothing to draw."""
+"""Topics without numbers, or with numbers that are columns of the cycles"""
 _NONE = np.zeros(0, [("cycle", "i8")])
 WORST = 8
-"""Cycles that woke up latest and are offered as jumps."""
+"""Number of latest cycles that are offered as jumps"""
 
 
 class RecordedRobot:
-    """A log that was read."""
+    """Log that was read into memory"""
 
     def __init__(self, path: Path, progress: Callable[[float], object] = lambda share: None) -> None:
-        """Read it; `progress` gets the share that is done. Raises LogError."""
+        """Read a log.
+
+        Args:
+            path: Log file, or directory of parts.
+            progress: Called with the fraction that has been read, 0..1.
+
+        Raises:
+            LogError: The log is not readable, is of another program, or has no cycle.
+        """
         reader = open_log(path)
         if reader.header is None:
             raise LogError(f"{path}: an MCAP file of another program; `dxlrun view` shows logs of dxlrun")
@@ -78,12 +86,12 @@ class RecordedRobot:
 
     @property
     def folder(self) -> Path | None:
-        """Where its robot file was, as far as it is still there."""
+        """Directory of the robot file, or None if it no longer exists"""
         folder = Path(self._info.file).parent
         return folder if folder.is_dir() else None
 
     def shown(self) -> Shown:
-        """Return what the page has around the curves."""
+        """Return everything that the page shows in addition to the curves."""
         frames = self._plan.frames if self._plan is not None else None
         return Shown(
             info=self._info,
@@ -99,11 +107,11 @@ class RecordedRobot:
         )
 
     def at(self, time_s: float | None) -> Moment:
-        """Return all columns at a time, by default at the end."""
+        """Return all columns at a time, by default at the end of the log."""
         return self._history.at(time_s)
 
     def curve(self, name: str, begin: float, end: float, points: int) -> Curve:
-        """Return a part of a column, or of a topic's field, `/arm/state:error[0]`. Raises KeyError."""
+        """Return a span of a column or of a field such as `/arm/state:error[0]`. Raises KeyError."""
         if name in self._history:
             return self._history.curve(name, begin, end, points)
         times, values = self._field(name)
@@ -111,18 +119,18 @@ class RecordedRobot:
         return thinned(name, times[inside], values[inside], points)
 
     def events(self, after: int) -> tuple[LiveEvent, ...]:
-        """Return the events behind this number."""
+        """Return the events with a number greater than `after`."""
         return self._events[after:]
 
     def urdf(self) -> str:
-        """Return the robot's URDF; empty: the log has none."""
+        """Return the robot's URDF, or an empty text."""
         return self._plan.urdf or "" if self._plan is not None else ""
 
     def close(self) -> None:
-        """Nothing is open."""
+        """Do nothing: the log is in memory."""
 
     def _field(self, name: str) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-        """Return times and values of a field of a topic. Raises KeyError."""
+        """Return the times and values of a field of a topic. Raises KeyError."""
         if name not in self._topics:
             topic, _, field = name.partition(":")
             field, _, index = field.partition("[")
@@ -138,7 +146,7 @@ class RecordedRobot:
         return self._topics[name]
 
     def _drawable(self) -> Iterator[str]:
-        """Yield the numbers in messages of topics, by the first message of each."""
+        """Yield the names of the numbers in the first message of each topic."""
         for topic in self._reader.topics:
             if topic in _IN_COLUMNS or topic.startswith(BUS_PREFIX):
                 continue
@@ -182,14 +190,14 @@ class RecordedRobot:
         )
 
     def _planned(self) -> Plan | None:
-        """Return the plan of the run; None: of an older version, or damaged."""
+        """Return the plan of the run, or None if it is damaged or of an older version."""
         try:
             return from_json(self._reader.attachments["plan.json"])
         except (KeyError, DxlrunError, msgspec.MsgspecError, ValueError):
             return None
 
     def _of_run(self, file: str) -> RobotInfo:
-        """Return what the robot said of itself in the run, as far as the log has it."""
+        """Return the information about the robot that the log contains."""
         header, plan = self._header, self._plan
         info = RobotInfo(
             header.robot,
@@ -219,19 +227,19 @@ class RecordedRobot:
 
 
 class _Read:
-    """Cycles of a log as they are read: where they become too many, every second one leaves."""
+    """Cycles of a log while it is read. Every second cycle is dropped when there are too many."""
 
     def __init__(self) -> None:
         self.every = 1
         self.skipped = 0
         self.events: list[Event] = []
         self.worst = _NONE
-        """The cycles that woke up latest."""
+        """Cycles with the latest wake-ups"""
         self._parts: list[NDArray[np.void]] = []
         self._seen = self._kept = 0
 
     def take(self, cycles: NDArray[np.void]) -> None:
-        """Take the cycles of a slice."""
+        """Add the cycles of a slice."""
         if not len(cycles):
             return
         self.skipped += int(cycles["skipped"].sum())
@@ -247,7 +255,7 @@ class _Read:
 
     @property
     def cycles(self) -> NDArray[np.void]:
-        """Those that are kept."""
+        """Cycles that were kept"""
         return np.concatenate(self._parts) if self._parts else _NONE
 
 

@@ -1,9 +1,9 @@
-"""Server of the page: one process of its own on 127.0.0.1, for the user's browser, and for no web site.
+"""Server of the page: a separate process on 127.0.0.1 that only serves the user's own browser.
 
-Each request must name this server as its host (no foreign name that points to 127.0.0.1 gets through), come
-from this page if it says from where, and show the token of the page's address. STOP
-works without `--control`. On another address than one of this computer itself, both ends show a certificate
-of `dxlrun keys`, and the role in that of the browser decides whether it may steer.
+Each request must have a host name of this server (which prevents DNS rebinding), an origin of this page if it
+has an origin, and the token of the page's address. STOP works without `--control`. On an address that is not
+local, both ends need a certificate of `dxlrun keys`, and the role in the browser's certificate decides if it
+may steer.
 """
 
 from __future__ import annotations
@@ -37,13 +37,15 @@ if TYPE_CHECKING:
 
 PORT = 8765
 ANY = str(IPv4Address(0))
-"""Stands for every address of this machine."""
+"""Wildcard for all addresses of this machine"""
 HEADER = "X-Dxlrun-Token"
-"""Has the token of the page's address."""
+"""Header with the token of the page's address"""
 MOST_POINTS = 4000
+"""Largest number of points of a curve"""
 MOST_CURVES = 64
+"""Largest number of curves of a plot"""
 MOST_BYTES = 1 << 16
-"""Of a request."""
+"""Largest size of a request body, bytes"""
 _TYPES = {"": "text/html", "page.js": "text/javascript", "page.css": "text/css"}
 _SECURITY = {
     "Content-Security-Policy": (
@@ -59,7 +61,7 @@ _MESHES = (".stl", ".dae", ".obj")
 
 
 class Span(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
-    """Curves that one plot of the page needs."""
+    """Curves and span of time of one plot"""
 
     names: tuple[str, ...]
     begin: float
@@ -68,19 +70,19 @@ class Span(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
 
 
 class Look(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
-    """What the page asks for, some 25 times a second."""
+    """Request of the page for new data, sent at about 25 Hz"""
 
     time: float | None = None
-    """Of a log, where its time line is; None: the newest."""
+    """Position of the time line of a log, s; None for the newest moment"""
     after: int = 0
-    """Number of the last event that it has."""
+    """Number of the last event that the page has"""
     shown: bool = False
-    """It needs what changes seldom, too."""
+    """True if the page also needs the values that rarely change"""
     spans: tuple[Span, ...] = ()
 
 
 class Seen(msgspec.Struct, frozen=True):
-    """The answer."""
+    """Response to a `Look`"""
 
     moment: Moment
     events: tuple[LiveEvent, ...]
@@ -95,12 +97,19 @@ Handler = Callable[[Request], Awaitable[Response]]
 
 
 class Page:
-    """The page of a robot or a log."""
+    """Web application that shows a robot or a log"""
 
     def __init__(
         self, source: Source, listener: Listener, *, hosts: tuple[str, ...], control: bool = False
     ) -> None:
-        """`hosts`: names of this server with its port, as browsers send them."""
+        """Create the token of the page.
+
+        Args:
+            source: Robot or log.
+            listener: Socket of the server.
+            hosts: Host names of this server with its port, as browsers send them.
+            control: Allow actions other than STOP.
+        """
         self.source, self.control, self.listener = source, control, listener
         self.token = secrets.token_urlsafe(16)
         self._hosts = frozenset(hosts)
@@ -133,7 +142,7 @@ class Page:
                 self.listener.admit(request.client)
             try:
                 response = await handler(request)
-            except (DxlrunError, OSError) as error:  # OSError: a mesh that cannot be read
+            except (DxlrunError, OSError) as error:  # OSError: a mesh is not readable
                 response = _refused(409, str(error))
             response.headers.update(_SECURITY)
             return response
@@ -141,7 +150,7 @@ class Page:
         return answer
 
     async def page(self, request: Request) -> Response:
-        """Return a file of the page; the address of the first has the token, which its script sends."""
+        """Return a file of the page. The script sends the token in the address of the first file."""
         name = request.url.path.strip("/")
         where = files("dxlrun_view").joinpath("page", *(("build", name) if name else ("page.html",)))
         if not where.is_file():
@@ -151,7 +160,7 @@ class Page:
         return Response(where.read_bytes(), media_type=_TYPES[name])
 
     async def look(self, request: Request) -> Response:
-        """Return what the page draws."""
+        """Return the data that the page draws."""
         asked = await _message(request, _LOOK)
         return _json(await run_in_threadpool(self._seen, asked, self._may_steer(request)))
 
@@ -177,11 +186,11 @@ class Page:
         return tuple(found)
 
     async def urdf(self, request: Request) -> Response:
-        """Return the robot's URDF; nothing where it has none."""
+        """Return the robot's URDF, or an empty body."""
         return Response(await run_in_threadpool(self.source.urdf), media_type="application/xml")
 
     async def mesh(self, request: Request) -> Response:
-        """Return a mesh that the URDF names, from the folder of the robot file."""
+        """Return a mesh that the URDF names, searched from the directory of the robot file."""
         name = request.query_params.get("name", "")
         path = await run_in_threadpool(self._mesh, name)
         if path is None:
@@ -189,14 +198,14 @@ class Page:
         return Response(path.read_bytes(), media_type="application/octet-stream")
 
     def _mesh(self, name: str) -> Path | None:
-        """Return a file that the URDF names; never another one."""
+        """Return the path of a mesh, or None. Only files that the URDF names are allowed."""
         if self.source.folder is None or f'"{name}"' not in self.source.urdf():
             return None
         found = mesh_file(self.source.folder, name)
         return found if found is not None and found.suffix.lower() in _MESHES else None
 
     async def act(self, request: Request) -> Response:
-        """Do what a button asks; without `--control` only STOP."""
+        """Perform an action. Without `--control`, only those with `always` are allowed, such as STOP."""
         action = await _message(request, _ACTION)
         if not isinstance(action, ListParameters) and self._role(request) < Role.COMMAND:
             return _refused(403, "the certificate of this browser has the role observe; it may only look")
@@ -208,7 +217,7 @@ class Page:
         return self.control and self._role(request) >= Role.COMMAND
 
     def _role(self, request: Request) -> Role:
-        """Return the role of a browser: by its certificate; without TLS it is one of this computer."""
+        """Return the role in a browser's certificate. A browser without TLS is local, and has all rights."""
         if self.listener.tls is None:
             return Role.ADMIN
         role: Role = request.scope["client"].role
@@ -216,9 +225,9 @@ class Page:
 
 
 def mesh_file(folder: Path, name: str) -> Path | None:
-    """Return where a mesh is: from the robot file's folder, `package://NAME/...` in a folder NAME above it.
+    """Find the file of a mesh, relative to the directory of the robot file, or return None.
 
-    None: nowhere.
+    `package://NAME/...` is searched in a directory NAME above it, and also without NAME.
     """
     if name.startswith("package://"):
         relative = Path(name.removeprefix("package://"))
@@ -230,12 +239,18 @@ def mesh_file(folder: Path, name: str) -> Path | None:
 
 
 def scheme_of(listener: Listener) -> str:
-    """Return how the address of a page begins."""
+    """Return the URL scheme of a page."""
     return "http" if listener.tls is None else "https"
 
 
 def hosts_of(address: str, port: int, *others: str) -> tuple[str, ...]:
-    """Return the names under which a browser may reach a server; `others`: those in its certificate."""
+    """Return the host names with port under which a browser can reach a server.
+
+    Args:
+        address: Address of the listener.
+        port: Port of the listener.
+        others: Names in the certificate of the server.
+    """
     names = [*others]
     if address in ("127.0.0.1", "localhost", ANY):
         names += ["localhost", "127.0.0.1"]
@@ -246,10 +261,10 @@ def hosts_of(address: str, port: int, *others: str) -> tuple[str, ...]:
 
 
 class Server(uvicorn.Server):
-    """Leaves signals to the command; a listener with TLS makes its connections, as that of the gateway."""
+    """uvicorn server that does not handle signals. A listener with TLS accepts its own connections."""
 
     async def startup(self, sockets: list[socket.socket] | None = None) -> None:
-        """Begin to serve the sockets of `run`."""
+        """Start to serve the sockets of `run`."""
         secured = [one for one in sockets or () if isinstance(one, Listener) and one.tls]
         for listener in secured:
             await serve_clients(listener, self.config, self.server_state)
@@ -257,12 +272,12 @@ class Server(uvicorn.Server):
 
     @contextmanager
     def capture_signals(self) -> Iterator[None]:
-        """Capture none."""
+        """Leave signals to the command."""
         yield
 
 
 def server_of(page: Page) -> Server:
-    """Return the server of a page; `run(sockets=[...])` serves it."""
+    """Return the server of a page. Call `run(sockets=[...])` to serve it."""
     config = uvicorn.Config(
         page.app(),
         ws="none",
@@ -278,7 +293,7 @@ def server_of(page: Page) -> Server:
 
 
 async def _message(request: Request, decoder: Decoder[Message]) -> Message:
-    """Return the message in a request's body. Raises InputError for one that is not of its kind."""
+    """Decode the message in the body of a request. Raises InputError if it is invalid or too long."""
     data = b""
     async for piece in request.stream():
         data += piece

@@ -1,4 +1,4 @@
-"""What a page shows around the curves: joints, controllers, events, marks on the time line."""
+"""Data that a page shows in addition to curves: joints, controllers, events, marks on the time line."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ from dxlrun_view.curves import Curve, Moment
 
 
 class Controller(msgspec.Struct, frozen=True):
-    """A controller of the graph, a row of RobotInfo."""
+    """Controller of a robot, a row of RobotInfo"""
 
     name: str
     type: str
@@ -20,106 +20,106 @@ class Controller(msgspec.Struct, frozen=True):
     joints: tuple[str, ...] = ()
     command: tuple[str, ...] = ()
     into: tuple[str, ...] = ()
-    """Controllers whose references it commands."""
+    """Controllers whose references it commands"""
     fallback: str = ""
     goals: tuple[str, ...] = ()
-    """Commands that are goals, by their kinds."""
+    """Kinds of its commands that are goals"""
 
 
 class RobotInfo(msgspec.Struct, frozen=True):
-    """The part of `RemoteRobot.info` that a page uses; a log has the same."""
+    """Part of `RemoteRobot.info` that a page uses, also filled from logs"""
 
     robot: str
     rate: float = 0.0
-    """Hz, nominal."""
+    """Nominal rate, Hz"""
     began: float | None = None
-    """The run's first cycle, s as the curves' times; None: not known."""
+    """Time of the first cycle on the clock of the curves, s; None if unknown"""
     paused: bool = False
     skipped: int = 0
-    """Periods."""
+    """Number of skipped periods"""
     joints: tuple[str, ...] = ()
     groups: Mapping[str, tuple[str, ...]] = {}
     units: Mapping[str, str] = {}
-    """Of positions: rad or m."""
+    """Units of positions by joint: rad or m"""
     effort_units: Mapping[str, str] = {}
-    """Empty: the fraction of the servo's maximum."""
+    """Units of efforts by joint; an empty text for the fraction of the servo's maximum"""
     limits: Mapping[str, tuple[float, float]] = {}
-    """Of positions; a joint that turns without end has none."""
+    """Position limits by joint. Continuous joints are not included."""
     controllers: tuple[Controller, ...] = ()
     file: str = ""
 
 
 class LiveEvent(msgspec.Struct, frozen=True):
-    """An event as `RemoteRobot.events` has it."""
+    """Event of `RemoteRobot.events`"""
 
     number: int
     time: float
-    """s, as the curves'."""
+    """Time on the clock of the curves, s"""
     severity: int
-    """As in Python's logging: 20 is information, 30 a warning, 40 an error."""
+    """Level of Python's logging: 20 information, 30 warning, 40 error"""
     source: str
     text: str
     run_time: float = 0.0
-    """s since the run's first cycle, as in its log; servos are set up before."""
+    """Time since the first cycle of the run, s; negative during the set-up of the servos"""
 
 
 class Mark(msgspec.Struct, frozen=True):
-    """A place in a log that is worth a jump."""
+    """Point of interest in a log"""
 
     time: float
     what: str
 
 
 class Shown(msgspec.Struct, frozen=True, kw_only=True):
-    """A robot or a log, as far as it changes seldom."""
+    """Properties of a robot or a log that rarely change"""
 
     info: RobotInfo
     live: bool
     columns: tuple[str, ...]
     span: tuple[float, float]
-    """s, of the oldest and the newest moment."""
+    """Times of the oldest and the newest moment, s"""
     run: int = 1
-    """Greater by one for each run of the robot: all of the page is built anew."""
+    """Counter of runs. The page is rebuilt when it changes."""
     problem: str = ""
-    """Why there is nothing new: the robot does not run, or has ended."""
+    """Reason for missing data: the robot does not run, or has ended"""
     every: int = 1
-    """Of a long log every so manieth cycle is shown."""
+    """Downsampling factor of the cycles of a long log"""
     units: Mapping[str, str] = {}
-    """SI units of the states of sources that have one, by column."""
+    """SI units of the states of sources, by column"""
     fields: tuple[str, ...] = ()
-    """Numbers in messages of topics, which can be drawn: `/arm/state:error[0]`."""
+    """Numbers in messages of topics that can be drawn, such as `/arm/state:error[0]`"""
     marks: tuple[Mark, ...] = ()
-    """Of a log: its worst cycles."""
+    """Latest cycles of a log"""
     control: bool = False
-    """The page may steer."""
+    """True if the page may steer the robot"""
     motions: tuple[str, ...] = ()
-    """Motion files of the robot's folder that a page may play."""
+    """Motion files that the page may play"""
     imu: str = ""
-    """The source whose orientation turns the body."""
+    """Source of the orientation of the body"""
     imu_link: str = ""
 
 
 class Source(Protocol):
-    """A running robot or a log."""
+    """Running robot or log"""
 
     @property
     def folder(self) -> Path | None:
-        """Where the robot file is; None: not known."""
+        """Directory of the robot file; None if unknown"""
 
     def shown(self) -> Shown:
-        """Return what changes seldom."""
+        """Return the properties that rarely change."""
 
     def at(self, time_s: float | None) -> Moment:
-        """Return all columns at a time, by default the newest, for which a running robot is asked."""
+        """Return all columns at a time. Without a time, poll a running robot and return the newest values."""
 
     def curve(self, name: str, begin: float, end: float, points: int) -> Curve:
-        """Return a part of a curve; raises KeyError for one that there is not."""
+        """Return a span of a curve. Raises KeyError for an unknown curve."""
 
     def events(self, after: int) -> tuple[LiveEvent, ...]:
-        """Return the events behind this number."""
+        """Return the events with a number greater than `after`."""
 
     def urdf(self) -> str:
-        """Return the robot's URDF; empty: it has none."""
+        """Return the robot's URDF, or an empty text."""
 
     def close(self) -> None:
-        """Leave it alone."""
+        """Release the connection, if there is one."""

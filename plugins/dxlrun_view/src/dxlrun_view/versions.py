@@ -1,4 +1,4 @@
-"""Versions: this package fits the dxlrun of the tree that it was built from, which has the same version."""
+"""Version check: this package requires the dxlrun of the same version."""
 
 from __future__ import annotations
 
@@ -6,13 +6,13 @@ from importlib.metadata import PackageNotFoundError, version
 
 
 def other_version() -> str | None:
-    """Return what is wrong with the versions of dxlrun and this package, and the fix; None if they fit.
+    """Return an error message if the versions of dxlrun and this package differ, or None if they match.
 
-    It uses nothing of dxlrun: another version may not have it.
+    The function must not import dxlrun, because another version may lack the imported names.
     """
     try:
         own = version("dxlrun-view")
-    except PackageNotFoundError:  # it runs from its tree
+    except PackageNotFoundError:  # runs from the source tree
         return None
     found = version("dxlrun")
     if found == own:

@@ -55,7 +55,7 @@ def view(
 
     source = _source(what)
     try:
-        # the name in the robot's certificate, under which a browser has to reach the page
+        # Beyond this computer, a browser must use the name in the robot's certificate.
         names = () if place.is_loopback else (source.shown().info.robot,)
         tls = server_context(*names) if names else None
         with place.listener(PORT, tls) as listener:
@@ -81,7 +81,7 @@ def view(
 
 
 def _source(what: str | None) -> Source:
-    """Return the robot or the log that is meant. Raises DxlrunError."""
+    """Open the robot or the log that the argument names. Raises DxlrunError."""
     from dxlrun_view.live import LiveRobot
 
     if what is None:
@@ -112,7 +112,7 @@ def _source(what: str | None) -> Source:
 
 
 def _open(url: str) -> None:
-    """Open a browser; one that does not start says so."""
-    # a browser in the terminal would take it over
+    """Open a browser, or print a warning if that is not possible."""
+    # Without a display, webbrowser would start a text browser in this terminal.
     if not (os.environ.get("DISPLAY") or os.environ.get("WAYLAND_DISPLAY")) or not webbrowser.open(url):
         print_warning("no browser could be opened; open the address yourself")

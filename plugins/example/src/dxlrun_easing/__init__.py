@@ -1,6 +1,6 @@
-"""A controller for dxlrun that leads joints to their goals gently.
+"""Controller for dxlrun that moves joints to their goals gently.
 
-It imports only the public package `dxlrun`.
+The package imports only the public package `dxlrun`.
 """
 
 from dxlrun_easing.controller import Easing, PositionsCommand

@@ -1,4 +1,4 @@
-"""Easing: joints go to their goals fast while they are far away, and arrive slowly."""
+"""Easing: move joints fast while they are far from their goals, and slowly on arrival."""
 
 from __future__ import annotations
 
@@ -13,32 +13,32 @@ from dxlrun import AngularVelocity, CommandModel, Floats, JointController, Time
 
 
 class PositionsCommand(CommandModel):
-    """One goal a joint."""
+    """One goal position per joint"""
 
     positions: tuple[float, ...]
     """rad, shape (joints,)"""
 
 
 class Easing(JointController):
-    """Leads joints to commanded positions along an exponential with a top speed."""
+    """Controller that moves joints to commanded positions along an exponential with a speed limit"""
 
     Commands: ClassVar[Mapping[str, type[CommandModel]]] = {"positions": PositionsCommand}
 
     time_constant: Annotated[Time, Field(gt=0)] = 0.2
-    """s; in each of it, two thirds of what is left of the way are done"""
+    """Time in which the distance to the goal falls by two thirds, s"""
     speed: Annotated[AngularVelocity, Field(gt=0)] = math.pi / 2
-    """rad/s; never faster than this; `dxlrun parameters` changes it in a run"""
+    """Speed limit, rad/s; `dxlrun parameters` changes it in a run"""
 
     def begin(self) -> None:
-        """Stay where the joints are."""
+        """Hold the joints where they are."""
         self.now = self.goal = self.start
 
     def on_command(self, kind: str, data: Floats, time_ns: int) -> None:
-        """Take new goals."""
+        """Set new goals."""
         self.goal = data
 
     def positions(self, time: float, dt: float) -> Floats:
-        """Come nearer: by the true period, so that a late cycle makes a longer step."""
+        """Return the next positions. `dt` is the measured period, so a late cycle makes a longer step."""
         share = -math.expm1(-dt / self.time_constant)
         longest = self.speed * dt
         self.now = self.now + np.clip((self.goal - self.now) * share, -longest, longest)

@@ -1,4 +1,4 @@
-"""The door: what dxlrun finds by the entry point in pyproject.toml."""
+"""Hooks that dxlrun finds by the entry point in pyproject.toml"""
 
 from __future__ import annotations
 
@@ -11,11 +11,11 @@ from dxlrun_easing.controller import Easing
 
 @hookimpl
 def dxlrun_contract() -> int:
-    """Return the contract that this package was written for: a number, not dxlrun's CONTRACT_VERSION."""
+    """Return the plug-in contract version as a number, not as CONTRACT_VERSION, which changes with dxlrun."""
     return 4
 
 
 @hookimpl
 def dxlrun_controllers() -> Mapping[str, type[Controller[Any]]]:
-    """Return the controllers by their type in the robot file."""
+    """Return the import paths of the controllers, by their type in the robot file."""
     return {"easing_position_controller": Easing}

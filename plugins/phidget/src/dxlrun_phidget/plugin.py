@@ -1,4 +1,4 @@
-"""The door: what dxlrun finds by the entry point in pyproject.toml."""
+"""Hooks that dxlrun finds by the entry point in pyproject.toml"""
 
 from __future__ import annotations
 
@@ -11,11 +11,11 @@ from dxlrun_phidget.spatial import PhidgetSpatial
 
 @hookimpl
 def dxlrun_contract() -> int:
-    """Return the contract that this package was written for."""
+    """Return the plug-in contract version that this package was written for."""
     return 4
 
 
 @hookimpl
 def dxlrun_sensors() -> Mapping[str, type[Sensor[Any]]]:
-    """Return the sensors by their type in the robot file."""
+    """Return the import paths of the sensors, by their type in the robot file."""
     return {"phidget_spatial": PhidgetSpatial}

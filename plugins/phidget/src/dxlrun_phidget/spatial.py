@@ -1,7 +1,7 @@
 """phidget_spatial: acceleration, angular velocity and magnetic field of a Phidget Spatial.
 
-Units and events: the API page of the class Spatial in Phidget's documentation (g, degrees per second, gauss).
-The sign of accelerations: ros-drivers/phidgets_drivers, which negates them for sensor_msgs/Imu.
+Units (g, degrees per second, gauss) and events are documented on the API page of the class Spatial of
+Phidgets. Accelerations are negated for sensor_msgs/Imu, as in ros-drivers/phidgets_drivers.
 """
 
 from __future__ import annotations
@@ -21,16 +21,17 @@ G = 9.80665
 """m/s^2"""
 TESLA_PER_GAUSS = 1e-4
 UNKNOWN = 1e300
-"""PUNK_DBL of phidget22.h: what the library gives for a value that is not known."""
+"""PUNK_DBL of phidget22.h: placeholder of the library for an unknown value"""
 _AXES = ("x", "y", "z")
 _LOOK_S = 0.5
+"""Timeout of one `read`, s, so that the sensor process can stop"""
 _FIELD_NS = 100_000_000
-"""So long the last magnetic field stands for one that is not known: the magnetometer is slower than the
-rest, and pauses to correct itself."""
+"""Time for which the last magnetic field replaces an unknown one, ns. The magnetometer is slower than the
+other sensors, and pauses for its internal calibration."""
 
 
 class PhidgetSpatialParameters(ParametersModel):
-    """Which unit."""
+    """Selection of the unit"""
 
     serial_number: Annotated[int, Field(ge=1)] | None = Field(
         default=None, description="Of the unit, or of the VINT hub that it is on; any when absent."
@@ -47,7 +48,7 @@ class PhidgetSpatialParameters(ParametersModel):
 
 
 class PhidgetSpatial(Sensor[PhidgetSpatialParameters]):
-    """The newest event of the unit; the library calls its handlers in a thread of its own."""
+    """Sensor that reads the newest event. The library calls the handlers in a thread of its own."""
 
     Parameters = PhidgetSpatialParameters
     waits = True
@@ -61,7 +62,7 @@ class PhidgetSpatial(Sensor[PhidgetSpatialParameters]):
         return tuple(f"{group}.{axis}" for group in groups for axis in _AXES)
 
     def open(self, context: SensorContext) -> None:
-        """Open the unit and set its data interval. Raises OSError, also when it does not come in time."""
+        """Open the unit and set its data interval. Raises OSError on an error or a timeout."""
         from Phidget22.Devices.Spatial import Spatial
         from Phidget22.PhidgetException import PhidgetException
 
@@ -85,7 +86,7 @@ class PhidgetSpatial(Sensor[PhidgetSpatialParameters]):
             raise OSError(f"{unit}: {error.description or error}") from error
 
     def read(self, values: Floats) -> int | None:
-        """Wait for the next event, half a second at most. Raises OSError when the unit was unplugged."""
+        """Wait for the next event, at most 0.5 s. Raises OSError if the unit is unplugged."""
         with self._news:
             self._news.wait_for(lambda: self._sample is not None or self._detached, _LOOK_S)
             sample, self._sample = self._sample, None
@@ -98,7 +99,7 @@ class PhidgetSpatial(Sensor[PhidgetSpatialParameters]):
         return t_ns
 
     def close(self) -> None:
-        """Let go of the unit."""
+        """Close the unit."""
         channel, self._channel = self._channel, None
         if channel is not None:
             channel.close()
@@ -111,7 +112,7 @@ class PhidgetSpatial(Sensor[PhidgetSpatialParameters]):
         field: list[float],
         _timestamp: float,
     ) -> None:
-        """Keep the values of an event, with the time at which it came."""
+        """Store the values of an event and the time of its arrival."""
         t_ns = self.context.now_ns()
         found = [-G * _known(value) for value in acceleration]
         found += [math.radians(_known(value)) for value in rate]
