@@ -1,4 +1,4 @@
 """Experiments: measurements of the machine, the loop and the servos, one package each.
 
-Statistics of any log belong in `dxlrun_analysis`.
+Statistics of logs are in `dxlrun_analysis`.
 """

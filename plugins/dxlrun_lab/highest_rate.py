@@ -1,8 +1,8 @@
-"""The highest rate that a robot keeps, found by running it at one rate after another: `dxlrun bench rate`.
+"""Highest rate that a robot keeps, found by runs at decreasing rates: `dxlrun bench rate`.
 
-The first run has nearly the rate that the buses allow by computation. A run that overran is followed by one
-at the rate that nearly all its cycles would have kept. Everything is as in a run: all processes, the
-controllers, each in its share of the cycles, and the recording; the robot holds its position.
+The first run has nearly the rate that the buses allow by computation. After a run with overruns, the next
+rate is the one that nearly all of its cycles would have kept. All processes, controllers and the recording
+work as in any run, and the robot holds its position.
 """
 
 from __future__ import annotations
@@ -30,39 +30,39 @@ from dxlsim import read_ledger
 HIGHEST_HZ = 2000.0
 MOST_TRIES = 8
 ALLOWED = 0.001
-"""Share of cycles that may overrun: one in a thousand."""
+"""Allowed fraction of cycles that overrun"""
 _STEP = 0.95
 _COMFORT = 0.98
 _INTERRUPTED = 130
 _LEDGER = "ledger.jsonl"
 
 Run = Callable[[Plan], Path]
-"""Runs a plan and returns its log; the ledger of simulated buses lies beside it."""
+"""Function that runs a plan and returns its log. The ledger of simulated buses is in the same directory."""
 
 
 class Tried(msgspec.Struct, frozen=True):
-    """One run."""
+    """Result of a run at one rate"""
 
     rate_hz: float
     cycles: int
     overruns: int
     by_simulation: int
-    """Of them, those that the simulated servos caused."""
+    """Overruns that the simulated servos caused"""
     median_us: float
-    """From a cycle's deadline to its last write."""
+    """Median time from a cycle's deadline to its last write, us"""
     p999_us: float
     kept: bool
-    """At most one cycle in a thousand overran by the robot's own fault."""
+    """True if at most one cycle in a thousand overran without being delayed by simulated servos"""
 
 
 class HighestRate(msgspec.Struct, frozen=True):
-    """The rate that a robot keeps on this machine, and the runs that led to it."""
+    """Highest rate that a robot keeps on this machine, and the runs that led to it"""
 
     robot: str
     computed_hz: float
-    """What the buses allow when they do nothing else."""
+    """Highest rate that the buses allow by computation, Hz"""
     kept_hz: float | None
-    """None: no rate that was tried was kept."""
+    """Highest rate that was kept, Hz; None if there is none"""
     tries: tuple[Tried, ...]
 
 
@@ -72,10 +72,17 @@ def highest_rate(
     run: Run,
     progress: Callable[[float], None] = lambda _: None,
 ) -> HighestRate:
-    """Run a robot at falling rates, each for some seconds, until one is kept.
+    """Run a robot at decreasing rates until one is kept.
 
-    `progress` is called with each rate before its run.
-    Raises InputError when the robot file cannot be compiled, ProcessFault when a run left no cycle.
+    Args:
+        description: Robot.
+        seconds: Duration of each run, s.
+        run: Function that runs a plan.
+        progress: Called with each rate before its run.
+
+    Raises:
+        InputError: The robot file is invalid.
+        ProcessFault: A run has no cycle.
     """
     plan = compile_robot(description, [], round(seconds * 1e9)).plan
     computed = 1e9 / plan.loop.least_period_ns
@@ -92,7 +99,7 @@ def highest_rate(
 
 @contextmanager
 def runs_to_discard() -> Iterator[Run]:
-    """Give runs of a robot with all its processes, in real time; their logs last until the context ends."""
+    """Yield a function that runs a robot in real time. Its logs are deleted at the end of the context."""
     with tempfile.TemporaryDirectory(prefix="dxlrun-bench-") as folder:
 
         def run(plan: Plan) -> Path:

@@ -1,14 +1,15 @@
-"""How long the cycles of a loop waited for simulated servos that were late, by their ledger.
+"""Time that the cycles of a loop waited for late simulated servos, from their ledger.
 
-A simulated servo is a process, so it takes an instruction later than a real one would, and hands its reply
-over later. The ledger records both:
+A simulated servo is a process, so it receives an instruction and delivers its reply later than a real servo.
+The ledger records both:
 
-- `in`: when the bytes were taken. When the host wrote them is known only of hosts that record it. Bytes
-  that had to wait for the line anyway are not late.
-- `out`: how long after it had passed the wire a reply was handed over.
+- `in`: time at which the bytes were received. The time at which the host wrote them is only known if the host
+  records it. Bytes that had to wait for the line are not late.
+- `out`: delay of a reply after it would have passed a real wire.
 
-Only what a host waits for counts: the last reply of a transaction, and the instruction before it, within the
-read, or in the idle time behind the deadline. Several buses are waited for at once, so the latest one counts.
+Only delays for which the host waits count: those of the last reply of a transaction and of the instruction
+before it, in the read or in the idle time after the deadline. The host waits for several buses at once, so
+the latest one counts.
 """
 
 from __future__ import annotations
@@ -26,20 +27,20 @@ from dxlwire import BITS_PER_BYTE, PacketKind
 
 Longs = NDArray[np.int64]
 Sent = Sequence[tuple[int, int]]
-"""When a host began to write, ns, and how many bytes; all that it wrote, in order."""
+"""Start times of the host's writes, ns, and their lengths in bytes"""
 
 
 class LedgerTransaction(NamedTuple):
-    """An instruction that was answered."""
+    """Instruction with its replies"""
 
-    handed_ns: int  # When the host was given the end of the last reply
-    late_ns: int  # How much sooner that could have been
-    taken: int  # Bytes that went to the servos until then, since the ledger began
-    given: int  # Bytes that came back
+    handed_ns: int  # time at which the end of the last reply was delivered to the host
+    late_ns: int  # delay of that delivery
+    taken: int  # bytes to the servos so far, since the start of the ledger
+    given: int  # bytes from the servos so far
 
 
 def waits_for_servos(log: Log, entries: Iterable[LedgerEntry]) -> tuple[Longs, Longs]:
-    """Return how long each cycle waited for late simulated servos, ns: in its read, behind its deadline."""
+    """Return the time that each cycle waited for simulated servos, ns: in its read, after its deadline."""
     by_bus: dict[str, list[LedgerEntry]] = {name: [] for name in log.buses}
     for entry in entries:
         by_bus.setdefault(entry.bus, []).append(entry)
@@ -55,13 +56,13 @@ def waits_for_servos(log: Log, entries: Iterable[LedgerEntry]) -> tuple[Longs, L
 
 
 def _waits(cycles: NDArray[np.void], found: Iterable[LedgerTransaction]) -> tuple[Longs, Longs]:
-    """Return how long each cycle waited for late servos of a bus: in its read, behind its deadline."""
+    """Return the time that each cycle waited for servos of a bus, ns: in its read, after its deadline."""
     scheduled, woken = cycles["scheduled_ns"], cycles["woken_ns"]
     in_read, in_idle = np.zeros(len(woken), np.int64), np.zeros(len(woken), np.int64)
     for one in found:
         index = int(np.searchsorted(woken, one.handed_ns, side="right")) - 1
         if index >= 0 and one.handed_ns <= cycles["read_ns"][index]:
-            # a reply that was asked for in the cycle before was on its way already when this one woke
+            # Only count the wait since the wake-up, because the request may be of the cycle before.
             in_read[index] += min(one.late_ns, one.handed_ns - int(woken[index]))
         elif index + 1 < len(woken) and one.handed_ns > scheduled[index + 1]:
             waited = min(one.late_ns, one.handed_ns - int(scheduled[index + 1]))
@@ -70,7 +71,7 @@ def _waits(cycles: NDArray[np.void], found: Iterable[LedgerTransaction]) -> tupl
 
 
 def overruns_by_servos(log: Log, entries: Iterable[LedgerEntry]) -> int:
-    """Return how many cycles left out periods only because simulated servos were late."""
+    """Return the number of cycles that skipped periods only because simulated servos were late."""
     cycles = log.cycles
     in_read, in_idle = waits_for_servos(log, entries)
     took_ns = cycles["written_ns"] - cycles["scheduled_ns"] - in_read - in_idle
@@ -79,7 +80,7 @@ def overruns_by_servos(log: Log, entries: Iterable[LedgerEntry]) -> int:
 
 
 def transactions(entries: Sequence[LedgerEntry], sent: Sent, byte_ns: float) -> Iterator[LedgerTransaction]:
-    """Yield what was answered on one bus; without `sent` only the replies' lateness counts."""
+    """Yield the transactions of one bus. Without `sent`, only the delays of replies count."""
     written = _written(entries, sent)
     free_ns = could_be_free_ns = waited_ns = 0.0
     taken = given = 0
@@ -107,7 +108,7 @@ def _answered(last: LedgerEntry, waited_ns: float, taken: int, given: int) -> Le
 
 
 def _written(entries: Sequence[LedgerEntry], sent: Sent) -> dict[int, int]:
-    """Return by number of an `in` when the host began to write its first byte; {} when they do not match."""
+    """Return the time at which the host wrote the first byte of each `in`, by number; {} on a mismatch."""
     ends = np.cumsum([count for _, count in sent])
     taken = sum(len(entry.data) for entry in entries if entry.direction == "in")
     if not len(ends) or taken > ends[-1]:

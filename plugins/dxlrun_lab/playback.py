@@ -1,4 +1,4 @@
-"""Playing a recorded motion on a robot: an experiment of one segment, and how near the joints came to it."""
+"""Playback of a recorded motion on a robot: an experiment of one segment, and its tracking errors."""
 
 from __future__ import annotations
 
@@ -14,38 +14,38 @@ from dxlrun_lab.guided.experiment import APPROACH_RAD_S, Procedure, Situation
 from dxlrun_lab.guided.segment import Guard, Recorded, Segment
 
 _SETTLE_S = 0.5
-"""For which the last pose is commanded still."""
+"""Time for which the last pose is still commanded, s"""
 _OLDEST_S, _OLDEST_CYCLES = 0.1, 3
-"""A state older than both ends the motion."""
+"""Largest age of a state, s and cycles. The motion ends if both are exceeded."""
 
 
 class PlayedJoint(msgspec.Struct, frozen=True):
-    """How a joint followed."""
+    """Tracking error of a joint"""
 
     name: str
     rms: float
-    """Of the distance between what was sent and where it was, rad"""
+    """Root mean square error, rad"""
     worst: float
-    """rad"""
+    """Largest error, rad"""
 
 
 class PlayedBack(msgspec.Struct, frozen=True):
-    """What was played."""
+    """Result of a playback"""
 
     seconds: float
-    """Of the robot's time."""
+    """Duration in the robot's time, s"""
     whole: bool
     joints: tuple[PlayedJoint, ...]
 
 
 class Playback(msgspec.Struct, frozen=True):
-    """The experiment that plays rows; the joints stay at its end, as the run's end has them."""
+    """Experiment that plays rows. The joints remain at the last pose."""
 
     rows: Rows
 
     @property
     def expected(self) -> tuple[str, ...]:
-        """What is known of the motion before the robot was asked where its joints are, in sentences."""
+        """Description of the motion before the positions of the joints are known, in sentences"""
         rows = self.rows
         way = rows.positions.max(axis=0) - rows.positions.min(axis=0)
         speed = np.abs(np.diff(rows.positions, axis=0)).max(axis=0, initial=0.0) / rows.period_s
@@ -58,7 +58,7 @@ class Playback(msgspec.Struct, frozen=True):
         )
 
     def moves(self, situation: Situation) -> Sequence[str]:
-        """Return how far and how fast the joints go to the first pose, and what is played."""
+        """Describe the way to the first pose, and the motion."""
         rows = self.rows
         ways = {
             joint.name: abs(float(rows.positions[0, rows.joints.index(joint.name)]) - joint.start)
@@ -91,7 +91,7 @@ class Playback(msgspec.Struct, frozen=True):
         )
 
     def finish(self, situation: Situation, recorded: Sequence[Recorded], why: str) -> PlayedBack:
-        """Return how long was played, and how far each joint was from what it was sent."""
+        """Return the duration and the tracking errors."""
         played = recorded[-1]
         off = np.abs(np.where(played.valid, played.position - played.goal, np.nan))
         joints = []

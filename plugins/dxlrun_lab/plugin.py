@@ -1,4 +1,4 @@
-"""The verbs that measure robots, and those that run a log again, by the same hooks as any other package."""
+"""Plug-in with the verbs that measure robots or replay logs. It uses the same hooks as any other package."""
 
 from __future__ import annotations
 
@@ -11,13 +11,13 @@ _PLACE = "dxlrun_lab.commands"
 
 @hookimpl
 def dxlrun_contract() -> int:
-    """Return the contract that this package was written for: the one it is published with."""
+    """Return the plug-in contract version. This package is released together with it."""
     return CONTRACT_VERSION
 
 
 @hookimpl
 def dxlrun_commands() -> Sequence[Command]:
-    """Return the verbs that run something: a log again, or a measurement."""
+    """Return the verbs that measure robots or replay logs."""
     return (
         Command("replay", f"{_PLACE}.replay:replay", group="Logs"),
         Command("convert", f"{_PLACE}.convert:convert", group="Logs"),

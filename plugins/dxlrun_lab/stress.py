@@ -1,12 +1,12 @@
-"""Stress: programs of ordinary priority load cores, memory and disk while something is measured.
+"""Stress: programs of ordinary priority that load cores, memory and disk during a measurement.
 
-The thesis loads its machine with the program `stress`. Where `stress-ng` is installed the load is as there:
-every core busy, and two processes that allocate and free up to 2 GB each; one writes to the disk beside them.
-Without it two processes of Python take its place: one computes, one allocates and writes.
+The thesis uses the program `stress`. If `stress-ng` is installed, the load is the same: all cores are busy,
+two processes allocate and free up to 2 GB each, and one process writes to the disk. Otherwise, two Python
+processes replace it: one computes, and one allocates memory and writes.
 
     with Stress() as stress:
         ...
-        stress.ended()      # whether the load ended by itself, for the report
+        stress.ended()      # remark for the report if the load ended early
 """
 
 from __future__ import annotations
@@ -22,9 +22,9 @@ from dxlrun import ProcessFault
 from dxlrun.tooling.output import counted
 
 MOST_MEMORY = 2 << 30
-"""Bytes that one process allocates, as in the thesis; two take at most half of what is free."""
+"""Bytes that one process allocates, as in the thesis. Two processes take at most half of the free memory."""
 _START_S = 0.5
-"""After which the load is at work."""
+"""Time until the load is effective, s"""
 _DISK = "/var/tmp"  # noqa: S108  files without a name; unlike /tmp it is on a disk (FHS 3.0, 5.15)
 
 _WITH_PARENT = """
@@ -50,11 +50,11 @@ with tempfile.TemporaryFile(dir=sys.argv[3], buffering=0) as file:
 
 
 class Stress:
-    """A load that lasts as long as the block it is entered for; `wanted=False`: none."""
+    """Context manager that loads the machine; with `wanted=False` it does nothing."""
 
     def __init__(self, *, wanted: bool = True) -> None:
         self.text = ""
-        """The load in words; empty: none."""
+        """Description of the load; empty without one"""
         self._programs: list[tuple[str, ...]] = []
         self._running: list[subprocess.Popen[bytes]] = []
         cores, free = len(os.sched_getaffinity(0)), os.sysconf("SC_AVPHYS_PAGES") * os.sysconf("SC_PAGE_SIZE")
@@ -72,7 +72,7 @@ class Stress:
             self._programs = [(_COMPUTE,), (_ALLOCATE_AND_WRITE, str(memory), _DISK)]
 
     def __enter__(self) -> Self:
-        """Start the load. Raises ProcessFault where it does not stay."""
+        """Start the load. Raises ProcessFault if it exits at once."""
         for code, *words in self._programs:
             command = [sys.executable, "-c", _WITH_PARENT + code, str(os.getpid()), *words]
             self._running.append(
@@ -80,7 +80,7 @@ class Stress:
                     command,
                     stdin=subprocess.DEVNULL,
                     stderr=subprocess.DEVNULL,
-                    start_new_session=True,  # a Ctrl-C ends the measurement, and that the load
+                    start_new_session=True,  # Ctrl-C only reaches the measurement, which ends the load
                 )
             )
         until = time.monotonic() + _START_S
@@ -92,7 +92,7 @@ class Stress:
         return self
 
     def __exit__(self, *_: object) -> None:
-        """End all of it."""
+        """End the load."""
         for process in self._running:
             process.terminate()
         for process in self._running:
@@ -100,6 +100,6 @@ class Stress:
         self._running.clear()
 
     def ended(self) -> tuple[str, ...]:
-        """Return a sentence where the load, or a part of it, ended by itself."""
+        """Return a remark if a process of the load has exited early."""
         gone = any(process.poll() is not None for process in self._running)
         return ("the load ended before the measurement did",) if gone else ()

@@ -1,5 +1,4 @@
-"""Build hooks: version of the source tree, and the script of the page with the libraries in
-package-lock.json."""
+"""Build hooks: version of the source tree, and the page's script with the libraries of package-lock.json."""
 
 from __future__ import annotations
 

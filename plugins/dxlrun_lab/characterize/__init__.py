@@ -1,4 +1,4 @@
 """Characterization of a servo: response, speed, dead band, rates, and gaps between commands.
 
-A model of the servo, fitted to a run, belongs in `identify`.
+Models that are fitted to a run are in `identify`.
 """

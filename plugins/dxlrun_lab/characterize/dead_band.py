@@ -1,8 +1,8 @@
-"""Dead band: how far from its goal a joint may rest, and which change of the goal moves it.
+"""Dead band: distance from its goal at which a joint may rest, and smallest change of the goal that moves it.
 
-A place is approached slowly from both sides, as the reversal value of ISO 230-2 is measured, and the joint is
-left to rest: it stops short of it by what friction and the position gain leave, and by the servo's margin.
-Turned round from there, it moves when the goal has gone through twice of that.
+A position is approached slowly from both sides, as for the reversal value of ISO 230-2, until the joint
+rests. The joint stops short of the goal because of friction, the limited position gain, and the servo's
+margin. After a reversal of the goal, the joint moves once the goal has changed by twice that distance.
 """
 
 from __future__ import annotations
@@ -20,37 +20,38 @@ from dxlrun_lab.characterize.trace import Trace, polynomial
 
 NAME, REVERSAL = "dead band", "smallest change that moves it"
 MARGINS = ("cw_compliance_margin", "ccw_compliance_margin")
-"""Registers of a dead band: Compliance Margin (26, 27) of AX and RX, ticks."""
+"""Registers of the dead band: Compliance Margin (26, 27) of AX and RX, ticks"""
 SLOW = math.radians(3.0)
-"""rad/s of the goal"""
+"""Speed of the goal during an approach, rad/s"""
 REST_S = 0.7
+"""Duration of a rest, s"""
 _LOOK_S = 0.3
-"""At the end of a rest, in which the joint must stand."""
+"""Time at the end of a rest in which the joint must not move, s"""
 _FOLLOWED_TICKS = 4
-"""A joint that came by less nearer to its goal did not follow it."""
+"""Shortest motion of a joint that counts as following its goal, ticks"""
 _LEAST_ROWS = 5
-"""Of a line"""
+"""Smallest number of samples for the fit of a line"""
 _MOVING = 0.5
-"""Of the goal's speed: a joint that goes faster follows it."""
+"""Fraction of the goal's speed above which a joint counts as following it"""
 
 
 class Approach(msgspec.Struct, frozen=True):
-    """One rest after a slow way to it."""
+    """Rest after a slow approach"""
 
     upward: bool
     short: float
-    """rad by which the joint stands short of the goal, positive where it did not come there"""
+    """Distance to the goal at rest, rad; positive if the joint stopped before the goal"""
     reversal: float
-    """rad that the goal had gone back from there when the joint began to move; NaN: not seen"""
+    """Change of the goal after the reversal at which the joint started to move, rad; NaN if not seen"""
 
 
 def stops(places: Sequence[float], reach: float) -> list[float]:
-    """Return the goals between which a table goes slowly, resting at each: to each place from both sides."""
+    """Return the goals of a table that approaches each place from both sides."""
     return [places[0], *(turn for place in places for turn in (place - reach, place, place + reach, place))]
 
 
 def table(goals: Sequence[float], period: float) -> tuple[Floats, float]:
-    """Return a table of goals that rest at each place and go slowly between them, and its duration, s."""
+    """Return a table of goals that rests at each place and moves slowly between them, and its duration, s."""
     pieces = [np.full(math.ceil(REST_S / period), goals[0])]
     for before, after in itertools.pairwise(goals):
         count = max(1, math.ceil(abs(after - before) / SLOW / period))
@@ -60,7 +61,7 @@ def table(goals: Sequence[float], period: float) -> tuple[Floats, float]:
 
 
 def approaches(trace: Trace) -> list[Approach]:
-    """Return the rests in a trace of such a table to which the joint followed its goal."""
+    """Return the rests in a trace of the table, except those to which the joint did not follow its goal."""
     moving = np.diff(trace.goal) != 0
     edges = np.flatnonzero(moving)
     if not len(edges):
@@ -90,9 +91,13 @@ def approaches(trace: Trace) -> list[Approach]:
 
 
 def _reversal(trace: Trace, moves: int, sign: float, rest: float) -> float:
-    """Return how far the goal had gone back when the joint left its rest, rad; NaN where it did not.
+    """Return the change of the goal after a reversal at which the joint left its rest, rad; NaN if not seen.
 
-    `trace`: the way back, of so many rows, and the rest after it.
+    Args:
+        trace: The way back and the rest that follows.
+        moves: Number of rows of the way back.
+        sign: Direction of the approach, 1 or -1.
+        rest: Position of the rest before the reversal, rad.
     """
     if moves < _LEAST_ROWS or sign * (trace.goal[moves - 1] - trace.goal[0]) > 0:
         return math.nan
@@ -100,12 +105,12 @@ def _reversal(trace: Trace, moves: int, sign: float, rest: float) -> float:
     left = np.flatnonzero(-sign * (way.position - rest) > 1.5 * trace.tick)
     if len(left) < _LEAST_ROWS or not len(after):
         return math.nan
-    # it goes as fast as the goal then: back along a line to where it rested
+    # The joint then moves as fast as the goal. Extrapolate its line back to the position of the rest.
     slope, offset = polynomial(way.time[left], way.position[left], 1)
     if abs(slope) < _MOVING * SLOW:
         return math.nan
     change = abs(float(np.interp((rest - offset) / slope, way.sent, way.goal)) - float(way.goal[0]))
-    # the line lies behind by what the motion itself needs: more than what is left when it rests again
+    # A moving joint lags behind more than a resting one. Subtract this additional lag.
     late = way.time > way.time[-1] - _LOOK_S
     behind = np.abs(np.interp(way.time[late], way.sent, way.goal) - way.position[late]).mean()
     standing = after.time > after.time[-1] - _LOOK_S
@@ -116,9 +121,13 @@ def _reversal(trace: Trace, moves: int, sign: float, rest: float) -> float:
 def dead_band(
     found: Sequence[Approach], tick: float, registers: Mapping[str, int], unit: float
 ) -> tuple[Measured, Measured]:
-    """Return the dead band, to each side, and the smallest change of the goal that moves the joint.
+    """Return the dead band to each side, and the smallest change of the goal that moves the joint.
 
-    `registers`: of the servo, as far as they are known; `unit`: of a margin, rad.
+    Args:
+        found: Rests.
+        tick: Resolution of the position, rad.
+        registers: Known registers of the servo.
+        unit: Unit of a margin register, rad.
     """
     up = [one.short for one in found if one.upward]
     down = [one.short for one in found if not one.upward]
@@ -129,7 +138,7 @@ def dead_band(
         why = "the joint did not follow its goal, or did not come to rest"
         return not_measured(NAME, "rad", why, how), not_measured(REVERSAL, "rad", why, how)
     halves = [(a + b) / 2 for a, b in zip(up, down, strict=False)]
-    # each of the two rests is rounded to ticks
+    # The positions of both rests are rounded to ticks.
     band = mean_of(NAME, "rad", halves, 0.5 * tick, how, _parts(float(np.mean(halves)), registers, unit))
     changes = [one.reversal for one in found if math.isfinite(one.reversal)]
     if len(changes) < 2:
@@ -139,7 +148,7 @@ def dead_band(
 
 
 def _parts(whole: float, registers: Mapping[str, int], unit: float) -> str:
-    """Return which part of a dead band is the servo's margin, and which the position gain leaves."""
+    """Describe the parts of a dead band that the servo's margin and the position gain cause."""
     margins = [registers[name] * unit for name in MARGINS if name in registers]
     if not margins:
         return "all of it by friction over the position gain: the model has no margin"

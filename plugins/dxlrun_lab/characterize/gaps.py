@@ -1,8 +1,8 @@
-"""How far commands may lie apart: a smooth motion is sampled and sent at growing gaps.
+"""Longest gap between commands: a smooth motion is sampled and sent with increasing gaps.
 
-The thesis names it as future work: the longest delay that leaves no unwanted deviation. A joint that is
-commanded by position goes to each sample as fast as it can and waits there; by posvel it goes on at its speed
-until the sample, and brakes before it.
+The thesis names it as future work: the longest delay without an unwanted deviation. A joint that is commanded
+by position moves to each sample as fast as it can and waits there. With posvel it moves to the sample at the
+commanded speed, and brakes before it.
 """
 
 from __future__ import annotations
@@ -20,26 +20,26 @@ from dxlrun_lab.characterize.measured import Measured, not_measured
 from dxlrun_lab.characterize.trace import Trace
 
 MOTION_S = math.pi
-"""A period of the thesis' motion, 0.5 (sin 2t - sin 4t)"""
+"""Period of the thesis' motion, 0.5 (sin 2t - sin 4t), s"""
 FADE_S = 0.5
-"""In which the motion comes up to its size; it is judged from then on."""
+"""Time in which the motion fades in, s. It is judged after that."""
 LARGEST = 1.7602
-"""Of |sin 2t - sin 4t|"""
+"""Maximum of |sin 2t - sin 4t|"""
 FASTEST = 6.0
-"""rad/s, of its speed for each rad of its size"""
+"""Peak speed of the motion per rad of its size, rad/s"""
 _STILL_TICKS = 1.5
-"""A joint that moves by less in the time in which its motion goes on by `_MOVES_TICKS` has come to rest."""
+"""Travel below which a joint counts as at rest while its motion continues by `_MOVES_TICKS`, ticks"""
 _MOVES_TICKS = 8.0
 _STILL_PART = 0.15
-"""The same as a part of what the motion goes on by."""
+"""The same threshold as a fraction of the travel of the motion"""
 _BETWEEN = 0.03
-"""Tried gaps lie closer than this part of one another in the end."""
+"""Relative distance between the best and the worst gap at which the search ends"""
 
 
 def motion(time: Floats, size: float) -> tuple[Floats, Floats]:
-    """Return position, rad, and speed, rad/s, of the thesis' motion; 0.5 (sin 2t - sin 4t) at the size 0.5.
+    """Return position (rad) and speed (rad/s) of the thesis' motion, `size` (sin 2t - sin 4t).
 
-    It fades in, so that it begins at rest, and ends as it is then.
+    The motion fades in from rest, but does not fade out.
     """
     fade = np.clip(time / FADE_S, 0.0, 1.0)
     shape, slope = fade * fade * (3 - 2 * fade), 6 * fade * (1 - fade) / FADE_S
@@ -49,36 +49,36 @@ def motion(time: Floats, size: float) -> tuple[Floats, Floats]:
 
 
 class Gap(msgspec.Struct, frozen=True):
-    """One gap that was tried."""
+    """Result of a motion with one gap"""
 
     gap_s: float
     deviation: float
-    """rad: the most by which the joint was elsewhere than with a command in each cycle"""
+    """Largest deviation from the path with a command in each cycle, rad"""
     stood: bool
-    """It came to rest while its motion went on."""
+    """True if the joint came to rest while its motion continued"""
 
     def kept(self, tolerance: float) -> bool:
-        """Return whether the joint stayed on its path."""
+        """Return True if the joint stayed on its path."""
         return self.deviation <= tolerance and not self.stood
 
 
 def judge(gap_s: float, trace: Trace, reference: Trace, size: float) -> Gap:
-    """Judge a motion that was sent with gaps by the same motion that was sent in each cycle.
+    """Compare a motion that was sent with gaps to the same motion that was sent in each cycle.
 
-    Times of both count from the first goal of the motion.
+    The times of both traces start with the first goal of the motion.
     """
     time, since = trace.time, trace.time > FADE_S
     path = np.interp(time, reference.time, reference.position)
     deviation = float(np.max(np.abs(trace.position - path)[since], initial=0.0))
     ideal, speed = motion(reference.time, size)
-    # the joint follows its motion later; a shift of the path does not change where it goes on
+    # The joint lags behind its motion, so the speed of the motion is shifted by this lag.
     lag = _lag(reference, ideal)
     going = np.abs(np.interp(time - lag, reference.time, speed))
     return Gap(gap_s, deviation, _stood(trace, going, since))
 
 
 def _lag(trace: Trace, ideal: Floats) -> float:
-    """Return by how much later the joint follows its motion, s."""
+    """Return the time by which the joint lags behind its motion, s."""
     shifts = np.linspace(0.0, 0.3, 61)
     middle = trace.position - trace.position.mean()
     off = [float(np.sum((middle - np.interp(trace.time - s, trace.time, ideal)) ** 2)) for s in shifts]
@@ -86,7 +86,7 @@ def _lag(trace: Trace, ideal: Floats) -> float:
 
 
 def _stood(trace: Trace, going: Floats, since: NDArray[np.bool_]) -> bool:
-    """Return whether the joint rested while the motion went on: `going`, rad/s, is how fast that was."""
+    """Return True if the joint rested while its motion continued. `going` is the motion's speed, rad/s."""
     fast = going > 0.3 * float(np.max(going, initial=0.0))
     way = np.concatenate(([0.0], np.cumsum(going[1:] * np.diff(trace.time))))
     ends = np.searchsorted(way, way + _MOVES_TICKS * trace.tick)
@@ -102,9 +102,9 @@ def _stood(trace: Trace, going: Floats, since: NDArray[np.bool_]) -> bool:
 def following(
     tried: Sequence[Gap], shortest: float, longest: float, step: float, tolerance: float
 ) -> float | None:
-    """Return the gap to try next, a multiple of `step`; None: those that were tried tell enough.
+    """Return the gap to try next, a multiple of `step`, or None at the end of the search.
 
-    They grow by half until the joint leaves its path, then halve what is left between.
+    Gaps grow by half until the joint leaves its path. A bisection follows.
     """
     kept = [round(gap.gap_s / step) for gap in tried if gap.kept(tolerance)]
     bad = min((round(gap.gap_s / step) for gap in tried if not gap.kept(tolerance)), default=0)
@@ -126,9 +126,15 @@ def longest_gap(
     *,
     tick: float = 0.0,
 ) -> Measured:
-    """Return the longest gap with which the joint stays on its path, from the gaps that were tried.
+    """Return the longest gap with which the joint stays on its path.
 
-    `shortest`: that of the reference, s; `speed`: the motion's highest, rad/s; `tick`: of positions, rad.
+    Args:
+        tried: Gaps in increasing order.
+        interface: Interface of the commands.
+        tolerance: Largest deviation, rad.
+        shortest: Gap of the reference, s.
+        speed: Peak speed of the motion, rad/s.
+        tick: Resolution of the position, rad.
     """
     name = f"longest gap, {interface}"
     degrees = f"{math.degrees(tolerance):.2g} deg"
@@ -151,11 +157,11 @@ def longest_gap(
         return Measured(
             name, "s", below_s + half, half, None, len(tried), how, "it comes to rest between commands"
         )
-    # between them the deviation grows with the gap
+    # Interpolate, because the deviation grows with the gap.
     part = (tolerance - below) / (first.deviation - below)
     limit = f"it leaves its path by {math.degrees(first.deviation):.2g} deg at {first.gap_s * 1e3:.0f} ms"
-    # each deviation is one of two positions, which are rounded to ticks
+    # A deviation is the difference of two positions that are rounded to ticks.
     coarse = tick * 2 * half / (first.deviation - below)
-    # wherever between both the deviation grows
+    # The deviation may grow anywhere between the two gaps.
     uncertainty = math.hypot(2 * half * max(part, 1 - part), coarse)
     return Measured(name, "s", below_s + part * 2 * half, uncertainty, None, len(tried), how, limit)

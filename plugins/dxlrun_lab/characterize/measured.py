@@ -1,4 +1,4 @@
-"""Measured: one figure of a joint with its uncertainty, or why it could not be measured."""
+"""Measured: figure of a joint with its uncertainty, or the reason why it was not measured."""
 
 from __future__ import annotations
 
@@ -9,36 +9,36 @@ import msgspec
 import numpy as np
 
 STUDENT_95 = (12.71, 4.30, 3.18, 2.78, 2.57, 2.45, 2.36, 2.31, 2.26, 2.23, 2.20, 2.18, 2.16, 2.14, 2.13)
-"""Two-sided 95 % quantile of Student's distribution with 1, 2, ... degrees of freedom."""
+"""Two-sided 95 % quantile of Student's distribution with 1, 2, ... degrees of freedom"""
 _NORMAL_95, _BEYOND = 1.96, 2.5
-"""Beyond the table it is 1.96 + 2.5 / freedom, within 0.01."""
+"""Approximation 1.96 + 2.5 / freedom of the quantile beyond the table, exact within 0.01"""
 
 
 class Measured(msgspec.Struct, frozen=True):
-    """One figure of a joint, in SI units; angles in rad."""
+    """Figure of a joint in SI units; angles in rad"""
 
     name: str
-    """As in the table: `response to first motion`."""
+    """Name in the table, such as `response to first motion`"""
     unit: str
     """rad, s, rad/s, rad/s^2, Hz"""
     value: float | None = None
-    """None: not measurable, or not measured; then `why`."""
+    """None if it was not measured; the reason is in `why`"""
     uncertainty: float | None = None
-    """Half of the interval that holds the value in 95 of 100 cases: scatter and resolution together."""
+    """Half-width of the 95 % confidence interval, from scatter and resolution"""
     spread: float | None = None
-    """Standard deviation of single measurements; None where there is one only."""
+    """Standard deviation of single measurements; None for a single one"""
     count: int = 0
-    """Of single measurements."""
+    """Number of single measurements"""
     how: str = ""
-    """How it was measured, with which motion."""
+    """Method and motion of the measurement"""
     limit: str = ""
-    """What limited it, where that is to be named."""
+    """Limiting factor, if it is known"""
     why: str = ""
-    """Why there is no value, one sentence."""
+    """Reason for a missing value, one sentence"""
 
     @property
     def near_zero(self) -> bool:
-        """True where the interval contains 0: only an upper bound is known."""
+        """True if the confidence interval contains 0, so that only an upper bound is known"""
         return self.value is not None and abs(self.value) <= (self.uncertainty or 0.0)
 
 
@@ -50,9 +50,15 @@ def not_measured(name: str, unit: str, why: str, how: str = "") -> Measured:
 def mean_of(  # noqa: PLR0917  the fields of Measured, in their order
     name: str, unit: str, values: Sequence[float], resolution: float, how: str, limit: str = ""
 ) -> Measured:
-    """Return the mean of single measurements.
+    """Return the mean of single measurements as a figure.
 
-    `resolution`: half of the interval that a single one is uncertain by for itself, whatever the others say.
+    Args:
+        name: Name of the figure.
+        unit: Unit of the values.
+        values: Single measurements.
+        resolution: Systematic uncertainty (half-width), which averaging does not reduce.
+        how: Method of the measurement.
+        limit: Limiting factor.
     """
     each = np.asarray(values, dtype=np.float64)
     spread = float(each.std(ddof=1)) if len(each) > 1 else None
@@ -63,7 +69,7 @@ def mean_of(  # noqa: PLR0917  the fields of Measured, in their order
 
 
 def student(freedom: int) -> float:
-    """Return the two-sided 95 % quantile for some degrees of freedom, 1 or more."""
+    """Return the two-sided 95 % quantile of Student's distribution for 1 or more degrees of freedom."""
     if freedom > len(STUDENT_95):
         return _NORMAL_95 + _BEYOND / freedom
     return STUDENT_95[freedom - 1]

@@ -1,4 +1,4 @@
-"""The result of `dxlrun characterize` as one page with figures; takes matplotlib."""
+"""HTML page with the result and the figures of `dxlrun characterize`. Needs matplotlib."""
 
 from __future__ import annotations
 

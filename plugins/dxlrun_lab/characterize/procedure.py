@@ -1,4 +1,4 @@
-"""What `dxlrun characterize` has a joint do, one measurement after the other, and what it makes of it."""
+"""Procedure of `dxlrun characterize`: motions of each measurement, and their evaluation."""
 
 from __future__ import annotations
 
@@ -24,12 +24,13 @@ MEASUREMENTS: Final[tuple[Measurement, ...]] = get_args(Measurement)
 TOLERANCE: Final = math.radians(1.0)
 
 _EASED_S: Final = 1.2
-"""After a controller was loaded the gate lets goals go slowly for a second."""
+"""Rest at the start of a segment, s. The gate limits speeds for one second after a controller was loaded."""
 _REST_S: Final = 0.3
 _FASTEST_SAMPLING: Final = 480.0
 _SAMPLING: Final = 240.0
 _SLOW_SAMPLING: Final = 60.0
-"""Hz of the loop: while speeds, gaps and the dead band are measured; less where the joint's rate is lower."""
+"""Loop rates for the measurement of speeds, gaps and dead band, Hz; lower if the joint's highest rate is
+lower"""
 _OF_HIGHEST: Final = 0.8
 _STEP: Final = math.radians(8.0)
 _STEP_HOLD_S: Final = 0.5
@@ -39,20 +40,20 @@ _SLOWEST_STEPS: Final = 0.75
 _STEP_RATES: Final = (30.0, 100.0)
 _MOVES: Final = 6
 _OVERSHOOTS: Final = 2.0
-"""So many times as far as in a short move a joint may overshoot in a long one."""
+"""Assumed ratio of the overshoot of a long move to that of a short move"""
 _LONGEST_HOLD_S: Final = 20.0
 _BAND_REACH: Final = math.radians(3.0)
 _BAND_PLACES: Final = (0.31, 0.5, 0.72)
 _LONGEST_GAP_S: Final = 0.5
 _GAP_SPEED: Final = 0.7
-"""Of the joint's highest speed: what the motion of the gaps has at most."""
+"""Peak speed of the motion with gaps, as a fraction of the joint's highest speed"""
 _BURST_CYCLES, _RATE_S, _MOST_RATE_CYCLES = 6, 2.0, 1000
 Part = Generator[Segment, Recorded, None]
 
 
 @dataclass(slots=True)
 class Found:
-    """What was measured of a joint, and what figures are drawn from."""
+    """Figures of a joint, and the data of their plots"""
 
     joint: Joint
     figures: list[Measured] = field(default_factory=list)
@@ -60,26 +61,26 @@ class Found:
     steps: list[response.Step] = field(default_factory=list)
     moves: list[response.Step] = field(default_factory=list)
     gaps: dict[str, list[gaps.Gap]] = field(default_factory=dict)
-    """By interface"""
+    """Tried gaps by interface"""
     band: Trace | None = None
 
     def value(self, name: str) -> float | None:
-        """Return a figure that was measured before, in its unit."""
+        """Return the value of a figure, or None if it was not measured."""
         return next((one.value for one in self.figures if one.name == name), None)
 
 
 class Characterized(msgspec.Struct, frozen=True):
-    """The result."""
+    """Result of the experiment"""
 
     robot: str
     joints: tuple[Found, ...]
     why: str
-    """Why it ended early, one sentence; empty: it did not."""
+    """Reason for an early end, one sentence; empty on success"""
     tolerance: float
 
 
 class Characterize:
-    """The experiment; see guided.experiment.Experiment. One joint moves at a time, the others hold."""
+    """Experiment (see guided.experiment.Experiment) that moves one joint at a time. All other joints hold."""
 
     def __init__(
         self, measurements: Sequence[Measurement] = MEASUREMENTS, tolerance: float = TOLERANCE
@@ -90,7 +91,7 @@ class Characterize:
         self._eased: set[str] = set()
 
     def moves(self, situation: Situation) -> Sequence[str]:
-        """Return what will move, how far and how fast; raises InputError where a joint is no servo's own."""
+        """Describe the motions of each joint. Raises InputError for a joint that shares its servos."""
         require_own_servos(situation.plan, situation.names, "characterize", gears=True)
         return [
             f"{joint.name}: {', '.join(self._measurements)}; as fast as "
@@ -100,7 +101,7 @@ class Characterize:
         ]
 
     def procedure(self, situation: Situation) -> Procedure:
-        """Yield the segments of all measurements, and keep what comes of them."""
+        """Yield the segments of all measurements, and evaluate their recordings."""
         parts = {
             "rate": self._rate,
             "response": self._response,
@@ -121,7 +122,7 @@ class Characterize:
                     ]
 
     def finish(self, situation: Situation, recorded: Sequence[Recorded], why: str) -> Characterized:
-        """Return what was measured; what was not says so."""
+        """Return the results. Each figure that was not measured has a reason."""
         reason = f"the experiment ended before: {why}" if why else "nothing was recorded"
         for joint in situation.joints:
             found = self._found.setdefault(joint.name, Found(joint))
@@ -146,13 +147,13 @@ class Characterize:
     # Rates of the loop
 
     def _sampling(self, situation: Situation, found: Found, wanted: float) -> float:
-        """Return at which rate the joint is looked at, Hz: not faster than it was found to answer."""
+        """Return the loop rate for a measurement, Hz, below the highest rate at which the joint responds."""
         kept = found.value(rates.NAME) or rates.highest_by_bus(situation.plan)
         lowest = 1e9 / situation.plan.loop.slowest_period_ns if situation.plan.loop.slowest_period_ns else 0.0
         return rates.fitting(max(min(wanted, _OF_HIGHEST * kept), lowest), rates.rate_step(situation.plan))
 
     def _lead(self, interface: str = "position") -> float:
-        """Return how long a segment rests at first, s: until the gate lets goals go as fast as they may."""
+        """Return the rest at the start of a segment, s, after which the gate no longer eases goals."""
         if interface in self._eased:
             return _REST_S
         self._eased.add(interface)
@@ -161,7 +162,7 @@ class Characterize:
     # Measurements
 
     def _rate(self, situation: Situation, joint: Joint, found: Found) -> Part:
-        """Let the goal go to and fro by a tick in each cycle, at rising rates."""
+        """Toggle the goal by one tick in each cycle, at increasing rates."""
         column, label = situation.names.index(joint.name), joint.plan.label
         step, tick = rates.rate_step(situation.plan), joint.servo.position_per_tick
         highest = min(rates.highest_by_bus(situation.plan), rates.MOST_HZ)
@@ -184,7 +185,7 @@ class Characterize:
         found.figures.append(rates.highest_rate(found.rates, situation.plan, label))
 
     def _response(self, situation: Situation, joint: Joint, found: Found) -> Part:
-        """Step twice up and twice down, in one packet each, at several loop rates."""
+        """Step twice up and twice down at several loop rates, with one packet per step."""
         low, high = joint.inner
         speed = joint.plan.highest_speed
         size = min(_STEP, (high - low) / 2)
@@ -208,7 +209,7 @@ class Characterize:
         found.figures += response.response(found.steps)
 
     def _step_rates(self, situation: Situation, found: Found, wanted: float) -> list[float]:
-        """Return the loop rates of the steps, Hz: many, where the controllers' own rates allow it."""
+        """Return the loop rates of the steps, Hz: as many as the rates of the controllers allow."""
         lowest, highest = _STEP_RATES
         fastest = self._sampling(situation, found, min(max(wanted, lowest), highest))
         step = rates.rate_step(situation.plan)
@@ -221,12 +222,13 @@ class Characterize:
         return found_rates
 
     def _speed(self, situation: Situation, joint: Joint, found: Found) -> Part:
-        """Move from end to end of the range, as fast as the joint goes."""
+        """Move from end to end of the range at full speed."""
         low, high = joint.inner
         rate = self._sampling(situation, found, _FASTEST_SAMPLING)
         speed = joint.plan.highest_speed
         hold = 2 * (high - low) / speed + 0.8
-        # the profile of an X series needs a speed to be one (e-Manual, Profile Velocity (112): 0 is a step)
+        # An X series servo only has a profile with a speed above 0 (e-Manual, Profile Velocity (112): 0 is a
+        # step).
         profiled = bool(joint.servo.declared.get("profile_acceleration"))
         interface: Literal["position", "posvel"] = "posvel" if profiled else "position"
         moves: list[response.Step] = []
@@ -248,11 +250,11 @@ class Characterize:
                     moves += new
                     break
                 if farthest > before + _THERE_TICKS * joint.servo.position_per_tick:
-                    hold *= 2  # it is on its way still
+                    hold *= 2  # still moving
                     continue
                 there = new  # it rests short of its goal
             if len(moves) == 0 and ends[1] - ends[0] < (high - low) / 2:
-                # how far it overshoots in a short one decides how near to the ends of its range it may go
+                # Keep a distance to the ends of the range, according to the overshoot of a short move.
                 beyond = max(float(np.max(move.way)) - move.height for move in there)
                 over = _OVERSHOOTS * max(joint.servo.position_per_tick, beyond)
                 if high - low - 2 * over > (high - low) / 2:
@@ -264,7 +266,7 @@ class Characterize:
         found.figures += speeds.speeds(moves, joint.upper - joint.lower, speed)
 
     def _dead_band(self, situation: Situation, joint: Joint, found: Found) -> Part:
-        """Approach some places slowly, from both sides."""
+        """Approach places slowly from both sides."""
         low, high = joint.inner
         rate = self._sampling(situation, found, _SLOW_SAMPLING)
         reach, most = _BAND_REACH, (high - low) / 2
@@ -287,7 +289,7 @@ class Characterize:
         )
 
     def _gap(self, situation: Situation, joint: Joint, found: Found) -> Part:
-        """Send a smooth motion at growing gaps, by position and by posvel."""
+        """Send a smooth motion with increasing gaps, by position and by posvel."""
         low, high = joint.inner
         rate = self._sampling(situation, found, _SAMPLING)
         size = min((high - low) / 2 / gaps.LARGEST, _GAP_SPEED * joint.plan.highest_speed / gaps.FASTEST)
@@ -316,7 +318,7 @@ class Characterize:
     def _motion(
         self, joint: Joint, interface: Literal["position", "posvel"], gap: float, rate: float, size: float
     ) -> Segment:
-        """Return the motion as it is sent with a gap; it begins after `_lead_of` a gap."""
+        """Return the segment of a motion with a gap. The motion starts after `_lead_of` gaps."""
         lead = _lead_of(gap)
         time = np.arange(lead + math.ceil((gaps.MOTION_S + gaps.FADE_S) / gap)) * gap - lead * gap
         position, _ = gaps.motion(np.maximum(time, 0.0), size)
@@ -324,7 +326,7 @@ class Characterize:
         title = f"{joint.name}: a motion in gaps of {gap * 1e3:.1f} ms, {interface}"
         speeds_of: Mapping[str, Floats] = {}
         if interface == "posvel":
-            # so fast it goes from the sample before to this one in a gap
+            # Mean speed from the previous sample to this one.
             speeds_of = {joint.name: np.abs(np.diff(position, prepend=position[:1])) / gap}
         return Segment(title, gap, rows, interface, speeds_of, settle_s=_REST_S, loop_rate=rate)
 
@@ -347,9 +349,9 @@ class Characterize:
 
 _THERE: Final = 0.9
 _THERE_TICKS: Final = 2
-"""A joint that comes no further with twice the time has come to rest."""
+"""Progress in twice the time below which a joint counts as at rest, ticks"""
 _BEGUN: Final = 0.1
-"""Parts of its way beyond which a joint has come to its goal, and has begun to go there."""
+"""Fractions of the way after which a joint counts as arrived (`_THERE`) and as started (`_BEGUN`)"""
 
 _FIGURES: Final[Mapping[Measurement, Sequence[tuple[str, str]]]] = {
     "rate": ((rates.NAME, "Hz"),),
@@ -361,12 +363,12 @@ _FIGURES: Final[Mapping[Measurement, Sequence[tuple[str, str]]]] = {
 
 
 def _lead_of(gap: float) -> int:
-    """Return how many gaps a motion rests before it begins."""
+    """Return the number of gaps before the start of a motion."""
     return math.ceil(_EASED_S / gap)
 
 
 def _margins(situation: Situation, joint: Joint) -> Mapping[str, int]:
-    """Return the registers of a servo's dead band, ticks: as the file declares them, else as shipped."""
+    """Return the registers of a servo's dead band, ticks: declared values, or else factory defaults."""
     protocol = next(bus.protocol for bus in situation.plan.buses if joint.servo in bus.servos)
     table = find_table(joint.servo.model, protocol)
     shipped = {name: table.items[name].initial or 0 for name in dead_band.MARGINS if name in table.items}

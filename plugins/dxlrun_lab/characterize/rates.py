@@ -1,8 +1,8 @@
-"""The highest rate of communication: rates rise until replies get lost, or a cycle is longer than its period.
+"""Highest rate of communication: the rate rises until replies are lost or cycles exceed their period.
 
-As the thesis' freq_estimator, which found 333 Hz for its MX-64. What counts is in the log: valid replies, and
-the time from a cycle's wake-up to its last write. That a cycle began late is the machine's, and does not
-count.
+The method is that of the thesis' freq_estimator, which found 333 Hz for its MX-64. The log provides the valid
+replies and the time from a cycle's wake-up to its last write. A late wake-up is caused by the machine, so it
+is ignored.
 """
 
 from __future__ import annotations
@@ -22,38 +22,38 @@ from dxlrun_lab.guided.segment import Recorded
 NAME = "highest rate"
 MOST_HZ = 2000.0
 ALLOWED = 0.001
-"""Share of the cycles whose reply may be lost, or that may be longer than their period."""
+"""Allowed fraction of cycles with a lost reply, or with an exchange longer than the period"""
 GROWS = 1.3
-"""From one rate to the next, until one is not kept."""
+"""Ratio of two successive rates, until one fails"""
 NEAR = 0.02
-"""Then what is between is halved until it is this part of the rate."""
+"""Relative distance between the best and the worst rate at which the bisection ends"""
 BURST_S = 0.04
-"""A rate is tried for so long first: 3 lost replies in a row and 50 ms of silence lose a servo."""
+"""Duration of a first try at a rate, s. A servo would be lost after 3 missing replies and 50 ms."""
 
 Fault = Literal["", "servo", "bus", "run"]
-"""What keeps a rate from being kept: lost replies, a cycle's exchange, or a refusal of the run."""
+"""Reason why a rate fails: lost replies, exchanges longer than the period, or a refusal of the run"""
 
 
 class Rate(msgspec.Struct, frozen=True):
-    """One rate that was tried."""
+    """Result of one rate"""
 
     rate: float
     """Hz"""
     cycles: int
     lost: int
-    """Cycles without an intact reply of the joint."""
+    """Number of cycles without an intact reply of the joint"""
     too_long: int
-    """Cycles whose exchange took longer than their period, though no reply was lost."""
+    """Number of cycles with an exchange longer than their period, although no reply was lost"""
     late: int
-    """Cycles that began later than a tenth of a period: the machine's own, which do not count."""
+    """Number of cycles with a wake-up later than a tenth of a period. They are caused by the machine."""
     exchange_s: float
-    """Median time from a cycle's wake-up to its last write; NaN: no cycle ran."""
+    """Median time from a cycle's wake-up to its last write, s; NaN without cycles"""
     text: str = ""
-    """Why it was not tried to the end."""
+    """Reason for an early end"""
 
     @property
     def fault(self) -> Fault:
-        """What kept the rate from being kept; empty: nothing."""
+        """Reason why the rate fails; empty on success"""
         if not self.cycles:
             return "run"
         if self.lost > ALLOWED * self.cycles:
@@ -62,7 +62,7 @@ class Rate(msgspec.Struct, frozen=True):
 
 
 def judge(rate: float, recorded: Sequence[Recorded], column: int) -> Rate:
-    """Judge the cycles that ran at a rate."""
+    """Evaluate the cycles at a rate."""
     period_ns = 1e9 / rate
     valid = np.concatenate([part.valid[:, column] for part in recorded])
     took = np.concatenate([part.of_cycles("written_ns") - part.of_cycles("woken_ns") for part in recorded])
@@ -84,7 +84,7 @@ def refused(rate: float, text: str) -> Rate:
 
 
 def rate_step(plan: Plan) -> Fraction:
-    """Return the frequency, Hz, of which controllers need the loop's rate to be a multiple; 0: of none."""
+    """Return the frequency of which controllers require the loop rate to be a multiple, Hz, or 0."""
     step = Fraction(0)
     for controller in plan.loop.controllers:
         if controller.rate is not None:
@@ -100,25 +100,25 @@ def _common(a: Fraction, b: Fraction) -> Fraction:
 
 
 def fitting(rate: float, step: Fraction) -> float:
-    """Return the next lower rate that controllers allow, Hz, at least one step."""
+    """Return the highest rate up to `rate` that the controllers allow, Hz, but at least one step."""
     if not step:
         return rate
     return float(max(1, math.floor(Fraction(rate) / step + Fraction(1, 10**6))) * step)
 
 
 def highest_by_bus(plan: Plan) -> float:
-    """Return the highest rate that the buses allow by computation, Hz; infinite where it was not computed."""
+    """Return the highest rate that the buses allow by computation, Hz; infinite if it was not computed."""
     return 1e9 / plan.loop.least_period_ns if plan.loop.least_period_ns else math.inf
 
 
 def following(tried: Sequence[Rate], begin: float, highest: float, step: Fraction) -> float | None:
-    """Return the rate to try next, Hz, up to a highest; None: those that were tried tell enough."""
+    """Return the rate to try next, Hz, up to `highest`, or None at the end of the search."""
     if not tried:
         return fitting(min(begin, highest), step)
     good = max((one.rate for one in tried if not one.fault), default=0.0)
     bad = min((one.rate for one in tried if one.fault), default=math.inf)
     if math.isinf(bad):
-        # where controllers allow few rates, the next one, however far it is
+        # If the controllers allow only few rates, the next one may be farther away than GROWS.
         rate = fitting(min(max(GROWS * good, good + float(step)), highest), step)
     else:
         rate = fitting((good + bad) / 2 if good else bad / GROWS, step)
@@ -127,7 +127,7 @@ def following(tried: Sequence[Rate], begin: float, highest: float, step: Fractio
 
 
 def highest_rate(tried: Sequence[Rate], plan: Plan, servo: str) -> Measured:
-    """Return the highest rate that was kept, and what limits it; `servo`: as sentences name it."""
+    """Return the highest rate without a fault, and its limiting factor; `servo` is the name in messages."""
     how = f"{len(tried)} rates, {sum(rate.cycles for rate in tried)} cycles"
     kept = [rate for rate in tried if not rate.fault]
     failed = [rate for rate in tried if rate.fault]

@@ -1,12 +1,12 @@
 """Response time, from small steps: to the first motion, and to 63 % of the way.
 
-The first motion is where a curve through the first samples leaves the rest: waiting for the first tick would
-add the time in which the shaft is too slow to be seen, which is some 9 ms of an AX-12A's 0.29 deg.
+The time of the first motion is found by a fit through the first samples. The first tick would be too late by
+the time in which the slow shaft turns by one tick: some 9 ms for the 0.29 deg of an AX-12A.
 
-The goal of a small step goes in one packet, so the loop is slow (the gate lets a goal go as fast as its servo
-can); the samples of steps at several loop rates lie between one another. The steps go twice up and twice
-down, so half of them start from a rest that was reached from below, half from above: what ticks and dead
-band shift the rest by is the opposite then, and cancels.
+A small step must fit into one packet, so the loop rate is low, because the gate limits a goal to the speed of
+its servo. Steps at several loop rates are combined, so that their samples interleave. Half of the steps start
+from a rest that was approached from below, and half from above, so that the shifts by ticks and dead band
+cancel.
 """
 
 from __future__ import annotations
@@ -23,47 +23,47 @@ from dxlrun_lab.characterize.measured import Measured, not_measured, student
 from dxlrun_lab.characterize.trace import Trace, polynomial
 
 PART = 1 - math.exp(-1)
-"""63 %: what a first-order lag has done of its way after its time constant."""
+"""63 %, the step response of a first-order lag after its time constant"""
 LEAST_STEPS = 6
-"""Fewer say nothing of their scatter."""
+"""Smallest number of steps for an estimate of their scatter"""
 _CLEAR_S = 0.02
-"""A response that is uncertain by less than half of it is told even if it is shorter."""
+"""A shorter response is still reported if its uncertainty is below half of this time, s"""
 LEAST_TICKS = 8
-"""A shorter way says nothing of when it began."""
+"""Shortest way from which a response time can be determined, ticks"""
 ONSET_PART = 0.5
-"""The part of the way by which the first motion is found."""
+"""Fraction of the way that is used to find the first motion"""
 _MISSED_PART = 0.04
-"""Of the time to 63 %: so far a first motion that is found lies beside known delays of simulated servos,
-beyond what scatter says: their way does not begin as a polynomial."""
+"""Systematic error of the first motion as a fraction of the time to 63 %, found with simulated servos of
+known delay. Their way does not start as a polynomial."""
 _REST_S = 0.1
-"""Before a step and at its end, in which the shaft must be at rest."""
+"""Time before a step, and before the next one, in which the shaft must be at rest, s"""
 _STILL_TICKS, _STILL_PART = 2.5, 0.05
-"""A joint that moves by less, or by less than this part of the step, is at rest."""
+"""Motion below which a joint counts as at rest: ticks, or fraction of the step"""
 _BEFORE_S = 0.03
-"""Before a step, samples that belong to it."""
+"""Time before a step from which samples are included, s"""
 ONSET, RISE = "response to first motion", "response to 63 %"
 
 
 class Step(msgspec.Struct, frozen=True):
-    """One step: the goal leaves a place where the joint rested; what happened until the next one."""
+    """Step response of a joint that was at rest, until the next step"""
 
     time: Floats
-    """s since the last byte of the first packet with another goal"""
+    """Time since the last byte of the first packet with the new goal, s"""
     way: Floats
-    """rad from where it rested, positive toward the goal"""
+    """Distance from the rest, rad, positive towards the goal"""
     goal: Floats
-    """rad, the same of what had been sent by then"""
+    """Distance of the sent goal from the previous one, rad"""
     height: float
-    """rad that the goal went in all"""
+    """Height of the step, rad"""
     reached: float
-    """rad where it came to rest; NaN: it did not"""
+    """Distance at the final rest, rad; NaN if the joint did not come to rest"""
     packets_s: float
-    """For how long packets with another goal left: the gate lets a goal go as fast as its servo can"""
+    """Time in which packets with changing goals were sent, s; above 0 if the gate limited the step"""
     tick: float
 
 
 def steps_of(trace: Trace) -> list[Step]:
-    """Return the steps in a trace: wherever the goal begins to change after a rest."""
+    """Return the steps in a trace. A step starts when the goal changes after a rest."""
     changed = np.flatnonzero(np.diff(trace.goal) != 0) + 1
     if not len(changed):
         return []
@@ -78,7 +78,7 @@ def steps_of(trace: Trace) -> list[Step]:
 
 
 def _step(trace: Trace, start: int, end: int) -> Step | None:
-    """Return one step; None where the joint did not rest before it."""
+    """Return a step, or None if the joint was not at rest before it."""
     origin = float(trace.sent[start])
     before = trace.part((trace.time > trace.time[start] - _REST_S) & (np.arange(len(trace)) <= start))
     height = float(trace.goal[end - 1] - trace.goal[start - 1])
@@ -107,9 +107,9 @@ def _step(trace: Trace, start: int, end: int) -> Step | None:
 
 
 def response(steps: Sequence[Step]) -> tuple[Measured, Measured]:
-    """Return the response times to the first motion and to 63 % of the way, of steps of one packet each.
+    """Return the response times to the first motion and to 63 % of the way.
 
-    The samples of all steps are taken together: at loop rates that differ they lie close, whatever the rates.
+    The samples of all steps are pooled. Steps at different loop rates interleave, so the samples are dense.
     """
     why, good = _not_usable(steps), [step for step in steps if _rested(step)]
     if why:
@@ -129,7 +129,7 @@ def _rested(step: Step) -> bool:
 
 
 def _not_usable(steps: Sequence[Step]) -> str:
-    """Return why steps say nothing of the response, a sentence; empty: they do."""
+    """Return the reason why steps are not usable, one sentence; empty if they are."""
     if len(steps) < LEAST_STEPS:
         return f"{len(steps)} steps were recorded in which the joint rested before; {LEAST_STEPS} are needed"
     most, height = max(float(np.max(step.way)) for step in steps), steps[0].height
@@ -153,7 +153,7 @@ def _not_usable(steps: Sequence[Step]) -> str:
 class _Pool(NamedTuple):
     time: Floats
     part: Floats
-    """Of the whole way"""
+    """Fraction of the whole way"""
 
 
 def _pooled(
@@ -163,10 +163,10 @@ def _pooled(
     how: str,
     resolution: float = 0.0,
 ) -> Measured:
-    """Return a time that is found from the samples of all steps together, by the first way.
+    """Return a time that the first of `ways` finds in the pooled samples of all steps.
 
-    Its scatter is found by leaving one step out after the other (jackknife; B. Efron and C. Stein, Annals of
-    Statistics 9, 1981); by how much another way differs counts too.
+    The scatter is estimated by the jackknife (B. Efron and C. Stein, Annals of Statistics 9, 1981).
+    Differences to the other estimators in `ways` add to the uncertainty.
     """
     value, count = ways[0](pools), len(pools)
     if math.isnan(value):
@@ -192,7 +192,7 @@ def _curve(pools: Sequence[_Pool]) -> tuple[Floats, Floats]:
 
 
 def _rise(pools: Sequence[_Pool], level: float = PART) -> float:
-    """Return when the steps have done a part of their way: by a parabola through the samples around it, s."""
+    """Return the time to a fraction of the way, s, by a parabola through the samples around it."""
     time, part = _curve(pools)
     rising = (time > 0) & (time < _until(time, part, 0.5 * (1 + level)))
     near = rising & (np.abs(part - level) < 0.5 * (1 - level) + 1e-9)
@@ -202,7 +202,7 @@ def _rise(pools: Sequence[_Pool], level: float = PART) -> float:
 
 
 def _until(time: Floats, part: Floats, level: float) -> float:
-    """Return the last time by which a level is not passed for good, in samples of several steps."""
+    """Return the last time at which a sample is below a level."""
     below = time[part < level]
     return float(below.max(initial=0.0))
 
@@ -210,10 +210,10 @@ def _until(time: Floats, part: Floats, level: float) -> float:
 def _first_motion(
     pools: Sequence[_Pool], part_of_way: float = ONSET_PART, powers: Sequence[int] = (2, 3, 4)
 ) -> float:
-    """Return when the way leaves 0: the t0 with which c2 (t - t0)^2 + c3 (t - t0)^3 + ... fits best, s.
+    """Return the time t0 of the first motion, s, with which c2 (t - t0)^2 + c3 (t - t0)^3 + ... fits best.
 
-    A motor's torque jumps with the goal, so its way begins with the square of the time; the other terms are
-    what speed and the shrinking error take from it. NaN: no t0 is better than its neighbours.
+    The motor's torque jumps with the goal, so the way starts with the square of the time. The other terms
+    account for the speed and the decreasing error. NaN if the fit has no minimum.
     """
     time, part = _curve(pools)
     until = _rise(pools, part_of_way)
@@ -228,7 +228,7 @@ def _first_motion(
     right = np.einsum("cni,n->ci", terms, part)
     found = np.linalg.solve(square, right[:, :, None])[:, :, 0]
     cost = part @ part - np.einsum("ci,ci->c", found, right)
-    cost[found[:, 0] <= 0] = math.inf  # it would begin backwards
+    cost[found[:, 0] <= 0] = math.inf  # reject fits that start backwards
     at = int(np.argmin(cost))
     if not 0 < at < len(candidates) - 1:
         return math.nan
@@ -243,11 +243,11 @@ _OTHER_FITS: Final[Sequence[Callable[[Sequence[_Pool]], float]]] = (
     lambda pools: _first_motion(pools, 0.7 * ONSET_PART),
     lambda pools: _first_motion(pools, 1.3 * ONSET_PART),
 )
-"""By less and by more of the way: how far they differ is what a polynomial and coarse ticks leave open."""
+"""Fits with less and with more of the way. Their differences estimate the error by polynomial and ticks."""
 
 
 def _spread(pools: Sequence[_Pool]) -> float | None:
-    """Return the standard deviation of the steps' response times, s: how far each lies beside all."""
+    """Return the standard deviation of the response times of single steps, s, by their shifts in the pool."""
     time, part = _curve(pools)
     rows = (part > 0.1) & (part < 0.9) & (time < _until(time, part, 0.9))
     if np.count_nonzero(rows) < 3 * LEAST_STEPS:

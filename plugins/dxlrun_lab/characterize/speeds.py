@@ -1,7 +1,7 @@
 """Top speed, acceleration and braking, from moves as long as the range allows.
 
-The thesis' step tests (Figures 19 and 20) went from -1 rad to +1 rad. Speeds are slopes of the positions:
-what a servo reports as its speed is filtered in a way that no manual tells.
+The thesis' step tests (Figures 19 and 20) moved from -1 rad to +1 rad. Speeds are slopes of the positions,
+because the manuals do not document the filter on a servo's reported speed.
 """
 
 from __future__ import annotations
@@ -19,42 +19,43 @@ from dxlrun_lab.characterize.trace import crossing, polynomial, slopes
 
 TOP, ACCELERATION, BRAKING = "top speed", "acceleration", "braking"
 RISE = 0.2, 0.8
-"""Parts of the highest speed between which a joint counts as accelerating, or braking."""
+"""Fractions of the highest speed between which acceleration and braking are measured"""
 _CRUISE = 0.95
-"""Of the highest speed: above it a joint cruises."""
+"""Fraction of the highest speed above which a joint counts as cruising"""
 _FOLLOWS = 0.015
-"""A cruise whose speed differs by less from the goal's is the goal's, not the servo's."""
+"""Relative difference to the speed of the goal below which the goal limits the cruise, not the servo"""
 _SLOPE_NOISE = 0.01
-"""Of the top speed: so much scatter a tick may give a slope; it is taken over that many samples."""
+"""Allowed scatter of a slope by ticks, as a fraction of the top speed"""
 _LEAST_SAMPLES, _MOST_SAMPLES = 5, 41
+"""Smallest and largest number of samples of a slope"""
 _ROOM = 1.3
-"""So much longer a range is recommended than it needs to be."""
+"""Safety factor on the recommended range"""
 
 
 class Move(msgspec.Struct, frozen=True):
-    """One long move as it is judged."""
+    """Evaluation of one long move"""
 
     time: Floats
     speed: Floats
-    """rad/s, positive toward the goal"""
+    """rad/s, positive towards the goal"""
     highest: float
-    """rad/s: while it cruised, else the peak"""
+    """Mean speed of the cruise, or else the peak, rad/s"""
     cruised_s: float
     cruised: bool
-    """It cruised for at least as long as it accelerated: its highest speed is the one that it has."""
+    """True if the joint cruised for at least as long as it accelerated, so that `highest` is its top speed"""
     rise_s: float
-    """Between the parts `RISE` of the highest speed; NaN: not seen"""
+    """Time between the fractions `RISE` of the highest speed, s; NaN if not seen"""
     fall_s: float
     drift: float
-    """rad/s by which the halves of its cruise differ; half of it"""
+    """Half of the speed difference between the two halves of the cruise, rad/s"""
     half_width_s: float
-    """Time to each side over which slopes were taken"""
+    """Half-width of the window of slopes, s"""
     follows: bool
-    """It went exactly as fast as its goal: the servo may be quicker."""
+    """True if the joint was exactly as fast as its goal, so the servo may be faster"""
 
 
 def move_of(step: Step) -> Move | None:
-    """Return a move, judged; None where there was hardly one."""
+    """Evaluate a move. Return None if the joint hardly moved."""
     way, tick = step.way, step.tick
     total = float(np.max(way))
     if total < LEAST_TICKS * tick:
@@ -98,7 +99,7 @@ def move_of(step: Step) -> Move | None:
 
 
 def _half_width(period: float, tick: float, speed: float) -> float:
-    """Return over how much time to each side a slope is taken, so that ticks scatter it little enough, s."""
+    """Return the half-width of the window of slopes, s, that keeps the scatter below _SLOPE_NOISE."""
     for count in range(_LEAST_SAMPLES, _MOST_SAMPLES, 2):
         scatter = tick / math.sqrt(12) / (period * math.sqrt(count * (count**2 - 1) / 12))
         if scatter <= _SLOPE_NOISE * speed:
@@ -109,8 +110,10 @@ def _half_width(period: float, tick: float, speed: float) -> float:
 def speeds(steps: Sequence[Step], range_rad: float, own_speed: float) -> tuple[Measured, Measured, Measured]:
     """Return top speed, acceleration and braking.
 
-    `range_rad`: of the joint in the experiment; `own_speed`: by the model's manual, rad/s, to tell which
-    range would do where this one does not.
+    Args:
+        steps: Long moves.
+        range_rad: Range of the joint in the experiment, rad.
+        own_speed: Speed in the model's manual, rad/s, for the recommendation of a range.
     """
     how = f"{len(steps)} moves of {math.degrees(max((s.height for s in steps), default=0.0)):.3g} deg"
     moves = [move for step in steps if (move := move_of(step)) is not None]
@@ -147,10 +150,7 @@ def _top(moves: Sequence[Move], range_rad: float, own_speed: float, how: str) ->
 
 
 def _needed_range(moves: Sequence[Move], own_speed: float) -> float | None:
-    """Return the range in which the joint would cruise, deg, as it accelerated and braked.
-
-    None where it showed none.
-    """
+    """Return the range in which the joint would cruise, deg, or None without acceleration or braking."""
     whole = [move for move in moves if math.isfinite(move.rise_s + move.fall_s)]
     if not whole:
         return None
@@ -166,7 +166,7 @@ def _needed_range(moves: Sequence[Move], own_speed: float) -> float | None:
 
 
 def _change(name: str, moves: Sequence[Move], times: Sequence[float], period: float, how: str) -> Measured:
-    """Return the mean change of the speed between the parts `RISE` of the highest one, rad/s^2."""
+    """Return the mean acceleration between the fractions `RISE` of the highest speed, rad/s^2."""
     part = RISE[1] - RISE[0]
     known = [(move.highest, time) for move, time in zip(moves, times, strict=True) if math.isfinite(time)]
     if len(known) < max(2, len(moves) // 2):
@@ -176,7 +176,7 @@ def _change(name: str, moves: Sequence[Move], times: Sequence[float], period: fl
         why = f"it takes less than {1.5 * period * 1e3:.1f} ms, about the time between two positions"
         return not_measured(name, "rad/s^2", why, how)
     values = [part * speed / time for speed, time in known]
-    # a slope over some time shows no quicker change; where both crossings lie in a ramp it shifts them alike
+    # The window of a slope smooths quick changes. Inside a ramp it shifts both crossings alike.
     resolution = (
         float(np.mean(values)) * 0.2 * float(np.median([move.half_width_s for move in moves])) / median
     )

@@ -1,4 +1,4 @@
-"""The result of `dxlrun characterize` as a table for each joint, and as JSON."""
+"""Result of `dxlrun characterize` as a table for each joint, and as JSON."""
 
 from __future__ import annotations
 
@@ -10,11 +10,11 @@ from dxlrun_lab.characterize.measured import Measured
 from dxlrun_lab.characterize.procedure import Characterized, Found
 
 _SHOWN = {"rad": ("deg", math.degrees(1.0)), "s": ("ms", 1e3)}
-"""Units in which people read; the JSON has SI."""
+"""Units of the tables. The JSON output has SI units."""
 
 
 def results(found: Characterized) -> dict[str, object]:
-    """Return a result as JSON has it: SI units, angles in rad."""
+    """Return the JSON content of a result, in SI units; angles in rad."""
     return {
         "robot": found.robot,
         "complete": not found.why,
@@ -36,7 +36,7 @@ def results(found: Characterized) -> dict[str, object]:
 
 
 def parts(found: Characterized) -> Iterator[Part]:
-    """Yield a table for each joint, and below it how each figure was measured, or why it was not."""
+    """Yield a table for each joint, and the reason for each figure that was not measured."""
     for joint in found.joints:
         yield table(joint)
         for one in joint.figures:
@@ -74,7 +74,7 @@ def table(found: Found) -> Table:
 
 
 def shown(one: Measured) -> str:
-    """Return a figure as people read it: `21.4 ms`; `below 3 ms` where it is not told from 0."""
+    """Format a figure: `21.4 ms`, or `below 3 ms` if its interval contains 0."""
     if one.value is None:
         return "-"
     if one.near_zero:
@@ -83,13 +83,13 @@ def shown(one: Measured) -> str:
 
 
 def shown_uncertainty(one: Measured) -> str:
-    """Return what a figure is uncertain by: `± 0.8`; empty where the figure itself says it."""
+    """Format the uncertainty of a figure: `± 0.8`, or an empty text if the figure is an upper bound."""
     known = one.value is not None and one.uncertainty is not None and not one.near_zero
     return f"± {_number((one.uncertainty or 0.0) * _factor(one))}" if known else ""
 
 
 def unit_of(one: Measured) -> str:
-    """Return the unit in which a figure is shown."""
+    """Return the unit of a figure in tables."""
     return _SHOWN.get(one.unit, (one.unit, 1.0))[0]
 
 

@@ -1,8 +1,7 @@
-"""Trace: one joint's goals and positions, each at the time at which the servo had it.
+"""Trace: goals and positions of one joint, with the times at which they were valid in the servo.
 
-A state in the log arrived with a reply; the servo took it when the instruction had ended, before its return
-delay and the reply's time on the wire. A goal is with the servo when the last byte of its packet has passed
-the wire.
+A servo samples its state at the end of the instruction packet, so before its return delay and before the
+transmission of the reply. A goal takes effect when the last byte of its packet has been transmitted.
 """
 
 from __future__ import annotations
@@ -22,22 +21,22 @@ from dxlwire import BITS_PER_BYTE, BusPlan, ServoPlan
 
 
 class Trace(msgspec.Struct, frozen=True):
-    """A joint over time, one row a cycle with an intact reply; times in s from one origin."""
+    """Goals and positions of a joint, one row per cycle with an intact reply; times in s"""
 
     time: Floats
-    """When the servo had the position"""
+    """Time of the position in the servo"""
     position: Floats
     """rad"""
     sent: Floats
-    """When the last byte of the cycle's goal had passed the wire; later than `time`"""
+    """Time at which the last byte of the cycle's goal was transmitted; later than `time`"""
     goal: Floats
-    """rad, behind the gate"""
+    """Goal after the gate, rad"""
     tick: float
-    """rad; the servo's unit of position"""
+    """Resolution of the position, rad"""
 
     @classmethod
     def of(cls, recorded: Recorded, joint: Joint, buses: Sequence[BusPlan]) -> Self:
-        """Return what was recorded of a joint; rows without an intact reply are left out."""
+        """Return the trace of a joint in a recording. Rows without an intact reply are omitted."""
         column = recorded.joints.index(joint.name)
         reply_ns, goal_ns = _on_the_wire(joint.servo, buses)
         taken_ns = recorded.of_cycles("read_ns") - recorded.of_joints("age_ns")[:, column] - reply_ns
@@ -58,16 +57,16 @@ class Trace(msgspec.Struct, frozen=True):
 
     @property
     def period(self) -> float:
-        """Median time between two positions, s; NaN below two."""
+        """Median time between two positions, s; NaN with fewer than two"""
         return float(np.median(np.diff(self.time))) if len(self) > 1 else math.nan
 
     def part(self, rows: slice | NDArray[np.bool_]) -> Trace:
-        """Return some rows."""
+        """Return a part of the rows."""
         return Trace(self.time[rows], self.position[rows], self.sent[rows], self.goal[rows], self.tick)
 
 
 def _on_the_wire(servo: ServoPlan, buses: Sequence[BusPlan]) -> tuple[int, int]:
-    """Return how long a servo's state needs to the host, and a goal to the servo, ns, by the plan."""
+    """Return the delays of a servo's state to the host and of a goal to the servo, ns, by the plan."""
     for bus in buses:
         if servo not in bus.servos:
             continue
@@ -78,7 +77,7 @@ def _on_the_wire(servo: ServoPlan, buses: Sequence[BusPlan]) -> tuple[int, int]:
                 continue
             asked_ns = len(read.packet) * BITS_PER_BYTE * 1_000_000_000 // bus.baud_rate
             replies_ns = read.due_ns - asked_ns
-            # those behind the first one of a group answer later, but in their state at its end
+            # Servos after the first one of a group answer later, but sample their state at the same time.
             place = group.index(index) + 1
             part_ns = replies_ns if fast else replies_ns * place // len(group)
             return part_ns + bus.latency_ns, goal_ns
@@ -86,10 +85,10 @@ def _on_the_wire(servo: ServoPlan, buses: Sequence[BusPlan]) -> tuple[int, int]:
 
 
 def slopes(time: Floats, values: Floats, half_width: float) -> Floats:
-    """Return the slope of a straight line through the samples within `half_width` of each one.
+    """Return the slope of a straight line through the samples within `half_width`, s, of each sample.
 
-    As the first derivative by A. Savitzky and M. J. E. Golay (Anal. Chem. 36, 1964), for times that need not
-    be evenly spaced; NaN where fewer than two samples are.
+    This is the first derivative of A. Savitzky and M. J. E. Golay (Anal. Chem. 36, 1964), for times that need
+    not be evenly spaced. It is NaN with fewer than two samples.
     """
     shifted_t, shifted_v = time - time[:1], values - values[:1]
     sums = [
@@ -106,7 +105,7 @@ def slopes(time: Floats, values: Floats, half_width: float) -> Floats:
 
 
 def crossing(time: Floats, values: Floats, level: float) -> float:
-    """Return when rising values first reach a level, between two samples by a straight line; NaN: never."""
+    """Return the time at which rising values first reach a level, linearly interpolated; NaN if never."""
     reached = np.flatnonzero(values >= level)
     if not len(reached):
         return math.nan
@@ -118,8 +117,8 @@ def crossing(time: Floats, values: Floats, level: float) -> float:
 
 
 def polynomial(x: Floats, y: Floats, degree: int) -> Floats:
-    """Return the coefficients of the least-squares polynomial, the highest power first, as numpy.polyfit.
+    """Return the coefficients of the least-squares polynomial, the highest power first, as in numpy.polyfit.
 
-    Of samples that determine none it is the smallest, without a warning.
+    If the samples do not determine it, the solution is the one of minimum norm, without a warning.
     """
     return np.linalg.lstsq(np.vander(x, degree + 1), y, rcond=None)[0].astype(np.float64)

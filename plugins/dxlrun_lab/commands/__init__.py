@@ -1,4 +1,4 @@
-"""Commands that measure, or play a log: `bench`, `latency`, `characterize`, `identify` and others.
+"""Commands that measure or play logs, such as `bench`, `latency`, `characterize` and `identify`.
 
-They parse options and print. The procedures are in the package of each experiment.
+They parse options and print results. The procedures are in the package of each experiment.
 """

@@ -73,7 +73,7 @@ def convert(
 
 
 def _where(motion: RecordedMotion) -> str:
-    """Return what was recorded, on one line whatever the file's name is."""
+    """Describe a recording on one line, with unprintable characters of the file name replaced."""
     name = "".join(letter if letter.isprintable() else "?" for letter in str(motion.path))
     end_s = motion.begin_s + motion.duration_s
     goals = [joint for joint, what in zip(motion.joints, motion.what, strict=True) if what == "goals"]

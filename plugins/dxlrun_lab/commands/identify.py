@@ -128,7 +128,7 @@ def _check(duration: float, inertia: float | None, gravity: float | None, voltag
 
 
 def _check_output(target: Path, joints: tuple[str, ...]) -> None:
-    """Raise InputError where a motor file cannot be written, before anything moves."""
+    """Raise InputError before anything moves if the motor file cannot be written."""
     if len(joints) != 1:
         raise InputError("--output takes the motor file of one joint; name that joint only")
     check_target(target)

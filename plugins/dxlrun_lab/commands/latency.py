@@ -71,7 +71,7 @@ def latency(
     cores
         Processor cores to measure on, such as 1 or 2,3.
     idle_latency
-        Keep the processor cores from deep idle states meanwhile.
+        Keep the processor cores from deep idle states during the measurement.
     log
         Write a log to this new file (.mcap), or into this directory; without it into logs, as runs do.
     record
@@ -105,7 +105,7 @@ def latency(
 def _measured(
     settings: Settings, stress: bool, place: Path | None, report: Path | None, *, as_json: bool
 ) -> int:
-    """Measure, then write and show what was measured; return the exit code."""
+    """Measure, then write and show the results. Return the exit code."""
     from dxlrun_lab.latency.measurement import (
         Measured,
         compiled_yardstick,
@@ -127,7 +127,7 @@ def _measured(
             try:
                 with load:
                     measure(settings, yardstick, load, progress, measured)
-            except KeyboardInterrupt:  # while the load began or ended
+            except KeyboardInterrupt:  # while the load was starting or ending
                 measured.interrupted = True
             except BaseException:
                 _discard(target)
@@ -160,7 +160,7 @@ def _show(
             raise KeyboardInterrupt
         raise InputError(measured.failure or "nothing was measured")
     if not as_json:
-        show(*parts(result))  # before the log, which takes its time: an interrupt leaves the table at least
+        show(*parts(result))  # writing the log takes long, and an interrupt must not lose the table
     with out().status("writing the log") if not as_json else nullcontext():
         if target is not None:
             summary = write(target, settings, measured.blocks, load, measured.remarks)
@@ -217,7 +217,7 @@ def _cores(text: str | None) -> tuple[int, ...]:
 
 
 def _log_place(log: Path | None, record: bool) -> Path | None:
-    """Return where the log goes, a file or a directory; None: nowhere."""
+    """Return the file or directory of the log, or None without a log."""
     if not record:
         return None
     if log is None:

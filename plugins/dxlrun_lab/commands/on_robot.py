@@ -1,4 +1,4 @@
-"""Experiments on a robot: their common options, the robot they work on, the countdown, and what ends them.
+"""Experiments on a robot: common options, choice of the robot, countdown, and abort.
 
 dxlrun characterize robots/single_joint.yaml port:=/dev/ttyUSB0 joint --range joint=-20deg..20deg
 dxlrun identify elbow --robot arm
@@ -35,7 +35,7 @@ if TYPE_CHECKING:
 
 R = TypeVar("R")
 COUNTDOWN_S = 3, 1.0
-"""How many numbers, and how long each is shown."""
+"""Number of counts, and duration of each, s"""
 _LOOK_S = 0.1
 INTERRUPTED = 130
 NOTHING_MOVED = "nothing was moved"
@@ -76,7 +76,7 @@ DEFAULTS = OnRobot()
 
 
 class Chosen(NamedTuple):
-    """The words of a command line: a robot file with its arguments, or none; and joints."""
+    """Arguments of a command line: an optional robot file with its arguments, and joints"""
 
     file: Path | None
     assignments: tuple[str, ...]
@@ -84,7 +84,7 @@ class Chosen(NamedTuple):
 
     @classmethod
     def of(cls, words: Sequence[str]) -> Chosen:
-        """Sort words; raises InputError for arguments without a robot file."""
+        """Parse the words. Raises InputError for arguments without a robot file."""
         rest = list(words)
         file = None
         if rest and (rest[0].endswith((".yaml", ".yml")) or os.sep in rest[0]):
@@ -100,43 +100,43 @@ class Chosen(NamedTuple):
 
 
 class Ran(msgspec.Struct, Generic[R], frozen=True):
-    """What an experiment on a robot led to."""
+    """Outcome of an experiment on a robot"""
 
     result: R | None
-    """Of what was recorded; None where nothing was."""
+    """Result; None if nothing was recorded"""
     robot: str
     log: Path | None
     why: str
-    """Why it ended early, one sentence; empty: it did not."""
+    """Reason for an early end, one sentence; empty on success"""
     problems: tuple[str, ...]
-    """What is not as it was before, and what went wrong with a run of its own."""
+    """State that was not restored, and errors of a run that the command started"""
     interrupted: bool
 
     @property
     def failures(self) -> tuple[str, ...]:
-        """Return why it ended early, and the problems; empty on success."""
+        """Reason for an early end, and problems; empty on success"""
         return (*filter(None, (self.why,)), *self.problems)
 
     @property
     def exit_code(self) -> int:
-        """0 good, 1 ended early or not restored, 130 aborted."""
+        """Exit code: 0 success, 1 early end or state not restored, 130 aborted"""
         return INTERRUPTED if self.interrupted else int(bool(self.why or self.problems))
 
 
 class Course(msgspec.Struct, frozen=True):
-    """What differs between an experiment and a recorded motion, when it is performed on a robot."""
+    """Settings in which an experiment and a recorded motion differ"""
 
     name: str = "the experiment"
     ranges: Mapping[str, tuple[float, float]] | None = {}
-    """Where joints may move, rad, by `--range`; None: within all of their limits."""
+    """Ranges of joints by `--range`, rad; None for their limits"""
     back: bool = True
-    """At the end the joints go back to where they were."""
+    """True if the joints move back to their start at the end"""
     expected: tuple[str, ...] | None = None
-    """What will move, for the question before a run is started; None: the joints, within their ranges."""
+    """Description of the motions for the question before the start of a run; None for joints and ranges"""
 
 
 def run_on_robot(experiment: Experiment[R], words: Sequence[str], options: OnRobot = DEFAULTS) -> Ran[R]:
-    """Perform an experiment on the robot of a command line, and return its result; see perform_on."""
+    """Perform an experiment on the robot of a command line. See perform_on."""
     from dxlrun_lab.guided.choice import parse_ranges
 
     chosen = Chosen.of(words)
@@ -147,10 +147,13 @@ def run_on_robot(experiment: Experiment[R], words: Sequence[str], options: OnRob
 def perform_on(
     experiment: Experiment[R], chosen: Chosen, plan: Plan | None, options: OnRobot, course: Course
 ) -> Ran[R]:
-    """Perform an experiment on the robot of a plan, which is started, or on the one that runs.
+    """Perform an experiment. Start the run of a plan, or use a running robot without one.
 
-    What happens is printed to stderr; the caller shows the result. Raises InputError before anything moves.
-    The question before real joints move comes before a run is started, which switches torque on.
+    Progress is printed to stderr, and the caller shows the result. The confirmation for real joints precedes
+    the start of a run, because a run enables torque.
+
+    Raises:
+        InputError: The arguments are invalid. Nothing has moved.
     """
     from dxlrun_lab.guided.choice import situation_of, whole_situation
     from dxlrun_lab.guided.experiment import Performed, perform
@@ -170,7 +173,7 @@ def perform_on(
                 situation = situation_of(rig, chosen.joints, course.ranges)
                 _announce(situation)
             sys.stderr.write("".join(f"{line}\n" for line in experiment.moves(situation)))
-            # a run of its own was asked for before it was started
+            # A run that was started here has been confirmed already.
             if plan is not None or _confirmed(rig.plan, options, aborting):
                 with aborting.by_any_key():
                     if _counted_down(situation, options, aborting):
@@ -186,20 +189,20 @@ def perform_on(
         try:
             with err().status("computing the result"):
                 result = experiment.finish(situation, performed.recorded, performed.why)
-        except KeyboardInterrupt:  # it may take a while
+        except KeyboardInterrupt:  # the computation can take long
             print_error(f"{rig.plan.robot}: what was measured is in {rig.log}")
             raise
         except DxlrunError as error:
             if not performed.why:
                 raise
-            ended = (*error.sentences, *ended)  # of a part there may be no result
+            ended = (*error.sentences, *ended)  # an incomplete recording may have no result
     problems = (*performed.not_restored, *ended)
     ran = Ran(result, rig.plan.robot, rig.log, performed.why, problems, interrupted)
     return _ended(ran, performed, course)
 
 
 def _ended(ran: Ran[R], performed: Performed, course: Course) -> Ran[R]:
-    """Print what went wrong; return how it went."""
+    """Print the problems of an outcome, and return it."""
     if ran.why:
         kept = len(performed.recorded) if course.ranges is not None else 0
         left = f"; {counted(kept, 'piece', 'pieces')} of it measured before" if kept else ""
@@ -210,7 +213,7 @@ def _ended(ran: Ran[R], performed: Performed, course: Course) -> Ran[R]:
 
 
 def _plan_of(chosen: Chosen, ranges: Mapping[str, tuple[float, float]], options: OnRobot) -> Plan | None:
-    """Return the plan of a robot file, whose joints and ranges are as asked for; None without a file."""
+    """Return the plan of a robot file, or None without a file. Joints and ranges are checked."""
     from dxlrun_lab.guided.choice import check_joints
 
     if chosen.file is not None:
@@ -225,9 +228,9 @@ def _plan_of(chosen: Chosen, ranges: Mapping[str, tuple[float, float]], options:
 
 
 def _rig(chosen: Chosen, plan: Plan | None, options: OnRobot, aborting: Aborting) -> Rig | None:
-    """Return the run to work on: one on virtual time, one that is started, or one that runs.
+    """Return the run of the experiment: on virtual time, started here, or already running.
 
-    None where it was aborted before.
+    Returns None if the user aborted.
     """
     from dxlrun_lab.guided.own_run import OwnRun
     from dxlrun_lab.guided.rig import live_rig, require_whole
@@ -241,7 +244,7 @@ def _rig(chosen: Chosen, plan: Plan | None, options: OnRobot, aborting: Aborting
         from dxlrun.tooling.runs import discard_log, new_log
         from dxlrun_lab.guided.virtual_rig import virtual_rig
 
-        recording = RecordingPlan(plan.recording.directory)  # whole and in one file: it is what is measured
+        recording = RecordingPlan(plan.recording.directory)  # one complete file, because it is evaluated
         log = new_log(recording, plan.robot)
         try:
             return virtual_rig(replace(plan, recording=recording), log=log)
@@ -288,7 +291,7 @@ def _real(plan: Plan, options: OnRobot) -> bool:
 def _start_confirmed(
     plan: Plan, names: Sequence[str], options: OnRobot, course: Course, aborting: Aborting
 ) -> bool:
-    """Ask before a run is started, with what is known without one; True where there is nothing to ask."""
+    """Ask for confirmation before a run is started. Return True if no real joint will move."""
     from dxlrun_lab.guided.choice import range_text
 
     if not _real(plan, options):
@@ -305,7 +308,11 @@ def _start_confirmed(
 
 
 def _confirmed(plan: Plan, options: OnRobot, aborting: Aborting) -> bool:
-    """Ask before a real joint moves. Raises InputError where there is no terminal, unless --yes is given."""
+    """Ask for confirmation before a real joint moves.
+
+    Raises:
+        InputError: stdin is not a terminal and --yes was not given.
+    """
     if options.yes or not _real(plan, options):
         return True
     if not sys.stdin.isatty():
@@ -322,7 +329,7 @@ def _confirmed(plan: Plan, options: OnRobot, aborting: Aborting) -> bool:
 
 
 def _counted_down(situation: Situation, options: OnRobot, aborting: Aborting) -> bool:
-    """Count down before a real joint moves; False where that was aborted."""
+    """Count down before a real joint moves. Return False if the user aborted."""
     if aborting.has_keys:
         sys.stderr.write("any key ends it: the joints come to rest, and the run is left as it was\n")
     if not _real(situation.plan, options):
@@ -349,9 +356,9 @@ def _show(segment: Segment, number: int) -> None:
 
 
 class Aborting:
-    """Ctrl-C, SIGTERM, the end of the terminal and, where stdin is one, any key end an experiment.
+    """Abort of an experiment by Ctrl-C, SIGTERM, SIGHUP, or any key if stdin is a terminal.
 
-    Asked ten times a second. A SIGHUP that is ignored (nohup) stays so.
+    It is polled ten times a second. A SIGHUP that is ignored (nohup) stays ignored.
     """
 
     def __init__(self) -> None:
@@ -360,7 +367,7 @@ class Aborting:
         self._before: dict[int, object] = {}
 
     def __enter__(self) -> Aborting:
-        """Take the signals from now on."""
+        """Install the signal handlers."""
         self.has_keys = sys.stdin.isatty()
         for number in (signal.SIGINT, signal.SIGTERM, signal.SIGHUP):
             if number != signal.SIGHUP or signal.getsignal(number) != signal.SIG_IGN:
@@ -368,22 +375,22 @@ class Aborting:
         return self
 
     def __exit__(self, *_: object) -> None:
-        """Let signals do what they did before."""
+        """Restore the signal handlers."""
         for number, handler in self._before.items():
             signal.signal(number, handler)  # type: ignore[arg-type]  # what signal() returned
 
     def _take(self, number: int, frame: FrameType | None) -> None:
-        # no import here: the signal may come in the middle of one, of the same module
+        # No import here, because the signal may interrupt an import of the same module.
         name = "Ctrl-C" if number == signal.SIGINT else signal.Signals(number).name
         self.reason = self.reason or f"aborted by {name}"
 
     @contextmanager
     def by_any_key(self) -> Iterator[None]:
-        """Take single keys from the terminal, which is as it was before afterwards."""
+        """Read single keys from the terminal. The terminal is restored afterwards."""
         if not self.has_keys:
             yield
             return
-        import termios  # not above: a log is replayed everywhere
+        import termios  # not at the top, because logs are also replayed on systems without it
         import tty
 
         descriptor = sys.stdin.fileno()
@@ -397,8 +404,8 @@ class Aborting:
             termios.tcsetattr(descriptor, termios.TCSADRAIN, before)
 
     def __call__(self) -> str | None:
-        """Return why the experiment is to end; None: it goes on."""
+        """Return the reason to abort the experiment, or None."""
         if self.reason is None and self._keys and select.select([sys.stdin], [], [], 0)[0]:
-            # an empty read: the terminal is gone, and with it the hand on the key
+            # An empty read means that the terminal was closed, so no key could abort.
             self.reason = "aborted by a key" if os.read(sys.stdin.fileno(), 64) else "the terminal is gone"
         return self.reason

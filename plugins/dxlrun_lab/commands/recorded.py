@@ -1,4 +1,4 @@
-"""Recorded motions on the command line: which part of which recording, and playing it on a robot."""
+"""Recorded motions on the command line: selection of a part of a recording, and playback on a robot."""
 
 from __future__ import annotations
 
@@ -41,7 +41,7 @@ class RecordedPart:
     joint
         Only this joint of the recording; may be given several times.
     map
-        A recorded joint is another one now: RECORDED=JOINT; RECORDED= leaves it out. May be given several
+        Play a recorded joint on another joint: RECORDED=JOINT; RECORDED= omits it. May be given several
         times.
     topic
         Topic of a foreign recording that has several.
@@ -60,7 +60,7 @@ class RecordedPart:
 
     @property
     def tolerance_rad(self) -> float | None:
-        """The tolerance, rad; None: none is given. Raises InputError for one that is none."""
+        """Tolerance, rad, or None without one. Raises InputError for an invalid tolerance."""
         if self.tolerance is None:
             return None
         from dxlrun.tooling.verbs import angle
@@ -76,7 +76,7 @@ class RecordedPart:
         return allowed
 
     def read(self, log: Path) -> RecordedMotion:
-        """Return the motion; what could not be read of the recording is printed. Raises InputError."""
+        """Read the motion, and print warnings about unreadable parts. Raises InputError."""
         from dxlrun_analysis.playback.recorded_motion import Stretch, parse_names
         from dxlrun_analysis.playback.sources import read_motion
 
@@ -125,7 +125,7 @@ NOWHERE = PlayedOn()
 def play_recorded(
     log: Path, chosen: Chosen, played_on: PlayedOn, part: RecordedPart, *, as_json: bool
 ) -> int:
-    """Play the motion of a recording on the robot of `chosen`, and return the exit code."""
+    """Play a recorded motion on the robot of `chosen`. Return the exit code."""
     from dxlrun_analysis.playback.rows import rows_of
     from dxlrun_lab.playback import Playback
 

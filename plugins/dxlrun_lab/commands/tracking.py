@@ -28,7 +28,7 @@ if TYPE_CHECKING:
 experiment = App(name="experiment", help="Repeat an experiment of the thesis on this machine.")
 
 _ACTIVE = ("position_trajectory:=false", "posvel_trajectory:=true")
-"""Arguments with which single_joint.yaml plays the thesis' motion, as positions and velocities."""
+"""Arguments of single_joint.yaml for the thesis' motion as positions and velocities"""
 _NAMES = "sequential-normal,loop-normal,loop-realtime,sequential-realtime"
 
 
@@ -48,7 +48,7 @@ def tracking(
     """Measure how well a motion is followed: by the loop, and by a sender that counts poses instead of time.
 
     The motion is sent once in each set-up, while other processes load cores, memory and disk. Each run
-    leaves a log. Ctrl-C ends the run in order and keeps what was measured.
+    leaves a log. Ctrl-C ends the run cleanly and keeps what was measured.
 
     Parameters
     ----------

@@ -1,7 +1,7 @@
-"""How figures are drawn: SVG with the page's colours, many samples on few columns.
+"""Drawing of figures as SVG with the colours of the page, with downsampling of long series.
 
-matplotlib is imported here and in the other modules of this room only, because it takes seconds; `Figure` is
-used without pyplot, so nothing global is kept and no display is needed.
+matplotlib is only imported in this package, because the import takes seconds. `Figure` is used without
+pyplot, so nothing is kept globally and no display is needed.
 """
 
 from __future__ import annotations
@@ -19,8 +19,8 @@ from matplotlib.figure import Figure
 from dxlrun import Floats
 from dxlrun.tooling import html
 
-_COLUMNS = 900  # About as many as a figure has pixels across
-WIDTH = 9.0  # Inches of 72 points; the page scales it
+_COLUMNS = 900  # about the width of a figure in pixels
+WIDTH = 9.0  # inches; the page scales the figure
 
 INK, MUTED, GRID, PAPER = "#0a0a01", "#0a0a02", "#0a0a03", "#0a0a04"
 BLUE, ORANGE, GREEN, PURPLE = "#0a0a05", "#0a0a06", "#0a0a07", "#0a0a08"
@@ -33,7 +33,8 @@ ROLES = dict(
         strict=True,
     )
 )
-"""Each colour drawn is a role; the page's style sheet defines it, in light and in dark."""
+"""Roles of the placeholder colours. The style sheet of the page defines each role, in light and in dark mode.
+"""
 
 _STYLE: dict[str, object] = {
     "axes.axisbelow": True,
@@ -77,10 +78,15 @@ _REFERENCE = re.compile(r"(?<=url\(#)[\w.-]+|(?<=href=\"#)[\w.-]+")
 def draw(  # noqa: PLR0917  what the figure shows, from its name to its size
     name: str, title: str, alt: str, text: str, height: float, fill: Callable[[Figure], None]
 ) -> ET.Element:
-    """Return the part of a page with what `fill` draws on an empty figure of `height` inches.
+    """Draw a figure as an element of a page.
 
-    `name`: unique in the page, of letters, digits and dashes. `alt`: for readers that cannot see it, the axes
-    with their units, and the finding. `text`: its caption.
+    Args:
+        name: Identifier, unique in the page, of letters, digits and dashes.
+        title: Title of the figure.
+        alt: Description for screen readers: the axes with their units, and the finding.
+        text: Caption.
+        height: Height of the figure, inches.
+        fill: Function that draws on the empty figure.
     """
     with mpl.rc_context(_STYLE):  # type: ignore[arg-type]  # the stubs want one literal type for all keys
         figure = Figure(figsize=(WIDTH, height), layout="constrained")
@@ -91,7 +97,7 @@ def draw(  # noqa: PLR0917  what the figure shows, from its name to its size
 
 
 def _svg(text: str, name: str, about: Sequence[tuple[str, str]]) -> ET.Element:
-    """Return matplotlib's SVG as part of a page: own identifiers, title, description, the page's colours."""
+    """Convert matplotlib's SVG for a page: unique identifiers, title, description, and the page's colours."""
     for colour, role in ROLES.items():
         text = text.replace(colour, f"var(--{role})")
     root = ET.fromstring(text)  # noqa: S314  written by matplotlib, a moment ago
@@ -105,7 +111,7 @@ def _svg(text: str, name: str, about: Sequence[tuple[str, str]]) -> ET.Element:
                 element.set(_NAMESPACE.sub("", key), _named(key, value, name))
     for parent in [root, *root.iter("defs")]:
         for child in [child for child in parent if child.tag in {"metadata", "style"}]:
-            parent.remove(child)  # a style here would hold for the whole page, which has it in its own sheet
+            parent.remove(child)  # a style here would apply to the whole page
     for key in ("width", "height", "version"):
         root.attrib.pop(key, None)
     root.set("role", "img")
@@ -118,7 +124,7 @@ def _svg(text: str, name: str, about: Sequence[tuple[str, str]]) -> ET.Element:
 
 
 def _named(key: str, value: str, name: str) -> str:
-    """Return an attribute with its identifier, or the reference to one, made unique in the page."""
+    """Return the value of an attribute, with the identifier in it made unique in the page."""
     if key == "id":
         return f"{name}-{value}"
     if key.endswith("href"):
@@ -127,9 +133,11 @@ def _named(key: str, value: str, name: str) -> str:
 
 
 def reduced(x: Floats, y: Floats) -> tuple[Floats, Floats]:
-    """Return the samples to draw: all, or of each of 900 columns the smallest and the largest.
+    """Downsample to the minimum and the maximum in each of 900 columns.
 
-    x, y: shape (samples,); NaN: no sample.
+    Args:
+        x: Shape (samples,).
+        y: Shape (samples,); NaN for a missing sample.
     """
     width = max(1, math.ceil(len(y) / _COLUMNS))
     if width == 1:

@@ -1,6 +1,6 @@
-"""Figures of what a servo can do: step responses, rates, gaps between commands, dead band.
+"""Figures of a servo's characteristics: step responses, rates, gaps between commands, dead band.
 
-Step responses as in M. A. Araujo, UFU 2017, Figures 19 and 20, many of them over one another.
+The step responses are those of M. A. Araujo, UFU 2017, Figures 19 and 20, with many steps in one figure.
 """
 
 from __future__ import annotations
@@ -26,11 +26,11 @@ from dxlrun_lab.figures.drawing import (
 )
 
 _HEIGHT = 2.6
-_PARTS_SHOWN = 4  # So many times the longest response time is shown of steps
+_PARTS_SHOWN = 4  # time axis of steps, in multiples of the longest response time
 
 
 class Mark(NamedTuple):
-    """A line at a measured value, with the interval in which it lies."""
+    """Line at a measured value, with its confidence interval"""
 
     name: str
     value: float
@@ -38,7 +38,7 @@ class Mark(NamedTuple):
 
 
 class Points(NamedTuple):
-    """Values that were tried, those that failed apart."""
+    """Values that were tried, with marks of those that failed"""
 
     name: str
     x: Floats
@@ -55,7 +55,7 @@ def curves_drawing(  # noqa: PLR0917  what the figure shows, from its name to it
     levels: Sequence[float],
     marks: Sequence[Mark] = (),
 ) -> Element:
-    """Return curves over one another, with dashed levels; marks are on the horizontal axis."""
+    """Draw superimposed curves with dashed levels, and marks on the horizontal axis."""
     x_label, y_label = labels
 
     def fill(figure: Figure) -> None:
@@ -83,7 +83,7 @@ def points_drawing(  # noqa: PLR0917  what the figure shows, from its name to it
     x_label: str,
     y_label: str,
 ) -> Element:
-    """Return points that were tried: kept ones filled, failed ones crossed; a level to compare them with."""
+    """Draw points that were tried, successful ones filled and failed ones crossed, with a level."""
 
     def fill(figure: Figure) -> None:
         axes = figure.add_subplot(xlabel=x_label, ylabel=y_label)

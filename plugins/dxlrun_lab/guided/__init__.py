@@ -1,4 +1,4 @@
-"""Guided experiments: a client of a run that plays tables of goals and collects what was recorded.
+"""Guided experiments: client of a run that plays tables of goals and collects the recordings.
 
-What is measured, and in which order, belongs in the package of the experiment.
+The measurements and their sequence are in the packages of the experiments.
 """

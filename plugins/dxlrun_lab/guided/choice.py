@@ -1,4 +1,4 @@
-"""Choice: which joints take part in an experiment, and within which range each may move."""
+"""Choice: joints of an experiment, and the range in which each may move."""
 
 from __future__ import annotations
 
@@ -16,17 +16,17 @@ from dxlrun_lab.guided.experiment import PLAYER, Joint, Situation
 from dxlrun_lab.guided.rig import TORQUED, JointNow, Rig, RunningController
 
 DEFAULT_REACH = math.radians(30)
-"""To each side of where a joint is, where no range is given and its limits allow it."""
+"""Default range to each side of the present position, rad, within the limits"""
 LEAST_WIDTH = math.radians(2)
-"""A narrower range is no room to move."""
+"""Narrowest range of an experiment, rad"""
 OVERSHOOT = math.radians(5)
-"""Beyond its limits, of a joint that is sent no farther than these."""
+"""Allowed overshoot of a servo beyond the limits of its joint, rad"""
 _FAR = 1e6
 _SLACK = 1e-9
 
 
 def parse_ranges(words: Sequence[str]) -> dict[str, tuple[float, float]]:
-    """Return the ranges of `JOINT=-30deg..30deg`, rad. Raises InputError with every mistake."""
+    """Parse ranges such as `JOINT=-30deg..30deg`, rad. Raises InputError with all mistakes."""
     ranges: dict[str, tuple[float, float]] = {}
     mistakes: list[str] = []
     for word in words:
@@ -56,9 +56,9 @@ def parse_ranges(words: Sequence[str]) -> dict[str, tuple[float, float]]:
 def check_joints(
     names: Sequence[str], ranges: Mapping[str, tuple[float, float]], joints: Sequence[JointPlan]
 ) -> None:
-    """Raise InputError with everything that is wrong with the joints and ranges of a command line.
+    """Raise InputError with all mistakes in the joints and ranges of a command line.
 
-    It needs no run: what depends on where a joint is comes later.
+    The check needs no run. Checks that depend on the positions of joints follow later.
     """
     plans = {joint.name: joint for joint in joints}
     known = tuple(plans)
@@ -86,10 +86,9 @@ def check_joints(
 
 
 def whole_situation(rig: Rig, names: Sequence[str]) -> Situation:
-    """Return what a motion begins with that was checked against the limits of its joints before.
+    """Return the situation of a motion that has already been checked against the limits of its joints.
 
-    A servo that swings beyond a limit, by OVERSHOOT at most, ends nothing. Raises InputError as
-    situation_of.
+    A servo may overshoot a limit by up to OVERSHOOT. Raises InputError as situation_of.
     """
     ranges = {joint.name: _within_all(joint) for joint in rig.plan.loop.joints if joint.name in names}
     situation = situation_of(rig, names, ranges)
@@ -128,7 +127,7 @@ def situation_of(rig: Rig, names: Sequence[str], ranges: Mapping[str, tuple[floa
 
 
 def require_own_servos(plan: Plan, names: Sequence[str], command: str, *, gears: bool) -> None:
-    """Raise InputError unless each joint turns by one servo of its own, through a gear where that may be."""
+    """Raise InputError unless each joint is rotary and has a single servo; `gears` allows a gear ratio."""
     alone = f"`dxlrun {command}` measures one servo: describe it as a joint of its own in another robot file"
     mistakes = []
     for joint in plan.loop.joints:
@@ -147,7 +146,7 @@ def require_own_servos(plan: Plan, names: Sequence[str], command: str, *, gears:
 
 
 def _taken(rig: Rig, names: Sequence[str], controllers: Sequence[RunningController]) -> list[str]:
-    """Return what other commands of the run speak against an experiment, a sentence each."""
+    """Return the conflicts of an experiment with other commands of the run, one sentence each."""
     robot = rig.plan.robot
     if rig.paused:
         return [f"{robot} is paused; let it go on first: dxlrun resume --robot {robot}"]
@@ -169,7 +168,7 @@ def _taken(rig: Rig, names: Sequence[str], controllers: Sequence[RunningControll
 
 
 def _limits(plan: JointPlan) -> tuple[float, float]:
-    """Return the limits of a joint's position, rad; infinite where it has none."""
+    """Return the position limits of a joint, rad; infinite without limits."""
     return (plan.lower, plan.upper) if plan.bounded else (-math.inf, math.inf)
 
 
@@ -178,7 +177,7 @@ def _degrees(lower: float, upper: float) -> str:
 
 
 def range_text(plan: JointPlan, given: tuple[float, float] | None) -> str:
-    """Return the range of a joint as people read it before it is known where the joint is."""
+    """Format the range of a joint whose position is still unknown."""
     if given is not None:
         return f"{_degrees(*given)} (--range)"
     reach = math.degrees(DEFAULT_REACH)
@@ -186,7 +185,7 @@ def range_text(plan: JointPlan, given: tuple[float, float] | None) -> str:
 
 
 def _range_problem(plan: JointPlan, given: tuple[float, float] | None) -> str:
-    """Return what is wrong with a joint's range, wherever the joint is; empty: nothing."""
+    """Return the problem with a joint's range, whatever its position, or an empty text."""
     lower, upper = _limits(plan)
     if given is None:
         if math.isfinite(lower) and math.isfinite(upper) and not plan.continuous:
@@ -204,7 +203,7 @@ def _range_problem(plan: JointPlan, given: tuple[float, float] | None) -> str:
 
 
 def _range_of(plan: JointPlan, now: JointNow, given: tuple[float, float] | None) -> tuple[float, float, str]:
-    """Return the range of a joint, rad, and how it was chosen. Raises ValueError where there is none."""
+    """Return the range of a joint, rad, and its origin. Raises ValueError if no range is possible."""
     name, position = plan.name, now.position
     if now.torque not in TORQUED:
         raise ValueError(

@@ -1,6 +1,6 @@
-"""An experiment: a procedure of segments, and what is made of what was recorded; performed on a rig.
+"""Experiment: a procedure of segments and the evaluation of their recordings, performed on a rig.
 
-However it ends, the run is left as it was: controllers, their activity, the loop's rate.
+At the end, the controllers, their activity and the loop rate of the run are always restored.
 """
 
 from __future__ import annotations
@@ -21,110 +21,115 @@ from dxlrun_lab.guided.segment import Guard, Interface, Recorded, Segment
 from dxlwire import Mode, ServoPlan, mode_of
 
 APPROACH_RAD_S: Final = 0.5
-"""Highest speed on the way to where a segment begins."""
+"""Highest speed on the way to the start of a segment, rad/s"""
 _NEAR_RAD: Final = 0.005
-"""So near to a place a joint is there."""
+"""Distance within which a joint counts as at its start, rad"""
 _APPROACH_PERIOD_S: Final = 0.02
 _PIECE_NUMBERS: Final = 2000
-"""Of a table in one command: 16 KiB, which gateway and loop take without being late."""
+"""Numbers of a table in one command: 16 KiB, which gateway and loop process without being late"""
 _EXTRA_S: Final = 5.0
-"""So much longer than a segment its goal may take."""
+"""Additional time for the goal of a segment, s"""
 PLAYER: Final = "experiment"
-"""Name of the controllers that are loaded, with the interface behind it: two experiments at once would have
-the same."""
+"""Prefix of the names of loaded controllers; the interface follows. Two experiments cannot run at once,
+because the names would be the same."""
 
 Procedure = Generator[Segment, Recorded, None]
 Abort = Callable[[], str | None]
-"""Returns why an experiment is to end now, as a sentence; None: go on."""
+"""Function that returns the reason to abort an experiment, one sentence, or None"""
 R_co = TypeVar("R_co", covariant=True)
 
 
 class Joint(msgspec.Struct, frozen=True):
-    """A joint of the experiment: where it may go, where it is, and what is known of it before."""
+    """Joint of an experiment, with its range and its start"""
 
     name: str
     lower: float
-    """rad; a joint that leaves this range ends the experiment"""
+    """Lower end of the range, rad. The experiment ends if the joint leaves the range."""
     upper: float
     chosen: str
-    """How the range was chosen: `--range`, or in words."""
+    """Origin of the range: `--range`, or a description"""
     start: float
-    """Where it was, rad"""
+    """Position before the experiment, rad"""
     plan: JointPlan
-    """Its limits in the robot file."""
+    """Joint in the robot file, with its limits"""
     servos: tuple[ServoPlan, ...]
-    """What moves it"""
+    """Servos that move the joint"""
 
     @property
     def servo(self) -> ServoPlan:
-        """The first of its servos; the only one where it has one of its own."""
+        """First servo of the joint"""
         return self.servos[0]
 
     @property
     def inner(self) -> tuple[float, float]:
-        """The range without a twentieth of it at each end, for motions that may overshoot, rad."""
+        """Range for motions that may overshoot, rad: a twentieth of the width is omitted at each end."""
         margin = (self.upper - self.lower) / 20
         return self.lower + margin, self.upper - margin
 
     @property
     def middle(self) -> float:
-        """Middle of the range, rad."""
+        """Middle of the range, rad"""
         return (self.lower + self.upper) / 2
 
 
 class Situation(msgspec.Struct, frozen=True):
-    """What a procedure begins with."""
+    """Initial situation of an experiment"""
 
     joints: tuple[Joint, ...]
-    """Of the experiment, in the order of the command line."""
+    """Joints of the experiment, in the order of the command line"""
     rate: float
-    """Hz, of the loop"""
+    """Loop rate, Hz"""
     plan: Plan
     virtual: bool = False
 
     @property
     def names(self) -> tuple[str, ...]:
-        """Names of the joints."""
+        """Names of the joints"""
         return tuple(joint.name for joint in self.joints)
 
 
 class Experiment(Protocol[R_co]):
-    """What is measured; see perform. A procedure may yield as many segments as it likes, one after the other.
+    """Protocol of an experiment that `perform` runs. A procedure can yield any number of segments.
 
-    A segment whose loop rate the run refuses, or whose mode a servo does not have, raises Refused in the
-    procedure, which may yield another one. Any other refusal ends the experiment.
+    If the run refuses the loop rate of a segment, or a servo lacks its mode, Refused is raised inside the
+    procedure, which can then yield another segment. Any other refusal ends the experiment.
     """
 
     def moves(self, situation: Situation) -> Sequence[str]:
-        """Return what will move, how far and how fast, one sentence each: printed before anything does."""
+        """Describe distance and speed of each motion, one sentence each, for a printout before the start."""
         ...
 
     def procedure(self, situation: Situation) -> Procedure:
-        """Yield segments, and get back what was recorded of each, always whole."""
+        """Yield segments. Each `yield` returns the complete recording of its segment."""
         ...
 
     def finish(self, situation: Situation, recorded: Sequence[Recorded], why: str) -> R_co:
-        """Return the result of all that was recorded; where the experiment ended early `why` is a sentence,
-        and the last piece may be part of a segment."""
+        """Evaluate the recordings.
+
+        Args:
+            situation: Initial situation.
+            recorded: Recordings. The last one may be incomplete if the experiment ended early.
+            why: Reason for an early end, one sentence; empty on success.
+        """
         ...
 
 
 class Performed(msgspec.Struct, frozen=True):
-    """How an experiment went."""
+    """Outcome of an experiment"""
 
     recorded: tuple[Recorded, ...]
     why: str = ""
-    """Why it ended early, one sentence; empty: it did not."""
+    """Reason for an early end, one sentence; empty on success"""
     not_restored: tuple[str, ...] = ()
-    """What is not as it was before, one sentence each."""
+    """State that was not restored, one sentence each"""
 
 
 class _Ended(Exception):
-    """The experiment ends early; the text is the reason."""
+    """Early end of an experiment, with the reason as its text"""
 
 
 class _Unfit(Exception):
-    """A segment does not fit the run, for the reason of `refusal`."""
+    """Segment that does not fit the run, for the reason in `refusal`"""
 
     def __init__(self, refusal: Refused) -> None:
         super().__init__(str(refusal))
@@ -140,10 +145,15 @@ def perform(
     *,
     back: bool = True,
 ) -> Performed:
-    """Play an experiment's segments, and leave the run as it was, whatever happens.
+    """Play the segments of an experiment, and always restore the run.
 
-    `show` is called with each segment before it begins, and its number from 1. The joints go back to where
-    they were before, unless `back` is false.
+    Args:
+        rig: Run.
+        experiment: Experiment.
+        situation: Initial situation.
+        abort: Function that returns a reason to abort.
+        show: Called with each segment before it starts, and its number (from 1).
+        back: Move the joints back to their start at the end.
     """
     stage = _Stage(rig, situation, abort)
     recorded: list[Recorded] = []
@@ -187,26 +197,27 @@ def _play_all(
 
 
 class _Stage:
-    """The run while an experiment works on it."""
+    """Run during an experiment"""
 
     def __init__(self, rig: Rig, situation: Situation, abort: Abort) -> None:
         self.rig, self.situation, self.abort = rig, situation, abort
         names = set(situation.names)
         self._rate = rig.rate
-        """The rate of before."""
+        """Loop rate before the experiment, Hz"""
         self._active = [one.name for one in rig.controllers() if one.active and names & set(one.joints)]
-        """The controllers that were active before and command a joint of the experiment."""
+        """Controllers of the experiment's joints that were active before"""
         self._players: dict[tuple[Interface, Guard], str] = {}
-        """Loaded sample_players by what differs between them."""
+        """Names of loaded sample_players by interface and guard"""
         self._player = ""
-        """The active one."""
+        """Active sample_player"""
 
     # Forward
 
     def begin(self, segment: Segment) -> None:
-        """Bring the run to where the segment can begin: joints at its start, its player, its rate.
+        """Prepare a segment: move the joints to its start, and set the loop rate and the player.
 
-        Raises _Unfit where it does not fit the run.
+        Raises:
+            _Unfit: The segment does not fit the run.
         """
         self._check()
         self._check_modes(segment.interface)
@@ -224,7 +235,7 @@ class _Stage:
         self._activate(segment.interface, segment.guard)
 
     def play(self, segment: Segment) -> Recorded:
-        """Play a segment and return what was recorded."""
+        """Play a segment and return its recording."""
         names = self.situation.names
         plan_joints = [joint.name for joint in self.situation.plan.loop.joints]
         goal = self._send(segment)
@@ -232,7 +243,7 @@ class _Stage:
         try:
             outcome, text = self.rig.wait(goal, self._look, segment.duration_s + _EXTRA_S)
             if outcome != "reached":
-                # a goal that the runtime ended has no reason of its own: its joint may have one
+                # A goal that the runtime ended has no text, but the state of its joint may have the reason.
                 text = self._look() or text or f"the samples were {outcome}"
         except RunGone as gone:
             text = str(gone)
@@ -241,12 +252,12 @@ class _Stage:
         return Recorded(names, cycles, columns, segment, outcome, text)
 
     def go_back(self) -> None:
-        """Lead the joints to where they were before the experiment."""
+        """Move the joints back to their positions before the experiment."""
         if self._players:
             self._approach({joint.name: joint.start for joint in self.situation.joints})
 
     def _approach(self, places: Mapping[str, float]) -> None:
-        """Lead joints to places slowly, with a speed that begins and ends at 0."""
+        """Move joints slowly to positions, from rest to rest."""
         now = self.rig.joints()
         far = {name: place for name, place in places.items() if abs(_place(now, name) - place) > _NEAR_RAD}
         if not far:
@@ -255,7 +266,7 @@ class _Stage:
         now = self.rig.joints()
         limits = {joint.name: joint.plan.highest_speed for joint in self.situation.joints}
         speeds = {name: min(APPROACH_RAD_S, limits[name] / 2) for name in far}
-        # a cubic from rest to rest is 1.5 times as fast as its mean
+        # The peak speed of a cubic from rest to rest is 1.5 times its mean speed.
         longest_s = max(1.5 * abs(place - _place(now, name)) / speeds[name] for name, place in far.items())
         part = np.linspace(0.0, 1.0, max(2, math.ceil(longest_s / _APPROACH_PERIOD_S) + 1))
         shape = part * part * (3 - 2 * part)
@@ -267,7 +278,7 @@ class _Stage:
             raise _Ended(text or f"the way to the start was {outcome}")
 
     def _send(self, segment: Segment) -> int:
-        """Send a segment's table, in pieces that a cycle can take; return the number of its goal."""
+        """Send the table of a segment in pieces that fit into a cycle. Return the number of its goal."""
         joints = self.situation.names
         now = self.rig.joints()
         still = 0.0
@@ -284,7 +295,7 @@ class _Stage:
         pieces = [table[at : at + size].tolist() for at in range(0, len(table), size)]
         for piece in pieces[:-1]:
             self.rig.send(self._player, "rows", {"rows": piece})
-        # What the joints do is what is measured: no distance from the last row is a failure.
+        # The motion of the joints is the measurement, so no distance from the last row is a failure.
         last = {
             "period": segment.period_s,
             "settle": segment.settle_s,
@@ -294,7 +305,7 @@ class _Stage:
         return self.rig.send(self._player, "samples", last)
 
     def _activate(self, interface: Interface, guard: Guard) -> None:
-        """Activate the player of an interface in place of what commands the joints; load it if need be."""
+        """Activate the player of an interface in place of the joints' controllers. Load it if necessary."""
         name = self._players.get((interface, guard))
         if name is not None and name == self._player:
             return
@@ -339,7 +350,7 @@ class _Stage:
             raise _Ended(why)
 
     def _look(self) -> str | None:
-        """Return why the experiment is to end: it was aborted, or a joint cannot be moved any more."""
+        """Return the reason to end the experiment: an abort, or a joint without torque."""
         why = self.abort()
         if why is not None:
             return why
@@ -353,7 +364,7 @@ class _Stage:
     # Back
 
     def restore(self) -> tuple[str, ...]:
-        """Leave the run as it was; return a sentence for each thing that is not. Raises nothing."""
+        """Restore the run. Return a sentence for each failure, without raising."""
         problems: list[str] = []
         try:
             for step in self._steps_back():
@@ -368,14 +379,14 @@ class _Stage:
         return tuple(dict.fromkeys(problems))
 
     def _steps_back(self) -> Iterator[Callable[[], None]]:
-        """Yield the steps; each is taken whether or not the one before could be."""
+        """Yield the steps that restore the run. A failed step does not prevent the next ones."""
         now = {one.name: one for one in self.rig.controllers()}
         ours = [name for name in self._players.values() if name in now and now[name].active]
         missing = [name for name in self._active if name in now and not now[name].active]
         if ours or missing:
             try:
                 self.rig.switch(missing, ours)
-            except Refused:  # one that cannot be active keeps the others from it: each by itself
+            except Refused:  # one controller blocks the whole switch, so switch them one by one
                 if ours:
                     yield partial(self.rig.switch, [], ours)
                 yield from (partial(self.rig.switch, [name], []) for name in missing)
@@ -385,6 +396,6 @@ class _Stage:
 
 
 def _place(now: Mapping[str, JointNow], name: str) -> float:
-    """Return where a joint was sent last, or where it is when it has no such goal, rad."""
+    """Return the last goal position of a joint, or else its measured position, rad."""
     joint = now[name]
     return joint.position if math.isnan(joint.goal_position) else joint.goal_position

@@ -1,4 +1,4 @@
-"""A run that is started for an experiment, as a child process, and ends with it."""
+"""Run that is started for an experiment as a child process, and ends with the experiment."""
 
 from __future__ import annotations
 
@@ -23,16 +23,17 @@ sys.exit(main())
 """
 _CREDENTIALS = struct.Struct("=3i")
 START_S = 60.0
-"""How long a robot may take until it runs: start-up of its servos, compilation, loading of plug-ins."""
+"""Timeout for the start of a run, s: compilation, loading of plug-ins, set-up of the servos"""
 END_S = 30.0
+"""Timeout for the end of a run, s"""
 _POLL_S = 0.05
 
 
 class OwnRun:
-    """A run in a process of its own; its output is kept, and shown only of one that fails.
+    """Run in a child process. Its output is only shown if it fails.
 
-    It has a session of its own, so that Ctrl-C reaches the experiment alone; it ends in order when the
-    experiment's process is gone.
+    The process has its own session, so that Ctrl-C only reaches the experiment. It ends cleanly when the
+    process of the experiment has exited.
     """
 
     def __init__(self, words: Sequence[str]) -> None:
@@ -49,9 +50,13 @@ class OwnRun:
         )
 
     def listening(self, abort: Callable[[], str | None]) -> RemoteRobot | None:
-        """Wait until it runs, and return it as its client; None where `abort` returned a sentence before.
+        """Wait for the start of the run, and connect to it.
 
-        Raises ProcessFault when it ended, or takes longer than START_S.
+        Returns:
+            The connection, or None if `abort` returned a reason.
+
+        Raises:
+            ProcessFault: The run has ended, or did not start within START_S.
         """
         until = time.monotonic() + START_S
         while abort() is None:
@@ -69,11 +74,11 @@ class OwnRun:
         return None
 
     def end(self) -> tuple[str, ...]:
-        """End it in order; return what went wrong with it, one sentence each."""
+        """End the run cleanly. Return its errors, one sentence each."""
         if self._process.poll() is None:
             self._stopping = True
             self._process.terminate()
-            for _ in range(2):  # the second request cuts torque at once
+            for _ in range(2):  # a second SIGTERM disables torque at once
                 try:
                     self._process.wait(END_S)
                     break
@@ -88,7 +93,7 @@ class OwnRun:
         return found
 
     def _sentences(self) -> tuple[str, ...]:
-        """Return why it failed; nothing where it did not."""
+        """Return the failure reasons; empty on success."""
         code = self._process.returncode
         if code == 0 or (code == 130 and self._stopping):
             return ()
@@ -96,14 +101,14 @@ class OwnRun:
         self._stdout.seek(0)
         errors = self._stderr.read().decode(errors="replace").split("\n")
         verdict = self._stdout.read().decode(errors="replace").split("\n")
-        # of the verdict, whose sentences are indented, the first says why it is not good
+        # The first indented line of the summary has the reason for a bad exit code.
         lines = (*errors, *[each for each in verdict if each.startswith("  ")][:1])
         what = tuple(dict.fromkeys(line.strip().removeprefix("dxlrun: ") for line in lines if line.strip()))
         return what or (f"the run ended with exit code {code}",)
 
 
 def _parent_of_listener(path: Path) -> int:
-    """Return the parent process of the one that listens at a socket; 0: it is not known."""
+    """Return the ID of the parent of the process that listens at a socket; 0 if unknown."""
     with socket.socket(socket.AF_UNIX, socket.SOCK_STREAM) as probe:
         probe.setblocking(False)
         with suppress(OSError, ValueError, IndexError):
@@ -111,6 +116,6 @@ def _parent_of_listener(path: Path) -> int:
             pid, _, _ = _CREDENTIALS.unpack(
                 probe.getsockopt(socket.SOL_SOCKET, socket.SO_PEERCRED, _CREDENTIALS.size)
             )
-            # proc(5): the name of the program, in brackets, may have spaces
+            # The name of the program, in parentheses, may contain spaces (proc(5)).
             return int(Path(f"/proc/{pid}/stat").read_text().rpartition(")")[2].split()[1])
     return 0

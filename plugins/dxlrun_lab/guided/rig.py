@@ -1,7 +1,7 @@
-"""Rig: a run that an experiment works on, by the client of a running robot; virtual_rig.py has another robot
-that answers it.
+"""Rig: access of an experiment to a run, through the client of a running robot.
 
-Each cycle is taken from the log that the run writes, on virtual time from the loop itself.
+The cycles are read from the log that the run is writing. On virtual time (virtual_rig.py) they come directly
+from the loop.
 """
 
 from __future__ import annotations
@@ -25,36 +25,36 @@ from dxlrun.tooling.records import Event, EventCode, GoalReport
 from dxlrun_lab.guided.own_run import OwnRun
 
 TORQUED = ("on", "doubt")
-"""Torque of joints that can be moved, see channels/cycle.py."""
+"""Torque states of joints that can be moved (see channels/cycle.py)"""
 _LOOK_S = 0.1
 _STOPPING_S = 3.0
 _LOG_S = 5.0
-"""How long the log may be behind: the recorder writes twice a second."""
+"""Timeout for cycles to appear in the log, s. The recorder writes twice a second."""
 Cycles = NDArray[np.void]
 Look = Callable[[], tuple[Cycles, Sequence[Event]]]
-"""Returns the cycles and events since the last call."""
+"""Function that returns the cycles and events since its last call"""
 
 
 class RunningController(NamedTuple):
-    """A controller of the run."""
+    """Controller of the run"""
 
     name: str
     active: bool
     joints: tuple[str, ...]
-    """Those that it commands; empty: none."""
+    """Joints that it commands"""
 
 
 class JointNow(NamedTuple):
-    """A joint in the newest cycle; NaN: not known."""
+    """State of a joint in the newest cycle; NaN if unknown"""
 
     position: float
     goal_position: float
     torque: str
-    """Name of a Torque, in lower case."""
+    """Name of a Torque, in lower case"""
 
 
 class Rig:
-    """A run that an experiment works on. Everything raises Refused with the reason, and RunGone."""
+    """Run of an experiment. All methods raise Refused with the reason of a refusal, and RunGone."""
 
     def __init__(
         self,
@@ -66,19 +66,28 @@ class Rig:
         end: Callable[[], Sequence[str]] | None = None,
         now_s: Callable[[], float] | None = None,
     ) -> None:
-        """`log`: None on virtual time without one. `end`: of a run that belongs to the experiment, which may
-        deactivate its controllers; returns what went wrong with it. `now_s`: virtual time."""
+        """Start to record cycles.
+
+        Args:
+            robot: Connection to the run.
+            plan: Plan of the run.
+            look: Function that returns new cycles and events.
+            log: Log of the run; None on virtual time without a log.
+            end: Function that ends a run of the experiment's own and returns its errors. The experiment may
+                deactivate the controllers of that run.
+            now_s: Clock of virtual time, s.
+        """
         self.robot, self.plan, self.log = robot, plan, log
         self.own, self.virtual = end is not None, now_s is not None
         self._look, self._end = look, end or tuple
         self._now_s = now_s or time.monotonic
         self._cycles = [look()[0][:0].copy()]
         self._times: dict[tuple[int, int], int] = {}
-        """When a goal began and ended, ns, by its number and the event."""
+        """Times of the start and end of goals, ns, by number and event"""
 
     @contextmanager
     def _asking(self) -> Iterator[RemoteRobot]:
-        """Turn the end of the connection into RunGone."""
+        """Convert connection errors to RunGone."""
         try:
             yield self.robot
         except (Refused, RunGone):
@@ -92,21 +101,21 @@ class Rig:
 
     @property
     def now_s(self) -> float:
-        """Time of the run, s."""
+        """Time of the run, s"""
         return self._now_s()
 
     @property
     def rate(self) -> float:
-        """Hz of the loop now."""
+        """Present loop rate, Hz"""
         return float(str(self._info()["rate"]))
 
     @property
     def paused(self) -> bool:
-        """True where a client paused the run."""
+        """True if a client has paused the run"""
         return bool(self._info()["paused"])
 
     def controllers(self) -> tuple[RunningController, ...]:
-        """Return the controllers that are loaded."""
+        """Return the loaded controllers."""
         rows = self._info()["controllers"]
         return tuple(
             RunningController(
@@ -118,25 +127,25 @@ class Rig:
         )
 
     def joints(self) -> Mapping[str, JointNow]:
-        """Return the joints as they are in the newest cycle."""
+        """Return the joints in the newest cycle."""
         with self._asking() as robot:
             states = robot.states()
         rows = zip(states.position.tolist(), states.goal_position.tolist(), states.torque, strict=True)
         return dict(zip(states.joints, starmap(JointNow, rows), strict=True))
 
     def load(self, name: str, entry: Mapping[str, object]) -> None:
-        """Load a controller, in a pause of its own."""
+        """Load a controller while the run is paused."""
         with self._pause() as robot:
             robot.load(name, entry)
 
     def unload(self, name: str) -> None:
-        """Unload a controller, in a pause of its own."""
+        """Unload a controller while the run is paused."""
         with self._pause() as robot:
             robot.unload(name)
 
     @contextmanager
     def _pause(self) -> Iterator[RemoteRobot]:
-        """Pause the run; one that another client has paused stays so."""
+        """Pause the run. A run that another client has paused is not resumed."""
         with self._asking() as robot:
             try:
                 robot.pause()
@@ -152,7 +161,7 @@ class Rig:
                     robot.resume()
 
     def switch(self, activate: Sequence[str], deactivate: Sequence[str]) -> None:
-        """Activate and deactivate controllers in one cycle; returns when they are."""
+        """Activate and deactivate controllers in one cycle, and wait for that cycle."""
         with self._asking() as robot:
             robot.switch(activate, deactivate)
 
@@ -162,7 +171,7 @@ class Rig:
             robot.rate(rate)
 
     def send(self, controller: str, kind: str, command: Mapping[str, object]) -> int:
-        """Send a command, from which on cycles are kept; return its goal's number, 0 where it is none."""
+        """Send a command, and keep all cycles from then on. Return the number of its goal, or 0."""
         self._record()
         self._cycles, self._times = self._cycles[:1], {}
         with self._asking() as robot:
@@ -170,8 +179,14 @@ class Rig:
         return goal.number if goal else 0
 
     def wait(self, goal: int, look: Callable[[], str | None], longest_s: float) -> tuple[str, str]:
-        """Wait for the end of a goal; return its outcome and text. Where `look`, called ten times a second of
-        the run, returns a sentence, or after `longest_s`, cancel it."""
+        """Wait for the end of a goal.
+
+        The goal is cancelled after `longest_s`, or when `look` returns a reason. `look` is called ten times
+        per second of the run.
+
+        Returns:
+            Outcome and text of the goal.
+        """
         until = self.now_s + longest_s
         with self._asking() as robot:
             while (end := robot.goal_state(goal, _LOOK_S)).status == "running":
@@ -179,15 +194,17 @@ class Rig:
                 if why is None and self.now_s > until:
                     why = f"the samples were not played within {longest_s:.0f} s"
                 if why is not None:
-                    with suppress(Refused):  # it has ended already
+                    with suppress(Refused):  # the goal has ended already
                         robot.cancel(goal)
-                        robot.goal_state(goal, _STOPPING_S)  # a controller whose joint is lost may not end it
+                        robot.goal_state(goal, _STOPPING_S)  # with a lost joint, the goal may not end
                     return "cancelled", why
         return end.status, end.text
 
     def recorded(self, goal: int) -> Cycles:
-        """Return the cycles of the goal that was sent last, when the log has them: from the one that took it
-        to the one in which it ended, or the last."""
+        """Wait for the cycles of the last goal in the log, and return them.
+
+        They start with the cycle that accepted the goal, and end with the one in which it ended, or the last.
+        """
         give_up = time.monotonic() + _LOG_S
         self._record()
         while not (self.virtual or self._whole(goal) or time.monotonic() > give_up):
@@ -197,18 +214,18 @@ class Rig:
         begun_ns, ended_ns = (self._times.get((goal, code)) for code in _BEGUN_AND_ENDED)
         if begun_ns is None:
             return cycles[:0]
-        # an event of a cycle is left between its wake-up and its last write
+        # The event of a cycle is stamped between its wake-up and its last write.
         written = cycles["written_ns"]
         end = len(cycles) if ended_ns is None else int(np.searchsorted(written, ended_ns)) + 1
         return cycles[int(np.searchsorted(written, begun_ns)) : end]
 
     def _whole(self, goal: int) -> bool:
-        """Return whether the cycle is there in which a goal ended."""
+        """Return True if the cycle in which a goal ended has been recorded."""
         ended_ns = self._times.get((goal, EventCode.GOAL_ENDED))
         return ended_ns is not None and bool((self._cycles[-1]["written_ns"][-1:] >= ended_ns).any())
 
     def _record(self) -> None:
-        with suppress(LogError):  # it was moved away: what is missing shows in what was recorded
+        with suppress(LogError):  # the log was moved away, so the recording will be incomplete
             cycles, events = self._look()
             if len(cycles):
                 self._cycles.append(cycles)
@@ -218,7 +235,7 @@ class Rig:
                     self._times[report.goal, event.code] = event.t_ns
 
     def close(self) -> Sequence[str]:
-        """Let go of the run, end it where it is the experiment's own; return what went wrong with it."""
+        """Close the connection, and end a run of the experiment's own. Return the errors of that run."""
         self.robot.close()
         return self._end()
 
@@ -227,9 +244,10 @@ _BEGUN_AND_ENDED = EventCode.GOAL_ACCEPTED, EventCode.GOAL_ENDED
 
 
 def live_rig(robot: RemoteRobot, run: OwnRun | None = None) -> Rig:
-    """Return the rig of a running robot; with `run`, of one that was started for the experiment.
+    """Return the rig of a running robot; `run` is the process if it was started for the experiment.
 
-    Raises InputError when the robot records no log, or not all of it.
+    Raises:
+        InputError: The robot records no log, or deletes old parts of the log.
     """
     log = robot.info()["log"]
     if log is None:
@@ -249,7 +267,7 @@ def live_rig(robot: RemoteRobot, run: OwnRun | None = None) -> Rig:
 
 
 def require_whole(recording: RecordingPlan, robot: str) -> None:
-    """Raise InputError where the log loses its beginning."""
+    """Raise InputError if old parts of the log are deleted."""
     if recording.keep_ns is not None:
         raise InputError(
             f"{robot} deletes the oldest parts of its log, and an experiment takes what it measures from the "

@@ -1,4 +1,4 @@
-"""Segments: tables of goals that an experiment has played, and what was recorded meanwhile."""
+"""Segments: tables of goals of an experiment, and their recordings."""
 
 from __future__ import annotations
 
@@ -12,42 +12,43 @@ from numpy.typing import NDArray
 from dxlrun import Floats
 
 Interface = Literal["position", "posvel", "velocity", "effort", "pwm"]
-"""What a table commands; see sample_player."""
+"""Command interface of a table (see sample_player)"""
 
 
 class Guard(msgspec.Struct, frozen=True):
-    """What ends a segment early, beside a joint that leaves its range; None: not checked."""
+    """Limits that end a segment early, in addition to the ranges of joints; None disables a limit."""
 
     temperature: float | None = 70.0
-    """The highest, deg C. Dynamixels shut down at 70 to 80 deg C (e-Manual, Temperature Limit)."""
+    """Highest temperature, deg C. Dynamixels shut down at 70 to 80 deg C (e-Manual, Temperature Limit)."""
     effort: float | None = None
-    """The highest measured one, Nm, A or the fraction of maximum."""
+    """Highest measured effort, Nm, A or the fraction of maximum"""
     age_s: float | None = 0.1
-    """The greatest age of a joint's state."""
+    """Largest age of a joint's state, s"""
 
 
 class Segment(msgspec.Struct, frozen=True):
-    """One table: goals of joints, one row each period, by time."""
+    """Table of goals of joints, one row per period"""
 
     title: str
-    """What it is for, as the progress shows it: `top speed, 20 deg up`."""
+    """Description in the progress output, such as `top speed, 20 deg up`"""
     period_s: float
     rows: Mapping[str, Floats]
-    """By joint, each of shape (rows,): rad, rad/s, the joint's effort unit, or the fraction of full voltage.
-    The joints of the experiment that are missing hold (position), or get 0."""
+    """Values by joint, shape (rows,): rad, rad/s, the joint's effort unit, or the fraction of full voltage.
+    Joints of the experiment that are missing hold their position, or get 0."""
     interface: Interface = "position"
     speeds: Mapping[str, Floats] = msgspec.field(default_factory=dict)
-    """Of posvel: the speeds toward the positions, rad/s, shape (rows,); by joint, all that `rows` has."""
+    """With posvel: speeds by joint, rad/s, shape (rows,), for the same joints as in `rows`"""
     begin: Mapping[str, float] = msgspec.field(default_factory=dict)
-    """Where joints are led slowly before, rad; those of a position table go to its first row anyway."""
+    """Positions to which joints move slowly first, rad. With a table of positions it is the first row anyway.
+    """
     settle_s: float = 0.0
-    """For which the last row is commanded still, and recorded."""
+    """Time for which the last row is still commanded and recorded, s"""
     loop_rate: float | None = None
-    """Hz of the loop for this segment; None: the run's own."""
+    """Loop rate for this segment, Hz; None for that of the run"""
     guard: Guard = msgspec.field(default_factory=Guard)
 
     def __post_init__(self) -> None:
-        """Raise ValueError for rows of different lengths, none, or such that are not finite."""
+        """Raise ValueError if rows are missing, have different lengths, or are not finite."""
         lengths = {len(values) for values in (*self.rows.values(), *self.speeds.values())}
         if len(lengths) != 1 or 0 in lengths:
             raise ValueError(f"{self.title}: each joint needs as many rows, at least one, not {lengths}")
@@ -58,60 +59,63 @@ class Segment(msgspec.Struct, frozen=True):
 
     @property
     def count(self) -> int:
-        """How many rows it has."""
+        """Number of rows"""
         return len(next(iter(self.rows.values())))
 
     @property
     def duration_s(self) -> float:
-        """How long it takes."""
+        """Duration, s"""
         return self.count * self.period_s + self.settle_s
 
 
 class Recorded(msgspec.Struct, frozen=True):
-    """What the log has of a segment: a row a cycle, from the one that took the goal to the one that ended it.
+    """Recording of a segment, one row per cycle from the acceptance to the end of its goal
 
-    `cycles` has the whole record of each cycle (see channels/cycle.py); times of the run's clock in ns.
+    `cycles` has the complete record of each cycle (see channels/cycle.py), with times of the run's clock in
+    ns.
     """
 
     joints: tuple[str, ...]
-    """The columns of what has shape (cycles, joints)."""
+    """Joints of the columns of all arrays of shape (cycles, joints)"""
     cycles: NDArray[np.void]
     columns: tuple[int, ...]
-    """The place of each joint in the rows of `cycles`."""
+    """Index of each joint in the rows of `cycles`"""
     segment: Segment
     outcome: str = "reached"
-    """How its goal ended: `reached`, or why it is not whole: `aborted`, `cancelled`, `lost`."""
+    """Outcome of the goal: `reached`, or for an incomplete segment `aborted`, `cancelled` or `lost`"""
     text: str = ""
-    """The sentence with which it ended early."""
+    """Reason for an early end, one sentence"""
 
     @property
     def whole(self) -> bool:
-        """True when all of the segment was played."""
+        """True if the segment was played to its end"""
         return self.outcome == "reached"
 
     def __len__(self) -> int:
         return len(self.cycles)
 
     def of_cycles(self, name: str) -> NDArray[np.int64]:
-        """Return a column of the record with one number a cycle, such as `woken_ns`; shape (cycles,)."""
+        """Return a column of the record with one number per cycle, such as `woken_ns`; shape (cycles,)."""
         values: NDArray[np.int64] = self.cycles[name]
         return values
 
     def of_joints(self, name: str) -> Floats:
-        """Return a column with one number a joint, such as `position`, in the record's unit; shape (cycles,
-        joints). A state is the last that is known, where `valid` is False."""
+        """Return a column with one number per joint, such as `position`, shape (cycles, joints).
+
+        A state is the last known one if `valid` is False.
+        """
         values: Floats = self.cycles[name][:, list(self.columns)]
         return values
 
     @property
     def time(self) -> Floats:
-        """Wake-up of each cycle, s since the first one; shape (cycles,)."""
+        """Time of each cycle's wake-up since the first one, s; shape (cycles,)"""
         since_ns = self.of_cycles("woken_ns") - self.of_cycles("woken_ns")[:1]
         return since_ns.astype(np.float64) * 1e-9
 
     @property
     def goal(self) -> Floats:
-        """What was sent in the segment's interface (of posvel the position); NaN: nothing."""
+        """Goals in the segment's interface (the position with posvel); NaN if none was sent"""
         interface = self.segment.interface
         return self.of_joints(f"goal_{'position' if interface == 'posvel' else interface}")
 
@@ -122,5 +126,5 @@ class Recorded(msgspec.Struct, frozen=True):
 
     @property
     def valid(self) -> NDArray[np.bool_]:
-        """True where the cycle's reply arrived intact; shape (cycles, joints)."""
+        """True for each intact reply; shape (cycles, joints)"""
         return self.of_joints("valid").astype(np.bool_)

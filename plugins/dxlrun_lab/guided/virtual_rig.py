@@ -1,4 +1,4 @@
-"""The rig of a robot on virtual time: for `--virtual` and for tests."""
+"""Rig of a robot on virtual time, for `--virtual` and for tests."""
 
 from __future__ import annotations
 

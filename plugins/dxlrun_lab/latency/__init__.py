@@ -1,4 +1,4 @@
 """Measurement of the machine's wake-up latency, with the wait of the loop (`rt_test` of the thesis).
 
-Its evaluation and page are in `dxlrun_analysis.latency`.
+The evaluation and the page are in `dxlrun_analysis.latency`.
 """

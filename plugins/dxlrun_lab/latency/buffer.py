@@ -1,7 +1,7 @@
-"""The shared memory of a measuring process: a few numbers about it, then two times of each wake-up.
+"""Shared memory of a measuring process: a header, then two times per wake-up.
 
-The process writes, and the front process reads, also while it measures; nothing else passes between them, so
-the measurement has neither sentences to make nor pipes to fill. yardstick.c has the same layout.
+The measuring process writes while the front process reads. There is no other communication, so the
+measurement neither formats text nor writes to pipes. yardstick.c uses the same layout.
 """
 
 from __future__ import annotations
@@ -16,72 +16,73 @@ from numpy.typing import NDArray
 
 
 class Place(IntEnum):
-    """Where the numbers are, in 64-bit integers; the wake-ups follow."""
+    """Offsets in 64-bit integers"""
 
     DONE = 0
-    """Wake-ups that are complete."""
+    """Number of complete wake-ups"""
     STOP = 1
-    """Not 0: the front process asks for the end."""
+    """Set to a value other than 0 by the front process to request the end"""
     CPU_NS = 2
-    """Processor time of the process from the first wait to the last wake-up."""
+    """Processor time from the first wait to the last wake-up, ns"""
     WALL_NS = 3
-    """The same in time that passed; 0 until it is finished."""
+    """Elapsed time from the first wait to the last wake-up, ns; 0 until the end"""
     MARGIN_NS = 4
-    """How long the clock is polled before a deadline."""
+    """Time for which the clock is polled before a deadline, ns"""
     WAKE_UPS = 8
+    """Start of the wake-ups"""
 
 
 SIZE = 8
 
 
 def create_file(name: str, content: bytes = b"") -> int:
-    """Return the descriptor of a nameless file (memfd) with `content`."""
+    """Create an anonymous file (memfd) with `content`, and return its descriptor."""
     descriptor = os.memfd_create(name)
     os.pwrite(descriptor, content, 0)
     return descriptor
 
 
 def read_file(descriptor: int) -> bytes:
-    """Return everything in a nameless file, wherever its offset is."""
+    """Return the whole content of an anonymous file, whatever its offset."""
     return os.pread(descriptor, os.fstat(descriptor).st_size, 0)
 
 
 class Buffer:
-    """The memory of one block; a nameless file."""
+    """Shared memory of one block, an anonymous file"""
 
     def __init__(self, descriptor: int) -> None:
         self.descriptor = descriptor
         self._map = mmap.mmap(descriptor, 0)
         self.words = memoryview(self._map).cast("q")
-        """Everything, to be read and written by place."""
+        """Whole memory as 64-bit integers, indexed by Place"""
 
     @classmethod
     def create(cls, iterations: int) -> Buffer:
-        """Return one that has room for so many wake-ups; every page of it is there."""
+        """Create a buffer for a number of wake-ups, with all pages allocated."""
         descriptor = os.memfd_create("wake_ups")
         size = SIZE * (Place.WAKE_UPS + 2 * iterations)
         os.posix_fallocate(descriptor, 0, size)
         return cls(descriptor)
 
     def touch(self) -> None:
-        """Have each page in this process' table of pages before the measurement begins."""
+        """Access each page, so that no page fault occurs during the measurement."""
         for word in range(0, len(self.words), mmap.PAGESIZE // SIZE):
             self.words[word] = self.words[word]
 
     def wake_ups(self) -> NDArray[np.int64]:
-        """Return a copy of what was measured until now: deadline and wake-up, ns; shape (wake-ups, 2)."""
+        """Return a copy of the measurements so far: deadline and wake-up, ns; shape (wake-ups, 2)."""
         done = self.words[Place.DONE]
         times = np.frombuffer(self.words, np.int64, 2 * done, Place.WAKE_UPS * SIZE)
         return times.reshape(-1, 2).copy()
 
     def worst_ns(self, begin: int, end: int) -> int:
-        """Return the largest lateness of the wake-ups from `begin` to before `end`, 0 without any."""
+        """Return the largest lateness of the wake-ups from `begin` to before `end`, ns; 0 without any."""
         times = np.frombuffer(self.words, np.int64, 2 * (end - begin), (Place.WAKE_UPS + 2 * begin) * SIZE)
         return int((times[1::2] - times[::2]).max(initial=0))
 
     def close(self) -> None:
-        """Let go of it."""
-        with suppress(BufferError):  # an interrupted reader still has a view: the memory goes with that
+        """Unmap the memory and close the file."""
+        with suppress(BufferError):  # an interrupted reader may still hold a view
             self.words.release()
             self._map.close()
         os.close(self.descriptor)

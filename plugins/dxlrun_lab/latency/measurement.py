@@ -1,7 +1,7 @@
-"""Measuring block after block: one process each, watched from here while it works.
+"""Measurement in blocks, one process per block, which is monitored while it measures.
 
-Everything that can be refused is refused before the first block: each condition's process is started once
-without a wake-up, and reports what the operating system granted.
+Settings that the operating system refuses are detected before the first block: the process of each condition
+is started once without wake-ups, and reports the granted settings.
 """
 
 from __future__ import annotations
@@ -32,32 +32,35 @@ from dxlrun_lab.stress import Stress
 _SOURCE = Path(__file__).with_name("yardstick.c")
 _FLAGS = ("-std=c11", "-O2", "-Wall", "-Wextra")
 _LOOK_S = 0.2
-"""How often the front process looks at a measurement; it sleeps in between."""
+"""Polling period of the front process, s"""
 _STANDSTILL_S = 30.0
-"""A process that measures nothing for so long, and two periods, is given up."""
+"""Time without progress after which a process is given up, s; two periods are added"""
 _STOP_S = 2.0
 
 Progress = Callable[[str, float], None]
-"""Takes what is measured, and the share of all that is done."""
+"""Function that gets the name of the present block, and the fraction of all wake-ups so far"""
 
 
 @dataclass(slots=True)
 class Measured:
-    """What was measured until now, whatever happens then."""
+    """Measurements so far, which remain valid after an interrupt or a failure"""
 
     blocks: list[Block] = field(default_factory=list)
     interrupted: bool = False
     failure: str = ""
-    """One sentence where a process failed."""
+    """Failure of a process, one sentence; empty on success"""
     remarks: list[str] = field(default_factory=list)
 
 
 @contextmanager
 def compiled_yardstick(settings: Settings) -> Iterator[str]:
-    """Compile the C program where a condition needs it; give a path to execute it by, or an empty one.
+    """Compile the C program if a condition needs it, and yield its path, or an empty text.
 
-    The program is in a nameless file, which ends with this process however that ends, and may be executed
-    where /tmp may not. Raises InputError where no compiler is found, or it fails.
+    The program is in an anonymous file. The file is always removed with this process, and can be executed
+    even if /tmp is mounted noexec.
+
+    Raises:
+        InputError: The compiler is missing, or it fails.
     """
     if not any(condition.in_c for condition in settings.conditions):
         yield ""
@@ -92,9 +95,13 @@ def compiled_yardstick(settings: Settings) -> Iterator[str]:
 
 
 def require_grants(settings: Settings, yardstick: str) -> tuple[str, ...]:
-    """Start each condition's process once, without a wake-up; raise InputError for what was not granted.
+    """Start the process of each condition once without wake-ups, to check the granted settings.
 
-    Returns a sentence where memory was not locked: that is measured all the same.
+    Returns:
+        A remark if memory was not locked, which does not prevent the measurement.
+
+    Raises:
+        InputError: The scheduling policy or the cores were not granted.
     """
     for condition in settings.conditions:
         with _Process(settings, condition, 0, yardstick) as process:
@@ -106,7 +113,7 @@ def require_grants(settings: Settings, yardstick: str) -> tuple[str, ...]:
 
 
 def keep_cores_awake(settings: Settings) -> None:
-    """Keep cores from deep idle states while this process lives; raises InputError where that is refused."""
+    """Keep cores from deep idle states while this process exists. Raises InputError if that is refused."""
     if settings.idle_latency:
         grant = realtime.keep_awake()
         if not grant.granted:
@@ -116,7 +123,7 @@ def keep_cores_awake(settings: Settings) -> None:
 def measure(
     settings: Settings, yardstick: str, stress: Stress, progress: Progress, measured: Measured
 ) -> None:
-    """Measure all blocks into `measured`, which has what is whole also after an interrupt or a failure."""
+    """Measure all blocks into `measured`. Complete blocks remain valid after an interrupt or a failure."""
     total = settings.iterations * len(settings.conditions)
     done = 0
     try:
@@ -177,9 +184,13 @@ class _Process:
         os.close(self._errors)
 
     def watch(self, show: Callable[[int, float], None]) -> None:
-        """Report how far it is until it ends. Raises ProcessFault when it stands still.
+        """Report the progress until the process ends.
 
-        At an interrupt it is asked to end, so that its last wake-up is whole, and KeyboardInterrupt goes on.
+        On an interrupt, the process is requested to end, so that its last wake-up is complete.
+        KeyboardInterrupt is then raised again.
+
+        Raises:
+            ProcessFault: The process made no progress for too long.
         """
         words, seen, worst_ns, idle_s = self._buffer.words, 0, 0, 0.0
         limit_s = _STANDSTILL_S + 2 * self._period_ns / 1e9
@@ -206,7 +217,7 @@ class _Process:
         return bool(ready)
 
     def end(self) -> None:
-        """Wait for its end. Raises ProcessFault when that was not in order."""
+        """Wait for the end of the process. Raises ProcessFault on a timeout or an error."""
         try:
             code = self._process.wait(_STANDSTILL_S)
         except subprocess.TimeoutExpired:
@@ -217,11 +228,11 @@ class _Process:
             raise ProcessFault(f"the process that measures {self._condition.label} ended ({how})")
 
     def grants(self) -> tuple[Grant, ...]:
-        """Return what the operating system granted."""
+        """Return the settings that the operating system granted."""
         return msgspec.json.decode(read_file(self._grants), type=tuple[Grant, ...])
 
     def block(self, number: int) -> Block:
-        """Return what it has measured until now."""
+        """Return the measurements so far."""
         words = self._buffer.words
         return Block(
             self._condition.name,

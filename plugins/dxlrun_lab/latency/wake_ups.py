@@ -1,9 +1,9 @@
-"""The measuring process: waits for one deadline after the other with the clock and the pacing of the loop.
+"""Measuring process: wait for deadlines with the clock and the pacing of the loop.
 
-It is executed and prepared as the loop's process is (one thread, real-time settings, the margin measured),
-and waits on the same clock; between two waits it does nothing but write down the times. For the yardstick it
-prepares itself in the same way and then becomes the program in C, which keeps policy, priority, cores and
-timer slack (execve(2), prctl(2)); only locked memory is lost and asked for again there.
+The process is set up like the loop's (one thread, real-time settings, measured margin) and waits on the same
+clock. Between two waits it only stores the times. For the yardstick, it is set up in the same way and then
+executes the C program, which inherits policy, priority, cores and timer slack (execve(2), prctl(2)). Only the
+lock of memory is lost, so the C program requests it again.
 """
 
 from __future__ import annotations
@@ -25,37 +25,37 @@ _PR_SET_PDEATHSIG = 1  # linux/prctl.h
 
 
 class Job(msgspec.Struct, frozen=True):
-    """What one process measures; JSON on its command line."""
+    """Job of a measuring process, passed as JSON on its command line"""
 
     parent: int
-    """Process ID: this process ends with it."""
+    """Process ID of the parent; this process ends with it."""
     scheduler: SchedulerPlan
     period_ns: int
     iterations: int
-    """0: ask for the settings, report what was granted, and end."""
+    """Number of wake-ups; with 0, only report the granted settings"""
     buffer: int
-    """Descriptor of the shared memory."""
+    """Descriptor of the shared memory"""
     grants: int
-    """Descriptor of a nameless file for what the operating system granted."""
+    """Descriptor of an anonymous file for the granted settings"""
     yardstick: str = ""
-    """Path of the program in C; empty: wait as the loop does."""
+    """Path of the C program; empty to wait as the loop does"""
 
 
 def measure(deadlines: Deadlines, iterations: int, buffer: Buffer) -> None:
-    """Wait for so many deadlines, or until the front process asks for the end, and note both times."""
+    """Wait for deadlines until the front process requests the end, and store the times of each wake-up."""
     words = buffer.words
     done, stop = int(Place.DONE), int(Place.STOP)  # plain integers: members of an enum are slower
     place = int(Place.WAKE_UPS)
     for number in range(1, iterations + 1):
         words[place], words[place + 1] = deadlines.wait()
         place += 2
-        store(words, done, number)  # both times are seen before it
+        store(words, done, number)  # release store: readers see both times first
         if words[stop]:
             return
 
 
 def run(job: Job) -> None:
-    """Prepare this process, measure, and leave the times it took in the buffer."""
+    """Set up this process, measure, and store the used processor time."""
     buffer = Buffer(job.buffer)
     grants = realtime.apply(job.scheduler)
     deadlines = Deadlines(job.period_ns)
@@ -76,11 +76,11 @@ def run(job: Job) -> None:
 
 
 def main() -> None:
-    """Be a measuring process: `JOB-AS-JSON`."""
+    """Run the job on the command line: `JOB-AS-JSON`."""
     ctypes.CDLL(None).prctl(_PR_SET_PDEATHSIG, signal.SIGKILL)
     job = msgspec.json.decode(sys.argv[1], type=Job)
     if os.getppid() != job.parent:
-        sys.exit(1)  # the parent was gone before its death could be signalled
+        sys.exit(1)  # the parent exited before prctl, so there will be no signal
     run(job)
 
 

@@ -1,4 +1,4 @@
-"""Tracking experiment: how well a motion is followed by four ways to time its commands (thesis, 5.3.3).
+"""Tracking experiment: tracking errors with four ways to time the commands (thesis, 5.3.3).
 
-How well a joint followed in any log is computed by `dxlrun_analysis.joints`.
+`dxlrun_analysis.joints` computes the tracking errors in any log.
 """

@@ -1,4 +1,4 @@
-"""The experiment: one run for each set-up, each measured from its log; what was measured is kept."""
+"""Tracking experiment: one run per set-up, evaluated from its log."""
 
 from __future__ import annotations
 
@@ -27,31 +27,31 @@ _INTERRUPTED = 130
 
 @dataclass(slots=True)
 class Experiment:
-    """What was measured until now, and why it ended before all set-ups were."""
+    """Measurements so far, and the reasons for an early end"""
 
     robot: str
     period_ns: int
     motion: DesiredMotion
     load: str
-    """In words; empty: none."""
+    """Description of the load; empty without one"""
     measured: list[Measured] = field(default_factory=list)
     failures: list[str] = field(default_factory=list)
-    """One sentence each."""
+    """Failures, one sentence each"""
     interrupted: bool = False
 
     @property
     def exit_code(self) -> int:
-        """0: all was measured, 1: a run failed, 130: interrupted."""
+        """Exit code: 0 success, 1 a run failed, 130 interrupted"""
         return _INTERRUPTED if self.interrupted else 1 if self.failures else 0
 
 
 def run_experiment(
     plan: Plan, motion: DesiredMotion, setups: Sequence[Setup], stress: Stress, console: Console
 ) -> Experiment:
-    """Run a robot in each set-up, under a load, and measure it; progress goes to the console.
+    """Run a robot in each set-up under a load, and evaluate the logs. Progress is printed to the console.
 
-    A run that fails is measured as far as it came; the others follow. Each leaves the robot as its policy
-    demands.
+    A failed run is evaluated up to its failure, and the next set-up follows. Each run ends by the policy of
+    the robot.
     """
     experiment = Experiment(plan.robot, plan.loop.period_ns, motion, stress.text)
     try:
@@ -85,7 +85,7 @@ def _one(experiment: Experiment, setup: Setup, plan: Plan, stress: Stress, conso
 
 
 def _refused(log: Log) -> list[str]:
-    """Return what the loop was not granted: the set-up is then not what its name says."""
+    """Return remarks about scheduler settings that were not granted, which change the set-up."""
     return [
         event.text
         for event in log.events

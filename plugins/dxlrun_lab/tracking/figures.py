@@ -1,7 +1,8 @@
-"""One figure a set-up, all with the same axes: what the thesis shows in its Figures 31 to 34.
+"""One figure per set-up, all with the same axes, as in Figures 31 to 34 of the thesis.
 
-Above, the whole motion: position as desired, sent and read, and how late each cycle was. Below, position and
-velocity in its first five seconds (Figure 31) and around the latest cycle (Figures 32 to 34).
+The upper part shows the whole motion: desired, sent and measured position, and the lateness of each cycle.
+The lower part shows position and velocity in the first five seconds (Figure 31) and around the latest cycle
+(Figures 32 to 34).
 """
 
 from __future__ import annotations
@@ -32,7 +33,7 @@ from dxlrun_lab.tracking.motion import DesiredMotion
 
 _BEGIN_S = 5.0
 _AROUND_S = 0.25
-"""Before and behind the latest cycle."""
+"""Time shown before and after the latest cycle, s"""
 _LEAST_US = 1.0
 _DESIRED: dict[str, object] = {"color": GREEN, "linewidth": 2.8, "alpha": 0.55}
 _SENT: dict[str, object] = {"color": ORANGE, "linewidth": 1.2}
@@ -47,7 +48,7 @@ class _Axes(msgspec.Struct, frozen=True):
 
     @classmethod
     def of(cls, measured: Sequence[Measured], motion: DesiredMotion) -> _Axes:
-        """Return axes on which every set-up has room."""
+        """Return axes that fit all set-ups."""
         curves = [one.curves for one in measured]
         return cls(
             max(float(one.woken_s[-1]) for one in curves),
@@ -71,7 +72,7 @@ def _span(arrays: Sequence[Floats]) -> tuple[float, float]:
 
 
 def drawings(measured: Sequence[Measured], motion: DesiredMotion) -> tuple[Element, ...]:
-    """Return a figure for each set-up; `measured` has at least one. Takes matplotlib."""
+    """Return a figure for each set-up, of at least one. Needs matplotlib."""
     axes = _Axes.of(measured, motion)
     return tuple(_SetupPlot(one, motion, axes).drawing() for one in measured)
 
@@ -147,7 +148,7 @@ class _SetupPlot(msgspec.Struct, frozen=True):
     def _series(  # noqa: PLR0917  one line of a plot
         axes: Axes, x: Floats, y: Floats, window: tuple[float, float], name: str, style: dict[str, object]
     ) -> None:
-        """Draw what lies in a window; a goal holds until the next one."""
+        """Draw the samples in a window. Goals are drawn as steps."""
         first, stop = np.searchsorted(x, window)
         first, stop = max(0, int(first) - 1), int(stop) + 1
         times, values = reduced(x[first:stop], y[first:stop])
@@ -155,7 +156,7 @@ class _SetupPlot(msgspec.Struct, frozen=True):
         axes.plot(times, values, label=name, drawstyle=held, **style)  # type: ignore[arg-type]  # one dictionary for all keys
 
     def _marks(self, axes: Axes, begin_s: float, end_s: float, *, extent: bool) -> None:
-        """Mark the late cycles of a window: by their extent, or where that is too fine by a tick."""
+        """Mark the late cycles in a window: by their extent, or by a tick if `extent` is false."""
         curves = self.measured.curves
         chosen = _late(curves) & (curves.woken_s >= begin_s) & (curves.due_s <= end_s)
         if extent:

@@ -1,9 +1,9 @@
-"""What a run's log says about a motion that was sent: when it ended, how it was followed, what was late.
+"""Evaluation of a motion in a log: drift, tracking error and late cycles.
 
-A cycle is *late* by the time from the first deadline after the cycle before began until it begins itself: if
-that one took too long, from the deadline of the first skipped period. Simulated servos answer later than real
-ones where their process gets no processor; what a cycle is late by that is taken from the ledger of the
-simulated bus, kept apart, and subtracted.
+A cycle is *late* by the time from its deadline to its start. The deadline is the first one after the start of
+the previous cycle, so if that cycle took too long, it is the one of the first skipped period. Simulated
+servos are late if their process is not scheduled. The ledger of the simulated bus records this lateness,
+which is reported separately and subtracted.
 """
 
 from __future__ import annotations
@@ -27,79 +27,79 @@ LATE_NS = ROUGH_NS
 
 
 class Curves(msgspec.Struct, frozen=True):
-    """The cycles of a motion, shape (cycles,); times in s since it began."""
+    """Cycles of a motion, shape (cycles,); times in s since the start of the motion"""
 
     due_s: Floats
-    """The first deadline after the cycle before began."""
+    """First deadline after the start of the previous cycle"""
     woken_s: Floats
     sent_s: Floats
     sent: Floats
     """rad"""
     read_s: Floats
     read: Floats
-    """rad; NaN where no reply came."""
+    """rad; NaN without a reply"""
     velocity: Floats
-    """rad/s, as read"""
+    """Measured velocity, rad/s"""
     late_us: Floats
-    """Without what the simulated bus was late."""
+    """Lateness without that of the simulated bus"""
 
     @property
     def worst(self) -> int:
-        """The cycle that was latest."""
+        """Index of the latest cycle"""
         return int(self.late_us.argmax())
 
 
 class Tracked(msgspec.Struct, frozen=True):
-    """The numbers of one set-up. Lateness and drift are measured; `*_by_bus` is the part of it that the
-    simulated bus caused, None on a real one."""
+    """Figures of one set-up. Fields `*_by_bus` are the part of a simulated bus, None on a real one."""
 
     setup: str
     title: str
     thesis: str
-    """Which figures of the thesis show this set-up."""
+    """Figures of the thesis that show this set-up"""
     log: str
     ended: bool
-    """The whole motion was sent; else only its begin was measured."""
+    """True if the whole motion was sent"""
     cycles: int
-    """From the first to the last that sent a pose of the motion."""
+    """Number of cycles from the first to the last pose of the motion"""
     duration_ns: int
-    """From the first pose to the end of the motion, or as far as it came."""
+    """Time from the first pose to the end of the motion, or to the end of the run"""
     drift_ns: int | None
-    """How much longer than the motion that is; the loop may end up to 150 us before the end."""
+    """Difference of the duration to that of the motion. The loop may end up to 150 us early."""
     start_delays_ns: int | None
-    """Sum of the delays with which the poses of a sequential sender began; None for the loop."""
+    """Sum of the start delays of a sequential sender's poses; None for the loop"""
     remainder_ns: int
-    """How much longer than the motion its whole periods are."""
+    """Difference of the motion's duration to the next multiple of the period"""
     last_late_ns: int
-    """How late the last of these cycles was; it is part of the drift."""
+    """Lateness of the last cycle, which is part of the drift"""
     drift_by_bus_ns: int | None
     rms_rad: float
-    """Of desired minus read position; desired is that of the moment of the reading."""
+    """Root mean square of desired minus measured position, with the desired position at the time of reading
+    """
     worst_rad: float
     late_cycles: int
-    """Later than 150 us, without the simulated bus; the next two are of these."""
+    """Number of cycles later than 150 us, without the simulated bus. The next two fields are about these."""
     mean_late_us: float
     max_late_us: float
     late_by_bus_us: float | None
-    """Of all cycles together."""
+    """Sum over all cycles"""
     silent_cycles: int
-    """Without an intact reply; the error does not count them."""
+    """Number of cycles without an intact reply, which do not count in the error"""
     remarks: tuple[str, ...] = ()
-    """What else must be known of this run, one sentence each."""
+    """Remarks about the run, one sentence each"""
 
     @property
     def own_drift_ns(self) -> int | None:
-        """The drift without what the simulated bus caused."""
+        """Drift without the part that the simulated bus caused"""
         return None if self.drift_ns is None else self.drift_ns - (self.drift_by_bus_ns or 0)
 
     @property
     def adds_up(self) -> bool:
-        """True where a sequential sender ended late by exactly the sum of its start delays."""
+        """True if the drift of a sequential sender equals the sum of its start delays"""
         return self.drift_ns is not None and self.drift_ns - self.remainder_ns == self.start_delays_ns
 
 
 class Measured(msgspec.Struct, frozen=True):
-    """One set-up: its numbers, and its curves."""
+    """Figures and curves of one set-up"""
 
     tracked: Tracked
     curves: Curves
@@ -112,9 +112,14 @@ def measure(
     ledger: Sequence[LedgerEntry] | None,
     remarks: tuple[str, ...] = (),
 ) -> Measured | None:
-    """Measure a motion in the log of its run; None where the run ended before it began.
+    """Evaluate a motion in the log of its run. Return None if the run ended before the motion started.
 
-    `ledger`: what simulated buses saw; None: the buses are real.
+    Args:
+        log: Log of the run.
+        setup: Set-up of the run.
+        desired: Desired motion.
+        ledger: Ledger of the simulated buses; None for real buses.
+        remarks: Remarks about the run.
     """
     span = _span(log, setup, desired)
     if span is None:
@@ -168,20 +173,21 @@ def measure(
 
 
 class _Span(NamedTuple):
-    """Where a motion is in a log."""
+    """Cycles of a motion in a log"""
 
     begin_ns: int
     first: int
-    """Index of the cycle that sent the first pose, and behind the one that sent the last."""
+    """Index of the cycle with the first pose"""
     stop: int
+    """Index after the cycle with the last pose"""
     ended: bool
 
 
 def _span(log: Log, setup: Setup, desired: DesiredMotion) -> _Span | None:
-    """Return the motion's cycles; None where it did not begin.
+    """Return the cycles of the motion, or None if it did not start.
 
-    The loop begins when its controller is at the first sample by the clock, a sequential sender with that
-    pose, whenever it is sent.
+    In the loop, the motion starts when the clock reaches the first sample. With a sequential sender, it
+    starts when the first pose is sent.
     """
     number, woken = log.cycles["cycle"], log.cycles["woken_ns"]
     taken = next((command for command in log.commands if command.planned == 0), None)
@@ -195,7 +201,7 @@ def _span(log: Log, setup: Setup, desired: DesiredMotion) -> _Span | None:
     else:
         begin_ns = taken.t_ns + desired.lead_ns
         first = int(np.searchsorted(woken, begin_ns))
-        # one that begins some ns before the end, as the first one some ns before the begin, is the last
+        # A cycle that starts slightly before the end of the motion counts as the last one.
         last = int(np.searchsorted(woken, begin_ns + desired.duration_ns - LATE_NS))
     if first + 1 >= len(woken):
         return None
@@ -206,17 +212,17 @@ def _late_ns(log: Log, setup: Setup) -> Longs:
     due, woken = log.cycles["scheduled_ns"], log.cycles["woken_ns"]
     late: Longs = woken - due
     if setup.schedule == "absolute":
-        # deadlines that passed since the cycle before began; those before it made that one late
+        # Only count deadlines since the start of the previous cycle. Earlier ones made that cycle late.
         passed = (due[1:] - woken[:-1] - 1) // log.period_ns
         late[1:] += np.minimum(passed, log.cycles["skipped"][1:]) * log.period_ns
     return late
 
 
 def _by_bus(log: Log, late_ns: Longs, ledger: Sequence[LedgerEntry]) -> Longs:
-    """Return how much of each cycle's lateness simulated servos caused, ns.
+    """Return the part of each cycle's lateness that simulated servos caused, ns.
 
-    They keep a cycle from beginning by the read of the one before, as far as that ended behind the deadline,
-    and by what was exchanged in idle time, as far as that did.
+    They delay a cycle by the read of the previous cycle, and by transactions in idle time. Only the time
+    after the deadline counts.
     """
     cycles = log.cycles
     in_read, in_idle = waits_for_servos(log, ledger)

@@ -1,4 +1,5 @@
-"""The desired motion: where a joint should be at any time, between the samples of a motion file."""
+"""Desired motion: position and velocity of a joint at any time, interpolated between samples of a motion
+file."""
 
 from __future__ import annotations
 
@@ -24,15 +25,15 @@ class DesiredMotion(msgspec.Struct, frozen=True):
     positions: tuple[float, ...]  # rad
     velocities: tuple[float, ...]  # rad/s
     lead_ns: int
-    """From the moment at which a controller takes the motion's first command to the first sample."""
+    """Time from the acceptance of the motion's first command to the first sample"""
 
     @property
     def duration_ns(self) -> int:
-        """From the first sample to the last."""
+        """Time from the first sample to the last"""
         return round(self.times_s[-1] * 1e9)
 
     def at(self, times_s: Floats) -> tuple[Floats, Floats]:
-        """Return position, rad, and velocity, rad/s; before and after the motion the joint rests."""
+        """Return position (rad) and velocity (rad/s). Before and after the motion the joint is at rest."""
         times, samples = np.clip(times_s, 0.0, self.times_s[-1]), np.array(self.times_s)
         states = np.array([self.positions, self.velocities])
         index = np.clip(np.searchsorted(samples, times, side="right") - 1, 0, len(samples) - 2)
@@ -46,7 +47,7 @@ class DesiredMotion(msgspec.Struct, frozen=True):
 
 
 def desired_motion(path: Path, plan: Plan) -> DesiredMotion:
-    """Return the motion of a file that the plan plays. Raises InputError where it is not one of one joint."""
+    """Return the motion of a file that the plan plays. Raises InputError unless it moves one joint."""
     parts = len(read_motion(path, plan.groups).motion.motions)
     commands = plan.loop.commands
     joints = next(one.joints for one in plan.loop.controllers if one.name == commands[0].controller)
@@ -64,14 +65,14 @@ def desired_motion(path: Path, plan: Plan) -> DesiredMotion:
     times = np.array([point.time_ns - points[0].time_ns for point in points]) * 1e-9
     positions = np.array([point.positions[0] for point in points], np.float64)
     given = np.array([point.velocities[0] if point.velocities else np.nan for point in points])
-    # where the file gives no velocity, the slope between the neighbours
+    # Without a velocity in the file, use the slope between the neighbouring samples.
     velocities = np.where(np.isfinite(given), given, np.gradient(positions, times))
     at, position, velocity = (tuple(one.tolist()) for one in (times, positions, velocities))
     return DesiredMotion(joints[0], str(path), at, position, velocity, lead_ns)
 
 
 class _Point(msgspec.Struct):
-    """Targets of the joints at a moment, as commands of controllers have them."""
+    """Point of a command: targets of the joints at a time"""
 
     time: float = 0.0
     """s"""
@@ -80,7 +81,7 @@ class _Point(msgspec.Struct):
 
     @property
     def time_ns(self) -> int:
-        """The moment, ns."""
+        """Time, ns"""
         return round(self.time * 1e9)
 
 
@@ -91,7 +92,7 @@ class _Trajectory(msgspec.Struct):
 
 
 def _points(commands: Sequence[ScheduledCommand]) -> tuple[Sequence[_Point], int]:
-    """Return the points of a motion, and the time from its first command to the first of them, ns."""
+    """Return the points of a motion, and the time from its first command to its first point, ns."""
     trajectory = msgspec.json.decode(commands[0].request, type=_Trajectory)
     if trajectory.points:
         return trajectory.points, round(trajectory.start_in * 1e9) + trajectory.points[0].time_ns

@@ -1,4 +1,4 @@
-"""The result of the experiment: a table and sentences, for the terminal, as JSON, and as a page."""
+"""Result of the tracking experiment for the terminal, as JSON, and as a page."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ _THESIS = "M. A. Araujo, UFU 2017, section 5.3.3"
 
 
 def parts(experiment: Experiment) -> tuple[Part, ...]:
-    """Return what a terminal shows: the table, what it says, where the logs are, what went wrong."""
+    """Return the output for the terminal: table, findings, paths of logs, and remarks."""
     tracked = _tracked(experiment)
     return (
         table(tracked),
@@ -25,7 +25,7 @@ def parts(experiment: Experiment) -> tuple[Part, ...]:
 
 
 def result(experiment: Experiment) -> dict[str, object]:
-    """Return the result as JSON has it."""
+    """Return the JSON content of the result."""
     motion = experiment.motion
     return {
         "robot": experiment.robot,
@@ -43,7 +43,7 @@ def result(experiment: Experiment) -> dict[str, object]:
 
 
 def machine() -> str:
-    """Return this machine in words; the version of its kernel says whether that is a real-time one."""
+    """Describe this machine. The version of the kernel shows if it is a real-time kernel."""
     here = os.uname()
     cores = counted(len(os.sched_getaffinity(0)), "core", "cores")
     return f"{here.sysname} {here.release} ({here.version}), {cores}"
@@ -54,8 +54,10 @@ def _tracked(experiment: Experiment) -> list[Tracked]:
 
 
 def table(tracked: Sequence[Tracked]) -> Table:
-    """Return one column a set-up, so that all of them fit a terminal; what the simulated bus was late has its
-    own row, and is in no other but the duration."""
+    """Return a table with one column per set-up, which fits a terminal.
+
+    The lateness of the simulated bus has its own row. It is only included in the duration.
+    """
     rows: list[tuple[str, Callable[[Tracked], Value]]] = [
         ("duration", lambda one: f"{one.duration_ns / 1e9:.3f} s"),
         ("drift", _drift),
@@ -82,7 +84,7 @@ def _us(value: float | None) -> str | None:
 
 
 def sentences(experiment: Experiment) -> list[str]:
-    """Return what the numbers say."""
+    """Return the findings, one sentence each."""
     tracked = _tracked(experiment)
     found = [_of_sequence(one) for one in tracked if one.start_delays_ns is not None and one.ended]
     found += [_of_loop(one) for one in tracked if one.start_delays_ns is None and one.ended]
@@ -110,7 +112,7 @@ def _of_loop(one: Tracked) -> str:
 
 
 def page(experiment: Experiment) -> str:
-    """Return the page of an experiment that measured at least one set-up. Takes matplotlib."""
+    """Return the page of an experiment with at least one set-up. Needs matplotlib."""
     from dxlrun_lab.tracking.figures import drawings
 
     tracked, motion = _tracked(experiment), experiment.motion

@@ -1,7 +1,7 @@
-"""Set-ups: which schedule sends the motion, and on which scheduler of the operating system.
+"""Set-ups: schedule that sends the motion, and scheduling policy of the operating system.
 
-The thesis (M. A. Araujo, UFU 2017, section 5.3.3) measures three of them. Its sequential sender on the
-real-time scheduler, the fourth, it leaves open.
+The thesis (M. A. Araujo, UFU 2017, section 5.3.3) measures three of them. It does not measure the fourth, a
+sequential sender on the real-time scheduler.
 """
 
 from __future__ import annotations
@@ -18,15 +18,15 @@ from dxlrun.tooling.realtime import missing_priority
 
 
 class Setup(msgspec.Struct, frozen=True):
-    """One way to send a motion; all else is as in any run."""
+    """Way to send a motion. All other settings are those of an ordinary run."""
 
     name: str
     title: str
     schedule: ScheduleName
     real_time: bool
-    """On the real-time scheduler of the robot file, else on the ordinary one."""
+    """True for the real-time scheduler of the robot file, false for the ordinary one"""
     thesis: str
-    """Which figures of the thesis show it."""
+    """Figures of the thesis that show it"""
 
     def plan(self, plan: Plan) -> Plan:
         """Return a robot's plan in this set-up."""
@@ -50,7 +50,7 @@ _BY_NAME = {setup.name: setup for setup in SETUPS}
 
 
 def chosen(names: Sequence[str]) -> tuple[Setup, ...]:
-    """Return set-ups by their names, in the order of SETUPS; raises InputError for a word that is none."""
+    """Return set-ups by name, in the order of SETUPS. Raises InputError for an unknown name."""
     for name in names:
         if name not in _BY_NAME:
             raise InputError(f"there is no set-up {name!r}; {suggestion(name, tuple(_BY_NAME))}")
@@ -58,7 +58,7 @@ def chosen(names: Sequence[str]) -> tuple[Setup, ...]:
 
 
 def require_right(setups: Sequence[Setup], plan: Plan) -> None:
-    """Raise InputError where a set-up needs a priority that this user may not have."""
+    """Raise InputError if a set-up needs a priority that this user is not allowed to use."""
     real_time = [one for one in setups if one.real_time]
     missing = [line for one in real_time if (line := missing_priority(one.plan(plan).loop.scheduler))]
     if not missing:

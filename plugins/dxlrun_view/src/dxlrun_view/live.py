@@ -209,10 +209,8 @@ class LiveRobot:
             message = robot.newest(topic.name)
             if message is not None:
                 numbers = numbers_in(message.message, f"{topic.name}:")
-                self._fields = {
-                    **self._fields,
-                    topic.name: tuple(numbers),
-                }  # new: it is read in threads
+                # A new mapping, because another thread may be reading the old one.
+                self._fields = {**self._fields, topic.name: tuple(numbers)}
 
     def _note_topics(self, robot: RemoteRobot, now_s: float) -> None:
         """Append the newest messages of the topics that a page draws."""
