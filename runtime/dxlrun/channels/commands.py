@@ -26,7 +26,7 @@ MOST_PER_CYCLE = 8
 LONGEST_COMMAND = 256 * 1024
 """Longest record of a command, bytes: a trajectory of some thousand points for twenty joints."""
 
-_USUAL_COMMAND = 512
+_USUAL_COMMAND = 512  # bytes of a typical record, for the capacity of rings
 _NUMBER = 8
 """Bytes of a float64."""
 

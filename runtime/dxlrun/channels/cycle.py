@@ -29,7 +29,7 @@ LOST_CYCLES = 3
 LOST_AGE_NS = 50_000_000
 """Age of the last reply after which a servo is lost. Three cycles at 1 kHz are shorter than the stalls of
 hosts, virtual machines and USB adapters; three cycles at 50 Hz are not [i]."""
-MOST_CONTROLLERS = 63
+MOST_CONTROLLERS = 63  # bits of the masks `active` and `published`
 
 SCALARS: tuple[tuple[str, str], ...] = (
     ("cycle", "int64"),

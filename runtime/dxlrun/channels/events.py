@@ -252,7 +252,7 @@ class EventSink(Protocol):
         ...
 
 
-LONGEST_SOURCE = 64
+LONGEST_SOURCE = 64  # characters; longer names are cut
 LONGEST_TEXT = 8192
 """Characters; a longer text, such as a plug-in's traceback, is cut."""
 LONGEST_DATA = 4096

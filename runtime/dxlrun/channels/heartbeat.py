@@ -22,11 +22,11 @@ from dxlrun.channels.shared_memory import load, store
 from dxlrun.process_table import read_stat
 
 _PHASE, _BEATS, _CYCLE, _SKIPPED, _LOOKS, _CYCLE_NS, _CALL, _SUPERVISOR_LOOKS, _STEERING = range(9)
-_NAMES = 4096
+_NAMES = 4096  # offset of the names of controllers, in bytes
 _NAME_BYTES = 128
 _MOST_NAMES = 64
 _SIZE = _NAMES + _MOST_NAMES * _NAME_BYTES
-_STEP_BITS = 8
+_STEP_BITS = 8  # low bits of the word _CALL, which have the method; the others have the place
 
 
 @unique

@@ -28,8 +28,8 @@ END_TIMEOUT_S = 10.0
 
 _ONE_THREAD = dict.fromkeys(("OPENBLAS_NUM_THREADS", "OMP_NUM_THREADS", "MKL_NUM_THREADS"), "1")
 """Environment that stops numpy from starting a thread for each core on import."""
-_LINE_LIMIT = 1 << 20
-_MOST_DESCRIPTORS = 64
+_LINE_LIMIT = 1 << 20  # bytes; a longer incomplete message closes the channel
+_MOST_DESCRIPTORS = 64  # in one receive
 
 
 def spare_core(taken: Collection[int]) -> int:

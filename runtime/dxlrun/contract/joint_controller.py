@@ -17,7 +17,7 @@ from dxlwire.modes import CommandName
 
 LAWS: dict[str, CommandName] = {"positions": "position", "velocities": "velocity", "efforts": "effort"}
 """Methods of a JointController with the command interface that each method claims."""
-_MOST_SHOWN = 60
+_MOST_SHOWN = 60  # characters of a wrong value in a message
 _TAKEN = ("start", "context", "parameters", "type", "active", "rate", "fallback", "into")
 """Names that are not allowed for fields: attributes of controllers, and keys of their entries."""
 

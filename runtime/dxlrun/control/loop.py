@@ -204,6 +204,7 @@ class Loop:
             self._take_servo_limits()
         if record.states.mode.tobytes() != self.gate.modes:
             self.gate.enter_modes()
+        # For some twenty joints, a search in bytes takes less than a tenth of the time of a numpy reduction.
         if Torque.GIVEN in record.states.torque.tobytes():
             self._anchoring.anchor_given()
         valid = record.states.valid

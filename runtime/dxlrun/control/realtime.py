@@ -419,7 +419,7 @@ class Pacing:
         self._clock.spin_ns = min(self.measured_ns, most_ns, period_ns // MOST_SHARE)
 
 
-# What a process may ask for
+# Limits of this process
 
 IPC_LOCK, SYS_NICE = 14, 23
 """Bit numbers of capabilities (linux/capability.h)."""

@@ -80,6 +80,7 @@ class Schedule:
                 not run in a burst. `catch_up` selects the next cycle, and skips cycles only if more than
                 MOST_CAUGHT_UP are due.
         """
+        # Floor division of the negative difference rounds up to the first deadline that has not passed.
         first = self.cycle - (self.due_ns - now_ns) // self.period_ns
         if policy == "catch_up":
             first -= MOST_CAUGHT_UP

@@ -23,6 +23,7 @@ import numpy as np
 from dxlrun.channels.heartbeat import ControllerMethod, Heartbeat
 from dxlrun.errors import ControllerFault, counted
 
+# Characters. The end of a traceback has the line that raised, and the text of an event has 8192 at most.
 _TRACEBACK = 6000
 P = ParamSpec("P")
 _LOADING = int(ControllerMethod.ON_CONFIGURE)

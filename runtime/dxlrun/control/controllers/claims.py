@@ -52,7 +52,7 @@ def conflicts(claimants: Iterable[ControllerPlan]) -> tuple[Conflict, ...]:
 def _claims(claimant: ControllerPlan, named: Plans) -> Iterator[tuple[str, str]]:
     """Yield pairs of joint and claimed reference. The reference is empty if the servo is claimed.
 
-    A controller that is into several ones claims each joint at the one in `named` that exports it.
+    A controller above several others claims each joint at the controller in `named` that exports it.
     """
     for command in claimant.source_commands:
         yield "", command

@@ -28,7 +28,7 @@ FEEDBACK_NS = 100_000_000
 GOALS_TOPIC = "/goals"
 KEPT = 256
 """Number of ended goals whose outcome is kept."""
-_LONGEST_TEXT = 500
+_LONGEST_TEXT = 500  # characters; a GoalReport must fit LONGEST_DATA of an event
 _UNREACHED = (Outcome.MISSED, Outcome.ABORTED)
 CERTAIN_NS = 500_000_000
 """Longest wait for missing replies and uncertain torque before a goal ends; at least LOST_CYCLES periods.

@@ -62,6 +62,7 @@ def update_order(plans: Sequence[ControllerPlan]) -> tuple[str, ...]:
     place = {plan.name: number for number, plan in enumerate(plans)}
     sorter = _sorter(plans, edges(plans))
     sorter.prepare()
+    # The heap keeps the given order among controllers that are ready at the same time.
     ready = [place[name] for name in sorter.get_ready()]
     heapify(ready)
     order: list[str] = []

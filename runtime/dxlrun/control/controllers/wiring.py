@@ -115,6 +115,7 @@ class Inputs:
     def gather(self) -> None:
         """Copy the inputs that are not views, and convert ages to s."""
         for source, own, place in self._pairs:
+            # numpy buffers `out` with the default mode "raise" (numpy.take). The indices are always valid.
             source.take(place, axis=-1, out=own, mode="clip")
         if self._aged:
             ages_ns = self._ages_ns[self._age_places]
@@ -244,6 +245,7 @@ class Outputs:
             ControllerFault: A command is infinite, or is NaN after a finite value.
         """
         own, seen, wrong = self.own, self._seen, self._wrong
+        # `greater` of bools is "claimed and not finite", without a temporary array.
         np.greater(self._claimed, np.isfinite(own, self._finite), wrong)
         if np.count_nonzero(wrong) and (wrong := wrong & (seen | np.isinf(own))).any():
             if self._rows is not None:
