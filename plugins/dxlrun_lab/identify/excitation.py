@@ -1,8 +1,8 @@
-"""What an identification moves: goals that tell inertia, back-EMF, friction, gravity and delay apart.
+"""Excitation: goals that separate inertia, back-EMF, friction, gravity and delay.
 
-Four parts, in the spirit of J. Swevers et al., "Optimal robot excitation and identification" (IEEE Trans.
-Robotics and Automation 13, 1997): steps, in which the voltage saturates and the motor is at its own dynamics;
-a sum of sines and a rising sine, for all frequencies that the joint follows; slow triangles of several
+It has four parts, in the spirit of J. Swevers et al., "Optimal robot excitation and identification" (IEEE
+Trans. Robotics and Automation 13, 1997): steps, which saturate the voltage and show the motor's own dynamics;
+a sum of sines and a chirp, for all frequencies that the joint can follow; and slow triangles at several
 speeds, for friction.
 """
 
@@ -18,16 +18,16 @@ from dxlrun import InputError
 from dxlrun_lab.identify.model import Floats
 
 LEAST_S, LEAST_RANGE = 10.0, math.radians(5)
-"""s, and rad to each side, less than which cannot tell a motor from friction"""
+"""Shortest duration, s, and smallest range to each side, rad, that separate a motor from friction"""
 _SHARES = {"steps": 0.3, "sines": 0.3, "chirp": 0.15, "triangles": 0.25}
 _SINES = 12
 _LOW_HZ, _HIGH_HZ = 0.15, 5.0
 _MARGIN = 0.95
-"""Part of the range and of the limits that is used: a servo overshoots"""
+"""Fraction of range and limits that is used, because a servo overshoots"""
 
 
 class Room(msgspec.Struct, frozen=True):
-    """Within what a joint may move."""
+    """Range and limits of a joint"""
 
     lower: float
     """rad"""
@@ -35,21 +35,21 @@ class Room(msgspec.Struct, frozen=True):
     velocity: float = math.inf
     """rad/s"""
     acceleration: float = math.inf
-    """rad/s^2; infinite: goals may jump"""
+    """rad/s^2; infinite if goals may jump"""
 
     @property
     def middle(self) -> float:
-        """rad"""
+        """Middle of the range, rad"""
         return (self.lower + self.upper) / 2
 
     @property
     def reach(self) -> float:
-        """rad to each side of the middle that goals use"""
+        """Largest distance of goals from the middle, rad"""
         return _MARGIN * (self.upper - self.lower) / 2
 
 
 class Part(NamedTuple):
-    """One part of the excitation: goals, rad, one each period."""
+    """Part of the excitation: goals, rad, one per period"""
 
     title: str
     goals: Floats
@@ -58,9 +58,17 @@ class Part(NamedTuple):
 def excitation(
     room: Room, seconds: float, period_s: float, *, start: float, seed: int = 0
 ) -> tuple[Part, ...]:
-    """Return goals for a joint at `start`, rad, which stay within the range and the limits.
+    """Return goals for a joint, which stay within the range and the limits.
 
-    Raises InputError where the range or the time is too small to tell anything.
+    Args:
+        room: Range and limits.
+        seconds: Duration, s.
+        period_s: Time between two goals, s.
+        start: Present position, rad.
+        seed: Seed of the random numbers.
+
+    Raises:
+        InputError: The range or the duration is too small.
     """
     if seconds < LEAST_S:
         raise InputError(
@@ -84,17 +92,17 @@ def excitation(
 
 
 def _glide(start: float, end: float, room: Room, period_s: float) -> Floats:
-    """Return a smooth way, at most at half of the limits and 1 rad/s."""
+    """Return a smooth motion at up to 1 rad/s and half of the limits."""
     way = abs(end - start)
     speed = min(1.0, room.velocity / 2)
-    # the peaks of 10 s^3 - 15 s^4 + 6 s^5 are 1.875 and 5.774
+    # The peaks of the first and second derivative of 10 s^3 - 15 s^4 + 6 s^5 are 1.875 and 5.774.
     duration = max(0.3, 1.875 * way / speed, math.sqrt(5.774 * way / min(20.0, room.acceleration / 2)))
     s = np.linspace(0.0, 1.0, max(2, round(duration / period_s)))
     return start + (end - start) * s**3 * (10 - 15 * s + 6 * s**2)
 
 
 def _steps(room: Room, count: int, period_s: float, random: np.random.Generator) -> Floats:
-    """Return steps between both halves of the range, held for 0.15 to 0.6 s; ramps where there are limits."""
+    """Return steps between both halves of the range, held for 0.15 to 0.6 s. With limits they are ramps."""
     goals = np.empty(0)
     side, at = 1.0, room.middle
     while len(goals) < count:
@@ -107,7 +115,7 @@ def _steps(room: Room, count: int, period_s: float, random: np.random.Generator)
 
 
 def _limited(start: float, end: float, room: Room, period_s: float) -> Floats:
-    """Return a jump, or what the limits of velocity and acceleration leave of it."""
+    """Return a step, or a ramp within the limits of velocity and acceleration."""
     way = abs(end - start)
     if room.acceleration == math.inf and room.velocity == math.inf:
         return np.full(1, end)
@@ -124,7 +132,7 @@ def _limited(start: float, end: float, room: Room, period_s: float) -> Floats:
 
 
 def _fitted(shape: Floats, room: Room, period_s: float) -> Floats:
-    """Return a shape around 0, as large as range, velocity and acceleration allow, around the middle."""
+    """Scale a shape as far as range, velocity and acceleration allow, and move it to the middle."""
     velocity = np.gradient(shape, period_s)
     factor = min(
         room.reach / max(1e-9, float(np.abs(shape).max())),
@@ -135,7 +143,7 @@ def _fitted(shape: Floats, room: Room, period_s: float) -> Floats:
 
 
 def _window(count: int, period_s: float) -> Floats:
-    """Return 1, with soft ends of 0.5 s."""
+    """Return a window of ones with smooth ends of 0.5 s."""
     ends = max(1, min(round(0.5 / period_s), count // 4))
     ramp = np.sin(np.linspace(0.0, math.pi / 2, ends)) ** 2
     return np.concatenate((ramp, np.ones(max(0, count - 2 * ends)), ramp[::-1]))
@@ -157,7 +165,7 @@ def _chirp(room: Room, count: int, period_s: float) -> Floats:
 
 
 def _triangles(room: Room, count: int, period_s: float) -> Floats:
-    """Return ways to and fro, each half at another slow speed."""
+    """Return triangles with a different slow speed on each flank."""
     goals, at, side = [np.full(1, room.middle)], room.middle, 1.0
     speeds, total = (0.15, 0.4, 0.8, 0.25, 0.6), 1
     while total < count:
@@ -169,7 +177,7 @@ def _triangles(room: Room, count: int, period_s: float) -> Floats:
             if total >= count:
                 break
     way = np.concatenate(goals)[: max(1, count)]
-    # a corner changes the speed by 2 x 0.8 rad/s: the mean over a time spreads that
+    # A corner changes the speed by 2 x 0.8 rad/s. A moving average keeps the acceleration limit.
     rounded = round(2 * max(speeds) / (_MARGIN * min(room.acceleration, 1e6)) / period_s)
     if rounded > 1:
         ends = (np.full(rounded, way[0]), way, np.full(rounded, way[-1]))

@@ -1,4 +1,4 @@
-"""The experiment: excitation of one joint after the other on a robot, and the fit of what was recorded."""
+"""Experiment: excitation of joints on a robot, one after the other, and the fit of the recordings."""
 
 from __future__ import annotations
 
@@ -21,40 +21,40 @@ from dxlrun_lab.identify.result import Identified, KnownLoad, identified
 from dxlrun_lab.identify.servo import Servo, servo_of, servos_in
 
 SECONDS = 60.0
-"""For which each joint is excited"""
+"""Duration of the excitation of each joint, s"""
 _LEAST_RATE = 50.0
-"""Hz, below which a motor's dynamics fall between two samples"""
+"""Lowest loop rate that resolves a motor's dynamics, Hz"""
 
 
 class Options(msgspec.Struct, frozen=True):
-    """How a servo is identified."""
+    """Options of an identification"""
 
     seconds: float = SECONDS
     seed: int = 0
-    """Of the excitation's chance"""
+    """Seed of the excitation's random numbers"""
     load: KnownLoad = msgspec.field(default_factory=KnownLoad)
     voltage: float | None = None
-    """V, instead of what the servo reports"""
+    """Supply voltage in place of the servo's measurement, V"""
 
 
 class JointResult(msgspec.Struct, frozen=True):
-    """One joint: what was found, or why nothing was."""
+    """Result of one joint, or the reason why there is none"""
 
     joint: str
     identified: Identified | None
     refusal: str = ""
-    """Why there is no result, one sentence"""
+    """Reason for a missing result, one sentence"""
     position: Curve | None = None
-    """As measured and as the model has it"""
+    """Measured and simulated positions"""
 
 
 class Identification(msgspec.Struct, frozen=True):
-    """Excites one joint after the other; an Experiment of guided/."""
+    """Experiment (see guided/) that excites one joint after the other"""
 
     options: Options = Options()
 
     def moves(self, situation: Situation) -> Sequence[str]:
-        """Return what will move; raises InputError where a joint cannot be identified here."""
+        """Describe the motions. Raises InputError for a joint that cannot be identified."""
         if situation.rate < _LEAST_RATE:
             raise InputError(
                 f"the loop's rate is {situation.rate:g} Hz, and a motor takes {_LEAST_RATE:g} Hz to be "
@@ -71,13 +71,13 @@ class Identification(msgspec.Struct, frozen=True):
         ]
 
     def procedure(self, situation: Situation) -> Procedure:
-        """Yield the excitation of each joint; the others hold."""
+        """Yield the excitation of each joint. All other joints hold."""
         for joint in situation.joints:
             for segment in self._parts(joint, situation):  # noqa: UP028  a list takes no answers
                 yield segment
 
     def finish(self, situation: Situation, recorded: Sequence[Recorded], why: str) -> tuple[JointResult, ...]:
-        """Return the result of each joint, from what there is of it."""
+        """Return the result of each joint, from its recordings."""
         results = []
         for joint in situation.joints:
             mine = [part for part in recorded if joint.name in part.segment.rows]
@@ -105,9 +105,10 @@ class Identification(msgspec.Struct, frozen=True):
 
 
 def from_log(log: Log, joints: Sequence[str], options: Options) -> tuple[JointResult, ...]:
-    """Return the result of some joints of an earlier run; all of them where none is named.
+    """Return the results of joints of an earlier run, by default of all joints.
 
-    Raises InputError for a joint that the log does not have, and where no joint can be identified.
+    Raises:
+        InputError: The log lacks a joint, or a joint cannot be identified.
     """
     source = Path(log.path).name
     return tuple(

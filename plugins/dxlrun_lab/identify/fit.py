@@ -1,12 +1,13 @@
-"""The fit: the numbers of the model with which its simulation is nearest to what was measured.
+"""Fit: parameters of the model with which the simulation is closest to the measurements.
 
-Output error: each piece of the run is simulated from its commands alone, and positions (and currents, or
-duties) are compared with the measured ones. A linear least squares on smoothed accelerations is the start.
+The method is output error. Each piece of the run is simulated from its commands alone, and positions (and
+currents, or duties) are compared with the measured ones. A linear least squares fit on smoothed accelerations
+provides the start.
 
-Intervals are linearised, with residuals that hang together taken into account: the covariance is the
-sandwich of K.-Y. Liang and S. L. Zeger, "Longitudinal data analysis using generalized linear models"
-(Biometrika 73, 1986), with the pieces of a second as clusters, jackknifed as they are few (R. M. Bell and
-D. F. McCaffrey, Survey Methodology 28, 2002), and Student's t of as many.
+Confidence intervals are linearised and account for correlated residuals. The covariance is the sandwich
+estimator of K.-Y. Liang and S. L. Zeger, "Longitudinal data analysis using generalized linear models"
+(Biometrika 73, 1986), with pieces of one second as clusters. They are few, so the estimator is jackknifed
+(R. M. Bell and D. F. McCaffrey, Survey Methodology 28, 2002) and Student's t is used.
 """
 
 from __future__ import annotations
@@ -24,7 +25,7 @@ from dxlrun_lab.identify.measured import Compared, Measured
 from dxlrun_lab.identify.model import ROWS, STEP_S, Floats, Numbers, Simulated, simulate
 
 _HELD_OUT = 5
-"""Every fifth piece is left out of the fit, and judges it"""
+"""Every fifth piece is held out of the fit for its validation"""
 _LIMITS: Mapping[str, tuple[float, float, float]] = {
     "drive": (1.0, 1e-2, 1e5),
     "back_emf": (0.02, 1e-4, 50.0),
@@ -40,68 +41,69 @@ _LIMITS: Mapping[str, tuple[float, float, float]] = {
     "resistance": (0.05, 1e-2, 1e4),
     "effort_delay": (2e-4, -0.02, 0.02),
 }
-"""Of each number a change that shows, by which derivatives are taken, and its bounds."""
+"""Step for derivatives, lower bound and upper bound of each parameter"""
 _RELATIVE = frozenset(("drive", "back_emf", "gain", "resistance"))
-"""Those whose change is a part of the start."""
+"""Parameters whose step is relative to their start value"""
 _COULOMB = ("drive", "back_emf", "friction", "delay", "gravity_sin", "gravity_cos")
 _ALIKE = 0.8
-"""Correlation of measured and simulated effort, below which the measured one is something else"""
+"""Correlation of measured and simulated effort below which the measurement is not the modelled effort"""
 _SATURATED = 0.01
-"""Part of the time at full duty from which on that tells how large a duty is"""
+"""Fraction of the time at full duty above which the scale of the duty can be identified"""
 _SMOOTH_S = 0.06
 _MORE_FRICTION = ("load_friction", "stribeck_friction")
 _BETTER = 0.03
-"""Part by which friction near standstill must lower the error in the pieces that were held out"""
+"""Relative reduction of the error in held-out pieces that friction near standstill must achieve"""
 _FAR = 0.15
-"""Part of the whole way by which a servo never is off the simplest model"""
+"""Largest error of the simplest model for a servo, as a fraction of the travel"""
 _LOOSE = 0.5
-"""Part of the drive as its half-width, from which on nothing is determined"""
+"""Relative half-width of the drive above which the motor is not determined"""
 _EFFORT_S = 3e-3
-"""s by which the time of an effort is uncertain: what it shows is of its control's last turn, and filtered"""
+"""Uncertainty of the time of an effort, s. It is filtered, and from the last period of the servo's control.
+"""
 _TIMING_S = 1.5e-3
-"""s by which all times of commands and positions may be wrong together, one standard deviation: turns of the
-servo's own control, and what an adapter keeps [i]. More samples do not make it less."""
+"""Common error of all times of commands and positions, s, one standard deviation: period of the servo's
+control and delay of the adapter [i]. More samples do not reduce it."""
 
 
 class Fit(msgspec.Struct, frozen=True):
-    """The numbers that fit best."""
+    """Parameters of the best fit"""
 
     friction_model: str
     """m1: Coulomb and viscous; m3: and load-dependent; m4: and Stribeck"""
     numbers: Numbers
     free: tuple[str, ...]
-    """Those that were fitted; the others are as they were given"""
+    """Names of the fitted parameters. All others have given values."""
     covariance: Floats
-    """Of `free`, shape (free, free)"""
+    """Covariance of `free`, shape (free, free)"""
     pieces: int
-    """As many clusters as the intervals are from"""
+    """Number of clusters of the confidence intervals"""
     independent: float
-    """As many independent residuals as those of the fit count for"""
+    """Effective number of independent residuals"""
     position_rms: float
-    """rad, of measured minus simulated in the pieces that were fitted"""
+    """Root mean square position error in the fitted pieces, rad"""
     held_out_rms: float
-    """rad, in those that were not"""
+    """Root mean square position error in the held-out pieces, rad"""
     effort_rms: float | None
-    """Of the efforts, A or part of the full voltage; None: not used"""
+    """Root mean square error of the efforts, A or fraction of full voltage; None if not used"""
     noise: tuple[float, float]
-    """Standard deviations of what is left of positions and efforts, for a fit that begins here"""
+    """Standard deviations of the residuals of positions and efforts, for the next fit"""
     bic: float
     """Schwarz' criterion; comparable between fits of one run"""
 
     @property
     def student(self) -> float:
-        """Half-widths of 95 % in standard deviations."""
+        """Half-width of a 95 % interval in standard deviations"""
         return float(stats.t.ppf(0.975, max(2, self.pieces - len(self.free))))
 
     def variance(self, name: str) -> float:
-        """Return the variance of a number; 0 where it was given."""
+        """Return the variance of a parameter, or 0 if it was given."""
         return (
             float(self.covariance[self.free.index(name), self.free.index(name)]) if name in self.free else 0.0
         )
 
 
 class Curve(msgspec.Struct, frozen=True):
-    """What was measured and what the model does, for a picture; shape (samples,)."""
+    """Measured and simulated values for a figure, shape (samples,)"""
 
     time_s: Floats
     measured: Floats
@@ -110,9 +112,10 @@ class Curve(msgspec.Struct, frozen=True):
 
 
 def fit_run(run: Measured) -> tuple[Fit, ...]:
-    """Fit the model with more and more friction; the first is the one that the run bears out.
+    """Fit the model with increasingly detailed friction. The first result is the model that the run supports.
 
-    Raises InputError with one sentence where the run does not determine the motor.
+    Raises:
+        InputError: The run does not determine the motor.
     """
     start = _start(run)
     noise = (max(run.servo.tick / np.sqrt(12), 3e-4), _first_effort_noise(run))
@@ -130,7 +133,7 @@ def fit_run(run: Measured) -> tuple[Fit, ...]:
 
 
 def curves(run: Measured, numbers: Numbers) -> tuple[Curve, Curve]:
-    """Return positions and efforts in the run's order, and what the model makes of them."""
+    """Return measured and simulated positions and efforts, by time."""
     parts = [(group, _simulated(group, numbers.array()[:, None])) for group in run.groups]
     order = np.argsort(np.concatenate([group.time_s for group in run.groups]), kind="stable")
     time_s = np.concatenate([group.time_s for group in run.groups])[order]
@@ -152,7 +155,7 @@ def curves(run: Measured, numbers: Numbers) -> tuple[Curve, Curve]:
 
 
 def _start(run: Measured) -> Numbers:
-    """Return the numbers of a linear least squares, or those of the built-in motor if they are nearer."""
+    """Return the start values: those of the built-in motor, or a linear fit if it is better."""
     built_in = run.servo.built_in
     gain, _ = run.servo.expected_gain()
     voltage = built_in.voltage or 12.0
@@ -171,7 +174,7 @@ def _start(run: Measured) -> Numbers:
 
 
 def _linear(run: Measured, known: Numbers, share: float) -> dict[str, float]:
-    """Return drive, back-EMF, friction and gravity by a linear least squares on the smoothed motion."""
+    """Fit drive, back-EMF, friction and gravity by linear least squares to the smoothed motion."""
     period = float(np.median(np.diff(run.time_s)))
     window = max(5, round(_SMOOTH_S / period) | 1)
     even = np.arange(run.time_s[0], run.time_s[-1], period)
@@ -212,7 +215,7 @@ def _cost(run: Measured, numbers: Numbers) -> float:
 
 
 def _free(run: Measured, start: Numbers) -> tuple[str, ...]:
-    """Return the numbers that the run can tell: the gain only where the size of a duty shows somewhere."""
+    """Return the parameters that the run determines. The gain needs a known scale of the duty."""
     values = start.array()[:, None]
     duties = [np.abs(_simulated(group, values).duty) for group in run.groups]
     limit = run.groups[0].control.limit
@@ -230,7 +233,7 @@ def _free(run: Measured, start: Numbers) -> tuple[str, ...]:
 
 
 def _alike(run: Measured, numbers: Numbers) -> bool:
-    """Return whether the measured effort is what it is taken for."""
+    """Return True if the measured effort correlates with the simulated one."""
     _, effort = curves(run, numbers)
     known = np.isfinite(effort.measured)
     if np.count_nonzero(known) < 100 or np.ptp(effort.measured[known]) == 0.0:
@@ -253,7 +256,7 @@ def _fit(run: Measured, name: str, start: Numbers, free: Sequence[str], noise: t
     x = np.clip(fixed[rows], bounds[0] + 1e-9, bounds[1] - 1e-9)
 
     def residuals(x: Floats, *, steps: Floats | None = None) -> Floats:
-        """Return the residuals of x, or of x and x with each number changed; shape (samples, sets)."""
+        """Return the residuals of x, and of x with a step in each parameter; shape (samples, sets)."""
         sets = 1 if steps is None else len(x) + 1
         values = np.repeat(fixed[:, None], sets, axis=1)
         values[rows] = x[:, None]
@@ -273,7 +276,7 @@ def _fit(run: Measured, name: str, start: Numbers, free: Sequence[str], noise: t
         return np.concatenate(parts)
 
     def jacobian(x: Floats) -> Floats:
-        # inwards at a bound
+        # Step inwards at a bound.
         steps = np.where(x + typical / 10 < bounds[1], typical, -typical) / 10
         found = residuals(x, steps=steps)
         slopes: Floats = (found[:, 1:] - found[:, :1]) / steps
@@ -315,11 +318,12 @@ def _fit(run: Measured, name: str, start: Numbers, free: Sequence[str], noise: t
 
 
 def _judged(fits: Sequence[Fit]) -> tuple[Fit, ...]:
-    """Return fits with their BIC, that one first which has no more friction than the run bears out.
+    """Return the fits with their BIC, the selected one first.
 
-    More friction must lower the BIC (G. Schwarz, Annals of Statistics 6, 1978) of the positions, with as many
-    residuals as are independent, and be told from 0. Friction near standstill must also lower the error in
-    the pieces that were held out: of very many samples the rest takes each small fault of the model for it.
+    Additional friction must lower the BIC (G. Schwarz, Annals of Statistics 6, 1978) of the positions,
+    computed with the effective number of residuals, and differ significantly from 0. Friction near standstill
+    must also lower the error in held-out pieces, because with many samples it would otherwise fit any error
+    of the model.
     """
     count = fits[-1].independent
     judged = [
@@ -341,13 +345,13 @@ def _simulated(group: Compared, values: Floats) -> Simulated:
 def _sampled(
     run: Measured, group: Compared, found: Simulated, quantity: str, delays: Floats | None = None
 ) -> Floats:
-    """Return positions, or efforts as the servo measures them, at the samples; shape (samples, sets).
+    """Return simulated positions or efforts at the samples, shape (samples, sets).
 
-    `delays`: s by which each set's effort is older than the position.
+    `delays` is the age of each set's effort relative to the position, s.
     """
     if quantity == "position":
         return _between(found.position, group, group.step, group.part)
-    # a duty holds for its step, and is in its middle what a line between two of them is at a point
+    # A duty holds for a whole step, so the interpolation is shifted by half a step.
     values = found.current if run.servo.measures_current else found.duty
     delays = np.zeros(values.shape[1]) if delays is None else delays
     sampled = np.empty((len(group.step), values.shape[1]))
@@ -376,9 +380,9 @@ def _first_effort_noise(run: Measured) -> float:
 
 
 def _noise(run: Measured, numbers: Numbers, before: tuple[float, float]) -> tuple[float, float]:
-    """Return what is left of positions and of efforts, robustly, not less than positions in ticks explain.
+    """Return robust standard deviations of the residuals of positions and efforts.
 
-    Efforts never count for more than at first: between their steps they are not what the model says.
+    They are at least the quantisation noise of positions, and the initial noise of efforts.
     """
     found = []
     for curve, least in zip(curves(run, numbers), (run.servo.tick / np.sqrt(12), before[1]), strict=True):
@@ -397,8 +401,8 @@ def _clusters(run: Measured, *, twice: bool) -> NDArray[np.intp]:
 
 
 def _sandwich(slopes: Floats, left: Floats, clusters: NDArray[np.intp]) -> Floats:
-    """Return the covariance of a least squares whose residuals hang together within clusters."""
-    # Huber's weights of the loss, as residuals of 3 and more count less
+    """Return the covariance of a least squares fit with residuals that are correlated within clusters."""
+    # Weights of the soft L1 loss, which reduce the influence of residuals above 3.
     weight = 1.0 / np.sqrt(1.0 + np.square(left / 3.0))
     scale = 1.0 / np.maximum(np.sqrt(np.sum(np.square(slopes), axis=0)), 1e-12)
     scaled = slopes * scale
@@ -410,7 +414,7 @@ def _sandwich(slopes: Floats, left: Floats, clusters: NDArray[np.intp]) -> Float
         mine = clusters == name
         slope, score = scaled[mine], (weight * left)[mine]
         own = (slope * weight[mine][:, None]).T @ slope
-        # as the fit without this piece has it: a piece pulls the fit towards itself
+        # Use the residuals of the fit without this piece, because a piece pulls the fit towards itself.
         jackknifed = information @ np.linalg.pinv(information - own, rcond=1e-12) @ (slope.T @ score)
         meat += np.outer(jackknifed, jackknifed)
     part = (len(names) - 1) / len(names)
@@ -419,9 +423,9 @@ def _sandwich(slopes: Floats, left: Floats, clusters: NDArray[np.intp]) -> Float
 
 
 def _by_timing(slopes: Floats, free: Sequence[str]) -> Floats:
-    """Return the covariance by a delay that is wrong: it moves the others as far as they can stand for it.
+    """Return the covariance by an error of the delay, which other parameters partly compensate.
 
-    In a smooth motion a larger gain looks like a shorter delay; where steps tell them apart this is small.
+    In a smooth motion, a larger gain looks like a shorter delay. Steps in the motion separate them.
     """
     delay = free.index("delay")
     others = [each for each in range(len(free)) if each != delay]
@@ -432,7 +436,7 @@ def _by_timing(slopes: Floats, free: Sequence[str]) -> Floats:
 
 
 def _independent(left: Floats, clusters: NDArray[np.intp]) -> float:
-    """Return as how many independent residuals these count, by their correlation within clusters."""
+    """Return the effective number of independent residuals, from their correlation within clusters."""
     same = clusters[1:] == clusters[:-1]
     power = float(np.mean(np.square(left)))
     lag = float(np.mean((left[1:] * left[:-1])[same])) / power if power > 0 and same.any() else 0.0
@@ -445,7 +449,7 @@ def _rms(values: Floats) -> float:
 
 
 def _require_followed(run: Measured, fit: Fit) -> None:
-    """Raise InputError where a run is not that of a servo which follows these goals."""
+    """Raise InputError if the joint did not follow its goals as a servo does."""
     if fit.position_rms > _FAR * run.moved:
         raise InputError(
             f"{run.servo.joint}: no model of a servo follows this run ({fit.position_rms:.2g} of "
@@ -455,7 +459,7 @@ def _require_followed(run: Measured, fit: Fit) -> None:
 
 
 def _require_determined(run: Measured, fit: Fit) -> None:
-    """Raise InputError where not even the motor's drive is determined."""
+    """Raise InputError if the drive of the motor is not determined."""
     name = run.servo.joint
     part = fit.student * np.sqrt(fit.variance("drive")) / fit.numbers.drive
     if part > _LOOSE:

@@ -1,7 +1,8 @@
-"""What a run has of one joint, as the fit takes it: commands, samples, voltage, and the spans that count.
+"""Measured data of one joint for the fit: commands, samples, voltage, and usable spans.
 
-A span is what happened without a break: torque on, one mode, goals known. It is cut into pieces, which are
-simulated side by side: each from a bit before the part that is compared, so that how it began is forgotten.
+A span is an uninterrupted time with torque, in one mode, and with known goals. It is cut into pieces, which
+are simulated in parallel. The simulation of a piece starts before the part that is compared, so that the
+error of its initial state has decayed.
 """
 
 from __future__ import annotations
@@ -21,77 +22,84 @@ from dxlrun_lab.identify.servo import Servo
 from dxlwire import Mode
 
 PIECE_S = 1.0
-"""s of a piece that are compared"""
+"""Compared part of a piece, s"""
 LEAD_S = 0.5
-"""s before it: 7 to 30 times what a position controller takes to forget"""
+"""Simulated time before the compared part, s: 7 to 30 time constants of a position controller"""
 _LEAST_S = 8.0
-"""s of usable data, less than which is no run"""
+"""Shortest duration of usable data, s"""
 _LEAST_MOVED = 40
-"""Ticks over which a joint moved, less than which is standing still"""
+"""Shortest travel that counts as motion, ticks"""
 _SLOW = 0.1
-"""rad/s, below which a joint hardly moves: friction there is of another kind"""
+"""Speed below which a joint hardly moves, rad/s, because friction is different there"""
 _EVEN = 0.2
-"""Spread of the speeds as a part of their mean, below which it is one speed"""
+"""Relative spread of speeds below which they count as one speed"""
 _SLOPE_S = 0.03
-"""s before and behind a time, by which a velocity is estimated"""
+"""Half-width of the window for a velocity, s"""
 _VOLTAGE_S = 10.0
-"""s over which the voltage is averaged: its readings are seconds apart, and of 0.1 V"""
+"""Window of the median voltage, s. Readings are seconds apart, with a resolution of 0.1 V."""
 
 Flags = NDArray[np.bool_]
 
 
 class Compared(msgspec.Struct, frozen=True):
-    """Pieces of one mode, and the samples that they are compared with; shape (samples,)."""
+    """Pieces of one mode, and the samples to compare them with; shape (samples,)"""
 
     pieces: Pieces
     control: Control
     piece: NDArray[np.intp]
-    """To which piece a sample belongs"""
+    """Index of the piece of each sample"""
     step: NDArray[np.intp]
-    """The point of the grid before the sample"""
+    """Index of the grid point before the sample"""
     part: Floats
-    """Of the step that has passed by then, 0 to 1"""
+    """Position of the sample between two grid points, 0..1"""
     position: Floats
     effort: Floats
     effort_rate: Floats
-    """How fast the effort changes there, 1/s: where it jumps, it says little of how large it is"""
+    """Rate of change of the effort, 1/s. A fast change makes the effort uncertain."""
     time_s: Floats
-    """In the run"""
+    """Time in the run, s"""
 
 
 class Measured(msgspec.Struct, frozen=True):
-    """One joint's run."""
+    """Run of one joint"""
 
     servo: Servo
     time_s: Floats
-    """Of each sample, since the first one; shape (samples,)"""
+    """Time of each sample since the first one, s; shape (samples,)"""
     position: Floats
     """rad"""
     effort: Floats
-    """A, or part of the full voltage"""
+    """A, or fraction of full voltage"""
     command: Floats
-    """rad, or the duty, as it was when the sample was taken"""
+    """Command at the time of the sample: rad, or duty"""
     voltage: Floats
     """V, averaged"""
     by_position: Flags
-    """True where the command is a position"""
+    """True if the command is a position"""
     groups: tuple[Compared, ...]
     """All pieces, by mode"""
     seconds: float
-    """Usable"""
+    """Usable duration, s"""
     lost_s: float
-    """s of the run that are left out: torque off, servo lost, in another mode"""
+    """Unusable duration, s: without torque, with a lost servo, or in another mode"""
 
     @property
     def moved(self) -> float:
-        """How far it moved, rad."""
+        """Travel of the joint, rad"""
         return float(np.ptp(self.position))
 
 
 def measured(cycles: NDArray[np.void], row: int, servo: Servo, *, voltage: float | None = None) -> Measured:
-    """Return one joint's run from the cycles of a log, row by row; `voltage`, V, instead of the log's.
+    """Extract the run of one joint from the cycles of a log.
 
-    Raises InputError with one sentence that says what is missing for an identification.
+    Args:
+        cycles: Records of the log.
+        row: Index of the joint in the records.
+        servo: Servo of the joint.
+        voltage: Supply voltage in place of the measured one, V.
+
+    Raises:
+        InputError: The log is not sufficient for an identification.
     """
     name = servo.joint
     usable = _usable(cycles, row)
@@ -144,7 +152,7 @@ def measured(cycles: NDArray[np.void], row: int, servo: Servo, *, voltage: float
 
 
 class _Sent(NamedTuple):
-    """What was sent in each cycle, also where no reply came."""
+    """Commands of all cycles, including those without a reply"""
 
     time_s: Floats
     command: Floats
@@ -152,7 +160,7 @@ class _Sent(NamedTuple):
 
 
 def _usable(cycles: NDArray[np.void], row: int) -> Flags:
-    """Return in which cycles a joint's servo certainly did what its goal asked."""
+    """Return True for each cycle with torque, a supported mode, and a known goal."""
     mode, torque = cycles["mode"][:, row], cycles["torque"][:, row]
     goal = np.where(mode == Mode.PWM, cycles["goal_pwm"][:, row], cycles["goal_position"][:, row])
     known = np.isin(mode, (Mode.POSITION, Mode.PWM)) & np.isin(torque, (Torque.ON, Torque.UNKNOWN))
@@ -161,7 +169,7 @@ def _usable(cycles: NDArray[np.void], row: int) -> Flags:
 
 
 def _voltage(cycles: NDArray[np.void], row: int, given: float | None, name: str) -> Floats:
-    """Return the voltage of each cycle, the median of what was read around it."""
+    """Return the voltage of each cycle, as the median of the readings around it."""
     count = len(cycles)
     if given is not None:
         return np.full(count, given)
@@ -188,7 +196,7 @@ def _voltage(cycles: NDArray[np.void], row: int, given: float | None, name: str)
 
 
 def _commands(cycles: NDArray[np.void], row: int, servo: Servo, sent_s: Floats, by_position: Flags) -> Floats:
-    """Return what the servo was to do from each cycle on; a goal with a speed is approached at that speed."""
+    """Return the command of the servo in each cycle. A goal with a speed is converted to a ramp."""
     goals = np.array([servo.rounded(goal) for goal in cycles["goal_position"][:, row].tolist()])
     speeds = np.abs(cycles["goal_velocity"][:, row])
     if (np.isfinite(speeds) & by_position).any():
@@ -198,7 +206,7 @@ def _commands(cycles: NDArray[np.void], row: int, servo: Servo, sent_s: Floats, 
 
 
 def _ramped(goals: Floats, speeds: Floats, sent_s: Floats, position: Floats) -> Floats:
-    """Return where the servo's own way to its goals is: a ramp at the commanded speed."""
+    """Return the servo's internal setpoint: a ramp to each goal at the commanded speed."""
     way = np.array(goals)
     at = float("nan")
     for index in range(len(goals)):
@@ -210,12 +218,12 @@ def _ramped(goals: Floats, speeds: Floats, sent_s: Floats, position: Floats) -> 
         ahead_s = sent_s[index + 1] - sent_s[index] if index + 1 < len(goals) else 0.0
         reach = float(speeds[index]) * float(ahead_s)
         before, at = at, at + min(max(goals[index] - at, -reach), reach)
-        way[index] = (before + at) / 2  # the mean of the way until the next goal, which is what is held
+        way[index] = (before + at) / 2  # mean of the ramp until the next cycle
     return way
 
 
 def _spans(usable: Flags, by_position: Flags, sent_s: Floats) -> list[slice]:
-    """Return the unbroken runs of usable cycles in one mode; a pause of the loop is a break too."""
+    """Return the uninterrupted spans of usable cycles in one mode. A pause of the loop ends a span."""
     period = float(np.median(np.diff(sent_s))) if len(sent_s) > 1 else 0.0
     broken = np.ones(len(usable) + 1, dtype=bool)
     pause = np.diff(sent_s) > max(0.1, 5 * period)
@@ -225,7 +233,7 @@ def _spans(usable: Flags, by_position: Flags, sent_s: Floats) -> list[slice]:
 
 
 def _require_motion(name: str, time_s: Floats, position: Floats, servo: Servo) -> None:
-    """Raise InputError when a joint stood still, or moved at one speed only."""
+    """Raise InputError if a joint did not move, or moved at a single speed."""
     if not len(position) or np.ptp(position) < _LEAST_MOVED * servo.tick:
         raise InputError(
             f"{name}: never moved in this log (by {_LEAST_MOVED} ticks), so nothing of its motor shows; "
@@ -246,7 +254,7 @@ def _require_motion(name: str, time_s: Floats, position: Floats, servo: Servo) -
 
 
 def _slopes(time_s: Floats, position: Floats, at_s: Floats) -> Floats:
-    """Return velocities at some times, rad/s: the difference over 60 ms around each."""
+    """Return velocities at given times, rad/s, as differences over 60 ms."""
     before = np.interp(at_s - _SLOPE_S, time_s, position)
     after = np.interp(at_s + _SLOPE_S, time_s, position)
     slopes: Floats = (after - before) / (2 * _SLOPE_S)
@@ -254,7 +262,7 @@ def _slopes(time_s: Floats, position: Floats, at_s: Floats) -> Floats:
 
 
 def _compared(run: Measured, sent: _Sent, spans: list[slice], control: Control) -> Compared | None:
-    """Cut spans into pieces of one length, and find the samples of each; None: there are none."""
+    """Cut spans into pieces of equal length, and find their samples. Return None if there are none."""
     starts: list[float] = []
     for span in spans:
         first, last = float(sent.time_s[span.start]), float(sent.time_s[span.stop - 1])

@@ -1,13 +1,13 @@
-"""The model of a servo that moves a load: the servo's control, a direct-current motor, its gear's friction.
+"""Model of a servo with a load: the servo's control, a direct-current motor, and the friction of the gear.
 
-M. Schwarz and S. Behnke, "Compliant Robot Behavior using Servo Actuator Models identified by Iterative
-Learning Control" (RoboCup 2013): voltage, back-EMF, Coulomb and viscous friction, inertia of motor and gear.
-Friction beyond that as M3 and M4 of M. Duclusaud et al., "Extended Friction Models for the Physics Simulation
-of Servo Actuators" (arXiv 2410.08650): a part of the torque between motor and load, and more at rest
-(Stribeck).
+Voltage, back-EMF, Coulomb and viscous friction, and the inertia of motor and gear are modelled as in M.
+Schwarz and S. Behnke, "Compliant Robot Behavior using Servo Actuator Models identified by Iterative Learning
+Control" (RoboCup 2013). Additional friction follows M3 and M4 of M. Duclusaud et al., "Extended Friction
+Models for the Physics Simulation of Servo Actuators" (arXiv 2410.08650): a fraction of the torque between
+motor and load, and additional friction at rest (Stribeck).
 
-Everything is divided by the inertia of motor and load, for that is all that positions show: a motion says
-nothing of torques. `scale.py` makes torques of it.
+All torques are divided by the inertia of motor and load, because positions alone do not determine the scale
+of torques. `result.py` converts them to torques.
 
     duty = gain * (goal - position) + damping part, beyond the margin, + punch; within the limit
     acceleration = drive * (V duty - back_emf * velocity) - gravity(position) - friction
@@ -24,93 +24,94 @@ from numpy.typing import NDArray
 Floats = NDArray[np.float64]
 
 STEP_S = 2e-3
-"""s of a step of the simulation: a seventh of the shortest time constant of a servo's motor. Everything in a
-step is of second order, so that a seventh is an error of a part in 600."""
+"""Step of the simulation, s: a seventh of the shortest time constant of a servo's motor. The integration is
+of second order, so the error is about 1 in 600."""
 
 
 class Numbers(msgspec.Struct, frozen=True):
-    """The numbers of the model; of inertia I = that of motor, gear and load."""
+    """Parameters of the model; I is the inertia of motor, gear and load"""
 
     drive: float
-    """rad/s^2 for a volt: torque constant / (resistance I)"""
+    """Acceleration per volt, torque constant / (resistance I), rad/s^2/V"""
     back_emf: float
-    """V s/rad: the torque constant, Nm/A"""
+    """Back-EMF constant, V s/rad, which equals the torque constant in Nm/A"""
     friction: float = 0.0
-    """rad/s^2 of Coulomb friction / I"""
+    """Coulomb friction / I, rad/s^2"""
     load_friction: float = 0.0
-    """Nm of friction for each Nm between the motor's torque and the load's"""
+    """Friction per torque between motor and load, Nm/Nm"""
     viscous_friction: float = 0.0
-    """1/s: viscous friction / I"""
+    """Viscous friction / I, 1/s"""
     stribeck_friction: float = 0.0
-    """rad/s^2 of friction / I at rest over Coulomb's; in motion exp(-(velocity / stribeck_speed)^2) of it"""
+    """Additional friction / I at rest, rad/s^2; in motion it is scaled by exp(-(velocity / stribeck_speed)^2)
+    """
     stribeck_speed: float = 0.5
     """rad/s"""
     gain: float = 0.0
-    """Duty for a rad of error, with the servo's P gain as it was"""
+    """Duty per rad of error, with the servo's present P gain"""
     delay: float = 0.0
-    """s from the goal's instruction to its effect, less the age of a position when it is read"""
+    """Time from the goal's instruction to its effect, minus the age of a position when it is read, s"""
     gravity_sin: float = 0.0
-    """rad/s^2 against the motion, times sin(position)"""
+    """Gravity that opposes the motion, as the factor of sin(position), rad/s^2"""
     gravity_cos: float = 0.0
-    """rad/s^2 along the motion, times cos(position)"""
+    """Gravity in the direction of the motion, as the factor of cos(position), rad/s^2"""
     resistance: float = 1.0
-    """ohm, as the servo's own measurement of current has it"""
+    """Resistance in the scale of the servo's current measurement, ohm"""
     effort_delay: float = 0.0
-    """s by which a measured effort is older than the position beside it"""
+    """Age of a measured effort relative to the position in the same reply, s"""
 
     def array(self) -> Floats:
-        """Return them in the order of ROWS."""
+        """Return the parameters in the order of ROWS."""
         return np.array(msgspec.structs.astuple(self))
 
     @classmethod
     def of(cls, values: Floats) -> Numbers:
-        """Return the numbers of an array in the order of ROWS."""
+        """Create the parameters from an array in the order of ROWS."""
         return cls(*(float(value) for value in values))
 
 
 ROWS: Mapping[str, int] = {name: row for row, name in enumerate(Numbers.__struct_fields__)}
-"""The row of each number in an array of them."""
+"""Row of each parameter in an array"""
 
 
 class Control(msgspec.Struct, frozen=True):
-    """What is known of the servo's control beside its gain, from registers and manual."""
+    """Properties of the servo's control except its gain, from registers and manual"""
 
     limit: float = 1.0
-    """Most duty"""
+    """Highest duty"""
     damping_s: float = 0.0
-    """s: D gain over P gain"""
+    """Ratio of D gain to P gain, s"""
     margin: float = 0.0
-    """rad of error that are left alone"""
+    """Dead band of the error, rad"""
     punch: float = 0.0
     """Duty at the edge of the margin"""
     by_position: bool = True
-    """False: the command is the duty itself"""
+    """False if the command is the duty"""
 
 
 class Pieces(msgspec.Struct, frozen=True):
-    """Pieces of a run that are simulated side by side; shape (steps, pieces) on a grid of STEP_S."""
+    """Pieces of a run that are simulated in parallel; shape (steps, pieces) on a grid of STEP_S"""
 
     start_s: Floats
-    """Shape (pieces,): time of the first point of the grid"""
+    """Time of the first grid point, shape (pieces,)"""
     steps: int
     voltage: Floats
     """V at each step"""
     position: Floats
-    """Shape (pieces,): rad, where each begins"""
+    """Initial position, rad, shape (pieces,)"""
     velocity: Floats
-    """Shape (pieces,): rad/s"""
+    """Initial velocity, rad/s, shape (pieces,)"""
     command_s: Floats
-    """Shape (commands,): when each command of the run was sent"""
+    """Time of each command in the run, shape (commands,)"""
     command: Floats
-    """rad, or the duty; each holds until the next one"""
+    """rad, or duty; each command holds until the next one"""
 
     def commands(self, delays: Floats) -> Floats:
-        """Return the mean command of each step under some delays, s; shape (steps, delays, pieces)."""
+        """Return the mean command of each step for each delay, s; shape (steps, delays, pieces)."""
         grid = self.start_s + np.arange(self.steps + 1)[:, None] * STEP_S
         sent, held = self.command_s, self.command
         area = np.concatenate(([0.0], np.cumsum(np.diff(sent) * held[:-1])))
         t = grid[:, None, :] - delays[:, None]
-        # the integral of the held command is a chain of straight lines; before the first one it holds as well
+        # The integral of a held command is piecewise linear. Both ends are extrapolated.
         total = np.interp(t, sent, area)
         total += np.minimum(t - sent[0], 0.0) * held[0] + np.maximum(t - sent[-1], 0.0) * held[-1]
         mean: Floats = np.diff(total, axis=0) / STEP_S
@@ -118,21 +119,21 @@ class Pieces(msgspec.Struct, frozen=True):
 
 
 class Simulated(msgspec.Struct, frozen=True):
-    """What the model does in each piece; shape (steps + 1, sets of numbers, pieces)."""
+    """Simulated pieces, shape (steps + 1, sets of parameters, pieces)"""
 
     position: Floats
     velocity: Floats
     duty: Floats
-    """The last row repeats the one before"""
+    """Duty; the last row repeats the previous one"""
     current: Floats
     """A, in the scale of `resistance`"""
 
 
 def simulate(values: Floats, pieces: Pieces, control: Control) -> Simulated:
-    """Simulate all pieces with several sets of numbers at once; `values` of shape (numbers, sets).
+    """Simulate all pieces with several sets of parameters, `values` of shape (parameters, sets).
 
-    Damping by Crank and Nicolson's rule, control by the position in the middle of a step; friction takes in a
-    step at most the velocity that there is.
+    Damping uses the Crank-Nicolson rule, and the control uses the position in the middle of a step. Friction
+    cannot reverse the velocity within a step.
     """
     column = {name: values[row][:, None] for name, row in ROWS.items()}
     drive, back_emf, gain = column["drive"], column["back_emf"], column["gain"]
@@ -175,7 +176,7 @@ def simulate(values: Floats, pieces: Pieces, control: Control) -> Simulated:
 
 
 def _duty(error: Floats, w: Floats, gain: Floats, control: Control) -> Floats:
-    """Return the duty for an error, rad, before it is limited; the damping part brakes all velocity."""
+    """Return the duty for an error, rad, before clamping. The damping term acts on the velocity."""
     if control.margin or control.punch:
         outside = np.abs(error) - control.margin
         error = np.where(outside > 0.0, np.copysign(outside + control.punch / gain, error), 0.0)

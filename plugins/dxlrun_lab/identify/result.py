@@ -1,7 +1,7 @@
-"""The result: torques, with their intervals, from the numbers of a fit and from one known torque.
+"""Result: torques with their intervals, from the parameters of a fit and one known torque.
 
-A motion alone says how large everything is beside the inertia that moves. What makes torques of it is, in
-this order: the known weight of a load, the current that the servo measures, the manual's stall torque.
+A motion only determines torques relative to the moving inertia. The scale comes from the first known of: the
+weight of a load, the current that the servo measures, the stall torque in the manual.
 """
 
 from __future__ import annotations
@@ -22,10 +22,10 @@ from dxlrun_lab.identify.servo import Servo
 Scale = Literal["load", "current", "manual"]
 
 _UNKNOWN = 0.5
-"""A value whose half-width is a greater part of it is not identified"""
+"""Relative half-width above which a value is not identified"""
 _CORRELATED = 0.98
 _LEAST_GRAVITY = 3.0
-"""Half-widths that a weight must be, to be one"""
+"""Number of half-widths above which a weight is significant"""
 UNITS: Mapping[str, str] = {
     "torque_constant": "Nm/A",
     "resistance": "ohm",
@@ -45,39 +45,40 @@ UNITS: Mapping[str, str] = {
 _BY_TORQUE = frozenset(
     ("resistance", "inertia", "friction", "viscous_friction", "stribeck_friction", "load_gravity")
 )
-"""What goes with the torque that a motion is scaled by; the torque constant is that of the back-EMF"""
+"""Figures that are proportional to the scale of torques (or inversely). The torque constant is the
+back-EMF's."""
 
 
 class KnownLoad(msgspec.Struct, frozen=True):
-    """What is known of what the joint moves."""
+    """Known properties of the load"""
 
     inertia: float | None = None
-    """kg m^2, beside that of motor and gear; None: not known"""
+    """Inertia in addition to that of motor and gear, kg m^2; None if unknown"""
     gravity: float | None = None
-    """Nm of the weight where it sticks out horizontally; None: not known"""
+    """Torque of the weight in the horizontal position, Nm; None if unknown"""
 
 
 class Value(msgspec.Struct, frozen=True):
-    """One identified figure."""
+    """Identified figure"""
 
     name: str
     value: float
     half: float | None
-    """Half-width of the 95 % interval; None: it was not fitted but taken"""
+    """Half-width of the 95 % interval; None if the value was not fitted"""
     unit: str
     expected: float | None
-    """What manual or the simulation's built-in motor say; None: nothing"""
+    """Value of the manual or of the simulation's built-in motor; None if unknown"""
     by_manual: bool = False
-    """True where it is in proportion to the manual's stall torque, whose error is in no interval"""
+    """True if the value depends on the manual's stall torque, whose error is not in the interval"""
 
     @property
     def identified(self) -> bool:
-        """False where the interval is so wide that the value says nothing."""
+        """False if the interval is too wide"""
         return self.half is not None and self.half <= _UNKNOWN * abs(self.value)
 
 
 class Identified(msgspec.Struct, frozen=True):
-    """What one joint's run says of its servo."""
+    """Identified servo of one joint"""
 
     joint: str
     model: str
@@ -86,24 +87,25 @@ class Identified(msgspec.Struct, frozen=True):
     scale: Scale
     scale_sentence: str
     notes: tuple[str, ...]
-    """What is not as one might think, a sentence each"""
+    """Remarks, one sentence each"""
     motor: MotorModel
     uncertainty: dict[str, float]
     """Half-widths, by the names of a motor file"""
     seconds: float
-    """of the run that were used"""
+    """Usable duration of the run, s"""
     position_rms: float
-    """rad, between the model and the pieces that it was fitted to"""
+    """Root mean square error in the fitted pieces, rad"""
     held_out_rms: float
-    """rad, and those that were held out"""
+    """Root mean square error in the held-out pieces, rad"""
     candidates: tuple[tuple[str, float, float], ...]
-    """Of each friction model: BIC, and error in what was held out, rad"""
+    """Friction models with their BIC and their error in the held-out pieces, rad"""
 
 
 def identified(run: Measured, fits: tuple[Fit, ...], load: KnownLoad, source: str) -> Identified:
-    """Return the figures of a servo from the fits of a run, of which the first counts.
+    """Return the figures of a servo from the first of the fits of a run.
 
-    Raises InputError where a known load contradicts the run.
+    Raises:
+        InputError: The known load contradicts the run, or the scale of torques is unknown.
     """
     fit, servo = fits[0], run.servo
     scale, sentence = _scale_of(fit, servo, load)
@@ -179,7 +181,7 @@ class _Physical(msgspec.Struct, frozen=True):
     load: KnownLoad
 
     def of(self, numbers: Floats) -> dict[str, float]:
-        """Return the figures by name; those of motors whose voltage is off by a factor follow from it."""
+        """Return the figures by name."""
         at = {name: float(numbers[row]) for name, row in ROWS.items()}
         drive, constant = at["drive"], at["back_emf"]
         gravity = math.hypot(at["gravity_sin"], at["gravity_cos"])
@@ -224,7 +226,7 @@ def _check_load(values: Mapping[str, float], load: KnownLoad, joint: str) -> Non
 
 
 def _covariance(fit: Fit, physical: _Physical, run: Measured) -> Floats:
-    """Return the figures' covariance: that of the numbers, and that of a voltage in steps of its unit."""
+    """Return the covariance of the figures, from that of the parameters and the resolution of the voltage."""
     numbers = fit.numbers.array()
 
     def slopes(direction: Floats) -> Floats:
@@ -238,7 +240,7 @@ def _covariance(fit: Fit, physical: _Physical, run: Measured) -> Floats:
     directions[range(len(fit.free)), [ROWS[name] for name in fit.free]] = sizes
     jacobian = np.stack([slopes(direction) for direction in directions], axis=1) / sizes
     covariance: Floats = jacobian @ fit.covariance @ jacobian.T
-    # all that is measured in volts goes with them: a motion only has drive / V and back-EMF * V
+    # An error of the voltage scales all parameters that contain volts.
     relative = run.servo.voltage_step / math.sqrt(12) / float(np.mean(run.voltage))
     volts = np.zeros(len(numbers))
     for name, power in (("drive", -1.0), ("back_emf", 1.0), ("resistance", 1.0)):
@@ -247,7 +249,7 @@ def _covariance(fit: Fit, physical: _Physical, run: Measured) -> Floats:
     return covariance + np.outer(by_voltage, by_voltage)
 
 
-# What is said beside the figures
+# Remarks on the figures
 
 
 def _fitted_names(fit: Fit) -> set[str]:
@@ -319,15 +321,16 @@ def _notes(  # noqa: PLR0917  all that a sentence may be about
 
 
 def _viscous_share(servo: Servo) -> float:
-    """Return the part of the back-EMF's damping that is viscous friction in published motors of that kind."""
+    """Return the share of viscous friction in the damping of the built-in motor (from publications)."""
     built_in = servo.built_in
     return built_in.viscous_friction / (built_in.damping + built_in.viscous_friction)
 
 
 def _expected(servo: Servo, viscous_share: float) -> dict[str, float]:
-    """Return what is known before: the built-in motor's figures, and the manual's stall torque.
+    """Return the expected figures, from the built-in motor and the manual's stall torque.
 
-    `viscous_share`: of the damping, which a torque constant has where it is not told from viscous friction.
+    `viscous_share` is the share of viscous friction in the damping, which the torque constant includes if the
+    two are not separated.
     """
     motor = servo.built_in
     voltage = motor.voltage or 12.0
@@ -359,7 +362,7 @@ def _motor(  # noqa: PLR0917  all that a motor file has
     run: Measured,
     source: str,
 ) -> tuple[MotorModel, dict[str, float]]:
-    """Return the motor, without what is not told from 0, and the half-widths of the figures that it has."""
+    """Return the motor with all significant figures, and their half-widths."""
     fitted = _fitted_names(fit)
     told = {
         name: value

@@ -1,4 +1,4 @@
-"""What is known of a servo before it is identified: from the plan in a log, from tables and from manuals."""
+"""Known properties of a servo before its identification: from the plan in a log, tables and manuals."""
 
 from __future__ import annotations
 
@@ -18,61 +18,61 @@ from dxlwire import ControlTable, find_table
 
 
 class Servo(msgspec.Struct, frozen=True):
-    """A joint's servo, as far as its identification asks."""
+    """Servo of a joint, with the properties that its identification needs"""
 
     joint: str
     table: ControlTable
     reference: float
-    """rad of the servo where the joint is at 0"""
+    """Position of the servo at the joint position 0, rad"""
     direction: int
     declared: Mapping[str, int] = msgspec.field(default_factory=dict)
-    """What the robot file declares"""
+    """Registers that the robot file declares"""
 
     @property
     def tick(self) -> float:
-        """rad of a unit of its positions."""
+        """Resolution of the position, rad"""
         return self.table.rad_per_tick
 
     @property
     def measures_current(self) -> bool:
-        """True where its effort is a current; else it is the part of the full voltage."""
+        """True if the effort is a current; otherwise it is the fraction of full voltage"""
         return self.table.effort_unit == "A"
 
     @property
     def voltage_step(self) -> float:
-        """V of a unit of the voltage that it reports."""
+        """Resolution of the reported voltage, V"""
         items = self.table.items
         item = items.get("present_input_voltage") or items.get("present_voltage")
         return 0.1 if item is None else item.scale
 
     @property
     def built_in(self) -> Motor:
-        """The motor that the simulation has for the model."""
+        """Motor of the model in the simulation"""
         return motor_of(self.table)
 
     @property
     def p_gain_item(self) -> str | None:
-        """The register of its P gain; None: it has compliance slopes."""
+        """Register of the P gain; None for a servo with compliance slopes"""
         return next((name for name in ("position_p_gain", "p_gain") if name in self.table.items), None)
 
     @property
     def p_gain(self) -> int | None:
-        """The register's value: of the robot file, else the one as shipped; None: it has none."""
+        """Value of the P gain register, declared or factory default; None without such register"""
         return None if self.p_gain_item is None else self.register(self.p_gain_item)
 
     def register(self, name: str, otherwise: int = 0) -> int:
-        """Return what the robot file declares, else the value as shipped."""
+        """Return the declared value of a register, or else its factory default."""
         if name in self.declared:
             return self.declared[name]
         item = self.table.items.get(name)
         return otherwise if item is None or item.initial is None else item.initial
 
     def manual_gain(self) -> float:
-        """Return the duty for a rad of error by the manual; 0: it says nothing.
+        """Return the duty per rad of error by the manual; 0 if it is not documented.
 
-        Position P Gain / 128 in PWM units for a tick (e-Manual, X series, 84); P gain 32 of the MX is as
-        stiff as a compliance slope of 32, which reaches the full duty in 32 units of 300 / 1023 deg (RX-28,
-        AX-12A).
+        On the X series, it is Position P Gain / 128 in PWM units per tick (e-Manual, X series, 84). The P
+        gain 32 of the MX is as stiff as a compliance slope of 32, which reaches full duty in 32 units of 300
+        / 1023 deg (RX-28, AX-12A).
         """
         table = self.table
         if self.p_gain_item == "position_p_gain":
@@ -87,14 +87,14 @@ class Servo(msgspec.Struct, frozen=True):
         return (1.0 - self.control().punch) / (slope * SLOPE_TICK)
 
     def expected_gain(self) -> tuple[float, str]:
-        """Return the duty for a rad of error before it was measured, and where that is from."""
+        """Return the expected duty per rad of error, and its source."""
         built_in = self.built_in
         if built_in.p_gain_duty and self.p_gain:
             return built_in.p_gain_duty * self.p_gain, built_in.gain_source
         return self.manual_gain(), "the manual"
 
     def control(self, *, by_position: bool = True) -> Control:
-        """Return the rest of its control; raises InputError for an integral part, which is not modelled."""
+        """Return the other properties of the control. Raises InputError for an unsupported setting."""
         for name in ("position_i_gain", "i_gain"):
             if self.register(name):
                 raise InputError(
@@ -122,7 +122,7 @@ class Servo(msgspec.Struct, frozen=True):
         )
 
     def rounded(self, goal: float) -> float:
-        """Return the goal, rad, that is left of one when it was sent in ticks."""
+        """Round a goal, rad, to ticks of the servo."""
         if not math.isfinite(goal):
             return goal
         ticks = round((self.direction * goal + self.reference) / self.tick)
@@ -130,14 +130,14 @@ class Servo(msgspec.Struct, frozen=True):
 
 
 def servo_of(plan: Plan, joint: str) -> Servo:
-    """Return what a plan knows of a joint's servo; raises LookupError for an unknown model."""
+    """Return the servo of a joint in a plan. Raises LookupError for an unknown model."""
     bus, servo = plan.servos_by_joint[joint][0]
     table = find_table(servo.model, bus.protocol)
     return Servo(joint, table, servo.reference, servo.direction, servo.declared)
 
 
 def servos_in(log: Log, joints: Sequence[str]) -> list[Servo]:
-    """Return the servos of some joints of a log; raises InputError where one cannot be identified."""
+    """Return the servos of joints in a log. Raises InputError if one cannot be identified."""
     for joint in joints:
         if joint not in log.joints:
             raise InputError(f"{log.path}: no joint {joint}; {suggestion(joint, log.joints)}")

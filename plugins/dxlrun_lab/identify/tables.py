@@ -1,4 +1,4 @@
-"""The result of an identification as tables and lines, for a terminal and for a page."""
+"""Result of an identification as tables and sentences, for a terminal and a page."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ _MODELS = {
 
 
 def parts(result: Identified) -> tuple[Part, ...]:
-    """Return what is shown of one joint."""
+    """Return the table and the sentences of one joint."""
     degrees = math.degrees(result.position_rms), math.degrees(result.held_out_rms)
     lines = [
         f"{'* ' if result.scale == 'manual' else ''}{result.scale_sentence}",
@@ -35,7 +35,7 @@ def parts(result: Identified) -> tuple[Part, ...]:
 
 
 def values_table(result: Identified) -> Table:
-    """Return the figures with their intervals, beside what manual or built-in motor say."""
+    """Return the table of figures with their intervals and expected values."""
     columns = (
         Column("", "name"),
         Column("value"),
@@ -61,7 +61,7 @@ def _row(value: Value) -> tuple[Cell | str | None, ...]:
 
 
 def _digits(value: float, half: float) -> str:
-    """Return a value with the digits that its half-width leaves, and one more."""
+    """Format a value with its significant digits by the half-width, and one more."""
     if half <= 0.0 or not math.isfinite(half):
         return f"{value:.4g}"
     return f"{value:.{max(0, min(8, 1 - math.floor(math.log10(half))))}f}"

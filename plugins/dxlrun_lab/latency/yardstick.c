@@ -1,8 +1,8 @@
-/* The yardstick of `dxlrun latency`: what the shortest program reaches that sleeps until each deadline.
+/* Yardstick of `dxlrun latency`: latency of a minimal program that sleeps until each deadline.
  *
- * Arguments: descriptor of the shared memory, wake-ups, period in ns, 1 to lock memory. Policy, priority, cores
- * and timer slack were set by the process that became this one. The shared memory is that of buffer.py. It uses
- * clock_nanosleep with absolute times, as cyclictest does (rt-tests). */
+ * Arguments: descriptor of the shared memory, number of wake-ups, period in ns, 1 to lock memory. The process that
+ * executes this program has set policy, priority, cores and timer slack. buffer.py defines the shared memory. The
+ * program uses clock_nanosleep with absolute times, as cyclictest does (rt-tests). */
 #define _GNU_SOURCE
 #include <errno.h>
 #include <stdint.h>
@@ -41,7 +41,7 @@ int main(int argc, char **argv)
     int64_t deadline_ns = begin_ns + period_ns;
     for (int64_t done = 0; done < iterations && !words[STOP]; deadline_ns += period_ns) {
         const int64_t passed_ns = now_ns(CLOCK_MONOTONIC) - deadline_ns;
-        if (passed_ns > 0) /* left out in one step, as by a loop that skips */
+        if (passed_ns > 0) /* skip all missed periods in one step, as the loop does */
             deadline_ns += (passed_ns + period_ns - 1) / period_ns * period_ns;
         const struct timespec deadline = {deadline_ns / 1000000000, deadline_ns % 1000000000};
         while (clock_nanosleep(CLOCK_MONOTONIC, TIMER_ABSTIME, &deadline, NULL) == EINTR)
@@ -49,7 +49,7 @@ int main(int argc, char **argv)
         words[WAKE_UPS + 2 * done + 1] = now_ns(CLOCK_MONOTONIC);
         words[WAKE_UPS + 2 * done] = deadline_ns;
         done++;
-        __atomic_store_n(&words[DONE], done, __ATOMIC_RELEASE); /* both times are seen before it */
+        __atomic_store_n(&words[DONE], done, __ATOMIC_RELEASE); /* readers see both times first */
     }
     if (iterations) {
         words[CPU_NS] = now_ns(CLOCK_PROCESS_CPUTIME_ID) - cpu_ns;
