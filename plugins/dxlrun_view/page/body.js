@@ -1,4 +1,4 @@
-// The robot in 3-D: its URDF, turned by the IMU, and a ghost of where its goals are.
+// 3-D view of the robot: its URDF, rotated by the IMU, and a ghost at the goal positions.
 import { AmbientLight, Box3, Color, DirectionalLight, GridHelper, Group, HemisphereLight, Matrix4, Mesh,
   MeshStandardMaterial, PerspectiveCamera, Quaternion, Scene, Vector3, WebGLRenderer } from "three";
 import { OrbitControls } from "three/examples/jsm/controls/OrbitControls.js";
@@ -58,7 +58,7 @@ export class Body {
     this.dirty = true;
   }
 
-  // `link`: the one that an IMU turns, or nothing
+  // Show a URDF. `link` is the link of the IMU, or an empty text.
   load(urdf, link) {
     this.world.clear();
     this.robot = this.parse(urdf, false);
@@ -106,7 +106,8 @@ export class Body {
     this.dirty = true;
   }
 
-  // `positions` and `goals`: by joint, rad or m; `orientation`: [x, y, z, w] of the IMU in the world, or null
+  // Move the robot and its ghost. `positions` and `goals` are by joint, rad or m. `orientation` is the
+  // quaternion [x, y, z, w] of the IMU in the world, or null.
   pose(positions, goals, orientation) {
     if (!this.robot) return;
     const moved = set(this.robot, positions) | set(this.ghost, goals);
@@ -131,8 +132,9 @@ function set(robot, values) {
 }
 
 function fade(robot) {
+  // The polygon offset hides the ghost where its faces coincide with those of the robot.
   const material = new MeshStandardMaterial({ color: 0xe08a1e, transparent: true, opacity: 0.4, depthWrite: false,
-    polygonOffset: true, polygonOffsetFactor: 2, polygonOffsetUnits: 2 }); // hidden where it lies in the robot's own faces
+    polygonOffset: true, polygonOffsetFactor: 2, polygonOffsetUnits: 2 });
   robot.traverse((one) => { if (one instanceof Mesh) one.material = material; });
 }
 
@@ -142,7 +144,8 @@ function meshOf(path, data) {
   throw new Error("only .stl and .dae are shown");
 }
 
-// What an IMU turns: its own link where that hangs from odom, else the whole robot.
+// Return the link of the IMU and the object that its orientation rotates: the joint between odom and this link,
+// or the whole robot if there is no such joint.
 function turnedLink(robot, link) {
   const sensor = robot.links[link];
   if (!sensor) return null;

@@ -1,4 +1,4 @@
-// Curves: plots one below the other, each of some columns, with zoom and pause.
+// Stacked plots of columns, with zoom and pause.
 import uPlot from "uplot";
 
 const COLOURS = ["--curve1", "--curve2", "--curve3", "--curve4", "--curve5", "--curve6"];
@@ -9,9 +9,9 @@ export const isAngle = (name) => /\/(goal_|command_)?(position|velocity)$/.test(
 export class Charts {
   constructor(element, scaleOf) {
     this.element = element;
-    this.scaleOf = scaleOf; // of a column: [factor, unit]
+    this.scaleOf = scaleOf; // function from the name of a column to [factor, unit]
     this.charts = [];
-    this.zoom = null; // [begin, end], or null: what is newest
+    this.zoom = null; // [begin, end], or null to follow the newest values
     this.seconds = 10;
     matchMedia("(prefers-color-scheme: dark)").addEventListener("change", () => this.charts.forEach((one) => one.build()));
   }
@@ -28,7 +28,7 @@ export class Charts {
     for (const one of this.charts) one.root.classList.toggle("chosen", one === chart && this.charts.length > 1);
   }
 
-  // draw a curve in the chosen plot, or take it out
+  // Add a curve to the chosen plot, or remove it.
   toggle(name) {
     const chart = this.chosen ?? this.add();
     chart.names = chart.names.includes(name) ? chart.names.filter((one) => one !== name) : [...chart.names, name];
@@ -74,7 +74,8 @@ class Chart {
     this.plot?.destroy();
     const style = getComputedStyle(document.documentElement);
     const colour = (name) => style.getPropertyValue(name).trim();
-    const pairs = [...new Set(this.names.map(pairOf))]; // a goal has its state's colour, dashed
+    // A goal is a dashed curve in the colour of its state.
+    const pairs = [...new Set(this.names.map(pairOf))];
     const colourOf = (name) => colour(COLOURS[pairs.indexOf(pairOf(name)) % COLOURS.length]);
     const scales = this.names.map((name) => this.all.scaleOf(name));
     this.factors = scales.map(([factor]) => factor);
@@ -127,7 +128,8 @@ class Chart {
   resize() { this.plot?.setSize({ width: Math.max(this.place.clientWidth, 50), height: Math.max(this.place.clientHeight, 60) }); }
 
   draw(curves, range, newest, cursor) {
-    this.zero = cursor === undefined ? newest : 0; // live: seconds before now
+    // The time axis of a live plot is relative to the newest moment, s.
+    this.zero = cursor === undefined ? newest : 0;
     this.range = range.map((time) => time - this.zero);
     this.cursor = cursor;
     const tables = this.names.map((name, at) => {
@@ -138,7 +140,8 @@ class Chart {
     });
     if (!tables.length) { this.plot.setData([[]]); return; }
     this.plot.setData(uPlot.join(tables, tables.map(() => [0, 2])));
-    tables.forEach(([times, values], at) => { // of a log where its time line is
+    // Figures show the newest value, or in a log the value at the cursor of the time line.
+    tables.forEach(([times, values], at) => {
       const behind = cursor === undefined ? -1 : times.findIndex((time) => time > cursor);
       const shown = values[(behind < 0 ? values.length : Math.max(behind, 1)) - 1];
       const item = this.legend.children[at];

@@ -1,4 +1,4 @@
-// The graph of controllers: what commands what, what is active; switched and tuned from here.
+// Graph of the controllers and of the references that they command, with buttons to switch and tune them.
 const SVG = "http://www.w3.org/2000/svg";
 
 export function drawControllers(element, shown, act) {

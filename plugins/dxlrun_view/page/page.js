@@ -1,4 +1,4 @@
-// The page: it asks for what is newest, draws it, and asks again; a page that sleeps asks for nothing.
+// Main loop of the page: request the newest data, and draw them. A hidden page sends no requests.
 import "./page.css";
 import { Body } from "./body.js";
 import { Charts, figure, isAngle } from "./charts.js";
@@ -44,7 +44,7 @@ function say(text, bad = false, seconds = 6) {
   saidUntil = performance.now() + seconds * 1000;
 }
 
-// ---- what is drawn
+// ---- drawing
 
 const missingMeshes = new Set();
 const body = webgl() && new Body($("scene"),
@@ -57,7 +57,7 @@ function webgl() {
   try { return Boolean(document.createElement("canvas").getContext("webgl2")); } catch { return false; }
 }
 
-// factor and unit of a column, as a person reads it
+// Return the factor and the unit in which a column is displayed.
 function scaleOf(name) {
   const [owner, column] = [name.slice(0, name.lastIndexOf("/")), name.slice(name.lastIndexOf("/") + 1)];
   const joint = page.joints.get(owner);
@@ -171,7 +171,8 @@ function buildJoints() {
       slider.oninput = () => { page.touching = joint.name; lead(joint.name, Number(slider.value)); };
       slider.onchange = slider.onpointerup = async () => {
         await lead(joint.name, Number(slider.value));
-        setTimeout(() => { if (page.touching === joint.name) page.touching = null; }, 600); // until the goal is there
+        // The slider follows the goal again after 600 ms, when the new goal has taken effect.
+        setTimeout(() => { if (page.touching === joint.name) page.touching = null; }, 600);
       };
       reach.append(slider);
     } else {
@@ -188,7 +189,7 @@ function buildJoints() {
   $("joints").replaceChildren(rows.size ? table : Object.assign(document.createElement("p"), { className: "empty", textContent: "waits for the robot …" }));
 }
 
-// send the newest goal of a slider, one at a time
+// Send the newest goal of a slider. One request is sent at a time, so that a fast slider does not queue old goals.
 const goals = new Map();
 let leading = null;
 function lead(joint, goal) {
@@ -272,7 +273,7 @@ function drawFigures() {
   rows.forEach(([, text], at) => { const cell = list.children[at].lastChild; if (cell.textContent !== text) cell.textContent = text; });
 }
 
-// what is active at the time line's place, or now
+// Draw the controllers that are active at the cursor of the time line, or now.
 function drawGraph() {
   for (const one of page.shown.info.controllers) one.active = Boolean(value(`${one.name}/active`) ?? one.active);
   const graph = JSON.stringify(page.shown.info.controllers);
@@ -303,7 +304,7 @@ function buildTimeline() {
   offer("worst cycles", page.shown.marks);
 }
 
-// a group of places to jump to
+// Add a group of times to the jump menu.
 function offer(label, places) {
   if (!places.length) return;
   const group = $("jump").appendChild(Object.assign(document.createElement("optgroup"), { label }));
@@ -337,7 +338,8 @@ function pause(paused) {
 // ---- the loop
 
 let curvesDue = 0, shownDue = 0, failures = 0;
-const centre = () => (page.shown.live ? newestTime : page.time + charts.seconds / 2); // newest time of the plots
+// Newest time of the plots, s.
+const centre = () => (page.shown.live ? newestTime : page.time + charts.seconds / 2);
 async function look() {
   const now = performance.now();
   const log = page.shown && !page.shown.live;

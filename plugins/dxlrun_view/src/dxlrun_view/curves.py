@@ -17,13 +17,13 @@ JOINT_COLUMNS = (
     *("goal_position", "goal_velocity", "goal_effort", "goal_pwm"),
     *("temperature", "voltage", "hardware_error", "mode", "torque", "valid"),
 )
-"""Columns of each joint, named `JOINT/position` and so on, with the field names of the log's cycles"""
+"""Columns of each joint, named `JOINT/position` and so on. The names are fields of the log's cycles."""
 LATE, CYCLE = "loop/late", "loop/cycle"
 """Columns of the loop: lateness of the wake-up, s, and number of the cycle"""
 
 
 MOST_OF_FIELD = 40
-"""Largest number of elements of an array in a message that are drawn"""
+"""Largest length of an array in a message whose elements can be drawn"""
 
 
 class Curve(msgspec.Struct, frozen=True):
@@ -128,6 +128,7 @@ class History:
 
 def thinned(name: str, times: Values, values: Values, points: int) -> Curve:
     """Return a curve, downsampled to about `points` points by the extremes of pieces."""
+    # The minimum and the maximum of each piece are kept, so that a plot never hides a short peak.
     if len(times) > max(points, 2):
         pieces = np.array_split(np.arange(len(times)), max(points // 2, 1))
         kept: list[int] = []

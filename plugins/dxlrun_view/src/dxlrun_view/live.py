@@ -70,7 +70,7 @@ class LiveRobot:
         with self._asking:
             self._gone("")
 
-    # What the page asks for
+    # Requests of the page
 
     def shown(self) -> Shown:
         """Return everything that the page shows in addition to the curves."""
@@ -127,7 +127,7 @@ class LiveRobot:
         """Open a separate connection for a request. Raises DxlrunError."""
         return connect(self._name, "dxlrun view")
 
-    # Asking the robot
+    # Polling the robot
 
     def _look(self, now_s: float) -> None:
         """Poll the newest cycle, and every SLOW_S the values that rarely change."""
@@ -152,7 +152,7 @@ class LiveRobot:
             self._gone(str(error) if self._name in running() else waits)
 
     def _begun(self) -> RemoteRobot:
-        """Connect to a run, and read what does not change until its end. Raises DxlrunError."""
+        """Connect to a run, and read the values that are constant during a run. Raises DxlrunError."""
         robot = self.asking()
         self._info = info_of(robot)
         self._urdf = robot.urdf()
@@ -180,9 +180,11 @@ class LiveRobot:
         time_s = states.time_ns * 1e-9
         with self._lock:
             newest_s = self._history.span[1]
+            # Another run can have other columns and an earlier clock. Its curves start again.
             if self._history.columns != columns or time_s <= newest_s:
                 self._history = History(columns, _KEPT)
             elif time_s - newest_s > GAP_S:
+                # A row of NaN interrupts the line of each curve.
                 self._history.append(newest_s, np.full(len(columns), np.nan))
             self._history.append(time_s, row)
         self._units = states.source_units
@@ -265,7 +267,7 @@ def _motions(info: RobotInfo) -> Iterator[str]:
 
 
 def _of_joints(states: RobotStates) -> Iterator[Values]:
-    """Yield the columns of the joints with the values of the log's cycles: mode and torque as numbers."""
+    """Yield the columns of the joints. Mode and torque are numbers, as in the log's cycles."""
     special = {
         "mode": [Mode[name.upper()] for name in states.mode],
         "torque": [_TORQUE[word] for word in states.torque],

@@ -28,7 +28,7 @@ from dxlrun_view.curves import (
 from dxlrun_view.shown import Controller, LiveEvent, Mark, RobotInfo, Shown
 
 MOST_CYCLES = 100_000
-"""Number of cycles of a log that are shown at least, if it has so many. 20 joints take some 120 MB."""
+"""Minimum number of cycles that are kept of a longer log. With 20 joints, they take some 120 MB."""
 _IN_COLUMNS = (
     LogTopic.CYCLE,
     LogTopic.ACTIVATION,
@@ -245,6 +245,7 @@ class _Read:
         self.skipped += int(cycles["skipped"].sum())
         both = np.concatenate([self.worst, cycles]) if len(self.worst) else cycles
         self.worst = both[np.argsort(_late_s(both))[::-1][:WORST]]
+        # The first index continues the stride of the previous slice.
         self._parts.append(cycles[-self._seen % self.every :: self.every].copy())
         self._seen += len(cycles)
         self._kept += len(self._parts[-1])

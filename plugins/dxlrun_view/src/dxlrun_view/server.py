@@ -150,7 +150,7 @@ class Page:
         return answer
 
     async def page(self, request: Request) -> Response:
-        """Return a file of the page. The script sends the token in the address of the first file."""
+        """Return a file of the page. It needs no token: the script adds the token to its own requests."""
         name = request.url.path.strip("/")
         where = files("dxlrun_view").joinpath("page", *(("build", name) if name else ("page.html",)))
         if not where.is_file():
@@ -227,7 +227,8 @@ class Page:
 def mesh_file(folder: Path, name: str) -> Path | None:
     """Find the file of a mesh, relative to the directory of the robot file, or return None.
 
-    `package://NAME/...` is searched in a directory NAME above it, and also without NAME.
+    `package://NAME/...` is searched in that directory and in all of its parents. Without NAME, it is searched
+    in that directory and two of its parents.
     """
     if name.startswith("package://"):
         relative = Path(name.removeprefix("package://"))
@@ -261,7 +262,7 @@ def hosts_of(address: str, port: int, *others: str) -> tuple[str, ...]:
 
 
 class Server(uvicorn.Server):
-    """uvicorn server that does not handle signals. A listener with TLS accepts its own connections."""
+    """uvicorn server without signal handlers. A listener with TLS accepts its own connections."""
 
     async def startup(self, sockets: list[socket.socket] | None = None) -> None:
         """Start to serve the sockets of `run`."""

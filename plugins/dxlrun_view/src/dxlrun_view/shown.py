@@ -89,7 +89,7 @@ class Shown(msgspec.Struct, frozen=True, kw_only=True):
     fields: tuple[str, ...] = ()
     """Numbers in messages of topics that can be drawn, such as `/arm/state:error[0]`"""
     marks: tuple[Mark, ...] = ()
-    """Latest cycles of a log"""
+    """Cycles of a log with the latest wake-ups"""
     control: bool = False
     """True if the page may steer the robot"""
     motions: tuple[str, ...] = ()
