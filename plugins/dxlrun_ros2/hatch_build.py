@@ -88,7 +88,8 @@ def make(source: Path, place: Path, library: Path, libraries: Path) -> None:
     from rosidl_typesupport_introspection_c.cli import GenerateIntrospectionCTypesupport
 
     prefix = Path(rosidl_cli.__file__).parents[4]
-    os.environ["AMENT_PREFIX_PATH"] = str(prefix)  # where the generators look for their templates
+    # The generators search their templates in this path.
+    os.environ["AMENT_PREFIX_PATH"] = str(prefix)
     shutil.rmtree(place, ignore_errors=True)
     name, out, includes = source.name, place / source.name, [str(prefix / "share")]
     files = [f"{source}:{path.relative_to(source)}" for path in sorted(source.glob("*/*"))]
@@ -98,14 +99,16 @@ def make(source: Path, place: Path, library: Path, libraries: Path) -> None:
     ]
     idl = [str(path) for path in written]
     hashes = [*map(Path, generate_type_hashes(interface_files=idl, output_path=out, **form))]
-    for folder in {path.parent.name for path in written}:  # types of two folders can have the same name
+    # One call per directory, because types of two directories can have the same name.
+    for folder in {path.parent.name for path in written}:
         own = [[str(path) for path in found if path.parent.name == folder] for found in (written, hashes)]
         GenerateC("c").generate(name, own[0], includes, out, own[1])
     GeneratePython("py", typesupport_implementations=["rosidl_typesupport_c"]).generate(
         name, idl, includes, out
     )
     GenerateFastRTPSCTypesupport("fastrtps_c").generate(name, idl, includes, out)
-    described = place / "described" / name  # files of the same names
+    # A separate directory, because other generators write files of the same names.
+    described = place / "described" / name
     GenerateIntrospectionCTypesupport("introspection_c").generate(name, idl, includes, described)
     GenerateCTypesupport("c", typesupport_implementations=list(SUPPORTS)).generate(name, idl, includes, out)
     _compile(source.name, place, prefix, library, libraries)
@@ -140,6 +143,7 @@ def _compile(name: str, place: Path, prefix: Path, library: Path, libraries: Pat
         of_python = [*pool.map(compiled, [path for path in sources if path.name[0] == "_"])]
     used = [path.name for path in sorted((prefix / "lib").glob("lib*.so")) if USED.search(path.name)]
     linked = ["-Wl,--as-needed", f"-L{prefix / 'lib'}", f"-L{libraries}", *(f"-l:{one}" for one in used)]
+    # Both type supports are linked into one library, which is copied to the name of the other.
     first, other = (f"lib{name}__{one}.so" for one in SUPPORTS)
     for folder in (libraries, library.parent):
         folder.mkdir(parents=True, exist_ok=True)

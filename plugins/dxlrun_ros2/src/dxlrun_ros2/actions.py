@@ -28,12 +28,15 @@ from dxlrun_ros2.trajectories import (
 
 Result = FollowJointTrajectory.Result
 FEEDBACK_S = 0.05
+"""Period of the feedback of a goal, s"""
 STATE_S = 1.0
 """Timeout for the state of a gripper after the end of its goal, s"""
 CLIENT_S = 1.0
 """Time without a client of the action after which a goal is cancelled, s"""
 _FAR_S = 10.0
+"""Duration of a goal that is cancelled at once, s"""
 _CYCLE_S = 0.01
+"""Polling period while a cycle is awaited, s"""
 _MEASURED_S = 5.0
 """Timeout for the arrival of a cycle, s"""
 _AT_ONCE = 3
@@ -78,9 +81,8 @@ class Action:
     def _answer(self, request: FollowJointTrajectory.Goal | GripperCommand.Goal) -> GoalResponse:
         try:
             self.check(request)
-            with connect(
-                self.run.address, CLIENT
-            ) as robot:  # ask the run, because the newest cycle may precede a switch
+            # The run is asked, because the newest cycle may precede a switch.
+            with connect(self.run.address, CLIENT) as robot:
                 active = {one.name for one in info_of(robot).controllers if one.active}
             if self.controller.name not in active:
                 raise Refused(f"{self.controller.name} is not active")
@@ -130,11 +132,12 @@ class Action:
                 except Refused as refused:
                     if refused.code not in ("goal_ended", "cancelled_already"):
                         raise
+        # The result must report measurements from the end of the goal.
         until = time.monotonic() + _MEASURED_S
         while self.run.time_s < (state.ended or 0.0) and time.monotonic() < until:
             if self.run.ended.is_set():
                 break  # there are no more cycles, and the bridge waits only shortly for results
-            time.sleep(_CYCLE_S)  # the result must report measurements from the end of the goal
+            time.sleep(_CYCLE_S)
         return state, why
 
 
@@ -169,7 +172,7 @@ class FollowTrajectory(Action):
         try:
             plan = self._wanted(request)
             fields = goal_fields(request, plan.joints)
-        except InputError as error:  # its last point has passed since it was accepted
+        except InputError as error:  # the last point has passed since the goal was accepted
             handle.abort()
             return self.failed(str(error), Result.OLD_HEADER_TIMESTAMP)
         watch = Watch(self.run, plan)

@@ -19,6 +19,7 @@ if TYPE_CHECKING:
 NICENESS = 10
 """Same niceness as the gateway, so that ROS only gets the processor time that the loop leaves"""
 RETRY_S = 0.2
+"""Time between two attempts to connect to the robot, s"""
 
 
 def arguments(words: list[str]) -> argparse.Namespace:

@@ -60,7 +60,7 @@ class ControllerNode:
             offer_torque(node, run.address, controller.name, name)
 
     def close(self) -> None:
-        """Stop to process cycles of the run."""
+        """Stop processing the cycles of the run."""
         self._run.seen.discard(getattr(self, "_show", None))
 
     # Topics

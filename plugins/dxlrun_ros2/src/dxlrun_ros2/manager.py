@@ -79,7 +79,7 @@ class Manager:
         request: AnyRequest,
         response: AnyResponse,
     ) -> AnyResponse:
-        """Answer a request. The response to a refused one is not `ok`, and the reason is logged in ROS."""
+        """Answer a request. If it is refused, `ok` stays false and the reason is logged in ROS."""
         try:
             with connect(self._address, CLIENT) as robot:
                 answer(robot, request, response)
@@ -91,7 +91,7 @@ class Manager:
                 response.message = str(error)
         return response
 
-    # Looking
+    # Queries
 
     def _list(
         self, robot: RemoteRobot, _: ListControllers.Request, response: ListControllers.Response
@@ -118,7 +118,7 @@ class Manager:
     ) -> None:
         response.component = [_hardware(robot)]
 
-    # Changing
+    # Changes
 
     def _switch(
         self, robot: RemoteRobot, request: SwitchController.Request, response: SwitchController.Response

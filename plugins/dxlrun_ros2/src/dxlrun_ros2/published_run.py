@@ -20,6 +20,7 @@ from dxlrun_ros2 import CLIENT
 STATE = QoSProfile(depth=1)
 """Quality of service of ros2_control's broadcasters: reliable, depth 1, volatile"""
 LATCHED = QoSProfile(depth=1, durability=DurabilityPolicy.TRANSIENT_LOCAL)
+"""Quality of service of topics whose last message a later subscriber also receives"""
 QUALITIES: Mapping[str, QoSProfile] = {
     LogTopic.FRAMES: QoSProfile(depth=100),
     LogTopic.ROSOUT: qos_profile_rosout_default,
@@ -80,7 +81,7 @@ class PublishedRun(LiveMessages):
             publisher.publish(data)
 
     def hear(self, robot: RemoteRobot) -> None:
-        """Start to listen to topics that have been opened since the last call. Raises DxlrunError."""
+        """Subscribe to topics that have been opened since the last call. Raises DxlrunError."""
         if new := self.heard(robot.topics()) - self._heard:
             self._heard |= new
             threading.Thread(target=self._listen, args=(new,), daemon=True).start()
