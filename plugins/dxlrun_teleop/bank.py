@@ -166,6 +166,7 @@ def _twist(robot: RemoteRobot, one: Row) -> list[Slot]:
         braking = rise if math.isinf(sink) else sink
         # Time in which the deceleration builds up, and again in which it ends, under the jerk limit.
         growth_s = 0.0 if math.isinf(jerk) else min(BRAKING_S / 2, braking / jerk)
+        # Area of a deceleration that ramps up and down in growth_s each.
         stops_from = (min(braking, jerk * growth_s) if growth_s else braking) * (BRAKING_S - growth_s)
         slots.append(Slot(field, unit, min(USUAL_TWIST[field], most, stops_from), most))
     return slots

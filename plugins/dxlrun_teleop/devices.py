@@ -50,7 +50,9 @@ class Gamepad:
         # A button that is held at the start does not count as pressed.
         self._device, self._held = device, frozenset({*BUTTONS, *KEYS})
         codes = {*device.capabilities(absinfo=False).get(EV_ABS, ())}
-        codes -= {5, 2} if 3 in codes else {code for code in codes & {5, 2} if self._axis(code)}  # triggers
+        # With ABS_RX, ABS_Z and ABS_RZ are triggers. Otherwise they are the right stick, unless they are
+        # deflected at rest, as only triggers are.
+        codes -= {5, 2} if 3 in codes else {code for code in codes & {5, 2} if self._axis(code)}
         self._codes = tuple(code for code in STICKS if code in codes)
         self.axes = tuple(STICKS[code] for code in self._codes)
 
@@ -113,7 +115,7 @@ def source_of(device: InputDevice[str]) -> Gamepad | None:
 
 
 def chosen(path: str | None) -> Gamepad:
-    """Return the device with a path, or the only gamepad without a path. All other devices are closed.
+    """Return the device at `path`, or the only gamepad if `path` is None. Close all other devices.
 
     Raises:
         InputError: The device was not found, or there are several gamepads. The message lists them.

@@ -17,8 +17,9 @@ from dxlrun_teleop.source import Given, Press
 PERIOD_S = 0.02
 """Period of the setpoints, s"""
 LEASE_S = 0.15
-"""Lease of a setpoint, s: seven periods. With some periods of the loop, joints hold within 250 ms."""
+"""Lease of a setpoint, s: seven periods. Including some periods of the loop, joints hold within 250 ms."""
 FACTORS = 0.1, 10.0
+"""Smallest and largest speed factor"""
 _FASTER = {Press.FASTER: 1.25, Press.SLOWER: 0.8}
 
 

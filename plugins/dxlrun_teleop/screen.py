@@ -12,6 +12,7 @@ from dxlrun_teleop.drive import Drive
 from dxlrun_teleop.source import Source
 
 REFRESH_S = 0.1
+"""Shortest time between two updates of the screen, s"""
 _SHOWN = {"rad": (180 / math.pi, "deg"), "m": (1e3, "mm")}
 
 
