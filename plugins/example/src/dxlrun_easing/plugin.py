@@ -17,5 +17,5 @@ def dxlrun_contract() -> int:
 
 @hookimpl
 def dxlrun_controllers() -> Mapping[str, type[Controller[Any]]]:
-    """Return the import paths of the controllers, by their type in the robot file."""
+    """Return the controller classes by their type in the robot file."""
     return {"easing_position_controller": Easing}

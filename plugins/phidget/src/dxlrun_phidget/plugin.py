@@ -17,5 +17,5 @@ def dxlrun_contract() -> int:
 
 @hookimpl
 def dxlrun_sensors() -> Mapping[str, type[Sensor[Any]]]:
-    """Return the import paths of the sensors, by their type in the robot file."""
+    """Return the sensor classes by their type in the robot file."""
     return {"phidget_spatial": PhidgetSpatial}

@@ -18,7 +18,7 @@ if TYPE_CHECKING:
     from Phidget22.Devices.Spatial import Spatial
 
 G = 9.80665
-"""m/s^2"""
+"""Standard gravity, m/s^2"""
 TESLA_PER_GAUSS = 1e-4
 UNKNOWN = 1e300
 """PUNK_DBL of phidget22.h: placeholder of the library for an unknown value"""
