@@ -26,9 +26,9 @@ def _line(text: str) -> str:
 class AgentForm(Form):
     """A computer where `dxlrun fleet FILE --serve NAME` starts robots."""
 
-    address: ListedAddress = key("Where its agent listens.", "lab3:7659")
+    address: ListedAddress = key("Address of the agent.", "lab3:7659")
     starts: dict[str, Annotated[str, AfterValidator(_line)]] = key(
-        "What follows `dxlrun` for each robot; paths are seen from this file's directory.",
+        "Arguments of `dxlrun` for each robot; paths are relative to this file's directory.",
         "{torso: robots/bioloid_torso.yaml port:=/dev/ttyUSB0 --listen 0.0.0.0:7660}",
     )
 
@@ -37,7 +37,7 @@ class FleetForm(Form):
     """Robots, and the agents that start them."""
 
     robots: dict[str, ListedAddress] = key("Addresses by the names of certificates.", "{torso: lab3:7660}")
-    agents: dict[str, AgentForm] = key("By the names of their certificates.", "{lab3: {}}", {})
+    agents: dict[str, AgentForm] = key("Agents by the names of their certificates.", "{lab3: {}}", {})
 
 
 class Agent(NamedTuple):
