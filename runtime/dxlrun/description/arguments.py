@@ -33,9 +33,11 @@ class Argument(Form):
     """One argument of a robot file."""
 
     default: Annotated[object, AfterValidator(_scalar)] = key(
-        "Value when none is given; without one it must be given.", "sim", None
+        "Value of the argument if the command line gives none; an argument without a default is required.",
+        "sim",
+        None,
     )
-    help: str = key("What it is for.", '"serial port of the adapter"', "")
+    help: str = key("Purpose of the argument.", '"serial port of the adapter"', "")
 
 
 class Arguments:

@@ -46,21 +46,25 @@ class Adapter(Form):
     """The adapter of a bus."""
 
     kind: Literal["ftdi", "direct"] | None = key(
-        "An FTDI chip with its latency timer at 1 ms, or one that hands bytes over at once.", "direct", None
+        "Kind of adapter: an FTDI chip with its latency timer at 1 ms, or an adapter that delivers "
+        "bytes at once (direct).",
+        "direct",
+        None,
     )
     latency: Duration = key(
-        "How long it may keep bytes back before it hands them over; kind says it, too (1 ms, or none).",
+        "Longest time for which the adapter buffers bytes; 1 ms by default with `kind: ftdi`, 0 ms "
+        "with `kind: direct`.",
         "1 ms",
         16_000_000,
     )
     rs485: bool = key(
-        "The kernel switches its direction (TIOCSRS485), as for an RS-485 transceiver at a UART.",
+        "Direction switching by the kernel (TIOCSRS485), for an RS-485 transceiver at a UART.",
         "true",
         False,
     )
     boot_time: Annotated[Duration, AfterValidator(_boot_time)] = key(
-        "How long its board needs after it was plugged in and its port is opened, at most 10 s: boards that "
-        "reset then.",
+        "Boot time, at most 10 s, of a board that resets when its port is first opened after it was "
+        "plugged in.",
         "2 s",
         0,
     )
@@ -77,12 +81,21 @@ class BusSimulation(Form):
     """Properties of a simulated bus itself, without its servos; a bus on a real port ignores them."""
 
     latency_timer: Annotated[Duration, AfterValidator(_timer)] = key(
-        "How long the simulated adapter gathers bytes before it hands them over, at most 255 ms.", "4 ms", 0
+        "Latency timer of the simulated adapter, at most 255 ms; with `adapter: {kind: ftdi}`, the "
+        "adapter's latency by default.",
+        "4 ms",
+        0,
     )
-    split: Literal["whole", "byte", "random"] = key("In which pieces it hands them over.", "byte", "whole")
-    echo: bool = key("The host hears its own bytes, as on some adapters.", "true", False)
+    split: Literal["whole", "byte", "random"] = key(
+        "Pieces in which the simulated adapter delivers bytes: all at once (whole), one by one "
+        "(byte), or 1 to 8 at a time (random).",
+        "byte",
+        "whole",
+    )
+    echo: bool = key("Echo of the host's own bytes, as with some adapters.", "true", False)
     absent: Literal["silent", "slot"] = key(
-        "In a sync or bulk read, the servos behind an absent one are silent, or wait its slot.",
+        "Replies to a sync or bulk read after a missing servo: none (silent), or after the missing "
+        "servo's time slot (slot, Protocol 2.0 only).",
         "slot",
         "silent",
     )
@@ -92,36 +105,40 @@ class SlowRegisters(Form):
     """Registers that are read periodically between the cycles."""
 
     items: Annotated[tuple[ItemName, ...], Field(strict=False)] | None = key(
-        "Items by the names of the control table; without: temperature and voltage.",
+        "Items to read, named as in the control table; temperature and voltage by default.",
         "[present_temperature]",
         None,
     )
-    rate: Rate = key("How often each of them is read, Hz.", "1", 1.0, ge=0.1, le=100)
+    rate: Rate = key("Readings of each item per second, Hz.", "1", 1.0, ge=0.1, le=100)
 
 
 class Bus(Form):
     """One serial line with its servos."""
 
-    port: str = key("Device of the adapter, or sim.", "/dev/ttyUSB0", min_length=1)
+    port: str = key("Serial device of the adapter, or sim for a simulated bus.", "/dev/ttyUSB0", min_length=1)
     protocol: Annotated[float, AfterValidator(_protocol)] = Field(
         description="Protocol of all servos on the bus.",
         examples=["1.0"],
         json_schema_extra={"enum": [1.0, 2.0]},
     )
-    baud_rate: int = key("Bits per second.", "1_000_000", gt=0, le=HIGHEST_BAUD_RATE)
-    adapter: Adapter = key("The adapter.", "{latency: 1 ms}", Adapter())
-    return_delay_time: Duration = key("How long a servo waits before it answers.", "500 us", 500_000)
+    baud_rate: int = key("Baud rate, bit/s.", "1_000_000", gt=0, le=HIGHEST_BAUD_RATE)
+    adapter: Adapter = key("Properties of the adapter.", "{latency: 1 ms}", Adapter())
+    return_delay_time: Duration = key(
+        "Delay before a servo's reply, as in its item Return Delay Time.", "500 us", 500_000
+    )
     bus_watchdog: AutoDuration = key(
-        "A servo of Protocol 2.0 stops after this time without instructions, 2.54 s at most; 0 ms: never; "
-        "auto: 200 ms, more below 15 Hz.",
+        "Bus Watchdog of Protocol 2.0 servos: time without instructions after which they stop, at "
+        "most 2.54 s. 0 ms disables it; auto is 200 ms, or three periods of a loop below 15 Hz.",
         "200 ms",
         "auto",
     )
     slow_registers: SlowRegisters = key(
-        "What is read now and then, between the cycles.", "{rate: 2}", SlowRegisters()
+        "Registers that are read periodically between the cycles.", "{rate: 2}", SlowRegisters()
     )
     simulation: BusSimulation = key(
-        "What the bus does when it is simulated.", "{latency_timer: 4 ms}", BusSimulation()
+        "Properties of the simulated bus; a bus on a real port ignores them.",
+        "{latency_timer: 4 ms}",
+        BusSimulation(),
     )
 
     @property

@@ -165,7 +165,7 @@ class PlugInEntry(Form):
     """An entry of a plug-in's type. Keys that are not common to all types are the type's parameters."""
 
     parameters: dict[str, object] = Field(
-        default={}, description="All other keys of the entry; its type says which there are."
+        default={}, description="Parameters of the entry's type: all other keys."
     )
 
     @model_validator(mode="before")

@@ -38,17 +38,17 @@ DIALECT = "https://json-schema.org/draft/2020-12/schema"
 _ARGUMENT: Schema = {
     "type": "string",
     "pattern": r"\$\{\s*[A-Za-z_][A-Za-z0-9_]*\s*\}",
-    "description": "The value of an argument.",
+    "description": "Value of an argument.",
 }
 _OF_FILE: Schema = {
     "type": "string",
     "pattern": r"^\./[A-Za-z_][A-Za-z0-9_]*\.py:[A-Za-z_][A-Za-z0-9_]*$",
-    "description": "A class of a file of Python beside the robot file: ./wave.py:Wave.",
+    "description": "Class of a Python file next to the robot file: ./wave.py:Wave.",
 }
 _GROUPED: Schema = {
     "type": "string",
     "pattern": r"^[-+]?[0-9]+(_[0-9]+)+$",
-    "description": "A whole number with its digits in groups.",
+    "description": "Integer with its digits in groups, such as 1_000_000.",
 }
 _SCALARS = ("string", "integer", "number", "boolean")
 _OF_MAPPINGS = ("properties", "additionalProperties", "required")
@@ -106,7 +106,7 @@ def _robot(controllers: Models, entries: Entries) -> Schema:
     own["joints"]["additionalProperties"] = _any_joint(own["joints"]["additionalProperties"])
     shared = _shared({form: definitions[form]["properties"] for form, _ in joint_conditions()})
     defaults = {"type": "object", "additionalProperties": False, "properties": shared}
-    defaults["description"] = "Keys that every joint has that does not have them itself, or by its groups."
+    defaults["description"] = "Default keys of all joints; keys of a joint or its groups have priority."
     definitions["Group"]["properties"] |= shared
     before = {"name": own.pop("name"), "arguments": _arguments(), INCLUDE: _include(), DEFAULTS: defaults}
     top["properties"] = before | own
@@ -137,7 +137,7 @@ def _shared(forms: Mapping[str, Schema]) -> Schema:
 def _arguments() -> Schema:
     about = {key: field.description for key, field in Argument.model_fields.items()}
     return {
-        "description": "What may be given on the command line as name:=value, and is put in by ${name}.",
+        "description": "Arguments for the command line (name:=value), inserted in place of ${name}.",
         "type": "object",
         "propertyNames": {"pattern": "^[A-Za-z_][A-Za-z0-9_]*$"},
         "additionalProperties": {
@@ -153,7 +153,7 @@ def _arguments() -> Schema:
 
 def _include() -> Schema:
     return {
-        "description": "Files that are merged below this one; names count from its folder.",
+        "description": "Files to include, relative to this file's folder; values of this file have priority.",
         "type": "array",
         "maxItems": MOST_FILES,
         "items": {"type": "string", "minLength": 1, "not": {"pattern": r"\$\{"}},

@@ -32,9 +32,11 @@ Expression = Annotated[
 class Target(Form):
     """Goal of a joint at the time of a point: position, velocity and acceleration."""
 
-    position: Position | None = key("Angle of the joint, or position of a linear one.", "30 deg", None)
-    velocity: Speed | None = key("Speed there.", "1 rad/s", None)
-    acceleration: Acceleration | None = key("Acceleration there.", "0 rad/s^2", None)
+    position: Position | None = key(
+        "Position of the joint: an angle, or a length for a linear joint.", "30 deg", None
+    )
+    velocity: Speed | None = key("Velocity of the joint at the point.", "1 rad/s", None)
+    acceleration: Acceleration | None = key("Acceleration of the joint at the point.", "0 rad/s^2", None)
 
     @model_validator(mode="after")
     def _says_something(self) -> Self:
@@ -51,16 +53,22 @@ class Target(Form):
 class Point(Form):
     """Targets at one time of a part."""
 
-    time: Duration = key("Since the part's start.", "1 s")
+    time: Duration = key("Time since the start of the part.", "1 s")
     joints: dict[Name, Target] = key("Targets by joint.", "{head_joint: {position: 30 deg}}", min_length=1)
 
 
 class Formula(Form):
     """Motion of one joint as formulas of t, s."""
 
-    position: Expression = key("rad", "0.5 * sin(2 * t)")
-    velocity: Expression | None = key("rad/s", "cos(2 * t)", None)
-    acceleration: Expression | None = key("rad/s^2", "-2 * sin(2 * t)", None)
+    position: Expression = key(
+        "Position as a formula of t: rad, or m for a linear joint.", "0.5 * sin(2 * t)"
+    )
+    velocity: Expression | None = key(
+        "Velocity as a formula of t: rad/s, or m/s for a linear joint.", "cos(2 * t)", None
+    )
+    acceleration: Expression | None = key(
+        "Acceleration as a formula of t: rad/s^2, or m/s^2 for a linear joint.", "-2 * sin(2 * t)", None
+    )
 
 
 class PointsPart(Form):
@@ -72,9 +80,9 @@ class PointsPart(Form):
     )
 
     controller: str = key("Name of the controller.", "head", min_length=1)
-    start: Duration = key("Since the loop's first deadline.", "1 s", 0)
+    start: Duration = key("Start of the part, as time since the loop's first deadline.", "1 s", 0)
     points: Annotated[tuple[Point, ...], Field(strict=False)] = key(
-        "Points in order of time.", "[{time: 0 s, joints: ...}]", min_length=1
+        "Points in ascending order of time.", "[{time: 0 s, joints: ...}]", min_length=1
     )
 
 
@@ -82,9 +90,11 @@ class FormulaPart(Form):
     """Motion of one controller, as formulas that are sampled before the loop starts."""
 
     controller: str = key("Name of the controller.", "head", min_length=1)
-    start: Duration = key("Since the loop's first deadline.", "1 s", 0)
-    duration: Annotated[Duration, Field(gt=0)] = key("Length of the part.", "20 s")
-    samples: int = key("Points, the first at the start, the last at the end.", "500", ge=2, le=1_000_000)
+    start: Duration = key("Start of the part, as time since the loop's first deadline.", "1 s", 0)
+    duration: Annotated[Duration, Field(gt=0)] = key("Duration of the part.", "20 s")
+    samples: int = key(
+        "Number of points, with one at the start and one at the end of the part.", "500", ge=2, le=1_000_000
+    )
     joints: dict[Name, Formula] = key("Formulas by joint.", "{head_joint: {position: sin(t)}}", min_length=1)
 
 
@@ -104,7 +114,7 @@ class Motion(Form):
 
     name: Name = key("Name of the motion.", "three_parts")
     motions: Annotated[tuple[Part, ...], Field(strict=False)] = key(
-        "What each controller does.", "[{controller: head, ...}]", min_length=1
+        "Parts of the motion, each for one controller.", "[{controller: head, ...}]", min_length=1
     )
 
     @property

@@ -50,55 +50,75 @@ def _one_or_more(value: object) -> object:
 class Scheduler(Form):
     """Settings of the operating system for the loop."""
 
-    policy: Literal["other", "fifo", "round_robin"] = key("Scheduling policy.", "round_robin", "other")
-    priority: int = key("Real-time priority; only for fifo and round_robin.", "31", 31, ge=1, le=99)
-    lock_memory: bool = key("Keep all memory in RAM.", "true", False)
+    policy: Literal["other", "fifo", "round_robin"] = key(
+        "Linux scheduling policy of the loop.", "round_robin", "other"
+    )
+    priority: int = key(
+        "Real-time priority for fifo and round_robin; 98 at most, because the guardian needs a higher one.",
+        "31",
+        31,
+        ge=1,
+        le=99,
+    )
+    lock_memory: bool = key("Memory lock, which keeps the loop from being swapped out.", "true", False)
     cores: (
         Annotated[
             tuple[Annotated[int, Field(ge=0, le=1023)], ...], Field(strict=False), AfterValidator(_cores)
         ]
         | None
-    ) = key("Processor cores that the loop may run on.", "[3]", None)
+    ) = key("Processor cores on which the loop may run.", "[3]", None)
     polling: AutoDuration = key(
-        "Longest time that the clock is polled before a deadline; auto: a tenth of the period.",
+        "Longest time of polling the clock before a deadline; auto is a tenth of the period.",
         "100 us",
         "auto",
     )
     reply_polling: Polling = key(
-        "Longest time that a servo's reply is polled for, at most half of a core; auto: a tenth.", "100 us", 0
+        "Longest time of polling for a servo's reply, with at most half of a core; auto is 1 ms with "
+        "a tenth of a core. Off by default.",
+        "100 us",
+        0,
     )
-    idle_latency: bool = key("Keep processor cores from deep idle states.", "true", False)
+    idle_latency: bool = key(
+        "Lock against deep idle states, from which processor cores wake late.", "true", False
+    )
 
 
 class Loop(Form):
     """The control loop."""
 
-    rate: Rate = key("Cycles per second, Hz.", "50", ge=0.001, le=100_000)
+    rate: Rate = key("Loop rate, Hz.", "50", ge=0.001, le=100_000)
     scheduler: Scheduler = key("Real-time settings of the loop.", "{policy: round_robin}", Scheduler())
     overrun: Literal["skip", "catch_up", "stop"] = key(
-        "After a late cycle whole periods are skipped, or up to 5 follow at once, or the run ends.",
+        "Reaction to a late cycle: skip the missed periods, run up to 5 late cycles "
+        "without waiting (catch_up), or end the run (stop).",
         "catch_up",
         "skip",
     )
-    tolerated_skips: Share = key("A run that skips more of its periods than this has failed.", "1 %", 0.1)
+    tolerated_skips: Share = key("Largest share of skipped periods in a good run.", "1 %", 0.1)
 
 
 class PoseStep(Form):
     """A step of a policy that moves to a pose."""
 
-    pose: str = key("Name of a pose.", "home", min_length=1)
-    speed: Annotated[AngularVelocity, Field(gt=0)] = key("How fast each joint goes there.", "60 deg/s")
+    pose: str = key("Name of the pose.", "home", min_length=1)
+    speed: Annotated[AngularVelocity, Field(gt=0)] = key(
+        "Speed of each rotary joint on its way to the pose.", "60 deg/s"
+    )
     linear_speed: Annotated[LinearVelocity, Field(gt=0)] | None = key(
-        "How fast each linear joint goes there.", "20 mm/s", None
+        "Speed of each linear joint on its way to the pose; required if the pose has linear joints.",
+        "20 mm/s",
+        None,
     )
 
 
 class TorqueStep(Form):
     """A step of a policy that reduces the torque gradually."""
 
-    reduce_torque: float = key("What is left of each servo's own torque limit.", "0.3", gt=0, lt=1)
-    steps: int = key("In how many steps.", "5", 5, ge=1, le=100)
-    over: Annotated[Duration, Field(gt=0)] = key("How long it takes.", "1 s", 1_000_000_000)
+    reduce_torque: float = key(
+        "Remaining share of each servo's own torque limit, between 0 and 1.", "0.3", gt=0, lt=1
+    )
+    steps: int = key("Number of steps of the reduction.", "5", 5, ge=1, le=100)
+    over: Annotated[Duration, Field(gt=0)] = key("Duration of the reduction.", "1 s", 1_000_000_000)
 
 
 Word = Literal["limp", "hold"]  # torque off; or torque on, every joint holding its position
@@ -135,7 +155,7 @@ class Group(Form):
     """Joints under one name. Its other keys have been copied into the joints when the file was read."""
 
     joints: Annotated[tuple[Name, ...], Field(strict=False, min_length=1)] = key(
-        "Its joints, or other groups.", "[left_shoulder, left_elbow]"
+        "Joints of the group, or other groups.", "[left_shoulder, left_elbow]"
     )
 
 
@@ -143,33 +163,46 @@ class GroupPolicies(Form):
     """Policies of a group of joints that differ from those of the robot."""
 
     joints: Annotated[tuple[Name, ...], Field(strict=False)] = key(
-        "Its joints, each in one at most; where it has none: the robot's group of that name.",
+        "Joints of the group, each in one group at most; by default those of the robot's group with "
+        "this name.",
         "[left_wheel, right_wheel]",
         (),
     )
-    on_returned_servo: Word | None = key("As the policy of that name, for this group.", "hold", None)
+    on_returned_servo: Word | None = key(
+        "State of a servo of the group that answers again after a reboot; the robot's policy by default.",
+        "hold",
+        None,
+    )
 
 
 class Policies(Form):
     """Actions at the end of a run and on faults."""
 
     on_exit: WrittenPolicy = key(
-        "At Ctrl-C, SIGTERM, `dxlrun stop` and the end of the motions.",
+        "Steps at the end of a run without a fault, as by Ctrl-C, SIGTERM, `dxlrun stop` or the last motion.",
         "[{pose: home, speed: 60 deg/s}, limp]",
         "limp",
     )
     on_fault: WrittenPolicy = key(
-        "When a controller failed without a fallback, a bus is gone, or by `overrun: stop`.", "limp", "limp"
+        "Steps after a fault, such as a lost bus, a failed controller without a fallback, or a late "
+        "cycle with `overrun: stop`.",
+        "limp",
+        "limp",
     )
     on_returned_servo: Word = key(
-        "When a servo answers again that has rebooted; hold: it gets torque where it stands.", "hold", "limp"
+        "State of a servo that answers again after a reboot: limp, or with torque at its present "
+        "position (hold).",
+        "hold",
+        "limp",
     )
     groups: dict[Name, GroupPolicies] = key(
-        "Groups of joints with policies of their own for lost servos.",
+        "Groups of joints with their own policies for lost and returned servos.",
         "{wheels: {joints: [left_wheel, right_wheel], on_lost_servo: limp}}",
         {},
     )
-    exit_timeout: Duration = key("Longest orderly end of a run.", "2 s", 2_000_000_000, gt=0)
+    exit_timeout: Duration = key(
+        "Time limit for the end of a run, including the steps of its policy.", "2 s", 2_000_000_000, gt=0
+    )
 
     def of_joint(self, name: str, joint: str) -> object:
         """Return the value of a key for a joint: its group's, or the robot's if the group has none."""
@@ -191,16 +224,21 @@ _ONE_OR_MORE = {"anyOf": [{"type": "string"}, {"type": "array", "minItems": 1, "
 class ControllerEntry(PlugInEntry):
     """One controller. Keys other than type, active, rate, fallback and into are its own parameters."""
 
-    type: str = key("Type that a plug-in offers.", "joint_group_position_controller", min_length=1)
-    active: bool = key("Active from the start.", "false", True)
+    type: str = key(
+        "Controller type of a plug-in, or a class of a Python file: `./wave.py:Wave`.",
+        "joint_group_position_controller",
+        min_length=1,
+    )
+    active: bool = key("Activation at the start of the run.", "false", True)
     rate: Annotated[float, Field(ge=0.001), units.rate] | None = key(
-        "Updates per second, Hz; the loop's when absent.", "50", None
+        "Update rate, Hz; the loop rate by default.", "50", None
     )
     fallback: str | None = key(
-        "Controller that takes over when this one breaks its contract.", "stand_still", None, min_length=1
+        "Controller that takes over when this controller fails.", "stand_still", None, min_length=1
     )
     into: Annotated[tuple[str, ...], BeforeValidator(_one_or_more), WithJsonSchema(_ONE_OR_MORE)] = key(
-        "Controllers whose references this one commands, instead of the servos: one, or a list.",
+        "Controllers that get the commands of this controller as references, instead of the servos: "
+        "one name or a list.",
         "arm_pid",
         (),
     )
@@ -209,7 +247,7 @@ class ControllerEntry(PlugInEntry):
 class Gateway(Form):
     """The process through which clients steer the run."""
 
-    enabled: bool = key("Let this user's programs steer the run.", "false", True)
+    enabled: bool = key("Permission for other programs of this user to steer the run.", "false", True)
 
 
 class Processes(Form):
@@ -217,21 +255,28 @@ class Processes(Form):
 
     refused: ClassVar[Mapping[str, str]] = {"view": "take it out; `dxlrun view` shows a run"}
 
-    gateway: Gateway = key("Steering from outside, over a Unix socket.", "{enabled: false}", Gateway())
+    gateway: Gateway = key(
+        "Access for programs that steer the run, over a Unix socket.", "{enabled: false}", Gateway()
+    )
 
 
 class RobotModel(Form):
     """The robot's body."""
 
     urdf: str = key(
-        "Its URDF, from the folder of the file that says it; goes into the log.", "torso.urdf", min_length=1
+        "URDF of the robot, relative to the folder of the file that names it; each log contains a copy.",
+        "torso.urdf",
+        min_length=1,
     )
-    frames_rate: Rate = key("Messages of /tf in the log a second, Hz; 0: none.", "10", 30.0, ge=0, le=100_000)
+    frames_rate: Rate = key("Rate of /tf messages in the log, Hz; 0 for none.", "10", 30.0, ge=0, le=100_000)
     imu: Name | None = key(
-        "Sensor, device or controller whose orientation turns the body in the frame odom.", "imu", None
+        "Sensor, device or controller that provides the orientation of the body in the frame odom.",
+        "imu",
+        None,
     )
     imu_link: str | None = key(
-        "Link of the URDF whose orientation that is; NAME, NAME_link or NAME_frame when absent.",
+        "URDF link on which the IMU is mounted; NAME, NAME_link or NAME_frame by default, where NAME "
+        "is the value of `imu`.",
         "torso",
         None,
         min_length=1,
@@ -242,11 +287,14 @@ class Simulation(Form):
     """Physics of the simulated servos' loads; servos on a real port ignore it."""
 
     physics: Literal["independent", "mujoco"] = key(
-        "Each joint by itself, or all together by MuJoCo after the model's URDF.", "mujoco", "independent"
+        "Physics engine: each joint on its own (independent), or the whole robot in MuJoCo, from the "
+        "URDF of `model`.",
+        "mujoco",
+        "independent",
     )
 
 
-_POLICIES = ("What happens on faults and at the end.", "{exit_timeout: 2 s}")
+_POLICIES = ("Actions on faults and at the end of a run.", "{exit_timeout: 2 s}")
 
 
 class Robot(Form):
@@ -260,27 +308,27 @@ class Robot(Form):
 
     name: Name = key("Name of the robot.", "bioloid_torso")
     buses: dict[Name, Bus] = key("Serial lines by name.", "{main: {port: sim, ...}}", min_length=1)
-    loop: Loop = key("The control loop.", "{rate: 50}")
+    loop: Loop = key("Rate and real-time settings of the control loop.", "{rate: 50}")
     joints: dict[Name, JointEntry] = key(
         "Joints by name.", "{head_joint: {bus: main, id: 1, ...}}", min_length=1
     )
     groups: dict[Name, Group] = key(
-        "Joints under one name, with keys that each of them gets.",
+        "Groups of joints by name, with keys for each joint of the group.",
         "{left_arm: {bus: main, joints: [left_shoulder, left_elbow]}}",
         {},
     )
     controllers: dict[Name, ControllerEntry] = key(
-        "Controllers by name, updated in this order.", "{head: {type: ...}}", {}
+        "Controllers by name, in the order of their updates.", "{head: {type: ...}}", {}
     )
     poses: dict[Name, Annotated[dict[Name, Position], Field(min_length=1)]] = key(
-        "Positions of some or all joints, by name, for policies.", "{home: {head_joint: 0 deg}}", {}
+        "Poses by name, with positions of some or all joints, for policies.",
+        "{home: {head_joint: 0 deg}}",
+        {},
     )
     policies: Policies = key(*_POLICIES, Policies())
-    processes: Processes = key("Processes beside the loop.", "{gateway: {enabled: false}}", Processes())
-    model: RobotModel | None = key("The robot's body.", "{urdf: torso.urdf}", None)
-    simulation: Simulation = key(
-        "How simulated servos move what they move.", "{physics: mujoco}", Simulation()
-    )
+    processes: Processes = key("Processes next to the loop.", "{gateway: {enabled: false}}", Processes())
+    model: RobotModel | None = key("URDF and frames of the robot.", "{urdf: torso.urdf}", None)
+    simulation: Simulation = key("Physics of the simulated servos' loads.", "{physics: mujoco}", Simulation())
 
 
 @cache

@@ -69,47 +69,52 @@ class JointSimulation(Form):
     """Load and delays of the simulated servos of a joint; real servos ignore it."""
 
     response_delay: Annotated[Duration, Field(le=LONGEST_RESPONSE_DELAY_NS)] = key(
-        "Time between an instruction to the servo and its effect on the motor.", "20 ms", 0
+        "Delay between an instruction to the servo and its effect on the motor; the delay in the "
+        "motor file by default.",
+        "20 ms",
+        0,
     )
     write_time: Annotated[Duration, Field(le=LONGEST_WRITE_TIME_NS)] = key(
-        "Time after a write in which the servo receives nothing.", "1 ms", 0
+        "Time after a write during which the servo receives nothing.", "1 ms", 0
     )
     motor: MotorFile | None = key(
-        "Motor file of the simulated servo, where that shall be another motor than the joint's.",
+        "Motor file of the simulated servo; the joint's motor file by default.",
         "other.motor.yaml",
         None,
     )
     inertia: Annotated[Inertia, Field(gt=0)] | None = key(
-        "Moment of inertia of what it moves.", "0.01 kg m^2", None
+        "Moment of inertia of the joint's load; the load in the motor file by default.", "0.01 kg m^2", None
     )
-    mass: Annotated[Mass, Field(gt=0)] | None = key("Mass of what a linear joint moves.", "0.2 kg", None)
+    mass: Annotated[Mass, Field(gt=0)] | None = key("Mass of a linear joint's load.", "0.2 kg", None)
     friction: Annotated[TorqueOrForce, Field(ge=0)] | None = key(
-        "Friction of the joint, at every speed.", "0.05 Nm", None
+        "Coulomb friction of the joint, in addition to the servo's own.", "0.05 Nm", None
     )
     gravity: Annotated[TorqueOrForce, Field(ge=0)] | None = key(
-        "Torque of the weight when it sticks out horizontally; of a linear joint the weight that "
-        "pulls towards lower positions.",
+        "Torque of the weight in the horizontal position; for a linear joint, force of the weight "
+        "towards lower positions.",
         "0.3 Nm",
         None,
     )
-    gravity_angle: Angle | None = key(
-        "Angle of the joint where the weight hangs straight down.", "0 deg", None
-    )
+    gravity_angle: Angle | None = key("Joint angle at which the weight hangs straight down.", "0 deg", None)
 
 
 class BareJoint(Form):
     """Keys that every joint has. A joint with only these keys has its servos in another section."""
 
-    continuous: bool = key("A wheel, or a joint of many turns; it needs no position limits.", "true", False)
-    torque: OnOff = key("off: it is limp from the start, until `dxlrun torque on`.", "off", True)
-    limits: Limits = key("Where it may go, and how fast.", "{position: [-90 deg, 90 deg]}", Limits())
+    continuous: bool = key("Wheel or multi-turn joint, which needs no position limits.", "true", False)
+    torque: OnOff = key(
+        "Torque at the start of a run; with off the joint is limp until `dxlrun torque on`.", "off", True
+    )
+    limits: Limits = key(
+        "Limits of position, velocity, acceleration and effort.", "{position: [-90 deg, 90 deg]}", Limits()
+    )
     tolerance: GoalTolerance = key(
-        "How near its goal it must come to have reached it.",
+        "Tolerance within which a goal counts as reached.",
         "{position: 2 deg, velocity: 2 deg/s, time: 2 s}",
         GoalTolerance(),
     )
     wrap: bool = key(
-        "A continuous joint that goes the shorter way: a turn more is the same place.", "true", False
+        "Shorter way to each goal, for a continuous joint whose whole turns do not matter.", "true", False
     )
 
     @model_validator(mode="after")
@@ -122,7 +127,7 @@ class BareJoint(Form):
         return self
 
     simulation: JointSimulation = key(
-        "What its servos move when they are simulated.", "{inertia: 0.01 kg m^2}", JointSimulation()
+        "Load and delays of the joint's simulated servos.", "{inertia: 0.01 kg m^2}", JointSimulation()
     )
 
 
@@ -132,18 +137,20 @@ class ServoJoint(BareJoint):
     A joint with `travel_per_turn` is linear: its positions are lengths.
     """
 
-    bus: str = key("Name of its bus.", "main")
+    bus: str = key("Name of the servo's bus.", "main")
     model: str = key(
-        "Model of its servo (`dxlrun models`), or auto: read from the servo.", "AX-12A", min_length=1
+        "Model of the servo (see `dxlrun models`), or auto to read it from the servo.", "AX-12A", min_length=1
     )
-    reference: Angle = key("Angle of the servo, from its zero, where the joint's is zero.", "150 deg")
-    direction: Direction = key("1: the joint's angle grows as the servo's does, -1: against it.", "1")
-    gear_ratio: GearRatio = key("Turns of the servo for one turn of the joint.", "2.5", 1.0)
+    reference: Angle = key("Servo angle, from its raw 0, at the joint's zero position.", "150 deg")
+    direction: Direction = key(
+        "Sense of rotation: 1 if the joint's position grows with the servo's angle, else -1.", "1"
+    )
+    gear_ratio: GearRatio = key("Gear ratio: servo turns per turn of the joint.", "2.5", 1.0)
     travel_per_turn: TravelPerTurn | None = key(
-        "How far the joint moves in one turn of the servo; makes it a linear joint.", "94.2 mm", None
+        "Travel per turn of the servo, which makes the joint linear.", "94.2 mm", None
     )
     motor: MotorFile | None = key(
-        "Motor file of its servo, from the folder of the file that says it.", "elbow.motor.yaml", None
+        "Motor file of the servo, relative to the folder of the file that names it.", "elbow.motor.yaml", None
     )
 
     @property
@@ -160,17 +167,18 @@ class ServoJoint(BareJoint):
 class Joint(ServoJoint):
     """A joint with one servo."""
 
-    id: ServoId = key("ID of its servo.", "1")
+    id: ServoId = key("ID of the servo.", "1")
 
 
 class SharedJoint(ServoJoint):
     """A joint with several servos, which get equal goals."""
 
     servos: Annotated[tuple[OneOfServos, ...], Field(strict=False, min_length=2)] = key(
-        "Its servos; what one does not have is the joint's.", "[{id: 1}, {id: 2, direction: -1}]"
+        "Servos of the joint, which supplies the keys that a servo omits.",
+        "[{id: 1}, {id: 2, direction: -1}]",
     )
     tolerance: SharedTolerance = key(
-        "How near its goal it must come to have reached it, and by how much its servos may disagree.",
+        "Tolerance within which a goal counts as reached, and largest difference between the servos.",
         "{servos: 3 deg, position: 2 deg}",
         SharedTolerance(),
     )

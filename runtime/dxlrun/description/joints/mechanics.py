@@ -64,13 +64,15 @@ class GoalTolerance(Form):
     alone: ClassVar[str] = "position"
     """Key that a bare value sets."""
     position: units.Tolerance | None = key(
-        "Distance from its goal; 5 deg or 5 mm when absent, inf: any.", "2 deg", None
+        "Largest distance from the goal; 5 deg or 5 mm by default, inf for any distance.", "2 deg", None
     )
     velocity: RestSpeed | None = key(
-        "Speed below which it is at rest; 5 deg/s or 5 mm/s when absent, inf: any.", "2 deg/s", None
+        "Speed below which the joint is at rest; 5 deg/s or 5 mm/s by default, inf for any speed.",
+        "2 deg/s",
+        None,
     )
     time: Duration | None = key(
-        "How long after the end of a motion its goal may still be reached; 1 s when absent.", "2 s", None
+        "Time after the end of a motion within which the goal must be reached; 1 s by default.", "2 s", None
     )
 
     @model_validator(mode="before")
@@ -93,7 +95,7 @@ class SharedTolerance(GoalTolerance):
 
     alone: ClassVar[str] = "servos"
     servos: Tolerance | None = key(
-        "By how much its servos may disagree, as a position of the joint; 3 deg or 1 mm when absent.",
+        "Largest difference between the servos, as a position of the joint; 3 deg or 1 mm by default.",
         "3 deg",
         None,
     )
@@ -123,19 +125,19 @@ class Limits(Form):
 
     position: Annotated[tuple[Position, Position], Field(strict=False), AfterValidator(_ordered)] | None = (
         key(
-            "Lower and upper limit of the joint's position; none: the servo's reach.",
+            "Lower and upper position limit; the servo's range by default.",
             "[-90 deg, 90 deg]",
             None,
         )
     )
     velocity: Annotated[Speed, Field(gt=0)] | None = key(
-        "Highest speed; none: the servo's own.", "2 rad/s", None
+        "Velocity limit; the servo's own by default.", "2 rad/s", None
     )
     acceleration: Annotated[Acceleration, Field(gt=0)] | None = key(
-        "By how much goals may become faster or slower; none: as much as commanded.", "20 rad/s^2", None
+        "Acceleration limit of goals; unlimited by default.", "20 rad/s^2", None
     )
     effort: Effort | None = key(
-        "Highest effort that may be commanded, in what the servo measures: Nm, N, A or %.", "800 mA", None
+        "Limit of commanded efforts, in the quantity that the servo measures: Nm, N, A or %.", "800 mA", None
     )
 
 
@@ -147,12 +149,17 @@ class OneOfServos(ServoEntry):
     """One of several servos on a joint; the joint supplies the missing keys."""
 
     id: ServoId = key("ID of the servo.", "2")
-    bus: str | None = key("Name of its bus; none: the joint's.", "legs", None)
-    model: str | None = key("Its model; none: the joint's.", "MX-64", None, min_length=1)
+    bus: str | None = key("Name of the servo's bus; the joint's by default.", "legs", None)
+    model: str | None = key("Model of the servo; the joint's by default.", "MX-64", None, min_length=1)
     reference: Angle | None = key(
-        "Its angle, from its zero, where the joint's is zero; none: the joint's.", "180 deg", None
+        "Servo angle, from its raw 0, at the joint's zero position; the joint's reference by default.",
+        "180 deg",
+        None,
     )
     direction: Direction | None = key(
-        "1: the joint's angle grows as the servo's does, -1: against it; none: the joint's.", "-1", None
+        "Sense of rotation: 1 if the joint's position grows with the servo's angle, else -1; the "
+        "joint's by default.",
+        "-1",
+        None,
     )
-    motor: MotorFile | None = key("Its motor file; none: the joint's.", "hip.motor.yaml", None)
+    motor: MotorFile | None = key("Motor file of the servo; the joint's by default.", "hip.motor.yaml", None)

@@ -44,23 +44,25 @@ def _short(delay_ns: int) -> int:
 class StribeckForm(Form):
     """Friction near standstill."""
 
-    friction: Annotated[Torque, Field(ge=0)] = key("Friction beside the other one, at standstill.", "0.05 Nm")
+    friction: Annotated[Torque, Field(ge=0)] = key("Additional friction at standstill.", "0.05 Nm")
     velocity: Annotated[AngularVelocity, Field(gt=0)] = key(
-        "Speed at which it has fallen to a third.", "0.2 rad/s"
+        "Speed at which the additional friction has fallen to 37 %.", "0.2 rad/s"
     )
-    exponent: float = key("How sharply it falls around that speed.", "2", 2.0, gt=0, le=20)
+    exponent: float = key(
+        "Exponent of the additional friction's fall; a higher one is steeper.", "2", 2.0, gt=0, le=20
+    )
 
 
 class LoadForm(Form):
     """Load that the motor moves."""
 
     inertia: Annotated[Inertia, Field(ge=0)] = key(
-        "Moment of inertia beside the motor's own.", "0.01 kg m^2", 0.0
+        "Moment of inertia of the load, in addition to the motor's own.", "0.01 kg m^2", 0.0
     )
     gravity: Annotated[Torque, Field(ge=0)] = key(
-        "Torque of the weight when it sticks out horizontally.", "0.3 Nm", 0.0
+        "Torque of the weight in the horizontal position.", "0.3 Nm", 0.0
     )
-    gravity_angle: Angle = key("Angle of the joint where the weight hangs straight down.", "0 deg", 0.0)
+    gravity_angle: Angle = key("Joint angle at which the weight hangs straight down.", "0 deg", 0.0)
 
 
 _UNCERTAIN: Mapping[str, tuple[object, str]] = {
@@ -88,7 +90,7 @@ UncertaintyForm = create_model(  # type: ignore[call-overload]  # fields by a ta
             Annotated[kind, Field(ge=0)] | None,
             Field(
                 default=None,
-                description=f"Of {name}.",
+                description=f"Half-width of the 95 % confidence interval of {name}.",
                 examples=[example],
             ),
         )
@@ -101,38 +103,42 @@ class MotorForm(Form):
     """A motor file."""
 
     model: str = key("Model of the servo.", "MX-64", min_length=1)
-    source: str = key("What it was identified from: log and date.", "elbow.mcap", "")
-    voltage: Annotated[Voltage, Field(gt=0)] = key("Supply, where it is not measured.", "12 V")
+    source: str = key("Data of the identification: log and date.", "elbow.mcap", "")
+    voltage: Annotated[Voltage, Field(gt=0)] = key("Supply voltage, unless the servo measures it.", "12 V")
     torque_constant: Annotated[TorqueConstant, Field(gt=0)] = key(
-        "Torque at the horn for each ampere.", "1.6 Nm/A"
+        "Torque at the horn per ampere.", "1.6 Nm/A"
     )
-    resistance: Annotated[Resistance, Field(gt=0)] = key("Of the motor's winding.", "3.6 ohm")
+    resistance: Annotated[Resistance, Field(gt=0)] = key("Resistance of the motor's winding.", "3.6 ohm")
     inertia: Annotated[Inertia, Field(gt=0)] = key(
         "Moment of inertia of rotor and gear, at the horn.", "0.011 kg m^2"
     )
-    friction: Annotated[Torque, Field(ge=0)] = key("Friction at every speed (Coulomb).", "0.1 Nm", 0.0)
+    friction: Annotated[Torque, Field(ge=0)] = key(
+        "Coulomb friction, the same at every speed.", "0.1 Nm", 0.0
+    )
     load_friction: float = key(
-        "Friction for each Nm between the motor's torque and the load's, Nm/Nm.", "0.08", 0.0, ge=0, lt=1
+        "Friction per Nm of difference between the torques of motor and load, Nm/Nm.", "0.08", 0.0, ge=0, lt=1
     )
     viscous_friction: Annotated[ViscousFriction, Field(ge=0)] = key(
-        "Friction that grows with the speed.", "0.01 Nm s/rad", 0.0
+        "Viscous friction, proportional to the speed.", "0.01 Nm s/rad", 0.0
     )
     stribeck: StribeckForm | None = key(
-        "More friction near standstill.", "{friction: 0.05 Nm, velocity: 0.2 rad/s}", None
+        "Additional friction near standstill (Stribeck effect).",
+        "{friction: 0.05 Nm, velocity: 0.2 rad/s}",
+        None,
     )
     position_gain: Annotated[Stiffness, Field(gt=0)] | None = key(
-        "Part of the full voltage for each rad of error and one unit of the P gain.", "0.158 1/rad", None
+        "Share of the full voltage per rad of error and per unit of the P gain.", "0.158 1/rad", None
     )
     p_gain: int | None = key(
-        "Value of the P gain's register when it was identified; none: it has no such register.",
+        "Value of the P gain register during the identification; absent if the servo has no such register.",
         "32",
         None,
         gt=0,
     )
     delay: Annotated[Duration, AfterValidator(_short)] = key(
-        "From a goal's arrival at the servo until the motor has it.", "2 ms", 0
+        "Delay between a goal's arrival at the servo and its effect on the motor, at most 100 ms.", "2 ms", 0
     )
-    load: LoadForm = key("What it moved.", "{inertia: 0.01 kg m^2}", LoadForm())
+    load: LoadForm = key("Load during the identification.", "{inertia: 0.01 kg m^2}", LoadForm())
     uncertainty: UncertaintyForm = key(
         "Half-widths of the 95 % confidence intervals, by name.", "{resistance: 0.05 ohm}", UncertaintyForm()
     )

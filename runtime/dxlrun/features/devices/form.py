@@ -89,48 +89,49 @@ class DeviceSimulation(Form):
     """States of a simulated device."""
 
     values: Numbers = key(
-        "What a state shows, SI units; else what the simulation knows of its name, or 0.",
+        "Fixed values of states, SI units; by default the simulated quantity with the state's name, or 0.",
         "{force.x: 12.5}",
         {},
     )
     noise: Numbers = key(
-        "Standard deviation of what a state shows, SI units; else none.", "{force.x: 0.2}", {}
+        "Standard deviations of the noise of states, SI units; no noise by default.", "{force.x: 0.2}", {}
     )
     link: str = key(
-        "Link of the URDF with which an IMU moves; none: it stands upright and still.", "torso", ""
+        "URDF link that carries the IMU; an IMU without a link is upright and at rest.", "torso", ""
     )
 
 
 class Device(Form):
     """A device on a bus, such as an IMU, a foot with pressure sensors, or a power board."""
 
-    bus: str = key("Name of its bus.", "main")
-    id: int = key("Its ID, which no servo of the bus has.", "241", ge=0, le=253)
+    bus: str = key("Name of the device's bus.", "main")
+    id: int = key(
+        "ID of the device, which no servo or other device of the bus may have.", "241", ge=0, le=253
+    )
     model: str = Field(
         min_length=1,
-        description="Its model, as `dxlrun models` lists it, or the TOML file of its control table.",
+        description="Model of the device (see `dxlrun models`), or the TOML file of its control table.",
         examples=["generic", "boards/my_board.toml"],
     )
     states: Items = key(
-        "Items read each cycle: a list, or NAME: ITEM for each; else those of its table.",
+        "Items read in each cycle, as a list or as NAME: ITEM; the cyclic items of the control table "
+        "by default.",
         "{pressure.left: register_1, pressure.right: register_2}",
         (),
     )
-    commands: Items = key("Items that controllers may command: a list, or NAME: ITEM for each.", "[led]", ())
+    commands: Items = key("Items that controllers may command, as a list or as NAME: ITEM.", "[led]", ())
     safe: Numbers = key(
-        "What a command becomes when no controller commands it any more, and at the end of the "
-        "run, SI units; else the safe value of its table, if there is one.",
+        "Values of commands, SI units, when their controller stops and at the end of the run; the "
+        "safe values in the control table by default.",
         "{led: 0}",
         {},
     )
-    simulation: DeviceSimulation = key(
-        "What it shows when it is simulated.", "{link: torso}", DeviceSimulation()
-    )
+    simulation: DeviceSimulation = key("States of the simulated device.", "{link: torso}", DeviceSimulation())
 
 
 STAGE: Section[dict[str, Device]] = Section(
     "devices",
     dict[Name, Device],
-    key("What is on a bus and is no servo, by name.", "{imu: {bus: main, id: 241, model: ...}}", {}),
+    key("Devices on a bus other than servos, by name.", "{imu: {bus: main, id: 241, model: ...}}", {}),
     before="controllers",
 )

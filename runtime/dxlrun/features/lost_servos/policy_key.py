@@ -12,7 +12,8 @@ OF_GROUP: PolicyKey[Literal["hold", "limp", "stop"] | None] = PolicyKey(
     "on_lost_servo",
     Literal["hold", "limp", "stop"] | None,
     key(
-        "hold: its controllers wait; limp: the group loses its torque; stop: the run ends by on_fault.",
+        "Reaction to a lost servo of the group: its controllers hold, the group goes limp, or the run "
+        "ends by on_fault (stop). The robot's policy by default.",
         "limp",
         None,
     ),
@@ -21,7 +22,12 @@ OF_GROUP: PolicyKey[Literal["hold", "limp", "stop"] | None] = PolicyKey(
 STAGE: PolicyKey[WrittenPolicy] = PolicyKey(
     "on_lost_servo",
     WrittenPolicy,
-    key("When a servo missed 3 replies in a row, and 50 ms; hold: its controllers wait.", "hold", "hold"),
+    key(
+        "Reaction to a lost servo, after 3 missed replies in a row and 50 ms: its controllers hold "
+        "until it answers, or the run ends by these steps.",
+        "hold",
+        "hold",
+    ),
     before="on_returned_servo",
     group=OF_GROUP,
 )

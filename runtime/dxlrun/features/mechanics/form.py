@@ -24,16 +24,20 @@ from dxlrun.features.feature import Section
 class TransmissionServo(ServoEntry):
     """One servo of a transmission."""
 
-    bus: str = key("Name of its bus.", "main")
+    bus: str = key("Name of the servo's bus.", "main")
     id: ServoId = key("ID of the servo.", "1")
-    model: str = key("Its model, or auto: it is asked.", "XL430-W250", min_length=1)
-    reference: Angle = key(
-        "Its angle, from its zero, where the transmission's joints are at zero.", "180 deg"
+    model: str = key(
+        "Model of the servo (see `dxlrun models`), or auto to read it from the servo.",
+        "XL430-W250",
+        min_length=1,
     )
-    direction: Direction = key("1: the transmission counts as the servo does, -1: against it.", "1")
-    gear_ratio: GearRatio = key("Turns of the servo for one turn of the transmission's input.", "2.5", 1.0)
+    reference: Angle = key("Servo angle, from its raw 0, with the transmission's joints at zero.", "180 deg")
+    direction: Direction = key(
+        "Sense of rotation: 1 if the transmission's input grows with the servo's angle, else -1.", "1"
+    )
+    gear_ratio: GearRatio = key("Gear ratio: servo turns per turn of the transmission's input.", "2.5", 1.0)
     motor: MotorFile | None = key(
-        "Its motor file, from the folder of the file that says it.", "wrist.motor.yaml", None
+        "Motor file of the servo, relative to the folder of the file that names it.", "wrist.motor.yaml", None
     )
 
 
@@ -41,13 +45,15 @@ class Transmission(Form):
     """Several servos that move several joints together: q = M s."""
 
     type: Literal["differential", "matrix"] = key(
-        "differential: half of the sum and half of the difference; matrix: as `matrix` says.", "differential"
+        "Kind of transmission: half of the sum and half of the difference of two servos "
+        "(differential), or the given `matrix`.",
+        "differential",
     )
     joints: Annotated[tuple[Name, ...], Field(strict=False, min_length=1)] = key(
-        "The joints that it moves, each in one transmission at most.", "[roll, pitch]"
+        "Joints that the transmission moves, each in one transmission at most.", "[roll, pitch]"
     )
     servos: dict[Name, TransmissionServo] = key(
-        "Its servos by name.", "{left: {bus: main, id: 1, ...}}", min_length=1
+        "Servos of the transmission, by name.", "{left: {bus: main, id: 1, ...}}", min_length=1
     )
     matrix: (
         Annotated[
@@ -56,12 +62,14 @@ class Transmission(Form):
         ]
         | None
     ) = key(
-        "Rows: joints, columns: servos, both in the order of the file; rad per rad.",
+        "Matrix with a row for each joint and a column for each servo, in the order of the file, rad/rad.",
         "[[0.5, 0.5], [0.5, -0.5]]",
         None,
     )
     tolerance: Tolerance | None = key(
-        "By how much a servo may be off where there are more servos than joints.", "3 deg", None
+        "Largest disagreement of the servos if there are more servos than joints; 3 deg by default.",
+        "3 deg",
+        None,
     )
 
 
@@ -82,7 +90,7 @@ STAGE: Section[dict[str, Transmission]] = Section(
     "transmissions",
     _form,
     key(
-        "Several servos that move several joints together, by name.",
+        "Transmissions by name: servos that move several joints together.",
         "{wrist: {type: differential, joints: [roll, pitch], ...}}",
         {},
     ),

@@ -10,18 +10,21 @@ from dxlrun.features.feature import Section
 class Recording(Form):
     """Settings of the log."""
 
-    directory: str = key("Where logs are written, from the working directory.", "logs", "logs", min_length=1)
+    directory: str = key(
+        "Directory of the logs, relative to the working directory.", "logs", "logs", min_length=1
+    )
     split: SizeOrDuration | None = key(
-        "Size or duration, 1 MB or 1 s at least, after which a log goes on in another file.", "100 MB", None
+        "Size or duration after which a log continues in another file, at least 1 MB or 1 s.", "100 MB", None
     )
     keep: SizeOrDuration | None = key(
-        "A size: a run deletes the oldest logs in the directory beyond it at its end. A duration (needs "
-        "split): files whose newest record is older are deleted while the run goes on.",
+        "Limit for old data. Beyond a size, the oldest logs in the directory are deleted at the end "
+        "of a run. Beyond a duration (needs `split`), older files of the log are deleted during the "
+        "run.",
         "10 GB",
         None,
     )
 
 
 STAGE: Section[Recording] = Section(
-    "recording", Recording, key("The log.", "{directory: logs}", Recording()), before="processes"
+    "recording", Recording, key("Settings of the log.", "{directory: logs}", Recording()), before="processes"
 )

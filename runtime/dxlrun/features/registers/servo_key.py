@@ -26,13 +26,17 @@ STAGE: ServoKey[Mapping[str, Register]] = ServoKey(
     "registers",
     dict[ItemName, Register],
     field=key(
-        "What its servo's control table shall hold: written at the start where it differs.",
+        "Values of items in the servo's control table, written at the start if they differ.",
         "{position_p_gain: 800, return_delay_time: 0 us}",
         {},
     ),
-    of_one=key("What its control table shall hold; none: the joint's.", "{position_p_gain: 800}", None),
+    of_one=key(
+        "Values of items in the servo's control table; the joint's by default.",
+        "{position_p_gain: 800}",
+        None,
+    ),
     of_section=key(
-        "What its control table shall hold: written at the start where it differs.",
+        "Values of items in the servo's control table, written at the start if they differ.",
         "{position_p_gain: 800}",
         {},
     ),

@@ -9,6 +9,11 @@ from dxlrun.features.feature import PolicyKey
 STAGE: PolicyKey[WrittenPolicy] = PolicyKey(
     "on_stale_command",
     WrittenPolicy,
-    key("When a stream of commands stopped; hold: its joints stay, the run goes on.", "hold", "hold"),
+    key(
+        "Reaction to a stream of commands that stopped: its joints hold until the next command, or "
+        "the run ends by these steps.",
+        "hold",
+        "hold",
+    ),
     before="exit_timeout",
 )
