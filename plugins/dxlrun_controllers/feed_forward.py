@@ -48,7 +48,7 @@ class FeedForwardParameters(JointsParameters):
     """Factor on the feed-forward, 0..1. With 0, `position` commands the unchanged reference."""
     most: PerJoint[Positive] | None = None
     """Largest magnitude of the offset (rad) or of the command (unit of the effort, fraction of full
-    voltage).."""
+    voltage)."""
     friction_speed: Annotated[AngularVelocity, Field(gt=0)] = 0.1
     """Desired speed at which 3/4 of the friction is compensated, rad/s. At rest, none is."""
     lead: Duration = 0

@@ -62,8 +62,7 @@ class IlcParameters(TrajectoryParameters):
     longest: Annotated[Duration, Field(gt=0)] = 40_000_000_000
     """Longest motion that is learned."""
     motions: Annotated[int, Field(ge=1, le=64)] = 4
-    """Number of motions that are remembered. A further one replaces the one that was played least recently..
-    """
+    """Number of remembered motions. A further motion replaces the one that was played least recently."""
     growth: Annotated[float, Field(gt=1)] = 2.0
     """Largest ratio of the error to the smallest error of the motion. The learned correction is dropped if
     two repetitions in a row exceed it, or are worse than without a correction."""

@@ -44,21 +44,23 @@ _REPORT_NS = 1_000_000_000
 class SerialImuParameters(ParametersModel):
     """Serial port and format of the lines"""
 
-    port: str = Field(min_length=1, description="Serial device.", examples=["/dev/ttyACM0"])
-    baud_rate: int = Field(default=115_200, gt=0, description="bit/s.", examples=["115_200"])
+    port: str = Field(min_length=1, description="Path of the serial port.", examples=["/dev/ttyACM0"])
+    baud_rate: int = Field(default=115_200, gt=0, description="Baud rate, bit/s.", examples=["115_200"])
     columns: tuple[str, ...] = Field(
         default=_SIX,
         min_length=1,
-        description="State of each number of a line, in order; - for one that is not used.",
+        description="State of each number of a line, in the order of the line; `-` for an unused number.",
         examples=["[angular_velocity.x, '-', linear_acceleration.z]"],
     )
     scale: dict[str, Annotated[float, Field(ge=-1e9, le=1e9)]] = Field(
         default={},
-        description="What the numbers of a group are multiplied by, to be rad/s, m/s^2 or T.",
+        description="Factors from the numbers of a group to rad/s, m/s^2 or T, by group; 1 by default.",
         examples=["{linear_acceleration: 9.80665, angular_velocity: 0.0174533}"],
     )
-    prefix: str = Field(default="", description="What each line begins with.", examples=["$IMU,"])
-    checksum: bool = Field(default=False, description="Lines end with * and a checksum, as in NMEA 0183.")
+    prefix: str = Field(default="", description="Text at the start of each line.", examples=["$IMU,"])
+    checksum: bool = Field(
+        default=False, description="If true, lines end with `*` and a checksum, as in NMEA 0183."
+    )
 
     @field_validator("columns")
     @classmethod

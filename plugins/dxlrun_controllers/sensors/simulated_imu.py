@@ -20,28 +20,32 @@ Density = Annotated[float, Field(ge=0)]
 class Gyroscope(ParametersModel):
     """Gyroscope model: noise, bias and drift of the bias."""
 
-    noise_density: Density = Field(default=0.0, description="White noise, rad/s/sqrt(Hz).", examples=["1e-4"])
+    noise_density: Density = Field(
+        default=0.0, description="Density of the white noise, rad/s/sqrt(Hz).", examples=["1e-4"]
+    )
     bias: tuple[AngularVelocity, AngularVelocity, AngularVelocity] = Field(
         default=(0.0, 0.0, 0.0),
-        description="What it shows at rest.",
+        description="Measured angular velocity at rest, rad/s.",
         examples=["[0.2 deg/s, 0 deg/s, 0 deg/s]"],
     )
     random_walk: Density = Field(
-        default=0.0, description="How the bias wanders, rad/s^2/sqrt(Hz).", examples=["1e-5"]
+        default=0.0, description="Random walk of the bias, rad/s^2/sqrt(Hz).", examples=["1e-5"]
     )
 
 
 class Accelerometer(ParametersModel):
     """Accelerometer model: noise, bias and drift of the bias."""
 
-    noise_density: Density = Field(default=0.0, description="White noise, m/s^2/sqrt(Hz).", examples=["2e-3"])
+    noise_density: Density = Field(
+        default=0.0, description="Density of the white noise, m/s^2/sqrt(Hz).", examples=["2e-3"]
+    )
     bias: tuple[LinearAcceleration, LinearAcceleration, LinearAcceleration] = Field(
         default=(0.0, 0.0, 0.0),
-        description="What it shows beside gravity at rest.",
+        description="Measured acceleration at rest in addition to gravity, m/s^2.",
         examples=["[0.05 m/s^2, 0 m/s^2, 0 m/s^2]"],
     )
     random_walk: Density = Field(
-        default=0.0, description="How the bias wanders, m/s^3/sqrt(Hz).", examples=["1e-4"]
+        default=0.0, description="Random walk of the bias, m/s^3/sqrt(Hz).", examples=["1e-4"]
     )
 
 
@@ -50,25 +54,36 @@ class Magnetometer(ParametersModel):
 
     field: tuple[float, float, float] = Field(
         default=(0.0, 2.0e-5, -4.4e-5),
-        description="Of the Earth in the world's frame (x east, y north, z up), T.",
+        description="Magnetic field of the Earth in the world frame (x east, y north, z up), T.",
         examples=["[0.0, 2.0e-5, -4.4e-5]"],
     )
-    noise_density: Density = Field(default=0.0, description="White noise, T/sqrt(Hz).", examples=["1e-7"])
+    noise_density: Density = Field(
+        default=0.0, description="Density of the white noise, T/sqrt(Hz).", examples=["1e-7"]
+    )
     bias: tuple[float, float, float] = Field(
-        default=(0.0, 0.0, 0.0), description="Of magnets on the link, T.", examples=["[1e-6, 0.0, 0.0]"]
+        default=(0.0, 0.0, 0.0),
+        description="Magnetic field of magnets on the link, in its axes, T.",
+        examples=["[1e-6, 0.0, 0.0]"],
     )
 
 
 class ImuParameters(ParametersModel):
     """Link of the unit, and models of its sensors"""
 
-    link: str = Field(min_length=1, description="Link of the URDF that it sits on, in its frame.")
+    link: str = Field(
+        min_length=1,
+        description="Link of the URDF that carries the unit. Its frame is the frame of the measurements.",
+    )
     gyroscope: Gyroscope = Gyroscope()
     accelerometer: Accelerometer = Accelerometer()
     magnetometer: Magnetometer | None = Field(
-        default=None, description="There is none where this is left out.", examples=["{noise_density: 1e-7}"]
+        default=None,
+        description="Magnetometer. Without this key, there is none.",
+        examples=["{noise_density: 1e-7}"],
     )
-    seed: int = Field(default=0, ge=0, description="Of the noise: the same seed, the same noise.")
+    seed: int = Field(
+        default=0, ge=0, description="Seed of the noise. The same seed results in the same noise."
+    )
 
 
 class _Noise:

@@ -34,15 +34,17 @@ class PhidgetSpatialParameters(ParametersModel):
     """Selection of the unit"""
 
     serial_number: Annotated[int, Field(ge=1)] | None = Field(
-        default=None, description="Of the unit, or of the VINT hub that it is on; any when absent."
+        default=None, description="Serial number of the unit, or of its VINT hub. Default: any."
     )
     hub_port: Annotated[int, Field(ge=0, le=5)] | None = Field(
-        default=None, description="Port of the VINT hub; any when absent."
+        default=None, description="Port of the VINT hub. Default: any."
     )
-    magnetometer: bool = Field(default=True, description="Its states too.")
+    magnetometer: bool = Field(
+        default=True, description="If true, the states of the magnetometer are provided as well."
+    )
     attach_timeout: Annotated[Duration, Field(gt=0)] = Field(
         default=5_000_000_000,
-        description="How long it may take until the unit is there.",
+        description="Timeout for the attachment of the unit at the start.",
         examples=["5 s"],
     )
 
