@@ -37,21 +37,22 @@ def fleet(
     as_json: JsonFlag = False,
     debug: DebugFlag = False,
 ) -> int:
-    """Show the robots of a file in one table, live; q or Ctrl-C ends it. Start and stop them.
+    """Show the robots of a file in one live table, or start and stop them.
 
-    Into a pipe, or with --json, one look. The exit code is 1 when a robot is unreachable, or was not started
-    or stopped. Needs certificates of `dxlrun keys`.
+    q or Ctrl-C ends the table. In a pipe or with --json, the table is printed once. Needs certificates of
+    `dxlrun keys`. Exit code: 0, or 1 if a robot is unreachable, or was not started or stopped.
 
     Parameters
     ----------
     file
-        Names the robots and where they listen, and the agents that start them.
+        Fleet file: the robots, their addresses, and the agents that start them.
     start
-        Let their agents start these robots; needs the role admin.
+        Robots that their agents start. Needs the role admin.
     stop
-        Stop these robots, by their policy on_exit; needs the role command.
+        Robots to stop by their policy on_exit. Needs the role command.
     serve
-        Be the agent of this name: start the robots that the file names for it. Robots continue when it exits.
+        Name of the agent to run on this computer. It starts the robots that the file assigns to it, when
+        `--start` requests them. Robots continue when the agent exits.
     """
     from dxlrun.tooling.live import client_context
     from dxlrun_fleet.fleet_file import read_fleet

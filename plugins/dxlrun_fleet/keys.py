@@ -31,25 +31,25 @@ def keys(
     as_json: JsonFlag = False,
     debug: DebugFlag = False,
 ) -> int:
-    """Make certificates for robots and clients of a network, renew and revoke them.
+    """Create, renew and revoke certificates of robots and clients.
 
-    The first use makes an authority of one's own, on this computer; its key never leaves it.
+    The first use creates a certificate authority on this computer. Its private key remains on this computer.
 
     Parameters
     ----------
     action
-        robot NAME and client NAME make a certificate, renew NAME replaces it, revoke NAME makes the robots of
-        this computer refuse it, list shows all.
+        Action: robot NAME and client NAME create a certificate. renew NAME replaces it. revoke NAME makes the
+        robots of this computer refuse it. list shows all certificates.
     name
-        Of a robot, as in its robot file, or of a client, as the robot's log shall name it.
+        Name of a robot, as in its robot file, or of a client, as in the logs of robots.
     role
-        What a client may do: observe (the default), command, or admin, which is registers, rates and
-        controllers, too.
+        Role of a client: observe, command, or admin. admin also changes registers, rates and controllers.
+        Default: observe.
     days
-        How long the certificate is valid, 365 by default.
+        Validity of the certificate, days. Default: 365.
     output
-        Write the result to this directory, to be copied to `~/.config/dxlrun/keys` of another computer;
-        without it this computer uses it.
+        Output directory, to be copied to `~/.config/dxlrun/keys` of another computer. Default: that directory
+        of this computer.
     """
     try:
         from dxlrun_fleet import authority

@@ -38,24 +38,25 @@ def foxglove(
     origin: Annotated[tuple[str, ...], Parameter(negative=(), show_default=False)] = (),
     debug: DebugFlag = False,
 ) -> int:
-    """Serve a running robot to Foxglove and Lichtblick: and to other viewers of their protocol.
+    """Serve a running robot to Foxglove, Lichtblick and other viewers.
 
-    They get the channels of the log, live, and the controllers' parameters. The address that is printed has a
-    token, which is another one at each start; a viewer without it gets nothing.
+    Viewers get the channels of the log live, and the parameters of the controllers. The printed address
+    contains a token, which is different at each start. A viewer without the token is refused.
 
     Parameters
     ----------
     control
-        Let viewers steer the robot: change parameters, switch controllers and torque, and halt it.
+        Allow viewers to steer the robot: change parameters, switch controllers and torque, and halt.
     listen
-        Listen at HOST:PORT, HOST or :PORT. Another host than 127.0.0.1 needs `--cert` and `--key`; without a
-        port it is 8765, or if that is taken a free one.
+        Address to listen at: HOST:PORT, HOST or :PORT. Any host other than 127.0.0.1 needs `--cert`. Default
+        port: 8765, or a free one if that is in use.
     cert
-        Certificate of this computer (PEM), for TLS.
+        Certificate of this computer for TLS, a PEM file.
     key
-        Its private key (PEM).
+        Private key of the certificate, a PEM file. Default: the key in the file of `--cert`.
     origin
-        Let this web page connect, too, such as http://localhost:8080 for a Lichtblick of your own.
+        Web page that may connect, such as http://localhost:8080 for your own Lichtblick. Can be given several
+        times. The page of Foxglove may always connect.
     """
     from dxlrun.tooling.live import Place
 

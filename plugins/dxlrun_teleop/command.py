@@ -25,20 +25,20 @@ def teleop(
 ) -> int:
     """Drive a running robot by hand, from the keyboard or a gamepad.
 
-    It moves while a key, or the shoulder button of a gamepad, is held, and holds when that is released, the
-    gamepad is gone, or this program ends in any way.
+    The robot moves while a key, or the shoulder button of a gamepad, is held. It holds its position when the
+    key is released, the gamepad is disconnected, or this program exits.
 
     Parameters
     ----------
     targets
-        What the axes move, in this order: joints, groups, controllers, such as a base. Without any: all that
-        active controllers take positions, velocities, twists or trajectories for.
+        Joints, groups or controllers that the axes move, in this order. Default: all that active controllers
+        move by positions, velocities, twists or trajectories.
     gamepad
-        Drive with the gamepad that is plugged in.
+        Use the connected gamepad.
     device
-        Drive with this gamepad or keyboard, such as /dev/input/event5.
+        Gamepad or keyboard to use, such as /dev/input/event5.
     speed
-        Factor of the speed: 0.5 takes twice as long.
+        Speed factor, 0.1 to 10.
     """
     from dxlrun.tooling.output import show
     from dxlrun_teleop.bank import banks_of

@@ -41,22 +41,22 @@ def analyze(
 ) -> int:
     """Analyze a log: latency, duration of each step, skipped periods, packets and errors per servo.
 
-    The exit code is 1 when the run was not good.
+    Exit code: 0, or 1 if the verdict on the run is bad.
 
     Parameters
     ----------
     logs
-        The log of a run, an .mcap file or a directory of parts; without one that of the newest run in the
-        directory logs that has ended. Several logs get one line each. s3://BUCKET/LOG is read from a store,
-        as a whole.
+        Log of a run: an .mcap file, or a directory of parts. s3://BUCKET/LOG downloads a whole log from a
+        store. Several logs get one line each. Default: the newest log of a finished run in the directory
+        logs.
     report
-        Write a report to this HTML file, with all numbers and plots. A zoom in one plot is one in all; the
-        page loads nothing from anywhere, and prints. Needs bokeh: `pip install 'dxlrun[report]'`.
+        HTML file for a report with all numbers and plots. A zoom in one plot applies to all plots. The page
+        needs no network, and can be printed. Needs bokeh: `pip install 'dxlrun[report]'`.
     worst
-        Also show so many of the worst cycles, at most 10, as timelines: each packet with when the plan
-        expected it.
+        Number of the worst cycles to show as timelines, at most 10. A timeline has each packet, and the time
+        at which the plan expected it.
     as_json
-        Print the result as JSON; of several logs a list, `logs`.
+        Print the result as JSON. The results of several logs are in the list `logs`.
     """
     _check(logs, report=report, worst=worst)
     if report is not None:

@@ -28,23 +28,23 @@ def export(
     as_json: JsonFlag = False,
     debug: DebugFlag = False,
 ) -> int:
-    """Write a log in another format, to a new file or directory; nothing is written over.
+    """Convert a log to another format, in a new file or directory.
 
-    Needs pyarrow: `pip install 'dxlrun[logs]'`. Programs that read MCAP with ROS 2 messages, such as Foxglove
-    and rosbag readers, open the log itself.
+    Existing files are not overwritten. Needs pyarrow: `pip install 'dxlrun[logs]'`. Programs that read MCAP
+    with ROS 2 messages, such as Foxglove and rosbag readers, can open the log itself.
 
     Parameters
     ----------
     log
-        The log of a run: an .mcap file, or the directory of a log in parts.
+        Log of a run: an .mcap file, or the directory of a log in parts.
     output
-        A new file for csv, a new directory for the other formats.
+        New file for csv, new directory for the other formats.
     file_format
-        csv: one line a cycle, or a record of another --topic. parquet: a file for cycles, packets, events,
-        commands and each topic; topics without a file are listed with the reason. lerobot: a data set in the
-        layout of LeRobotDataset v3.0.
+        Output format. csv: one line per cycle, or per record of another --topic. parquet: one file each for
+        cycles, packets, events, commands and every topic; topics without a file are listed with the reason.
+        lerobot: a data set in the layout of LeRobotDataset v3.0.
     topic
-        Topic for csv: /events, /commands, /bus/NAME or one of a controller, instead of /cycle.
+        Topic for csv: /events, /commands, /bus/NAME or a topic of a controller. Default: /cycle.
     """
     if not log.exists():
         raise InputError(f"there is no log {log}; a run prints at its end where its log is")

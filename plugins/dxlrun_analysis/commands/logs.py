@@ -49,24 +49,24 @@ def logs(
     as_json: JsonFlag = False,
     debug: DebugFlag = False,
 ) -> int:
-    """Show all logs below a directory as a table, one row a log.
+    """List all logs below a directory in a table, one row per log.
 
-    Each log is read once, several at a time; the table is kept as Parquet in ~/.cache/dxlrun/logs. Needs
-    duckdb and pyarrow: `pip install 'dxlrun[logs]'`.
+    Each log is read only once. The table is stored as Parquet in ~/.cache/dxlrun/logs. Needs duckdb and
+    pyarrow: `pip install 'dxlrun[logs]'`.
 
     Parameters
     ----------
     directory
-        The directory with the logs, or s3://BUCKET/PREFIX, where `dxlrun upload` has put some.
+        Directory with logs, or s3://BUCKET/PREFIX for logs of `dxlrun upload`.
     where
-        Only logs that meet this condition in SQL, such as "not good and lost > 10", or
-        "list_contains(findings, 'late_replies')". A wrong name is answered with all names.
+        SQL condition that selects logs, such as "not good and lost > 10" or "list_contains(findings,
+        'late_replies')". A wrong name is answered with all names.
     sort
-        Order of the rows in SQL, such as "worst_wake_up_us DESC"; without it by name.
+        Order of the rows in SQL, such as "worst_wake_up_us DESC". Default: by name.
     prune
-        Show the oldest logs of runs in the directory beyond --keep, and delete them if the answer is yes.
+        List the oldest logs of runs in the directory beyond --keep, and delete them after confirmation.
     keep
-        How much of the newest logs --prune leaves, such as 10GB.
+        Total size of the newest logs that --prune keeps, such as 10GB.
     """
     if prune or keep is not None:
         if not prune or keep is None or (where, sort) != (None, None):
@@ -99,16 +99,16 @@ def logs(
 def upload(directory: Path, store: str, /, *, as_json: JsonFlag = False, debug: DebugFlag = False) -> int:
     """Copy the logs below a directory to an object store, each with its row of `dxlrun logs`.
 
-    Logs that the store already has are skipped, and so is a log that a run is writing. The next upload
-    completes an interrupted one. Nothing is deleted, and no other run is overwritten. Needs
-    `pip install 'dxlrun[store]'`. The exit code is 1 when a log could not be copied.
+    Logs that are already in the store are skipped, and so is a log that a run is writing. The next upload
+    completes an interrupted one. Nothing is deleted, and no other run is overwritten. Needs `pip install
+    'dxlrun[store]'`. Exit code: 0, or 1 if the store has another run with the name of a log.
 
     Parameters
     ----------
     directory
-        The directory with the logs.
+        Directory with logs.
     store
-        Such as s3://BUCKET/PREFIX, or file:///DIRECTORY. Keys and the address of a server of one's own are
+        Address of the store, such as s3://BUCKET/PREFIX or file:///DIRECTORY. Credentials and endpoint are
         those of the AWS command line: AWS_ACCESS_KEY_ID, AWS_SECRET_ACCESS_KEY, AWS_ENDPOINT_URL.
     """
     if missing := missing_extra("`dxlrun upload`", "store", "fsspec", "duckdb", "pyarrow"):

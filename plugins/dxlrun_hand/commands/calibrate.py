@@ -27,13 +27,14 @@ def calibrate(
 ) -> int:
     """Measure reference, direction and limits of joints by hand: for the robot file.
 
-    A dialogue: the joints become limp, are brought to their zero pose, and each to both of its ends. What
-    changes in the file is shown first; all else in it stays as it is, comments too.
+    The command is a dialogue. The joints become limp. You move all of them to their zero pose, and each of
+    them to both of its limits. The changes of the file are shown first. All other content remains, including
+    comments.
 
     Parameters
     ----------
     joint
-        Only this joint, or the joints of this group; may be given several times.
+        Joint or group to calibrate. Can be given several times. Default: all joints.
     """
     from dxlrun.tooling.servos import TunablePort
     from dxlrun_hand.dialogue import Dialogue

@@ -24,18 +24,18 @@ def setup(
     find_port: Flag = False,
     debug: DebugFlag = False,
 ) -> int:
-    """Give new servos the ID, rate and registers of a robot file: one after the other.
+    """Write IDs, baud rates and registers of a robot file to new servos.
 
-    A dialogue: each servo is connected alone, and written to as the file has it; at the end all are
-    connected, read back and compared. A port that is not there is found by its adapter that is unplugged and
-    plugged in.
+    The command is a dialogue. You connect each servo alone, and its settings are written. At the end you
+    connect all servos, which are read back and compared with the file. If a port does not exist, the dialogue
+    finds it while you unplug and plug in its adapter.
 
     Parameters
     ----------
     joint
-        Only this joint, or the joints of this group; may be given several times.
+        Joint or group to set up. Can be given several times. Default: all joints.
     find_port
-        Find the port of each bus by unplugging its adapter, also where the file's is there.
+        Find the port of each bus by unplugging its adapter, even if the port in the file exists.
     """
     from dxlrun.tooling.robots import load_plugins, read_robot
     from dxlrun.tooling.servos import TunablePort

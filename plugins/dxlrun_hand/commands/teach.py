@@ -24,19 +24,19 @@ def teach(
 ) -> int:
     """Show a running robot a motion by hand, and save it as a motion file.
 
-    A dialogue: joints become limp, Enter takes each pose, or a motion is recorded as it is shown; standstill
-    at its ends is cut off, trembling is smoothed. It is played back with a soft start, now or by
-    `dxlrun play MOTION.yaml`.
+    The command is a dialogue. The joints become limp. Enter adds a pose, and r records a motion. Standstill
+    at both ends of a motion is cut off, and trembling is smoothed. The robot plays the result with a soft
+    start, at once or later with `dxlrun play MOTION.yaml`.
 
     Parameters
     ----------
     motion
-        The new motion file, whose name ends in .yaml.
+        New motion file, whose name ends in .yaml.
     joints
-        Joints that become limp; the name of a group or controller means its joints. Without any: all that an
-        active controller plays motions for.
+        Joints that become limp, or groups or controllers for all their joints. Default: all joints for which
+        an active controller plays motions.
     velocity
-        Velocity of the joints on the way from one pose to the next.
+        Speed of the joints from one pose to the next.
     """
     from dxlrun.tooling.output import check_target
     from dxlrun.tooling.verbs import angular_velocity

@@ -26,15 +26,15 @@ def bench_rate(
     as_json: JsonFlag = False,
     debug: DebugFlag = False,
 ) -> int:
-    """Find the highest rate that a robot keeps, by running it at one rate after another.
+    """Find the highest rate that a robot keeps, by runs at decreasing rates.
 
-    The robot holds its position: its servos get torque. At the kept rate at most one cycle in a
-    thousand overruns; those that simulated servos cause do not count. Exit code 1 when no rate is kept.
+    Torque is enabled, and the robot holds its position. A rate is kept if at most one cycle in a thousand
+    overruns. Overruns that simulated servos cause do not count. Exit code: 0, or 1 if no rate is kept.
 
     Parameters
     ----------
     duration
-        Run for this time, s, at each rate.
+        Duration of the run at each rate, s.
     """
     if not robot.is_file():
         raise InputError(f"there is no robot file {robot}; check the path")

@@ -22,20 +22,20 @@ def characterize(
     tolerance: str = "1deg",
     options: OnRobot = DEFAULTS,
 ) -> int:
-    """Measure what servos can do: response, speed, dead band, highest rate, longest gap of commands.
+    """Measure the performance of servos: response, speed, dead band, highest rate, longest gap of commands.
 
-    The joints that are named move one after the other, each within its range, as fast as they can. With a
-    robot file the run is started and stopped; without one it is the robot that runs. Any key or Ctrl-C ends
-    it: what was measured until then is shown.
+    The named joints move one after the other within their ranges, as fast as they can. With a robot file, a
+    run is started and stopped. Without one, the running robot is used. Any key or Ctrl-C ends the measurement
+    and shows the results so far.
 
     Parameters
     ----------
     words
-        The robot file with its arguments, or nothing for the robot that runs; and the joints.
+        Joints, after a robot file with its arguments. Default robot: the running one.
     measure
-        Only this; may be given several times. Without it: all five.
+        Quantity to measure. Can be given several times. Default: all five.
     tolerance
-        Largest deviation of a joint from its path when commands lie apart.
+        Largest deviation of a joint from its path during a gap of commands.
     """
     from dxlrun.tooling.verbs import angle
     from dxlrun_lab.characterize.procedure import MEASUREMENTS, Characterize

@@ -27,19 +27,20 @@ def convert(
     as_json: JsonFlag = False,
     debug: DebugFlag = False,
 ) -> int:
-    """Write a recorded motion to a new motion file: of a log, a foreign MCAP file or a ROS 2 bag.
+    """Write a recorded motion to a new motion file.
 
-    `dxlrun ROBOT.yaml --play MOTION.yaml` and `dxlrun play MOTION.yaml` play it.
+    The recording is a log, a foreign MCAP file or a ROS 2 bag. `dxlrun ROBOT.yaml --play MOTION.yaml` and
+    `dxlrun play MOTION.yaml` play the motion file.
 
     Parameters
     ----------
     log
-        A log of dxlrun, a foreign .mcap file, or the directory of a ROS 2 bag.
+        Log of dxlrun, foreign .mcap file, or directory of a ROS 2 bag.
     motion
-        The new motion file, whose name ends in .yaml.
+        New motion file, whose name ends in .yaml.
     controller
-        This controller is to play it, a joint_trajectory_controller for example; without it those that moved
-        the joints in the log.
+        Controller that plays the motion, such as a joint_trajectory_controller. Default: the controllers that
+        moved the joints in the log.
     """
     if motion.suffix not in (".yaml", ".yml"):
         raise InputError(f"a motion file is YAML, so its name ends in .yaml, not as {motion} does")

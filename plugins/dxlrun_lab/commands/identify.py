@@ -34,29 +34,29 @@ def identify(
     output: Path | None = None,
     options: OnRobot = DEFAULTS,
 ) -> int:
-    """Identify servos: torque constant, resistance, inertia, friction, gain, delay; 95 % intervals.
+    """Identify the parameters of servos: torque constant, resistance, inertia, friction, gain, delay.
 
-    Each joint that is named is moved for a minute through its range, and the model of a servo is fitted to
-    what was recorded.
+    Each named joint moves through its range for the --duration, and a servo model is fitted to the recording.
+    The results have 95 % intervals.
 
     Parameters
     ----------
     words
-        A robot file with its arguments, or none: the robot that runs; and the joints.
+        Joints, after a robot file with its arguments. Default robot: the running one.
     recorded
-        Use this log, of an earlier run, instead of moving anything; without joints all of the log.
+        Log of an earlier run to evaluate. Nothing is moved then. Without joints, all joints of the log are
+        evaluated.
     duration
-        Run for this time, s, with each joint.
+        Duration of the motion of each joint, s.
     load_inertia
-        Inertia of what the joint moves, kg m^2; what is left is the motor's own.
+        Known inertia of the load, kg m^2. The rest of the identified inertia is the motor's own.
     load_gravity
-        Torque of the weight where it sticks out horizontally, Nm: it gives the scale of all torques, which is
-        otherwise that of the measured current, or of the manual's stall torque.
+        Known torque of the weight of the horizontal load, Nm. It sets the scale of all torques. Default
+        scale: the measured current, or the stall torque of the manual.
     voltage
-        Voltage of the supply, V, instead of what the servo reports.
+        Supply voltage, V. Default: the voltage that the servo reports.
     output
-        Write the result to this file: the motor file of the joint, which its key `motor` in the robot file
-        names.
+        Output file for the motor file of the joint, which the key `motor` in the robot file names.
     """
     from dxlrun_lab.commands.on_robot import Chosen, run_on_robot
 

@@ -44,41 +44,42 @@ def latency(
     as_json: JsonFlag = False,
     debug: DebugFlag = False,
 ) -> int:
-    """Measure how late this machine wakes a loop up: one that waits as a run's; no robot is used.
+    """Measure the wake-up latency of a loop on this machine.
 
-    Ctrl-C ends the measurement and shows what was measured until then.
+    The loop waits like that of a run. No robot is used. Ctrl-C ends the measurement and shows the results so
+    far.
 
     Parameters
     ----------
     count
-        End after this number of wake-ups of each condition, in all blocks together.
+        Number of wake-ups of each condition, in all blocks together.
     period
         Time between two deadlines, 10 us to 1 s.
     policy
-        Scheduling policy, other without this option; with --compare that of c.
+        Scheduling policy. Default: other. With --compare, it is the policy of c, by default that of its
+        neighbour in the list.
     priority
-        Real-time priority, for round_robin and fifo.
+        Real-time priority of round_robin and fifo.
     compare
-        Measure several conditions in alternating blocks: policies, and c, a small program in C that sleeps
-        until each deadline (compiled on the spot), such as other,round_robin,c; c alone compares with
-        round_robin or --policy.
+        Conditions to measure in alternating blocks, such as other,round_robin,c. A condition is a policy, or
+        c: a small C program that sleeps until each deadline, and that is compiled first. c alone is compared
+        with round_robin, or with --policy.
     blocks
-        Into how many blocks the wake-ups of a condition are divided.
+        Number of blocks of each condition.
     stress
         Load all cores, memory and disk, as other programs would.
     polling
-        Longest time that the clock is polled before a deadline; auto: a tenth of the period.
+        Longest time for which the clock is polled before a deadline; auto: a tenth of the period.
     cores
-        Processor cores to measure on, such as 1 or 2,3.
+        Processor cores to measure on, such as 1 or 2,3. Default: all.
     idle_latency
-        Keep the processor cores from deep idle states during the measurement.
+        Keep the processor cores out of deep idle states during the measurement.
     log
-        Write a log to this new file (.mcap), or into this directory; without it into logs, as runs do.
+        New log file (.mcap), or directory for a new one. Default: the directory logs, as for runs.
     record
-        Write a log; --no-record: none.
+        Write a log.
     report
-        Write a report to this HTML file, with all numbers and plots. Needs bokeh:
-        `pip install 'dxlrun[report]'`.
+        HTML file for a report with all numbers and plots. Needs bokeh: `pip install 'dxlrun[report]'`.
     """
     import os
 

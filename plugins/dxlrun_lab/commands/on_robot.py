@@ -46,21 +46,21 @@ Words = Annotated[str, Parameter(name="[ROBOT.yaml [arg:=value ...]] JOINT")]
 @Parameter(name="*")
 @dataclass(frozen=True, slots=True)
 class OnRobot:
-    """The robot and its joints' ranges, the question before, and the form of the output.
+    """Robot and ranges of its joints, confirmation, and form of the output.
 
     Parameters
     ----------
     range
-        Where a joint may move: JOINT=-30deg..30deg. Without it: 30 deg to each side of where it is, within
-        its limits.
+        Range of a joint: JOINT=-30deg..30deg. Can be given several times. Default: 30 deg to each side of the
+        present position, within the joint's limits.
     robot
-        Name of the robot, where several run and no robot file is given.
+        Name of the robot, if several run and no robot file is given.
     virtual
-        Run on virtual time, with simulated servos: in a second; with a robot file.
+        Run on virtual time, with simulated servos. Requires a robot file.
     yes
-        Do not ask before a real joint moves; the countdown stays.
+        Do not ask for confirmation before a real joint moves. The countdown remains.
     report
-        Write a report to this HTML file, with all numbers and plots.
+        HTML file for a report with all numbers and plots.
     """
 
     range: Annotated[tuple[str, ...], Parameter(negative=(), show_default=False)] = ()

@@ -27,27 +27,27 @@ _MOST_DEG = 10.0
 @Parameter(name="*")
 @dataclass(frozen=True, slots=True)
 class RecordedPart:
-    """Which motion of a recording.
+    """Part of a recording: quantity, time, joints.
 
     Parameters
     ----------
     what
-        The goals that were sent, or the states that were measured. Without it the goals of joints that were
-        sent a path of positions, and the states of the others.
+        Recorded quantity: goals that were sent, or states that were measured. Default: goals for joints that
+        were sent a path of positions, states for all other joints.
     from_
-        Begin so many seconds after the beginning of the recording.
+        Start of the part, s from the start of the recording.
     to
-        End so many seconds after the beginning of the recording.
+        End of the part, s from the start of the recording.
     joint
-        Only this joint of the recording; may be given several times.
+        Joint of the recording to use. Can be given several times. Default: all joints.
     map
-        Play a recorded joint on another joint: RECORDED=JOINT; RECORDED= omits it. May be given several
-        times.
+        New joint for a recorded joint: RECORDED=JOINT. RECORDED= omits the recorded joint. Can be given
+        several times.
     topic
-        Topic of a foreign recording that has several.
+        Topic of a foreign recording. Required if the recording has several.
     tolerance
-        Largest deviation from the recording; what is smaller is taken for noise. Without it 0.1 deg from
-        goals, 0.5 deg from states.
+        Largest deviation of the smoothed motion from the recording. Default: 0.1 deg from goals, 0.5 deg from
+        states.
     """
 
     what: Literal["goals", "states"] | None = None
@@ -99,18 +99,19 @@ ALL_OF_IT = RecordedPart()
 @Parameter(name="*")
 @dataclass(frozen=True, slots=True)
 class PlayedOn:
-    """The robot on which a recorded motion is played.
+    """Robot on which a recorded motion is played.
 
     Parameters
     ----------
     on
-        Play the recorded motion on the robot of this robot file, instead of running controllers again.
+        Robot file of a robot that plays the recorded motion. The controllers of the log are not run again
+        then.
     speed
-        Factor of the speed: 0.5 takes twice as long.
+        Speed factor: at 0.5 a motion takes twice as long.
     virtual
         Run on virtual time, with simulated servos.
     yes
-        Do not ask before a real joint moves; the countdown stays.
+        Do not ask for confirmation before a real joint moves. The countdown remains.
     """
 
     on: Path | None = None

@@ -34,22 +34,23 @@ def replay(
     as_json: JsonFlag = False,
     debug: DebugFlag = False,
 ) -> int:
-    """Run the controllers of a log again: on its inputs; commands and goals are compared bit for bit.
+    """Run the controllers of a log again.
 
-    With --on: play the motion of a log, a foreign MCAP file or a ROS 2 bag on a robot. Ctrl-C brings the
-    joints to rest and ends it.
+    They get the recorded inputs, and their commands and goals are compared with the log bit for bit. With
+    --on, a robot plays the motion of a log, a foreign MCAP file or a ROS 2 bag. Ctrl-C brings the joints to
+    rest and ends the motion.
 
     Parameters
     ----------
     log
-        The log of a run, an .mcap file; with --on also a foreign one, or the directory of a ROS 2 bag.
+        Log of a run, an .mcap file. With --on, also a foreign .mcap file, or the directory of a ROS 2 bag.
     assignments
-        Other arguments for the robot file that is in the log, or for that of --on.
+        Other arguments for the robot file in the log, or for the robot file of --on.
     settings
-        Another value of a controller's parameter: CONTROLLER.PARAMETER=VALUE; may be given several times.
+        Other value for a parameter of a controller: CONTROLLER.PARAMETER=VALUE. Can be given several times.
     code
-        Which files of controllers (`./wave.py:Wave`) to execute where the disk has others than the log:
-        current, as they are now; log, as the log has them, which trusts the log.
+        Version of controller files (`./wave.py:Wave`) that differ between disk and log: current runs the
+        files on the disk, log runs those in the log. Choose log only if you trust its source.
     """
     if played_on.on is not None:
         if settings:

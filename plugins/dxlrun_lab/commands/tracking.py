@@ -47,22 +47,21 @@ def tracking(
 ) -> int:
     """Measure how well a motion is followed: by the loop, and by a sender that counts poses instead of time.
 
-    The motion is sent once in each set-up, while other processes load cores, memory and disk. Each run
-    leaves a log. Ctrl-C ends the run cleanly and keeps what was measured.
+    The motion is sent once in each set-up, while other processes load cores, memory and disk. Each run leaves
+    a log. Ctrl-C ends the run, and the results so far are kept.
 
     Parameters
     ----------
     robot
-        The robot file; without it single_joint.yaml of `dxlrun examples`.
+        Robot file. Default: single_joint.yaml of `dxlrun examples`.
     play
-        Play this motion file, of one joint; without it the thesis' motion for single_joint.yaml, 30 s.
+        Motion file to play, of one joint. Default: the motion of the thesis for single_joint.yaml, 30 s.
     setups
-        Only these, with commas between them.
+        Set-ups to measure, separated by commas.
     stress
-        Load all cores, memory and disk, as other programs would; --no-stress: load nothing.
+        Load all cores, memory and disk, as other programs would.
     report
-        Write a report to this HTML file, with all numbers and plots. Needs matplotlib:
-        `pip install 'dxlrun[report]'`.
+        HTML file for a report with all numbers and plots. Needs matplotlib: `pip install 'dxlrun[report]'`.
     """
     words = list(assignments)
     if robot is not None and ":=" in robot:

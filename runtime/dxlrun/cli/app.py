@@ -43,14 +43,14 @@ _BEHIND = 100
 _PARAMETERS = Group("Parameters", sort_key=_BEHIND + 1)
 HELP = """Run a robot of Dynamixel servos from one YAML file.
 
-`dxlrun ROBOT.yaml` runs it, `dxlrun check ROBOT.yaml` looks at it without touching hardware,
-`dxlrun examples` has robots to start with, `dxlrun help COMMAND` shows a command with examples."""
+`dxlrun ROBOT.yaml` runs the robot. `dxlrun check ROBOT.yaml` checks the file without touching hardware.
+`dxlrun examples` lists robots to start with. `dxlrun help COMMAND` shows a command with examples."""
 
 USAGE = """Usage: dxlrun ROBOT.yaml [ARG:=VALUE ...] [OPTIONS]
        dxlrun COMMAND ...
 """
 
-EPILOGUE = """Exit codes: 0 good, 1 the robot or the run failed, 2 the input is wrong, 130
+EPILOGUE = """Exit codes: 0 success, 1 failure of the robot or the run, 2 invalid input, 130
 interrupted."""
 
 
@@ -97,12 +97,12 @@ def build(verb: str = "", *, listed: bool = False) -> App:
 
 
 def install_completion(*, shell: Literal["bash", "zsh", "fish"] | None = None) -> None:
-    """Install tab completion for bash, zsh or fish (--shell), from the next shell on.
+    """Install tab completion for bash, zsh or fish (--shell). New shells use it.
 
     Parameters
     ----------
     shell
-        The shell; without it the one that runs this command.
+        Shell to install completion for. Default: the shell that runs this command.
     """
     # Imported here because the import takes long.
     from cyclopts.completion.install import create_install_completion_command

@@ -46,23 +46,25 @@ def check(
     as_json: JsonFlag = False,
     debug: DebugFlag = False,
 ) -> int:
-    """Check a robot file: joints, reach, controllers, claims, the time budget of each bus.
+    """Check a robot file: joints, reach, controllers, claims and the time budget of each bus.
 
-    Without --online no port is opened. Exit code 0, or 2 with every error as `file:line:column: what; how
-    to fix it`; with --online 1 where a servo holds another register than the file declares, or is not ready.
+    Without --online, no port is opened. Exit code: 0, or 2 for an invalid file, with one line per error:
+    `file:line:column: problem; fix`. With --online, the exit code is 1 if a register differs from the file,
+    or a servo is not ready.
 
     Parameters
     ----------
     play
-        Play this motion file, as far as it is checked; may be given several times.
+        Motion file to check together with the robot file. Can be given several times.
     duration
-        Run for this time, s, or with its unit: 500ms, 2min.
+        Duration of the run, s, or with a unit: 500ms, 2min.
     online
-        Read the servos too, and compare their registers with those of the file; nothing is written.
+        Also read the servos, and compare their registers with the file. Nothing is written.
     graph
-        Draw a graph here, or into a file, .svg or .dot: the controllers, what they read and command.
+        Draw the graph of the controllers with all that they read and command: in the terminal, or into an
+        .svg or .dot file.
     log
-        Write a log to this new file, with every packet of --online.
+        New log file for all packets of --online.
     """
     if log is not None and not online:
         raise InputError("--log keeps what --online sends and receives; give --online too")

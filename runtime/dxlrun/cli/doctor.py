@@ -17,10 +17,10 @@ _TONES: Mapping[str, Tone] = {"good": "good", "worse": "warning", "missing": "er
 
 
 def doctor(*, as_json: JsonFlag = False, debug: DebugFlag = False) -> int:
-    """Check whether this machine is fit to run robots: ports, rights, kernel, processor.
+    """Check whether this machine can run robots: ports, permissions, kernel and processor.
 
-    Nothing is changed; what could be better is printed with the command that improves it. Exit code 0, or 1
-    when something is missing without which no robot runs.
+    Nothing is changed. Each possible improvement is printed with the command for it. Exit code: 0, or 1 if
+    something is missing without which no robot runs.
     """
     from dxlrun.run.doctor import Machine, diagnose
 

@@ -50,14 +50,14 @@ def examples(
     as_json: JsonFlag = False,
     debug: DebugFlag = False,
 ) -> int:
-    """List the robots that come with dxlrun, or copy one with its motions: to be run and changed.
+    """List the robots that come with dxlrun, or copy one with its motions.
 
     Parameters
     ----------
     name
-        The robot to be copied; without it all are listed.
+        Robot to copy. Default: list all robots.
     directory
-        Where it is copied to; nothing there is overwritten.
+        Directory for the copy. Existing files are not overwritten.
     """
     source = examples_directory()
     known = {path.stem: path for path in sorted(source.glob("*.yaml"))}
@@ -187,17 +187,17 @@ def schema(
     output: Path | None = None,
     debug: DebugFlag = False,
 ) -> int:
-    """Print the JSON Schema of robot files: with the parameters of all installed controllers.
+    """Print the JSON Schema of robot files.
 
-    Editors with a YAML language server use it when the file's first line is
-    `# yaml-language-server: $schema=robot.schema.json`.
+    It includes the parameters of all installed controllers. Editors with a YAML language server use the
+    schema if the first line of a robot file is `# yaml-language-server: $schema=robot.schema.json`.
 
     Parameters
     ----------
     kind
-        Which files: robot, motion, motor, or fragment (what a robot file includes).
+        Kind of file. A fragment is a file that a robot file includes.
     output
-        Write the result to this file.
+        Output file. Default: standard output.
     """
     text = schema_text(kind)
     if output is None:

@@ -39,21 +39,21 @@ def frames(
     as_json: JsonFlag = False,
     debug: DebugFlag = False,
 ) -> int:
-    """Draw a robot's frames after its URDF, or print where one of them lies: in another one.
+    """Draw a robot's frames as a tree, or print the pose of one frame.
 
-    Dashed: a frame that does not move in the one above it.
+    The frames are those of the URDF. A dashed line leads to a frame that is fixed in its parent frame.
 
     Parameters
     ----------
     of
-        Print where this frame lies, instead of the tree.
+        Frame whose pose is printed instead of the tree.
     relative_to
-        The frame in which it lies; without it the root of the tree.
+        Reference frame of the pose. Default: the root of the tree.
     at
-        A pose: joints or groups with their positions, such as elbow=30deg jaw=5mm, as `dxlrun get` prints it
-        and `dxlrun send` takes it. The others rest.
+        Positions of joints or groups, such as elbow=30deg jaw=5mm, in the notation of `dxlrun get` and
+        `dxlrun send`. Default of each joint: 0, or the middle of its limits if they exclude 0.
     graph
-        Draw a graph here, or into a file, .svg or .dot: the tree, which is drawn without it, too.
+        Draw the graph of the frames into an .svg or .dot file. Without a file, this option has no effect.
     """
     if of is None and (at or relative_to):
         raise InputError(

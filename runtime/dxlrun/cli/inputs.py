@@ -49,8 +49,8 @@ GraphFile = Annotated[
     tuple[Path, ...] | None, Parameter(negative=(), show_default=False, consume_multiple=(0, 1))
 ]
 """`--graph`, with or without a file."""
-RobotPath = Annotated[Path, Parameter(help="The robot file.")]
-RobotName = Annotated[str | None, Parameter(help="Name of the robot, where several run.")]
+RobotPath = Annotated[Path, Parameter(help="Robot file.")]
+RobotName = Annotated[str | None, Parameter(help="Name of the robot, if several run.")]
 Motions = Annotated[tuple[Path, ...], Parameter(negative=(), show_default=False)]
 """Motion files; the option may be given several times."""
 AssignmentOfItsOwn = Annotated[str, Parameter(name="arg:=value")]

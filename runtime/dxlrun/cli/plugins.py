@@ -36,7 +36,7 @@ Row = dict[str, Any]
 
 
 def plugins(*, as_json: JsonFlag = False, debug: DebugFlag = False) -> int:
-    """List the plug-ins that are installed, and what each of them offers."""
+    """List the installed plug-ins: controllers, servo models, drivers and commands of each."""
     from dxlrun.control.controllers.plugins import load_plugins
 
     found = load_plugins()
@@ -154,14 +154,14 @@ def _table(row: Row) -> Table:
 def new_plugin(
     name: str, directory: Path | None = None, /, *, as_json: JsonFlag = False, debug: DebugFlag = False
 ) -> int:
-    """Make a package with a controller of your own: a robot file that uses it, and a test.
+    """Create a package with a new controller, a robot file and a test.
 
     Parameters
     ----------
     name
         Name of the package, such as my_robotics.
     directory
-        Where it is made; without it, in a new directory of its name.
+        Directory to create. Default: the name of the package.
     """
     module = _module(name)
     place = Path(name) if directory is None else directory

@@ -64,32 +64,33 @@ def run(
     verbose: Flag = False,
     debug: Flag = False,
 ) -> int:
-    """Run a robot until its motions have ended, or until Ctrl-C.
+    """Run a robot until its motions or its --duration have ended, or until Ctrl-C.
 
     Parameters
     ----------
     robot
-        The robot file, for example robots/bioloid_torso.yaml.
+        Robot file, for example robots/bioloid_torso.yaml.
     duration
-        Run for this time, s, or with its unit: 500ms, 2min.
+        Duration of the run, s, or with a unit: 500ms, 2min.
     play
-        Play this motion file; may be given several times.
+        Motion file to play. Can be given several times.
     record
-        Write a log; --no-record: none.
+        Write a log.
     take_over
-        Start although a servo has its torque on already.
+        Start even if the torque of a servo is enabled already.
     virtual
-        Run on virtual time, as fast as the processor can; only with simulated buses, and with --duration or
+        Run on virtual time, as fast as the processor allows. Requires simulated buses, and --duration or
         --play.
     ledger
-        Write what the simulated buses saw to this file: every byte with its time, and every fault.
+        Output file for the ledger of the simulated buses: every byte with its time, and every fault.
     gateway
-        Take commands while it runs; --no-gateway: the run cannot be steered.
+        Accept commands during the run. With --no-gateway, the run cannot be steered.
     listen
-        Listen at [NAME@]HOST:PORT for clients of other computers, too, by mutual TLS with certificates of
-        `dxlrun keys`; NAME is that of the robot's certificate, by default the robot's.
+        Address to listen at for clients on other computers: [NAME@]HOST:PORT. They connect by mutual TLS with
+        certificates of `dxlrun keys`. NAME is the name in the robot's certificate, by default the name of the
+        robot.
     verbose
-        Print all that the operating system granted for real time, not only what it refused.
+        Print all real-time settings that the operating system granted, in addition to those that it refused.
     debug
         Print the traceback of an error, and the output of the processes.
     """
@@ -140,14 +141,16 @@ def run(
 
 
 def demo(*, page: PageFlag = True, virtual: Flag = False, debug: DebugFlag = False) -> int:
-    """Run a simulated torso that plays a motion of 35 s: no hardware, no files.
+    """Run a simulated torso that plays a motion of 35 s.
+
+    The demo needs no hardware and no files.
 
     Parameters
     ----------
     page
-        Show it on the page of `dxlrun view`, where that is installed; --no-page: run without.
+        Show the robot on the page of `dxlrun view`, if that is installed.
     virtual
-        Run on virtual time, as fast as the processor can.
+        Run on virtual time, as fast as the processor allows. The page is not shown then.
     """
     robot, motion = (examples_directory() / name for name in DEMO)
     with _page_beside(shown=page and not virtual):

@@ -20,7 +20,7 @@ def show_help(*verb: str) -> int:
     Parameters
     ----------
     verb
-        The command; without it, all commands.
+        Name of the command. Default: list all commands.
     """
     if not verb:
         print_help()

@@ -25,16 +25,16 @@ RETRY_S = 0.2
 def arguments(words: list[str]) -> argparse.Namespace:
     """Parse the command line, from which the arguments of ROS have been removed."""
     parser = argparse.ArgumentParser(
-        "dxlrun-ros2", description="A running robot in ROS 2, under the names of ros2_control."
+        "dxlrun-ros2", description="Bridge a running robot to ROS 2, with the names of ros2_control."
     )
     parser.add_argument(
-        "robot", nargs="?", help="its name, where several run; NAME@HOST:PORT of another computer"
+        "robot", nargs="?", help="name of the robot, if several run; NAME@HOST:PORT for another computer"
     )
     parser.add_argument(
         "--lease",
         type=float,
         default=0.5,
-        help="s; the joints of a publisher that is silent for longer are held",
+        help="time without a message after which the joints of a publisher are held, s; default 0.5",
     )
     found = parser.parse_args(words)
     if not 0.01 <= found.lease <= 60:

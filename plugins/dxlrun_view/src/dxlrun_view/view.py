@@ -35,16 +35,16 @@ def view(
     Parameters
     ----------
     what
-        Name of a running robot, its robot file, or a log (.mcap, or a directory of parts). Without one: the
-        only robot that runs.
+        Name of a running robot, its robot file, or a log (.mcap, or a directory of parts). Default: the only
+        running robot.
     control
-        Let viewers steer the robot: a slider for each joint, and buttons. STOP is there always.
+        Allow viewers to steer the robot: a slider for each joint, and buttons. STOP is always available.
     browser
-        Open the page in a browser.
+        Open the page in a browser. A page for other computers is not opened.
     listen
-        Listen at HOST:PORT, HOST or :PORT. Beyond this computer both ends show a certificate of `dxlrun
-        keys`: the robot's, and the browser's, whose role decides whether it may steer. Without a port it is
-        8765, or if that is taken a free one.
+        Address to listen at: HOST:PORT, HOST or :PORT. Beyond this computer, robot and browser authenticate
+        with certificates of `dxlrun keys`. The role of the browser decides whether it may steer. Default
+        port: 8765, or a free one if that is in use.
     """
     from dxlrun.tooling.live import Place, in_url
 

@@ -64,50 +64,50 @@ def sim(
     as_json: JsonOfItsOwn = False,
     debug: Flag = False,
 ) -> int:
-    """Serve simulated servos on pseudo-terminals: for any program that speaks Dynamixel, until Ctrl-C.
+    """Serve simulated servos on pseudo-terminals: for any program that speaks Dynamixel.
 
-    Give a robot file, servos by `--servo`, or a log by `--recorded`. Faults can be typed while it runs;
-    `help` lists them.
+    Give a robot file, servos with `--servo`, or a log with `--recorded`. Faults can be typed during the
+    simulation; `help` lists them. Ctrl-C ends the simulation.
 
     Parameters
     ----------
     robot
-        A robot file: each of its buses is simulated, whatever its port is.
+        Robot file. All its buses are simulated, whatever their ports are.
     assignments
         Arguments of the robot file, for example rate:=25.
     servo
-        Servos on one bus without a robot file, MODEL:IDS, for example XL430-W250:1-3 or AX-12A:1,4; may be
+        Servos on one bus without a robot file, MODEL:IDS, for example XL430-W250:1-3 or AX-12A:1,4. Can be
         given several times.
     baud
-        Baud rate, bit/s, of that bus; without it the one that the servos are shipped with.
+        Baud rate, bit/s, of the bus of --servo. Default: the factory setting of the servos.
     protocol
-        Protocol, 1.0 or 2.0, of that bus; needed only by models that exist with both.
+        Protocol, 1.0 or 2.0, of the bus of --servo. Required only for models that exist with both.
     recorded
-        Use this log: answer a host as its servos answered theirs, instead of simulating any.
+        Log to replay: a host gets the replies that the servos of the log sent. No servo is simulated then.
     link
-        A symbolic link to the pseudo-terminal, which gets another name at each start; with several buses
-        LINK.NAME for each bus.
+        Symbolic link to the pseudo-terminal, whose own name changes at each start. With several buses, the
+        links are LINK.NAME with the name of each bus.
     fault
-        A fault, for example "lose servo=3 at=2s"; may be given several times.
+        Fault to inject, for example "lose servo=3 at=2s". Can be given several times.
     faults
-        A text file of faults, one a line.
+        Text file with one fault per line.
     seed
-        What is random in faults and adapter is drawn from this number (0 without it).
+        Seed of the random numbers of faults and adapter. Default: 0.
     ledger
-        Write what the simulated buses saw to this file: every byte with its time, and every fault.
+        Output file for the ledger of the simulated buses: every byte with its time, and every fault.
     latency_timer
-        The adapter keeps replies back for so long, for example "4 ms", as FTDI adapters do.
+        Time for which the adapter holds replies back, as FTDI adapters do, for example "4 ms".
     split
-        How the adapter hands replies over: whole, byte by byte, or in pieces of random length.
+        Form in which the adapter delivers replies: whole, byte by byte, or in pieces of random length.
     echo
-        The adapter gives back what is sent, as some half-duplex adapters do.
+        Return all bytes that are sent, as some half-duplex adapters do.
     absent
-        What the servos after one that is missing do in a sync or bulk read: answer never (silent), or later
-        (slot).
+        Reaction of the servos after a missing one in a sync or bulk read: no reply (silent), or a reply after
+        its slot (slot).
     as_json
-        Print the result as JSON: the ports, then a line for each fault.
+        Print the result as JSON: the ports, then one line per fault.
     debug
-        Print the traceback of an error, and the output of the servos' process.
+        Print the traceback of an error, and the output of the simulation process.
     """
     leave_real_time()
     mistakes = Mistakes()

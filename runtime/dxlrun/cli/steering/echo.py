@@ -28,18 +28,18 @@ def echo(
     rate: Hertz | None = None,
     chosen: Chosen = ONLY_ONE,
 ) -> int:
-    """Print the messages of a topic as they come: `dxlrun echo /arm/state`.
+    """Print the messages of a topic as they arrive: `dxlrun echo /arm/state`.
 
-    Without a topic, list those that there are. Ctrl-C ends it, and so does the end of the run.
+    Without a topic, all topics are listed. The command ends with the run, or on Ctrl-C.
 
     Parameters
     ----------
     topic
-        Name of the topic; the leading / is optional.
+        Name of the topic. The leading / is optional.
     count
-        End after this number of messages.
+        Number of messages to print. Default: all until the end of the run.
     rate
-        Print at most so many messages a second, the newest each time, Hz.
+        Largest number of messages per second, Hz. Older messages are skipped. Default: no limit.
     """
     if count is not None and count < 1:
         raise InputError(f"--count {count} is no number of messages; give 1 or more")

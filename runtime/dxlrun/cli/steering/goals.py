@@ -39,27 +39,28 @@ def send(
     wait: WaitFlag = False,
     chosen: Chosen = ONLY_ONE,
 ) -> int:
-    """Send a controller of a running robot a command: `dxlrun send arm position elbow=20deg wrist=0deg`.
+    """Send a command to a controller or a device: `dxlrun send arm position elbow=20deg wrist=0deg`.
 
-    A pose names joints or groups; the others keep their goals. Other commands of a controller have keys:
-    `dxlrun send base velocity 'linear=0.1 m/s'`; `dxlrun list` shows which it takes. Commands of a device:
-    `dxlrun send board led=1`.
+    A pose names joints or groups. All other joints keep their goals. Other commands of a controller have
+    keys: `dxlrun send base velocity 'linear=0.1 m/s'`. `dxlrun list` shows the commands of each controller. A
+    device has no command names: `dxlrun send board led=1`.
 
     Parameters
     ----------
     controller
-        Name of the controller, or of a device.
+        Name of the controller or device.
     kind
-        The command; or position, velocity, effort, pwm of joints by name. None for a device: NAME=VALUE.
+        Name of the command, or position, velocity, effort or pwm for joints by name. A device has none.
     words
-        Its keys, or joints; values are YAML, quantities have their units.
+        Keys of the command, or joints, with their values. Values are YAML. Quantities have units.
     file
-        A YAML file with its keys, instead of the words.
+        YAML file with the keys, in place of words on the command line.
     in_
-        Time for joints by name to get there, such as 2s; of controllers that take trajectories.
+        Time in which joints by name reach their goals, such as 2s. Only for controllers that take
+        trajectories.
     wait
-        Return when the goal has ended, with its result, and show its progress; Ctrl-C cancels it. --no-wait:
-        as soon as the controller has accepted it.
+        Wait until the goal has ended, with a progress bar, and print the result. Ctrl-C cancels the goal.
+        With --no-wait, return as soon as the controller has accepted the command.
     """
     from dxlrun.channels.answers import Code
     from dxlrun.cli.steering.written import Written
@@ -96,14 +97,17 @@ def send(
 
 
 def cancel(goal: str = "", /, *, wait: WaitFlag = False, chosen: Chosen = ONLY_ONE) -> int:
-    """Cancel goals of a running robot: their controllers bring the joints to rest.
+    """Cancel goals of a running robot.
+
+    Their controllers bring the joints to rest.
 
     Parameters
     ----------
     goal
-        Number of a goal, or the name of a controller; without it all goals that run.
+        Number of a goal, or name of a controller. Default: all active goals.
     wait
-        Return when the joints are at rest; --no-wait: as soon as the loop has accepted it.
+        Wait until the joints are at rest. With --no-wait, return as soon as the loop has accepted the
+        request.
     """
     from dxlrun.channels.answers import Code
 

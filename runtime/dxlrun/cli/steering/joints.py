@@ -41,20 +41,21 @@ _WRITTEN: Mapping[str, tuple[float, int, str]] = MappingProxyType(
 def torque(
     state: Literal["on", "off"], /, *joints: Joints, release: Flag = False, chosen: Chosen = ONLY_ONE
 ) -> int:
-    """Switch the torque of joints on or off while the robot runs: `dxlrun torque off elbow_joint`.
+    """Enable or disable the torque of joints of a running robot: `dxlrun torque off elbow_joint`.
 
-    Off: the joint is limp, and stays so whatever policies say. On: its servo is checked as at the start, and
-    holds where it is; a controller that commands the joint begins again there. Returns when the torque was
-    read back.
+    With `off`, the joint becomes limp, and remains limp whatever the policies are. With `on`, the servo is
+    checked as at the start of a run, and the joint holds its position. A controller that commands the joint
+    continues from there. The command returns when the torque state has been read back.
 
     Parameters
     ----------
     state
-        on or off.
+        New torque state.
     joints
-        Joints; the name of a group or controller means its joints, `all` every joint.
+        Joints, or groups or controllers for all their joints. `all` selects every joint.
     release
-        Deactivate the controllers that command the joints; without it they are a reason to refuse `off`.
+        Deactivate the controllers that command the joints. Without this option, `off` is refused if there are
+        any.
     """
     names = _named(joints)
     with connect_robot(chosen.robot, f"torque {state}") as robot:
@@ -64,17 +65,18 @@ def torque(
 
 
 def reboot(*joints: Joints, release: Flag = False, chosen: Chosen = ONLY_ONE) -> int:
-    """Reboot servos of a running robot, which clears a hardware error: `dxlrun reboot elbow_joint`.
+    """Reboot servos of a running robot to clear a hardware error: `dxlrun reboot elbow_joint`.
 
-    Only servos of Protocol 2.0 support this. Returns when they are operational again; they have torque if
-    they had it before.
+    Only servos with Protocol 2.0 can be rebooted. The command returns when they are operational again. Torque
+    is enabled again if it was enabled before.
 
     Parameters
     ----------
     joints
-        Joints; the name of a group or controller means its joints, `all` every joint.
+        Joints, or groups or controllers for all their joints. `all` selects every joint.
     release
-        Deactivate the controllers that command the joints; without it they are a reason to refuse.
+        Deactivate the controllers that command the joints. Without this option, the reboot is refused if
+        there are any.
     """
     names = _named(joints)
     with connect_robot(chosen.robot, "reboot") as robot:
@@ -84,19 +86,19 @@ def reboot(*joints: Joints, release: Flag = False, chosen: Chosen = ONLY_ONE) ->
 
 
 def get(joint: str, item: str = "", /, *, chosen: Chosen = ONLY_ONE) -> int:
-    """Print the state of a joint, or an item of its servo's control table: of a robot that runs.
+    """Print the state of a joint, or an item of its servo's control table.
 
-    Of a group or a controller, or `all`, the pose, as `dxlrun send` takes it. Of a device or a sensor its
-    states, or one of them: `dxlrun get imu/orientation.x`; of a device what is commanded, too:
-    `dxlrun get board/led`.
+    For a group, a controller or `all`, the pose is printed in the notation of `dxlrun send`. For a device or
+    a sensor, all states are printed, or one of them: `dxlrun get imu/orientation.x`. For a device, commanded
+    values are printed as well: `dxlrun get board/led`.
 
     Parameters
     ----------
     joint
-        Name of the joint, group, controller, device or sensor; for an item of one of its servos alone that,
-        such as hip/1.
+        Name of a joint, group, controller, device or sensor. For an item of one of several servos of a joint,
+        name of that servo, such as hip/1.
     item
-        Item of its servo's control table, RAM or EEPROM, such as position_p_gain; `dxlrun models` lists them.
+        Control table item in RAM or EEPROM, such as position_p_gain. `dxlrun models` lists the items.
     """
     with connect_robot(chosen.robot, "get") as robot:
         if not item and (names := _meant(robot.info(), joint)):
@@ -135,18 +137,19 @@ def _show_pose(robot: RemoteRobot, names: Sequence[str], chosen: Chosen) -> int:
 
 
 def set_register(joint: str, item: str, value: str, /, *, chosen: Chosen = ONLY_ONE) -> int:
-    """Change a register of a servo while the robot runs: `dxlrun set elbow_joint position_p_gain 900`.
+    """Write a register of a servo while the robot runs: `dxlrun set elbow_joint position_p_gain 900`.
 
-    Items of the RAM that no controller commands; returns when the servo has it. `dxlrun models` lists them.
+    Only items in RAM that no controller commands can be written. The command returns when the servo has the
+    value.
 
     Parameters
     ----------
     joint
-        Name of the joint, for all its servos; for one of several that of the servo, such as hip/1.
+        Name of the joint for all its servos, or of one servo, such as hip/1.
     item
-        Item of its servo's control table.
+        Control table item. `dxlrun models` lists the items.
     value
-        Whole number as in the e-Manual, or a quantity with its unit, such as '10 rad/s^2'.
+        Integer as in the e-Manual, or quantity with a unit, such as '10 rad/s^2'.
     """
     from dxlrun.description.document import plain_value
 

@@ -19,14 +19,14 @@ _DURATIONS = ("s", 1e9), ("ms", 1e6), ("us", 1e3)
 def parameters(controller: str, /, *words: Words, chosen: Chosen = ONLY_ONE) -> int:
     """Show the parameters of a controller, or change live ones: `dxlrun parameters arm gains.p=4.0`.
 
-    All that are given change in one cycle, or none does.
+    All given parameters change in the same cycle, or none does.
 
     Parameters
     ----------
     controller
         Name of the controller.
     words
-        New values of live parameters, as in the robot file; quantities with their units: 'speed=20 deg/s'.
+        New values of live parameters, as in the robot file. Quantities have units: 'speed=20 deg/s'.
     """
     values = dict(_pair(word) for word in words)
     if len(values) < len(words):

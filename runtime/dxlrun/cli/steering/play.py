@@ -56,22 +56,22 @@ def play(
 ) -> int:
     """Play motions on a running robot: `dxlrun play wave bow`.
 
-    All controllers of a motion begin in one cycle. Ctrl-C cancels them, and returns when the joints are at
-    rest; the first motion that does not reach its end is the last one.
+    All controllers of a motion start in the same cycle. After a motion that does not reach its end, no other
+    motion is played. Ctrl-C cancels the motion, and the command returns when the joints are at rest.
 
     Parameters
     ----------
     motions
-        A motion file; or the name of a file next to the robot file or in its folder motions; or the name of a
-        motion of a keyframe_player. Its controllers must be active.
+        Motion files, or names of motions. A name stands for a file next to the robot file or in its folder
+        motions, or for a motion of a keyframe_player. The controllers of a motion must be active.
     speed
-        Factor of the speed: 0.5 takes twice as long.
+        Speed factor: at 0.5 a motion takes twice as long.
     loop
-        How often all of them are played.
+        Number of times that all motions are played.
     listed
-        List the motions that the robot has by name, with their joints and lengths.
+        List the motions that can be played by name, with their joints and durations.
     wait
-        Return when all are played; --no-wait: when the motion has begun.
+        Wait until all motions have ended. With --no-wait, return when the motion has started.
     """
     _check(motions, loop, listed=listed, wait=wait)
     with connect_robot(chosen.robot, "play") as robot:

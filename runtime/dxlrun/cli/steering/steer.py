@@ -35,12 +35,12 @@ Row = Mapping[str, Any]
 @Parameter(name="*")
 @dataclass(frozen=True, slots=True)
 class Chosen:
-    """The robot, and the form of the output.
+    """Choice of the robot, and form of the output.
 
     Parameters
     ----------
     robot
-        Name of the robot, where several run; NAME@HOST:PORT of one on another computer.
+        Name of the robot, if several run. NAME@HOST:PORT addresses a robot on another computer.
     """
 
     robot: str | None = None
@@ -55,15 +55,15 @@ ONLY_ONE = Chosen()
 def list_robots(
     *, robot: str | None = None, graph: GraphFile = None, as_json: JsonFlag = False, debug: DebugFlag = False
 ) -> int:
-    """List the robots that run: their controllers, devices and sensors, and the commands these take.
+    """List the running robots: controllers, devices and sensors, and the commands that these take.
 
     Parameters
     ----------
     robot
-        Name of the robot, where several run; only this one is listed.
+        Name of the robot to list. Default: all running robots.
     graph
-        Draw a graph here, or into a file, .svg or .dot: the controllers, what they read and command, with
-        those that are active now. A file takes one robot.
+        Draw the graph of the controllers with all that they read and command, and with their states: in the
+        terminal, or into an .svg or .dot file. A file shows one robot.
     """
     from dxlrun.remote.client import connect
     from dxlrun.remote.network.network_link import known_robots
@@ -132,7 +132,9 @@ def _show_robot(info: Row, graph: Sequence[Path] | None) -> None:
 
 
 def switch(*, activate: Names = (), deactivate: Names = (), chosen: Chosen = ONLY_ONE) -> int:
-    """Activate and deactivate controllers of a running robot: in one cycle, or not at all.
+    """Activate and deactivate controllers of a running robot.
+
+    All of them change in the same cycle, or none does.
 
     Parameters
     ----------
@@ -155,12 +157,12 @@ def switch(*, activate: Names = (), deactivate: Names = (), chosen: Chosen = ONL
 
 
 def rate(hz: Hertz, /, *, chosen: Chosen = ONLY_ONE) -> int:
-    """Change the rate of a running robot's loop.
+    """Change the loop rate of a running robot.
 
     Parameters
     ----------
     hz
-        Cycles per second, Hz.
+        New loop rate, Hz.
     """
     # Also refuses NaN.
     if not 0 < hz < float("inf"):
@@ -171,7 +173,10 @@ def rate(hz: Hertz, /, *, chosen: Chosen = ONLY_ONE) -> int:
 
 
 def halt(*, chosen: Chosen = ONLY_ONE) -> int:
-    """Let every joint come to a stop within its limits, and hold: the run continues."""
+    """Stop all joints within their limits, and hold them.
+
+    The run continues. All controllers that command joints are deactivated.
+    """
     with connect_robot(chosen.robot, "halt") as robot:
         done = robot.halt()
         text = f"{robot.name} stands still"
@@ -181,14 +186,20 @@ def halt(*, chosen: Chosen = ONLY_ONE) -> int:
 
 
 def take_over(*, chosen: Chosen = ONLY_ONE) -> int:
-    """Command a robot that a client of another computer commands; that one is refused from now on."""
+    """Take over a robot that a client on another computer commands.
+
+    Commands of that client are refused from then on.
+    """
     with connect_robot(chosen.robot, "take-over") as robot:
         done = robot.take_over()
         return report_done(robot, chosen, done, f"{robot.name} is commanded from here")
 
 
 def pause(*, chosen: Chosen = ONLY_ONE) -> int:
-    """Pause a running robot: its joints are held, its controllers' time stops."""
+    """Pause a running robot.
+
+    Its joints hold their positions, and the time of its controllers stops.
+    """
     with connect_robot(chosen.robot, "pause") as robot:
         done = robot.pause()
         text = "is paused, its joints are held; `dxlrun resume` ends that"
@@ -196,23 +207,26 @@ def pause(*, chosen: Chosen = ONLY_ONE) -> int:
 
 
 def resume(*, chosen: Chosen = ONLY_ONE) -> int:
-    """Resume the controllers of a paused robot where they were."""
+    """Resume a paused robot: its controllers continue where they stopped."""
     with connect_robot(chosen.robot, "resume") as robot:
         done = robot.resume()
         return report_done(robot, chosen, done, f"{robot.name} runs again")
 
 
 def load(name: str, /, *words: Words, file: Path | None = None, chosen: Chosen = ONLY_ONE) -> int:
-    """Load another controller into a paused robot; it is not active until it is switched on.
+    """Load another controller into a paused robot.
+
+    `dxlrun switch --activate NAME` starts the controller.
 
     Parameters
     ----------
     name
         Name of the new controller.
     words
-        Its keys as in the robot file, such as type=joint_group_position_controller 'joints=[head_yaw_joint]'.
+        Keys of the controller as in the robot file, such as type=joint_group_position_controller
+        'joints=[head_yaw_joint]'.
     file
-        A YAML file with its keys, instead of the words.
+        YAML file with the keys, in place of words on the command line.
     """
     from dxlrun.cli.steering.written import Written
 
@@ -226,7 +240,7 @@ def load(name: str, /, *words: Words, file: Path | None = None, chosen: Chosen =
 
 
 def unload(name: str, /, *, chosen: Chosen = ONLY_ONE) -> int:
-    """Take a controller that is not active out of a paused robot.
+    """Remove an inactive controller from a paused robot.
 
     Parameters
     ----------
@@ -244,7 +258,7 @@ def stop(*, wait: WaitFlag = True, chosen: Chosen = ONLY_ONE) -> int:
     Parameters
     ----------
     wait
-        Return when it has ended; --no-wait: as soon as the loop has accepted it.
+        Wait until the run has ended. With --no-wait, return as soon as the loop has accepted the request.
     """
     from dxlrun.run.unsteered import end_run
 

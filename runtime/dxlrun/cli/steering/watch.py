@@ -86,14 +86,15 @@ class Watched:
 
 
 def watch(*, once: Flag = False, chosen: Chosen = ONLY_ONE) -> int:
-    """Watch a running robot: its joints, controllers, rate and events, live; q or Ctrl-C ends it.
+    """Watch a running robot live: joints, controllers, rate and events.
 
-    Into a pipe, one snapshot as tables; with --json one object a line, until the run ends.
+    q or Ctrl-C ends the command. In a pipe, one snapshot is printed as tables. With --json, objects are
+    printed until the run ends, one per line.
 
     Parameters
     ----------
     once
-        Print one snapshot.
+        Print one snapshot and exit.
     """
     with connect_robot(chosen.robot, "watch") as robot:
         watched = Watched(robot)

@@ -41,14 +41,16 @@ def models(
     as_json: JsonFlag = False,
     debug: DebugFlag = False,
 ) -> int:
-    """List the models of servos and devices, or print one's control table: those that a robot file can name.
+    """List models of servos and devices, or print the control table of one.
+
+    A robot file can name all these models.
 
     Parameters
     ----------
     name
-        A model, for example AX-12A; without it all are listed.
+        Model to print, for example AX-12A. Default: list all models.
     protocol
-        Protocol, 1.0 or 2.0; only its models.
+        Protocol, 1.0 or 2.0, of the models. Default: both.
     """
     from dxlrun.control.controllers.plugins import load_plugins
 

@@ -50,25 +50,25 @@ def scan(
     as_json: JsonFlag = False,
     debug: DebugFlag = False,
 ) -> int:
-    """Look for servos and devices on a port: both protocols, every baud rate, every ID; writes nothing.
+    """Search a port for servos and devices: both protocols, all baud rates, all IDs.
 
-    It takes about half a minute; --protocol, --baud and --ids make it quicker. Exit code 0, or 1 when no
-    servo answered.
+    Nothing is written. The search takes about half a minute; --protocol, --baud and --ids make it faster.
+    Exit code: 0, or 1 if no servo and no device answered.
 
     Parameters
     ----------
     port
-        The adapter, for example /dev/ttyUSB0; `dxlrun doctor` lists those that are plugged in.
+        Port of the adapter, for example /dev/ttyUSB0. `dxlrun doctor` lists the connected adapters.
     protocol
-        Protocol, 1.0 or 2.0; only this one.
+        Protocol, 1.0 or 2.0, to search. Default: both.
     baud
-        Baud rate, bit/s; only this one. May be given several times.
+        Baud rate, bit/s, to search. Can be given several times. Default: all baud rates.
     ids
-        Only these IDs, for example 1-20 or 1,4,7.
+        IDs to search, for example 1-20 or 1,4,7. Default: all IDs.
     output
-        Write the result to this file: a robot file for the servos that were found, to be completed by hand.
+        Output file for a draft of a robot file with the servos that were found. Complete it by hand.
     log
-        Write a log to this new file, with every packet.
+        New log file for all packets.
     """
     from dxlrun.dynamixel.tools import scanning
     from dxlrun.dynamixel.tools.tool_line import ToolLine, TunablePort

@@ -45,34 +45,34 @@ def servo(
     as_json: JsonFlag = False,
     debug: DebugFlag = False,
 ) -> int:
-    """Read or change one servo on a port that no run uses: its registers, ID, baud rate, torque.
+    """Read or change one servo on a port that no run uses: registers, ID, baud rate, torque.
 
     VERB is one of: get [ITEM...], set ITEM VALUE, id NEW, baud RATE, reboot, factory-reset, backup [FILE],
-    restore [FILE], blink [TIMES], torque on|off; of a device that is not a servo, get and set. A change of
-    the EEPROM asks for confirmation, needs the torque off, and is verified afterwards. Without FILE the
-    servo's own backup is meant.
+    restore [FILE], blink [TIMES], torque on|off. A device that is not a servo has only get and set. A change
+    of the EEPROM asks for confirmation, requires disabled torque, and is verified afterwards. Without FILE,
+    backup and restore use the backup in the servo itself.
 
     Parameters
     ----------
     port
-        The adapter, for example /dev/ttyUSB0.
+        Port of the adapter, for example /dev/ttyUSB0.
     servo_id
-        ID of the servo; `dxlrun scan` lists the servos.
+        ID of the servo. `dxlrun scan` lists the servos.
     verb
-        What to do.
+        Action on the servo.
     words
-        What the verb needs.
+        Arguments of VERB.
     protocol
-        Protocol, 1.0 or 2.0; without it both are tried.
+        Protocol, 1.0 or 2.0. Default: both are tried.
     baud
-        Baud rate, bit/s; without it all are tried.
+        Baud rate, bit/s. Default: all are tried.
     keep
-        What a factory reset does not change; without it ID and baud rate (Protocol 2.0), or nothing (Protocol
+        Settings that a factory reset keeps. Default: ID and baud rate (Protocol 2.0), or nothing (Protocol
         1.0).
     yes
-        Do not ask before the EEPROM is changed.
+        Do not ask for confirmation.
     log
-        Write a log to this new file, with every packet.
+        New log file for all packets.
     """
     from dxlrun.dynamixel.tools.one_node import OneDevice
     from dxlrun.dynamixel.tools.one_servo import OneServo
