@@ -1,6 +1,6 @@
-"""Prose: docstrings, comments and pages contain none of the phrases below, which have a plainer form.
+"""Prose: docstrings, comments, descriptions of keys and pages contain none of the phrases below.
 
-The list is the floor. A text without these phrases can still be hard to read.
+Each phrase has a plainer form. The list is the floor: a text without these phrases can still be hard to read.
 """
 
 from __future__ import annotations
@@ -44,17 +44,29 @@ _CODE = re.compile(r"`[^`]*`")
 
 
 class Text(NamedTuple):
-    """One docstring or comment."""
+    """One docstring, comment or description of a key."""
 
     line: int
     text: str
     kind: str
-    """`docstring`, `attribute` or `comment`."""
+    """`docstring`, `attribute`, `comment` or `description`."""
+
+
+def descriptions_of(call: ast.Call) -> Iterator[Text]:
+    """Yield the descriptions of keys in a call: `key("...")`, and the argument `description`."""
+    found = [one.value for one in call.keywords if one.arg == "description"]
+    if isinstance(call.func, ast.Name) and call.func.id == "key":
+        found += call.args[:1]
+    for value in found:
+        if isinstance(value, ast.Constant) and isinstance(value.value, str):
+            yield Text(value.lineno, value.value, "description")
 
 
 def texts_of(source: str) -> Iterator[Text]:
-    """Yield the docstrings, attribute docstrings and comments of a Python source."""
+    """Yield the docstrings, attribute docstrings, descriptions of keys and comments of a Python source."""
     for node in ast.walk(ast.parse(source)):
+        if isinstance(node, ast.Call):
+            yield from descriptions_of(node)
         if not isinstance(node, ast.Module | ast.ClassDef | ast.FunctionDef | ast.AsyncFunctionDef):
             continue
         if text := ast.get_docstring(node):
@@ -140,6 +152,9 @@ x = 1  # written anew
 """What was read."""
 def read():
     """Return `of it`, which is no code."""
+class Joint:
+    limits = key("Where it may go.", "1")
+    speed = Field(description="Speed at " "its end.")
 '''
     found = [name for text in texts_of(source) for name in find_phrases(text)]
-    assert sorted(found) == ["anew", "begins with What", "is no"]
+    assert sorted(found) == ["anew", "at its end", "begins with What", "begins with Where", "is no"]
