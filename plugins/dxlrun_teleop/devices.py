@@ -71,7 +71,7 @@ class Gamepad:
         return tuple(map(self._axis, self._codes)), not SHOULDERS.isdisjoint(held)
 
     def _axis(self, code: int) -> float:
-        """Return the deflection of a stick, -1..1. Up and left are positive, as in the twist of a base."""
+        """Return the deflection of a stick, -1..1, without its dead zone. Up and left are positive."""
         value, lowest, highest = self._device.absinfo(code)[:3]
         way: float = (lowest + highest - 2 * value) / ((highest - lowest) or 1)
         beyond = min(max(0.0, abs(way) - DEAD_ZONE) / (1.0 - DEAD_ZONE), 1.0)

@@ -71,7 +71,7 @@ MENTIONS = {
     "sensor": Mention(r"(?i)sensor(?!_msgs|_?broadcaster)", "sensors"),
     "register declaration": Mention(
         r"\b(servo|joint|described|desired|own)\.registers\b(?! import)|registers: dict\[ItemName|'registers'"
-        r"|compile_registers|declared_registers|declarable|steered_value|RegisterDifference",
+        r"|compile_registers|declared_registers|declarable|steered_value|ComparedSetting",
         "registers",
         r"(dxlsim|simulation)/",  # the memory of a simulated servo
     ),

@@ -195,7 +195,7 @@ def _found(place: str) -> Folder | Store:
 
 
 def _check(place: str) -> None:
-    """Validate the directory and the installed extras.
+    """Check that a place is a directory or the address of a store, and that its extras are installed.
 
     Raises:
         InputError: One line for each problem.

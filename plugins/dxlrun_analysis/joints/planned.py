@@ -27,7 +27,7 @@ _ACCELERATIONS = ("profile_acceleration", "goal_acceleration")
 
 @dataclass(frozen=True, slots=True)
 class PlannedJoint:
-    """One joint with the limits of its servos; m instead of rad for a linear joint."""
+    """A joint as the plan of a recorded run has it, with the limits of its servos; rad, or m if linear."""
 
     name: str = ""
     bus: str = ""

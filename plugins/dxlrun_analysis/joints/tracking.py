@@ -202,7 +202,9 @@ class _OpenRest:
     highest: float = -math.inf  # Range of the desired positions since the last rest, before the kept cycles
 
     def take(self, times: Floats, way: Floats, error: Floats, tick: float, *, final: bool) -> Iterator[_Rest]:
-        """Yield completed rests, and with `final` also the open one.
+        """Yield the rests that end in these cycles, and with `final` also the open one.
+
+        A rest that is too short, or without any known error, is dropped. A long rest is yielded in pieces.
 
         Args:
             times: s, shape (cycles,).

@@ -252,7 +252,7 @@ class RingReader(_Ring):
 
 
 class Handover:
-    """Appender that passes each record to the function `take`, in the same process, on virtual time."""
+    """Appender that passes each record to the function `take` in the same process, without a ring."""
 
     __slots__ = ("_take", "head")
 

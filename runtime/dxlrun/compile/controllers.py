@@ -287,9 +287,10 @@ def _names_motor(joint: CompiledJoint) -> bool:
 def compile_modes(
     file: RobotFile, joints: Mapping[str, CompiledJoint], controllers: Mapping[str, CompiledController]
 ) -> dict[str, Mode]:
-    """Return the start mode of each joint, by name; the joint's model has the mode.
+    """Return the start mode of each joint, by name: that of its first active controller, or its rest mode.
 
-    Each joint must have the mode that its controllers need, and a mode in which it rests.
+    A problem is added to the file if the model of a joint lacks a mode that its controllers need, or its rest
+    mode.
     """
     able = {name: joint.modes for name, joint in joints.items()}
     for name, joint in joints.items():

@@ -430,7 +430,11 @@ def command_kind(controller: type[Controller[Any]]) -> str | None:
 def group_command(
     controller: type[Controller[Any]], kind: str, joints: Sequence[str], sample: Sample
 ) -> dict[str, object]:
-    """Return one command with a value for each joint; raise InputError for a quantity that it lacks."""
+    """Return one command with a value for each joint.
+
+    Raises:
+        InputError: The controller does not take a quantity of the sample, or a joint has no value for one.
+    """
     fields = controller.Commands[kind].model_fields
     quantities = [quantity for quantity, name in _FIELDS.items() if name in fields]
     for joint, target in sample.targets.items():

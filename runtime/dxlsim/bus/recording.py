@@ -25,7 +25,7 @@ class RecordedPackets(msgspec.Struct, frozen=True):
 
 
 class Heard(NamedTuple):
-    """Bytes that the host received together."""
+    """One packet of a recorded answer, and its delay after the instruction."""
 
     delay_ns: int  # From the end of the instruction on the wire to the last byte's arrival at the host
     data: bytes

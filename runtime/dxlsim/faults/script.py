@@ -122,8 +122,11 @@ def _action(fault: Fault, first: object, **others: object) -> Callable[[], None]
 
 
 def _chosen(fault: Fault, buses: Sequence[SimulatedBus]) -> Sequence[SimulatedBus]:
-    """Return the bus of a fault, or all buses for a storm without one. Raises InputError for a missing
-    target.
+    """Return the bus of a fault, or all buses for a storm that names none.
+
+    Raises:
+        InputError: The bus or the servo does not exist, the fault cannot happen to that device, or it names
+            no bus although there are several.
     """
     names = " or ".join(f"bus={bus.name}" for bus in buses)
     chosen = [bus for bus in buses if fault.bus in (None, bus.name)]

@@ -257,7 +257,10 @@ def info_of(robot: RemoteRobot) -> RobotInfo:
 
 
 def _motions(info: RobotInfo) -> Iterator[str]:
-    """Yield the motion files next to the robot file that only use controllers of this robot."""
+    """Yield the files `motions/*.yaml` next to the robot file that only use controllers of this robot.
+
+    Files that cannot be read are skipped.
+    """
     names = {row.name for row in info.controllers}
     for path in sorted(Path(info.file).parent.glob("motions/*.yaml")):
         with suppress(DxlrunError, OSError):

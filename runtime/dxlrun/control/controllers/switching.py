@@ -268,7 +268,11 @@ class Switching:
         self._fall_back_all(failed)
 
     def request_modes(self) -> None:
-        """Request modes from the hardware according to the claims of active and waiting controllers."""
+        """Request the modes that active and waiting controllers claim from the hardware.
+
+        A joint without a claim keeps a mode in which it holds still. From other modes it enters its rest
+        mode.
+        """
         self.modes_requested = True
         claimed = claimed_modes(self.standing.engaged.values())
         modes = np.zeros(len(self._joints), dtype=np.uint8)

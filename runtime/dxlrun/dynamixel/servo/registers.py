@@ -21,8 +21,8 @@ from dxlwire.transaction import Program
 _RELEASE = "switch its torque off and start again, without --take-over"
 
 
-class RegisterDifference(msgspec.Struct, frozen=True):
-    """A declared register and its present value in the servo."""
+class ComparedSetting(msgspec.Struct, frozen=True):
+    """A setting of a servo and the present value of its register, which may be equal."""
 
     register: RegisterValue
     found: int | None
@@ -34,11 +34,11 @@ class RegisterDifference(msgspec.Struct, frozen=True):
         return self.found is not None and self.found != self.register.value
 
 
-def compare(one: ItemAccess, registers: Sequence[RegisterValue]) -> Program[tuple[RegisterDifference, ...]]:
+def compare(one: ItemAccess, registers: Sequence[RegisterValue]) -> Program[tuple[ComparedSetting, ...]]:
     """Read registers of one servo without writing any."""
     found = []
     for register in registers:
-        found.append(RegisterDifference(register, (yield from _integer(one, register))))
+        found.append(ComparedSetting(register, (yield from _integer(one, register))))
     return tuple(found)
 
 

@@ -15,7 +15,7 @@ from dxlrun.dynamixel.remedies import choose_remedy
 from dxlrun.dynamixel.servo.access import Access, first_reach
 from dxlrun.dynamixel.servo.checks import LISTEN_NS, inspect, survey
 from dxlrun.dynamixel.servo.modes import read_limits, servo_limits
-from dxlrun.dynamixel.servo.registers import RegisterDifference, compare
+from dxlrun.dynamixel.servo.registers import ComparedSetting, compare
 from dxlrun.dynamixel.tools.scanning import identity
 from dxlrun.dynamixel.tools.tool_line import ToolLine
 from dxlrun.errors import StartUpError
@@ -230,7 +230,7 @@ def _look(plan: BusPlan, joints: Mapping[int, JointPlan]) -> Program[Found]:
     found = Found(len(answered), problems=surveyed.problems, remarks=remarks)
     found.deviations = [_deviation(*one) for one in surveyed.deviations]
     for servo in plan.servos:
-        differences = [RegisterDifference(register, None) for register in servo.settings]
+        differences = [ComparedSetting(register, None) for register in servo.settings]
         if servo.joint in answered:
             differences = list((yield from compare(first_reach(plan, servo), servo.settings)))
             found.remarks += yield from _tighter_limits(first_reach(plan, servo), joints.get(servo.row))
@@ -253,7 +253,7 @@ def _deviation(joint: str, servo: str, one: FoundDeviation) -> DeviationRow:
     return DeviationRow(joint, servo, item.name, item.address, item.area, one.found, one.factory, one.effect)
 
 
-def _row(plan: BusPlan, servo: ServoPlan, one: RegisterDifference) -> RegisterRow:
+def _row(plan: BusPlan, servo: ServoPlan, one: ComparedSetting) -> RegisterRow:
     register = one.register
     item = find_table(servo.model, plan.protocol).items[register.name]
     action = "write" if one.differs else "nothing"

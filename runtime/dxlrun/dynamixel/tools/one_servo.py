@@ -16,7 +16,7 @@ from dxlrun.dynamixel.findings import Findings
 from dxlrun.dynamixel.servo import modes, watchdog
 from dxlrun.dynamixel.servo.access import Access, reach
 from dxlrun.dynamixel.servo.checks import deviations
-from dxlrun.dynamixel.servo.registers import RegisterDifference, compare, settle, shown, tripped
+from dxlrun.dynamixel.servo.registers import ComparedSetting, compare, settle, shown, tripped
 from dxlrun.dynamixel.tools.one_node import Confirm, OneNode, agree
 from dxlrun.dynamixel.tools.scanning import FoundServo
 from dxlrun.dynamixel.tools.tool_line import ToolLine
@@ -92,7 +92,7 @@ class OneServo(OneNode):
         """Return the values that differ from the factory's and matter to a run."""
         return deviations(self.access, values, mode_in(self._servo, values))
 
-    def differences(self, desired: Sequence[RegisterValue]) -> tuple[RegisterDifference, ...]:
+    def differences(self, desired: Sequence[RegisterValue]) -> tuple[ComparedSetting, ...]:
         """Compare registers with their desired values without writing any."""
         found = self.run(compare(self.access, desired))
         silent = [self.table.items[one.register.name].title for one in found if one.found is None]

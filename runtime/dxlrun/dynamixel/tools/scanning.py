@@ -180,7 +180,10 @@ def _search(tool: ToolLine, ids: Sequence[int], beat: Callable[[float], None]) -
 def _one_by_one(
     tool: ToolLine, ids: Sequence[int], timeout_ns: int | None, beat: Callable[[float], None]
 ) -> Program[set[int]]:
-    """Ping every ID; return the IDs that answered, intact or not."""
+    """Ping every ID and return the IDs that answered.
+
+    An ID with a damaged reply counts if a second ping is answered, too, or a late reply names it.
+    """
     line, heard = tool.line, tool.heard
     there: set[int] = set()
     suspected: list[int] = []
