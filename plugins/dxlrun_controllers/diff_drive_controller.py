@@ -103,9 +103,9 @@ class VelocityCommand(CommandModel):
     """Twist of the base in the plane. It is valid until the next command, at most for the timeout."""
 
     linear: Annotated[float, or_number(TypeAdapter(LinearVelocity))] = 0.0
-    """m/s, forward"""
+    """Forward velocity, m/s"""
     angular: Annotated[float, or_number(TypeAdapter(AngularVelocity))] = 0.0
-    """rad/s, to the left"""
+    """Rate of turn, rad/s, positive to the left"""
 
 
 class Ramp:

@@ -20,46 +20,47 @@ class PositionsCommand(CommandModel):
     """One goal position per joint"""
 
     positions: tuple[float, ...]
-    """rad, shape (joints,)"""
+    """Goal positions, rad, shape (joints,)"""
 
 
 class PosVelCommand(CommandModel):
     """One goal position and one speed per joint"""
 
     positions: tuple[float, ...]
-    """rad, shape (joints,)"""
+    """Goal positions, rad, shape (joints,)"""
     velocities: tuple[float, ...]
-    """rad/s, shape (joints,); signs are ignored"""
+    """Speeds on the way, rad/s, shape (joints,). Signs are ignored"""
 
 
 class PosEffortCommand(CommandModel):
     """One goal position and one effort limit per joint"""
 
     positions: tuple[float, ...]
-    """rad, shape (joints,)"""
+    """Goal positions, rad, shape (joints,)"""
     efforts: tuple[float, ...]
-    """Nm, A or the fraction of maximum, as the model measures it; shape (joints,); signs are ignored"""
+    """Effort limits, Nm, A or the fraction of maximum, as the model measures it, shape (joints,). Signs are
+    ignored"""
 
 
 class VelocitiesCommand(CommandModel):
     """One velocity per joint"""
 
     velocities: tuple[float, ...]
-    """rad/s, signed, shape (joints,)"""
+    """Goal velocities, rad/s, signed, shape (joints,)"""
 
 
 class EffortsCommand(CommandModel):
     """One effort per joint"""
 
     efforts: tuple[float, ...]
-    """Nm, A or the fraction of maximum, as the model measures it; signed, shape (joints,)"""
+    """Goal efforts, Nm, A or the fraction of maximum, as the model measures it, signed, shape (joints,)"""
 
 
 class PwmCommand(CommandModel):
     """One PWM duty per joint"""
 
     pwm: tuple[Annotated[float, Field(ge=-1, le=1)], ...]
-    """Fraction of the full voltage, -1..1, shape (joints,); 20 for 20 % is rejected"""
+    """PWM duties, fraction of the full voltage, -1..1, shape (joints,). 20 for 20 % is rejected"""
 
 
 class _GroupController(Controller[GroupParameters]):

@@ -46,51 +46,51 @@ def _parser() -> argparse.ArgumentParser:
         action="append",
         default=[],
         metavar="MODEL:IDS",
-        help="servos, such as XL430-W250:1-3 or AX-12A:1,4; may be given several times",
+        help="servos, such as XL430-W250:1-3 or AX-12A:1,4; can be given several times",
     )
     add(
         "--baud",
         type=int,
         metavar="RATE",
-        help="baud rate, bit/s; without it the one that the servos are shipped with",
+        help="baud rate, bit/s; default: the factory setting of the servos",
     )
     add(
         "--protocol",
         type=float,
         metavar="1.0|2.0",
-        help="protocol; needed only by models that exist with both",
+        help="protocol; required only for models that exist with both",
     )
     add(
         "--link",
         type=Path,
         metavar="PATH",
-        help="symbolic link to the pseudo-terminal, which gets another name at each start",
+        help="symbolic link to the pseudo-terminal, whose own name changes at each start",
     )
     add(
         "--fault",
         action="append",
         default=[],
         metavar="LINE",
-        help='a fault, such as "lose servo=3 at=2s"; may be given several times',
+        help='fault to inject, such as "lose servo=3 at=2s"; can be given several times',
     )
-    add("--faults", action="store_true", help="print the faults that there are, and end")
+    add("--faults", action="store_true", help="list the kinds of faults, and exit")
     add(
         "--seed",
         type=int,
         default=0,
         metavar="NUMBER",
-        help="what faults leave to chance is drawn from this number (0)",
+        help="seed of the random numbers of faults; default: 0",
     )
     add(
         "--ledger",
         type=Path,
         metavar="FILE",
-        help="write every byte on the bus with its time, and each fault, as JSON lines to this new file",
+        help="new file for the ledger, JSON lines: every byte on the bus with its time, and every fault",
     )
     add(
         "--latency-timer",
         metavar="TIME",
-        help='the adapter keeps replies back for so long, such as "4 ms", as FTDI adapters do',
+        help='time for which the adapter holds replies back, as FTDI adapters do, such as "4 ms"',
     )
     return parser
 

@@ -43,10 +43,10 @@ class JointTolerance(CommandModel):
     """Tolerances of a joint in one goal. The robot file has the defaults."""
 
     position: Near | None = None
-    """rad or m"""
+    """Position tolerance, rad or m"""
     velocity: Slow | None = None
-    """rad/s or m/s. At the end it is the speed below which the joint is at rest; on the way it limits the
-    difference to the desired velocity."""
+    """Velocity tolerance, rad/s or m/s. At the end, it is the speed below which the joint is at rest. On the
+    way, it limits the difference to the desired velocity."""
 
     @model_validator(mode="before")
     @classmethod
@@ -61,11 +61,11 @@ class TrajectoryPoint(CommandModel):
     time: Seconds
     """Time since the start of the trajectory, s"""
     positions: tuple[float, ...]
-    """rad, shape (joints,)"""
+    """Positions, rad, shape (joints,)"""
     velocities: tuple[float, ...] | None = None
-    """rad/s, shape (joints,)"""
+    """Velocities, rad/s, shape (joints,)"""
     accelerations: tuple[float, ...] | None = None
-    """rad/s^2, shape (joints,)"""
+    """Accelerations, rad/s^2, shape (joints,)"""
 
 
 class TrajectoryCommand(CommandModel):

@@ -48,11 +48,11 @@ class ImuCovariance(ParametersModel):
     """Variances from the data sheet. Unknown ones are omitted, and published as zeros, as ROS defines."""
 
     orientation: Diagonal | None = None
-    """rad^2."""
+    """Variances of the orientation about x, y and z, rad^2."""
     angular_velocity: Diagonal | None = None
-    """(rad/s)^2."""
+    """Variances of the angular velocity about x, y and z, (rad/s)^2."""
     linear_acceleration: Diagonal | None = None
-    """(m/s^2)^2."""
+    """Variances of the linear acceleration along x, y and z, (m/s^2)^2."""
 
 
 class ImuParameters(ParametersModel):

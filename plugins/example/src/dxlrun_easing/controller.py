@@ -16,7 +16,7 @@ class PositionsCommand(CommandModel):
     """One goal position per joint"""
 
     positions: tuple[float, ...]
-    """rad, shape (joints,)"""
+    """Goal positions, rad, shape (joints,)"""
 
 
 class Easing(JointController):
