@@ -147,7 +147,7 @@ def test_controllers_are_held_until_no_policy_holds_them() -> None:
     noted = HeldJoints()
     context = SimpleNamespace(plan=loop_plan([JointPlan("a", -1.0, 1.0, None)]))
     actions = PolicyActions(context, noted, noted)
-    first, second = type("First", (), {})(), type("Second", (), {})()
+    first, second = HeldJoints(), HeldJoints()  # two monitors of one class
     for holder, rows in ((first, {0}), (second, {0, 1}), (first, set()), (second, set())):
         actions.hold_controllers(holder, rows, "are cool")  # two monitors may have the same sentence
     assert [rows for rows, _ in noted.held] == [{0}, {0, 1}, {0, 1}, set()]

@@ -382,7 +382,7 @@ def test_a_controller_is_loaded_and_unloaded_in_a_pause_only(steered):
 
 def test_a_controller_that_is_loaded_while_its_servo_is_lost_is_held(steered):
     manager = steered.build().manager
-    manager.hold_lost({0})
+    manager.hold_lost({0}, "all its joints answer again")
     for name, joint in (("extra", "j0"), ("other", "j1")):
         assert isinstance(manager.load(plan_of(name, type="left", joints=(joint,))), int)
     assert [manager._named[name].held for name in ("extra", "other")] == [True, False]

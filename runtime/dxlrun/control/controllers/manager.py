@@ -317,7 +317,7 @@ class Manager:
         if (managed := self._named.get(controller)) is not None:
             self._attempt(managed, managed.hold_joints)
 
-    def hold_lost(self, lost: Collection[int], until: str = "all its joints answer again") -> tuple[int, ...]:
+    def hold_lost(self, lost: Collection[int], until: str) -> tuple[int, ...]:
         """Hold the controllers that command a lost joint, and the controllers above them.
 
         Held controllers are updated, but their joints stay where they are. This includes controllers that are

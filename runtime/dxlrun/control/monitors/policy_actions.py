@@ -24,8 +24,8 @@ class PolicyActions:
         self._context = context
         self._manager = manager
         self._gate = gate
-        self._held: dict[type, Collection[int]] = {}
-        """Rows of the joints whose controllers are held, by the monitor that holds them."""
+        self._held: dict[int, Collection[int]] = {}
+        """Rows of the joints whose controllers are held, by the `id` of the monitor that holds them."""
 
     def end_run(self, policy: str, why: str) -> None:
         """End the run after this cycle by a policy other than on_exit. Only the first call has an effect."""
@@ -45,7 +45,7 @@ class PolicyActions:
             rows: Rows of all joints that the monitor holds now.
             until: End of the hold as a clause for events: `all its joints answer again`.
         """
-        self._held[type(holder)] = rows
+        self._held[id(holder)] = rows
         self._gate.ease_in(self._manager.hold_lost(frozenset().union(*self._held.values()), until))
 
     def report(
