@@ -134,7 +134,7 @@ class Stage:
             units=(self.unit,) * count,
             urdf=self.urdf,
             provided=np.full(len(self.interfaces.provides), np.nan),
-            device_commands=np.full(len(self.interfaces.device_commands), np.nan),
+            source_commands=np.full(len(self.interfaces.source_commands), np.nan),
             kept=self.kept,
             keep=self.keeps.append,
             take_over=lambda names, why: self.takeovers.append((tuple(names), why)),

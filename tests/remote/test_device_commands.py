@@ -2,6 +2,7 @@
 
 import json
 
+import msgspec
 import numpy as np
 import pytest
 
@@ -9,6 +10,7 @@ from dxlrun.cli.steering.joints import source_facts
 from dxlrun.control.controllers.plugins import load_plugins
 from dxlrun.messages.cdr import Codec
 from dxlrun.messages.definition import MessageType
+from dxlrun.remote.live.states import RobotStates, array
 from dxlrun.testing import plan_of
 
 ROBOT = """\
@@ -133,3 +135,15 @@ def test_states_of_a_device_are_asked_for_by_name_and_listened_to(board):
     assert message["value"].tolist() == [12.5]
     assert board.ask("GET", "/stream?topic=/foot/nothing")[0] == 404
     assert {"/foot", "/board"} <= {one["name"] for one in board.ask("GET", "/topics")[1]["topics"]}
+
+
+def test_states_keep_their_older_names_of_commands(board):
+    board.record.source_commands[:] = 1.0, np.nan, 300.0
+    board.finish_cycle()
+    _, content = board.ask("GET", "/states")
+    assert content["device_commands"] == ["board/led", "board/register_7", "board/register_8"]
+    assert content["device_command"] == [1.0, None, 300.0]
+    states = msgspec.json.decode(json.dumps(content), type=RobotStates, dec_hook=array)
+    assert states.device_commands is states.source_commands
+    assert states.device_command is states.source_command
+    np.testing.assert_array_equal(states.source_command, [1.0, np.nan, 300.0])

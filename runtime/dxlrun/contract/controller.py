@@ -313,8 +313,8 @@ class Context(msgspec.Struct, frozen=True):
     provided: Floats = msgspec.field(default_factory=_none)
     """Provided states, shape (provides,), written in `update`; NaN = not known. They are valid in cycles with
     an update if all are finite. If all are NaN, the last states stay published and grow older."""
-    device_commands: Floats = msgspec.field(default_factory=_none)
-    """Commands of devices and other sources, shape (device_commands,), written in `update`. NaN = not
+    source_commands: Floats = msgspec.field(default_factory=_none)
+    """Commands of devices and other sources, shape (source_commands,), written in `update`. NaN = not
     commanded: the source keeps its last command."""
     kept: bytes = b""
     """Last state that the controller kept, in this or an earlier run. Empty: none, or it was kept with other
@@ -334,9 +334,9 @@ class Context(msgspec.Struct, frozen=True):
     """Request the end of the run after this cycle by the policy `on_fault`, with a reason as text."""
 
     @property
-    def source_commands(self) -> Floats:
-        """Alias of `device_commands`, which also has the commands of other sources."""
-        return self.device_commands
+    def device_commands(self) -> Floats:
+        """Older name of `source_commands`."""
+        return self.source_commands
 
 
 class Controller(ABC, Generic[P]):

@@ -185,7 +185,7 @@ class Managed:
             units=tuple(joint.unit for joint in joints),
             urdf=run.plan.urdf,
             provided=np.zeros(0) if self.provided is None else self.provided.own,
-            device_commands=self._outputs.source_commands,
+            source_commands=self._outputs.source_commands,
             take_over=partial(_take_over, requests, plan),
             end_run=partial(_end_run, requests, plan),
         )

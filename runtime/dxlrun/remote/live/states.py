@@ -9,6 +9,8 @@ import msgspec
 import numpy as np
 from numpy.typing import NDArray
 
+from dxlrun.description.source_names import SOURCE_COMMAND, SOURCE_COMMANDS, OlderSourceNames
+
 Floats = NDArray[np.float64]
 Integers = NDArray[np.int64]
 Bools = NDArray[np.bool_]
@@ -19,7 +21,7 @@ _OF_JOINTS = (
 )
 
 
-class RobotStates(msgspec.Struct, frozen=True):
+class RobotStates(OlderSourceNames, msgspec.Struct, frozen=True):
     """Snapshot of the newest cycle. Arrays have one row for each name; NaN is unknown or not commanded."""
 
     cycle: int
@@ -62,10 +64,10 @@ class RobotStates(msgspec.Struct, frozen=True):
     source_valid: Bools
     source_age_ns: Integers
     """-1 before the first values."""
-    device_commands: tuple[str, ...]
-    """Items of devices that controllers command: `board/led`."""
-    device_command: Floats
-    """Commanded value of each item, in the item's unit."""
+    source_commands: tuple[str, ...] = msgspec.field(name=SOURCE_COMMANDS)
+    """Commands of devices and other sources: `board/led`."""
+    source_command: Floats = msgspec.field(name=SOURCE_COMMAND)
+    """Commanded value of each command, in its unit."""
     controllers: tuple[str, ...]
     controller_ns: Integers
     """Duration of each controller's update in this cycle; 0 without an update."""
@@ -77,7 +79,7 @@ class RobotStates(msgspec.Struct, frozen=True):
     @property
     def source_names(self) -> tuple[str, ...]:
         """Names of sources, their states and their commands."""
-        return (*self.sources, *self.source_states, *self.device_commands)
+        return (*self.sources, *self.source_states, *self.source_commands)
 
     def joint(self, name: str) -> dict[str, object]:
         """Return the values of a joint by field name, with `age` in s; None is unknown. Raises ValueError."""
@@ -103,7 +105,7 @@ class RobotStates(msgspec.Struct, frozen=True):
             }
             for values in (
                 [*zip(self.source_states, map(_plain, self.source_state), strict=True)],
-                [*zip(self.device_commands, map(_plain, self.device_command), strict=True)],
+                [*zip(self.source_commands, map(_plain, self.source_command), strict=True)],
                 self.source_units.items(),
                 self.command_units.items(),
             )

@@ -12,7 +12,6 @@ from dxlrun.channels.cycle import CycleRecord, Torque
 from dxlrun.channels.loop_requests import Register, RegisterReading
 from dxlrun.compile.joints.register_values import UnfitRegister, steered_value
 from dxlrun.description.joints.groups import ALL
-from dxlrun.description.source_names import SOURCE_COMMANDS
 from dxlrun.dynamixel.servo.registers import meaning
 from dxlrun.errors import suggestion
 from dxlrun.plan.loop_plan import ControllerPlan
@@ -34,7 +33,8 @@ def states_of(plan: Plan, record: CycleRecord, controllers: Mapping[str, int]) -
     layout, states = record.layout, record.states
     row = np.frombuffer(record.raw, layout.dtype)[0]
     known = row.dtype.names or ()
-    arrays = {name: row[name] for name in RobotStates.__struct_fields__ if name in known}
+    fields = zip(RobotStates.__struct_fields__, RobotStates.__struct_encode_fields__, strict=True)
+    arrays = {field: row[name] for field, name in fields if name in known}
     efforts = effort_units(plan)
     timed = {name: place for name, place in controllers.items() if place < len(record.controller_ns)}
     special: dict[str, Any] = {
@@ -44,7 +44,7 @@ def states_of(plan: Plan, record: CycleRecord, controllers: Mapping[str, int]) -
         "controller_ns": record.controller_ns[[*timed.values()]],
     }
     return RobotStates(
-        **arrays | special | {SOURCE_COMMANDS: layout.source_commands},
+        **arrays | special,
         time_ns=record.woken_ns,
         late_ns=record.woken_ns - record.scheduled_ns,
         joints=layout.joints,
@@ -52,6 +52,7 @@ def states_of(plan: Plan, record: CycleRecord, controllers: Mapping[str, int]) -
         effort_units=tuple(efforts.get(name, "") for name in layout.joints),
         references=layout.references,
         source_states=layout.source_states,
+        source_commands=layout.source_commands,
         sources=layout.sources,
         controllers=tuple(timed),
         source_units=plan.loop.source_units,
