@@ -8,13 +8,8 @@ from hypothesis import strategies as st
 from tests.kit.pages import page_text
 from tests.kit.robots import compile_text, problems_in
 
-from dxlrun.compile.joints.register_values import (
-    UnfitRegister,
-    any_value,
-    declarable,
-    register_value,
-    steered_value,
-)
+from dxlrun.compile.joints.register_values import UnfitRegister, any_value
+from dxlrun.features.registers.settings import check_change, declarable, register_value
 from dxlwire.control_table import all_tables, find_table
 from dxlwire.control_table.device_table import read_device_table
 
@@ -148,9 +143,9 @@ def test_what_is_declarable_is_declared_on_every_model():
 )  # fmt: skip
 def test_a_client_may_change_only_ram_of_its_own(name, said):
     table = find_table("XM430-W350", 2.0)
-    assert steered_value(table, "position_p_gain", 640).value == 640
+    assert check_change(table, "position_p_gain", 640).value == 640
     with pytest.raises(ValueError, match=said):
-        steered_value(table, name, 2)
+        check_change(table, name, 2)
 
 
 def test_of_a_model_that_is_still_to_be_asked_what_fits_the_usual_one_is_taken():

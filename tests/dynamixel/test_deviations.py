@@ -11,12 +11,12 @@ from msgspec.structs import replace
 from tests.kit.rigs import make_rig, make_x, start_rig
 
 from dxlrun.channels.events import EventCode
-from dxlrun.compile.joints.register_values import register_value
 from dxlrun.dynamixel.findings import Findings
 from dxlrun.dynamixel.servo.access import first_reach
 from dxlrun.dynamixel.servo.checks import inspect
 from dxlrun.dynamixel.servo.torque_limits import restore_torque_limits
 from dxlrun.errors import StartUpError
+from dxlrun.features.registers.settings import register_value
 from dxlwire.bus_plan import BusPlan, RegisterValue
 from dxlwire.control_table import (
     ControlItem,

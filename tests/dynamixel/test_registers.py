@@ -5,12 +5,13 @@ from msgspec.structs import replace
 from tests.kit.rigs import make_plan, make_rig, make_x
 
 from dxlrun.channels.events import EventCode
-from dxlrun.compile.joints.register_values import UnfitRegister, declarable, register_value
+from dxlrun.compile.joints.register_values import UnfitRegister
 from dxlrun.dynamixel.findings import Findings
 from dxlrun.dynamixel.servo.access import first_reach, reach
 from dxlrun.dynamixel.servo.offline import rejoin
-from dxlrun.dynamixel.servo.registers import compare, settle
+from dxlrun.dynamixel.servo.registers import read_registers, settle
 from dxlrun.errors import StartUpError
+from dxlrun.features.registers.settings import declarable, register_value
 from dxlwire.bus_plan import RegisterValue
 from dxlwire.control_table import all_tables, find_table
 from dxlwire.exchange.bus import Lines
@@ -86,11 +87,8 @@ def test_only_what_differs_is_written_and_it_is_read_back():
 def test_comparing_writes_nothing():
     plan = declared(make_x((11, 12)), position_p_gain=900, position_d_gain=0)
     rig, execute = bench(plan)
-    found = execute(compare(first_reach(plan, plan.servos[0]), plan.servos[0].settings))
-    assert [(one.register.name, one.found, one.differs) for one in found] == [
-        ("position_p_gain", 800, True),
-        ("position_d_gain", 0, False),
-    ]
+    found = execute(read_registers(first_reach(plan, plan.servos[0]), plan.servos[0].settings))
+    assert found == {"position_p_gain": 800, "position_d_gain": 0}
     assert rig.writes() == []
 
 

@@ -1,58 +1,14 @@
-"""Values of registers: the items that a robot file, a client or a tool may write, and those reserved for
-dxlrun."""
+"""Values of registers: integers or quantities as text, checked against an item of a control table."""
 
 from __future__ import annotations
 
 import math
 import struct
-from collections.abc import Mapping
-from types import MappingProxyType
 
 from dxlrun.description.units import quantity
 from dxlrun.errors import suggestion
 from dxlwire.bus_plan import RegisterValue
-from dxlwire.control_table import ControlItem, ControlTable, Table
-
-_COMMANDED = ("controllers command it", "take it out; a controller sends it")
-_MODE = ("the interfaces of the active controllers choose the mode", "take it out; claim other interfaces")
-_ADDRESS = ("dxlrun finds the servo by it", "take it out; `dxlrun servo` changes it")
-_SECOND_ID = ("a servo with a second ID executes the goals of another one", "take it out")
-_TICK = ("it changes the size of a tick", "take it out")
-_OWN: Mapping[str, tuple[str, str]] = MappingProxyType(
-    {
-        "id": _ADDRESS,
-        "baud_rate": _ADDRESS,
-        "baud_rate_bus": _ADDRESS,
-        "protocol_type": _ADDRESS,
-        "secondary_id": _SECOND_ID,
-        "secondary_shadow_id": _SECOND_ID,
-        "torque_enable": ("dxlrun switches the torque, after its checks", "take it out"),
-        "operating_mode": _MODE,
-        "control_mode": _MODE,
-        "torque_ctrl_mode_enable": _MODE,
-        "goal_position": _COMMANDED,
-        "goal_velocity": _COMMANDED,
-        "goal_current": _COMMANDED,
-        "goal_pwm": _COMMANDED,
-        "goal_torque": _COMMANDED,
-        "moving_speed": _COMMANDED,
-        "profile_velocity": _COMMANDED,
-        "current": ("it is measured", "take it out"),
-        "torque_limit": (
-            "policies reduce it, and a start restores it",
-            "declare max_torque, its value after power-on",
-        ),
-        "bus_watchdog": ("dxlrun arms it", "take it out; the bus' key `bus_watchdog` is its time"),
-        "lock": ("it closes the EEPROM until power-off", "take it out"),
-        "hybrid_save": ("it stores RAM values in the EEPROM", "take it out"),
-        "electronic_gearratio_numerator": _TICK,
-        "electronic_gearratio_denominator": _TICK,
-    }
-)
-"""Items that dxlrun writes itself or relies on, with the reason and the fix."""
-_RESTORED = ("profile_velocity", "torque_limit")
-"""Items that start-up writes on some models only; on the other models they are reported."""
-_ANGLE_LIMITS = ("cw_angle_limit", "ccw_angle_limit")
+from dxlwire.control_table import ControlItem, Table
 
 
 class UnfitRegister(ValueError):
@@ -64,32 +20,17 @@ class UnfitRegister(ValueError):
         self.fix = fix
 
 
-def register_value(table: ControlTable, name: str, value: int | str) -> RegisterValue:
-    """Return the value to write for a declared register.
+def any_value(table: Table, name: str, value: int | str) -> RegisterValue:
+    """Return the value to write into a writable item, such as that of a tool.
 
     Args:
-        table: Control table of the servo.
+        table: Control table of the servo or device.
         name: Name of the item.
         value: Integer on the wire, signed if the item is; or text with a unit of the item's kind, rounded to
             the nearest tick.
 
     Raises:
-        UnfitRegister: The register or the value cannot be declared.
-    """
-    item = table.items.get(name)
-    if item is None:
-        raise UnfitRegister(f"an {table.model} has no register {name}", suggestion(name, declarable(table)))
-    if reason := own_reason(table, item):
-        raise UnfitRegister(f"{item.title} cannot be declared: {reason[0]}", reason[1])
-    found = any_value(table, name, value)
-    _check_meaning(item, found.value)
-    return found
-
-
-def any_value(table: Table, name: str, value: int | str) -> RegisterValue:
-    """Return the value that a tool writes into any writable item; raise UnfitRegister.
-
-    `value` is as in `register_value`.
+        UnfitRegister: There is no such item, or it cannot have the value.
     """
     item = table.items.get(name)
     if item is None:
@@ -104,48 +45,6 @@ def any_value(table: Table, name: str, value: int | str) -> RegisterValue:
             "write a value in this range",
         )
     return RegisterValue(item.address, item.size, raw, name, item.area == "EEPROM")
-
-
-def steered_value(table: ControlTable, name: str, value: int | str) -> RegisterValue:
-    """Return the value to write for a register that a client changes in a run; raise UnfitRegister."""
-    item = table.items.get(name)
-    if item is not None and item.access == "R":
-        raise UnfitRegister(f"{item.title} can only be read", "write another item")
-    if item is not None and (reason := own_reason(table, item)):
-        raise UnfitRegister(f"{item.title} cannot be changed: {reason[0]}", "write another item")
-    found = register_value(table, name, value)
-    item = table.items[name]
-    if found.eeprom:
-        raise UnfitRegister(
-            f"{item.title} is in the EEPROM, which cannot be written while the servo has torque",
-            "declare it under `registers` in the robot file, which the next start writes",
-        )
-    if item.deviation is not None and item.deviation.may_refuse:
-        raise UnfitRegister(
-            f"{item.title} cannot be changed: another value {item.deviation.effect}", "leave it as it is"
-        )
-    return found
-
-
-def declarable(table: ControlTable) -> tuple[str, ...]:
-    """Return the items of a model that can be declared, in the order of their addresses."""
-    items = table.items.values()
-    return tuple(item.name for item in items if item.access == "RW" and not own_reason(table, item))
-
-
-def own_reason(table: ControlTable, item: ControlItem) -> tuple[str, str] | None:
-    """Return the reason why an item is reserved for dxlrun, and the fix; None if it is not."""
-    if item.name.startswith("indirect_"):
-        return "a reboot resets it", "take it out"
-    if item.name in _ANGLE_LIMITS and table.protocol == 1.0:
-        return (
-            "both angle limits choose the mode, which dxlrun sets",
-            "write `limits: {position: ...}` instead",
-        )
-    rule = item.deviation
-    if rule is not None and item.name in _RESTORED and rule.judgement == "report":
-        return None  # start-up does not write it on this model
-    return _OWN.get(item.name)
 
 
 def _raw(item: ControlItem, value: int | str) -> int:
@@ -175,13 +74,3 @@ def _range(item: ControlItem) -> str:
 
 def _shown(value: int | str, raw: int) -> str:
     return str(value) if isinstance(value, int) else f"{value} ({raw})"
-
-
-def _check_meaning(item: ControlItem, raw: int) -> None:
-    """Refuse values that a servo accepts but that prevent every start."""
-    rule, factory = item.deviation, item.initial
-    if rule is None or rule.planned or factory is None or rule.judge(raw, factory) != "refuse":
-        return
-    raise UnfitRegister(
-        f"{item.title} cannot be {raw}, which {rule.effect_of(raw)}", f"write {factory}, or take it out"
-    )

@@ -104,6 +104,9 @@ class SettingsStage:
     the later feature takes precedence."""
     check: Callable[[RobotFile, BusPlan], None] = lambda file, plan: None
     """Checks the values against the plan of a bus."""
+    change: Callable[[ControlTable, str, int | str], RegisterValue] | None = None
+    """Returns the value that a client writes into an item during a run, an integer or a quantity as text;
+    raises UnfitRegister. The first feature with this function decides for all items."""
 
 
 def compile_servos(file: RobotFile, models: Mapping[str, str], motors: Motors) -> dict[str, CompiledServo]:

@@ -17,7 +17,7 @@ from dxlrun.dynamixel.findings import Findings
 from dxlrun.dynamixel.servo import modes
 from dxlrun.dynamixel.servo.life import Life
 from dxlrun.dynamixel.servo.reboots import Reboots
-from dxlrun.dynamixel.servo.registers import compare, merged, settle
+from dxlrun.dynamixel.servo.registers import merged, read_registers, settle
 from dxlrun.dynamixel.servo.torque_limits import limits_positions, restore_torque_limit
 from dxlwire.bus_plan import RegisterValue
 from dxlwire.exchange.goals import GoalArrays
@@ -178,8 +178,7 @@ class DesiredState:
     def _read(self, index: int, register: RegisterValue, done: RegisterDone) -> Program[None]:
         one = self._life.reach(index)
         for pause_ns in PAUSES_NS:
-            (compared,) = yield from compare(one, (register,))
-            found = compared.found
+            found = (yield from read_registers(one, (register,)))[register.name]
             if found is not None or not pause_ns:
                 break
             yield listen(pause_ns)

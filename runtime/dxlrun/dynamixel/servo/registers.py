@@ -1,4 +1,4 @@
-"""Declared registers of a servo: compared, written only if they differ, and read back.
+"""Settings of a servo: read, written only if they differ, and read back.
 
 EEPROM wears. A servo of Protocol 2.0 refuses to write it while it holds torque (e-Manual XM430-W350, Control
 Table of EEPROM Area), so it is never written then.
@@ -8,8 +8,6 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
-
-import msgspec
 
 from dxlrun.channels.events import EventCode, Severity
 from dxlrun.dynamixel.findings import Findings
@@ -21,25 +19,15 @@ from dxlwire.transaction import Program
 _RELEASE = "switch its torque off and start again, without --take-over"
 
 
-class ComparedSetting(msgspec.Struct, frozen=True):
-    """A setting of a servo and the present value of its register, which may be equal."""
-
-    register: RegisterValue
-    found: int | None
-    """Integer on the wire, signed if the item is; None: it could not be read."""
-
-    @property
-    def differs(self) -> bool:
-        """True if it must be written."""
-        return self.found is not None and self.found != self.register.value
-
-
-def compare(one: ItemAccess, registers: Sequence[RegisterValue]) -> Program[tuple[ComparedSetting, ...]]:
-    """Read registers of one servo without writing any."""
-    found = []
+def read_registers(one: ItemAccess, registers: Sequence[RegisterValue]) -> Program[dict[str, int | None]]:
+    """Read registers of one servo; return the integers on the wire by item, None for those without an
+    answer."""
+    present: dict[str, int | None] = {}
     for register in registers:
-        found.append(ComparedSetting(register, (yield from _integer(one, register))))
-    return tuple(found)
+        reply = yield from one.read_bytes(register.address, register.size)
+        item = one.items[register.name]
+        present[item.name] = item.integer(reply.parameters[: item.size]) if reply.answered else None
+    return present
 
 
 def settle(one: ItemAccess, registers: Sequence[RegisterValue], found: Findings) -> Program[dict[str, int]]:
@@ -47,12 +35,12 @@ def settle(one: ItemAccess, registers: Sequence[RegisterValue], found: Findings)
 
     Nothing is written if one of them cannot be read, or if a closed EEPROM prevents one of the writes.
     """
-    differences = yield from compare(one, registers)
-    before = {each.register.name: each.found for each in differences if each.found is not None}
-    if silent := [each.register for each in differences if each.found is None]:
+    present = yield from read_registers(one, registers)
+    before = {name: found for name, found in present.items() if found is not None}
+    if silent := [each for each in registers if each.name not in before]:
         found.problems.append(f"{one} did not answer when {_names(one, silent)} was read")
         return before
-    differing = [each.register for each in differences if each.differs]
+    differing = [each for each in registers if each.value != before[each.name]]
     stored = [register for register in differing if register.eeprom]
     if stored and (problem := (yield from one.closed_eeprom(_names(one, stored), release=_RELEASE))):
         found.problems.append(f"{one} {problem}")
@@ -109,12 +97,6 @@ def _quantity(item: ControlItem, value: int) -> str:
     if item.unit.startswith("rad"):
         return f"{math.degrees(quantity):.6g} {item.unit.replace('rad', 'deg')}"
     return f"{quantity * 100:.6g} %" if item.unit == "1" else f"{quantity:.6g} {item.unit}"
-
-
-def _integer(one: ItemAccess, register: RegisterValue) -> Program[int | None]:
-    reply = yield from one.read_bytes(register.address, register.size)
-    item = one.items[register.name]
-    return item.integer(reply.parameters[: item.size]) if reply.answered else None
 
 
 def _names(one: ItemAccess, registers: Sequence[RegisterValue]) -> str:

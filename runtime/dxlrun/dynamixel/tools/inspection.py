@@ -15,7 +15,7 @@ from dxlrun.dynamixel.remedies import choose_remedy
 from dxlrun.dynamixel.servo.access import Access, first_reach
 from dxlrun.dynamixel.servo.checks import LISTEN_NS, inspect, survey
 from dxlrun.dynamixel.servo.modes import read_limits, servo_limits
-from dxlrun.dynamixel.servo.registers import ComparedSetting, compare
+from dxlrun.dynamixel.servo.registers import read_registers
 from dxlrun.dynamixel.tools.scanning import identity
 from dxlrun.dynamixel.tools.tool_line import ToolLine
 from dxlrun.errors import StartUpError
@@ -165,12 +165,14 @@ def _compare_servos(plan: BusPlan, servos: Sequence[ServoPlan]) -> Program[Findi
         if not (yield from inspect(one, survey, take_over=True)):
             continue
         table = find_table(servo.model, plan.protocol)
-        for each in (yield from compare(one, stored_registers(table, plan, servo))):
-            title = table.items[each.register.name].title
-            if each.found is None:
+        stored = stored_registers(table, plan, servo)
+        present = yield from read_registers(one, stored)
+        for each in stored:
+            title, raw = table.items[each.name].title, present[each.name]
+            if raw is None:
                 survey.problems.append(f"{one} did not answer when {title} was read")
-            elif each.differs:
-                survey.problems.append(f"{one} has {title} = {each.found}, not {each.register.value}")
+            elif raw != each.value:
+                survey.problems.append(f"{one} has {title} = {raw}, not {each.value}")
     return survey
 
 
@@ -230,11 +232,11 @@ def _look(plan: BusPlan, joints: Mapping[int, JointPlan]) -> Program[Found]:
     found = Found(len(answered), problems=surveyed.problems, remarks=remarks)
     found.deviations = [_deviation(*one) for one in surveyed.deviations]
     for servo in plan.servos:
-        differences = [ComparedSetting(register, None) for register in servo.settings]
+        present: dict[str, int | None] = {}
         if servo.joint in answered:
-            differences = list((yield from compare(first_reach(plan, servo), servo.settings)))
+            present = yield from read_registers(first_reach(plan, servo), servo.settings)
             found.remarks += yield from _tighter_limits(first_reach(plan, servo), joints.get(servo.row))
-        found.registers += [_row(plan, servo, one) for one in differences]
+        found.registers += [_row(plan, servo, one, present.get(one.name)) for one in servo.settings]
     return found
 
 
@@ -253,11 +255,10 @@ def _deviation(joint: str, servo: str, one: FoundDeviation) -> DeviationRow:
     return DeviationRow(joint, servo, item.name, item.address, item.area, one.found, one.factory, one.effect)
 
 
-def _row(plan: BusPlan, servo: ServoPlan, one: ComparedSetting) -> RegisterRow:
-    register = one.register
-    item = find_table(servo.model, plan.protocol).items[register.name]
-    action = "write" if one.differs else "nothing"
-    return RegisterRow(servo.joint, item.name, item.address, item.area, register.value, one.found, action)
+def _row(plan: BusPlan, servo: ServoPlan, wanted: RegisterValue, found: int | None) -> RegisterRow:
+    item = find_table(servo.model, plan.protocol).items[wanted.name]
+    action = "nothing" if found in (None, wanted.value) else "write"
+    return RegisterRow(servo.joint, item.name, item.address, item.area, wanted.value, found, action)
 
 
 def _identify(plan: BusPlan, joints: Collection[str]) -> Program[tuple[Identity, ...]]:

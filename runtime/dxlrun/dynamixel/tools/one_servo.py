@@ -16,7 +16,7 @@ from dxlrun.dynamixel.findings import Findings
 from dxlrun.dynamixel.servo import modes, watchdog
 from dxlrun.dynamixel.servo.access import Access, reach
 from dxlrun.dynamixel.servo.checks import deviations
-from dxlrun.dynamixel.servo.registers import ComparedSetting, compare, settle, shown, tripped
+from dxlrun.dynamixel.servo.registers import read_registers, settle, shown, tripped
 from dxlrun.dynamixel.tools.one_node import Confirm, OneNode, agree
 from dxlrun.dynamixel.tools.scanning import FoundServo
 from dxlrun.dynamixel.tools.tool_line import ToolLine
@@ -92,13 +92,12 @@ class OneServo(OneNode):
         """Return the values that differ from the factory's and matter to a run."""
         return deviations(self.access, values, mode_in(self._servo, values))
 
-    def differences(self, desired: Sequence[RegisterValue]) -> tuple[ComparedSetting, ...]:
-        """Compare registers with their desired values without writing any."""
-        found = self.run(compare(self.access, desired))
-        silent = [self.table.items[one.register.name].title for one in found if one.found is None]
-        if silent:
+    def differences(self, desired: Sequence[RegisterValue]) -> tuple[RegisterValue, ...]:
+        """Return the registers that differ from their desired values; raise ServoFault without an answer."""
+        present = self.run(read_registers(self.access, desired))
+        if silent := [self.table.items[name].title for name, found in present.items() if found is None]:
             raise self.fail(f"did not answer when {', '.join(silent)} was read")
-        return found
+        return tuple(each for each in desired if each.value != present[each.name])
 
     def write(self, desired: Sequence[RegisterValue]) -> tuple[str, ...]:
         """Write the registers that differ, in the given order, and read each back; return a text for each
@@ -386,7 +385,7 @@ class OneServo(OneNode):
         self, desired: Sequence[RegisterValue], path: Path, confirm: Confirm = agree
     ) -> tuple[str, ...]:
         """Restore the registers of a backup file."""
-        if not (differing := [each.register for each in self.differences(desired) if each.differs]):
+        if not (differing := self.differences(desired)):
             return (f"has everything that {path} restores already",)
         self.writable(differing)
         names = ", ".join(each.name for each in differing)
@@ -394,8 +393,9 @@ class OneServo(OneNode):
             return ()
         written = self.write(desired)
         # A restored mode resets other registers, so compare again.
-        if left := [each.register.name for each in self.differences(desired) if each.differs]:
-            raise self.fail(f"{', '.join(left)} changed again while others were written; try again")
+        if left := self.differences(desired):
+            names = ", ".join(each.name for each in left)
+            raise self.fail(f"{names} changed again while others were written; try again")
         return written
 
     def _has_backup(self) -> None:

@@ -10,10 +10,12 @@ import numpy as np
 from dxlrun.channels.answers import Code, Field
 from dxlrun.channels.cycle import CycleRecord, Torque
 from dxlrun.channels.loop_requests import Register, RegisterReading
-from dxlrun.compile.joints.register_values import UnfitRegister, steered_value
+from dxlrun.compile.joints.register_values import UnfitRegister
+from dxlrun.compile.joints.servos import SettingsStage
 from dxlrun.description.joints.groups import ALL
 from dxlrun.dynamixel.servo.registers import meaning
 from dxlrun.errors import suggestion
+from dxlrun.features import stages
 from dxlrun.plan.loop_plan import ControllerPlan
 from dxlrun.plan.robot_plan import Plan
 from dxlrun.remote.live.states import RobotStates
@@ -133,8 +135,9 @@ def prepared_register(plan: Plan, name: str, item: str, value: int | str) -> Reg
         value: Integer on the wire, or a quantity with its unit.
     """
     servo, table, fields = _servo(plan, name, item)
+    change = next(stage.change for _, stage in stages(SettingsStage, plan.features) if stage.change)
     try:
-        register = steered_value(table, item[:_LONGEST], value)
+        register = change(table, item[:_LONGEST], value)
     except UnfitRegister as error:
         code = Code.INVALID_REGISTER if item in table.items else Code.UNKNOWN_REGISTER
         raise refused(code, fields | {"problem": str(error)}) from error
