@@ -20,8 +20,6 @@ from dxlrun.contract.hookspecs import Command as Command
 from dxlrun.contract.hookspecs import hookimpl as hookimpl
 from dxlrun.contract.joint_controller import JointController as JointController
 from dxlrun.contract.joint_controller import reading as reading
-from dxlrun.contract.sensor import Sensor as Sensor
-from dxlrun.contract.sensor import SensorContext as SensorContext
 from dxlrun.contract.serial_line import open_serial as open_serial
 from dxlrun.description.form import Mistake as Mistake
 from dxlrun.description.form import ParametersModel as ParametersModel
@@ -54,6 +52,8 @@ from dxlrun.errors import ProcessFault as ProcessFault
 from dxlrun.errors import Refused as Refused
 from dxlrun.errors import ServoFault as ServoFault
 from dxlrun.errors import StartUpError as StartUpError
+from dxlrun.features.sensors.driver import Sensor as Sensor
+from dxlrun.features.sensors.driver import SensorContext as SensorContext
 from dxlrun.log.reader import Log as Log
 from dxlrun.log.reader import LogReader as LogReader
 from dxlrun.log.reader import Topic as Topic

@@ -1,4 +1,5 @@
-"""Contract: base classes of controllers and sensors, hooks, and the interface of the loop's hardware.
+"""Contract: base class of controllers, hooks, and the interface of the loop's hardware.
 
-Implementations belong elsewhere: controllers in plugins/dxlrun_controllers, the hardware in `dynamixel`.
+The base class of sensors is in `features/sensors/driver.py`. Implementations belong elsewhere: controllers in
+plugins/dxlrun_controllers, the hardware in `dynamixel`.
 """

@@ -24,8 +24,8 @@ import pluggy
 from dxlrun.installed_plugins import GROUP
 
 if TYPE_CHECKING:  # the verbs of a package need neither numpy nor pydantic
+    from dxlrun import Sensor
     from dxlrun.contract.controller import Controller
-    from dxlrun.contract.sensor import Sensor
     from dxlrun.features.feature import Feature
 
 CONTRACT_VERSION = 4

@@ -5,9 +5,9 @@ from __future__ import annotations
 from collections.abc import Collection, Mapping
 from typing import cast
 
-from dxlrun.contract.sensor import Sensor
 from dxlrun.control.controllers.offers import Breach, OfferStage, is_model, methods_breach
 from dxlrun.description.form import ParametersModel
+from dxlrun.features.sensors.driver import Sensor
 from dxlrun.features.sensors.form import SensorEntry
 
 _METHODS = ("__init__", "states", "units", "links", "noisy", "open", "read", "close")

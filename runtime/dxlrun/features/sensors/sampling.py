@@ -8,10 +8,10 @@ from typing import Any
 import numpy as np
 
 from dxlrun.channels.slot import Floats, SlotState, SlotWriter
-from dxlrun.contract.sensor import Sensor, SensorContext
 from dxlrun.control.controllers.plugins import PlugIns
 from dxlrun.control.source_process import describe_error
 from dxlrun.errors import PlugInError
+from dxlrun.features.sensors.driver import Sensor, SensorContext
 from dxlrun.features.sensors.plan import SensorPlan
 from dxlsim.motion.link_motion import Body
 
