@@ -9,6 +9,7 @@ import msgspec
 
 from dxlrun.description.frames.tree import FramesPlan
 from dxlrun.errors import Mark
+from dxlrun.features import FEATURES
 from dxlrun.features.feature import Feature
 from dxlrun.plan.loop_plan import LoopPlan, ScheduledCommand
 from dxlrun.plan.mechanics_plan import MechanicsPlan
@@ -128,14 +129,20 @@ def decode_plan(data: bytes, parts: type[Parts]) -> Parts:
     """
     import msgspec  # not above: to check a robot needs no JSON
 
-    return msgspec.json.decode(_move_sensors(data.replace(b'"linear":true', b'"unit":"m"')), type=parts)
+    return msgspec.json.decode(_move_sections(data.replace(b'"linear":true', b'"unit":"m"')), type=parts)
 
 
-def _move_sensors(data: bytes) -> bytes:
-    """Move the sensors in plans of earlier versions from the loop to the feature plans."""
-    if b'"sensors":[{' not in data:
+class _OlderPlan(msgspec.Struct):
+    loop: dict[str, msgspec.Raw] = {}
+
+
+def _move_sections(data: bytes) -> bytes:
+    """Move sections that the loop has in plans of earlier versions to the plans of their features."""
+    loop = msgspec.json.decode(data, type=_OlderPlan).loop
+    found = {one.name: bytes(loop.get(one.name, b"[]")) for one in FEATURES}
+    moved = {name: b64encode(section).decode() for name, section in found.items() if section != b"[]"}
+    if not moved:
         return data
     tree = msgspec.json.decode(data, type=dict[str, Any])
-    sensors = msgspec.json.encode(tree["loop"].pop("sensors", []))
-    tree["loop"].setdefault("feature_plans", {})["sensors"] = b64encode(sensors).decode()
+    tree["loop"].setdefault("feature_plans", {}).update(moved)
     return msgspec.json.encode(tree)
