@@ -22,8 +22,9 @@ _ROLES = {
     b"dxlrun.run.loop_process": "loop",
     b"dxlrun.log.recorder": "recorder",
     b"dxlrun.remote": "gateway",
-    b"dxlrun.run.source_process": "sensor",
 }
+KIND = "--kind"
+"""Argument of the processes of features, which is followed by the role."""
 
 
 class ProcessStat(NamedTuple):
@@ -177,7 +178,13 @@ def _words(process: Path) -> list[bytes]:
 
 
 def _role(process: Path) -> str:
-    return next((_ROLES[word] for word in _words(process) if word in _ROLES), "")
+    words = iter(_words(process))
+    for word in words:
+        if word == KIND.encode():
+            return next(words, b"").decode()
+        if word in _ROLES:
+            return _ROLES[word]
+    return ""
 
 
 def _executes_dxlrun(process: Path) -> bool:

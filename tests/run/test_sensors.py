@@ -36,6 +36,7 @@ from dxlrun.features.sensors.plan import decode_sensors
 from dxlrun.features.sensors.reader import Readings
 from dxlrun.features.sensors.sampling import SampledSensor, build_sensor
 from dxlrun.plan.robot_plan import Plan
+from dxlrun.process_table import found_runs
 from dxlrun.run import source_process, supervisor
 from dxlrun.run.run_processes import create_memory, start_source
 from dxlrun.testing import plan_of
@@ -146,6 +147,8 @@ def test_a_sensor_that_dies_sends_nan_or_stops_and_comes_back(tmp_path, unit, mo
     try:
         sensor.child.ready()
         read_until(True)
+        found = {one.pid: one.role for run in found_runs() for one in run.processes}
+        assert found[sensor.child.process.pid] == "sensor"
         os.kill(sensor.child.process.pid, signal.SIGKILL)
         read_until(False)
         assert record.sources.age_ns[0] < 1_000_000_000  # at once, not by its timeout

@@ -280,7 +280,7 @@ _PR_SET_PDEATHSIG = 1
 
 
 def begun(job: type[Job], received: msgspec.json.Decoder[Received]) -> tuple[Job, MessageChannel[Received]]:
-    """Set up this process as a `Child` with the arguments `--job-fd N --control-fd M`.
+    """Set up this process as a `Child` with the arguments `--job-fd N ... --control-fd M`.
 
     SIGINT is ignored: only the supervisor handles Ctrl-C.
 
@@ -293,7 +293,7 @@ def begun(job: type[Job], received: msgspec.json.Decoder[Received]) -> tuple[Job
     """
     signal.signal(signal.SIGINT, signal.SIG_IGN)
     found = msgspec.json.decode(whole(int(sys.argv[2])), type=job)
-    return found, MessageChannel(socket.socket(fileno=int(sys.argv[4])), received)
+    return found, MessageChannel(socket.socket(fileno=int(sys.argv[-1])), received)
 
 
 def hold_foreign_code(number: signal.Signals) -> None:

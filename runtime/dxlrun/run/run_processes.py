@@ -25,6 +25,7 @@ from dxlrun.control.source_process import PlannedProcess, planned_processes
 from dxlrun.description.bus import SIMULATED
 from dxlrun.log.schemas import LogClosed, LogHeader, RecorderJob
 from dxlrun.plan.robot_plan import Plan, to_json
+from dxlrun.process_table import KIND
 from dxlrun.remote.job import Descriptors, GatewayJob
 from dxlrun.run.guardian import GuardianJob, GuardianMessage, GuardianPlan
 from dxlrun.run.loop_process import LoopOutcome
@@ -152,7 +153,8 @@ def start_source(
     slot_of = memory.slots[planned.feature.name][planned.index]
     job = SourceJob(planned.feature, planned.process, slot_of, os.getpid(), restarted, bodies, memory.shafts)
     inherited = [job.slot, *([job.shafts] if bodies is not None else [])]
-    program = Program(planned.process.title, "dxlrun.run.source_process")
+    role = (KIND, planned.process.kind)
+    program = Program(planned.process.title, "dxlrun.run.source_process", role)
     return _executed(program, job, inherited, memory, Decoder(SourceMessage))
 
 
@@ -238,6 +240,7 @@ class Program(NamedTuple):
     name: str
     """Name in sentences."""
     module: str
+    arguments: tuple[str, ...] = ()
 
 
 def _executed(
@@ -248,12 +251,11 @@ def _executed(
     messages: Decoder[Message],
 ) -> Child[Message]:
     """Execute a program, which reads its job from a file descriptor."""
-    name, module = program
-    descriptor = process.memory_file(f"dxlrun-{name}", msgspec.json.encode(job))
-    arguments = ["--job-fd", str(descriptor)]
+    descriptor = process.memory_file(f"dxlrun-{program.name}", msgspec.json.encode(job))
+    arguments = ["--job-fd", str(descriptor), *program.arguments]
     try:
         # Each process inherits the plan's memory, by which the process table finds the processes of a run.
         shared = {descriptor, memory.plan, *inherited}
-        return Child(name, module, arguments, sorted(shared), memory.stderr, messages)
+        return Child(program.name, program.module, arguments, sorted(shared), memory.stderr, messages)
     finally:
         os.close(descriptor)

@@ -96,7 +96,7 @@ def _stop(*_: object) -> None:
 
 
 def main() -> int:
-    """Run the process of a source: `--job-fd N --control-fd M`."""
+    """Run the process of a source: `--job-fd N --kind KIND --control-fd M`."""
     job, channel = process.begun(SourceJob, msgspec.json.Decoder(msgspec.Struct))
     signal.signal(signal.SIGTERM, _stop)
     process.hold_foreign_code(signal.SIGTERM)
