@@ -107,7 +107,7 @@ def test_a_stuck_imu_is_a_failed_sensor(tmp_path, monkeypatch, on_silence, stick
         robot_file.read_text().replace("time: 30 ms}", f"time: 30 ms, on_silence: {on_silence}}}")
     )
     robot = simulated_robot(robot_file, duration_s=1.5, log=tmp_path / "run.mcap")
-    sensor = robot.sensors["torso_imu"]
+    sensor = robot.drivers["torso_imu"]
     read, kept = sensor.read, []
 
     def stick(values: Any) -> int | None:

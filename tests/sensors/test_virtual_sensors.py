@@ -134,7 +134,7 @@ class _Silent:
 
     def __init__(self, robot: VirtualRobot, until_ns: int, after_ns: int) -> None:
         self._robot, self._until_ns, self._after_ns = robot, until_ns, after_ns
-        self._read = robot.sensors["imu"].read
+        self._read = robot.drivers["imu"].read
 
     def __call__(self, values: np.ndarray) -> int | None:
         silent = self._until_ns <= self._robot.clock.now_ns() < self._after_ns
@@ -150,7 +150,7 @@ def test_a_sensor_that_stops_ends_the_run_where_it_shall_and_a_replay_too(
     plan = plan_of(crane(("  arm: {type", filter_first), (IMU, entry)), duration_s=3.0)
     log = tmp_path / "run.mcap"
     robot = VirtualRobot(plan, log=log)
-    monkeypatch.setattr(robot.sensors["imu"], "read", _Silent(robot, 1_500_000_000, 2_000_000_000))
+    monkeypatch.setattr(robot.drivers["imu"], "read", _Silent(robot, 1_500_000_000, 2_000_000_000))
     result = robot.run()
     found = read_log(log)
     events = [(event.name, event.text) for event in found.events if event.source == "imu"]
@@ -178,7 +178,7 @@ class _Stuck:
 
     def __init__(self, robot, from_ns: int) -> None:
         self._robot, self._from_ns = robot, from_ns
-        self._read, self._kept = robot.sensors["imu"].read, None
+        self._read, self._kept = robot.drivers["imu"].read, None
 
     def __call__(self, values):
         t_ns = self._read(values)
@@ -196,7 +196,7 @@ def test_a_stuck_sensor_is_a_lost_one_in_the_run_and_its_replay(crane, tmp_path,
     entry = f"{{type: simulated_imu, link: tip, timeout: 80 ms, on_lost: {on_lost}, {NOISY}}}"
     log = tmp_path / "run.mcap"
     robot = VirtualRobot(plan_of(crane((IMU, entry)), duration_s=2.0), log=log)
-    monkeypatch.setattr(robot.sensors["imu"], "read", _Stuck(robot, 1_000_000_000))
+    monkeypatch.setattr(robot.drivers["imu"], "read", _Stuck(robot, 1_000_000_000))
     result = robot.run()
     found = read_log(log)
     ((name, text),) = [(event.name, event.text) for event in found.events if event.source == "imu"]
@@ -221,7 +221,7 @@ def test_a_simulated_imu_without_noise_is_not_accused(crane, tmp_path):
 def test_a_sensor_that_never_brought_a_sample_ends_the_run_too(crane, monkeypatch):
     entry = "{type: simulated_imu, link: tip, timeout: 80 ms, on_lost: stop}"
     robot = VirtualRobot(plan_of(crane((IMU, entry)), duration_s=1.0))
-    monkeypatch.setattr(robot.sensors["imu"], "read", lambda values: None)
+    monkeypatch.setattr(robot.drivers["imu"], "read", lambda values: None)
     result = robot.run()
     assert (result.reason, result.cycles) == ("fault", 10)  # the one at 90 ms is the last
     assert "sensor imu brought nothing for 80 ms; on_fault: " in result.detail
@@ -230,7 +230,7 @@ def test_a_sensor_that_never_brought_a_sample_ends_the_run_too(crane, monkeypatc
 def test_a_driver_that_raises_is_an_event_and_is_opened_again(crane, tmp_path, monkeypatch):
     log = tmp_path / "run.mcap"
     robot = VirtualRobot(plan_of(crane(), duration_s=3.0), log=log)
-    sensor, closed = robot.sensors["imu"], []
+    sensor, closed = robot.drivers["imu"], []
     read = sensor.read
 
     def fail_once(values: np.ndarray) -> int | None:

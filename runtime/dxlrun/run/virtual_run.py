@@ -140,7 +140,7 @@ class VirtualRobot:
         bodies = sensed_bodies(self.plan)
         body = None if bodies is None else SensedBody(bodies, mechanics, self.clock.now_ns)
         slots: dict[str, list[memoryview]] = {}
-        self.sensors: dict[str, Any] = {}
+        self.drivers: dict[str, Any] = {}
         """Driver of each source, as its plug-in made it, by the source's name."""
         self._sampled: list[SampledSource] = []
         for planned in planned_processes(self.plan.loop):
@@ -149,7 +149,7 @@ class VirtualRobot:
             own_body = body if process.has_body else None
             context = SourceContext(plugins, SlotWriter(memory), self.clock.now_ns, own_body)
             sampled = planned.stage.build(process.plan, context)
-            self.sensors[process.source] = sampled.driver
+            self.drivers[process.source] = sampled.driver
             try:
                 sampled.open_first()
             # Any error of a driver becomes a sentence.

@@ -84,7 +84,7 @@ def imu_gives(story: Story, change: Callable[[float, np.ndarray[Any, Any]], None
 def imu_reads(story: Story, given: Callable[[Callable[[Any], int], Any], int]) -> None:
     """Let `given` read the IMU: it gets how it is read and the values to fill, and returns their time, ns."""
     story.prepared.append(
-        lambda: instead(story.virtual.sensors["gyro"], "read", lambda read: partial(given, read))
+        lambda: instead(story.virtual.drivers["gyro"], "read", lambda read: partial(given, read))
     )
 
 
