@@ -1,4 +1,4 @@
-"""Orientations: the link of the URDF to which each belongs, by its sensor, its messages and its users."""
+"""Orientations: the link of the URDF to which each belongs, by its source, its messages and its users."""
 
 from __future__ import annotations
 
@@ -23,10 +23,12 @@ def check_orientations(
     contributions: Iterable[Contribution],
     controllers: Mapping[str, CompiledController],
 ) -> None:
-    """Warn if sensor, frame of the messages, `model.imu_link` and users of an orientation disagree."""
+    """Warn if source, frame of the messages, `model.imu_link` and users of an orientation disagree."""
     links = {name: link for each in contributions for name, link in each.links.items()}
     for name, controller in controllers.items():
-        if (frame := _text(controller, "frame")) and _text(controller, "sensor"):
+        frame, plan = _text(controller, "frame"), controller.plan
+        has_vectors = any(state.endswith(".x") for state in plan.provides)
+        if frame and plan.reads and has_vectors:
             _check_frame(file, urdf, name, controller, links)
             links[name] = frame
     marks, model = file.marks, file.robot.model
@@ -54,19 +56,19 @@ def check_orientations(
 def _check_frame(
     file: RobotFile, urdf: Urdf, name: str, controller: CompiledController, links: Mapping[str, str]
 ) -> None:
-    """Compare the frame of a controller's messages with the link of its sensor and with its mounting."""
-    frame, sensor = _text(controller, "frame"), _text(controller, "sensor")
+    """Compare the frame of a controller's messages with the link of its first source and its mounting."""
+    frame, source = _text(controller, "frame"), controller.plan.reads[0].partition("/")[0]
     mark = file.at("controllers", name, "frame")
     if frame not in urdf.links:
         what = f"the messages of {name} have the frame {frame}, which is no link of the URDF"
         file.warning(mark, what, suggestion(frame, urdf.links))
-    elif links.get(sensor) in urdf.links:
+    elif links.get(source) in urdf.links:
         mounting = getattr(controller.parameters, "mounting", (0.0, 0.0, 0.0))
-        if turn := _turn(urdf, frame, links[sensor], from_rpy(mounting)):
+        if turn := _turn(urdf, frame, links[source], from_rpy(mounting)):
             file.warning(
                 mark,
-                f"the messages of {name} have the frame {frame}, but {sensor} is on {links[sensor]}, {turn}",
-                f"write `frame: {links[sensor]}`, or how it is turned there as `mounting`",
+                f"the messages of {name} have the frame {frame}, but {source} is on {links[source]}, {turn}",
+                f"write `frame: {links[source]}`, or how it is turned there as `mounting`",
             )
 
 
