@@ -8,6 +8,7 @@ A page has marks, and the text between them is generated:
     <!-- page: NAME -->      table of the names of a module of `dxlrun.tooling`
     <!-- requests -->        every HTTP request of a running robot
     <!-- codes -->           every code of a refusal with its sentence
+    <!-- events -->          every event of the log with its texts
     <!-- rules -->           every rule of the verdict
     <!-- end -->
 
@@ -33,7 +34,10 @@ from importlib.metadata import Distribution
 from itertools import chain
 from os import PathLike
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
+
+if TYPE_CHECKING:
+    from dxlrun.channels.events import EventText
 
 DOCS = Path(__file__).resolve().parent
 ROOT = DOCS.parent
@@ -41,7 +45,7 @@ PACKAGES = (ROOT, ROOT / "plugins/dxlrun_view")
 """Folders of the distributions whose commands and keys belong to the reference."""
 SOURCES = ("runtime", "plugins", "plugins/dxlrun_view/src")
 MARK = re.compile(
-    r"^(<!-- (keys|commands|api|page|requests|codes|rules):? ?(.*?) ?-->)\n.*?^<!-- end -->$",
+    r"^(<!-- (keys|commands|api|page|requests|codes|events|rules):? ?(.*?) ?-->)\n.*?^<!-- end -->$",
     re.MULTILINE | re.DOTALL,
 )
 
@@ -235,6 +239,57 @@ def codes(_: str = "") -> str:
     return "\n".join(["| code | sentence |", "|---|---|", *(f"| `{code}` | {code.text} |" for code in Code)])
 
 
+class Field(str):
+    """Field of an event in a generated text: any format or arithmetic leaves its name in braces."""
+
+    def __format__(self, spec: str) -> str:
+        """Return the name; digits and units are up to the value."""
+        return str(self)
+
+    def __mul__(self, other: object) -> Field:  # type: ignore[override]
+        """Return the field in another unit than ns."""
+        return Field(self.replace("_ns}", "}"))
+
+    def __iter__(self) -> Iterator[str]:
+        """Iterate as a list of this one field."""
+        return iter([str(self)])
+
+    __truediv__ = __rtruediv__ = __mul__
+
+
+def event_rows() -> list[tuple[str, str, EventText[...]]]:
+    """Return all rows of the tables of texts: file below `runtime/`, name, row."""
+    import dxlrun.log.log_writer
+    from dxlrun.channels.events import EventText
+
+    names = [".".join(path.relative_to(ROOT / "runtime").with_suffix("").parts) for path in text_tables()]
+    modules = [*map(importlib.import_module, names), dxlrun.log.log_writer]
+    return [
+        (module.__name__.replace(".", "/") + ".py", name, row)
+        for module in modules
+        for name, row in vars(module).items()
+        if isinstance(row, EventText)
+    ]
+
+
+def text_tables() -> list[Path]:
+    """Return the tables of texts of the runtime's rooms."""
+    return sorted((ROOT / "runtime/dxlrun").rglob("texts.py"))
+
+
+def text_of(row: EventText[...]) -> str:
+    """Return the text of a row, with its fields in braces."""
+    text = row.write(**{name: Field(f"{{{name}}}") for name in inspect.signature(row.write).parameters})
+    return " ".join(text.split())
+
+
+def events(_: str = "") -> str:
+    """Return the table of events, in the order of their codes."""
+    rows = sorted({(row.code, row.severity, text_of(row)) for _, _, row in event_rows()})
+    lines = [f"| `{code.name.lower()}` | {severity.name.lower()} | {text} |" for code, severity, text in rows]
+    return "\n".join(["| event | severity | text |", "|---|---|---|", *lines])
+
+
 def rules(_: str = "") -> str:
     """Return the table of the rules of the verdict."""
     from dxlrun_analysis.finding import ROBOT
@@ -253,6 +308,7 @@ MAKERS: dict[str, Callable[[str], str]] = {
     "page": tooling_page,
     "requests": requests,
     "codes": codes,
+    "events": events,
     "rules": rules,
 }
 

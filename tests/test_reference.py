@@ -44,7 +44,7 @@ def test_every_mark_has_its_end() -> None:
     for name in PATHS:
         text = page_text(name)
         marks = re.findall(
-            r"^<!-- (keys|commands|api|page|requests|codes|rules|end)\b.*-->$", text, re.MULTILINE
+            r"^<!-- (keys|commands|api|page|requests|codes|events|rules|end)\b.*-->$", text, re.MULTILINE
         )
         assert all(mark == "end" for mark in marks[1::2]), name
         assert "end" not in marks[::2], name

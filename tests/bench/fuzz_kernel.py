@@ -175,8 +175,8 @@ class Events:
     def __init__(self):
         self.list = []
 
-    def emit(self, *event):
-        self.list.append(event)
+    def emit(self, source, event, data=b""):
+        self.list.append((source, *event))
 
 
 class Hardware(DynamixelHardware):
@@ -338,7 +338,7 @@ class Side:
             ],
             "torqued": [one.life.torqued.tolist() for one in hardware._servos],
             "failures": [str(bus.failure) for bus in hardware._buses],
-            "events": sorted(self.events.list, key=itemgetter(2)),  # in order for each source, as packets are
+            "events": sorted(self.events.list, key=itemgetter(0)),  # in order for each source, as packets are
         }
 
 

@@ -18,6 +18,7 @@ from tests.kit.commands import Said
 
 from dxlrun.channels.events import (
     RUN_ENDED,
+    EventBody,
     EventCode,
     EventGroup,
     EventRing,
@@ -368,7 +369,7 @@ def test_a_traceback_with_any_bytes_reaches_the_end_of_the_run():
     ring = EventRing(
         SimpleNamespace(append=lambda _, data: written.append(data)), SimpleNamespace(now_ns=int)
     )
-    ring.emit(EventCode.CONTROLLER_FAULT, Severity.ERROR, "arm", "no file \udcff")
+    ring.emit("arm", EventBody(EventCode.CONTROLLER_FAULT, Severity.ERROR, "no file \udcff"))
     outcome = msgspec.json.encode(ring.totals)
     assert msgspec.json.decode(outcome, type=EventTotals).errors[0].text == "no file ?"
     assert len(written) == 1

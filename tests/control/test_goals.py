@@ -109,9 +109,9 @@ class Story(Robot):
             if self.given[-1][1] == [13.0]:
                 raise RuntimeError("no way")
 
-    def _emit(self, code, severity, source, text, data=b""):
-        self.emit(code, severity, source, text, data)
-        if code in (EventCode.GOAL_ACCEPTED, EventCode.GOAL_ENDED):
+    def _emit(self, source, event, data=b""):
+        self.emit(source, event, data)
+        if event.code in (EventCode.GOAL_ACCEPTED, EventCode.GOAL_ENDED):
             self.reports.append((self.record.cycle, msgspec.json.decode(data, type=GoalReport)))
 
     def moves(self, updates):
@@ -371,7 +371,7 @@ def test_a_goal_that_a_limp_joint_misses_is_aborted_because_of_it(torque, outcom
     goal = Goals(record, events, joints, lambda controller: Commanded(("j0",))).accept("arm", "move", "anna")
     goal.end(Outcome.MISSED, "", "j0", 0.2)
     assert goal.outcome == outcome
-    assert ("j0 is limp" in seen[-1][3]) is (outcome == "aborted")
+    assert ("j0 is limp" in seen[-1][1].text) is (outcome == "aborted")
 
 
 # Live parameters

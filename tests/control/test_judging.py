@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from dxlrun.channels.cycle import CycleLayout, CycleRecord, Torque
-from dxlrun.channels.events import EventCode, Severity
+from dxlrun.channels.events import EventBody
 from dxlrun.contract.controller import GoalTolerances, Outcome
 from dxlrun.control.controllers.goals import Commanded, Goals, RunningGoal
 from dxlrun.plan.loop_plan import JointPlan
@@ -35,8 +35,8 @@ class Judged:
         self.states.motion[:], self.states.valid[:], self.states.torque[:] = 0.0, True, Torque.ON
         self.goals = Goals(self.record, self, plans, lambda controller: Commanded(("a", "b")))
 
-    def emit(self, code: EventCode, severity: Severity, source: str, text: str, data: bytes = b"") -> None:
-        self.events.append(text)
+    def emit(self, source: str, event: EventBody, data: bytes = b"") -> None:
+        self.events.append(event.text)
 
     def accept(self) -> RunningGoal:
         return self.goals.accept("arm", "move", "anna")

@@ -11,7 +11,7 @@ from msgspec.structs import replace
 from tests.kit.loops import loop_plan
 
 from dxlrun.channels.cycle import CycleRecord
-from dxlrun.channels.events import Severity
+from dxlrun.channels.events import EventCode, Severity, event_text
 from dxlrun.control.monitors import build_monitors
 from dxlrun.control.monitors.monitor import MonitorStage
 from dxlrun.control.monitors.policy_actions import PolicyActions
@@ -34,6 +34,11 @@ joints:
 ENDS_S = 0.5
 
 
+@event_text(EventCode.POLICY, Severity.WARNING)
+def is_limp(joint: str) -> str:
+    return f"{joint} is limp"
+
+
 class FarJoints:
     """Takes the torque of joint 0 after a while, and ends the run a little later."""
 
@@ -51,7 +56,7 @@ class FarJoints:
         if time_ns > 0.5e9 * ENDS_S and not self.limp:
             self.limp = True
             self.actions.make_limp([0])
-            self.actions.report(Severity.WARNING, "pan is limp", source="pan")
+            self.actions.report(is_limp("pan"), source="pan")
         if time_ns > 1e9 * ENDS_S:
             self.actions.end_run("on_fault", "it is enough")
             self.actions.end_run("on_exit", "the first reason counts")

@@ -129,7 +129,7 @@ def test_refused_read_is_fatal_only_for_an_item_that_decides(item, refused):
 def test_a_servo_that_fits_has_neither_problem_nor_difference(protocol):
     found = look(protocol, {})
     assert found.problems == []
-    assert [code for code, *_ in found.events] == [EventCode.SETUP]
+    assert [event.code for _, event in found.events] == [EventCode.SETUP]
     assert found.deviations == []
 
 

@@ -64,10 +64,10 @@ def test_a_start_that_fails_says_whose_torque_was_not_confirmed_off(monkeypatch)
     rig = make_rig()
     emit = rig.events.emit
 
-    def unplug(code, *rest):
-        if code is EventCode.TORQUE_ON:
+    def unplug(source, event):
+        if event.code is EventCode.TORQUE_ON:
             rig.servo(4).silence()
-        emit(code, *rest)
+        emit(source, event)
 
     monkeypatch.setattr(rig.events, "emit", unplug)
     with pytest.raises(StartUpError) as caught:

@@ -2,6 +2,7 @@
 
 import pytest
 
+from dxlrun.channels.events import EventBody
 from dxlrun.dynamixel.wire_reports import WireReports
 from dxlwire.exchange.reports import Reason
 
@@ -10,15 +11,14 @@ class Events:
     """Keeps what is emitted."""
 
     def __init__(self) -> None:
-        self.found: list[tuple[object, ...]] = []
+        self.found: list[tuple[str, str]] = []
 
-    def emit(self, *event: object) -> None:
-        self.found.append(event)
+    def emit(self, source: str, event: EventBody, data: bytes = b"") -> None:
+        self.found.append((source, event.text))
 
 
 @pytest.mark.parametrize("reason", Reason)
 def test_each_reason_of_the_wire_is_an_event(reason: Reason) -> None:
     events = Events()
     WireReports(events).report(reason, "main", "a sentence")
-    ((_, _, source, text),) = events.found
-    assert (source, text) == ("main", "a sentence")
+    assert events.found == [("main", "a sentence")]

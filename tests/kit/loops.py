@@ -13,7 +13,7 @@ import numpy as np
 from dxlrun.channels.answers import Refusal
 from dxlrun.channels.commands import LOOP, Command, QueueInbox
 from dxlrun.channels.cycle import Clamp, Commands, CycleRecord, Floats
-from dxlrun.channels.events import EventCode, Severity
+from dxlrun.channels.events import EventBody, EventCode, Severity
 from dxlrun.contract.controller import Controller, Interfaces, ParametersModel
 from dxlrun.control.context import ControlContext, StopFlag
 from dxlrun.control.controllers.manager import Manager
@@ -115,8 +115,8 @@ def following(context: Any, *_: object) -> None:
 class Events:
     seen: list[tuple[EventCode, Severity, str, str]] = field(default_factory=list)
 
-    def emit(self, code: EventCode, severity: Severity, source: str, text: str, data: bytes = b"") -> None:
-        self.seen.append((code, severity, source, text))
+    def emit(self, source: str, event: EventBody, data: bytes = b"") -> None:
+        self.seen.append((event.code, event.severity, source, event.text))
 
     def of(self, code: EventCode) -> list[tuple[str, str]]:
         return [(source, text) for seen, _, source, text in self.seen if seen == code]
@@ -484,9 +484,9 @@ class GateRig:
         if eased:
             self.apply(SLOW_START_NS)
 
-    def emit(self, code: EventCode, severity: Severity, source: str, text: str, data: bytes = b"") -> None:
-        assert code in self._accepts
-        self.texts.append(text)
+    def emit(self, source: str, event: EventBody, data: bytes = b"") -> None:
+        assert event.code in self._accepts
+        self.texts.append(event.text)
 
     def apply(self, dt_ns: int = 0, **commands: Any) -> Sent:
         """Command these values for a cycle; what is not named is not commanded."""

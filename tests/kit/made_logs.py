@@ -11,7 +11,7 @@ import msgspec
 from msgspec import structs
 
 from dxlrun.channels.cycle import CycleLayout, CycleRecord
-from dxlrun.channels.events import EventCode, EventRing, Severity
+from dxlrun.channels.events import EventBody, EventCode, EventRing, Severity
 from dxlrun.channels.packets import PacketBatch
 from dxlrun.channels.ring import Handover, RecordKind
 from dxlrun.log.log_writer import LogWriter
@@ -112,7 +112,7 @@ def made_log(
     batch.commit()
     ring = EventRing(Handover(log.take), VirtualClock(9))
     for said in events:
-        ring.emit(said.code, said.severity, said.source, said.text, said.data)
+        ring.emit(said.source, EventBody(said.code, said.severity, said.text), said.data)
     if gaps:
         log.gap("loop/packets", gaps)
     if close:

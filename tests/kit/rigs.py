@@ -29,7 +29,7 @@ from tests.kit.line_faults import corrupt_next, truncate_next
 from tests.kit.plans import make_plan
 
 from dxlrun.channels.cycle import Commands, SourceStates, States, Torque
-from dxlrun.channels.events import EventCode, Severity
+from dxlrun.channels.events import EventBody, EventCode, Severity
 from dxlrun.channels.packets import LoggedPacket, PacketBatch
 from dxlrun.channels.ring import Handover
 from dxlrun.dynamixel.bus_part import FeatureParts
@@ -75,8 +75,8 @@ class Events:
 
     list: list[tuple[EventCode, Severity, str, str]] = field(default_factory=list)
 
-    def emit(self, code: EventCode, severity: Severity, source: str, text: str, data: bytes = b"") -> None:
-        self.list.append((code, severity, source, text))
+    def emit(self, source: str, event: EventBody, data: bytes = b"") -> None:
+        self.list.append((event.code, event.severity, source, event.text))
 
     def of(self, code: EventCode) -> list[tuple[str, str]]:
         return [(source, text) for kind, _, source, text in self.list if kind == code]

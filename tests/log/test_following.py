@@ -8,7 +8,7 @@ from pathlib import Path
 
 import pytest
 
-from dxlrun.channels.events import EventCode, EventRing, Severity
+from dxlrun.channels.events import EventBody, EventCode, EventRing, Severity
 from dxlrun.channels.packets import PacketBatch
 from dxlrun.channels.ring import Handover, RecordKind
 from dxlrun.errors import LogError
@@ -25,7 +25,7 @@ def written(log: LogWriter, tmp_path: Path, cycle: Callable[[int], bytes]) -> by
     for number in range(400):
         log.take(RecordKind.CYCLE, cycle(number))
         if number % 20 == 19:
-            events.emit(EventCode.CONTROLLER_SAYS, Severity.INFO, "arm", f"cycle {number}")
+            events.emit("arm", EventBody(EventCode.CONTROLLER_SAYS, Severity.INFO, f"cycle {number}"))
             log.flush()
     batch = PacketBatch(Handover(log.take))
     batch.packet(0, PacketKind.INSTRUCTION, 1, 10, 11, bytes.fromhex("ffff0104022406ce"))

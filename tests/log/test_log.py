@@ -27,7 +27,7 @@ from msgspec import structs
 from rosbags.typesys.store import Typestore
 
 from dxlrun.channels.cycle import CycleLayout
-from dxlrun.channels.events import MOST_FAILED, Event, EventCode, EventRing, GoalReport, Severity
+from dxlrun.channels.events import MOST_FAILED, Event, EventBody, EventCode, EventRing, GoalReport, Severity
 from dxlrun.channels.packets import LoggedPacket, PacketBatch
 from dxlrun.channels.ring import Handover, RecordKind
 from dxlrun.errors import LogError
@@ -60,7 +60,7 @@ def fill(log: LogWriter, cycle: Cycle, cycles: int = 10) -> LogSummary:
     batch.commit()
     events = EventRing(Handover(log.take), VirtualClock(7_000))
     for code, severity, source, text in SAID:
-        events.emit(code, severity, source, text)
+        events.emit(source, EventBody(code, severity, text))
     return log.close()
 
 
@@ -85,8 +85,8 @@ def test_everything_comes_back_as_it_was(
 
 def test_the_data_of_an_event_come_back(log: LogWriter, tmp_path: Path) -> None:
     ring = EventRing(Handover(log.take), VirtualClock(7))
-    ring.emit(EventCode.STEERED, Severity.INFO, "loop", "in words", b'{"kind":"pause"}')
-    ring.emit(EventCode.STEERED, Severity.INFO, "loop", "too long", b"x" * 5000)
+    ring.emit("loop", EventBody(EventCode.STEERED, Severity.INFO, "in words"), b'{"kind":"pause"}')
+    ring.emit("loop", EventBody(EventCode.STEERED, Severity.INFO, "too long"), b"x" * 5000)
     log.gap("loop/packets", 3)
     log.close()
     first, long, gap = read_log(tmp_path / "run.mcap").events
@@ -100,9 +100,9 @@ def test_failed_goals_of_clients_hide_none_of_a_motion_file(log: LogWriter) -> N
     ring.goals.planned = {"motion.yaml:7:5"}
     for number in range(MOST_FAILED + 50):
         report = GoalReport(number, "arm", "trajectory", "a client", "missed")
-        ring.emit(EventCode.GOAL_ENDED, Severity.WARNING, "arm", "", msgspec.json.encode(report))
+        ring.emit("arm", EventBody(EventCode.GOAL_ENDED, Severity.WARNING, ""), msgspec.json.encode(report))
     planned = GoalReport(999, "arm", "trajectory", "motion.yaml:7:5", "missed")
-    ring.emit(EventCode.GOAL_ENDED, Severity.WARNING, "arm", "", msgspec.json.encode(planned))
+    ring.emit("arm", EventBody(EventCode.GOAL_ENDED, Severity.WARNING, ""), msgspec.json.encode(planned))
     log.close()
     assert len(ring.totals.goals.failed) == MOST_FAILED + 1
     assert ring.totals.goals.failed[-1] == planned

@@ -14,7 +14,7 @@ from mcap_ros2.decoder import DecoderFactory
 from msgspec import structs
 from msgspec.structs import replace
 
-from dxlrun.channels.events import EventCode, EventRing, Severity
+from dxlrun.channels.events import EventBody, EventCode, EventRing, Severity
 from dxlrun.channels.packets import PacketBatch
 from dxlrun.channels.ring import Handover, RecordKind
 from dxlrun.errors import LogError
@@ -48,7 +48,7 @@ class Run:
 
     def event(self, text: str, severity: Severity = Severity.INFO) -> None:
         """Report something now."""
-        self._events.emit(EventCode.CONTROLLER_SAYS, severity, "head", text)
+        self._events.emit("head", EventBody(EventCode.CONTROLLER_SAYS, severity, text))
 
     def cycles(self, first: int, end: int) -> None:
         """Run some cycles: packets, then the cycle."""

@@ -22,7 +22,7 @@ import pytest
 
 from dxlrun.channels import ring
 from dxlrun.channels.cycle import CycleLayout
-from dxlrun.channels.events import LONGEST_EVENT, EventCode, EventRing, Severity
+from dxlrun.channels.events import LONGEST_EVENT, EventBody, EventCode, EventRing, Severity
 from dxlrun.channels.packets import LONGEST_BATCH, PacketBatch
 from dxlrun.channels.process import LateMetadata, LoopRuns, MessageChannel
 from dxlrun.channels.ring import RecordKind, RingWriter, record_size
@@ -138,7 +138,7 @@ def test_what_the_rings_carry_is_in_the_log_byte_for_byte(start: Start, cycle: C
         recording.cycles.append(RecordKind.CYCLE, cycle(number))
         recording.packets.packet(0, PacketKind.STATUS, 1, number, number + 1, sent[number])
         recording.packets.commit()
-    recording.events.emit(EventCode.TORQUE_OFF, Severity.INFO, "loop", "every servo is limp")
+    recording.events.emit("loop", EventBody(EventCode.TORQUE_OFF, Severity.INFO, "every servo is limp"))
     summary = recording.finish()
     assert recording.process.wait(60) == 0
     log = read_log(recording.path)

@@ -18,7 +18,7 @@ from tests.kit.pages import page_text
 from dxlrun.channels.answers import Code, Done, Refusal, Waiting
 from dxlrun.channels.commands import MOST_PER_CYCLE
 from dxlrun.channels.cycle import CycleLayout, CycleRecord
-from dxlrun.channels.events import EventCode, Severity
+from dxlrun.channels.events import EventBody, EventCode, Severity
 from dxlrun.channels.heartbeat import Phase
 from dxlrun.compile.joints.limits import BeyondLimit
 from dxlrun.plan.loop_plan import ControllerPlan
@@ -581,12 +581,12 @@ def test_states_show_the_references_by_their_names(desk):
 
 def test_events_of_both_processes_are_returned_whole_and_once(desk):
     long = "ä" * 400
-    desk.events.emit(EventCode.SETUP, Severity.INFO, "loop", long)
-    desk.guardian_events.emit(EventCode.GUARDIAN, Severity.INFO, "guardian", long)
+    desk.events.emit("loop", EventBody(EventCode.SETUP, Severity.INFO, long))
+    desk.guardian_events.emit("guardian", EventBody(EventCode.GUARDIAN, Severity.INFO, long))
     desk.link.collect()
     told = desk.ask("GET", "/events")[1]
     assert [(one["source"], one["text"]) for one in told["events"]] == [("loop", long), ("guardian", long)]
-    desk.events.emit(EventCode.SETUP, Severity.INFO, "loop", "more")
+    desk.events.emit("loop", EventBody(EventCode.SETUP, Severity.INFO, "more"))
     desk.link.collect()
     told = desk.ask("GET", f"/events?after={told['last']}")[1]
     assert [one["text"] for one in told["events"]] == ["more"]

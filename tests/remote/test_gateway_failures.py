@@ -6,7 +6,7 @@ import time
 import pytest
 from tests.remote.conftest import Arm, Desk
 
-from dxlrun.channels.events import EventCode, Severity
+from dxlrun.channels.events import EventBody, EventCode, Severity
 from dxlrun.control.controllers.plugins import Offer, PlugIns
 from dxlrun.remote import link, preparation
 
@@ -18,7 +18,7 @@ SET_POINT = "/controllers/left/set-points/go"
 @pytest.mark.parametrize(("text", "count"), [("x", 3000), ("x" * 7000, 300)])
 def test_a_storm_of_events_is_kept_in_bounded_memory(desk, text, count):
     for number in range(count):
-        desk.events.emit(EventCode.GATE, Severity.WARNING, "pan", f"{number} {text}")
+        desk.events.emit("pan", EventBody(EventCode.GATE, Severity.WARNING, f"{number} {text}"))
         desk.link.collect()
     kept = [event.text for _, event in desk.link.events]
     assert len(kept) <= link.KEPT_EVENTS
@@ -40,7 +40,7 @@ def test_a_controller_whose_stream_ended_is_held_until_its_next_command(desk):
         (EventCode.STALE_COMMAND, True),
         (EventCode.CONTROLLER_DEACTIVATED, False),
     ):
-        desk.events.emit(code, Severity.INFO, "left", "")
+        desk.events.emit("left", EventBody(code, Severity.INFO, ""))
         assert held() is expected
 
 

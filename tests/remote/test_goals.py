@@ -11,7 +11,7 @@ from pydantic import Field, model_validator
 
 import dxlrun
 from dxlrun.channels.answers import Code, Done, Refusal
-from dxlrun.channels.events import EventCode, GoalReport, Severity
+from dxlrun.channels.events import EventBody, EventCode, GoalReport, Severity
 from dxlrun.channels.heartbeat import Phase
 from dxlrun.channels.messages import PublishedTopic
 from dxlrun.control.controllers.goals import GoalStatus as LoopStatus
@@ -83,7 +83,7 @@ def arm(desk):
 def report(desk, number, status, controller="left", **more):
     code = EventCode.GOAL_ACCEPTED if status == "accepted" else EventCode.GOAL_ENDED
     data = msgspec.json.encode(GoalReport(number, controller, "go", "anna", status, **more))
-    desk.events.emit(code, Severity.INFO, controller, f"goal {number} {status}", data)
+    desk.events.emit(controller, EventBody(code, Severity.INFO, f"goal {number} {status}"), data)
     desk.link.collect()
 
 
@@ -377,7 +377,7 @@ def test_after_lost_events_a_goal_of_a_controller_that_is_not_active_has_ended(a
     report(arm, 1, "accepted")
     report(arm, 2, "accepted", controller="right")
     for _ in range(3000):
-        arm.events.emit(EventCode.GUARDIAN, Severity.INFO, "x", "x" * 400)
+        arm.events.emit("x", EventBody(EventCode.GUARDIAN, Severity.INFO, "x" * 400))
     arm.record.active = 0b001
     while arm.record.woken_ns < 8_000_000_000:  # later than the goals' beginnings
         arm.finish_cycle()

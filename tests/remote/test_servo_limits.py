@@ -6,7 +6,7 @@ import msgspec
 from msgspec.structs import replace
 from tests.remote.conftest import PLAN, Desk
 
-from dxlrun.channels.events import EventCode, Severity
+from dxlrun.channels.events import EventBody, EventCode, Severity
 from dxlrun.control.controllers.plugins import load_plugins
 from dxlrun.plan.loop_plan import ControllerPlan, ServoLimit
 
@@ -36,7 +36,7 @@ def push(kind: str, interface: str) -> Desk:
 
 
 def report(desk: Desk, *limits: ServoLimit) -> None:
-    desk.events.emit(EventCode.SERVO_LIMITS, Severity.INFO, "pan", "", msgspec.json.encode(limits))
+    desk.events.emit("pan", EventBody(EventCode.SERVO_LIMITS, Severity.INFO, ""), msgspec.json.encode(limits))
     desk.link.collect()
 
 

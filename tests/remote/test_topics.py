@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from dxlrun import Floats
-from dxlrun.channels.events import EventCode, Severity
+from dxlrun.channels.events import EventBody, EventCode, Severity
 from dxlrun.channels.messages import PublishedTopic
 from dxlrun.messages import Header
 from dxlrun.messages.cdr import Codec
@@ -127,14 +127,14 @@ def test_of_the_newest_only_the_last_comes_of_each_topic(desk, number):
 
 
 def test_events_and_every_cycle_are_topics_too(desk):
-    desk.events.emit(EventCode.COMMAND, Severity.INFO, "left", "first")
-    desk.events.emit(EventCode.COMMAND, Severity.INFO, "left", "second")
+    desk.events.emit("left", EventBody(EventCode.COMMAND, Severity.INFO, "first"))
+    desk.events.emit("left", EventBody(EventCode.COMMAND, Severity.INFO, "second"))
     desk.link.collect()
     stream = desk.link.listen(["/events", "/joint_states", "/cycle"], newest=False)
     event, states, cycle, *newest = desk.frames(stream)
     assert [(one.place, one.number) for one in newest] == [(1, 1), (2, 1), (0, 2)]
     codecs = [Codec(MessageType(one.type, one.definition)) for one in (event, states, cycle)]
-    desk.events.emit(EventCode.COMMAND, Severity.INFO, "left", "third")
+    desk.events.emit("left", EventBody(EventCode.COMMAND, Severity.INFO, "third"))
     desk.link.collect()
     (sample,) = samples(desk, stream)
     assert codecs[0].unpack(sample.data)["text"] == "third"

@@ -25,7 +25,7 @@ from tests.kit.stories import plugin_folder
 
 from dxlrun import ControllerFault
 from dxlrun.channels.cycle import CycleLayout, CycleRecord
-from dxlrun.channels.events import EventCode, Severity
+from dxlrun.channels.events import EventBody, EventCode, Severity
 from dxlrun.channels.kept import (
     LONGEST_FILE,
     MOST_KEPT,
@@ -292,7 +292,7 @@ class _Sink:
 
 
 class _Events:
-    def emit(self, code: EventCode, severity: Severity, source: str, text: str, data: bytes = b"") -> None:
+    def emit(self, source: str, event: EventBody, data: bytes = b"") -> None:
         """Forget it."""
 
 

@@ -6,7 +6,7 @@ import socket
 from msgspec.json import Decoder
 
 from dxlrun.channels.process import LineLost, LineReturned, MessageChannel
-from dxlrun.run.line_reopener import LineReopener
+from dxlrun.run.loop_process import LineReopener
 
 
 def test_lost_line_is_requested_once_per_loss(tmp_path):

@@ -269,9 +269,7 @@ def test_a_joint_that_cannot_reach_its_pose_is_said_and_does_not_keep_the_robot_
     cut, lose = lambda: servo.poke("torque_enable", 0), lambda: servo.cut_power(START_NS - 50_000_000)
     bus.at(START_NS - 100_000_000, lose if seen else cut)
     said: list[str] = []
-    monkeypatch.setattr(
-        EventRing, "emit", lambda ring, code, severity, source, text, data=b"": said.append(text)
-    )
+    monkeypatch.setattr(EventRing, "emit", lambda ring, source, event, data=b"": said.append(event.text))
     robot.run()
     assert servo.position < (HOME[3] - 20) * TICK
     limp = "is limp: it was reset, its torque was cut, or it shut itself down"

@@ -19,6 +19,7 @@ from dxlrun.channels.ring import Handover, Record, RecordKind, RingReader, RingW
 from dxlrun.channels.shared_memory import mapped
 from dxlrun.channels.tagged import decode
 from dxlrun.plan.policy_plan import TORQUE_STAYS
+from dxlrun.run import texts
 from dxlrun.run.guardian import GuardianJob, SafeStop
 from dxlrun.run.run_processes import create_memory, guardian_job
 from dxlrun.testing import installed, plan_of, simulated_robot
@@ -122,9 +123,9 @@ def test_the_guardian_holds_only_a_robot_that_was_running_by_the_policy_for_faul
     memory = create_memory(plan)
     Heartbeat(memory.heartbeat).enter(phase)
     limp: list[str] = []
-    monkeypatch.setattr(SafeStop, "limp", lambda safe_stop, ports, how, severity: limp.append(how) or [how])
+    monkeypatch.setattr(SafeStop, "limp", lambda safe_stop, ports, how, text: limp.append(how) or [how])
     monkeypatch.setattr(SafeStop, "stand", lambda safe_stop, ports: ())
-    said = SafeStop(guardian_job(plan, {}, memory, take_over=False)).end((), "it died", Severity.ERROR)
+    said = SafeStop(guardian_job(plan, {}, memory, take_over=False)).end((), "it died", texts.loop_failed)
     assert bool(limp) is not holds
     assert ("torque stays on" in " ".join(said)) is holds
 
@@ -174,7 +175,7 @@ def test_a_guardian_that_leaves_torque_on_stops_what_is_led_by_a_velocity(safe_s
     robot, safe_stop, _ = safe_stop
     wheel = robot.buses[0].servo(1)
     assert wheel.registers["goal_velocity"] > 0
-    said = safe_stop.end((), "it died", Severity.ERROR)
+    said = safe_stop.end((), "it died", texts.loop_failed)
     assert said == ["it died", TORQUE_STAYS, "left (ID 1 on bus main) stands: its goal is 0"]
     assert wheel.registers["goal_velocity"] == 0
     assert [servo.torque_on for servo in robot.buses[0].servos] == [True, True]
@@ -191,7 +192,7 @@ def test_guardian_makes_the_feature_of_a_package_safe(tmp_path, monkeypatch):
         packets = PacketBatch(Handover(lambda kind, payload: None))
         lines = Lines(robot.plan.buses, VirtualPorts(robot.clock, robot.buses), robot.clock, packets)
         monkeypatch.setattr(safe_stop, "_take_over", lambda _: (lines, packets))
-        safe_stop.limp((), "it died", Severity.ERROR)
+        safe_stop.limp((), "it died", texts.loop_failed)
         assert [each["led"] for each in leds] == [0, 0]
 
 
@@ -199,7 +200,7 @@ def test_guardian_makes_the_feature_of_a_package_safe(tmp_path, monkeypatch):
 def test_a_safe_stop_names_the_servos_that_did_not_confirm_torque_off(safe_stop, silent):
     robot, safe_stop, memory = safe_stop
     robot.buses[0].servo(2).silence(silent)
-    _, result = safe_stop.limp((), "torque was cut on request", Severity.WARNING)
+    _, result = safe_stop.limp((), "torque was cut on request", texts.run_cut)
     event = decode(records(memory.guardian, RecordKind.TAGGED)[-1])
     assert isinstance(event, Event)
     assert event.text == f"torque was cut on request; {result}"

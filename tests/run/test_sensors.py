@@ -125,8 +125,8 @@ def test_a_sensor_that_dies_sends_nan_or_stops_and_comes_back(tmp_path, unit, mo
     memory, record, events = create_memory(plan), CycleRecord(plan.loop.layout), []
 
     class Sink:
-        def emit(self, code, severity, source, text):
-            events.append(text.removeprefix("sensor imu").lstrip(": "))
+        def emit(self, source, event):
+            events.append(event.text.removeprefix("sensor imu").lstrip(": "))
 
     slots = [mapped(descriptor) for descriptor in memory.slots["sensors"]]
     readings = Readings(

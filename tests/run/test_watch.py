@@ -18,7 +18,7 @@ from rich.console import Console
 
 from dxlrun.channels import heartbeat, process
 from dxlrun.channels.cycle import Commands, States
-from dxlrun.channels.events import Event, EventCode, EventRing, Severity, Waited
+from dxlrun.channels.events import Event, EventBody, EventCode, EventRing, Severity, Waited
 from dxlrun.channels.heartbeat import ControllerMethod, Heartbeat, Phase, ProcessorTime, Standstill
 from dxlrun.channels.process import Cut, LineLost, Stop
 from dxlrun.channels.ring import Handover
@@ -647,10 +647,8 @@ def test_waits_for_simulated_servos_are_reported_once_a_second() -> None:
     clock = VirtualClock(10**10)
 
     class Sink:
-        def emit(
-            self, code: EventCode, severity: Severity, source: str, text: str, data: bytes = b""
-        ) -> None:
-            reported.append(Event(clock.now_ns(), code, severity, source, text, data))
+        def emit(self, source: str, event: EventBody, data: bytes = b"") -> None:
+            reported.append(Event(clock.now_ns(), event.code, event.severity, source, event.text, data))
 
     stalls = StallCounter()
     report = StallReport(stalls, Sink())

@@ -11,7 +11,7 @@ import pytest
 
 from dxlrun.channels import slot
 from dxlrun.channels.cycle import CycleRecord
-from dxlrun.channels.events import EventCode, Severity
+from dxlrun.channels.events import EventBody, EventCode, Severity
 from dxlrun.channels.slot import SlotState, SlotWriter
 from dxlrun.control.source_process import ReaderContext
 from dxlrun.features.sensors.plan import SensorPlan, encode_sensors
@@ -47,8 +47,8 @@ class Desk:
         context = ReaderContext(encode_sensors(sensors), slots, self.record, lambda: self.now_ns, self)
         self.readings = Readings(context)
 
-    def emit(self, code: EventCode, severity: Severity, source: str, text: str, data: bytes = b"") -> None:
-        self.events.append((code, severity, source, text))
+    def emit(self, source: str, event: EventBody, data: bytes = b"") -> None:
+        self.events.append((event.code, event.severity, source, event.text))
 
     def cycle(self, ms: int = 20) -> tuple[list[float], bool, int]:
         """Let a cycle read; return values, validity and age of the first sensor."""

@@ -3,9 +3,9 @@
 from __future__ import annotations
 
 from collections import Counter
-from collections.abc import Container
+from collections.abc import Callable, Container
 from enum import IntEnum, unique
-from typing import Protocol
+from typing import Generic, NamedTuple, ParamSpec, Protocol
 
 import msgspec
 from msgspec import structs
@@ -236,17 +236,60 @@ class GoalHistory:
         return GoalTotals(dict(self._counts), dict(self._begun), tuple(self._failed), self._allowed.copy())
 
 
+Fields = ParamSpec("Fields")
+
+
+class EventBody(NamedTuple):
+    """Event without source and time, as a row of a table of texts makes it."""
+
+    code: EventCode
+    severity: Severity
+    text: str
+
+
+class EventText(Generic[Fields]):
+    """Row of a table of texts: code, severity, and the function that writes the text from its fields.
+
+    A room has its rows in its `texts.py`, so that all its texts can be read at once. A call writes the text.
+    """
+
+    __slots__ = ("code", "severity", "write")
+
+    def __init__(self, code: EventCode, severity: Severity, write: Callable[Fields, str]) -> None:
+        self.code = code
+        self.severity = severity
+        self.write = write
+
+    def __call__(self, *args: Fields.args, **kwargs: Fields.kwargs) -> EventBody:
+        """Return the event with these fields in its text."""
+        return EventBody(self.code, self.severity, self.write(*args, **kwargs))
+
+
+def event_text(code: EventCode, severity: Severity) -> Callable[[Callable[Fields, str]], EventText[Fields]]:
+    """Make a row of a table of texts from a function that writes the text.
+
+    @event_text(EventCode.LOOP_STARTED, Severity.INFO)
+    def loop_started(rate: float) -> str:
+        return f"the loop has started at {rate:g} Hz"
+
+    events.emit("loop", loop_started(100.0))
+    """
+
+    def decorate(write: Callable[Fields, str]) -> EventText[Fields]:
+        return EventText(code, severity, write)
+
+    return decorate
+
+
 class EventSink(Protocol):
     """Destination of events. Never blocks and never raises."""
 
-    def emit(self, code: EventCode, severity: Severity, source: str, text: str, data: bytes = b"") -> None:
+    def emit(self, source: str, event: EventBody, data: bytes = b"") -> None:
         """Record an event.
 
         Args:
-            code: Kind of the event.
-            severity: Severity.
             source: Name of a joint, a controller or a process.
-            text: Sentence for people.
+            event: Code, severity and text, from a row of a table of texts.
             data: JSON for programs.
         """
         ...
@@ -354,16 +397,17 @@ class EventRing:
         """Totals of the events so far."""
         return EventTotals(self._errors.groups, self.goals.totals, self._started_ns)
 
-    def emit(self, code: EventCode, severity: Severity, source: str, text: str, data: bytes = b"") -> None:
+    def emit(self, source: str, event: EventBody, data: bytes = b"") -> None:
         """Record an event with the current time; see `EventSink.emit`."""
         t_ns = self._clock.now_ns()
+        code, severity, text = event
         if severity >= Severity.ERROR or code == EventCode.TAKEOVER:
             self._errors.add(Event(t_ns, code, severity, source, _writable(text)))
         if code in _GOALS and data:
             self.goals.add(msgspec.json.decode(data, type=GoalReport))
         elif code == EventCode.LOOP_STARTED:
             self._started_ns = t_ns
-        event = Event(
+        record = Event(
             t_ns,
             code,
             severity,
@@ -371,7 +415,7 @@ class EventRing:
             _writable(text[:LONGEST_TEXT]),
             data if len(data) <= LONGEST_DATA else b"",
         )
-        self._writer.append(RecordKind.TAGGED, msgspec.msgpack.encode(event))
+        self._writer.append(RecordKind.TAGGED, msgspec.msgpack.encode(record))
 
 
 def _writable(text: str) -> str:

@@ -14,7 +14,8 @@ from msgspec.structs import replace
 from numpy.typing import NDArray
 
 from dxlrun.channels.cycle import Clamp, CycleRecord, Floats
-from dxlrun.channels.events import EventCode, EventSink, Severity
+from dxlrun.channels.events import EventSink
+from dxlrun.control import texts
 from dxlrun.plan.loop_plan import JointPlan, LimitedInterface, LoopPlan, ServoLimit
 from dxlrun.plan.policy_plan import SLOW_SPEED, SLOW_START_NS
 from dxlwire.compiled import load_compiled, parse_structs
@@ -155,11 +156,10 @@ class Gate:
             if joint.servo_limits == before.servo_limits or not (binding or before.binding_servo_limits):
                 continue
             warns = any(joint.exceeds_file_limit(own.interface) for own in binding)
-            severity = Severity.WARNING if warns else Severity.INFO
-            data = msgspec.json.encode(joint.servo_limits)
-            text = "; ".join(joint.describe_servo_limit(own) for own in binding)
-            text = text or "registers of its servo no longer limit goals"
-            self._events.emit(EventCode.SERVO_LIMITS, severity, joint.name, f"{joint.label}: {text}", data)
+            text = texts.servo_limits_tighter_than_file if warns else texts.servo_limits_found
+            described = "; ".join(joint.describe_servo_limit(own) for own in binding)
+            event = text(joint.label, described) if binding else texts.servo_limits_gone(joint.label)
+            self._events.emit(joint.name, event, msgspec.json.encode(joint.servo_limits))
         self._limited = tuple(joints)
         for name, values in _speeds_and_efforts(joints).items():
             self._joints[name] = values
@@ -243,11 +243,11 @@ class Gate:
                     continue
                 name = self._plan.joints[row].name
                 # A fallback may command the joint by now. The fault's own event names the controller.
-                by = "" if bit is Clamp.NOT_FINITE else f", {self._owner(name)}"
+                owner = "" if bit is Clamp.NOT_FINITE else self._owner(name)
                 own = self._limited[row].find_servo_limit(_LIMITED[bit]) if bit in _LIMITED else None
                 what_by = f"clamped by register {own.text}" if own else what
                 self._clamps[bit, row] = _Clamped(what_by, self._now_ns, self._now_ns)
-                self._events.emit(EventCode.GATE, Severity.WARNING, name, f"{name}{by}: {what_by}")
+                self._events.emit(name, texts.goal_clamped(name, owner, what_by))
 
     def _report_ended(self) -> None:
         for (bit, row), clamped in tuple(self._clamps.items()):
@@ -255,9 +255,8 @@ class Gate:
                 clamped.last_ns = self._now_ns
             elif self._now_ns - clamped.last_ns >= CLAMP_ENDS_NS:
                 del self._clamps[bit, row]
-                name, lasted_s = self._plan.joints[row].name, (clamped.last_ns - clamped.begun_ns) * 1e-9
-                text = f"{name}: {clamped.what}; this ended after {lasted_s:.1f} s"
-                self._events.emit(EventCode.GATE, Severity.INFO, name, text)
+                name, lasted_ns = self._plan.joints[row].name, clamped.last_ns - clamped.begun_ns
+                self._events.emit(name, texts.clamp_ended(name, clamped.what, lasted_ns))
 
     def _owner(self, joint: str) -> str:
         """Return the controller that commands a servo, and the controllers above it, as text."""
@@ -331,9 +330,9 @@ class SourceGate:
         if np.count_nonzero(outside):
             for index in np.flatnonzero(outside & ~held).tolist():
                 source, name = self._names[index]
-                ends = f"{self._lowest[index]:.6g}..{self._highest[index]:.6g}"
-                text = f"{source.label}: {name} was commanded {commands[index]:.6g}, held to {ends}"
-                self._events.emit(EventCode.GATE, Severity.WARNING, source.name, text)
+                value, lowest, highest = commands[index], self._lowest[index], self._highest[index]
+                event = texts.source_command_clamped(source.label, name, value, lowest, highest)
+                self._events.emit(source.name, event)
             np.copyto(commands, np.clip(commands, self._lowest, self._highest), where=outside)
         # The clamped value stays in the array until the next command, so it still counts as clamped.
         np.logical_or(outside, held & at_end, out=held)

@@ -11,7 +11,8 @@ from numpy.typing import NDArray
 
 from dxlrun.channels.commands import LOOP, TakenCommand
 from dxlrun.channels.cycle import CycleRecord, Torque
-from dxlrun.channels.events import EventCode, EventSink, Severity
+from dxlrun.channels.events import EventSink
+from dxlrun.control import texts
 from dxlrun.control.context import ControlContext
 from dxlrun.control.controllers.activity import is_interrupt
 from dxlrun.control.controllers.managed import PERIOD_CAP
@@ -23,7 +24,7 @@ from dxlrun.control.monitors.policy_actions import PolicyActions
 from dxlrun.control.safe_motion import SafeMotion
 from dxlrun.control.source_process import SourceReader
 from dxlrun.control.steering import Steering
-from dxlrun.errors import PortError, counted
+from dxlrun.errors import PortError
 from dxlrun.plan.loop_plan import OverrunPolicy, ServoLimit
 from dxlrun.plan.policy_plan import Last
 
@@ -145,9 +146,7 @@ class Loop:
         """Activate the controllers, one period before the first deadline."""
         self._woken_ns = self.clock.now_ns()
         self.schedule.start(self._woken_ns)
-        period_ms = self.plan.period_ns / 1e6
-        text = f"loop started, period {period_ms:g} ms"
-        self.context.events.emit(EventCode.LOOP_STARTED, Severity.INFO, "loop", text)
+        self.context.events.emit("loop", texts.loop_started(self.plan.period_ns))
         for reader in self.readers:
             reader.read()
         self._take_servo_limits()
@@ -264,14 +263,14 @@ class Loop:
             except PortError as error:
                 motion.give_up(str(error))
             if motion.unfinished:
-                text = f"{name}: {motion.unfinished}; now {policy.last}"
-                self.context.events.emit(EventCode.POLICY, Severity.WARNING, "loop", text)
+                unfinished = texts.policy_unfinished(name, motion.unfinished, policy.last)
+                self.context.events.emit("loop", unfinished)
         if policy.last == "hold":
-            self.context.events.emit(EventCode.POLICY, Severity.WARNING, "loop", f"{name}: torque stays on")
+            self.context.events.emit("loop", texts.policy_keeps_torque(name))
         return policy.last
 
     def _log_policy(self, name: str, text: str) -> None:
-        self.context.events.emit(EventCode.POLICY, Severity.INFO, "loop", f"{name}: {text}")
+        self.context.events.emit("loop", texts.policy_begins(name, text))
         data = f'{{"policy":"{name}"}}'.encode()
         begun = TakenCommand(self.record.woken_ns, self.schedule.cycle, -1, LOOP, "policy", "loop", data)
         self.context.command_log.take(begun)
@@ -303,15 +302,8 @@ class Loop:
         self._skipped += skipped
         late = bool(skipped) or (policy == "catch_up" and now_ns > next_ns)
         if late and not self._late:
-            late_ms = (now_ns - due_ns) / 1e6
-            self.context.events.emit(
-                EventCode.OVERRUN,
-                Severity.WARNING,
-                "loop",
-                f"cycle {cycle} ended {late_ms:.3f} ms after its deadline; "
-                f"{counted(skipped, 'period', 'periods')} skipped"
-                f"{', the next one follows at once' if policy == 'catch_up' else ''}",
-            )
+            overrun = texts.cycle_overran(cycle, now_ns - due_ns, skipped, policy == "catch_up")
+            self.context.events.emit("loop", overrun)
         self._late = late
         return bool(skipped) and policy == "stop"
 
@@ -324,12 +316,11 @@ class Loop:
         self.sink.begin(record)
 
     def _log_end(self, reason: str, detail: str) -> None:
-        severity = Severity.FATAL if reason == "fault" else Severity.INFO
-        cycles = counted(self._cycles, "cycle", "cycles")
-        skipped = counted(self._skipped, "period", "periods")
-        text = f"loop {reason} after {cycles}, {skipped} skipped"
-        text = f"{text}: {detail}" if detail else text
-        self.context.events.emit(EventCode.LOOP_STOPPED, severity, "loop", text)
+        if reason == "fault":
+            event = texts.loop_failed(self._cycles, self._skipped, detail)
+        else:
+            event = texts.loop_stopped(reason, self._cycles, self._skipped, detail)
+        self.context.events.emit("loop", event)
 
 
 class Overruns:
@@ -362,9 +353,4 @@ class Overruns:
 
     def _dismiss(self, hook: OverrunHook, why: str) -> None:
         self._hooks.remove(hook)
-        self._events.emit(
-            EventCode.OVERRUN,
-            Severity.ERROR,
-            hook.plugin,
-            f"dxlrun_overrun {why}; it is not asked again in this run",
-        )
+        self._events.emit(hook.plugin, texts.overrun_hook_dismissed(why))

@@ -21,7 +21,8 @@ from typing import ParamSpec
 
 import msgspec
 
-from dxlrun.channels.events import EventCode, EventSink, Granted, Severity
+from dxlrun.channels.events import EventSink, Granted
+from dxlrun.control import texts
 from dxlrun.plan.loop_plan import MOST_SHARE, Policy, SchedulerPlan
 from dxlwire.clock import MonotonicClock
 
@@ -93,9 +94,8 @@ def apply_to_guardian(priority: int, lock: bool) -> tuple[Grant, ...]:
 def log_grants(grants: Sequence[Grant], source: str, events: EventSink) -> None:
     """Emit an event for each request of a process, a warning if it was refused."""
     for grant in grants:
-        severity = Severity.INFO if grant.granted else Severity.WARNING
-        data = msgspec.json.encode(Granted(grant.request, grant.granted))
-        events.emit(EventCode.SCHEDULER, severity, source, grant.text, data)
+        text = texts.request_granted if grant.granted else texts.request_denied
+        events.emit(source, text(grant.text), msgspec.json.encode(Granted(grant.request, grant.granted)))
 
 
 def freeze_collector() -> Grant:

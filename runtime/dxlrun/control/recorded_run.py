@@ -19,7 +19,7 @@ from numpy.typing import NDArray
 from dxlrun.channels.answers import Answer, Refusal
 from dxlrun.channels.commands import ClientCommand, Command, TakenCommand
 from dxlrun.channels.cycle import CycleRecord, States
-from dxlrun.channels.events import EventCode, Severity
+from dxlrun.channels.events import EventBody, EventCode
 from dxlrun.channels.kept import KeptStates
 from dxlrun.channels.messages import MessageSink
 from dxlrun.contract.controller import Controller
@@ -292,7 +292,7 @@ class PlannedCommands:
 class _NoEvents:
     """Event sink that drops the events of a replay; the log has the original ones."""
 
-    def emit(self, code: EventCode, severity: Severity, source: str, text: str, data: bytes = b"") -> None:
+    def emit(self, source: str, event: EventBody, data: bytes = b"") -> None:
         """Drop an event."""
 
 

@@ -12,7 +12,6 @@ import msgspec
 
 from dxlrun.channels.answers import Answer, Code, CommandOutcome, Done, Refusal
 from dxlrun.channels.commands import LOOP, Command, TakenCommand
-from dxlrun.channels.events import EventCode, Severity
 from dxlrun.channels.loop_requests import (
     Cancel,
     NewCommander,
@@ -25,6 +24,7 @@ from dxlrun.channels.loop_requests import (
     TorqueRequest,
     Unload,
 )
+from dxlrun.control import texts
 from dxlrun.control.anchoring import Anchoring
 from dxlrun.control.context import ControlContext
 from dxlrun.control.controllers.goals import PlayedPart
@@ -160,11 +160,11 @@ class Steering:
             if not (ends := self._stale("no client ended the pause")):
                 commanding = manager.switching.commanding(record.layout.joints)
                 manager.switching.switch_controllers((), commanding)
-            self._log_stale("loop", f"no client ended the pause; {ends or what}")
+            self._context.events.emit("loop", texts.pause_expired(ends or what))
         for name in manager.stale(record.woken_ns) if manager.streams else ():
             if not (ends := self._stale(f"the stream of commands for {name} ended")):
                 manager.hold_controller(name)
-            self._log_stale(name, f"the stream of commands ended; {ends or 'its joints are held'}")
+            self._context.events.emit(name, texts.stream_expired(ends or "its joints are held"))
         return count
 
     def refuse(self) -> None:
@@ -315,16 +315,13 @@ class Steering:
         """Report a refused command or a command for the loop. `Manager` reports those for controllers."""
         refusal = answer if isinstance(answer, Refusal) else None
         if refusal is not None:
-            code, severity, source = EventCode.COMMAND_REFUSED, Severity.WARNING, command.controller or "loop"
-            text = f"{command.kind} from {command.origin} refused: {refusal.text}"
+            source = command.controller or "loop"
+            event = texts.command_refused(command.kind, command.origin, refusal.text)
         else:
-            code, severity, source = EventCode.STEERED, Severity.INFO, "loop"
+            source = "loop"
             shown = command.data.partition(b"\n")[0].decode(errors="replace")
             if len(shown) > LONGEST_SHOWN:
                 shown = f"{shown[:LONGEST_SHOWN]} ..."  # the log of commands has all data
-            text = f"{f'{command.kind} {shown}'.strip()} from {command.origin}"
+            event = texts.loop_steered(f"{command.kind} {shown}".strip(), command.origin)
         data = msgspec.json.encode(CommandOutcome(command.kind, command.origin, refusal, place))
-        self._context.events.emit(code, severity, source, text, data)
-
-    def _log_stale(self, source: str, text: str) -> None:
-        self._context.events.emit(EventCode.STALE_COMMAND, Severity.WARNING, source, text)
+        self._context.events.emit(source, event, data)

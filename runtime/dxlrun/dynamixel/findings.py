@@ -4,7 +4,8 @@ from __future__ import annotations
 
 import msgspec
 
-from dxlrun.channels.events import EventCode, EventSink, Severity
+from dxlrun.channels.events import EventBody, EventCode, EventSink
+from dxlrun.dynamixel import texts
 from dxlwire.control_table import FoundDeviation
 
 _MOST_NAMED = 6  # settings of one servo that an event lists, to keep it readable
@@ -14,22 +15,25 @@ class Findings(msgspec.Struct):
     """Problems and events, in the order in which they were found."""
 
     problems: list[str] = []  # reasons to refuse the start, one sentence each
-    events: list[tuple[EventCode, Severity, str, str]] = []
-    """Events for the log: code, severity, joint or device, text."""
+    events: list[tuple[str, EventBody]] = []
+    """Events for the log, each with its joint or device."""
     deviations: list[tuple[str, str, FoundDeviation]] = []
     """Settings that differ from the factory's: joint, `ID 4 on bus main`, and the deviation."""
 
-    def note(self, code: EventCode, severity: Severity, source: str, text: str) -> None:
-        """Add an event for the log."""
-        self.events.append((code, severity, source, text))
+    def note(self, source: str, event: EventBody) -> None:
+        """Add an event of a joint or a device for the log."""
+        self.events.append((source, event))
 
     def texts(self, code: EventCode) -> list[tuple[str, str]]:
         """Return the events with a code, each as its source and text."""
-        return [(source, text) for each, _, source, text in self.events if each is code]
+        return [(source, event.text) for source, event in self.events if event.code is code]
 
     def describe_deviations(self) -> list[tuple[str, str]]:
         """Return a sentence for each servo whose settings differ from the factory's, with its joint."""
-        sentences: list[tuple[str, str]] = []
+        return [(joint, event.text) for joint, event in self._deviation_events()]
+
+    def _deviation_events(self) -> list[tuple[str, EventBody]]:
+        events: list[tuple[str, EventBody]] = []
         for joint, place in dict.fromkeys((joint, place) for joint, place, _ in self.deviations):
             own = [each for _, where, each in self.deviations if where == place]
             named = "; ".join(f"{each.text}, which {each.effect}" for each in own[:_MOST_NAMED])
@@ -42,12 +46,10 @@ class Findings(msgspec.Struct):
                 remedy if len(remedies) == 1 else f"{remedy} ({', '.join(titles)})"
                 for remedy, titles in remedies.items()
             )
-            sentences.append((joint, f"{place} differs from the factory's settings: {named}; {how}"))
-        return sentences
+            events.append((joint, texts.settings_differ(place, named, how)))
+        return events
 
     def log(self, events: EventSink) -> None:
         """Log the events, and one event per servo for its settings that differ from the factory's."""
-        for event in self.events:
-            events.emit(*event)
-        for joint, text in self.describe_deviations():
-            events.emit(EventCode.REGISTER_DIFFERS, Severity.WARNING, joint, text)
+        for source, event in (*self.events, *self._deviation_events()):
+            events.emit(source, event)

@@ -11,7 +11,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from dxlrun.channels.cycle import Commands, SourceStates, States
-from dxlrun.channels.events import EventCode, EventSink, Severity
+from dxlrun.channels.events import EventSink
+from dxlrun.dynamixel import texts
 from dxlrun.dynamixel.bus_part import FeatureParts, SafeEnd
 from dxlrun.dynamixel.remedies import CHECK, choose_remedy
 from dxlrun.dynamixel.servo import watchdog
@@ -403,15 +404,10 @@ class DynamixelHardware:
         # A servo that did not confirm torque off keeps its watchdog: without instructions it stops.
         self._disarm({(one.bus, one.servo_id) for one in outcomes if one.confirmed})
         for sentence in failures:
-            self._events.emit(EventCode.SHUTDOWN_FAILED, Severity.ERROR, "hardware", sentence)
+            self._events.emit("hardware", texts.torque_off_not_confirmed(sentence))
         if not failures:
             count = sum(len(plan.servos) for plan in self._plans)
-            self._events.emit(
-                EventCode.TORQUE_OFF,
-                Severity.INFO,
-                "hardware",
-                f"torque is off on {'the servo' if count == 1 else f'all {count} servos'}",
-            )
+            self._events.emit("hardware", texts.torque_is_off(count))
         return failures
 
     def release(self) -> None:
@@ -423,12 +419,12 @@ class DynamixelHardware:
         programs = [limit_patience(watchdog.release_all(plan), any_age=True) for plan in self._plans]
         for problems in self._lines.run(programs):
             for problem in problems or ():
-                self._events.emit(EventCode.WATCHDOG, Severity.WARNING, "hardware", problem)
+                self._events.emit("hardware", texts.watchdog_not_disarmed(problem))
         self._make_rest_safe()
 
     def _make_rest_safe(self) -> None:
         for problem in self._safe_end.make_safe(self._lines):
-            self._events.emit(EventCode.SHUTDOWN_FAILED, Severity.WARNING, "hardware", problem)
+            self._events.emit("hardware", texts.output_not_made_safe(problem))
 
     def _disarm(self, limp: Set[tuple[str, int]]) -> None:
         """Disarm the Bus Watchdogs of servos without torque, by (bus, ID); the other servos must still stop
@@ -483,11 +479,7 @@ class DynamixelHardware:
         for plan, servos in zip(self._plans, self._servos, strict=True):
             for group in servos.reads.given_up:
                 names = ", ".join(plan.member_name(index) for index in plan.groups[group])
-                text = (
-                    f"bus {plan.name}: {MOST_BROKEN} fast reads in a row stayed incomplete, so {names} are "
-                    "read without them from now on: does one have another firmware, or a loose contact?"
-                )
-                self._events.emit(EventCode.SETUP, Severity.WARNING, plan.name, text)
+                self._events.emit(plan.name, texts.fast_reads_given_up(plan.name, MOST_BROKEN, names))
             servos.reads.given_up.clear()
 
     def _first_states(self) -> None:

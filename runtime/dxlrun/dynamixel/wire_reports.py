@@ -2,14 +2,12 @@
 
 from __future__ import annotations
 
-from dxlrun.channels.events import EventCode, EventSink, Severity
+from dxlrun.channels.events import EventSink
+from dxlrun.dynamixel import texts
 from dxlwire.exchange.reports import Reason
 
-_EVENTS = {
-    Reason.IMPLAUSIBLE: (EventCode.IMPLAUSIBLE, Severity.WARNING),
-    Reason.NO_IDLE_TIME: (EventCode.OVERRUN, Severity.WARNING),
-}
-"""Code and severity of each reason."""
+_EVENTS = {Reason.IMPLAUSIBLE: texts.values_implausible, Reason.NO_IDLE_TIME: texts.idle_time_short}
+"""Event of each reason."""
 
 
 class WireReports:
@@ -20,4 +18,4 @@ class WireReports:
 
     def report(self, reason: Reason, source: str, text: str) -> None:
         """Emit a report as the event of its reason."""
-        self._events.emit(*_EVENTS[reason], source, text)
+        self._events.emit(source, _EVENTS[reason](text))

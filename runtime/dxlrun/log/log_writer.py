@@ -13,7 +13,7 @@ import msgspec
 import zstandard
 from mcap.writer import CompressionType, Writer
 
-from dxlrun.channels.events import Event, EventCode, LostRecords, Severity
+from dxlrun.channels.events import Event, EventCode, LostRecords, Severity, event_text
 from dxlrun.channels.messages import MessageRing, PublishedTopic
 from dxlrun.channels.ring import Handover, Payload
 from dxlrun.errors import counted
@@ -34,6 +34,13 @@ _LIBRARY = "dxlrun"
 _PACKAGE = "dxlrun_msgs"
 _LIBRARIES = ("dxlrun", "mcap", "numpy")
 _MEDIA_TYPES = {".json": "application/json", ".yaml": "application/yaml", ".txt": "text/plain"}
+
+
+@event_text(EventCode.RECORDER_GAP, Severity.ERROR)
+def records_lost(source: str, lost: int) -> str:
+    """Row of the only event of this room."""
+    what = counted(lost, f"record of {source} was", f"records of {source} were")
+    return f"{what} overwritten or damaged before the recorder read {'it' if lost == 1 else 'them'}"
 
 
 class LogWriter(RunMessages):
@@ -158,11 +165,9 @@ class LogWriter(RunMessages):
     def gap(self, source: str, lost: int) -> None:
         """Add an event for `lost` records of `source` that did not reach the log."""
         self._lost += lost
-        what = counted(lost, f"record of {source} was", f"records of {source} were")
-        them = "it" if lost == 1 else "them"
-        text = f"{what} overwritten or damaged before the recorder read {them}"
+        code, severity, text = records_lost(source, lost)
         data = msgspec.json.encode(LostRecords(source, lost))
-        event = Event(self.last_ns, EventCode.RECORDER_GAP, Severity.ERROR, "recorder", text, data=data)
+        event = Event(self.last_ns, code, severity, "recorder", text, data)
         self._guarded(self.event, event)
 
     def flush(self) -> None:

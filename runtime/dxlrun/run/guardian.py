@@ -18,13 +18,13 @@ import sys
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Literal
+from typing import Literal, TypeAlias
 
 import msgspec
 from msgspec.json import Decoder
 
 from dxlrun.channels import process
-from dxlrun.channels.events import EventCode, EventRing, Severity
+from dxlrun.channels.events import EventBody, EventRing, EventText
 from dxlrun.channels.heartbeat import Heartbeat, Phase, ProcessorTime, SimulationProgress
 from dxlrun.channels.packets import PacketBatch, salvage
 from dxlrun.channels.process import Cut, Failed, LineLost, LineReturned, MessageChannel, RunMemory, Stop
@@ -38,6 +38,7 @@ from dxlrun.errors import PortError
 from dxlrun.features.feature import Feature
 from dxlrun.plan.policy_plan import TORQUE_STAYS, Last
 from dxlrun.process_table import describe_run
+from dxlrun.run import texts
 from dxlrun.run.watch import Duty, SignsOfLife, Watched, duty_of, loop_timeout_ns
 from dxlwire.bus_plan import BusPlan
 from dxlwire.clock import MonotonicClock
@@ -130,6 +131,8 @@ class Ended(msgspec.Struct, frozen=True, tag=True):
 GuardianMessage = Started | LineLost | LineReturned | Ended | Failed
 _REQUESTS: Decoder[Stop | Cut] = Decoder(Stop | Cut)
 _LINES_LOST = Decoder(LineLost)
+EndText: TypeAlias = EventText[[Sequence[str]]]
+"""Event about the end of a loop: `texts.loop_failed` or `texts.run_cut`."""
 
 
 def make_ports(
@@ -171,16 +174,16 @@ class SafeStop:
         self._events = EventRing(self._ring, self._clock)
         self._safe_end = SafeEnd.of(job.plan.features, job.plan.feature_plans)
 
-    def end(self, descriptors: Sequence[int], how: str, severity: Severity) -> list[str]:
+    def end(self, descriptors: Sequence[int], how: str, text: EndText) -> list[str]:
         """Apply the final state of the fault policy, without its steps; return sentences about it.
 
         The robot holds only when the loop was running: during set-up, only some servos have torque.
         """
         if self._job.plan.last == "limp" or self._heartbeat.phase is not Phase.RUNNING:
-            return self.limp(descriptors, how, severity)
-        standing = self.stand(descriptors)
-        self.report("; ".join([how, TORQUE_STAYS, *standing]), severity)
-        return [how, TORQUE_STAYS, *standing]
+            return self.limp(descriptors, how, text)
+        sentences = [how, TORQUE_STAYS, *self.stand(descriptors)]
+        self.report(text(sentences))
+        return sentences
 
     def stand(self, descriptors: Sequence[int]) -> tuple[str, ...]:
         """Stop the joints that would continue to move with torque on; return a sentence for each."""
@@ -189,7 +192,7 @@ class SafeStop:
         packets.commit()
         return sentences
 
-    def limp(self, descriptors: Sequence[int], how: str, severity: Severity) -> list[str]:
+    def limp(self, descriptors: Sequence[int], how: str, text: EndText) -> list[str]:
         """Send torque off to every servo; return `how` (the cause) and the result as sentences."""
         lines, packets = self._take_over(descriptors)
         outcome, unsafe = limp(lines), self._safe_end.make_safe(lines)
@@ -201,8 +204,9 @@ class SafeStop:
             if not silent
             else f"torque off was sent, but not confirmed by {', '.join(silent)}"
         )
-        self.report("; ".join([how, result, *unsafe]), Severity.ERROR if silent else severity)
-        return [how, result, *unsafe]
+        sentences = [how, result, *unsafe]
+        self.report((texts.loop_failed if silent else text)(sentences))
+        return sentences
 
     def _take_over(self, descriptors: Sequence[int]) -> tuple[Lines, PacketBatch]:
         """Log the unfinished packets of the loop; return its lines, and the batch for further packets."""
@@ -216,9 +220,9 @@ class SafeStop:
         """Log the real-time properties that the operating system granted to this process."""
         realtime.log_grants(grants, "guardian", self._events)
 
-    def report(self, text: str, severity: Severity) -> None:
-        """Log a sentence."""
-        self._events.emit(EventCode.GUARDIAN, severity, "guardian", text)
+    def report(self, event: EventBody) -> None:
+        """Log an event of the guardian."""
+        self._events.emit("guardian", event)
 
 
 class Guardian:
@@ -255,9 +259,9 @@ class Guardian:
         grants = realtime.apply_to_guardian(self._job.plan.priority, self._job.plan.lock_memory)
         self._safe_stop.report_grants(grants)
         for sentence in lines.done:
-            self._safe_stop.report(sentence, Severity.INFO)
+            self._safe_stop.report(texts.line_adjusted(sentence))
         for sentence in lines.remarks:
-            self._safe_stop.report(sentence, Severity.WARNING)
+            self._safe_stop.report(texts.line_remark(sentence))
         loop_channel, theirs = process.message_channel(_LINES_LOST)
         loop = self._execute(lines.descriptors, theirs.fileno())
         theirs.close()
@@ -268,14 +272,14 @@ class Guardian:
         how = self._how(ending, loop)
         if ending == "unused":
             outcome.append(f"{how}; nothing had been sent to the robot")
-            self._safe_stop.report(outcome[-1], Severity.ERROR)
+            self._safe_stop.report(texts.loop_failed(outcome[-1:]))
         elif ending != "done":
             # Add a line that returned just now, so that its servos receive torque off as well.
             lines.returned()
             if ending == "cut":
-                outcome += self._safe_stop.limp(lines.descriptors, how, Severity.WARNING)
+                outcome += self._safe_stop.limp(lines.descriptors, how, texts.run_cut)
             else:
-                outcome += self._safe_stop.end(lines.descriptors, how, Severity.ERROR)
+                outcome += self._safe_stop.end(lines.descriptors, how, texts.loop_failed)
         lines.close()
         self._control.send(Ended(ending, tuple(outcome)))
 
@@ -350,17 +354,17 @@ class Guardian:
         for message in channel.receive():
             self._control.send(message)
             if not lines.lost(message.bus):
-                self._safe_stop.report("a line is gone and is not opened again", Severity.ERROR)
+                self._safe_stop.report(texts.line_gone())
 
     def _hand_over(self, lines: KeptLines, channel: MessageChannel[LineLost]) -> None:
         """Pass lines that are open again to the loop and to the supervisor."""
         for opened in lines.returned():
             if opened.done:
-                self._safe_stop.report(opened.done, Severity.INFO)
+                self._safe_stop.report(texts.line_adjusted(opened.done))
             if opened.remark:
-                self._safe_stop.report(opened.remark, Severity.WARNING)
+                self._safe_stop.report(texts.line_remark(opened.remark))
             if opened.wrong:
-                self._safe_stop.report(opened.wrong, Severity.ERROR)
+                self._safe_stop.report(texts.line_problem(opened.wrong))
             for each in (channel, self._control):
                 each.send(LineReturned(opened.index), [lines.descriptors[opened.index]])
 
@@ -402,7 +406,7 @@ class Guardian:
         self._unsupervised = (
             f"the supervisor (process {self._job.supervisor}) {what}; the loop was asked to stop"
         )
-        self._safe_stop.report(self._unsupervised, Severity.WARNING)
+        self._safe_stop.report(texts.supervisor_gone(self._unsupervised))
 
     def _request(self) -> Literal["stop", "cut"] | None:
         """Return the request of the supervisor."""

@@ -8,6 +8,7 @@ independently when neither supervisor nor guardian responds (`watch.py`).
 from __future__ import annotations
 
 import os
+import select
 import signal
 import socket
 import sys
@@ -22,13 +23,13 @@ from msgspec.json import Decoder
 
 from dxlrun.channels import process
 from dxlrun.channels.commands import CommandRing
-from dxlrun.channels.events import EventCode, EventRing, EventSink, EventTotals, Severity, Waited
+from dxlrun.channels.events import EventRing, EventSink, EventTotals, Waited
 from dxlrun.channels.heartbeat import Heartbeat, Phase
 from dxlrun.channels.kept import KeptStates
 from dxlrun.channels.mailbox import Mailbox
 from dxlrun.channels.messages import MessageRing
 from dxlrun.channels.packets import PacketBatch
-from dxlrun.channels.process import LineReturned, MessageChannel
+from dxlrun.channels.process import LineLost, LineReturned, MessageChannel
 from dxlrun.channels.ring import RingWriter
 from dxlrun.channels.shared_memory import mapped
 from dxlrun.control import realtime
@@ -42,9 +43,9 @@ from dxlrun.plan.loop_plan import SchedulerPlan
 from dxlrun.plan.machine_load import SimulationWait
 from dxlrun.plan.policy_plan import TORQUE_STAYS
 from dxlrun.plan.robot_plan import Plan, from_json
+from dxlrun.run import texts
 from dxlrun.run.assembly import LoopHost, Sinks, assemble
 from dxlrun.run.guardian import LoopJob, make_ports
-from dxlrun.run.line_reopener import LineReopener
 from dxlrun.run.watch import Duty, LoopWatch
 from dxlwire.clock import MonotonicClock
 from dxlwire.port.ports import (
@@ -124,7 +125,28 @@ def _looked_at(heartbeat: Heartbeat) -> Callable[[str], None]:
 _WAIT_OVER_NS = 20_000_000
 # Shortest interval between two events, when most replies are late.
 _WAITS_EVENT_NS = 1_000_000_000
-UNWATCHED = "neither the supervisor nor the guardian responds: the run ends by on_exit; start it again"
+
+
+class LineReopener:
+    """Requests lost lines from the guardian, which opens them again; the `reopened` of `SerialPorts`."""
+
+    def __init__(self, channel: MessageChannel[LineReturned]) -> None:
+        self._channel = channel
+        self._asked: set[int] = set()
+        self._came: dict[int, int] = {}
+
+    def __call__(self, index: int) -> int | None:
+        """Return the file descriptor of a line that is open again, once; None until then. Does not block."""
+        if index not in self._asked:
+            self._asked.add(index)
+            self._channel.send(LineLost(index))
+        if not self._channel.closed and select.select([self._channel], [], [], 0)[0]:
+            for message in self._channel.receive():
+                self._came[message.bus] = self._channel.descriptors.pop(0)
+        descriptor = self._came.pop(index, None)
+        if descriptor is not None:
+            self._asked.remove(index)
+        return descriptor
 
 
 class AskedToStop(Exception):
@@ -166,8 +188,7 @@ class StallReport:
         if since.waited_ns or since.times:
             self._reported_ns, self._reported_times = total.waited_ns, total.times
             data = msgspec.json.encode(Waited(since.waited_ns, since.times))
-            text = f"{since.text}: the machine is too busy"
-            self._events.emit(EventCode.SIMULATION_STALLED, Severity.WARNING, "machine", text, data)
+            self._events.emit("machine", texts.simulation_stalled(since.text), data)
 
 
 @dataclass(slots=True)
@@ -194,7 +215,7 @@ class Pulse:
         self.stalls.look(now_ns)
         if not self.stop.requested and self.watch.duty(now_ns) is Duty.END:
             self.stop.request()
-            self.events.emit(EventCode.GUARDIAN, Severity.ERROR, "loop", UNWATCHED)
+            self.events.emit("loop", texts.loop_unwatched())
         if self.stop.requested and self.heartbeat.phase in (Phase.SETUP, Phase.ENGAGING):
             self.heartbeat.enter(Phase.STOPPING)
             raise AskedToStop
@@ -264,7 +285,7 @@ def _run(plan: Plan, job: LoopJob, heartbeat: Heartbeat, sinks: Sinks, stalls: S
         finally:
             report.emit()
     except AskedToStop as asked:
-        sinks.events.emit(EventCode.SETUP, Severity.INFO, "loop", "the set-up was given up on request")
+        sinks.events.emit("loop", texts.set_up_aborted())
         notes: list[str] = getattr(asked, "__notes__", [])
         return LoopOutcome("stopped", sentences=tuple(note for note in notes if note != TAKEN_BACK))
     detail = (result.detail,) if result.detail else ()
@@ -321,13 +342,13 @@ def main() -> None:
     except DxlrunError as error:
         for_replies = isinstance(error, StartUpError) and error.for_replies
         outcome = LoopOutcome("start-up", sentences=error.sentences, refused_for_replies=for_replies)
-        events.emit(EventCode.SETUP, Severity.ERROR, "loop", "\n".join(error.sentences))
+        events.emit("loop", texts.start_refused(error.sentences))
     # Last resort: the run ends with a sentence, and the log has the traceback.
     except Exception as error:
         sentence = f"dxlrun itself failed: {type(error).__name__}: {error}; --debug shows where"
         outcome = LoopOutcome("fault", sentences=(sentence,), traceback=traceback.format_exc())
         sys.stderr.write(outcome.traceback)
-        events.emit(EventCode.LOOP_STOPPED, Severity.FATAL, "loop", outcome.traceback)
+        events.emit("loop", texts.loop_crashed(outcome.traceback))
     outcome = structs.replace(outcome, simulation_wait=SimulationWait(stalls.waited_ns, stalls.times))
     sinks.packets.commit()
     os.pwrite(job.memory.result, msgspec.json.encode(outcome), 0)

@@ -17,7 +17,6 @@ from msgspec.structs import replace
 
 from dxlrun.channels import process
 from dxlrun.channels.commands import LOOP, Command
-from dxlrun.channels.events import Severity
 from dxlrun.channels.heartbeat import Heartbeat, Phase, Steering
 from dxlrun.channels.kept import KeptStates
 from dxlrun.channels.mailbox import MailboxWriter
@@ -43,7 +42,7 @@ from dxlrun.errors import ProcessFault, counted
 from dxlrun.log.schemas import FAILURES_NAME, CycleSpan, LogClosed, epoch_offset_ns
 from dxlrun.plan.machine_load import MachineLoad
 from dxlrun.plan.robot_plan import Plan
-from dxlrun.run import source_process
+from dxlrun.run import source_process, texts
 from dxlrun.run.guardian import Ended, GuardianJob, GuardianMessage, SafeStop, Started
 from dxlrun.run.kept_files import KeptFiles, KeptStateWriter, read_states, state_directory
 from dxlrun.run.loop_process import LoopOutcome
@@ -390,7 +389,7 @@ class _Run:
             how = f"the loop ended too{where}" if gone else f"the loop did not stop{where} and was killed"
             safe_stop = SafeStop(job)
             leave = safe_stop.limp if cut else safe_stop.end
-            self.sentences += leave(guardian.channel.descriptors, how, Severity.ERROR)
+            self.sentences += leave(guardian.channel.descriptors, how, texts.loop_failed)
 
     def end(self) -> None:
         """End the remaining processes in sequence: guardian, sources, recorder, simulated bus, gateway."""

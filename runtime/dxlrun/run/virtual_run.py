@@ -13,7 +13,7 @@ from typing import TYPE_CHECKING, Any
 from dxlrun.channels import slot
 from dxlrun.channels.commands import CommandRing, Inbox, NoCommands, QueueInbox
 from dxlrun.channels.cycle import CycleRecord
-from dxlrun.channels.events import EventCode, EventRing, EventTotals, Severity
+from dxlrun.channels.events import EventRing, EventTotals
 from dxlrun.channels.messages import MessageRing, MessageSink
 from dxlrun.channels.packets import PacketBatch
 from dxlrun.channels.ring import Handover, Payload, RecordKind
@@ -35,6 +35,7 @@ from dxlrun.log.ledger_file import open_ledger
 from dxlrun.log.part_writer import PartWriter, open_writer
 from dxlrun.plan.policy_plan import TORQUE_STAYS
 from dxlrun.plan.robot_plan import Plan
+from dxlrun.run import texts
 from dxlrun.run.assembly import LoopHost, Sinks, assemble
 from dxlrun.run.kept_files import KeptFiles, read_states, state_directory
 from dxlrun.run.run_log import discard_log, incomplete_log, log_header, new_log
@@ -209,7 +210,7 @@ class VirtualRobot:
         try:
             self.result = self.robot.run()
         except DxlrunError as error:
-            self.sinks.events.emit(EventCode.SETUP, Severity.ERROR, "loop", "\n".join(error.sentences))
+            self.sinks.events.emit("loop", texts.start_refused(error.sentences))
             raise
         finally:
             self.sinks.packets.commit()

@@ -22,7 +22,10 @@ from typing import TYPE_CHECKING
 from dxlwire.faces import lazy_face
 
 if TYPE_CHECKING:
+    from dxlrun.channels.events import EventBody as EventBody
     from dxlrun.channels.events import EventSink as EventSink
+    from dxlrun.channels.events import EventText as EventText
+    from dxlrun.channels.events import event_text as event_text
     from dxlrun.compile.contribution import BusDevice as BusDevice
     from dxlrun.compile.contribution import Compilation as Compilation
     from dxlrun.compile.contribution import CompileStage as CompileStage

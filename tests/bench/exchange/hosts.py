@@ -15,7 +15,7 @@ import numpy as np
 
 from dxlrun.channels.commands import NoCommands
 from dxlrun.channels.cycle import Torque
-from dxlrun.channels.events import EventCode, Severity
+from dxlrun.channels.events import EventBody
 from dxlrun.channels.packets import LONGEST_BATCH, PacketBatch, packet_capacity, split_packets
 from dxlrun.channels.ring import Gap, Handover, RingReader, RingWriter, create
 from dxlrun.control.controllers.plugins import load_plugins
@@ -79,7 +79,7 @@ class HostKind:
 class _Events:
     """Takes events and forgets them."""
 
-    def emit(self, code: EventCode, severity: Severity, source: str, text: str, data: bytes = b"") -> None:
+    def emit(self, source: str, event: EventBody, data: bytes = b"") -> None:
         """Forget it."""
 
 

@@ -11,6 +11,7 @@ from dxlrun.channels.events import (
     LONGEST_EVENT,
     LONGEST_TEXT,
     Event,
+    EventBody,
     EventCode,
     EventRing,
     Severity,
@@ -24,7 +25,7 @@ from dxlwire.clock import VirtualClock
 def emitted(code: EventCode, severity: Severity, source: str, text: str, at_ns: int = 5) -> bytes:
     records: list[bytes] = []
     ring = EventRing(Handover(lambda _, payload: records.append(bytes(payload))), VirtualClock(at_ns))
-    ring.emit(code, severity, source, text)
+    ring.emit(source, EventBody(code, severity, text))
     (record,) = records
     assert len(record) <= LONGEST_EVENT
     return record

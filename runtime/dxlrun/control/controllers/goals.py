@@ -16,8 +16,9 @@ from numpy.typing import NDArray
 
 from dxlrun.channels.answers import Code, Refusal
 from dxlrun.channels.cycle import LOST_CYCLES, Commands, CycleRecord, Floats, Torque
-from dxlrun.channels.events import EventCode, EventSink, GoalReport, Severity
+from dxlrun.channels.events import EventBody, EventSink, GoalReport
 from dxlrun.contract.controller import GoalTolerances, Outcome
+from dxlrun.control import texts
 from dxlrun.control.controllers.topics import Publisher, TopicLog
 from dxlrun.messages import Header
 from dxlrun.plan.loop_plan import UNLIMITED, JointPlan
@@ -265,8 +266,7 @@ class Goals:
         """Create and report a goal. The previous goal of the controller must have ended."""
         self.last += 1
         goal = self.running[self.last] = RunningGoal(self, self.last, controller, kind, origin)
-        text = f"goal {goal.number}: {kind} from {origin}"
-        self._report(goal, EventCode.GOAL_ACCEPTED, Severity.INFO, "accepted", text)
+        self._report(goal, texts.goal_accepted(goal.number, kind, origin), "accepted")
         return goal
 
     def found(self, number: int) -> RunningGoal | Refusal:
@@ -437,9 +437,8 @@ class Goals:
             goal.progress = 1.0
         del self.running[goal.number]
         self._ended[goal.number % KEPT] = (goal.number, goal.controller, outcome)
-        sentence = f"goal {goal.number} {outcome}{f': {goal.text}' if goal.text else ''}"
-        severity = Severity.WARNING if outcome in _UNREACHED else Severity.INFO
-        self._report(goal, EventCode.GOAL_ENDED, severity, outcome.value, sentence)
+        ended = texts.goal_failed if outcome in _UNREACHED else texts.goal_ended
+        self._report(goal, ended(goal.number, outcome, goal.text), outcome.value)
 
     def judge_running(self) -> None:
         """Judge the goals whose motions have ended."""
@@ -452,13 +451,11 @@ class Goals:
         """True while the motion of a goal has ended and its joints may still settle."""
         return any(goal.is_judged for goal in self.running.values())
 
-    def _report(
-        self, goal: RunningGoal, code: EventCode, severity: Severity, status: str, sentence: str
-    ) -> None:
+    def _report(self, goal: RunningGoal, event: EventBody, status: str) -> None:
         error = goal.error if math.isfinite(goal.error) else None
         about = goal.number, goal.controller, goal.kind, goal.origin
         report = GoalReport(*about, status, goal.text, goal.joint, error)
-        self._events.emit(code, severity, goal.controller, sentence, msgspec.json.encode(report))
+        self._events.emit(goal.controller, event, msgspec.json.encode(report))
         self.publish(goal, status)
 
     def publish(self, goal: RunningGoal, status: str) -> None:

@@ -8,7 +8,7 @@ from zlib import crc32
 
 import numpy as np
 
-from dxlrun.channels.events import EventCode, EventSink, Severity
+from dxlrun.channels.events import EventSink
 from dxlrun.channels.kept import (
     MOST_KEPT,
     TOPIC,
@@ -18,6 +18,7 @@ from dxlrun.channels.kept import (
     difference,
     file_pieces,
 )
+from dxlrun.control import texts
 from dxlrun.control.controllers.graph import Plans
 from dxlrun.control.controllers.topics import Publisher, TopicLog
 from dxlrun.errors import ControllerFault
@@ -69,11 +70,9 @@ class Keeping:
             return b"", keep
         problem = file.problem or difference(file.made_with, facts)
         if problem:
-            text = f"begins anew: {problem} ({file.place})"
-            self._events.emit(EventCode.KEPT, Severity.WARNING, plan.name, text)
+            self._events.emit(plan.name, texts.kept_state_unusable(problem, file.place))
             return b"", keep
-        text = f"begins with the {len(file.state)} bytes that it kept before ({file.place})"
-        self._events.emit(EventCode.KEPT, Severity.INFO, plan.name, text)
+        self._events.emit(plan.name, texts.kept_state_used(len(file.state), file.place))
         return file.state, keep
 
     def _made_with(self, plan: ControllerPlan, plans: Plans) -> Facts:

@@ -24,9 +24,10 @@ from msgspec.structs import replace
 from numpy.typing import NDArray
 
 from dxlrun.channels.cycle import Floats
-from dxlrun.channels.events import EventCode, Severity
+from dxlrun.channels.events import EventSink, EventText
 from dxlrun.channels.heartbeat import ControllerMethod
 from dxlrun.contract.controller import Context, Controller, JointLimits, Outcome
+from dxlrun.control import texts
 from dxlrun.control.context import ControlContext
 from dxlrun.control.controllers.activity import Activity
 from dxlrun.control.controllers.goals import Commanded, RunningGoal
@@ -172,8 +173,8 @@ class Managed:
             commands=self._outputs.commands,
             # None of these refers to this object: a reference cycle would never be freed after an unload,
             # because the garbage collector is off.
-            say=partial(run.events.emit, EventCode.CONTROLLER_SAYS, Severity.INFO, plan.name),
-            warn=partial(run.events.emit, EventCode.CONTROLLER_SAYS, Severity.WARNING, plan.name),
+            say=partial(_emit, run.events, plan.name, texts.controller_says),
+            warn=partial(_emit, run.events, plan.name, texts.controller_warns),
             publish=self._topics.publish,
             references=self._inputs.references,
             reads=self._inputs.reads,
@@ -436,6 +437,10 @@ def _take_over(requests: list[Request], plan: ControllerPlan, controllers: Seque
 
 def _end_run(requests: list[Request], plan: ControllerPlan, why: str) -> None:
     requests.append(Request(plan.name, (), why))
+
+
+def _emit(events: EventSink, controller: str, row: EventText[[str]], text: str) -> None:
+    events.emit(controller, row(text))
 
 
 def _row(values: Sequence[float | None]) -> Floats:

@@ -12,9 +12,9 @@ from numpy.typing import NDArray
 from dxlrun.channels.answers import Code, CommandOutcome, Field, Refusal
 from dxlrun.channels.commands import Command, TakenCommand
 from dxlrun.channels.cycle import MOST_CONTROLLERS
-from dxlrun.channels.events import EventCode, Severity
 from dxlrun.channels.kept import KeptStates
 from dxlrun.contract.controller import Controller, Outcome
+from dxlrun.control import texts
 from dxlrun.control.context import ControlContext
 from dxlrun.control.controllers.activity import Activity
 from dxlrun.control.controllers.claims import conflicts
@@ -217,9 +217,7 @@ class Manager:
             managed.until_ns = self._record.woken_ns + command.lease_ns
             self.streams[managed.place] = managed
         if not streaming:
-            self._events.emit(
-                EventCode.COMMAND, Severity.INFO, managed.plan.name, f"{kind} from {command.origin}"
-            )
+            self._events.emit(managed.plan.name, texts.command_accepted(kind, command.origin))
         return 0
 
     def _end(self, managed: Managed, fault: ControllerFault) -> Refusal:
@@ -269,8 +267,8 @@ class Manager:
             pursued = self._pursue(command)
             answer = self.dispatch_command(Command(place, name, kind, command.data, origin), pursued)
             if isinstance(answer, Refusal):
-                text = f"{kind} from {origin} refused: {answer.text}"
-                self.switching.report_refusal(name, text, CommandOutcome(kind, origin, answer))
+                event = texts.command_refused(kind, origin, answer.text)
+                self.switching.report_refusal(name, event, CommandOutcome(kind, origin, answer))
             else:
                 record.command_count += 1
 
@@ -296,7 +294,7 @@ class Manager:
             return Refusal(Code.INVALID, {"problem": f"{controller}: {error}"})
         if refusal is None:
             shown = ", ".join(f"{name} = {value:g}" for name, value in values.items())
-            self._log(EventCode.PARAMETERS, managed, shown)
+            self._events.emit(managed.plan.name, texts.parameters_changed(shown))
         return refusal
 
     def stale(self, now_ns: int) -> list[str]:
@@ -335,12 +333,12 @@ class Manager:
         for managed in reversed(self._order):  # lower controllers first: the upper ones depend on them
             if not managed.hold_lost(self._lost, below=self._holds_below(managed)):
                 continue
-            text, severity = f"resumes: {until}", Severity.INFO
             if managed.held:
-                text, severity = f"is held until {until}", Severity.WARNING
+                event = texts.controller_held(until)
             else:
+                event = texts.controller_resumes(until)
                 resumed += managed.rows.tolist()
-            self._events.emit(EventCode.POLICY, severity, managed.plan.name, text)
+            self._events.emit(managed.plan.name, event)
         return tuple(resumed)
 
     def _holds_below(self, managed: Managed) -> bool:
@@ -459,7 +457,7 @@ class Manager:
         self._managed = (*self._managed[:place], managed, *self._managed[place + 1 :])
         self._named[plan.name] = managed
         self._sort()
-        self._log_loaded(managed, "loaded", begin_ns)
+        self._events.emit(plan.name, texts.controller_loaded(self._clock.now_ns() - begin_ns))
         return place
 
     def _refusals(self, plan: ControllerPlan, place: int) -> Iterator[Refusal]:
@@ -511,7 +509,7 @@ class Manager:
         begin_ns = self._clock.now_ns()
         del self._named[name]
         self._sort()
-        self._log_loaded(managed, "unloaded", begin_ns)
+        self._events.emit(name, texts.controller_unloaded(self._clock.now_ns() - begin_ns))
         return None
 
     def change_period(self, period_ns: int) -> Refusal | None:
@@ -543,13 +541,6 @@ class Manager:
         for one in loaded:
             one.uppers = tuple(upper for upper in self._named.values() if one.plan.name in upper.plan.into)
         self._order = tuple(self._named[name] for name in update_order([one.plan for one in loaded]))
-
-    def _log_loaded(self, managed: Managed, what: str, begin_ns: int) -> None:
-        text = f"{what} in {(self._clock.now_ns() - begin_ns) / 1e6:.1f} ms, while the loop stood still"
-        self._log(EventCode.CONTROLLER_LOADED, managed, text)
-
-    def _log(self, code: EventCode, managed: Managed, text: str) -> None:
-        self._events.emit(code, Severity.INFO, managed.plan.name, text)
 
     def _configured(self, place: int, plan: ControllerPlan) -> Managed:
         managed = Managed(plan, place, self._shared)

@@ -16,7 +16,8 @@ from msgspec.structs import replace
 
 from dxlrun.channels.answers import MOST_NAMED, Code, CommandOutcome, Refusal, Waiting, list_names
 from dxlrun.channels.cycle import LIMP
-from dxlrun.channels.events import RUN_ENDED, EventCode, Severity
+from dxlrun.channels.events import RUN_ENDED, EventBody
+from dxlrun.control import texts
 from dxlrun.control.context import ControlContext
 from dxlrun.control.controllers.claims import Standing, Step, claimed_modes
 from dxlrun.control.controllers.graph import above, lowers_first, uppers_first
@@ -120,16 +121,13 @@ class Switching:
         step = self.standing.request(names)
         if isinstance(step, Step) and not step.enter:
             return
-        taken, verb = " and ".join(names), "take" if names[1:] else "takes"
         refusal = step if isinstance(step, Refusal) else self._refuse_limp(step.enter)
         if isinstance(step, Refusal) or refusal is not None:
             reason = "" if refusal is None else refusal.text
-            text = f"takeover by {taken} refused: {reason} (requested because of {why})"
-            self._report_left_out(requester, text, refusal, requester)
+            event = texts.takeover_refused(" and ".join(names), reason, why)
+            self._report_left_out(requester, event, refusal, requester)
             return
-        instead = f" from {', '.join(step.leave)}" if step.leave else ""
-        text = f"{taken} {verb} over{instead}: {why}"
-        self._events.emit(EventCode.TAKEOVER, Severity.WARNING, requester, text)
+        self._events.emit(requester, texts.controllers_take_over(names, step.leave, why))
         self._take(step, None, f"{requester}: {why}")
 
     def restart_controllers(self, joints: Collection[str], why: str) -> None:
@@ -148,8 +146,7 @@ class Switching:
             # A controller above others may command none of these joints itself.
             own = [joint for joint in managed.plan.joints if joint in joints] or list(joints)
             reason = f"{list_names(own)} {why}"
-            text = f"restarted at the measured positions: {reason}"
-            self._events.emit(EventCode.POLICY, Severity.INFO, managed.plan.name, text)
+            self._events.emit(managed.plan.name, texts.controller_restarted(reason))
             self._deactivate(managed, reason)
         if self.fault is not None:
             return
@@ -331,7 +328,7 @@ class Switching:
         for managed in group.entering:
             managed.on(Event.LEAVE)  # it may have left already
             name = managed.plan.name
-            self._report_left_out(name, f"{name} is not activated: {problem}", refusal)
+            self._report_left_out(name, texts.controller_not_activated(name, problem), refusal)
         self.fault = self.fault or group.why or None
 
     # Entering and leaving
@@ -370,7 +367,7 @@ class Switching:
         self.groups.append(Group(tuple(entering), until_ns, number, why))
         for managed in entering:
             managed.on(Event.AWAIT)
-            self._log(EventCode.MODE, managed, "waits until its joints are in their modes")
+            self._events.emit(managed.plan.name, texts.controller_waits_for_modes())
         return Waiting(tuple(names))
 
     def _activate_all(
@@ -393,7 +390,8 @@ class Switching:
             if missing := [lower for lower in into if lower not in active]:
                 managed.on(Event.LEAVE)
                 problem = f"{missing[0]}, whose references it commands, is not active"
-                self._report_left_out(name, f"{name} is not activated: {problem}", fault_of(managed, problem))
+                event = texts.controller_not_activated(name, problem)
+                self._report_left_out(name, event, fault_of(managed, problem))
                 continue
             try:
                 managed.activate(restarts=restarts)
@@ -402,7 +400,7 @@ class Switching:
                 uppers = above([one.plan for one in entering], name)
                 failed.append(((managed, *(self.named[upper] for upper in uppers)), str(fault)))
                 continue
-            self._log(EventCode.CONTROLLER_ACTIVATED, managed, "active")
+            self._events.emit(managed.plan.name, texts.controller_activated())
             for lower in (one for one in lowers if one.active):  # commanded by this controller from now on
                 try:
                     lower.follow_upper()
@@ -421,7 +419,7 @@ class Switching:
             self._take_out(managed, fault)  # no fallback: the controller was to leave anyway
             self.fault = self.fault or str(fault)
         else:
-            self._log(EventCode.CONTROLLER_DEACTIVATED, managed, "inactive")
+            self._events.emit(managed.plan.name, texts.controller_deactivated())
 
     # Faults
 
@@ -429,8 +427,8 @@ class Switching:
         """Deactivate a controller that broke its contract, without a fallback, and report the fault."""
         managed.release(Event.FAULT, str(fault))
         self.modes_requested = False
-        text = "\n".join([str(fault), *getattr(fault, "__notes__", ())])
-        self._events.emit(EventCode.CONTROLLER_FAULT, Severity.ERROR, managed.plan.name, text)
+        event = texts.controller_failed(str(fault), getattr(fault, "__notes__", ()))
+        self._events.emit(managed.plan.name, event)
 
     def _take_out_with_uppers(self, managed: Managed, fault: ControllerFault) -> _Failed:
         """Deactivate a controller that broke its contract and those above it; return all, nearest first."""
@@ -466,7 +464,7 @@ class Switching:
             if refusal is None:
                 self._take(step, None, why)
                 return
-            self._report_left_out(fallback, f"{fallback} does not take over: {refusal.text}", refusal)
+            self._report_left_out(fallback, texts.fallback_refused(fallback, refusal.text), refusal)
         self.fault = self.fault or why
 
     # Reports
@@ -475,16 +473,14 @@ class Switching:
         if number is not None:
             self.ended.append((number, refusal))
 
-    def report_refusal(self, controller: str, text: str, outcome: CommandOutcome) -> None:
-        """Report a refused command as an event."""
-        data = msgspec.json.encode(outcome)
-        self._events.emit(EventCode.COMMAND_REFUSED, Severity.WARNING, controller, text, data)
+    def report_refusal(self, controller: str, event: EventBody, outcome: CommandOutcome) -> None:
+        """Report a refused command, with its outcome as data."""
+        self._events.emit(controller, event, msgspec.json.encode(outcome))
 
-    def _report_left_out(self, name: str, text: str, refusal: Refusal | None, requester: str = "") -> None:
-        self.report_refusal(name, text, CommandOutcome("switch", requester, refusal))
-
-    def _log(self, code: EventCode, managed: Managed, text: str) -> None:
-        self._events.emit(code, Severity.INFO, managed.plan.name, text)
+    def _report_left_out(
+        self, name: str, event: EventBody, refusal: Refusal | None, requester: str = ""
+    ) -> None:
+        self.report_refusal(name, event, CommandOutcome("switch", requester, refusal))
 
 
 def fault_of(managed: Managed, problem: str) -> Refusal:

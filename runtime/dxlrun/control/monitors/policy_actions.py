@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Collection, Iterable
 from typing import TYPE_CHECKING
 
-from dxlrun.channels.events import EventCode, Severity
+from dxlrun.channels.events import EventBody
 from dxlrun.plan.policy_plan import PolicyPlan
 
 if TYPE_CHECKING:  # `check` shows the policies and needs nothing of the run
@@ -48,11 +48,9 @@ class PolicyActions:
         self._held[id(holder)] = rows
         self._gate.ease_in(self._manager.hold_lost(frozenset().union(*self._held.values()), until))
 
-    def report(
-        self, severity: Severity, text: str, *, source: str = "loop", code: EventCode = EventCode.POLICY
-    ) -> None:
+    def report(self, event: EventBody, *, source: str = "loop") -> None:
         """Report an action of a policy as an event."""
-        self._context.events.emit(code, severity, source, text)
+        self._context.events.emit(source, event)
 
 
 def _ignore_answer(problem: str) -> None:

@@ -14,8 +14,8 @@ from typing import NamedTuple
 
 import msgspec
 
-from dxlrun.channels.events import EventCode, Severity
 from dxlrun.description.bus import SIMULATED
+from dxlrun.dynamixel import texts
 from dxlrun.dynamixel.findings import Findings
 from dxlrun.dynamixel.remedies import CHECK, choose_remedy
 from dxlrun.dynamixel.servo.access import Access, first_reach
@@ -243,8 +243,8 @@ def inspect(one: Access, found: Findings, *, take_over: bool) -> Program[Mode | 
     values = {name: declared.get(name, raw) for name, raw in read.items()}
     if plan.protocol == 1.0:
         values[STATUS_ERROR] = reply.error
-    text = f"{servo.model}, ID {servo.servo_id} on bus {plan.name}, firmware {values['firmware_version']}"
-    found.note(EventCode.SETUP, Severity.INFO, servo.joint, text)
+    firmware = values["firmware_version"]
+    found.note(servo.joint, texts.servo_found(servo.model, servo.servo_id, plan.name, firmware))
     inspected = Inspected(plan, servo, one.items, values, one.table.errors, take_over)
     for check in CHECKS:
         if check.item in values and check.fails(inspected, values[check.item]):
@@ -252,7 +252,7 @@ def inspect(one: Access, found: Findings, *, take_over: bool) -> Program[Mode | 
             if check.refuses:
                 found.problems.append(f"{one} {sentence}")
             else:
-                found.note(EventCode.REGISTER_DIFFERS, Severity.WARNING, servo.joint, sentence)
+                found.note(servo.joint, texts.register_check_failed(sentence))
     # Torque control mode of Protocol 1.0 is in RAM, and only some models have it: it is not read here.
     mode = mode_in(servo, {"torque_ctrl_mode_enable": 0, **values})
     for each in deviations(one, values, mode, declared):

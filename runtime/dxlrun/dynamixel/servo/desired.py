@@ -12,7 +12,7 @@ from functools import partial
 import numpy as np
 from numpy.typing import NDArray
 
-from dxlrun.channels.events import EventCode, Severity
+from dxlrun.dynamixel import texts
 from dxlrun.dynamixel.findings import Findings
 from dxlrun.dynamixel.servo import modes
 from dxlrun.dynamixel.servo.life import Life
@@ -147,14 +147,14 @@ class DesiredState:
         life.give_torque(index)
         self._changing[index] = False
         if problem:
-            life.report(EventCode.MODE, Severity.ERROR, index, f"{problem}; it is in {_words(mode)}")
+            life.report(index, texts.mode_not_entered(life.name(index), problem, _words(mode)))
             self._show(index, mode)
             self._modes[index] = mode or self._modes[index]
         elif self._modes[index] != mode:  # a newer request came during the change
             self._begin_change(index)
         else:
             self.entered(index, mode)
-            life.report(EventCode.MODE, Severity.INFO, index, f"is in {_words(mode)}")
+            life.report(index, texts.mode_entered(life.name(index), _words(mode)))
 
     def read_limits(self, index: int) -> Program[None]:
         """Read the limits beyond which a servo refuses goals; the servo may have been replaced."""
@@ -208,7 +208,7 @@ class DesiredState:
                 break
             yield listen(pause_ns)
         if problem := "; ".join(found.problems):
-            life.events.emit(EventCode.REGISTER_DIFFERS, Severity.WARNING, one.servo.joint, problem)
+            life.events.emit(one.servo.joint, texts.register_not_written(problem))
         else:
             self._settings[index] = merged(self._settings[index], register)
         found.log(life.events)

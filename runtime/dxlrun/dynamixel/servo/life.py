@@ -46,7 +46,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from dxlrun.channels.cycle import Floats, Torque
-from dxlrun.channels.events import EventCode, EventSink, Severity
+from dxlrun.channels.events import EventBody, EventSink
+from dxlrun.dynamixel import texts
 from dxlrun.dynamixel.bus_part import BusPart
 from dxlrun.dynamixel.servo.access import Access, reach
 from dxlrun.dynamixel.servo.watchdog import RETURN_SPEED
@@ -339,12 +340,11 @@ class Life:
         enable`."""
         self.idle.add(program, urgency, f"{what} of {self.name(index)}", index)
 
-    def report(self, code: EventCode, severity: Severity, index: int, text: str) -> None:
-        """Log an event of a servo; its name is put before `text`."""
-        self.events.emit(code, severity, self.plan.servos[index].joint, f"{self.name(index)} {text}")
+    def report(self, index: int, event: EventBody) -> None:
+        """Log an event of a servo under the name of its joint."""
+        self.events.emit(self.plan.servos[index].joint, event)
 
     def report_limp(self, index: int, enabled: int) -> None:
         """Log that a servo was found without torque."""
-        item = f"Torque Enable ({self.plan.servos[index].torque_address})"
-        text = f"has {item} = {enabled}: it was reset or its torque was cut; it gets no goals"
-        self.report(EventCode.SERVO_LIMP, Severity.ERROR, index, text)
+        address = self.plan.servos[index].torque_address
+        self.report(index, texts.torque_lost(self.name(index), address, enabled))

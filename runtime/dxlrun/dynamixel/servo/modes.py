@@ -14,7 +14,7 @@ from collections.abc import Callable, Collection, Mapping
 
 import msgspec
 
-from dxlrun.channels.events import EventCode, Severity
+from dxlrun.dynamixel import texts
 from dxlrun.dynamixel.findings import Findings
 from dxlrun.dynamixel.servo import watchdog
 from dxlrun.dynamixel.servo.access import Access, reach
@@ -135,8 +135,7 @@ def settle_modes(plan: BusPlan, found: Findings) -> Program[list[dict[OwnLimit, 
             continue
         was = ", ".join(f"{one.items[name].title} was {value}" for name, value in before.items())
         words = servo.start_mode.name.lower().replace("_", "-")
-        text = f"{was}: {one} was brought into {words} mode"
-        found.note(EventCode.MODE, Severity.WARNING, servo.joint, text)
+        found.note(servo.joint, texts.start_mode_set(str(one), was, words))
     return limits
 
 

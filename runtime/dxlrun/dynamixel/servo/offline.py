@@ -11,7 +11,7 @@ from collections.abc import Sequence
 
 from msgspec.structs import replace
 
-from dxlrun.channels.events import EventCode, Severity
+from dxlrun.dynamixel import texts
 from dxlrun.dynamixel.findings import Findings
 from dxlrun.dynamixel.remedies import CHECK, choose_remedy
 from dxlrun.dynamixel.servo import modes, watchdog
@@ -109,10 +109,10 @@ class Offline:
         reply = yield one.line.ping(one.servo.servo_id)
         if reply.answered and (read := self.reboots.read(index)) is not None:
             reply = yield from retry(read)
-        problem = ""
+        event = None
         if reply.outcome is Outcome.GARBLED:
             remedy = choose_remedy(life.plan.port, " If not, check its cable", simulated="")
-            problem = f"answers garbled or twice: do two servos have its ID?{remedy}"
+            event = texts.servo_garbled(life.name(index), remedy)
         if reply.outcome not in (Outcome.TIMEOUT, Outcome.GARBLED):
             found = Findings()
             torqued, mode = yield from self._rejoin(index, reply, found)
@@ -124,12 +124,12 @@ class Offline:
                 found.log(life.events)
                 self._take_back(index, loss, torqued, mode)
                 return
-            problems = (each.removeprefix(f"{one} ") for each in found.problems)
-            problem = f"answers again, but cannot take part: it {'; it '.join(problems)}"
-            self._answer(index, loss, problem)
-        if problem and problem != loss.problem:
-            loss.problem = problem
-            life.report(EventCode.SERVO_LOST, Severity.ERROR, index, problem)
+            problems = [each.removeprefix(f"{one} ") for each in found.problems]
+            event = texts.servo_unfit(life.name(index), problems)
+            self._answer(index, loss, texts.unfit_clause(problems))
+        if event is not None and event.text != loss.problem:
+            loss.problem = event.text
+            life.report(index, event)
         loss.probing, loss.probe_at_ns = False, life.now_ns() + PROBE_NS
 
     def _rejoin(self, index: int, reply: Reply, found: Findings) -> Program[tuple[bool, Mode]]:
@@ -153,11 +153,7 @@ class Offline:
             loss = life.losses.get(index)
             if loss is not None and not loss.limp_reported:
                 loss.limp_reported = True
-                text = (
-                    "lost count of its turns when it rebooted, so it stays limp where it is and counts from "
-                    f"there; `dxlrun torque on {servo.joint}` gives it torque"
-                )
-                life.report(EventCode.SERVO_LIMP, Severity.ERROR, index, text)
+                life.report(index, texts.turns_lost(life.name(index), servo.joint))
         torqued = yield from rejoin(one, found, mode, self.desired.settings(index), torque=torque)
         if not found.problems:
             yield from self.desired.read_limits(index)
@@ -180,20 +176,20 @@ class Offline:
         return self.life.plan.servos[index].torque_on_return and not self.reboots.exhausted(index)
 
     def _take_back(self, index: int, loss: Loss, torqued: bool, mode: Mode) -> None:
-        life, how = self.life, "limp: it gets no goals"
+        life, back = self.life, texts.servo_back_limp
         if loss.released or not torqued:
             life.on(index, ServoEvent.RETURNED_LIMP)
         elif loss.kept_torque and self.desired.mode_shown(index) is mode:
             life.on(index, ServoEvent.RETURNED)
             life.on(index, ServoEvent.TORQUE_ON)
-            how = "with the torque and the goal that it kept"
+            back = texts.servo_back_with_goal
         else:
             life.on(index, ServoEvent.TORQUE_GIVEN)
-            how = "holding where it is"
+            back = texts.servo_back_holding
         if loss.rebooted and life.plan.servos[index].continuous:
             life.reads.samples.restart_count(index)
         self.desired.returned(index, mode)
-        life.report(EventCode.SERVO_BACK, Severity.INFO, index, f"is in order and takes part again, {how}")
+        life.report(index, back(life.name(index)))
         if loss.released:
             life.on(index, ServoEvent.RELEASE)
             if torqued:

@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections import deque
 from typing import NamedTuple
 
-from dxlrun.channels.events import EventCode, Severity
+from dxlrun.dynamixel import texts
 from dxlrun.dynamixel.remedies import choose_remedy
 from dxlrun.dynamixel.servo.life import Life
 from dxlwire.plan.retry import retry
@@ -152,13 +152,13 @@ class Reboots:
         if loss is not None:
             loss.rebooted, loss.had_torque = True, False
             if loss.reboot is not None:
-                life.report(EventCode.SERVO_REBOOTED, Severity.INFO, index, "started anew, as requested")
+                life.report(index, texts.servo_rebooted_on_request(life.name(index)))
                 return
-        text = "started anew: it was without power, or something rebooted it"
+        event = texts.servo_rebooted(life.name(index))
         if self._counts[index].add(life.now_ns()):
             remedy = choose_remedy(life.plan.port, "check its supply")
-            text += f"; it rebooted twice within a minute, so no policy gives it torque again: {remedy}"
-        life.report(EventCode.SERVO_REBOOTED, Severity.ERROR, index, text)
+            event = texts.servo_reboots_repeatedly(life.name(index), remedy)
+        life.report(index, event)
 
     def exhausted(self, index: int) -> bool:
         """Return True if a servo rebooted so often that no policy gives it torque any more."""

@@ -9,7 +9,7 @@ from __future__ import annotations
 import math
 from collections.abc import Sequence
 
-from dxlrun.channels.events import EventCode, Severity
+from dxlrun.dynamixel import texts
 from dxlrun.dynamixel.findings import Findings
 from dxlrun.dynamixel.servo.access import ItemAccess, first_reach
 from dxlwire.bus_plan import BusPlan, RegisterValue
@@ -50,8 +50,8 @@ def settle(one: ItemAccess, registers: Sequence[RegisterValue], found: Findings)
             found.problems.append(f"{one} {problem}")
         else:
             item = one.items[register.name]
-            text = f"{item.title} was {shown(item, before[item.name])} and is {register.value}"
-            found.note(EventCode.REGISTER_WRITTEN, Severity.INFO, one.name, text)
+            was = shown(item, before[item.name])
+            found.note(one.name, texts.register_written(item.title, was, register.value))
     return before
 
 

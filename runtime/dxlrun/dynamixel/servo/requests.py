@@ -7,7 +7,7 @@ switched off stays limp until a client requests torque again.
 
 from __future__ import annotations
 
-from dxlrun.channels.events import EventCode, Severity
+from dxlrun.dynamixel import texts
 from dxlrun.dynamixel.findings import Findings
 from dxlrun.dynamixel.servo import modes, watchdog
 from dxlrun.dynamixel.servo.life import (
@@ -75,10 +75,9 @@ class Requests:
         else:
             life.on(index, ServoEvent.TORQUE_GIVEN)
             self._desired.returned(index, mode)
-            text = "has torque, as requested: it holds where it is"
-            life.report(EventCode.TORQUE_ON, Severity.INFO, index, text)
+            life.report(index, texts.torque_on_as_requested(name))
         if problem:
-            life.report(EventCode.TORQUE_ON, Severity.WARNING, index, f"gets no torque: it {problem}")
+            life.report(index, texts.torque_refused(name, problem))
         done(problem and f"{name} {problem}")
 
     def _torqued(self, index: int) -> Program[str]:

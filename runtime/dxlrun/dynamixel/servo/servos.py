@@ -12,7 +12,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from dxlrun.channels.cycle import LOST_AGE_NS, LOST_CYCLES, Commands, States
-from dxlrun.channels.events import EventCode, EventSink, Severity
+from dxlrun.channels.events import EventSink
+from dxlrun.dynamixel import texts
 from dxlrun.dynamixel.bus_part import FeatureParts
 from dxlrun.dynamixel.findings import Findings
 from dxlrun.dynamixel.servo.desired import DesiredState
@@ -23,7 +24,6 @@ from dxlrun.dynamixel.servo.reboots import Reboots
 from dxlrun.dynamixel.servo.requests import Requests
 from dxlrun.dynamixel.servo.slow_registers import SlowReads
 from dxlrun.dynamixel.servo.watchdog_monitor import WatchdogMonitor
-from dxlrun.errors import counted
 from dxlrun.plan.loop_plan import ServoLimit
 from dxlwire.control_table import find_table
 from dxlwire.exchange.cyclic_reads import CyclicReads
@@ -148,7 +148,7 @@ class Servos:
         """Report once that the line is lost."""
         if not self._line_lost:
             self._line_lost = True
-            self._events.emit(EventCode.PORT_LOST, Severity.ERROR, self._plan.name, text)
+            self._events.emit(self._plan.name, texts.line_lost(text))
 
     def found(self) -> None:
         """Report that the line is back. Its servos had no host, and may have had no power."""
@@ -157,16 +157,14 @@ class Servos:
             self.life.lose(index).kept_goal = False
         for part in self._parts:
             part.recover_line()
-        text = f"bus {self._plan.name} is back; its servos count as rebooted"
-        self._events.emit(EventCode.PORT_BACK, Severity.WARNING, self._plan.name, text)
+        self._events.emit(self._plan.name, texts.line_back(self._plan.name))
 
     def _report_noise(self, now_ns: int) -> None:
         name = self._plan.name
         count = self._bus.noise_bytes - self._noise_seen
         if count and now_ns - self._noise_at_ns >= NOISE_EVENT_NS:
             self._noise_seen, self._noise_at_ns = self._bus.noise_bytes, now_ns
-            text = f"{counted(count, 'byte', 'bytes')} belonged to no packet"
-            self._events.emit(EventCode.BUS_NOISE, Severity.WARNING, name, text)
+            self._events.emit(name, texts.noise_received(count))
         count = self._bus.unrequested - self._unrequested_seen
         if count < LEAST_UNREQUESTED:
             if self._lone != self._bus.unrequested:
@@ -176,11 +174,7 @@ class Servos:
                 self._unrequested_seen = self._lone
         elif now_ns - self._unrequested_at_ns >= UNREQUESTED_EVENT_NS:
             self._unrequested_seen, self._unrequested_at_ns = self._bus.unrequested, now_ns
-            text = (
-                f"{count} packets on bus {name} answer no request of this run: another program or another "
-                "computer writes on the line; stop it, or its commands move these servos too"
-            )
-            self._events.emit(EventCode.UNREQUESTED, Severity.WARNING, name, text)
+            self._events.emit(name, texts.other_host_found(name, count))
 
     # A cycle
 
@@ -217,20 +211,17 @@ class Servos:
                 continue
             if fresh:
                 if missed[index]:
-                    lost = "1 reply was" if missed[index] == 1 else f"{missed[index]} replies in a row were"
+                    life.report(index, texts.servo_answers_again(life.name(index), missed[index]))
                     missed[index] = 0
-                    text = f"answers again; {lost} lost"
-                    life.report(EventCode.READ_BACK, Severity.INFO, index, text)
                 continue
             missed[index] += 1
             life.on(index, ServoEvent.DOUBT)
             if missed[index] == 1:
-                how = "sent a garbled reply" if self.reads.garbled[index] else "did not answer"
-                life.report(EventCode.READ_LOST, Severity.WARNING, index, how)
+                text = texts.reply_garbled if self.reads.garbled[index] else texts.reply_missed
+                life.report(index, text(life.name(index)))
             # Require an age, too: at a high rate a few cycles are too short to call a servo lost.
             elif missed[index] >= LOST_CYCLES and now_ns - self._samples.at_ns[index] >= LOST_AGE_NS:
-                text = f"missed {missed[index]} replies in a row; it is probed once a second until"
-                life.report(EventCode.SERVO_LOST, Severity.ERROR, index, f"{text} it is in order")
+                life.report(index, texts.servo_lost(life.name(index), missed[index]))
                 self._offline.lose(index)
 
     def _report_errors(self) -> None:
@@ -252,9 +243,8 @@ class Servos:
                     self._strained.append(index)
                     self.life.on(index, ServoEvent.DOUBT)
             self._reported_errors[index] = error
-            severity = Severity.ERROR if error else Severity.INFO
-            text = f"reports {self._dialect.describe_error(error)}"
-            self.life.report(EventCode.SERVO_ERROR, severity, index, text)
+            text = texts.error_byte_set if error else texts.error_byte_cleared
+            self.life.report(index, text(self.life.name(index), self._dialect.describe_error(error)))
 
     # Idle time
 
@@ -376,8 +366,7 @@ class Servos:
         if not any(reply.parameters) and not self.life.offline(index):
             self.life.on(index, ServoEvent.DOUBT)
             self.life.on(index, ServoEvent.TORQUE_OFF)
-            text = f"has {name} = 0: it shut down, and gets no goals until the next run"
-            self.life.report(EventCode.SERVO_LIMP, Severity.ERROR, index, text)
+            self.life.report(index, texts.servo_shut_down(self.life.name(index), name))
 
     def _read_hardware_error(self, index: int, read: Transaction) -> Program[None]:
         """Read and report a new hardware error; its shutdown may have cut the torque."""
@@ -390,12 +379,12 @@ class Servos:
             return
         self._read_errors[index] = value
         title = self.life.reach(index).items[errors.item].title
-        text = f"has {title} = {value}: {errors.describe(value)}"
+        about = self.life.name(index), title, value, errors.describe(value)
         # A warning is not in the states: a joint with an error there gets no torque.
         if errors.is_warning(value):
             self._shown[self._rows[index]] = 0
-            self.life.report(EventCode.SERVO_ERROR, Severity.WARNING, index, text)
+            self.life.report(index, texts.hardware_warning(*about))
             return
         self._shown[self._rows[index]] = value
         self.life.on(index, ServoEvent.DOUBT)
-        self.life.report(EventCode.SERVO_ERROR, Severity.ERROR, index, text)
+        self.life.report(index, texts.hardware_error(*about))

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from dxlrun.channels.cycle import States
-from dxlrun.channels.events import EventCode, Severity
+from dxlrun.dynamixel import texts
 from dxlrun.dynamixel.servo.life import Life
 from dxlrun.dynamixel.servo.reboots import Reboots
 from dxlwire.bus_plan import SLOW_STATES, BusPlan
@@ -86,8 +86,8 @@ class SlowReads:
         elif state == "voltage":
             states.voltage[row] = raw * item.scale
         elif before not in (None, raw) and item.name not in _LIMITS:
-            text = f"{item.title} was {before}, is {raw}"
-            self._life.report(EventCode.REGISTER_DIFFERS, Severity.INFO, index, text)
+            event = texts.register_changed(self._life.name(index), item.title, before, raw)
+            self._life.report(index, event)
 
     def _warm(self, index: int, celsius: float) -> None:
         items = self._life.reach(index).items
@@ -100,14 +100,13 @@ class SlowReads:
                 self._begin(index, (item,))
             return
         limit = raw * item.scale
-        text = f"is at {celsius:.0f} deg C; its {item.title} is {limit:.0f} deg C"
+        about = self._life.name(index), celsius, item.title, limit
         if celsius >= limit - WARN_BELOW and index not in self._hot:
             self._hot.add(index)
-            text = f"{text}, beyond which it cuts its torque: let it rest"
-            self._life.report(EventCode.SERVO_HOT, Severity.WARNING, index, text)
+            self._life.report(index, texts.servo_hot(*about))
         elif celsius <= limit - WARN_BELOW - COOLED and index in self._hot:
             self._hot.remove(index)
-            self._life.report(EventCode.SERVO_HOT, Severity.INFO, index, text)
+            self._life.report(index, texts.servo_cooled(*about))
 
 
 def _round(plan: BusPlan) -> list[tuple[int, _Block]]:

@@ -15,7 +15,8 @@ from typing import TypeAlias
 import msgspec
 
 from dxlrun.channels.cycle import Commands
-from dxlrun.channels.events import EventCode, EventSink, Severity
+from dxlrun.channels.events import EventSink
+from dxlrun.dynamixel import texts
 from dxlrun.dynamixel.bus_part import BusStage
 from dxlrun.dynamixel.findings import Findings
 from dxlrun.dynamixel.remedies import choose_remedy, describe_late_start
@@ -108,10 +109,9 @@ class StartUp:
             # Servos of one joint are adjacent; name the joint once.
             names = ", ".join(dict.fromkeys(servo.joint for servo in plan.servos if servo.torque_at_start))
             if names:
-                self._events.emit(EventCode.TORQUE_ON, Severity.INFO, plan.name, f"torque is on: {names}")
+                self._events.emit(plan.name, texts.torque_is_on(names))
             if limp := ", ".join(servo.joint for servo in plan.servos if not servo.torque_at_start):
-                text = f"limp, as the robot file says: {limp}"
-                self._events.emit(EventCode.TORQUE_OFF, Severity.INFO, plan.name, text)
+                self._events.emit(plan.name, texts.joints_start_limp(limp))
 
     def confirm(self) -> None:
         """Read torque enable of every servo again, and start sending goals.
@@ -143,12 +143,8 @@ class StartUp:
             if probed.refused:
                 total_ns = plan.budget.total_ns + _extra_ns(plan, probed.refused)
                 why = "; ".join(probed.refused.values())
-                text = (
-                    f"bus {plan.name} is not read by a fast form, {why}: a cycle "
-                    f"takes {total_ns / 1e6:.2f} ms instead of {plan.budget.total_ns / 1e6:.2f} ms, at most "
-                    f"{1e9 / total_ns:.0f} Hz"
-                )
-                self._events.emit(EventCode.SETUP, Severity.WARNING, plan.name, text)
+                event = texts.fast_reads_refused(plan.name, why, total_ns, plan.budget.total_ns)
+                self._events.emit(plan.name, event)
 
     def stage(self, stage: Stage[Result], most_ns: Sequence[int] = ()) -> list[Result]:
         """Run a stage on all lines, log its findings and raise its problems; return the result of each line.

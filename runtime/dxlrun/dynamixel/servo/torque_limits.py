@@ -9,7 +9,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 
-from dxlrun.channels.events import EventCode, Severity
+from dxlrun.dynamixel import texts
 from dxlrun.dynamixel.findings import Findings
 from dxlrun.dynamixel.servo.access import Access, first_reach
 from dxlwire.bus_plan import BusPlan, ModePlan, ServoPlan
@@ -58,8 +58,7 @@ def restore_torque_limit(one: Access, mode: Mode, found: Findings) -> Program[in
         if problem := (yield from one.write(item.name, value)):
             found.problems.append(f"{one} {problem}")
         else:
-            text = f"{place.name} was {present} and is {value} again"
-            found.note(EventCode.SETUP, Severity.INFO, one.servo.joint, text)
+            found.note(one.servo.joint, texts.torque_limit_restored(place.name, present, value))
     return own
 
 

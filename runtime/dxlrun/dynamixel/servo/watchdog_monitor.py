@@ -3,7 +3,7 @@ servos."""
 
 from __future__ import annotations
 
-from dxlrun.channels.events import EventCode, Severity
+from dxlrun.dynamixel import texts
 from dxlrun.dynamixel.findings import Findings
 from dxlrun.dynamixel.servo import watchdog
 from dxlrun.dynamixel.servo.desired import DesiredState
@@ -75,8 +75,7 @@ class WatchdogMonitor:
                 self._reviving.add(index)
                 life.do(index, self._revive(index), "the Bus Watchdog")
         if armed:
-            text = f"no instruction for {silent_ms} ms: the Bus Watchdog has stopped the servos"
-            life.events.emit(EventCode.WATCHDOG, Severity.ERROR, plan.name, f"{text}; they are revived")
+            life.events.emit(plan.name, texts.watchdog_stopped_servos(silent_ms))
 
     def _revive(self, index: int) -> Program[None]:
         """Restore the desired registers that the watchdog stop reset, then clear and arm the watchdog."""
@@ -87,5 +86,5 @@ class WatchdogMonitor:
         problem = "; ".join(found.problems) or (yield from watchdog.revive(one))
         self._reviving.remove(index)
         if problem and not life.offline(index):
-            life.events.emit(EventCode.WATCHDOG, Severity.ERROR, one.servo.joint, problem)
+            life.events.emit(one.servo.joint, texts.watchdog_not_cleared(problem))
             life.lose(index)

@@ -118,7 +118,7 @@ class OneNode:
     def _settle(self, desired: Sequence[RegisterValue]) -> tuple[str, ...]:
         found = Findings()
         self.run(settle(self.access, desired, found))
-        written = [text for _, _, _, text in found.events]
+        written = [event.text for _, event in found.events]
         if found.problems:
             before = [f"written before that: {text}" for text in written]
             raise ServoFault("\n".join([*found.problems, *before]))

@@ -4,9 +4,9 @@ from __future__ import annotations
 
 from msgspec.structs import replace
 
-from dxlrun.channels.events import EventCode, Severity
 from dxlrun.dynamixel.findings import Findings
 from dxlrun.dynamixel.remedies import choose_remedy
+from dxlrun.features.devices import texts
 from dxlwire.bus_plan import BusPlan, DevicePlan
 from dxlwire.control_table import models_by_number
 from dxlwire.control_table.devices import devices_by_number
@@ -34,8 +34,7 @@ def survey_devices(plan: BusPlan, found: Findings) -> Program[None]:
         if problem:
             found.problems.append(f"{plan.label(device)} {problem}")
         else:
-            text = f"{device.model}, ID {device.servo_id} on bus {plan.name}"
-            found.note(EventCode.SETUP, Severity.INFO, device.name, text)
+            found.note(device.name, texts.device_found(device.model, device.servo_id, plan.name))
 
 
 def inspect_device(plan: BusPlan, device: DevicePlan, line: Line) -> Program[str]:

@@ -12,8 +12,9 @@ import msgspec
 from msgspec.structs import replace
 
 from dxlrun.channels.cycle import LOST_AGE_NS, LOST_CYCLES
-from dxlrun.channels.events import EventCode, Severity
+from dxlrun.channels.events import EventBody
 from dxlrun.dynamixel.bus_part import BusContext, BusStage
+from dxlrun.features.devices import texts
 from dxlrun.features.devices.checks import inspect_device, survey_devices
 from dxlrun.features.devices.plan import DeviceCommand, decode_devices
 from dxlwire.bus_plan import DevicePlan
@@ -94,6 +95,7 @@ class Devices:
         """Do nothing: a device returns independently of the servos."""
 
     def _miss(self, index: int, now_ns: int) -> None:
+        label = self._label(index)
         garbled = any(self._reads.garbled[member] for member in self._members[index])
         servos = len(self._plan.servos)
         newest_ns = min(int(self._samples.blocks_at_ns[member - servos]) for member in self._members[index])
@@ -101,16 +103,13 @@ class Devices:
         if self._flaps[index] == MOST_BROKEN:
             for member in self._members[index]:
                 self._reads.apart[member] = True
-            text = "answers alone but not together with others, and is read by itself from now on"
-            self._report(EventCode.SETUP, Severity.WARNING, index, text)
+            self._report(index, texts.device_read_apart(label))
         loss = _Loss(now_ns, now_ns)
         if not self._flaps[index]:
-            how = "sent a garbled reply" if garbled else "did not answer"
-            self._report(EventCode.READ_LOST, Severity.WARNING, index, how)
+            self._report(index, texts.reply_garbled(label) if garbled else texts.reply_missed(label))
         elif self._flaps[index] >= 2 * MOST_BROKEN:
             loss.reported, loss.probe_at_ns = True, now_ns + PROBE_NS
-            text = "answers between the cycles, but not in them; it is asked once a second"
-            self._report(EventCode.DEVICE_LOST, Severity.ERROR, index, text)
+            self._report(index, texts.device_silent_in_cycles(label))
         self._leave(index, loss)
 
     def _leave(self, index: int, loss: _Loss) -> None:
@@ -121,9 +120,8 @@ class Devices:
     def _report_error(self, index: int, error: int) -> None:
         if error != self._errors[index]:
             self._errors[index] = error
-            severity = Severity.WARNING if error else Severity.INFO
-            text = f"reports {self._dialect.describe_error(error)}"
-            self._report(EventCode.SERVO_ERROR, severity, index, text)
+            text = texts.error_byte_set if error else texts.error_byte_cleared
+            self._report(index, text(self._label(index), self._dialect.describe_error(error)))
 
     # Idle time
 
@@ -135,7 +133,7 @@ class Devices:
                 self._command(index, now_ns)
             elif not loss.probing and loss.probe_at_ns <= now_ns:
                 loss.probing = True
-                name = f"the return of {self._plan.label(self._plan.devices[index])}"
+                name = f"the return of {self._label(index)}"
                 self._idle.add(self._probe(index, loss), Urgency.REPAIR, name)
 
     def _probe(self, index: int, loss: _Loss) -> Program[None]:
@@ -172,11 +170,10 @@ class Devices:
             loss.probe_at_ns += PROBE_NS
             if problem not in {loss.problem, "does not answer"}:
                 loss.problem = problem
-                self._report(EventCode.DEVICE_LOST, Severity.ERROR, index, problem)
+                self._report(index, texts.device_unfit(self._label(index), problem))
         elif loss.missed >= LOST_CYCLES and now_ns - loss.since_ns >= LOST_AGE_NS:
             loss.reported = True
-            text = f"missed {loss.missed} replies in a row; it is asked once a second until it is back"
-            self._report(EventCode.DEVICE_LOST, Severity.ERROR, index, text)
+            self._report(index, texts.device_lost(self._label(index), loss.missed))
 
     def _take_back(self, index: int, loss: _Loss) -> None:
         self._losses[index] = None
@@ -186,10 +183,9 @@ class Devices:
         for _, written in self._written[index]:
             written.data = b""  # the device may have rebooted
         if loss.reported:
-            self._report(EventCode.DEVICE_BACK, Severity.INFO, index, "is in order and is read again")
+            self._report(index, texts.device_back(self._label(index)))
         elif not self._flaps[index]:
-            lost = "1 reply was" if loss.missed == 1 else f"{loss.missed} replies in a row were"
-            self._report(EventCode.READ_BACK, Severity.INFO, index, f"answers again; {lost} lost")
+            self._report(index, texts.device_answers_again(self._label(index), loss.missed))
 
     # Commands
 
@@ -211,7 +207,7 @@ class Devices:
             data = command.data(value)
             if data != written.data or now_ns - written.at_ns >= REPEAT_NS:
                 written.writing = True
-                name = f"{command.name} of {self._plan.label(self._plan.devices[index])}"
+                name = f"{command.name} of {self._label(index)}"
                 urgency = Urgency.SLOW if data == written.data else Urgency.STEERED
                 self._idle.add(self._write(index, command, written, data), urgency, name)
 
@@ -221,17 +217,18 @@ class Devices:
         written.writing = False
         refused = reply.outcome is Outcome.REFUSED
         if refused and not written.refused:
-            text = f"refuses {command.item} = {int.from_bytes(data, 'little')}: "
-            text += self._dialect.describe_error(reply.error)
-            self._report(EventCode.SERVO_ERROR, Severity.WARNING, index, text)
+            value, errors = int.from_bytes(data, "little"), self._dialect.describe_error(reply.error)
+            self._report(index, texts.command_refused(self._label(index), command.item, value, errors))
         written.refused = refused
         # Record a refused value as written, so that it is not tried again before it is due.
         written.data = data if reply.answered or refused else b""
         written.at_ns = self._idle.now_ns()
 
-    def _report(self, code: EventCode, severity: Severity, index: int, text: str) -> None:
-        device = self._plan.devices[index]
-        self._events.emit(code, severity, device.name, f"{self._plan.label(device)} {text}")
+    def _label(self, index: int) -> str:
+        return self._plan.label(self._plan.devices[index])
+
+    def _report(self, index: int, event: EventBody) -> None:
+        self._events.emit(self._plan.devices[index].name, event)
 
 
 def attach_devices(context: BusContext) -> Devices | None:

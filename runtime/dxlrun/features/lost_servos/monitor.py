@@ -7,9 +7,9 @@ from typing import Self
 import numpy as np
 
 from dxlrun.channels.cycle import LOST_AGE_NS, LOST_CYCLES, CycleRecord, States, Torque
-from dxlrun.channels.events import Severity
 from dxlrun.control.monitors.monitor import MonitorStage
 from dxlrun.control.monitors.policy_actions import PolicyActions
+from dxlrun.features.lost_servos import texts
 from dxlrun.plan.loop_plan import LoopPlan
 from dxlrun.plan.policy_plan import GroupPolicy, PolicyPlan
 
@@ -42,8 +42,7 @@ class LostServos:
         ending, limp = self._judge(actions.policies)
         for group in limp:
             actions.make_limp(group.rows)
-            text = f"group {group.name} lost a servo: it is limp until a client requests torque"
-            actions.report(Severity.ERROR, text)
+            actions.report(texts.group_is_limp(group.name))
         for policy, ending_rows in ending.items():
             names = ", ".join(self._joints[row] for row in ending_rows)
             actions.end_run(policy, f"{names} missed at least {LOST_CYCLES} replies in a row")

@@ -10,9 +10,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from dxlrun.channels.cycle import LIMP, Torque
-from dxlrun.channels.events import EventCode, EventSink, Severity
+from dxlrun.channels.events import EventSink
 from dxlrun.contract.hardware import Hardware
 from dxlrun.dynamixel.hardware_layer import HardwareLayer
+from dxlrun.features.mechanics import texts
 from dxlrun.features.mechanics.joint_arrays import JointArrays
 from dxlrun.plan.loop_plan import LimitedInterface, LoopPlan, ServoLimit
 from dxlrun.plan.mechanics_plan import CouplingPlan, MechanicsPlan
@@ -87,8 +88,7 @@ class ServosTogether:
     def report_no_torque(self, index: int, problem: str) -> None:
         """Report that the servos of a coupling get no torque."""
         name = self._plan.couplings[index].name
-        text = f"{name} gets no torque: {problem}"
-        self._events.emit(EventCode.TORQUE_ON, Severity.WARNING, name, text)
+        self._events.emit(name, texts.torque_refused(name, problem))
 
     def unfit(self, index: int) -> list[str]:
         """Return reasons why the servos of one coupling must not get torque at their last positions."""
@@ -121,13 +121,13 @@ class ServosTogether:
             spread, apart = self._spread(index, coupling), self._apart[index]
             if not apart and spread > coupling.tolerance:
                 self._apart[index] = True
-                text = f"{self._disagreement(index, coupling)}: is a gear or a horn slipping?"
-                self._events.emit(EventCode.SERVOS_DISAGREE, Severity.WARNING, coupling.name, text)
+                event = texts.servos_disagree(self._disagreement(index, coupling))
+                self._events.emit(coupling.name, event)
             elif apart and spread < AGREES * coupling.tolerance:
                 self._apart[index] = False
                 first = self._servos[coupling.servos[0]]
-                text = f"the servos of {coupling.name} agree again, within {first.position_text(spread)}"
-                self._events.emit(EventCode.SERVOS_DISAGREE, Severity.INFO, coupling.name, text)
+                event = texts.servos_agree_again(coupling.name, first.position_text(spread))
+                self._events.emit(coupling.name, event)
 
     def partners(self) -> list[tuple[int, tuple[int, ...], tuple[int, ...]]]:
         """Return couplings with both limp servos and servos with torque: index, and rows of both kinds."""
@@ -142,11 +142,9 @@ class ServosTogether:
 
     def report_torque_off(self, index: int, limp: Sequence[int], pulling: Sequence[int]) -> None:
         """Report that servos lose their torque because other servos of their joint have none."""
-        names = " and ".join(self._labels[row] for row in limp)
-        others = " and ".join(self._labels[row] for row in pulling)
-        name = self._plan.couplings[index].name
-        text = f"{name}: {names} is limp, so {others} loses its torque: they move one mechanism"
-        self._events.emit(EventCode.TORQUE_OFF, Severity.WARNING, name, text)
+        name, labels = self._plan.couplings[index].name, self._labels
+        event = texts.partners_released(name, [labels[row] for row in limp], [labels[row] for row in pulling])
+        self._events.emit(name, event)
 
     def _spread(self, index: int, coupling: CouplingPlan) -> float:
         """Return the disagreement of servos, rad or m: the difference for two servos on one joint."""

@@ -7,9 +7,10 @@ import math
 import numpy as np
 
 from dxlrun.channels.cycle import CycleRecord
-from dxlrun.channels.events import EventCode, EventSink, Severity
+from dxlrun.channels.events import EventSink
 from dxlrun.channels.slot import Floats, SlotReader, SlotState
 from dxlrun.control.source_process import ReaderContext, ReaderStage
+from dxlrun.features.sensors import texts
 from dxlrun.features.sensors.plan import SensorPlan, decode_sensors
 
 _GONE = (SlotState.FAILED, SlotState.ENDED)
@@ -123,27 +124,22 @@ class _Row:
         np.copyto(self._values, sample)
 
     def _say(self, text: str) -> None:
-        severity = Severity.ERROR if self._reader.state in _GONE else Severity.INFO
-        self._events.emit(EventCode.SENSOR, severity, self._plan.name, f"sensor {self._plan.name}: {text}")
+        row = texts.sensor_failed if self._reader.state in _GONE else texts.sensor_says
+        self._events.emit(self._plan.name, row(self._plan.name, text))
 
     def _report(self, silent: bool, age_ns: int) -> None:
         name = self._plan.name
         if not self._lost:
-            text = f"sensor {name} brings samples again"
-            self._events.emit(EventCode.SENSOR_BACK, Severity.INFO, name, text)
+            self._events.emit(name, texts.sensor_back(name))
             return
         if not self._finite:
             values = zip(self._plan.states, self._reader.sample.tolist(), strict=True)
             wrong = ", ".join(f"{state} is {value}" for state, value in values if not math.isfinite(value))
-            text = f"sensor {name}: {wrong}; its values are not used"
+            event = texts.sensor_not_finite(name, wrong)
         elif silent and self._stuck:
-            text = (
-                f"sensor {name} has returned the same sample for {age_ns / 1e6:.0f} ms; "
-                "check its cable and its driver"
-            )
+            event = texts.sensor_stuck(name, age_ns)
         elif silent:
-            since = f"for {age_ns / 1e6:.0f} ms" if age_ns >= 0 else "since the start"
-            text = f"sensor {name} brought no sample {since}"
+            event = texts.sensor_silent(name, age_ns) if age_ns >= 0 else texts.sensor_never_answered(name)
         else:
-            text = f"sensor {name} is gone; its values are not valid"
-        self._events.emit(EventCode.SENSOR_LOST, Severity.ERROR, name, text)
+            event = texts.sensor_gone(name)
+        self._events.emit(name, event)

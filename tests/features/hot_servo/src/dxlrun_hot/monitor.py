@@ -7,11 +7,16 @@ from typing import Self
 import msgspec
 import numpy as np
 
-from dxlrun.tooling.features import MonitorStage, PolicyActions
+from dxlrun.tooling.features import MonitorStage, PolicyActions, event_text
 from dxlrun.tooling.plans import LoopPlan
-from dxlrun.tooling.records import CycleRecord, Severity
+from dxlrun.tooling.records import CycleRecord, EventCode, Severity
 
 NAME = "on_hot_servo"
+
+
+@event_text(EventCode.POLICY, Severity.WARNING)
+def servo_is_hot(policy: str) -> str:
+    return f"is hot; on_hot_servo: {policy}"
 
 
 class HotServos:
@@ -32,9 +37,7 @@ class HotServos:
         if hot == self._hot:
             return
         for row in sorted(hot - self._hot):
-            self._actions.report(
-                Severity.WARNING, f"is hot; on_hot_servo: {self._do[row]}", source=self._joints[row]
-            )
+            self._actions.report(servo_is_hot(self._do[row]), source=self._joints[row])
             if self._do[row] == "stop":
                 self._actions.end_run("on_fault", f"{self._joints[row]} is hot")
             if self._do[row] == "limp":

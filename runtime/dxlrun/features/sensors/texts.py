@@ -1,0 +1,48 @@
+"""Texts of sensors: their events."""
+
+from __future__ import annotations
+
+from dxlrun.channels.events import EventCode, Severity, event_text
+
+
+@event_text(EventCode.SENSOR, Severity.INFO)
+def sensor_says(sensor: str, text: str) -> str:
+    return f"sensor {sensor}: {text}"
+
+
+@event_text(EventCode.SENSOR, Severity.ERROR)
+def sensor_failed(sensor: str, error: str) -> str:
+    return f"sensor {sensor}: {error}"
+
+
+@event_text(EventCode.SENSOR_LOST, Severity.ERROR)
+def sensor_not_finite(sensor: str, values: str) -> str:
+    return f"sensor {sensor}: {values}; its values are not used"
+
+
+@event_text(EventCode.SENSOR_LOST, Severity.ERROR)
+def sensor_stuck(sensor: str, lasted_ns: int) -> str:
+    return (
+        f"sensor {sensor} has returned the same sample for {lasted_ns / 1e6:.0f} ms; "
+        "check its cable and its driver"
+    )
+
+
+@event_text(EventCode.SENSOR_LOST, Severity.ERROR)
+def sensor_silent(sensor: str, age_ns: int) -> str:
+    return f"sensor {sensor} brought no sample for {age_ns / 1e6:.0f} ms"
+
+
+@event_text(EventCode.SENSOR_LOST, Severity.ERROR)
+def sensor_never_answered(sensor: str) -> str:
+    return f"sensor {sensor} brought no sample since the start"
+
+
+@event_text(EventCode.SENSOR_LOST, Severity.ERROR)
+def sensor_gone(sensor: str) -> str:
+    return f"sensor {sensor} is gone; its values are not valid"
+
+
+@event_text(EventCode.SENSOR_BACK, Severity.INFO)
+def sensor_back(sensor: str) -> str:
+    return f"sensor {sensor} brings samples again"
