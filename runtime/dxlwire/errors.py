@@ -13,12 +13,12 @@ from __future__ import annotations
 
 import re
 from collections.abc import Iterable, Sequence
-from dataclasses import dataclass
 from typing import Literal
 
+import msgspec
 
-@dataclass(frozen=True, slots=True, order=True)
-class Mark:
+
+class Mark(msgspec.Struct, frozen=True, order=True):
     """Position in a file, in the form that editors can jump to; line and column count from 1."""
 
     file: str
@@ -29,8 +29,7 @@ class Mark:
         return f"{self.file}:{self.line}:{self.column}"
 
 
-@dataclass(frozen=True, slots=True)
-class Problem:
+class Problem(msgspec.Struct, frozen=True):
     """One problem of an input, with its position and fix."""
 
     mark: Mark

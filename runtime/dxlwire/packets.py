@@ -3,8 +3,9 @@
 from __future__ import annotations
 
 import struct
-from dataclasses import dataclass
 from enum import IntEnum, unique
+
+import msgspec
 
 Bytes = bytes | bytearray | memoryview
 
@@ -30,8 +31,7 @@ class PacketKind(IntEnum):
     """An instruction of this host, echoed by the adapter."""
 
 
-@dataclass(frozen=True, slots=True)
-class Desk:
+class Desk(msgspec.Struct, frozen=True):
     """Memory of a log batch that is not committed yet."""
 
     records: memoryview

@@ -7,6 +7,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from msgspec import structs
 
 from dxlrun.channels.packets import LoggedPacket
 from dxlrun.log.columns import PacketColumns
@@ -158,7 +159,7 @@ def test_a_reply_that_was_given_up_is_late_if_it_took_longer_than_others(took: i
             given_up = servo == 2 and cycle % 10 == 0
             line.exchange(cycle, ask(servo), [servo], [took if given_up else DELAY])
             if given_up:
-                line.packets[-1] = replace(line.packets[-1], kind=PacketKind.LATE)
+                line.packets[-1] = structs.replace(line.packets[-1], kind=PacketKind.LATE)
     assert [one.code for one in findings(line)] == named
 
 

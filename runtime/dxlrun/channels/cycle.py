@@ -14,6 +14,7 @@ from dataclasses import dataclass, field
 from enum import IntEnum, IntFlag, unique
 from typing import Any, ClassVar, Self
 
+import msgspec
 import numpy as np
 from numpy.lib.stride_tricks import as_strided
 from numpy.typing import NDArray
@@ -181,8 +182,7 @@ class States:
         )
 
 
-@dataclass(frozen=True, slots=True)
-class SourceStates:
+class SourceStates(msgspec.Struct, frozen=True):
     """States of sources other than joints: devices on a bus, sensors, and controllers that provide states."""
 
     values: Floats

@@ -7,7 +7,7 @@ line of JSON that describes the file, the controller's bytes, and the CRC-32 of 
 from __future__ import annotations
 
 from collections.abc import Iterator, Mapping
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from typing import Annotated
 from zlib import crc32
 
@@ -53,25 +53,23 @@ class _FirstLine(msgspec.Struct, frozen=True):
     made_with: Facts
 
 
-@dataclass(frozen=True, slots=True)
-class KeptFile:
+class KeptFile(msgspec.Struct, frozen=True):
     """File of a controller, read at the start of a run."""
 
     place: str
     """Path of the file."""
     state: bytes = b""
-    made_with: Facts = field(default_factory=dict)
+    made_with: Facts = msgspec.field(default_factory=dict)
     problem: str = ""
     """Reason why the file cannot be used; empty: it can."""
 
 
-@dataclass(frozen=True, slots=True)
-class KeptStates:
+class KeptStates(msgspec.Struct, frozen=True):
     """Kept states for the controllers of a run; passed to the loop and logged as JSON."""
 
-    files: dict[str, KeptFile] = field(default_factory=dict)
+    files: dict[str, KeptFile] = msgspec.field(default_factory=dict)
     """Files by controller."""
-    servos: dict[str, Facts] = field(default_factory=dict)
+    servos: dict[str, Facts] = msgspec.field(default_factory=dict)
     """Facts about the servo of each joint. A state does not fit after the servo was replaced."""
 
 

@@ -4,7 +4,8 @@ from __future__ import annotations
 
 import struct
 from collections.abc import Callable
-from dataclasses import dataclass
+
+import msgspec
 
 from dxlrun.channels.ring import RING_SECONDS, Appender, Payload, RecordKind, RingWriter, record_size
 from dxlwire.packets import RECORD, RECORD_HEADER, Desk, PacketKind, PacketLog
@@ -30,8 +31,7 @@ BEFORE_FIRST_CYCLE = -1
 _KINDS = frozenset(int(kind) for kind in PacketKind)
 
 
-@dataclass(frozen=True, slots=True)
-class LoggedPacket:
+class LoggedPacket(msgspec.Struct, frozen=True):
     """A packet or a sequence of noise bytes on a bus.
 
     Times of an instruction packet: before and after the write() that sent it. Times of a status packet: after

@@ -7,7 +7,6 @@ from __future__ import annotations
 
 import re
 from collections.abc import Callable, Iterator, Mapping, Sequence
-from dataclasses import dataclass
 from typing import ClassVar, Protocol
 
 import msgspec
@@ -82,8 +81,7 @@ class SampledSource(Protocol):
         """Close the device."""
 
 
-@dataclass(frozen=True, slots=True)
-class SourceContext:
+class SourceContext(msgspec.Struct, frozen=True):
     """Objects that a source gets from its process."""
 
     plugins: PlugIns
@@ -94,8 +92,7 @@ class SourceContext:
     """The simulated body; None without `SourceProcess.has_body`."""
 
 
-@dataclass(frozen=True)
-class ProcessStage:
+class ProcessStage(msgspec.Struct, frozen=True):
     """`STAGE` of `process.py`: processes of a feature. On virtual time, they run in the loop's process."""
 
     FILE: ClassVar[str] = "process"
@@ -108,8 +105,7 @@ class ProcessStage:
     """Returns the reason why a run with `Contribution.plan` cannot use virtual time; empty if it can."""
 
 
-@dataclass(frozen=True, slots=True)
-class PlannedProcess:
+class PlannedProcess(msgspec.Struct, frozen=True):
     """A process of a run, with its index among the processes of its feature."""
 
     feature: Feature
@@ -132,8 +128,7 @@ class SourceReader(Protocol):
         """Update the rows of its sources. Called in each cycle after the servos were read. Never waits."""
 
 
-@dataclass(frozen=True, slots=True)
-class ReaderContext:
+class ReaderContext(msgspec.Struct, frozen=True):
     """Objects that a reader gets in the loop's process."""
 
     plan: bytes
@@ -146,8 +141,7 @@ class ReaderContext:
     events: EventSink
 
 
-@dataclass(frozen=True)
-class ReaderStage:
+class ReaderStage(msgspec.Struct, frozen=True):
     """`STAGE` of `reader.py`: reads the samples of a feature in the loop. A replay has no readers."""
 
     FILE: ClassVar[str] = "reader"

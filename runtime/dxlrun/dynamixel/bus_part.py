@@ -3,8 +3,9 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Iterable, Mapping, Sequence
-from dataclasses import dataclass
 from typing import TYPE_CHECKING, ClassVar, Protocol
+
+import msgspec
 
 from dxlrun.dynamixel.findings import Findings
 from dxlrun.features import stages
@@ -21,8 +22,7 @@ if TYPE_CHECKING:  # the guardian makes the robot safe without numpy
     from dxlwire.exchange.samples import BusSamples
 
 
-@dataclass(frozen=True, slots=True)
-class BusContext:
+class BusContext(msgspec.Struct, frozen=True):
     """One bus with the objects that a feature's part uses on it.
 
     A part reads and writes with programs: generators that yield transactions of `plan_line(idle.plan)` and
@@ -45,8 +45,7 @@ class BusContext:
     """Sink of events for the log."""
 
 
-@dataclass(frozen=True, slots=True)
-class FeatureParts:
+class FeatureParts(msgspec.Struct, frozen=True):
     """Features of a robot and the commands that they execute on its buses."""
 
     features: Sequence[Feature]
@@ -117,8 +116,7 @@ def inspect_nothing(plan: BusPlan, found: Findings) -> Program[None]:
     yield from ()
 
 
-@dataclass(frozen=True)
-class BusStage:
+class BusStage(msgspec.Struct, frozen=True):
     """`STAGE` of `runtime.py`: creates the part of a feature in the loop's process."""
 
     FILE: ClassVar[str] = "runtime"
@@ -130,8 +128,7 @@ class BusStage:
     it adds to `Findings.problems` refuses the start. It does not receive `Contribution.plan`."""
 
 
-@dataclass(frozen=True)
-class SafeStage:
+class SafeStage(msgspec.Struct, frozen=True):
     """`STAGE` of `safe.py`: makes the outputs of a feature safe at the end of a run.
 
     Called at every end of a run: after torque off, or after the joints were stopped if torque stays on. The
@@ -147,8 +144,7 @@ class SafeStage:
     """
 
 
-@dataclass(frozen=True, slots=True)
-class SafeEnd:
+class SafeEnd(msgspec.Struct, frozen=True):
     """The stages that make a robot safe, each with its feature and that feature's plan."""
 
     stages: tuple[tuple[Feature, SafeStage, bytes], ...]

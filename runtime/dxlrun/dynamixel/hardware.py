@@ -5,8 +5,8 @@ from __future__ import annotations
 from array import array
 from collections.abc import Callable, Mapping, Sequence, Set
 from contextlib import suppress
-from dataclasses import dataclass, field
 
+import msgspec
 import numpy as np
 from numpy.typing import NDArray
 
@@ -47,13 +47,12 @@ IDLE_MARGIN_NS = 150_000
 """Time that stays free before the deadline: a stock kernel wakes about 50-100 us late."""
 
 
-@dataclass(frozen=True, slots=True)
-class ServoArrays:
+class ServoArrays(msgspec.Struct, frozen=True):
     """States and goals of the servos: the cycle's record, or the arrays below a hardware layer."""
 
     states: States
     goals: Commands
-    sources: SourceStates = field(default_factory=SourceStates.empty)
+    sources: SourceStates = msgspec.field(default_factory=SourceStates.empty)
     """States of the devices."""
 
 

@@ -7,9 +7,9 @@ in the other direction if it changes them. Without layers the servos' hardware u
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass
 from typing import ClassVar
 
+import msgspec
 import numpy as np
 from numpy.typing import NDArray
 
@@ -89,8 +89,7 @@ class HardwareLayer:
         self._hardware.release()
 
 
-@dataclass(frozen=True)
-class PreparedLayer:
+class PreparedLayer(msgspec.Struct, frozen=True):
     """A layer of this robot, before the hardware below it is built."""
 
     states: States
@@ -103,8 +102,7 @@ class PreparedLayer:
     """Returns reasons to refuse the start at the present positions, one sentence each; None: no check."""
 
 
-@dataclass(frozen=True)
-class LayerStage:
+class LayerStage(msgspec.Struct, frozen=True):
     """`STAGE` of `layer.py`: called when a robot is assembled, before the hardware of its servos is built.
 
     The stages are called in the order of their features: the first is next to the loop, the last next to the

@@ -15,7 +15,6 @@ import dataclasses
 import re
 import struct
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass
 from operator import attrgetter
 from typing import Annotated, TypeAlias, cast, get_args, get_origin, get_type_hints
 
@@ -78,8 +77,7 @@ class Length(msgspec.Struct, frozen=True):
     length: int
 
 
-@dataclass(frozen=True, slots=True)
-class DeclaredMessage:
+class DeclaredMessage(msgspec.Struct, frozen=True):
     """Message type declared by a dataclass: definition, and conversion of its objects to bytes."""
 
     cls: type

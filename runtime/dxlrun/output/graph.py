@@ -3,9 +3,10 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
 from itertools import pairwise
 from typing import Literal
+
+import msgspec
 
 _SWEEPS = 6
 """Number of passes that improve the order in the layers, alternately from the left and from the right."""
@@ -13,8 +14,7 @@ _LISTED = 40
 """Characters per line of names."""
 
 
-@dataclass(frozen=True, slots=True)
-class Node:
+class Node(msgspec.Struct, frozen=True):
     """A box: a source of values, a controller, or joints that controllers move."""
 
     name: str
@@ -29,16 +29,14 @@ class Node:
     active: bool = True
 
 
-@dataclass(frozen=True, slots=True)
-class Edge:
+class Edge(msgspec.Struct, frozen=True):
     """An arrow from one node to another one."""
 
     source: str
     target: str
 
 
-@dataclass(frozen=True, slots=True)
-class Graph:
+class Graph(msgspec.Struct, frozen=True):
     """Nodes and edges without cycles."""
 
     title: str
@@ -46,8 +44,7 @@ class Graph:
     edges: tuple[Edge, ...]
 
 
-@dataclass(frozen=True, slots=True)
-class Placed:
+class Placed(msgspec.Struct, frozen=True):
     """A graph in layers. An edge that crosses a layer occupies a place there, without a node."""
 
     layers: tuple[tuple[str, ...], ...]

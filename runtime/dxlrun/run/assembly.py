@@ -6,6 +6,8 @@ from collections.abc import Callable
 from dataclasses import dataclass, field
 from functools import partial
 
+import msgspec
+
 from dxlrun.channels.commands import CommandSink, Inbox, NoInbox
 from dxlrun.channels.cycle import CycleRecord
 from dxlrun.channels.events import EventSink
@@ -110,18 +112,17 @@ class AssembledRobot:
         return result
 
 
-@dataclass(frozen=True, slots=True, kw_only=True)
-class LoopHost:
+class LoopHost(msgspec.Struct, frozen=True, kw_only=True):
     """Environment of a loop: lines, time, log, clients, and the processes that watch the loop."""
 
     ports: Ports
     clock: Clock
     sinks: Sinks
-    supervision: Supervision = field(default_factory=Unsupervised)
-    inbox: Inbox = field(default_factory=NoInbox)
-    activity: Activity = field(default_factory=Activity)
+    supervision: Supervision = msgspec.field(default_factory=Unsupervised)
+    inbox: Inbox = msgspec.field(default_factory=NoInbox)
+    activity: Activity = msgspec.field(default_factory=Activity)
     """Record of the controller whose code is running."""
-    slots: Slots = field(default_factory=dict)
+    slots: Slots = msgspec.field(default_factory=dict)
     """Shared memory that processes of features write."""
 
 

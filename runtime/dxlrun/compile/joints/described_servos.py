@@ -7,7 +7,6 @@ The servos of a file also decide which features it uses, because a feature's key
 from __future__ import annotations
 
 from collections.abc import Callable, Iterable, Iterator, Mapping
-from dataclasses import dataclass
 from typing import ClassVar
 
 import msgspec
@@ -56,8 +55,7 @@ class DescribedServo(msgspec.Struct, frozen=True):
         )
 
 
-@dataclass(frozen=True)
-class ServoStage:
+class ServoStage(msgspec.Struct, frozen=True):
     """`STAGE` of `servos.py`: called for the servos in a feature's section, before their models are known."""
 
     FILE: ClassVar[str] = "servos"

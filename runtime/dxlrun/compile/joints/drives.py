@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping
-from dataclasses import dataclass
 from typing import ClassVar
 
 import msgspec
@@ -42,8 +41,7 @@ class JointDrive(msgspec.Struct, frozen=True):
         return self.servos[0].described.name in self.together
 
 
-@dataclass(frozen=True)
-class DriveStage:
+class DriveStage(msgspec.Struct, frozen=True):
     """`STAGE` of `drives.py`: called when the models of all servos are known, before joints are compiled.
 
     Receives the servos by name and returns the drive of each joint that they move. A joint without a drive

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Iterable, Mapping
-from dataclasses import dataclass
 from functools import partial
 from typing import ClassVar, Protocol
 
@@ -89,8 +88,7 @@ class CompiledServo(msgspec.Struct, frozen=True):
         )
 
 
-@dataclass(frozen=True)
-class SettingsStage:
+class SettingsStage(msgspec.Struct, frozen=True):
     """`STAGE` of `settings.py`: items of a control table that are written before their servo gets torque.
 
     They are part of the servo's plan. Start-up writes those that differ, and so does the recovery of the

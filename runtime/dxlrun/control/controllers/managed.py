@@ -13,12 +13,12 @@ causes the transitions.
 from __future__ import annotations
 
 from collections.abc import Callable, Collection, Mapping, Sequence
-from dataclasses import dataclass
 from enum import Enum, unique
 from functools import partial
 from types import MappingProxyType
 from typing import Any, NamedTuple
 
+import msgspec
 import numpy as np
 from msgspec.structs import replace
 from numpy.typing import NDArray
@@ -87,8 +87,7 @@ class Request(NamedTuple):
     why: str
 
 
-@dataclass(frozen=True, slots=True, kw_only=True)
-class ControllersContext:
+class ControllersContext(msgspec.Struct, frozen=True, kw_only=True):
     """Objects that the controllers of one run share, including controllers that are loaded later."""
 
     run: ControlContext

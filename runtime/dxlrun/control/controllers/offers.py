@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import inspect
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass
 from typing import Any, ClassVar, TypeAlias
 
 import msgspec
@@ -26,8 +25,7 @@ class DriverOffer(msgspec.Struct, frozen=True):
     """Its publisher: `name version`."""
 
 
-@dataclass(frozen=True)
-class OfferStage:
+class OfferStage(msgspec.Struct, frozen=True):
     """`STAGE` of `offer.py`: classes that plug-ins offer for the entries of the feature's section."""
 
     FILE: ClassVar[str] = "offer"

@@ -2,8 +2,9 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
 from typing import ClassVar, Protocol, Self
+
+import msgspec
 
 from dxlrun.channels.cycle import CycleRecord
 from dxlrun.control.monitors.policy_actions import PolicyActions
@@ -29,8 +30,7 @@ class Monitor(Protocol):
         """
 
 
-@dataclass(frozen=True)
-class MonitorStage:
+class MonitorStage(msgspec.Struct, frozen=True):
     """`STAGE` of `monitor.py`, used when a loop is built."""
 
     FILE: ClassVar[str] = "monitor"

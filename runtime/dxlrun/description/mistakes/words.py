@@ -9,11 +9,11 @@ import json
 import re
 import tomllib
 from collections.abc import Callable, Collection, Iterator, Mapping
-from dataclasses import dataclass
 from functools import cache
 from pathlib import Path
 from typing import NamedTuple
 
+import msgspec
 from pydantic import BaseModel
 
 from dxlrun.description.form import folded
@@ -65,8 +65,7 @@ class _Meaning(NamedTuple):
     kind: str
 
 
-@dataclass(frozen=True, slots=True)
-class Context:
+class Context(msgspec.Struct, frozen=True):
     """The form with the unknown keys, and its surroundings in the file."""
 
     root: type[BaseModel]
