@@ -21,7 +21,7 @@ from tests.kit.examples import as_parameters
 
 from dxlrun.channels.answers import Done
 from dxlrun.channels.commands import Command
-from dxlrun.channels.events import EventCode
+from dxlrun.channels.events import event_names
 from dxlrun.cli import verbs
 from dxlrun.cli.examples import schema_text
 from dxlrun.cli.sim import sim
@@ -444,7 +444,7 @@ def test_architecture_md_its_key_becomes_these_bytes() -> None:
 
 
 def test_failures_md_names_events_and_keys_that_exist() -> None:
-    events = {code.name.lower() for code in EventCode}
+    events = {*event_names().values()}
     names = set(re.findall(r"`([a-z]+_[a-z_]+)`", PAGES["failures.md"]))
     assert {"servo_lost", "on_exit"} <= names
     schema = schema_text("robot")

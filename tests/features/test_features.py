@@ -13,6 +13,7 @@ import pytest
 from msgspec import to_builtins
 
 import dxlrun.features
+from dxlrun.channels.events import Event, EventCode, EventStage, event_names
 from dxlrun.compile.contribution import CompileStage
 from dxlrun.compile.robot import compile_files
 from dxlrun.description.form import Form, with_keys
@@ -185,3 +186,11 @@ def test_all_names_of_the_core_are_reserved() -> None:
     report = to_builtins(compile_files(ROBOT, {}, []).report)
     assert all(report.keys() - features <= {*names.split()} for names in RESERVED.values())
     assert report["joints"][0].keys() <= {*RESERVED[JointKey].split()}
+
+
+def test_kinds_of_events_have_numbers_of_their_own() -> None:
+    kinds = [EventCode, *(stage.codes for _, stage in stages(EventStage, FEATURES))]
+    numbers = [code.value for kind in kinds for code in kind]
+    assert len(kinds) > 1
+    assert sorted(numbers) == sorted(event_names())
+    assert (Event(0, 53, 40, "imu", "").name, Event(0, 999, 40, "", "").name) == ("sensor_lost", "code_999")

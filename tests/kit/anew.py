@@ -17,7 +17,7 @@ import numpy as np
 from msgspec import structs
 
 from dxlrun.channels.commands import CommandRing
-from dxlrun.channels.events import EventBody, EventCode, EventRing, Severity
+from dxlrun.channels.events import EventBody, EventRing, Severity
 from dxlrun.channels.messages import MessageRing, PublishedTopic
 from dxlrun.channels.ring import Handover, RecordKind
 from dxlrun.log.log_writer import LogWriter
@@ -49,9 +49,7 @@ def written_anew(path: Path, target: Path, *changes: Change, gaps: Sequence[tupl
         writer.take(RecordKind.CYCLE, log.cycles[row : row + 1].tobytes())
     for event in log.events:
         ring = EventRing(take, VirtualClock(event.t_ns))
-        ring.emit(
-            event.source, EventBody(EventCode(event.code), Severity(event.severity), event.text), event.data
-        )
+        ring.emit(event.source, EventBody(event.code, Severity(event.severity), event.text), event.data)
     published = MessageRing(take)
     for topic in log.topics.values():
         number = published.announce(PublishedTopic(topic.name, topic.type))

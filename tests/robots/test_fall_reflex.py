@@ -12,6 +12,7 @@ import numpy as np
 import pytest
 
 from dxlrun.channels.events import EventCode
+from dxlrun.features.sensors.events import SensorEvent
 from dxlrun.log.reader import Log, read_log
 from dxlrun.testing import VirtualRobot, simulated_robot
 from dxlrun_analysis.replay import replay_log
@@ -127,7 +128,7 @@ def test_a_stuck_imu_is_a_failed_sensor(tmp_path, monkeypatch, on_silence, stick
         [f"curl takes over from wave: {silence}"] if sticks and on_silence == "activate" else []
     )
     assert (f"{silence}: a fall would not be seen" in said) == (sticks and on_silence == "report")
-    lost = [event.text for event in log.events if event.code == EventCode.SENSOR_LOST]
+    lost = [event.text for event in log.events if event.code == SensorEvent.SENSOR_LOST]
     assert [text[:36] for text in lost] == ["sensor torso_imu has returned the sa"] * sticks
     # 0.2 s of equal samples; then the orientation becomes too old, and the reflex waits as long again
     acted = [event.t_ns * 1e-9 for event in log.events if event.code == EventCode.TAKEOVER]

@@ -25,13 +25,13 @@ import pytest
 
 from dxlrun.channels import slot
 from dxlrun.channels.cycle import CycleRecord
-from dxlrun.channels.events import EventCode
 from dxlrun.channels.process import RunMemory
 from dxlrun.channels.shared_memory import mapped
 from dxlrun.channels.slot import SlotReader, SlotState
 from dxlrun.control.controllers.plugins import load_plugins
 from dxlrun.control.source_process import PlannedProcess, ReaderContext, planned_processes
 from dxlrun.errors import PortError
+from dxlrun.features.sensors.events import SensorEvent
 from dxlrun.features.sensors.plan import decode_sensors
 from dxlrun.features.sensors.reader import Readings
 from dxlrun.features.sensors.sampling import SampledSensor, build_sensor
@@ -216,14 +216,14 @@ def test_a_sensor_that_dies_sends_nan_or_stops_costs_the_run_nothing_but_its_row
     ended = "sensor imu: its process ended (signal SIGKILL), another one is started"
     nan = "sensor imu: angular_velocity.z is nan; its values are not used"
     expected = [
-        (EventCode.SENSOR, ended),
-        (EventCode.SENSOR_LOST, "sensor imu is gone; its values are not valid"),
-        (EventCode.SENSOR_BACK, "sensor imu brings samples again"),
-        (EventCode.SENSOR_LOST, nan),
-        (EventCode.SENSOR_BACK, "sensor imu brings samples again"),
+        (SensorEvent.SENSOR, ended),
+        (SensorEvent.SENSOR_LOST, "sensor imu is gone; its values are not valid"),
+        (SensorEvent.SENSOR_BACK, "sensor imu brings samples again"),
+        (SensorEvent.SENSOR_LOST, nan),
+        (SensorEvent.SENSOR_BACK, "sensor imu brings samples again"),
     ]
     assert found[:-1] == expected
-    assert found[-1][0] == EventCode.SENSOR_LOST
+    assert found[-1][0] == SensorEvent.SENSOR_LOST
     assert found[-1][1].startswith("sensor imu brought no sample for 1")
     cycles = log.cycles
     valid = cycles["source_valid"][:, 0]

@@ -11,9 +11,10 @@ import pytest
 
 from dxlrun.channels import slot
 from dxlrun.channels.cycle import CycleRecord
-from dxlrun.channels.events import EventBody, EventCode, Severity
+from dxlrun.channels.events import EventBody, Severity
 from dxlrun.channels.slot import SlotState, SlotWriter
 from dxlrun.control.source_process import ReaderContext
+from dxlrun.features.sensors.events import SensorEvent
 from dxlrun.features.sensors.plan import SensorPlan, encode_sensors
 from dxlrun.features.sensors.reader import Readings
 from dxlrun.plan.loop_plan import LoopPlan, SchedulerPlan, SourcePlan
@@ -28,7 +29,7 @@ class Desk:
 
     now_ns: int = 1_000 * MS
     noisy: tuple[str, ...] = ()
-    events: list[tuple[EventCode, Severity, str, str]] = field(default_factory=list)
+    events: list[tuple[SensorEvent, Severity, str, str]] = field(default_factory=list)
 
     def __post_init__(self) -> None:
         sensors = tuple(
@@ -60,7 +61,7 @@ class Desk:
     def sample(self, x: float, y: float = 0.0, *, age_ms: int = 0) -> None:
         self.writer.write(self.now_ns - age_ms * MS, np.array((x, y)))
 
-    def told(self) -> list[tuple[EventCode, str]]:
+    def told(self) -> list[tuple[SensorEvent, str]]:
         found = [(code, text) for code, _, source, text in self.events if source == "imu"]
         self.events.clear()
         return found
@@ -78,12 +79,12 @@ def test_a_sample_is_valid_until_its_timeout_and_its_age_is_true(desk):
     assert desk.cycle() == ([1.0, 2.0], True, 43 * MS)
     assert desk.told() == []
     assert desk.cycle() == ([1.0, 2.0], False, 63 * MS)
-    assert desk.told() == [(EventCode.SENSOR_LOST, "sensor imu brought no sample for 63 ms")]
+    assert desk.told() == [(SensorEvent.SENSOR_LOST, "sensor imu brought no sample for 63 ms")]
     assert desk.cycle()[1:] == (False, 83 * MS)
     assert desk.told() == []
     desk.sample(3.0)
     assert desk.cycle(5) == ([3.0, 0.0], True, 5 * MS)
-    assert desk.told() == [(EventCode.SENSOR_BACK, "sensor imu brings samples again")]
+    assert desk.told() == [(SensorEvent.SENSOR_BACK, "sensor imu brings samples again")]
     assert math.isnan(desk.record.sources.values[0])
 
 
@@ -93,7 +94,7 @@ def test_before_the_first_sample_there_is_nothing_and_the_silence_is_an_event(de
     assert (valid, age_ns) == (False, -1)
     for _ in range(3):
         desk.cycle()
-    assert desk.told() == [(EventCode.SENSOR_LOST, "sensor imu brought no sample since the start")]
+    assert desk.told() == [(SensorEvent.SENSOR_LOST, "sensor imu brought no sample since the start")]
 
 
 def bring(desk: Desk, x: float, y: float, seconds: float) -> list[tuple[bool, int]]:
@@ -114,12 +115,12 @@ def test_a_sensor_whose_noise_does_not_show_is_stuck_until_it_changes():
     assert list(ages[1:]) == [(200 + 10 * more) * MS for more in range(2, 31)]
     ((code, text),) = desk.told()
     assert (code, text) == (
-        EventCode.SENSOR_LOST,
+        SensorEvent.SENSOR_LOST,
         "sensor imu has returned the same sample for 210 ms; check its cable and its driver",
     )
     desk.sample(1.0, 2.5)
     assert desk.cycle(10) == ([1.0, 2.5], True, 10 * MS)
-    assert [code for code, _ in desk.told()] == [EventCode.SENSOR_BACK]
+    assert [code for code, _ in desk.told()] == [SensorEvent.SENSOR_BACK]
 
 
 def test_a_sensor_is_not_stuck_while_one_noisy_value_changes_or_it_has_no_noise():
@@ -167,13 +168,13 @@ def test_a_sample_that_is_not_finite_is_an_event_and_never_in_the_record(desk, w
     desk.sample(2.0, wrong)
     assert desk.cycle(1) == ([1.0, 0.0], False, 2 * MS)
     what = f"sensor imu: angular_velocity.y is {wrong}; its values are not used"
-    assert desk.told() == [(EventCode.SENSOR_LOST, what)]
+    assert desk.told() == [(SensorEvent.SENSOR_LOST, what)]
     desk.sample(wrong)
     assert desk.cycle(1) == ([1.0, 0.0], False, 3 * MS)
     assert desk.told() == []
     desk.sample(4.0)
     assert desk.cycle(1) == ([4.0, 0.0], True, MS)
-    assert [code for code, _ in desk.told()] == [EventCode.SENSOR_BACK]
+    assert [code for code, _ in desk.told()] == [SensorEvent.SENSOR_BACK]
 
 
 def test_the_end_of_its_process_is_an_event_and_its_row_is_not_valid_at_once(desk):
@@ -181,19 +182,19 @@ def test_the_end_of_its_process_is_an_event_and_its_row_is_not_valid_at_once(des
     desk.cycle(1)
     desk.writer.say(SlotState.ENDED, "its process ended (signal SIGKILL), another one is started")
     assert desk.cycle(1)[1] is False
-    assert desk.events[0][:2] == (EventCode.SENSOR, Severity.ERROR)
-    assert [code for code, _ in desk.told()] == [EventCode.SENSOR, EventCode.SENSOR_LOST]
+    assert desk.events[0][:2] == (SensorEvent.SENSOR, Severity.ERROR)
+    assert [code for code, _ in desk.told()] == [SensorEvent.SENSOR, SensorEvent.SENSOR_LOST]
     desk.writer.say(SlotState.OPEN, "")
     desk.sample(2.0)
     assert desk.cycle(1)[1] is True
-    assert [code for code, _ in desk.told()] == [EventCode.SENSOR_BACK]
+    assert [code for code, _ in desk.told()] == [SensorEvent.SENSOR_BACK]
 
 
 def test_a_sentence_of_a_sensor_is_an_event_once(desk):
     desk.writer.say(SlotState.OPEN, "calibrated")
     desk.cycle(1)
     desk.cycle(1)
-    assert desk.told() == [(EventCode.SENSOR, "sensor imu: calibrated")]
+    assert desk.told() == [(SensorEvent.SENSOR, "sensor imu: calibrated")]
 
 
 def test_a_sensor_that_never_is_silent_fills_no_log(desk):
@@ -206,14 +207,14 @@ def test_a_sensor_that_never_is_silent_fills_no_log(desk):
     assert told[-1][1] == "sensor imu: sample 90"
     desk.writer.say(SlotState.FAILED, "gone")  # what matters is not kept back
     desk.cycle(1)
-    assert desk.told()[0] == (EventCode.SENSOR, "sensor imu: gone")
+    assert desk.told()[0] == (SensorEvent.SENSOR, "sensor imu: gone")
 
 
 def test_a_time_in_the_future_is_now_and_hides_no_silence(desk):
     desk.sample(1.0, age_ms=-5000)
     assert desk.cycle(0) == ([1.0, 0.0], True, 0)
     assert desk.cycle(60) == ([1.0, 0.0], False, 60 * MS)
-    assert desk.told() == [(EventCode.SENSOR_LOST, "sensor imu brought no sample for 60 ms")]
+    assert desk.told() == [(SensorEvent.SENSOR_LOST, "sensor imu brought no sample for 60 ms")]
 
 
 def test_reading_allocates_nothing_that_stays(desk):

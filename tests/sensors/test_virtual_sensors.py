@@ -10,8 +10,8 @@ import numpy as np
 import pytest
 
 from dxlrun.channels.commands import Command
-from dxlrun.channels.events import EventCode
 from dxlrun.errors import InputError
+from dxlrun.features.sensors.events import SensorEvent
 from dxlrun.log.reader import Log, read_log
 from dxlrun.run.virtual_run import VirtualRobot
 from dxlrun.testing import plan_of
@@ -70,7 +70,7 @@ def test_values_are_valid_in_every_cycle_and_their_age_is_that_of_the_last_sampl
     ages = log.cycles["source_age_ns"][:, 0]
     since = log.cycles["read_ns"] % 25_000_000
     assert ages.tolist() == since.tolist()
-    assert not [event for event in log.events if event.code in (EventCode.SENSOR, EventCode.SENSOR_LOST)]
+    assert not [event for event in log.events if event.code in (SensorEvent.SENSOR, SensorEvent.SENSOR_LOST)]
 
 
 def test_noise_has_the_density_that_was_asked_for_and_bias_stays(crane, tmp_path):

@@ -3,14 +3,17 @@
 from __future__ import annotations
 
 from collections import Counter
-from collections.abc import Callable, Container
+from collections.abc import Callable, Container, Mapping
+from dataclasses import dataclass
 from enum import IntEnum, unique
-from typing import Generic, NamedTuple, ParamSpec, Protocol
+from functools import cache
+from typing import ClassVar, Generic, NamedTuple, ParamSpec, Protocol
 
 import msgspec
 from msgspec import structs
 
 from dxlrun.channels.ring import RING_SECONDS, Appender, RecordKind, record_size
+from dxlrun.features import FEATURES, stages
 from dxlwire.clock import Clock
 
 
@@ -26,7 +29,10 @@ class Severity(IntEnum):
 
 @unique
 class EventCode(IntEnum):
-    """Kind of an event. The log has the number, which is never used again for another kind."""
+    """Kind of an event. The log has the number, which is never used again for another kind.
+
+    A feature can have its own kinds in `events.py`.
+    """
 
     LOOP_STARTED = 1
     LOOP_STOPPED = 2
@@ -103,15 +109,28 @@ class EventCode(IntEnum):
     GUARDIAN = 50
     KEPT = 51
     """A controller starts with its state from an earlier run, or without it for the reason in the text."""
-    SENSOR = 52
-    """Report of a sensor or its process: open failed, ended, opened again, or a text of the driver."""
-    SENSOR_LOST = 53
-    """A sensor had no new samples within its timeout, or values that are not finite. It is not valid."""
-    SENSOR_BACK = 54
-    """A lost sensor has samples again."""
     TAKEOVER = 58
     """A controller requested a takeover; the text has the reason."""
     RECORDER_GAP = 61
+
+
+@dataclass(frozen=True)
+class EventStage:
+    """`STAGE` of `events.py`: kinds of events of a feature, with numbers that no other kind has."""
+
+    FILE: ClassVar[str] = "events"
+
+    codes: type[IntEnum]
+
+
+@cache
+def event_names() -> Mapping[int, str]:
+    """Return the names of all kinds of events by number, in lower case."""
+    kinds: tuple[type[IntEnum], ...] = (
+        EventCode,
+        *(stage.codes for _, stage in stages(EventStage, FEATURES)),
+    )
+    return {code.value: code.name.lower() for kind in kinds for code in kind}
 
 
 class LostRecords(msgspec.Struct, frozen=True):
@@ -242,7 +261,8 @@ Fields = ParamSpec("Fields")
 class EventBody(NamedTuple):
     """Event without source and time, as a row of a table of texts makes it."""
 
-    code: EventCode
+    code: IntEnum
+    """An EventCode, or a kind of a feature."""
     severity: Severity
     text: str
 
@@ -255,7 +275,7 @@ class EventText(Generic[Fields]):
 
     __slots__ = ("code", "severity", "write")
 
-    def __init__(self, code: EventCode, severity: Severity, write: Callable[Fields, str]) -> None:
+    def __init__(self, code: IntEnum, severity: Severity, write: Callable[Fields, str]) -> None:
         self.code = code
         self.severity = severity
         self.write = write
@@ -265,7 +285,7 @@ class EventText(Generic[Fields]):
         return EventBody(self.code, self.severity, self.write(*args, **kwargs))
 
 
-def event_text(code: EventCode, severity: Severity) -> Callable[[Callable[Fields, str]], EventText[Fields]]:
+def event_text(code: IntEnum, severity: Severity) -> Callable[[Callable[Fields, str]], EventText[Fields]]:
     """Make a row of a table of texts from a function that writes the text.
 
     @event_text(EventCode.LOOP_STARTED, Severity.INFO)
@@ -312,7 +332,7 @@ class Event(msgspec.Struct, frozen=True, array_like=True, tag_field="is", tag=0)
     t_ns: int
     """ns of the run's clock."""
     code: int
-    """An EventCode; another number in the log of a newer version."""
+    """Kind of the event; an unknown number in the log of a newer version."""
     severity: int
     source: str
     """Name of a joint, a controller or a process."""
@@ -323,10 +343,7 @@ class Event(msgspec.Struct, frozen=True, array_like=True, tag_field="is", tag=0)
     @property
     def name(self) -> str:
         """The name of the code, in lower case."""
-        try:
-            return EventCode(self.code).name.lower()
-        except ValueError:
-            return f"code_{self.code}"
+        return event_names().get(self.code, f"code_{self.code}")
 
 
 class EventGroup(msgspec.Struct, frozen=True):

@@ -2,25 +2,26 @@
 
 from __future__ import annotations
 
-from dxlrun.channels.events import EventCode, Severity, event_text
+from dxlrun.channels.events import Severity, event_text
+from dxlrun.features.sensors.events import SensorEvent
 
 
-@event_text(EventCode.SENSOR, Severity.INFO)
+@event_text(SensorEvent.SENSOR, Severity.INFO)
 def sensor_says(sensor: str, text: str) -> str:
     return f"sensor {sensor}: {text}"
 
 
-@event_text(EventCode.SENSOR, Severity.ERROR)
+@event_text(SensorEvent.SENSOR, Severity.ERROR)
 def sensor_failed(sensor: str, error: str) -> str:
     return f"sensor {sensor}: {error}"
 
 
-@event_text(EventCode.SENSOR_LOST, Severity.ERROR)
+@event_text(SensorEvent.SENSOR_LOST, Severity.ERROR)
 def sensor_not_finite(sensor: str, values: str) -> str:
     return f"sensor {sensor}: {values}; its values are not used"
 
 
-@event_text(EventCode.SENSOR_LOST, Severity.ERROR)
+@event_text(SensorEvent.SENSOR_LOST, Severity.ERROR)
 def sensor_stuck(sensor: str, lasted_ns: int) -> str:
     return (
         f"sensor {sensor} has returned the same sample for {lasted_ns / 1e6:.0f} ms; "
@@ -28,21 +29,21 @@ def sensor_stuck(sensor: str, lasted_ns: int) -> str:
     )
 
 
-@event_text(EventCode.SENSOR_LOST, Severity.ERROR)
+@event_text(SensorEvent.SENSOR_LOST, Severity.ERROR)
 def sensor_silent(sensor: str, age_ns: int) -> str:
     return f"sensor {sensor} brought no sample for {age_ns / 1e6:.0f} ms"
 
 
-@event_text(EventCode.SENSOR_LOST, Severity.ERROR)
+@event_text(SensorEvent.SENSOR_LOST, Severity.ERROR)
 def sensor_never_answered(sensor: str) -> str:
     return f"sensor {sensor} brought no sample since the start"
 
 
-@event_text(EventCode.SENSOR_LOST, Severity.ERROR)
+@event_text(SensorEvent.SENSOR_LOST, Severity.ERROR)
 def sensor_gone(sensor: str) -> str:
     return f"sensor {sensor} is gone; its values are not valid"
 
 
-@event_text(EventCode.SENSOR_BACK, Severity.INFO)
+@event_text(SensorEvent.SENSOR_BACK, Severity.INFO)
 def sensor_back(sensor: str) -> str:
     return f"sensor {sensor} brings samples again"
