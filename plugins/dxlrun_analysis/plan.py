@@ -149,12 +149,12 @@ class LoggedPlan(msgspec.Struct):
         """Return whether the subject of a finding is simulated.
 
         In a robot with a simulated bus, every subject counts as simulated unless the plan has it on a real
-        bus, as a controller or as a sensor. If a controller and a bus have the same name, the name means the
-        bus.
+        bus, as a controller, or as a source that a process samples. If a controller and a bus have the same
+        name, the name means the bus.
         """
         if not any(bus.simulated for bus in self.buses):
             return False
-        real = {one.name for one in self.loop.controllers} | self.sensors
+        real = {one.name for one in self.loop.controllers} | self.sampled
         real -= self.by_name.keys()
         for bus in self.buses:
             if not bus.simulated:
@@ -163,9 +163,10 @@ class LoggedPlan(msgspec.Struct):
         return subject not in real and of_bus not in real
 
     @property
-    def sensors(self) -> set[str]:
-        """Names of the sources that separate processes sample."""
-        return {one.name for one in self.loop.sources if one.kind == "sensor"}
+    def sampled(self) -> set[str]:
+        """Names of the sources that separate processes sample, because they are not on a bus."""
+        on_bus = {device.name for bus in self.buses for device in bus.devices}
+        return {source.name for source in self.loop.sources} - on_bus
 
     @property
     def by_name(self) -> dict[str, LoggedBus]:

@@ -23,7 +23,7 @@ from dxlrun.tooling.records import (
 )
 from dxlrun_analysis.causes.causes import NO_CAUSES, Causes, CycleCauses
 from dxlrun_analysis.conduct.conduct import NO_CONDUCT, Conduct, ConductHistory
-from dxlrun_analysis.conduct.sensors import Sensors
+from dxlrun_analysis.conduct.frozen_sources import FrozenSources
 from dxlrun_analysis.conduct.steering import Act, Pause, SteeringHistory
 from dxlrun_analysis.cycles.latency import Latency, Periods, Punctuality, Slowest, on_virtual_time
 from dxlrun_analysis.finding import Finding
@@ -130,7 +130,7 @@ class Tally:
         """
         own = (
             *(Punctuality(), CycleCauses(), Traffic(watch), ServoHealth()),
-            *(Tracking(), SteeringHistory(), ConductHistory(), Sensors()),
+            *(Tracking(), SteeringHistory(), ConductHistory(), FrozenSources()),
         )
         self._collectors: dict[type[Collector], Collector] = {type(each): each for each in own}
         self._collectors |= {kind: kind() for kind in others}
@@ -207,7 +207,7 @@ class Tally:
                 *traffic.findings,
                 *movement,
                 *self.of(ServoHealth).findings(movement),
-                *self.of(Sensors).findings(),
+                *self.of(FrozenSources).findings(),
             ),
             tracking=tracking,
             conduct=conduct,

@@ -1,13 +1,13 @@
-"""Detection of frozen sensors and devices: they answer, but their values are identical to the bit.
+"""Detection of frozen sources, such as sensors and devices: their samples are identical to the bit.
 
 Times count only cycles with valid values. A standstill is reported only if it lasts a second, and ten times
 as long as any standstill before.
 
-- A sensor is frozen if no value changes while joints move.
+- A source that a process samples is frozen if no value changes while joints move.
 - A value that trembled is frozen if it stops changing. A value trembled if 16 of its last 40 changes
   reversed direction, and it took several distinct values. Most of the frozen values must be within the range
-  that they had before: an extreme value can be genuine, such as that of a foot in the air. A device or sensor
-  is reported if all its trembling values freeze at once, while joints move or after they also trembled at
+  that they had before: an extreme value can be genuine, such as that of a foot in the air. A source is
+  reported if all its trembling values freeze at once, while joints move or after they also trembled at
   rest. A single value is reported if others still tremble.
 """
 
@@ -116,7 +116,7 @@ class _Watched:
 
 
 class _Source:
-    """Values of one sensor or device."""
+    """Values of one source."""
 
     def __init__(self, at_ns: int, values: Floats, position: Floats) -> None:
         self._at_ns, self._lived_ns, self._was_valid, self._last = at_ns, 0, True, values
@@ -140,8 +140,8 @@ class _Source:
             one.take(lived, column, mine, position)
 
 
-class Sensors:
-    """Accumulator that finds frozen sensors and devices. Its memory does not grow with the log."""
+class FrozenSources:
+    """Accumulator that finds frozen sources. Its memory does not grow with the log."""
 
     def __init__(self) -> None:
         self._sources: dict[str, _Source] = {}
@@ -152,8 +152,7 @@ class Sensors:
         if not len(log.cycles):
             return
         self._plan, self._states = plan_of(log), dict(log.header.sources)
-        known = self._plan.sensors
-        known |= {device.name for bus in self._plan.buses for device in bus.devices}
+        known = {source.name for source in self._plan.loop.sources}
         position, at_ns = np.nan_to_num(log.cycles["position"]), log.cycles["read_ns"]
         for index, (name, states) in enumerate(self._states.items()):
             if name not in known or not states:
@@ -171,8 +170,8 @@ class Sensors:
                 self._sources[name].take(at_ns, valid, values, position)
 
     def findings(self) -> Iterable[Finding]:
-        """Report frozen sensors and devices."""
-        sensors = self._plan.sensors
+        """Report frozen sources."""
+        sampled = self._plan.sampled
         for name, one in self._sources.items():
             whole, stays = one.all.stay, [each.stay for each in one.each]
             still = {
@@ -182,7 +181,7 @@ class Sensors:
             }
             lively = sum(_trembled(each.recent) >= _FEWEST_VALUES for each in one.each)
             inside = sum(stay.inside for stay in still.values())
-            if name in sensors and whole.hung_s and whole.moved:
+            if name in sampled and whole.hung_s and whole.moved:
                 yield self._frozen(name, "all its values", whole, " while joints moved")
             elif still and len(still) == lively and _at_once(still.values()):
                 if 2 * inside >= lively and any(each.moved or each.rested for each in still.values()):
@@ -197,7 +196,7 @@ class Sensors:
     def _frozen(self, name: str, values: str, stay: _Stay, then: str = "") -> Finding:
         found = [(bus, each) for bus in self._plan.buses for each in bus.devices if each.name == name]
         where = "".join(f" (ID {each.servo_id} on bus {bus.name})" for bus, each in found)
-        kind = "Device" if found else "Sensor"
+        kind = next(source.kind for source in self._plan.loop.sources if source.name == name).capitalize()
         sentence = (
             f"{kind} {name}{where} is frozen: {values} stayed the same to the bit for "
             f"{stay.hung_s:.1f} s{then}, from {stay.from_s:.1f} s of the run on; before, for "

@@ -1,4 +1,4 @@
-"""Sensors that hang, and sensors that only stay as they are."""
+"""Sources that hang, and sources that only stay as they are."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ import pytest
 from tests.kit.made_logs import loop_of
 
 from dxlrun.plan.loop_plan import SourcePlan
-from dxlrun_analysis.conduct.sensors import Sensors
+from dxlrun_analysis.conduct.frozen_sources import FrozenSources
 from dxlrun_analysis.finding import Rank
 
 Floats = npt.NDArray[np.floating[Any]]
@@ -36,10 +36,10 @@ def findings(
     cycles["read_ns"] = 10**9 + np.rint(TIME * 1e9).astype(np.int64)
     cycles["source_valid"][:, 0] = True if valid is None else valid
     cycles["position"][:, 0], cycles["source_state"] = joint, values
-    sensors, layout = Sensors(), SimpleNamespace(source_slice=lambda name: slice(0, len(states)))
-    sensor = (SourcePlan(name, "sensor", states),)
+    sensors, layout = FrozenSources(), SimpleNamespace(source_slice=lambda name: slice(0, len(states)))
     device = {"name": "main", "devices": [{"name": name, "servo_id": 101}]}
-    plan = {"loop": loop_of(sources=sensor)} if kind == "sensor" else {"buses": [device]}
+    plan = {"loop": loop_of(sources=(SourcePlan(name, kind, states),))}
+    plan |= {"buses": [device]} if kind == "device" else {}
     for begin in range(0, len(TIME), 170):
         part: Any = SimpleNamespace(
             cycles=cycles[begin : begin + 170],
