@@ -29,12 +29,10 @@ from dxlrun.channels.process import RunMemory
 from dxlrun.channels.shared_memory import mapped
 from dxlrun.channels.slot import SlotReader, SlotState
 from dxlrun.control.controllers.plugins import load_plugins
-from dxlrun.control.source_process import PlannedProcess, ReaderContext, planned_processes
+from dxlrun.control.source_process import PlannedProcess, ReaderContext, SourceContext, planned_processes
 from dxlrun.errors import PortError
 from dxlrun.features.sensors.events import SensorEvent
-from dxlrun.features.sensors.plan import decode_sensors
 from dxlrun.features.sensors.reader import Readings
-from dxlrun.features.sensors.sampling import SampledSensor, build_sensor
 from dxlrun.plan.robot_plan import Plan
 from dxlrun.process_table import found_runs
 from dxlrun.run import source_process, supervisor
@@ -358,8 +356,8 @@ def test_a_time_in_the_future_is_reported(tmp_path, monkeypatch):
     plan = installed(tmp_path, monkeypatch, "import time\n" + FUTURE)
     memory = slot.private(1)
     reader, writer = SlotReader(memory), slot.SlotWriter(memory)
-    (sensor,) = decode_sensors(plan.feature_plans["sensors"])
-    sampled = SampledSensor(sensor, build_sensor(load_plugins(), sensor), writer, time.monotonic_ns, None)
+    planned, context = only_process(plan), SourceContext(load_plugins(), writer, time.monotonic_ns, None)
+    sampled = planned.stage.build(planned.process.plan, context)
     sampled.open_first()
     for _ in range(2):
         assert sampled.sample()

@@ -15,8 +15,8 @@ from tests.kit.pages import page_text
 from dxlrun import SensorContext
 from dxlrun.cli import main
 from dxlrun.cli.examples import schema_text
+from dxlrun.control.source_process import REOPEN_NS
 from dxlrun.features.sensors.offer import sensor_breach
-from dxlrun.features.sensors.sampling import REOPEN_NS
 from dxlrun.run import source_process, supervisor
 
 ROOT = Path(__file__).parents[2]

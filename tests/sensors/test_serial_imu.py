@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 import math
 import os
 import pty
@@ -11,14 +12,17 @@ from collections.abc import Iterator
 from dataclasses import dataclass, field
 from pathlib import Path
 
+import msgspec
 import numpy as np
 import pytest
 
 from dxlrun import SensorContext
 from dxlrun.channels import slot
 from dxlrun.channels.slot import SlotReader, SlotState, SlotWriter
+from dxlrun.control.controllers.plugins import load_plugins
+from dxlrun.control.source_process import SourceContext
 from dxlrun.features.sensors.plan import SensorPlan
-from dxlrun.features.sensors.sampling import SampledSensor
+from dxlrun.features.sensors.process import build_sampled_sensor
 from dxlrun_controllers.sensors.serial_imu import SerialImu, SerialImuParameters, checked
 
 LINE = b"0.5,-0.25,9.75,1,2,-3\n"
@@ -161,13 +165,12 @@ def test_a_port_in_use_is_refused(device):
 def test_pulled_and_plugged_in_again_it_goes_on(device, monkeypatch):
     now_ns = time.monotonic_ns
     ahead_ns = 0
-    parameters = SerialImuParameters(port=str(device.name))
-    plan = SensorPlan("imu", "serial_imu", "", "{}", SerialImu.states(parameters), 10_000_000, 50_000_000)
+    parameters = json.dumps({"port": str(device.name)})
+    plan = SensorPlan("imu", "serial_imu", "", parameters, (), 10_000_000, 50_000_000)
     memory = slot.private(6)
     reader = SlotReader(memory)
-    sampled = SampledSensor(
-        plan, SerialImu(parameters), SlotWriter(memory), lambda: now_ns() + ahead_ns, None
-    )
+    context = SourceContext(load_plugins(), SlotWriter(memory), lambda: now_ns() + ahead_ns, None)
+    sampled = build_sampled_sensor(msgspec.json.encode(plan), context)
     sampled.open_first()
     device.send(b"\n" + LINE)
     assert sampled.sample()

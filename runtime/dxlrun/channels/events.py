@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from collections import Counter
 from collections.abc import Callable, Container, Mapping
-from dataclasses import dataclass
 from enum import IntEnum, unique
 from functools import cache
 from typing import ClassVar, Generic, NamedTuple, ParamSpec, Protocol
@@ -114,8 +113,7 @@ class EventCode(IntEnum):
     RECORDER_GAP = 61
 
 
-@dataclass(frozen=True)
-class EventStage:
+class EventStage(msgspec.Struct, frozen=True):
     """`STAGE` of `events.py`: kinds of events of a feature, with numbers that no other kind has."""
 
     FILE: ClassVar[str] = "events"

@@ -10,10 +10,11 @@ from collections.abc import Callable, Iterator, Mapping, Sequence
 from typing import ClassVar, Protocol
 
 import msgspec
+import numpy as np
 
 from dxlrun.channels.cycle import CycleRecord
 from dxlrun.channels.events import EventSink
-from dxlrun.channels.slot import SlotWriter
+from dxlrun.channels.slot import Floats, SlotState, SlotWriter
 from dxlrun.control.controllers.plugins import PlugIns
 from dxlrun.features import stages
 from dxlrun.features.feature import Feature
@@ -22,6 +23,8 @@ from dxlsim.motion.link_motion import Body
 
 Slots = Mapping[str, Sequence[memoryview]]
 """Slots of the processes of each feature, by name of the feature."""
+REOPEN_NS = 1_000_000_000
+"""Pause before a failed source is opened again."""
 _NUMBER = re.compile(r"\[Errno -?\d+\] ")
 
 
@@ -47,40 +50,6 @@ class SourceProcess(msgspec.Struct, frozen=True):
         return f"{self.kind} {self.source}"
 
 
-class SampledSource(Protocol):
-    """A running source, which writes its samples into a slot.
-
-    Only `open_first` may raise exceptions of the driver.
-    """
-
-    reopen_ns: int
-    """Time of the next attempt to open the device. Valid only while it is not `open`."""
-
-    @property
-    def driver(self) -> object:
-        """Driver object of a plug-in."""
-
-    @property
-    def open(self) -> bool:
-        """True while the device is open."""
-
-    @property
-    def waits(self) -> bool:
-        """True if `sample` waits for the next sample of the device."""
-
-    def open_first(self) -> None:
-        """Open the device at the start of a run."""
-
-    def sample(self) -> bool:
-        """Sample once, or reopen the device when that is due; return whether there was a sample."""
-
-    def fail(self, error: Exception) -> None:
-        """Close the device after an error, and schedule an attempt to reopen it."""
-
-    def close(self) -> None:
-        """Close the device."""
-
-
 class SourceContext(msgspec.Struct, frozen=True):
     """Objects that a source gets from its process."""
 
@@ -90,6 +59,111 @@ class SourceContext(msgspec.Struct, frozen=True):
     """The run's clock."""
     body: Body | None
     """The simulated body; None without `SourceProcess.has_body`."""
+
+
+class Driver(Protocol):
+    """Driver of a source's device, such as the class of a plug-in. Its methods may raise anything."""
+
+    @property
+    def waits(self) -> bool:
+        """True if `read` waits for the next sample of the device."""
+
+    def read(self, values: Floats) -> int | None:
+        """Read a sample into values that are NaN; return its time on the run's clock, None without one."""
+
+    def close(self) -> None:
+        """Close the device, also after an incomplete opening."""
+
+
+class SampledSource:
+    """A source that writes its samples into a slot. Only `open_first` raises exceptions of the driver.
+
+    Args:
+        driver: Driver of its device.
+        open_driver: Opens the driver; the argument logs a sentence.
+        period_ns: Time between two samples.
+        context: Objects of its process.
+    """
+
+    def __init__(
+        self,
+        driver: Driver,
+        open_driver: Callable[[Callable[[str], None]], None],
+        period_ns: int,
+        context: SourceContext,
+    ) -> None:
+        self.driver = driver
+        self.open = False
+        """True while the device is open."""
+        self.reopen_ns = 0
+        """Time of the next attempt to open the device; meaningful only while it is not `open`."""
+        self._open_driver = open_driver
+        self._period_ns = period_ns
+        self._writer = context.writer
+        self._now_ns = context.now_ns
+        self._values: Floats = np.full(context.writer.values, np.nan)
+        self._ahead = False
+
+    def open_first(self) -> None:
+        """Open the device at the start of a run; raise whatever the driver raises."""
+        try:
+            self._open_driver(self._say)
+        except BaseException:
+            self.close()
+            raise
+        self.open = True
+        self._writer.say(SlotState.OPEN, "")
+
+    def sample(self) -> bool:
+        """Sample once, or reopen the device if that is due; return True if there was a sample."""
+        if not self.open and not self._reopen():
+            return False
+        # A value that the driver does not set must be invalid, not old.
+        self._values.fill(np.nan)
+        try:
+            t_ns = self.driver.read(self._values)
+            if t_ns is None:
+                return False
+            now_ns = self._now_ns()
+            ahead_ns = int(t_ns) - now_ns
+            if ahead_ns > self._period_ns and not self._ahead:
+                self._ahead = True
+                self._say(f"its times are {ahead_ns / 1e6:.0f} ms in the future: times of arrival are used")
+            # A time in the future would make the sample younger than it is.
+            self._writer.write(min(int(t_ns), now_ns), self._values)
+        except Exception as error:  # every error of a driver becomes an event
+            self.fail(error)
+            return False
+        return True
+
+    def close(self) -> None:
+        """Close the device and report any exception."""
+        self.open = False
+        try:
+            self.driver.close()
+        except Exception as error:  # as above
+            self._writer.say(SlotState.FAILED, f"cannot be closed: {describe_error(error)}")
+
+    def fail(self, error: Exception) -> None:
+        """Close the device after an exception, and schedule its reopening."""
+        self.close()
+        self.reopen_ns = self._now_ns() + REOPEN_NS
+        self._writer.say(SlotState.FAILED, describe_error(error))
+
+    def _reopen(self) -> bool:
+        if self._now_ns() < self.reopen_ns:
+            return False
+        try:
+            self._open_driver(self._say)
+        except Exception as error:  # as above
+            self.fail(error)
+            return False
+        self.open = True
+        self._writer.say(SlotState.OPEN, "is open again")
+        return True
+
+    def _say(self, text: str) -> None:
+        self._writer.say(SlotState.OPEN if self.open else SlotState.STARTING, text)
 
 
 class ProcessStage(msgspec.Struct, frozen=True):

@@ -151,7 +151,7 @@ def _sample_for_ever(sampled: SampledSource, period_ns: int) -> NoReturn:
         now_ns = time.monotonic_ns()
         if not sampled.open:
             time.sleep(max(_SHORTEST_NAP_S, (sampled.reopen_ns - now_ns) * 1e-9))
-        elif sampled.waits:
+        elif sampled.driver.waits:
             if not came:
                 time.sleep(_SHORTEST_NAP_S)
         else:

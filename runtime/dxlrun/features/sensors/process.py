@@ -2,11 +2,16 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
+from typing import Any
+
 import msgspec
 
-from dxlrun.control.source_process import ProcessStage, SourceContext, SourceProcess
+from dxlrun.control.controllers.plugins import PlugIns
+from dxlrun.control.source_process import ProcessStage, SampledSource, SourceContext, SourceProcess
+from dxlrun.errors import PlugInError
+from dxlrun.features.sensors.driver import Sensor, SensorContext
 from dxlrun.features.sensors.plan import SensorPlan, decode_sensors
-from dxlrun.features.sensors.sampling import SampledSensor, build_sensor
 
 
 def list_processes(plan: bytes) -> tuple[SourceProcess, ...]:
@@ -24,11 +29,32 @@ def list_processes(plan: bytes) -> tuple[SourceProcess, ...]:
     )
 
 
-def build_sampled_sensor(plan: bytes, context: SourceContext) -> SampledSensor:
+def build_sampled_sensor(plan: bytes, context: SourceContext) -> SampledSource:
     """Build the sensor of a process; raise PlugInError."""
     sensor = msgspec.json.decode(plan, type=SensorPlan)
-    built = build_sensor(context.plugins, sensor)
-    return SampledSensor(sensor, built, context.writer, context.now_ns, context.body)
+    driver = build_sensor(context.plugins, sensor)
+
+    def open_driver(say: Callable[[str], None]) -> None:
+        driver.open(SensorContext(sensor.name, sensor.period_ns, context.now_ns, say, context.body))
+
+    return SampledSource(driver, open_driver, sensor.period_ns, context)
+
+
+def build_sensor(plugins: PlugIns, plan: SensorPlan) -> Sensor[Any]:
+    """Return a new sensor of the plan's type.
+
+    Raises:
+        PlugInError: The type is not available, or its class refuses the parameters.
+    """
+    offer = plugins.drivers_of("sensors").get(plan.type)
+    if offer is None:
+        raise plugins.unknown_type(f"sensor {plan.name}", plan.type)
+    try:
+        sensor: Sensor[Any] = offer.driver(offer.driver.Parameters.model_validate_json(plan.parameters))
+    except (Exception, SystemExit) as error:  # foreign code: one sentence instead of its traceback
+        what = f"{type(error).__name__}: {' '.join(str(error).split())}"
+        raise PlugInError(f"sensor {plan.name} cannot be built: {what}") from error
+    return sensor
 
 
 def refuse_virtual_time(plan: bytes) -> str:

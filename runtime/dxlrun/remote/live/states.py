@@ -97,20 +97,19 @@ class RobotStates(OlderSourceNames, msgspec.Struct, frozen=True):
             None for an unknown source. A command is null when no controller commands it.
         """
         owner = name.partition("/")[0]
-        states, commands, units, command_units = (
-            {
-                full.partition("/")[2]: value
-                for full, value in values
-                if name in (full, full.partition("/")[0])
+        values = {
+            "states": zip(self.source_states, map(_plain, self.source_state), strict=True),
+            "commands": zip(self.source_commands, map(_plain, self.source_command), strict=True),
+            "units": self.source_units.items(),
+            "command_units": self.command_units.items(),
+        }
+        found = {
+            kind: {
+                full.partition("/")[2]: one for full, one in pairs if name in (full, full.partition("/")[0])
             }
-            for values in (
-                [*zip(self.source_states, map(_plain, self.source_state), strict=True)],
-                [*zip(self.source_commands, map(_plain, self.source_command), strict=True)],
-                self.source_units.items(),
-                self.command_units.items(),
-            )
-        )
-        if not states and not commands:
+            for kind, pairs in values.items()
+        }
+        if not found["states"] and not found["commands"]:
             return None
         place = self.sources.index(owner)
         age_ns = int(self.source_age_ns[place])
@@ -118,10 +117,7 @@ class RobotStates(OlderSourceNames, msgspec.Struct, frozen=True):
         return {
             "valid": bool(self.source_valid[place]),
             "age": age,
-            "states": states,
-            "commands": commands,
-            "units": units,
-            "command_units": command_units,
+            **found,
         }
 
 
