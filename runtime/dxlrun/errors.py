@@ -23,10 +23,9 @@ from __future__ import annotations
 
 import re
 from collections.abc import Collection, Iterable, Mapping
+from dataclasses import replace
 from importlib.util import find_spec
 from types import MappingProxyType
-
-from msgspec.structs import replace
 
 from dxlwire.errors import DxlError as DxlrunError
 from dxlwire.errors import InputError, Mark, PortError, Problem, counted, near, suggestion

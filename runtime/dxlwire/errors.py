@@ -13,12 +13,12 @@ from __future__ import annotations
 
 import re
 from collections.abc import Iterable, Sequence
+from dataclasses import dataclass
 from typing import Literal
 
-import msgspec
 
-
-class Mark(msgspec.Struct, frozen=True, order=True):
+@dataclass(frozen=True, slots=True, order=True)
+class Mark:
     """Position in a file, in the form that editors can jump to; line and column count from 1."""
 
     file: str
@@ -29,7 +29,8 @@ class Mark(msgspec.Struct, frozen=True, order=True):
         return f"{self.file}:{self.line}:{self.column}"
 
 
-class Problem(msgspec.Struct, frozen=True):
+@dataclass(frozen=True, slots=True)
+class Problem:
     """One problem of an input, with its position and fix."""
 
     mark: Mark

@@ -3,12 +3,10 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Iterable, Mapping, Sequence
+from dataclasses import dataclass, replace
 from itertools import compress
 from operator import attrgetter
 from typing import TYPE_CHECKING, Literal, TypeAlias, TypeVar
-
-import msgspec
-from msgspec.structs import replace
 
 from dxlrun.output.escaping import escaped
 
@@ -20,7 +18,8 @@ Kind = Literal["name", "number", "text"]
 Tone = Literal["plain", "good", "warning", "error"]
 
 
-class Cell(msgspec.Struct, frozen=True):
+@dataclass(frozen=True, slots=True)
+class Cell:
     """A cell; its tone marks values that need attention."""
 
     text: str
@@ -31,7 +30,8 @@ Value = Cell | str | float | None
 """A cell's content (int included); None: empty."""
 
 
-class Column(msgspec.Struct, frozen=True):
+@dataclass(frozen=True, slots=True)
+class Column:
     """A column and the format of its values."""
 
     name: str
@@ -55,7 +55,8 @@ Columns: TypeAlias = Sequence[tuple[Column, str | Callable[[T], Value]]]
 """Columns with the source of their values: the name of an attribute or a key, or a function."""
 
 
-class Table(msgspec.Struct, frozen=True):
+@dataclass(frozen=True, slots=True)
+class Table:
     """Rows of cells under columns. Without column names, the first column names the rows."""
 
     title: str
@@ -130,7 +131,8 @@ def _value(thing: T, value: str | Callable[[T], Value]) -> Value:
     return found
 
 
-class Sentence(msgspec.Struct, frozen=True):
+@dataclass(frozen=True, slots=True)
+class Sentence:
     """A sentence on its own line; never wrapped, so that commands in it can be copied."""
 
     text: str

@@ -11,9 +11,8 @@ import textwrap
 import time
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager, suppress
+from dataclasses import replace
 from typing import IO, TYPE_CHECKING, TypeAlias, cast
-
-from msgspec.structs import replace
 
 from dxlrun.output.escaping import escaped
 from dxlrun.output.json import NO_REASON, Report, answer_text

@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 from collections.abc import Iterable, Mapping, Sequence
 from contextlib import suppress
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import msgspec
 import numpy as np
@@ -249,7 +249,7 @@ def _check(part: _Part, running: Running, problems: Problems) -> None:
 
 def _refused(warning: Problem) -> Problem:
     """Return an error in place of a start-up warning: in a run, the gate would hold the joint."""
-    return structs.replace(warning, severity="error", fix=warning.fix.rpartition("; ")[2])
+    return replace(warning, severity="error", fix=warning.fix.rpartition("; ")[2])
 
 
 def _way_ns(part: _Part, running: Running) -> int:
