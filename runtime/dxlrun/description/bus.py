@@ -122,7 +122,7 @@ class Bus(Form):
         json_schema_extra={"enum": [1.0, 2.0]},
     )
     baud_rate: int = key("Baud rate, bit/s.", "1_000_000", gt=0, le=HIGHEST_BAUD_RATE)
-    adapter: Adapter = key("Properties of the adapter.", "{latency: 1 ms}", Adapter())
+    adapter: Adapter = key("Properties of the adapter.", "{latency: 1 ms}", Adapter.of_defaults())
     return_delay_time: Duration = key(
         "Delay before a servo's reply, as in its item Return Delay Time.", "500 us", 500_000
     )
@@ -133,12 +133,12 @@ class Bus(Form):
         "auto",
     )
     slow_registers: SlowRegisters = key(
-        "Registers that are read periodically between the cycles.", "{rate: 2}", SlowRegisters()
+        "Registers that are read periodically between the cycles.", "{rate: 2}", SlowRegisters.of_defaults()
     )
     simulation: BusSimulation = key(
         "Properties of the simulated bus; a bus on a real port ignores them.",
         "{latency_timer: 4 ms}",
-        BusSimulation(),
+        BusSimulation.of_defaults(),
     )
 
     @property

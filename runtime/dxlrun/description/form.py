@@ -79,6 +79,14 @@ class Form(BaseModel):
 
     model_config = ConfigDict(frozen=True, extra="forbid", strict=True, allow_inf_nan=False, defer_build=True)
 
+    @classmethod
+    def of_defaults(cls) -> Self:
+        """Return the form of an absent section: every key has its default.
+
+        It is made without validation, which would build a validator for this value alone.
+        """
+        return cls.model_construct()
+
 
 def key(
     description: str,

@@ -87,7 +87,9 @@ class Loop(Form):
     """The control loop."""
 
     rate: Rate = key("Loop rate, Hz.", "50", ge=0.001, le=100_000)
-    scheduler: Scheduler = key("Real-time settings of the loop.", "{policy: round_robin}", Scheduler())
+    scheduler: Scheduler = key(
+        "Real-time settings of the loop.", "{policy: round_robin}", Scheduler.of_defaults()
+    )
     overrun: Literal["skip", "catch_up", "stop"] = key(
         "Reaction to a late cycle: skip the missed periods, run up to 5 late cycles "
         "without waiting (catch_up), or end the run (stop).",
@@ -256,7 +258,9 @@ class Processes(Form):
     refused: ClassVar[Mapping[str, str]] = {"view": "take it out; `dxlrun view` shows a run"}
 
     gateway: Gateway = key(
-        "Access for programs that steer the run, over a Unix socket.", "{enabled: false}", Gateway()
+        "Access for programs that steer the run, over a Unix socket.",
+        "{enabled: false}",
+        Gateway.of_defaults(),
     )
 
 
@@ -325,10 +329,14 @@ class Robot(Form):
         "{home: {head_joint: 0 deg}}",
         {},
     )
-    policies: Policies = key(*_POLICIES, Policies())
-    processes: Processes = key("Processes next to the loop.", "{gateway: {enabled: false}}", Processes())
+    policies: Policies = key(*_POLICIES, Policies.of_defaults())
+    processes: Processes = key(
+        "Processes next to the loop.", "{gateway: {enabled: false}}", Processes.of_defaults()
+    )
     model: RobotModel | None = key("URDF and frames of the robot.", "{urdf: torso.urdf}", None)
-    simulation: Simulation = key("Physics of the simulated servos' loads.", "{physics: mujoco}", Simulation())
+    simulation: Simulation = key(
+        "Physics of the simulated servos' loads.", "{physics: mujoco}", Simulation.of_defaults()
+    )
 
 
 @cache
@@ -338,6 +346,6 @@ def robot_form() -> type[Robot]:
     sections = [section for _, section in stages(Section, installed_features())]
     return with_keys(
         Robot,
-        [Section("policies", policies, key(*_POLICIES, policies())), *sections],
+        [Section("policies", policies, key(*_POLICIES, policies.of_defaults())), *sections],
         joints=dict[Name, joint_form()],  # type: ignore[misc]  # made at run time
     )

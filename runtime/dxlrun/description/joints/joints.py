@@ -106,12 +106,14 @@ class BareJoint(Form):
         "Torque at the start of a run; with off the joint is limp until `dxlrun torque on`.", "off", True
     )
     limits: Limits = key(
-        "Limits of position, velocity, acceleration and effort.", "{position: [-90 deg, 90 deg]}", Limits()
+        "Limits of position, velocity, acceleration and effort.",
+        "{position: [-90 deg, 90 deg]}",
+        Limits.of_defaults(),
     )
     tolerance: GoalTolerance = key(
         "Tolerance within which a goal counts as reached.",
         "{position: 2 deg, velocity: 2 deg/s, time: 2 s}",
-        GoalTolerance(),
+        GoalTolerance.of_defaults(),
     )
     wrap: bool = key(
         "Shorter way to each goal, for a continuous joint whose whole turns do not matter.", "true", False
@@ -127,7 +129,9 @@ class BareJoint(Form):
         return self
 
     simulation: JointSimulation = key(
-        "Load and delays of the joint's simulated servos.", "{inertia: 0.01 kg m^2}", JointSimulation()
+        "Load and delays of the joint's simulated servos.",
+        "{inertia: 0.01 kg m^2}",
+        JointSimulation.of_defaults(),
     )
 
 
@@ -180,7 +184,7 @@ class SharedJoint(ServoJoint):
     tolerance: SharedTolerance = key(
         "Tolerance within which a goal counts as reached, and largest difference between the servos.",
         "{servos: 3 deg, position: 2 deg}",
-        SharedTolerance(),
+        SharedTolerance.of_defaults(),
     )
 
 

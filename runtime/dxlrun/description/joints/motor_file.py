@@ -138,9 +138,11 @@ class MotorForm(Form):
     delay: Annotated[Duration, AfterValidator(_short)] = key(
         "Delay between a goal's arrival at the servo and its effect on the motor, at most 100 ms.", "2 ms", 0
     )
-    load: LoadForm = key("Load during the identification.", "{inertia: 0.01 kg m^2}", LoadForm())
+    load: LoadForm = key("Load during the identification.", "{inertia: 0.01 kg m^2}", LoadForm.of_defaults())
     uncertainty: UncertaintyForm = key(
-        "Half-widths of the 95 % confidence intervals, by name.", "{resistance: 0.05 ohm}", UncertaintyForm()
+        "Half-widths of the 95 % confidence intervals, by name.",
+        "{resistance: 0.05 ohm}",
+        UncertaintyForm.of_defaults(),
     )
 
     def motor(self) -> MotorModel:

@@ -126,7 +126,9 @@ class Device(Form):
         "{led: 0}",
         {},
     )
-    simulation: DeviceSimulation = key("States of the simulated device.", "{link: torso}", DeviceSimulation())
+    simulation: DeviceSimulation = key(
+        "States of the simulated device.", "{link: torso}", DeviceSimulation.of_defaults()
+    )
 
 
 STAGE: Section[dict[str, Device]] = Section(

@@ -26,5 +26,8 @@ class Recording(Form):
 
 
 STAGE: Section[Recording] = Section(
-    "recording", Recording, key("Settings of the log.", "{directory: logs}", Recording()), before="processes"
+    "recording",
+    Recording,
+    key("Settings of the log.", "{directory: logs}", Recording.of_defaults()),
+    before="processes",
 )
