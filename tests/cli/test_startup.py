@@ -17,6 +17,25 @@ with contextlib.redirect_stdout(io.StringIO()):
     assert main(sys.argv[1:]) == 0
 print(json.dumps(sorted(sys.modules)))
 """
+DATACLASSES = """
+import contextlib, dataclasses, io, json, sys
+made = []
+process = dataclasses._process_class
+dataclasses._process_class = lambda cls, *rest: made.append(cls) or process(cls, *rest)
+from dxlrun.cli import main
+with contextlib.redirect_stdout(io.StringIO()):
+    assert main(sys.argv[1:]) == 0
+print(json.dumps([cls.__name__ for cls in made if cls.__module__.startswith("dxl")]))
+"""
+VALIDATORS = """
+import json
+import dxlrun.features.devices.form, dxlrun.features.mechanics.form, dxlrun.features.recording.form
+import dxlrun.description.robot
+from dxlrun.description.form import Form
+def forms(form):
+    return [form, *(each for below in form.__subclasses__() for each in forms(below))]
+print(json.dumps([len(forms(Form)), [each.__name__ for each in forms(Form) if each.__pydantic_complete__]]))
+"""
 RUN_TIME = {
     "dxlrun.control": ("gate", "loop", "realtime", "safe_motion", "steering"),
     "dxlrun.dynamixel": ("hardware", "servo/life", "servo/servos", "tools"),
@@ -29,11 +48,16 @@ RUN_TIME = {
 
 def loaded(*words: str) -> set[str]:
     """Return the modules that a process has imported after a command."""
+    return {str(name) for name in printed(LOADED, *words)}
+
+
+def printed(code: str, *words: str) -> list[object]:
+    """Return the list that a process prints as JSON."""
     done = subprocess.run(
-        [sys.executable, "-c", LOADED, *words], cwd=ROOT, capture_output=True, text=True, check=True
+        [sys.executable, "-c", code, *words], cwd=ROOT, capture_output=True, text=True, check=True
     )
-    found: list[str] = json.loads(done.stdout)
-    return set(found)
+    found: list[object] = json.loads(done.stdout)
+    return found
 
 
 def beneath(modules: set[str], *packages: str) -> set[str]:
@@ -56,6 +80,22 @@ def test_check_imports_no_part_that_runs(checked: set[str]) -> None:
 def test_check_imports_no_library_that_it_does_not_use(checked: set[str]) -> None:
     unused = "mujoco mcap starlette uvicorn lz4 zstandard serial matplotlib simpleeval rich subprocess"
     assert beneath(checked, *unused.split()) == set()
+
+
+def test_check_generates_no_methods_of_records() -> None:
+    """A dataclass takes 50 times as long to import as a struct."""
+    # The first two have fields without arguments, and `RobotInfo` inherits from the third and another one.
+    # The help of a command uses the others, and imports no msgspec.
+    allowed = "States Commands JointValues Mark Problem Cell Column Table Sentence"
+    assert set(printed(DATACLASSES, "check", "robots/bioloid_torso.yaml")) == {*allowed.split()}
+
+
+def test_forms_build_no_validators_on_import() -> None:
+    """The form of the robot file builds one validator for all sections."""
+    forms, built = printed(VALIDATORS)
+    assert isinstance(forms, int)
+    assert forms > 30
+    assert built == []
 
 
 def test_check_imports_what_it_uses(checked: set[str]) -> None:

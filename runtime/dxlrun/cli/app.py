@@ -55,7 +55,10 @@ interrupted."""
 
 
 def build(verb: str = "", *, listed: bool = False) -> App:
-    """Return the application for a `verb`; `listed` imports all commands, for a list of them."""
+    """Return the application for a command line that begins with a `verb`.
+
+    `listed` imports all commands, for a list of them.
+    """
     app = App(
         name="dxlrun",
         help=HELP,
@@ -72,6 +75,9 @@ def build(verb: str = "", *, listed: bool = False) -> App:
     )
     app.default(run)
     found = {name: (place, group) for group, places in verbs.GROUPS.items() for name, place in places.items()}
+    if verb in found and not listed:
+        # Each other command costs time in every step of the parser.
+        found = {verb: found[verb]}
     if listed or (verbs.is_verb(verb) and verb not in found):
         for added in verbs.packaged().values():
             if not listed or verbs.is_importable(added):

@@ -12,6 +12,7 @@ from __future__ import annotations
 from collections.abc import Callable, Iterable, Mapping
 from functools import cache
 from importlib import import_module
+from importlib.resources import files
 from typing import Any, ClassVar, Generic, Protocol, TypeVar, cast
 
 import msgspec
@@ -168,13 +169,19 @@ class Feature(msgspec.Struct, frozen=True):
 
 @cache
 def _stage(package: str, kind: type[S]) -> S | None:
+    if kind.FILE not in _files(package):
+        return None
     module = f"{package}.{kind.FILE}"
-    try:
-        stage = import_module(module).STAGE
-    except ModuleNotFoundError as error:
-        if error.name == module:
-            return None
-        raise
+    stage = import_module(module).STAGE
     if not isinstance(stage, kind):
         raise TypeError(f"STAGE of {module} is a {type(stage).__name__}, not a {kind.__name__}")
     return stage
+
+
+@cache
+def _files(package: str) -> frozenset[str]:
+    """Return the names of the modules in a package.
+
+    A feature has few of the files, so one list costs less than a search for each missing file.
+    """
+    return frozenset(entry.name.partition(".")[0] for entry in files(package).iterdir())
