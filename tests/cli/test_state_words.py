@@ -29,7 +29,7 @@ def test_joint_without_torque_is_limp_whatever_the_reason() -> None:
 
 
 def test_page_has_the_words_of_the_states() -> None:
-    text = (ROOT / "plugins/dxlrun_view/page/page.js").read_text()
+    text = (ROOT / "plugins/dxlrun_view/page/state.js").read_text()
     (words,) = re.findall(r"const TORQUE = (\[.+?\]);", text)
     assert json.loads(words) == [torque.word for torque in Torque]
 

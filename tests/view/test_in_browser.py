@@ -13,10 +13,22 @@ from tests.kit.browser import CHROMIUM, Browser
 from tests.kit.torso import GOAL_POSITION, JOINT, SERVO, TORQUE_ENABLE, Run
 from tests.view.served import Served
 
+from dxlrun_view.curves import Curve, Moment
 from dxlrun_view.live import LiveRobot
 from dxlrun_view.recorded import RecordedRobot
+from dxlrun_view.shown import Controller, LiveEvent, RobotInfo, Shown
 
 Serve = Callable[..., Served]
+VISIBLE = "(selector => document.querySelector(selector).offsetParent !== null)"
+"""In the page: whether an element is visible."""
+ENABLED = """[...document.querySelectorAll('fieldset :is(input, button, select)')]
+  .filter(one => !one.matches(':disabled'))"""
+"""In the page: the controls that steer the robot and can be used."""
+LABELS = """[...document.querySelectorAll(
+  'button, th, dt, label, optgroup, #phase, #kind, #figures b, .empty')]
+  .map(one => one.label ?? one.innerText).concat(document.querySelector('#pick').placeholder,
+    [...document.querySelectorAll('select')].map(one => one.options[0]?.text ?? ''))"""
+"""In the page: the texts of labels, which are no names of joints or files."""
 BUNDLE = files("dxlrun_view").joinpath("page", "build", "page.js")
 pytestmark = [
     pytest.mark.skipif(CHROMIUM is None, reason="no Chromium is installed; apt install chromium"),
@@ -48,7 +60,7 @@ def test_a_log_plays_and_jumps(recorded: RecordedRobot, serve: Serve, browser: B
     browser.until("window.looked > 3 && !!document.querySelector('.legend b')?.textContent")
     assert browser.value("document.querySelector('#robot').textContent") == "bioloid_torso_imu"
     assert browser.value("document.querySelectorAll('#joints tbody tr').length") == 8
-    assert browser.value("document.querySelector('#stop').hidden")
+    assert not browser.value(f"{VISIBLE}('#stop') || {VISIBLE}('#steering')")
     before = browser.picture("#scene")
     move = "(time => { const input = document.querySelector('#time'); input.value = time; input.oninput(); })"
     looked = browser.value(f"{move}(8), window.looked")
@@ -78,18 +90,18 @@ def test_switch_slider_and_stop_reach_the_servos(
     browser.open(serve(live, control=True).address)
     browser.until("document.querySelector('.legend b')?.textContent")
     browser.click("[data-tab=controllers]")
-    browser.click("[aria-label='deactivate right_arm']")
-    browser.until("!!document.querySelector('[aria-label=\"activate right_arm\"]')")
+    browser.click("[aria-label='Deactivate right_arm']")
+    browser.until("!!document.querySelector('[aria-label=\"Activate right_arm\"]')")
     assert not live.shown().info.controllers[3].active
-    browser.click("[aria-label='activate right_arm']")
-    browser.until("!!document.querySelector('[aria-label=\"deactivate right_arm\"]')")
+    browser.click("[aria-label='Activate right_arm']")
+    browser.until("!!document.querySelector('[aria-label=\"Deactivate right_arm\"]')")
 
     browser.click("[data-tab=joints]")
     browser.click(f"[title^={JOINT}]")  # its curves
     browser.until("document.querySelectorAll('.legend b').length === 4")
     looks(browser, 5)
     still, curves = browser.picture("#scene"), browser.picture("#charts")
-    name = f"[aria-label='goal of {JOINT}']"
+    name = f"[aria-label='Goal of {JOINT}']"
     slider = f'document.querySelector("{name}")'
     span = browser.value(f"{slider}.max - {slider}.min")
     share = browser.value(f"({slider}.value - {slider}.min) / {span}")
@@ -114,6 +126,128 @@ def test_switch_slider_and_stop_reach_the_servos(
     assert errors(browser) == []
 
 
+class Scripted:
+    """A running robot with two joints, whose states a test sets."""
+
+    def __init__(self) -> None:
+        self.names = ("elbow_joint", "wrist_joint")
+        self.events_: tuple[LiveEvent, ...] = ()
+        self.values: dict[str, float | None] = {}
+        self.problem, self.time, self.moving = "", 100.0, True
+
+    folder = None
+
+    def begin(self, **columns: tuple[float | None, float | None]) -> None:
+        """Let the robot have its first cycle, with values of columns of both joints."""
+        known: dict[str, float | None] = {"loop/cycle": 1.0, "loop/late": 0.001}
+        for column, pair in columns.items():
+            known |= {f"{name}/{column}": one for name, one in zip(self.names, pair, strict=True)}
+        self.values = known
+
+    def shown(self) -> Shown:
+        arm = Controller("arm", "position_controller", True, ("elbow_joint",), ("position",))
+        began = bool(self.values)
+        limits = dict.fromkeys(self.names, (-2.6, 0.17))
+        info = RobotInfo("arm", 50.0, 0.0, joints=self.names, limits=limits, controllers=(arm,))
+        return Shown(
+            info=info if began else RobotInfo("arm"),
+            live=True,
+            columns=tuple(self.values),
+            span=(0.0, self.time),
+            run=int(began),
+            problem=self.problem,
+            control=True,
+        )
+
+    def at(self, time_s: float | None) -> Moment:
+        self.time += 0.04 if self.moving else 0.0
+        return Moment(self.time if self.values else 0.0, [*self.values.values()])
+
+    def curve(self, name: str, begin: float, end: float, points: int) -> Curve:
+        return Curve(name, [], [])
+
+    def events(self, after: int) -> tuple[LiveEvent, ...]:
+        return self.events_[after:]
+
+    def urdf(self) -> str:
+        return ""
+
+    def close(self) -> None: ...
+
+
+def await_phase(browser: Browser, phase: str) -> None:
+    browser.until(f"document.body?.dataset.phase === '{phase}' && window.looked > 1")
+
+
+def test_controls_are_enabled_only_with_fresh_states(serve: Serve, browser: Browser) -> None:
+    robot = Scripted()
+    browser.open(serve(robot, control=True).address)
+    await_phase(browser, "loading")
+    assert browser.value(f"{ENABLED}.length") == 0
+    assert browser.value("document.querySelectorAll('[type=range]').length") == 1, "that of the time line"
+    robot.begin(goal_position=(-1.0, None), position=(-0.9, None), torque=(1, 3))
+    await_phase(browser, "live")
+    sliders = (
+        "[...document.querySelectorAll('#joints input')].map(one => "
+        "[one.disabled, one.hidden, Number(one.value)])"
+    )
+    # No controller commands the wrist, and its position is unknown: its slider would be drawn near an end.
+    browser.until("document.querySelectorAll('#joints input').length === 2")
+    elbow, wrist = browser.value(sliders)
+    assert (elbow[:2], wrist[:2]) == ([False, False], [True, True])
+    assert elbow[2] == pytest.approx(-1.0, abs=0.01)
+    assert browser.value(f"{ENABLED}.length") > 4
+    for cause in ("stale", "problem"):
+        robot.moving, robot.problem = cause != "stale", "arm does not run" * (cause == "problem")
+        await_phase(browser, "gone")
+        assert browser.value(f"{ENABLED}.length") == 0, cause
+        assert browser.value(f"{VISIBLE}('#stop') && !document.querySelector('#stop').disabled"), (
+            "STOP is always sent"
+        )
+        assert browser.value("document.querySelector('#banner').textContent"), cause
+        robot.moving, robot.problem = True, ""
+        await_phase(browser, "live")
+        assert not browser.value(f"{VISIBLE}('#banner')")
+    assert errors(browser) == []
+
+
+def test_header_shows_voltage_hottest_servo_and_errors_first(serve: Serve, browser: Browser) -> None:
+    robot = Scripted()
+    robot.begin(voltage=(11.9, 11.2), temperature=(41, 67), hardware_error=(0, 0), torque=(1, 1))
+    browser.open(serve(robot, control=True).address, 390, 844)
+    await_phase(browser, "live")
+    figures = (
+        "[...document.querySelectorAll('#figures div')].map(one => "
+        "one.innerText.replace(/\\s+/g, ' ').trim())"
+    )
+    assert browser.value(figures)[:3] == ["Voltage 11.2 V", "Hottest servo 67 °C wrist", "Errors None"]
+    right = "document.querySelectorAll('#figures div')[2].getBoundingClientRect().right"
+    assert browser.value(right) <= 390
+    robot.events_ = (LiveEvent(1, 50.0, 40, "loop", "the bus was silent", 50.0),)
+    browser.until(f"{figures}[2] === 'Errors 1 event'")
+    robot.begin(hardware_error=(0, 32), torque=(1, 1))
+    browser.until(f"{figures}[2] === 'Errors error 0x20 wrist'")
+    browser.click("#figures div:nth-child(3)")
+    assert browser.value(f"{VISIBLE}('#events')")
+    assert errors(browser) == []
+
+
+def test_labels_are_in_sentence_case(recorded: RecordedRobot, serve: Serve, browser: Browser) -> None:
+    robot = Scripted()
+    for source in (robot, recorded):
+        browser.open(serve(source, control=source is robot).address)
+        browser.until("window.looked > 3")
+        if source is robot:
+            robot.begin(position=(0.0, 0.0))
+            await_phase(browser, "live")
+        for tab in ("joints", "controllers", "events"):
+            browser.click(f"[data-tab={tab}]")
+            labels = [label for label in browser.value(LABELS) if label[:1].isalpha()]
+            assert len(labels) > 10
+            # A tag of a joint has the word of its state, and CSS makes its first letter a capital.
+            assert [label for label in labels if not label[0].isupper() and label != "unknown"] == []
+
+
 @pytest.mark.parametrize("window", [(1440, 900, False), (1024, 700, False), (390, 844, True)])
 def test_all_of_the_page_fits_the_window(
     recorded: RecordedRobot, serve: Serve, browser: Browser, window: tuple[int, int, bool]
@@ -124,6 +258,8 @@ def test_all_of_the_page_fits_the_window(
     assert browser.value("document.documentElement.scrollWidth") <= width
     assert browser.value("(tab => tab.scrollWidth - tab.clientWidth)(document.querySelector('#joints'))") == 0
     assert browser.value("document.querySelector('footer').getBoundingClientRect().bottom") <= height
+    if width < 600:
+        assert browser.place("#time")[2] > 0.9 * width, "the time line has no row of its own"
     ground = browser.value("getComputedStyle(document.documentElement).backgroundColor")
     assert (sum(map(int, ground[4:-1].split(","))) < 384) is dark
     assert errors(browser) == []
@@ -132,7 +268,7 @@ def test_all_of_the_page_fits_the_window(
 def test_a_page_without_the_token_says_so(recorded: RecordedRobot, serve: Serve, browser: Browser) -> None:
     served = serve(recorded)
     browser.open(served.address.partition("?")[0])
-    browser.until("document.querySelector('#message')?.textContent.includes('token')")
+    browser.until("document.querySelector('#banner')?.textContent.includes('token')")
 
 
 def test_a_page_whose_server_ended_says_so(log: Path, serve: Serve, browser: Browser) -> None:
@@ -140,4 +276,5 @@ def test_a_page_whose_server_ended_says_so(log: Path, serve: Serve, browser: Bro
     browser.open(served.address)
     browser.until("window.looked > 3")
     served.close()
-    browser.until("document.querySelector('#message').textContent.includes('has ended')")
+    browser.until("document.querySelector('#banner').textContent.includes('has ended')")
+    assert browser.value("document.body.dataset.phase") == "gone"

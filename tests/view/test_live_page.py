@@ -191,7 +191,7 @@ def test_a_robot_that_ends_and_comes_back(live: LiveRobot, serve: Serve, run: Ru
     until(lambda: column(served, "loop/cycle"))
     before = until(lambda: served.look(after=0)["events"])
     run.end()
-    assert "goes on when it is started" in until(lambda: served.look(shown=True)["shown"]["problem"])
+    assert "start it, and this page continues" in until(lambda: served.look(shown=True)["shown"]["problem"])
     assert served.ask("/act", {"verb": "stop"})[0] == 409
     assert served.ask("/urdf")[1].startswith(b"<?xml")  # its last state is still shown
     run.start()
@@ -232,4 +232,4 @@ def test_stop_ends_the_run_where_torque_off_is_refused(refused: bool) -> None:
 
     said = Stop().perform(cast("RemoteRobot", Robot())).said
     assert asked == ["torque of all: False", *(["stop"] if refused else [])]
-    assert ("the run ends" in said) is refused
+    assert ("The run ends" in said) is refused

@@ -13,8 +13,12 @@ export class Charts {
     this.charts = [];
     this.zoom = null; // [begin, end], or null to follow the newest values
     this.seconds = 10;
-    matchMedia("(prefers-color-scheme: dark)").addEventListener("change", () => this.charts.forEach((one) => one.build()));
+    this.builds = 0; // number of changes of the plots
+    matchMedia("(prefers-color-scheme: dark)").addEventListener("change", () => this.build());
   }
+
+  // Build all plots again, after a change of units or colours.
+  build() { this.charts.forEach((one) => one.build()); }
 
   add(names = []) {
     const chart = new Chart(this, names);
@@ -71,6 +75,7 @@ class Chart {
   }
 
   build() {
+    this.all.builds += 1;
     this.plot?.destroy();
     const style = getComputedStyle(document.documentElement);
     const colour = (name) => style.getPropertyValue(name).trim();
@@ -88,14 +93,14 @@ class Chart {
       mark.classList.toggle("goal", isGoal(name));
       item.append(name, " ", item.value = document.createElement("b"));
       const away = item.appendChild(document.createElement("button"));
-      away.textContent = "×"; away.title = `take ${name} out`; away.type = "button";
+      away.textContent = "×"; away.title = `Remove ${name}`; away.type = "button";
       away.onclick = () => { this.names = this.names.filter((one) => one !== name); this.build(); };
       return item;
     }));
     if (this.all.charts.length > 1 || !this.names.length) {
       const away = this.legend.appendChild(document.createElement("button"));
       away.type = "button";
-      away.textContent = this.names.length ? "remove plot" : "click a joint, or add a curve above";
+      away.textContent = this.names.length ? "Remove plot" : "Click a joint, or add a curve above";
       away.onclick = () => this.all.remove(this);
     }
     this.plot = new uPlot({

@@ -1,8 +1,11 @@
 // Graph of the controllers and of the references that they command, with buttons to switch and tune them.
+import { isNew, make } from "./dom.js";
+
 const SVG = "http://www.w3.org/2000/svg";
 
-export function drawControllers(element, shown, act) {
-  const { controllers } = shown.info;
+// Draw the graph of the state again if it has changed.
+export function drawControllers(element, { shown, graph: controllers }, act) {
+  if (!isNew(element, controllers, shown?.live, shown?.control)) return;
   const open = element.dataset.open;
   element.replaceChildren();
   const names = controllers.map((one) => one.name);
@@ -16,29 +19,27 @@ export function drawControllers(element, shown, act) {
     const node = graph.appendChild(document.createElement("div"));
     node.className = `node${controller.active ? " active" : ""}`;
     node.style.gridColumn = deepest - depths[controller.name] + 1;
-    const about = node.appendChild(document.createElement("div"));
-    about.append(text("strong", controller.name), text("small", controller.type));
     const joints = controller.joints.length;
     const what = controller.command.length ? `${controller.command.join(", ")} of ${joints} joint${joints === 1 ? "" : "s"}` : "commands no joint";
-    about.append(text("small", `${controller.active ? "active" : "not active"}; ${what}`));
+    node.append(make("div", {}, text("strong", controller.name), text("small", controller.type), text("small", `${controller.active ? "Active" : "Not active"}; ${what}`)));
     if (shown.live) {
       const row = node.appendChild(document.createElement("div"));
       row.className = "row";
       if (shown.control) {
-        const button = text("button", controller.active ? "deactivate" : "activate");
+        const button = text("button", controller.active ? "Deactivate" : "Activate");
         button.type = "button";
         button.setAttribute("aria-label", `${button.textContent} ${controller.name}`);
         button.onclick = () => act({ verb: "switch", controller: controller.name, on: !controller.active });
         row.append(button);
       }
-      const more = text("button", "parameters");
+      const more = text("button", "Parameters");
       more.type = "button";
       more.onclick = () => parameters(element, shown, controller.name, act);
       row.append(more);
     }
     nodes[controller.name] = node;
   }
-  element.append(names.length ? graph : Object.assign(text("p", "no controllers"), { className: "empty" }));
+  element.append(names.length ? graph : make("p", { className: "empty", textContent: shown?.columns.length ? "No controllers" : "Waiting for the robot …" }));
   const lines = graph.appendChild(document.createElementNS(SVG, "svg"));
   const draw = () => connect(lines, graph, nodes, controllers);
   new ResizeObserver(draw).observe(graph);
@@ -78,7 +79,7 @@ async function parameters(element, shown, name, act) {
   if (!found) return;
   const table = document.createElement("table");
   table.className = "parameters";
-  table.createTHead().insertRow().append(text("th", `parameters of ${name}`), text("th", ""));
+  table.createTHead().insertRow().append(text("th", `Parameters of ${name}`), text("th", ""));
   const body = table.createTBody();
   for (const { name: parameter, value: now, live, range, description } of found.parameters) {
     const row = body.insertRow();
@@ -95,10 +96,8 @@ async function parameters(element, shown, name, act) {
       };
     } else cell.textContent = now;
   }
-  if (!found.parameters.length) body.insertRow().append(text("td", "none"));
+  if (!found.parameters.length) body.insertRow().append(text("td", "None"));
   element.append(table);
 }
 
-function text(tag, content) {
-  return Object.assign(document.createElement(tag), { textContent: content });
-}
+const text = (tag, textContent) => make(tag, { textContent });

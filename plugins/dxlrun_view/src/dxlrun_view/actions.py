@@ -42,7 +42,7 @@ class Stop(_Message, frozen=True, tag="stop"):
             robot.torque("all", on=False, release=True)
         except DxlrunError as error:
             robot.stop(wait=False)
-            return Done(f"the run ends: torque off was refused ({error})")
+            return Done(f"The run ends, because torque off was refused ({error})")
         return Done("STOP: all joints are limp")
 
 
@@ -52,7 +52,7 @@ class Halt(_Message, frozen=True, tag="halt"):
     def perform(self, robot: RemoteRobot) -> Done:
         """Halt the robot."""
         halted = robot.halt().halted
-        return Done("halted" if halted is None else f"halted in {halted.seconds:.2f} s")
+        return Done("Halted" if halted is None else f"Halted in {halted.seconds:.2f} s")
 
 
 class Pause(_Message, frozen=True, tag="pause"):
@@ -61,7 +61,7 @@ class Pause(_Message, frozen=True, tag="pause"):
     def perform(self, robot: RemoteRobot) -> Done:
         """Pause the robot."""
         robot.pause()
-        return Done("paused")
+        return Done("Paused")
 
 
 class Resume(_Message, frozen=True, tag="resume"):
@@ -70,7 +70,7 @@ class Resume(_Message, frozen=True, tag="resume"):
     def perform(self, robot: RemoteRobot) -> Done:
         """Resume the robot."""
         robot.resume()
-        return Done("resumed")
+        return Done("Resumed")
 
 
 class SetTorque(_Message, frozen=True, tag="torque"):
@@ -82,7 +82,7 @@ class SetTorque(_Message, frozen=True, tag="torque"):
     def perform(self, robot: RemoteRobot) -> Done:
         """Enable the torque, or disable it and release the controllers."""
         robot.torque(self.joints, self.on, release=not self.on)
-        return Done(f"torque {'on' if self.on else 'off'}: {', '.join(self.joints)}")
+        return Done(f"Torque {'on' if self.on else 'off'}: {', '.join(self.joints)}")
 
 
 class Switch(_Message, frozen=True, tag="switch"):
@@ -122,7 +122,7 @@ class Play(_Message, frozen=True, tag="play"):
     def perform(self, robot: RemoteRobot) -> Done:
         """Play the motion."""
         goals = robot.play(self.motion).goals
-        return Done(f"plays {self.motion}" + (f" (goal {goals[0].number})" if goals else ""))
+        return Done(f"Playing {self.motion}" + (f" (goal {goals[0].number})" if goals else ""))
 
 
 class ListParameters(_Message, frozen=True, tag="parameters"):
@@ -155,8 +155,8 @@ Action = Stop | Halt | Pause | Resume | SetTorque | Switch | Goal | Play | ListP
 def act(source: Source, action: Action) -> Done:
     """Perform an action. Raises DxlrunError with the reason if it is not possible."""
     if not isinstance(source, LiveRobot):
-        raise InputError("this is a log: nothing can be steered in it")
+        raise InputError("this is a log; start the robot to steer it")
     if isinstance(action, Play) and action.motion not in source.shown().motions:
-        raise InputError("only a motion beside the robot file is played from here")
+        raise InputError("the page plays only motions next to the robot file; use `dxlrun play`")
     with source.asking() as robot:
         return action.perform(robot)

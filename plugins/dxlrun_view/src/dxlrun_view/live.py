@@ -147,8 +147,8 @@ class LiveRobot:
                 self._note_topics(self._robot, now_s)
         except DxlrunError as error:
             self._looked_slowly_s = now_s
-            file = f" (dxlrun {self._info.file})" if self._info.file else ""
-            waits = f"{self._name} does not run; this page goes on when it is started{file}"
+            start = f"dxlrun {self._info.file or 'ROBOT.yaml'}"
+            waits = f"{self._name} does not run; start it, and this page continues: {start}"
             self._gone(str(error) if self._name in running() else waits)
 
     def _begun(self) -> RemoteRobot:
