@@ -1,9 +1,11 @@
-"""Builds what is published into `dist/`: the sdist, and of it a wheel for each platform; then judges them.
+"""Build the files of a release into `dist/`, and check them.
 
     pip install '.[release]' && python release/build.py
 
-`ziglang` compiles for all platforms, so one machine is enough; the same versions of it and of hatchling make
-the same bytes at each build.
+The files are the sdist, a wheel of dxlrun for each platform, and a wheel of each package in PACKAGES.
+`ziglang` compiles for all platforms, so one machine is enough. The same versions of ziglang, hatchling and
+the libraries in package-lock.json make the same bytes at each build. npm fetches these libraries: a build
+needs a network.
 """
 
 from __future__ import annotations
@@ -29,6 +31,8 @@ PLATFORMS = {
     "musllinux_1_2_aarch64": "aarch64-linux-musl",
 }
 """The platform in each wheel's tag, and as zig names it."""
+PACKAGES = ("plugins/dxlrun_view",)
+"""Packages that are published next to dxlrun, with its version. Their wheels fit all platforms."""
 
 
 def run(*words: str | Path, folder: Path = ROOT, environment: Mapping[str, str] | None = None) -> str:
@@ -64,23 +68,34 @@ def compiling_for(platform: str, cache: Path) -> dict[str, str]:
 
 
 def build(root: Path, dist: Path, platforms: Collection[str] = PLATFORMS) -> list[Path]:
-    """Build the sdist of a tree, and wheels of that sdist; return their paths. Raises RuntimeError."""
+    """Build the sdist of a tree, and wheels of that sdist.
+
+    Returns:
+        Paths of the sdist, of a wheel for each of `platforms` and of a wheel for each of PACKAGES.
+
+    Raises:
+        RuntimeError: A build failed.
+    """
     dist = dist.resolve()
     sdist = dist / Path(run("hatchling", "build", "-t", "sdist", "-d", dist, folder=root).split()[-1]).name
     with tempfile.TemporaryDirectory() as made, ThreadPoolExecutor(os.cpu_count()) as several:
         with tarfile.open(sdist) as archive:
             archive.extractall(made, filter="data")
         (unpacked,) = Path(made).iterdir()
-        wheel = partial(run, "hatchling", "build", "-t", "wheel", "-d", dist, folder=unpacked)
+        wheel = partial(run, "hatchling", "build", "-t", "wheel", "-d", dist)
         environments = [compiling_for(platform, Path(made, "cache")) for platform in platforms]
-        printed = several.map(lambda environment: wheel(environment=environment), environments)
+        printed = [
+            *several.map(lambda environment: wheel(folder=unpacked, environment=environment), environments),
+            *several.map(lambda package: wheel(folder=unpacked / package), PACKAGES),
+        ]
         return [sdist, *(dist / Path(text.split()[-1]).name for text in printed)]
 
 
 def judge(files: Collection[Path]) -> None:
     """Raise RuntimeError where an index would refuse a file, or a wheel needs more than its tag promises."""
     run("twine", "check", "--strict", *files)
-    for wheel in (path for path in files if path.suffix == ".whl"):
+    # A wheel for any platform has no compiled objects.
+    for wheel in (path for path in files if path.suffix == ".whl" and not path.stem.endswith("-any")):
         shown = " ".join(run("auditwheel", "show", wheel).split())
         if f'tag: "{wheel.stem.rpartition("-")[2]}"' not in shown:
             raise RuntimeError(f"the objects in {wheel.name} need another platform: {shown}")
@@ -89,7 +104,7 @@ def judge(files: Collection[Path]) -> None:
 def main() -> int:
     """Build, judge, and print what was built."""
     parser = argparse.ArgumentParser(
-        description="Build what is published: the sdist, and a wheel for each platform."
+        description="Build the files of a release: the sdist, a wheel for each platform, and dxlrun-view."
     )
     parser.add_argument("--output", type=Path, default=ROOT / "dist", help="the folder (default: dist)")
     try:

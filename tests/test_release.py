@@ -6,17 +6,24 @@ These run where ziglang is installed (extra `release`), for a minute or two.
 from __future__ import annotations
 
 import email
+import http.client
 import importlib
+import json
 import re
 import shutil
+import signal
 import subprocess
+import sys
 import tarfile
 import tomllib
 import zipfile
+from contextlib import closing
 from pathlib import Path
+from platform import machine
 from types import ModuleType
 
 import pytest
+from tests.kit.awaited import until
 from tests.kit.loaded import loaded
 
 pytestmark = pytest.mark.needs("release")
@@ -77,8 +84,9 @@ def test_each_platform_has_a_wheel_with_its_tag_and_the_version(
     release: ModuleType, built: list[Path]
 ) -> None:
     names = [f"dxlrun-{VERSION}-py3-none-{platform}.whl" for platform in release.PLATFORMS]
-    assert [path.name for path in built] == [f"dxlrun-{VERSION}.tar.gz", *names]
-    for path, platform in zip(built[1:], release.PLATFORMS, strict=True):
+    page = f"dxlrun_view-{VERSION}-py3-none-any.whl"
+    assert [path.name for path in built] == [f"dxlrun-{VERSION}.tar.gz", *names, page]
+    for path, platform in zip(built[1:-1], release.PLATFORMS, strict=True):
         with zipfile.ZipFile(path) as wheel:
             assert wheel.testzip() is None
             facts = email.message_from_bytes(wheel.read(f"dxlrun-{VERSION}.dist-info/WHEEL"))
@@ -95,7 +103,7 @@ def test_a_wheel_has_the_package_with_objects_for_its_processor(built: list[Path
         for path in (ROOT / "runtime/dxlrun").rglob("*.py*")
         if path.suffix in {".py", ".pyi"}
     }
-    for path in built[1:]:
+    for path in built[1:-1]:
         with zipfile.ZipFile(path) as wheel:
             assert sources - {*wheel.namelist()} == set()
             assert {name for name in wheel.namelist() if name.endswith(".so")} == OBJECTS.keys()
@@ -110,7 +118,7 @@ def test_a_wheel_has_the_package_with_objects_for_its_processor(built: list[Path
 @pytest.mark.timeout(600)
 def test_no_object_needs_a_newer_system_than_its_tag_names(built: list[Path]) -> None:
     elffile = importlib.import_module("elftools.elf.elffile")
-    for path in built[1:]:
+    for path in built[1:-1]:
         with zipfile.ZipFile(path) as wheel:
             for name in OBJECTS:
                 with wheel.open(name) as stream:
@@ -140,7 +148,7 @@ def test_the_same_tree_gives_the_same_bytes(release: ModuleType, built: list[Pat
     root = tree(tmp_path / "another" / "folder", umask=0o077)
     again = release.build(root, tmp_path / "dist", ["manylinux_2_17_x86_64", "musllinux_1_2_aarch64"])
     first = {path.name: path.read_bytes() for path in built}
-    assert len(again) == 3
+    assert len(again) == 4
     assert [path.name for path in again if path.read_bytes() != first[path.name]] == []
 
 
@@ -175,6 +183,53 @@ def test_the_sdist_can_be_built_without_a_clone(built: list[Path]) -> None:
         names = {name.partition("/")[2] for name in sdist.getnames()}
     assert {"hatch_build.py", "release/build.py", "pyproject.toml", "LICENSE"} <= names
     assert not any(name.endswith(".so") for name in names)
+
+
+@pytest.mark.timeout(600)
+def test_demo_runs_from_the_wheels_in_an_empty_environment(
+    built: list[Path], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Without a clone: the motion with dxlrun alone, then the page with dxlrun-view."""
+    monkeypatch.setenv("XDG_RUNTIME_DIR", str(tmp_path))
+    monkeypatch.delenv("PYTHONPATH", raising=False)
+    python = tmp_path / "environment/bin/python"
+    subprocess.run([sys.executable, "-m", "venv", tmp_path / "environment"], check=True)
+    (core,) = [path for path in built if path.stem.endswith(f"manylinux_2_17_{machine()}")]
+
+    def install(wheel: Path) -> None:
+        subprocess.run([python, "-m", "pip", "install", "--quiet", wheel], check=True, timeout=400)
+
+    def demo(*words: str) -> subprocess.Popen[str]:
+        command = [python.with_name("dxlrun"), "demo", *words]
+        return subprocess.Popen(
+            command, cwd=tmp_path, text=True, stdout=subprocess.PIPE, stderr=subprocess.STDOUT
+        )
+
+    install(core)
+    said, _ = demo("--virtual").communicate(timeout=120)
+    assert "3 of 3 goals reached" in said, said
+
+    install(built[-1])
+    with demo() as running:
+        try:
+            assert running.stdout is not None
+            lines = iter(running.stdout.readline, "")
+            found = next(filter(None, (re.search(r"http://(\S+)/\?token=(\S+)", line) for line in lines)))
+            host, token = found.groups()
+            headers = {"X-Dxlrun-Token": token, "Content-Type": "application/json"}
+
+            def ask(path: str, body: str | None = None) -> bytes:
+                with closing(http.client.HTTPConnection(host, timeout=20)) as connection:
+                    connection.request("GET" if body is None else "POST", path, body, headers)
+                    answer = connection.getresponse()
+                    assert answer.status == 200, path
+                    return answer.read()
+
+            assert min(len(ask(path)) for path in ("/", "/page.js", "/page.css")) > 1000
+            until(lambda: json.loads(ask("/look", "{}"))["moment"]["values"])
+            assert json.loads(ask("/look", '{"shown": true}'))["shown"]["info"]["robot"] == "bioloid_torso"
+        finally:
+            running.send_signal(signal.SIGINT)
 
 
 def test_what_cannot_be_built_is_one_message(release: ModuleType, tmp_path: Path) -> None:

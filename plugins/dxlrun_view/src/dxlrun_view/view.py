@@ -70,7 +70,8 @@ def view(
 
             signal.signal(signal.SIGINT, end)
             signal.signal(signal.SIGTERM, end)
-            show(f"{source.shown().info.robot}: {url}", "Ctrl-C ends the page, not the robot.")
+            robot = source.shown().info.robot
+            show(f"{robot}: {url}", "Ctrl-C ends the page. A robot in another terminal continues.")
             sys.stdout.flush()
             if browser and not names:
                 threading.Thread(target=_open, args=(url,), daemon=True).start()
