@@ -131,3 +131,29 @@ def test_each_page_is_whole_in_chromium(built: Path, sources: Path, address: str
     assert [
         one["url"] for one in answers if one["status"] >= 400 or not one["url"].startswith((address, "data:"))
     ] == []
+
+
+ROOM = "[...document.querySelectorAll('*')].find(one => one.shadowRoot)?.shadowRoot"
+"""In a page: what the search draws in."""
+
+
+@pytest.mark.timeout(600)
+@pytest.mark.skipif(CHROMIUM is None, reason="no Chromium is installed; apt install chromium")
+def test_search_works_without_a_server(built: Path, address: str, tmp_path: Path) -> None:
+    browser = Browser(tmp_path)
+    for start in (built.as_uri(), address):
+        browser.open(f"{start}/how-to/view.html")
+        browser.until(f"!!{ROOM}")
+        browser.click("[data-md-component=search]")
+        browser.until(f"!!{ROOM}.activeElement?.matches('input')")
+        for letter in "hottest":  # the field must keep the letters before
+            browser("Input.insertText", text=letter)
+        browser.until(f"{ROOM}.activeElement.value === 'hottest'")
+        browser.until(f"[...{ROOM}.querySelectorAll('a')].some(one => one.href.includes('view.html'))")
+    browser.close()
+
+
+def test_first_screen_shows_the_product(sources: Path) -> None:
+    first = (sources / "index.md").read_text().partition("\n## ")[0]
+    assert "](pictures/view.png)" in first
+    assert "dxlrun demo" in first
