@@ -60,15 +60,13 @@ def _compiled(
             where_to_get(entry.type, tuple(plugins.drivers_of("sensors")), plugins.broken),
         )
         return None
-    names = report_entry(
-        file, "sensor", name, entry, offer.driver.Parameters, lambda: _names(name, entry, offer)
+    period_ns = round(1e9 / (entry.rate or file.robot.loop.rate))
+    plan = report_entry(
+        file, "sensor", name, entry, offer.driver.Parameters, lambda: _plan(name, entry, offer, period_ns)
     )
-    if names is None:
+    if plan is None:
         return None
-    states, links, noisy, units = names
-    _check_links(file, name, entry, links, known)
-    rate = entry.rate or file.robot.loop.rate
-    period_ns = round(1e9 / rate)
+    _check_links(file, name, entry, plan.links, known)
     if entry.timeout is not None and entry.timeout <= period_ns:
         file.error(
             marks.value("sensors", name, "timeout"),
@@ -76,26 +74,11 @@ def _compiled(
             f"{entry.timeout / 1e6:g} ms without one",
             "write a longer timeout, such as five periods, or the rate that it has",
         )
-    return SensorPlan(
-        name=name,
-        type=entry.type,
-        distribution=offer.distribution,
-        parameters=json.dumps(entry.parameters),  # as written, because the model accepts `60 deg`
-        states=states,
-        period_ns=period_ns,
-        timeout_ns=entry.timeout or max(_TIMEOUT_PERIODS * period_ns, _LEAST_TIMEOUT_NS),
-        on_lost=entry.on_lost,
-        links=links,
-        simulated=offer.driver.simulated,
-        noisy=noisy,
-        units=units,
-    )
+    return plan
 
 
-def _names(
-    name: str, entry: SensorEntry, offer: DriverOffer
-) -> tuple[tuple[str, ...], tuple[str, ...], tuple[str, ...], dict[str, str]]:
-    """Return the states of a sensor, its links, the states with noise, and the units of states.
+def _plan(name: str, entry: SensorEntry, offer: DriverOffer, period_ns: int) -> SensorPlan:
+    """Return the plan of a sensor, with what its class names.
 
     Raises:
         ValidationError: The parameters are invalid.
@@ -114,7 +97,20 @@ def _names(
         breach = f"returns {units!r} from units", "return a mapping from its states to texts"
     if breach:
         raise code.broken(breach)
-    return states, links, noisy, dict(units)
+    return SensorPlan(
+        name=name,
+        type=entry.type,
+        distribution=offer.distribution,
+        parameters=json.dumps(entry.parameters),  # as written, because the model accepts `60 deg`
+        states=states,
+        period_ns=period_ns,
+        timeout_ns=entry.timeout or max(_TIMEOUT_PERIODS * period_ns, _LEAST_TIMEOUT_NS),
+        on_lost=entry.on_lost,
+        links=links,
+        simulated=sensor.simulated,
+        noisy=noisy,
+        units=dict(units),
+    )
 
 
 def _check_links(
