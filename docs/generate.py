@@ -273,8 +273,10 @@ def event_rows() -> list[tuple[str, str, EventText[...]]]:
 
 
 def text_tables() -> list[Path]:
-    """Return the tables of texts of the runtime's rooms."""
-    return sorted((ROOT / "runtime/dxlrun").rglob("texts.py"))
+    """Return the tables of texts of the runtime's rooms, and the features of one module."""
+    runtime = ROOT / "runtime/dxlrun"
+    modules = (path for path in (runtime / "features").glob("*.py") if path.stem != "__init__")
+    return sorted([*runtime.rglob("texts.py"), *modules])
 
 
 def text_of(row: EventText[...]) -> str:

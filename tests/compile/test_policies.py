@@ -35,7 +35,7 @@ def test_a_fallback_is_in_the_plan() -> None:
 def test_without_policies_a_run_ends_limp_and_a_lost_servo_does_not_end_it() -> None:
     policies = compile_text(PAIR).plan.loop.policies
     assert (policies.on_exit, policies.on_fault) == (LIMP, LIMP)
-    assert (policies.on_lost_servo, policies.on_stale_command) == (HOLD, HOLD)
+    assert policies.of_features == {"on_lost_servo": HOLD, "on_stale_command": HOLD}
 
 
 def test_policies_become_steps_in_radians() -> None:
@@ -46,15 +46,15 @@ def test_policies_become_steps_in_radians() -> None:
     assert (torque.fraction, torque.levels, torque.longest_ns) == (0.25, 3, 600_000_000)
     assert policies.on_exit.last == "limp"
     assert policies.on_fault == Policy((), "hold")
-    assert policies.on_lost_servo.steps[0].targets == (None, pytest.approx(math.radians(10)))
-    assert policies.on_lost_servo.last == "hold"
-    assert not policies.on_lost_servo.goes_on
+    assert policies.of_features["on_lost_servo"].steps[0].targets == (None, pytest.approx(math.radians(10)))
+    assert policies.of_features["on_lost_servo"].last == "hold"
+    assert not policies.of_features["on_lost_servo"].goes_on
 
 
 def test_a_pose_takes_its_time_from_the_farthest_limit_with_a_slow_first_second() -> None:
     """right_arm_joint, 10 deg of -90..60: 100 deg away; a second at 1.5 rad/s, the rest at 4 rad/s, 0.3 s to
     settle."""
-    step = compile_text(PAIR + POLICIES).plan.loop.policies.on_lost_servo.steps[0]
+    step = compile_text(PAIR + POLICIES).plan.loop.policies.of_features["on_lost_servo"].steps[0]
     assert step.longest_ns * 1e-9 == pytest.approx(1 + (math.radians(100) - 1.5) / 4 + 0.3, abs=1e-6)
 
 
@@ -100,13 +100,13 @@ def test_steps_one_after_the_other_take_the_sum_of_their_times() -> None:
 
 def test_a_pose_is_no_faster_than_its_joints_may_be() -> None:
     slow = PAIR.replace("60 deg]}", "60 deg], velocity: 0.5 rad/s}")
-    step = compile_text(slow + POLICIES).plan.loop.policies.on_lost_servo.steps[0]
+    step = compile_text(slow + POLICIES).plan.loop.policies.of_features["on_lost_servo"].steps[0]
     assert step.longest_ns * 1e-9 == pytest.approx(math.radians(100) / 0.5 + 0.3, abs=1e-6)
 
 
 def test_a_pose_takes_the_time_to_stop_before_and_to_gain_speed() -> None:
     text = PAIR.replace("60 deg]}", "60 deg], velocity: 2 rad/s, acceleration: 4 rad/s^2}")
-    step = compile_text(text + POLICIES).plan.loop.policies.on_lost_servo.steps[0]
+    step = compile_text(text + POLICIES).plan.loop.policies.of_features["on_lost_servo"].steps[0]
     moving_s = 1 + (math.radians(100) - 1.5) / 2
     assert step.longest_ns * 1e-9 == pytest.approx(2 / 4 + 2 / 4 + moving_s + 0.3, abs=1e-6)
 

@@ -16,7 +16,7 @@ from dxlrun.control.monitors import build_monitors
 from dxlrun.control.monitors.monitor import MonitorStage
 from dxlrun.control.monitors.policy_actions import PolicyActions
 from dxlrun.features.feature import Feature, S
-from dxlrun.features.lost_servos.monitor import LostServos
+from dxlrun.features.lost_servos import LostServos
 from dxlrun.features.sensors.monitor import NeededSensors
 from dxlrun.features.sensors.plan import SensorPlan, encode_sensors
 from dxlrun.plan.loop_plan import JointPlan, LoopPlan, SourcePlan

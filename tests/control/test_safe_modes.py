@@ -139,7 +139,7 @@ def test_a_run_that_ends_in_a_pause_leaves_the_guardian_its_usual_patience(robot
 
 
 def test_of_two_policies_that_end_a_run_the_first_one_counts(robot):
-    plan = PolicyPlan(on_lost_servo=Policy(POSE.steps, "hold"), on_stale_command=LIMP)
+    plan = PolicyPlan(of_features={"on_lost_servo": Policy(POSE.steps, "hold"), "on_stale_command": LIMP})
     robot.build(policies=plan)
 
     def both(*_):

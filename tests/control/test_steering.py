@@ -184,7 +184,7 @@ def test_the_controllers_time_never_goes_back_when_a_loop_that_catches_up_is_pau
     assert (np.diff(left.times("left")) >= 0).all()
 
 
-STRICT = PolicyPlan(on_stale_command=LIMP)
+STRICT = PolicyPlan(of_features={"on_stale_command": LIMP})
 
 
 @pytest.mark.parametrize("policies", [PolicyPlan(), STRICT])

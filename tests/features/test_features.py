@@ -47,6 +47,17 @@ def test_feature_without_file_takes_no_part_in_stage() -> None:
     assert Feature("empty", "dxlrun.messages").stage(CompileStage) is None
 
 
+def test_guardian_does_not_import_a_feature_of_one_module() -> None:
+    code = (
+        "import sys; from dxlrun.dynamixel.bus_part import SafeEnd; from dxlrun.features import FEATURES; "
+        "SafeEnd.of(FEATURES, {}); print(*(one.package for one in FEATURES if one.package in sys.modules))"
+    )
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
+    imported = done.stdout.split()
+    assert "dxlrun.features.devices" in imported
+    assert "dxlrun.features.lost_servos" not in imported
+
+
 def test_broken_file_of_feature_is_an_error(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     package = tmp_path / "broken_feature"
     package.mkdir()

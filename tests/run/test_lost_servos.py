@@ -14,9 +14,9 @@ from tests.kit.wire import all_writes
 from dxlrun.channels.answers import Done
 from dxlrun.channels.commands import LOOP, Command
 from dxlrun.channels.cycle import States
-from dxlrun.channels.events import EventCode, Severity
-from dxlrun.features.lost_servos.monitor import LostServos, MissedReplies
-from dxlrun.plan.policy_plan import LIMP, GroupPolicy, PolicyPlan
+from dxlrun.channels.events import EventBody, EventCode
+from dxlrun.features.lost_servos import GroupPolicy, LostServos, MissedReplies
+from dxlrun.plan.policy_plan import LIMP, PolicyPlan
 from dxlrun.run.virtual_run import VirtualRobot
 from dxlrun.testing import read_log, simulated_robot
 from dxlrun_controllers.group import JointGroupPositionController
@@ -286,14 +286,14 @@ class NotedActions:
     def hold_controllers(self, holder: object, lost: frozenset[int], until: str) -> None:
         self.done.append(("hold", set(lost)))
 
-    def report(self, severity: Severity, text: str) -> None:
-        self.done.append((severity.name, text))
+    def report(self, event: EventBody) -> None:
+        self.done.append((event.severity.name, event.text))
 
 
 def test_group_becomes_limp_once_however_long_its_servo_stays_away():
     arm = GroupPolicy("arm", frozenset({0, 1}), "limp")
-    states, actions = States.empty(3), NotedActions(PolicyPlan(groups=(arm,)))
-    monitor = LostServos(("a", "b", "c"), states, actions)
+    states, actions = States.empty(3), NotedActions(PolicyPlan())
+    monitor = LostServos(("a", "b", "c"), states, actions, (arm,))
     states.age_ns[:] = 100_000_000
     for lost in [(0,)] * 5 + [(0, 1)] * 5 + [()] * 2 + [(0,)] * 5:
         states.valid[:] = True
@@ -309,8 +309,8 @@ def test_group_becomes_limp_once_however_long_its_servo_stays_away():
 )
 def test_a_lost_servo_of_a_group_ends_the_run_by_on_fault_if_the_group_says_stop(own, policy):
     groups = () if own is None else (GroupPolicy("arm", frozenset({0}), own),)
-    states, actions = States.empty(1), NotedActions(PolicyPlan(on_lost_servo=LIMP, groups=groups))
-    monitor = LostServos(("a",), states, actions)
+    states, actions = States.empty(1), NotedActions(PolicyPlan(of_features={"on_lost_servo": LIMP}))
+    monitor = LostServos(("a",), states, actions, groups)
     states.age_ns[:] = 100_000_000
     for _ in range(3):
         monitor.check(0)

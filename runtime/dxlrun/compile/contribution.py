@@ -11,10 +11,8 @@ from dxlrun.compile.joints.joints import CompiledJoint
 from dxlrun.compile.joints.urdf import CompiledUrdf
 from dxlrun.compile.problems import RobotFile
 from dxlrun.control.controllers.plugins import PlugIns
-from dxlrun.description.robot import WrittenPolicy
 from dxlrun.plan.loop_plan import ControllerPlan, SourcePlan
 from dxlrun.plan.mechanics_plan import MechanicsPlan
-from dxlrun.plan.policy_plan import GroupPolicy
 from dxlrun.plan.recording_plan import RecordingPlan
 from dxlsim.simulation_plan import Shown
 from dxlwire.bus_plan import DevicePlan
@@ -43,17 +41,6 @@ class BusDevice(msgspec.Struct, frozen=True):
     """Its states if the bus is simulated."""
 
 
-class PolicyEntry(msgspec.Struct, frozen=True):
-    """Policy of a feature."""
-
-    name: str
-    """Its key, or the key and a group: `on_lost_servo of wheels`."""
-    does: str
-    """Its action while the run continues, for `dxlrun check`."""
-    steps: WrittenPolicy | None = None
-    """Steps with which it ends the run, in the notation of the file; None for `hold`, or without steps."""
-
-
 class Contribution(msgspec.Struct, frozen=True):
     """The share of one feature in a plan."""
 
@@ -78,10 +65,8 @@ class Contribution(msgspec.Struct, frozen=True):
     """Assignment of servos to joints, set by one feature only."""
     recording: RecordingPlan | None = None
     """Destination of the log, set by one feature only."""
-    policies: tuple[PolicyEntry, ...] = ()
-    """Policies of the feature, for `dxlrun check`."""
-    group_policies: tuple[GroupPolicy, ...] = ()
-    """Groups of joints with their own policy for lost servos."""
+    policies: Mapping[str, str] = {}
+    """Actions of policies, for `dxlrun check`, by key, or by key and group: `on_lost_servo of wheels`."""
 
 
 class CompileStage(msgspec.Struct, frozen=True):

@@ -3,15 +3,15 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 
-from dxlrun.compile.contribution import Contribution
 from dxlrun.compile.joints.joints import CompiledJoint
 from dxlrun.compile.joints.limits import Interval, degrees, limits_of
 from dxlrun.compile.problems import RobotFile
 from dxlrun.description.document import KeyPath
 from dxlrun.description.robot import PoseStep, TorqueStep, WrittenPolicy
 from dxlrun.errors import suggestion
+from dxlrun.features.feature import PolicyKey
 from dxlrun.plan.policy_plan import (
     HOLD,
     LIMP,
@@ -35,16 +35,14 @@ def compile_policies(
     file: RobotFile,
     joints: Mapping[str, CompiledJoint],
     buses: Sequence[BusPlan],
-    contributions: Sequence[Contribution],
+    keys: Iterable[PolicyKey[WrittenPolicy]],
 ) -> PolicyPlan:
     """Return the policies of a file; add problems if they do not fit the robot or `exit_timeout`."""
     _check_poses(file, joints)
     robot = file.robot
     limit_ns = robot.policies.exit_timeout - _reserve_ns(buses, robot.loop.rate)
     written = {"on_exit": robot.policies.on_exit, "on_fault": robot.policies.on_fault}
-    for entry in (entry for each in contributions for entry in each.policies):
-        if entry.steps is not None:
-            written[entry.name] = entry.steps
+    written |= {each.name: each.of(robot.policies) for each in keys}
     found: dict[str, Policy] = {}
     for name, steps in written.items():
         found[name] = _policy(file, name, steps, joints)
@@ -55,8 +53,7 @@ def compile_policies(
         if found[name].last == "hold" and (name in ("on_exit", "on_fault") or not found[name].goes_on):
             _check_stopping(file, name, joints, limit_ns - found[name].longest_ns)
     _check_groups(file, joints)
-    groups = tuple(group for each in contributions for group in each.group_policies)
-    return PolicyPlan.collect(found, groups, max(0, limit_ns))
+    return PolicyPlan(found.pop("on_exit"), found.pop("on_fault"), max(0, limit_ns), of_features=found)
 
 
 def _check_poses(file: RobotFile, joints: Mapping[str, CompiledJoint]) -> None:

@@ -11,7 +11,6 @@ from typing import Any, ClassVar, Literal
 
 import msgspec
 
-from dxlrun.compile.contribution import PolicyEntry
 from dxlrun.compile.graph import ControllerGraph
 from dxlrun.compile.joints.described_servos import DescribedServo
 from dxlrun.compile.joints.joints import CompiledJoint
@@ -47,7 +46,7 @@ def check_report(
     rate: float,
     joints: Sequence[CompiledJoint],
     parts: Sequence[MotionPart],
-    policies: Sequence[PolicyEntry],
+    policies: Mapping[str, str],
 ) -> Row:
     """Return all results of the compilation of a robot, for JSON."""
     loop, buses = plan.loop, plan.buses
@@ -207,13 +206,13 @@ class PolicyRow(msgspec.Struct, frozen=True):
     without_loop: str  # action taken by the guardian when the loop process has exited
 
 
-def policy_rows(plan: Plan, entries: Sequence[PolicyEntry]) -> list[PolicyRow]:
+def policy_rows(plan: Plan, shown: Mapping[str, str]) -> list[PolicyRow]:
     """Return the rows of all policies: those with steps come first."""
     policies = plan.loop.policies.by_name
     found = {name: (policy.text, policy.longest_ns * 1e-9) for name, policy in policies.items()}
-    for entry in entries:
-        if entry.name not in policies or policies[entry.name].goes_on:
-            found[entry.name] = entry.does, 0.0
+    found |= {
+        name: (does, 0.0) for name, does in shown.items() if name not in policies or policies[name].goes_on
+    }
     found["on_returned_servo"] = _on_returned_servo(plan.buses), 0.0
     alone = policies["on_fault"].last
     return [PolicyRow(name, does, longest, alone) for name, (does, longest) in found.items()]

@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, TypeAlias
 import msgspec
 
 from dxlrun.compile.buses import compile_buses, slowest_period_ns
-from dxlrun.compile.contribution import Compilation, CompileStage, PolicyEntry, check_source_names
+from dxlrun.compile.contribution import Compilation, CompileStage, check_source_names
 from dxlrun.compile.controllers import (
     check_motions,
     check_robot,
@@ -40,7 +40,7 @@ from dxlrun.description.reading import Description, Replacement, read_robot
 from dxlrun.description.robot import Loop
 from dxlrun.errors import InputError, Problem
 from dxlrun.features import stages
-from dxlrun.features.feature import Feature
+from dxlrun.features.feature import Feature, PolicyKey
 from dxlrun.installed_plugins import PHYSICS_GROUP, distribution_name, installed_plugins
 from dxlrun.plan.loop_plan import MOST_SHARE, LoopPlan, SchedulerPlan
 from dxlrun.plan.mechanics_plan import MechanicsPlan
@@ -66,7 +66,7 @@ class Compiled(msgspec.Struct, frozen=True):
     rate: float  # rate of the loop in the file, Hz
     joints: tuple[CompiledJoint, ...]
     parts: tuple[MotionPart, ...]
-    policies: tuple[PolicyEntry, ...]
+    policies: Mapping[str, str]  # actions of the features' policies while the run continues
 
     @property
     def report(self) -> Row:
@@ -190,7 +190,8 @@ def compile_robot(
     check_motions(file, joints, controllers)
     modes = compile_modes(file, joints, controllers)
     buses = compile_buses(file, joints, contributions, modes)
-    policies = compile_policies(file, joints, buses, contributions)
+    policy_keys = [one for _, one in stages(PolicyKey, features) if one.does]
+    policies = compile_policies(file, joints, buses, policy_keys)
     parts: list[MotionPart] = []
     if motions:
         from dxlrun.compile.motions import check_times, compile_motion  # as above
@@ -222,8 +223,10 @@ def compile_robot(
         feature_plans={name: each.plan for name, each in by_feature.items() if each.plan},
     )
     texts = {**description.included, **motors.texts}
+    shown = {one.name: one.does for one in policy_keys}
     for each in contributions:
         texts |= each.texts
+        shown |= each.policies
     robot, folder = description.robot, description.path.parent
     plan = Plan(
         robot=robot.name,
@@ -246,7 +249,6 @@ def compile_robot(
         | _packages(features),
         mechanics=next((each.mechanics for each in contributions if each.mechanics), MechanicsPlan()),
     )
-    shown = tuple(entry for each in contributions for entry in each.policies)
     return Compiled(plan, file.warnings, settings.rate, tuple(joints.values()), tuple(parts), shown)
 
 

@@ -34,6 +34,7 @@ from dxlrun.control.halt import Halt
 from dxlrun.control.joint_requests import JointRequests
 from dxlrun.control.monitors.policy_actions import PolicyActions
 from dxlrun.plan.loop_plan import ControllerPlan
+from dxlrun.plan.policy_plan import HOLD
 
 MOST_RATE = 100_000.0
 """Hz; same limit as in the robot file."""
@@ -247,7 +248,7 @@ class Steering:
 
     def _stale(self, why: str) -> str:
         """End the run if the policy for stale commands requires it; return that as text, or an empty one."""
-        policy = self._context.plan.policies.on_stale_command
+        policy = self._context.plan.policies.of_features.get("on_stale_command", HOLD)
         if policy.goes_on:
             return ""
         self._actions.end_run("on_stale_command", why)

@@ -1,8 +1,7 @@
-"""Features: one folder for each section or key of the robot file, with everything that it needs.
+"""Features: a folder or a module for each section or key of the robot file, with everything that it needs.
 
-A folder contains the files of one feature for every stage, from its form to its part in the loop. Code that
-two features share belongs to the package of that stage. `feature.py` describes the files; `FEATURES` lists
-the folders.
+It contains one feature for every stage, from its form to its part in the loop. Code that two features share
+belongs to the package of that stage. `feature.py` describes the files; `FEATURES` lists the features.
 """
 
 from __future__ import annotations
@@ -107,7 +106,7 @@ def _find_fault(feature: Feature, found: Container[str]) -> str:
     names = {key.name for key in (*keys, *groups)}
     faults = {
         "another feature has that name": name in found,
-        "no form.py, joint_key.py, servo_key.py or policy_key.py declares it": name not in names,
+        "no STAGES, form.py, joint_key.py, servo_key.py or policy_key.py declares it": name not in names,
         f"a file declares {', '.join(sorted(names - {name}))} instead": len(names) > 1,
         "a key begins with a letter": name.startswith("_"),
         "dxlrun has a key of that name": any(name in RESERVED[type(key)].split() for key in keys),

@@ -1,10 +1,12 @@
-"""Feature: a section or a key of the robot file with everything that it needs, in one folder.
+"""Feature: a section or a key of the robot file with everything that it needs, in one place.
 
 A feature is a package whose files have fixed names, one for each stage in which it takes part: `form.py` has
 its section, `joint_key.py`, `servo_key.py` or `policy_key.py` its key of joints, servos or `policies`,
 `compile.py` its share of the plan, and so on. Each file has one object `STAGE`. The class of the object
 belongs to the package of that stage, and documents when the stage is used. A feature has only the files that
 it needs. The stage imports its file, so `dxlrun check` does not import any file of the run.
+
+A small feature is one module with these objects in a tuple `STAGES`, but for `events`, `process` and `safe`.
 """
 
 from __future__ import annotations
@@ -13,6 +15,7 @@ from collections.abc import Callable, Iterable, Mapping
 from functools import cache
 from importlib import import_module
 from importlib.resources import files
+from importlib.util import find_spec
 from typing import Any, ClassVar, Generic, Protocol, TypeVar, cast
 
 import msgspec
@@ -141,6 +144,9 @@ class PolicyKey(msgspec.Struct, Generic[T], frozen=True):
     """Type of the value, for pydantic: `Literal["stop", "limp"] | None`."""
     field: T
     """Field of the key with its default, as `dxlrun.description.form.key` returns it."""
+    does: str = ""
+    """Action of `hold`, for `dxlrun check`. With it, the value is a `WrittenPolicy`: `hold` while the run
+    continues, or steps that end the run, which are checked as those of `on_exit`."""
     before: str = ""
     """Next key of the section in lists of all keys; if it does not exist, this key is the last."""
     group: PolicyKey[Any] | None = None
@@ -153,22 +159,30 @@ class PolicyKey(msgspec.Struct, Generic[T], frozen=True):
 
 
 class Feature(msgspec.Struct, frozen=True):
-    """Name of a feature, and the package with its files."""
+    """Name of a feature, and the package with its files, or its one module."""
 
     name: str
     """Its key in the robot file, such as `devices`: at the top, of joints, of servos or of `policies`."""
     package: str
-    """Package with its files, such as `dxlrun.features.devices`."""
+    """Package with its files, such as `dxlrun.features.devices`, or module with `STAGES`."""
     distribution: str = ""
     """Publisher of the plug-in with the package: `name version`. Empty for the features of dxlrun."""
 
     def stage(self, kind: type[S]) -> S | None:
-        """Return the feature's `STAGE` for one stage; None if the feature does not have the file."""
+        """Return the feature's object for one stage; None if the feature takes no part in it."""
         return _stage(self.package, kind)
+
+
+_OF_PACKAGES = ("events", "process", "safe")
+"""Files that guardian, processes of sensors and readers of logs import without the rest of a feature."""
 
 
 @cache
 def _stage(package: str, kind: type[S]) -> S | None:
+    spec = find_spec(package)
+    if spec is not None and spec.submodule_search_locations is None:
+        found = () if kind.FILE in _OF_PACKAGES else getattr(import_module(package), "STAGES", ())
+        return next((each for each in found if isinstance(each, kind)), None)
     if kind.FILE not in _files(package):
         return None
     module = f"{package}.{kind.FILE}"

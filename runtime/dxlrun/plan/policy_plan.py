@@ -1,4 +1,4 @@
-"""Policy plan: actions of a robot at the end of a run, after faults, and after lost servos or commands."""
+"""Policy plan: actions of a robot at the end of a run, after faults, and by features."""
 
 from __future__ import annotations
 
@@ -7,7 +7,6 @@ from collections.abc import Mapping
 from typing import Literal
 
 import msgspec
-from msgspec.structs import replace
 
 from dxlwire.joint_unit import LINEAR, ROTARY, JointUnit
 
@@ -103,47 +102,20 @@ LIMP = Policy()
 HOLD = Policy(last="hold")
 
 
-class GroupPolicy(msgspec.Struct, frozen=True):
-    """Policy for the loss of a servo in a group of joints."""
-
-    name: str
-    rows: frozenset[int]  # Rows of its joints
-    on_lost_servo: Literal["hold", "limp", "stop"]
-    """`hold`: its controllers are held; `limp`: the group's torque is disabled; `stop`: the run ends."""
-
-
 class PolicyPlan(msgspec.Struct, frozen=True):
     """Policies of a robot."""
 
     on_exit: Policy = LIMP  # After a stop request, or at the end of the plan
     on_fault: Policy = LIMP  # After a fault of the loop, a bus, or a controller without an available fallback
-    on_lost_servo: Policy = HOLD
-    on_stale_command: Policy = HOLD
-    groups: tuple[GroupPolicy, ...] = ()  # Replace `on_lost_servo` for the joints of a group
     limit_ns: int = 1_500_000_000
     """Time limit of the steps. The rest of the exit timeout is reserved for torque off."""
-    others: dict[str, Policy] = {}
-    """Policies of features without a field above, by name."""
-
-    @classmethod
-    def collect(
-        cls, policies: Mapping[str, Policy], groups: tuple[GroupPolicy, ...], limit_ns: int
-    ) -> PolicyPlan:
-        """Return a plan with policies by name."""
-        own = {name: policies[name] for name in cls().by_name if name in policies}
-        others = {name: policy for name, policy in policies.items() if name not in own}
-        return replace(cls(groups=groups, limit_ns=limit_ns, others=others), **own)
+    of_features: dict[str, Policy] = {}
+    """Policies of features by name; those with `hold` do not end the run."""
 
     @property
     def by_name(self) -> dict[str, Policy]:
         """All policies by name."""
-        return {
-            "on_exit": self.on_exit,
-            "on_fault": self.on_fault,
-            "on_lost_servo": self.on_lost_servo,
-            "on_stale_command": self.on_stale_command,
-            **self.others,
-        }
+        return {"on_exit": self.on_exit, "on_fault": self.on_fault, **self.of_features}
 
     def slowest_period_ns(self, planned_ns: int) -> int:
         """Return the longest period with which a run ends within its exit timeout.

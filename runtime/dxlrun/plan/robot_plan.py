@@ -132,17 +132,17 @@ def decode_plan(data: bytes, parts: type[Parts]) -> Parts:
     return msgspec.json.decode(_move_sections(data.replace(b'"linear":true', b'"unit":"m"')), type=parts)
 
 
-class _OlderPlan(msgspec.Struct):
-    loop: dict[str, msgspec.Raw] = {}
-
-
 def _move_sections(data: bytes) -> bytes:
-    """Move sections that the loop has in plans of earlier versions to the plans of their features."""
-    loop = msgspec.json.decode(data, type=_OlderPlan).loop
-    found = {one.name: bytes(loop.get(one.name, b"[]")) for one in FEATURES}
-    moved = {name: b64encode(section).decode() for name, section in found.items() if section != b"[]"}
-    if not moved:
+    """Move sections and policies that the loop has in plans of earlier versions to their features."""
+    if b'"of_features":' in data:
         return data
     tree = msgspec.json.decode(data, type=dict[str, Any])
-    tree["loop"].setdefault("feature_plans", {}).update(moved)
-    return msgspec.json.encode(tree)
+    loop = msgspec.convert(tree.get("loop", {}), dict[str, Any])
+    policies = msgspec.convert(loop.get("policies", {}), dict[str, Any])
+    own = {one.name: policies.pop(one.name) for one in FEATURES if one.name in policies}
+    sections = {one.name: loop.pop(one.name, None) for one in FEATURES}
+    sections["on_lost_servo"] = policies.pop("groups", None)
+    plans = {name: b64encode(msgspec.json.encode(one)).decode() for name, one in sections.items() if one}
+    loop["feature_plans"] = loop.get("feature_plans", {}) | plans
+    loop["policies"] = policies | {"of_features": own}
+    return msgspec.json.encode(tree | {"loop": loop})

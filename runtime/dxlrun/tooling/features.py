@@ -4,7 +4,8 @@ A feature is a package with files of fixed names. Each has an object `STAGE` of 
 `Section` in `form.py`, `JointKey` in `joint_key.py`, `ServoKey` in `servo_key.py`, `PolicyKey` in
 `policy_key.py`, `CompileStage` in `compile.py`, `SettingsStage` in `settings.py`, `LayerStage` in `layer.py`,
 `BusStage` in `runtime.py`, `MonitorStage` in `monitor.py`, `SafeStage` in `safe.py`, `ProcessStage` in
-`process.py`, `ReaderStage` in `reader.py`, `TableStage` in `table.py`. One of the first four is required.
+`process.py`, `ReaderStage` in `reader.py`, `TableStage` in `table.py`. One of the first four is required. A
+small feature is one module with these objects in a tuple `STAGES`.
 Forms use the names of `dxlrun.tooling.files`. The hook `dxlrun_features` registers the feature:
 
     from dxlrun import hookimpl
@@ -30,7 +31,6 @@ if TYPE_CHECKING:
     from dxlrun.compile.contribution import Compilation as Compilation
     from dxlrun.compile.contribution import CompileStage as CompileStage
     from dxlrun.compile.contribution import Contribution as Contribution
-    from dxlrun.compile.contribution import PolicyEntry as PolicyEntry
     from dxlrun.compile.joints.described_servos import DescribedServo as DescribedServo
     from dxlrun.compile.joints.servos import SettingsStage as SettingsStage
     from dxlrun.compile.problems import RobotFile as RobotFile

@@ -1,1 +1,1 @@
-"""Policy for hot servos: the example of a policy of a package."""
+"""Policies for hot servos: the examples of policies of a package."""

@@ -13,4 +13,4 @@ def dxlrun_contract() -> int:
 
 @hookimpl
 def dxlrun_features() -> list[Feature]:
-    return [Feature("on_hot_servo", "dxlrun_hot"), Feature("on_overheat", "dxlrun_overheat")]
+    return [Feature("on_hot_servo", "dxlrun_hot.hot_servo"), Feature("on_overheat", "dxlrun_hot.overheat")]

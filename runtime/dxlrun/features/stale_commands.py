@@ -1,4 +1,7 @@
-"""Key `on_stale_command` of the policies."""
+"""Policy `on_stale_command`: reaction of a run to a client whose stream of commands stops.
+
+`control/steering.py` detects that, because a command may come in the cycle in which its lease expires.
+"""
 
 from __future__ import annotations
 
@@ -6,7 +9,7 @@ from dxlrun.description.form import key
 from dxlrun.description.robot import WrittenPolicy
 from dxlrun.features.feature import PolicyKey
 
-STAGE: PolicyKey[WrittenPolicy] = PolicyKey(
+ON_STALE_COMMAND: PolicyKey[WrittenPolicy] = PolicyKey(
     "on_stale_command",
     WrittenPolicy,
     key(
@@ -15,5 +18,7 @@ STAGE: PolicyKey[WrittenPolicy] = PolicyKey(
         "hold",
         "hold",
     ),
+    does="hold its joints until the next command",
     before="exit_timeout",
 )
+STAGES = (ON_STALE_COMMAND,)

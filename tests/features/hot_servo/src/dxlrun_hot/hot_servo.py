@@ -1,17 +1,60 @@
-"""Monitor of hot servos: acts once when one becomes hot, and holds controllers until it is cool."""
+"""Policy `on_hot_servo`: acts once when a servo becomes hot, and holds controllers until it is cool."""
 
 from __future__ import annotations
 
-from typing import Self
+from typing import Literal, Self
 
 import msgspec
 import numpy as np
 
-from dxlrun.tooling.features import MonitorStage, PolicyActions, event_text
+from dxlrun import Temperature
+from dxlrun.tooling.features import (
+    Compilation,
+    CompileStage,
+    Contribution,
+    MonitorStage,
+    PolicyActions,
+    PolicyKey,
+    event_text,
+)
+from dxlrun.tooling.files import Form, key
 from dxlrun.tooling.plans import LoopPlan
 from dxlrun.tooling.records import CycleRecord, EventCode, Severity
 
 NAME = "on_hot_servo"
+EXAMPLE = "{above: 70 degC, do: limp}"
+MOST = 100.0  # degC
+
+
+class HotServo(Form):
+    above: Temperature = key("Temperature from which a servo is hot.", "70 degC")
+    do: Literal["stop", "hold", "limp", "continue"] = key(
+        "Its action; stop: the run ends by on_fault.", "limp"
+    )
+
+
+GROUP = PolicyKey[HotServo | None](
+    NAME, HotServo | None, key("As the policy of that name, for this group.", EXAMPLE, None)
+)
+KEY = PolicyKey[HotServo | None](
+    NAME, HotServo | None, key("When a servo is hot.", EXAMPLE, None), group=GROUP
+)
+
+
+def compile_hot_servo(compilation: Compilation) -> Contribution:
+    file, plan = compilation.file, {}
+    policies = file.robot.policies
+    for joint in compilation.joints:
+        hot = policies.of_joint(NAME, joint)
+        if isinstance(hot, HotServo):
+            plan[joint] = hot.above, hot.do
+            if hot.above > MOST:
+                place = file.at("policies", NAME, "above")
+                file.error(place, f"no servo works at {hot.above:g} degC", f"write {MOST:g} degC at most")
+    if not plan:
+        return Contribution()
+    does = ", ".join(f"{joint} above {above:g} degC: {do}" for joint, (above, do) in plan.items())
+    return Contribution(policies={NAME: does}, plan=msgspec.json.encode(plan))
 
 
 @event_text(EventCode.POLICY, Severity.WARNING)
@@ -47,4 +90,4 @@ class HotServos:
         self._hot = hot
 
 
-STAGE = MonitorStage(HotServos)
+STAGES = (KEY, CompileStage(compile_hot_servo), MonitorStage(HotServos))

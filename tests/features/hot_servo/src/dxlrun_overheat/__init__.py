@@ -1,1 +1,0 @@
-"""Policy for overheated servos: the example of a policy with steps that end the run."""
