@@ -10,9 +10,11 @@ import numpy as np
 import pytest
 
 from dxlrun.channels.commands import Command
-from dxlrun.errors import InputError
+from dxlrun.control.source_process import SampledSource
+from dxlrun.errors import InputError, PlugInError, PortError
 from dxlrun.features.sensors.events import SensorEvent
 from dxlrun.log.reader import Log, read_log
+from dxlrun.run import virtual_run
 from dxlrun.run.virtual_run import VirtualRobot
 from dxlrun.testing import plan_of
 from dxlrun_analysis.replay import replay_log
@@ -249,3 +251,26 @@ def test_a_driver_that_raises_is_an_event_and_is_opened_again(crane, tmp_path, m
         "sensor imu brings samples again",
     ]
     assert len(closed) == 2  # then, and at the end
+
+
+@pytest.mark.parametrize("part", ["source", "controller"])
+def test_source_is_closed_when_a_later_part_cannot_start(crane, monkeypatch, part):
+    opened: list[SampledSource] = []
+
+    def open_first(source: SampledSource) -> None:
+        if part == "source" and opened:
+            raise OSError("the second device is not there")
+        opened.append(source)
+        source.open = True
+
+    def fail(*_: object, **__: object) -> None:
+        raise PlugInError("the controller cannot be configured")
+
+    monkeypatch.setattr(SampledSource, "open_first", open_first)
+    if part == "controller":
+        monkeypatch.setattr(virtual_run, "assemble", fail)
+    plan = plan_of(crane((f"imu: {IMU}", f"imu: {IMU}\n  other: {IMU}")))
+    with pytest.raises((PortError, PlugInError), match=r"the second device|the controller"):
+        VirtualRobot(plan)
+    assert opened
+    assert not any(source.open for source in opened)

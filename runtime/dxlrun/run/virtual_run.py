@@ -6,6 +6,7 @@ import sys
 import time
 import traceback
 from collections.abc import Callable
+from contextlib import ExitStack
 from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -94,56 +95,60 @@ class VirtualRobot:
         if simulated.sensed is not None:
             fix_to_links((one for bus in self.buses for one in bus.devices), mechanics, simulated.sensed)
         plugins = load_plugins(files=plan.included)
-        slots = self._start_sources(plugins, mechanics)
-        self.stop = StopFlag()
-        self.inbox = QueueInbox()
-        """Commands put here are read at the start of a cycle."""
-        self.result: LoopResult | None = None
-        self.messages = 0
-        self.log_error: str | None = None
-        """Reason why the log is incomplete."""
-        states = read_states(plan, kept)
-        header = log_header(plan, 0, virtual=True, kept=states) if log else None
-        self._writer = open_writer(log, header, plan.recording) if log and header else None
-        self._kept = KeptFiles(kept) if kept else None
+        with ExitStack() as opened:
+            slots = self._open_sources(plugins, mechanics, opened)
+            self.stop = StopFlag()
+            self.inbox = QueueInbox()
+            """Commands put here are read at the start of a cycle."""
+            self.result: LoopResult | None = None
+            self.messages = 0
+            self.log_error: str | None = None
+            """Reason why the log is incomplete."""
+            states = read_states(plan, kept)
+            header = log_header(plan, 0, virtual=True, kept=states) if log else None
+            self._writer = open_writer(log, header, plan.recording) if log and header else None
+            self._kept = KeptFiles(kept) if kept else None
 
-        def take(kind: RecordKind, payload: Payload) -> None:
-            if self._writer:
-                self._writer.take(kind, payload)
-                if kind == RecordKind.CYCLE and isinstance(self._writer, PartWriter):
-                    self._writer.settle()
-            watch(kind, payload)
-            if self._kept:
-                self._kept.take(kind, payload)
+            def take(kind: RecordKind, payload: Payload) -> None:
+                if self._writer:
+                    self._writer.take(kind, payload)
+                    if kind == RecordKind.CYCLE and isinstance(self._writer, PartWriter):
+                        self._writer.settle()
+                watch(kind, payload)
+                if self._kept:
+                    self._kept.take(kind, payload)
 
-        to_log = Handover(take)
-        self._events = EventRing(to_log, self.clock)
-        self._events.goals.planned = plan.loop.origins
-        self.sinks = Sinks(
-            to_log,
-            PacketBatch(to_log) if log else PacketLog(),
-            self._events,
-            CommandRing(to_log) if log else NoCommands(),
-            messages=MessageRing(to_log) if log or kept else MessageSink(),
-        )
-        host = LoopHost(
-            ports=VirtualPorts(self.clock, self.buses),
-            clock=self.clock,
-            sinks=self.sinks,
-            supervision=Unsupervised(self.stop),
-            inbox=self.inbox if inbox is None else inbox,
-            slots=slots,
-        )
-        self.robot = assemble(plan, plugins, host, take_over=take_over, kept=states)
+            to_log = Handover(take)
+            self._events = EventRing(to_log, self.clock)
+            self._events.goals.planned = plan.loop.origins
+            self.sinks = Sinks(
+                to_log,
+                PacketBatch(to_log) if log else PacketLog(),
+                self._events,
+                CommandRing(to_log) if log else NoCommands(),
+                messages=MessageRing(to_log) if log or kept else MessageSink(),
+            )
+            host = LoopHost(
+                ports=VirtualPorts(self.clock, self.buses),
+                clock=self.clock,
+                sinks=self.sinks,
+                supervision=Unsupervised(self.stop),
+                inbox=self.inbox if inbox is None else inbox,
+                slots=slots,
+            )
+            self.robot = assemble(plan, plugins, host, take_over=take_over, kept=states)
+            # From here on, the end of the run closes the sources.
+            self._opened = opened.pop_all()
 
-    def _start_sources(self, plugins: PlugIns, mechanics: Mechanics) -> dict[str, list[memoryview]]:
+    def _open_sources(
+        self, plugins: PlugIns, mechanics: Mechanics, opened: ExitStack
+    ) -> dict[str, list[memoryview]]:
         """Open the sources of features, and schedule their samples; return the slots. Raises PortError."""
         bodies = sensed_bodies(self.plan)
         body = None if bodies is None else SensedBody(bodies, mechanics, self.clock.now_ns)
         slots: dict[str, list[memoryview]] = {}
         self.drivers: dict[str, Any] = {}
         """Driver of each source, as its plug-in made it, by the source's name."""
-        self._sampled: list[SampledSource] = []
         for planned in planned_processes(self.plan.loop):
             process, memory = planned.process, slot.private(planned.process.values)
             slots.setdefault(planned.feature.name, []).append(memory)
@@ -156,7 +161,7 @@ class VirtualRobot:
             # Any error of a driver becomes a sentence.
             except Exception as error:
                 raise PortError(f"{process.title} cannot be opened: {describe_error(error)}") from error
-            self._sampled.append(sampled)
+            opened.callback(sampled.close)
             self._sample(sampled, process.period_ns, self.clock.now_ns())
         return slots
 
@@ -214,8 +219,7 @@ class VirtualRobot:
             raise
         finally:
             self.sinks.packets.commit()
-            for sampled in self._sampled:
-                sampled.close()
+            self._opened.close()
             if self._writer:
                 summary = self._writer.close()
                 self.messages, self.log_error = summary.messages, summary.error
