@@ -20,9 +20,11 @@ from dxlrun.description.form import Form, with_keys
 from dxlrun.description.joints.joints import BareJoint, Joint, SharedJoint
 from dxlrun.description.joints.mechanics import OneOfServos
 from dxlrun.description.robot import Group, GroupPolicies, Policies, Robot, robot_form
+from dxlrun.errors import InputError
 from dxlrun.features import FEATURES, RESERVED, stages
 from dxlrun.features.feature import Feature, JointKey, PolicyKey, Section, ServoKey
 from dxlrun.installed_plugins import InstalledPlugin
+from dxlrun.testing import installed, plan_of
 
 ROOT = Path(__file__).parents[2]
 ROBOT = ROOT / "robots" / "bioloid_torso.yaml"
@@ -98,6 +100,41 @@ def test_broken_section_of_plugin_leaves_robots_usable(
     assert installed == FEATURES
     assert broken.keys() == {"lamps", "devices"}
     assert "another feature has that name" in broken["devices"]
+
+
+@pytest.mark.parametrize(
+    ("name", "form", "fault"),
+    [
+        ("lamps", "lambda: missing", "NameError: name 'missing' is not defined"),
+        ("torches", "object()", "PydanticSchemaGenerationError: Unable to generate pydantic-core schema for"),
+    ],
+)
+def test_section_whose_form_cannot_be_built_refuses_only_files_with_it(
+    tmp_path: Path, name: str, form: str, fault: str
+) -> None:
+    package = tmp_path / "src" / f"dxlrun_{name}"
+    package.mkdir(parents=True)
+    (package / "__init__.py").touch()
+    (package / "plugin.py").write_text(
+        "from dxlrun import hookimpl\nfrom dxlrun.tooling.features import Feature\n\n\n"
+        "@hookimpl\ndef dxlrun_contract():\n    return 4\n\n\n"
+        f"@hookimpl\ndef dxlrun_features():\n    return [Feature({name!r}, 'dxlrun_{name}')]\n"
+    )
+    (package / "form.py").write_text(
+        "from dxlrun.tooling.features import Section\nfrom dxlrun.tooling.files import key\n\n"
+        f"STAGE = Section({name!r}, {form}, key('Lights.', '{{}}', None))\n"
+    )
+    (tmp_path / "pyproject.toml").write_text(
+        f"[project]\nname = {name!r}\nversion = '1.0'\n"
+        f"[project.entry-points.dxlrun]\n{name} = 'dxlrun_{name}.plugin'\n"
+    )
+    robot, other = ROOT / "robots" / "single_joint.yaml", tmp_path / "robot.yaml"
+    other.write_text(f"{robot.read_text()}{name}: {{}}\n")
+    with installed(tmp_path):
+        plan_of(robot)
+        with pytest.raises(InputError) as refused:
+            plan_of(other)
+    assert f":1: the key {name} of {name} 1.0 cannot be used: {fault}" in str(refused.value)
 
 
 KEYS = {

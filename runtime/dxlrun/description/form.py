@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import re
 from collections.abc import Iterable, Iterator, Sequence
-from types import EllipsisType, FunctionType
+from types import EllipsisType
 from typing import Annotated, Any, Protocol, Self, TypeVar, cast
 
 from pydantic import (
@@ -17,6 +17,8 @@ from pydantic import (
     model_validator,
 )
 from pydantic_core import PydanticCustomError
+
+from dxlrun.features.feature import type_of
 
 T = TypeVar("T")
 F = TypeVar("F", bound=BaseModel)
@@ -155,8 +157,7 @@ def with_keys(form: type[F], keys: Iterable[FormKey], **replaced: object) -> typ
     added = [*keys]
     definitions: dict[str, Any] = {name: (kind, form.model_fields[name]) for name, kind in replaced.items()}
     for each in added:
-        kind = each.form() if isinstance(each.form, FunctionType) else each.form
-        definitions[each.name] = (kind, each.field)
+        definitions[each.name] = (type_of(each.form), each.field)
     if not definitions:
         return form
     made = create_model(form.__name__, __base__=form, __doc__=form.__doc__, **definitions)

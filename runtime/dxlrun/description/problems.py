@@ -17,6 +17,7 @@ from dxlrun.description.mistakes.syntax import list_text
 from dxlrun.description.mistakes.words import Context, Remedy
 from dxlrun.description.units import bound_text, example_of, units_of
 from dxlrun.errors import InputError, Mark, Problem, suggestion
+from dxlrun.features import broken_features
 
 Form = TypeVar("Form", bound=BaseModel)
 
@@ -467,6 +468,9 @@ def _sentence_unknown(error: _Error) -> tuple[str, str]:
         known = (*known, *error.beside)
     if key in refused:
         return f"{path_text(error.path)} is not possible", refused[key]
+    if why := broken_features().get(key):
+        what, _, fix = why.rpartition("; ")
+        return what, fix
     if error.remedy is not None:
         keys = error.remedy.keys
         named = f"an unknown key {key!r}" if len(keys) == 1 else f"unknown keys {keys[0]!r} and {keys[1]!r}"

@@ -13,7 +13,7 @@ from typing import Any
 
 from msgspec.structs import replace
 
-from dxlrun.features.feature import Feature, JointKey, PolicyKey, S, Section, ServoKey
+from dxlrun.features.feature import Feature, JointKey, PolicyKey, S, Section, ServoKey, type_of
 from dxlrun.installed_plugins import InstalledPlugin, installed_plugins
 
 FEATURES = (
@@ -100,9 +100,11 @@ def _find_fault(feature: Feature, found: Container[str]) -> str:
     name = feature.name
     try:
         keys = [key for kind in RESERVED if (key := feature.stage(kind)) is not None]
+        groups = [key.group for key in keys if isinstance(key, PolicyKey) and key.group is not None]
+        for key in (*keys, *groups):
+            _build_form(key.form)
     except (Exception, SystemExit) as error:
-        return f"{type(error).__name__}: {error}"
-    groups = [key.group for key in keys if isinstance(key, PolicyKey) and key.group is not None]
+        return f"{type(error).__name__}: {str(error).partition(chr(10))[0]}"
     names = {key.name for key in (*keys, *groups)}
     faults = {
         "another feature has that name": name in found,
@@ -114,6 +116,17 @@ def _find_fault(feature: Feature, found: Container[str]) -> str:
         <= {*map(type, keys)},
     }
     return next((fault for fault, is_so in faults.items() if is_so), "")
+
+
+def _build_form(form: object) -> None:
+    """Build the validator of a plug-in's form, which raises for a wrong type.
+
+    In the form of the robot file, the wrong type would make every file unreadable.
+    """
+    # Imported here because most processes use no feature of a plug-in.
+    from pydantic import TypeAdapter
+
+    TypeAdapter(type_of(form)).rebuild(force=True)
 
 
 def _features_of(plugin: InstalledPlugin) -> Iterator[Feature]:

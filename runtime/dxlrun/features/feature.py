@@ -16,6 +16,7 @@ from functools import cache
 from importlib import import_module
 from importlib.resources import files
 from importlib.util import find_spec
+from types import FunctionType
 from typing import Any, ClassVar, Generic, Protocol, TypeVar, cast
 
 import msgspec
@@ -33,6 +34,11 @@ class Stage(Protocol):
 
 
 S = TypeVar("S", bound=Stage)
+
+
+def type_of(form: object) -> object:
+    """Return the type of a key's value, which a feature may give as a function that returns the type."""
+    return form() if isinstance(form, FunctionType) else form
 
 
 class Section(msgspec.Struct, Generic[T], frozen=True):
