@@ -71,8 +71,12 @@ class Dialogue:
         self._write(question)
         try:
             while (line := self._line(LOOK_S if look else None)) is None:
-                if look:
-                    self._write(f"\r\x1b[K{look()[: shutil.get_terminal_size().columns - 1]}")
+                if not look:
+                    continue
+                text = look()[: shutil.get_terminal_size().columns - 1]
+                # The terminal has echoed an Enter that is waiting, so the cursor is on the next line.
+                if not select.select([self._input], [], [], 0)[0]:
+                    self._write(f"\r\x1b[K{text}")
         except BaseException:  # The next output must begin a new line
             self._write("\n")
             raise
