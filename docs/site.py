@@ -61,7 +61,7 @@ def settings(index: str) -> str:
 
 def gather(source: Path) -> None:
     """Write all pages, pictures and what they link to below `source`."""
-    shutil.copytree(DOCS / "pictures", source / "pictures", ignore=shutil.ignore_patterns("*.py"))
+    shutil.copytree(DOCS / "pictures", source / "pictures", ignore=shutil.ignore_patterns("*.py", "*.json"))
     shutil.copy(DOCS / "site.css", source)
     shutil.copy(DOCS / "site.js", source / "iframe-worker.js")
     rest = {path for path in DOCS.rglob("*.md") if path.parent.name != "changes"}

@@ -9,6 +9,7 @@ import sys
 from importlib import import_module
 from pathlib import Path
 
+import pytest
 from tests.kit.loaded import loaded
 from tests.kit.pages import PATHS, page_text
 
@@ -26,6 +27,14 @@ def test_reference_is_up_to_date() -> None:
     checked = subprocess.run(
         [sys.executable, GENERATE, "--check"], capture_output=True, text=True, check=False, cwd=ROOT
     )
+    assert checked.returncode == 0, checked.stdout + checked.stderr
+
+
+@pytest.mark.needs("report")
+def test_pictures_are_up_to_date() -> None:
+    """A picture is stale when a file, an output or a word that it shows has changed since it was made."""
+    make = [sys.executable, ROOT / "docs/pictures/make.py", "--check"]
+    checked = subprocess.run(make, capture_output=True, text=True, check=False, cwd=ROOT)
     assert checked.returncode == 0, checked.stdout + checked.stderr
 
 

@@ -1,10 +1,16 @@
-"""The pictures of the pages, made anew from the program: `python docs/pictures/make.py [NAME ...]`.
+"""Make the pictures of the pages from the program: `python docs/pictures/make.py [NAME ...]`.
 
-Each is named after its file. Those of a terminal are what commands print there; `report`, `arm_report`,
-`latency` and `characterize` are some plots of pages of `--report`, as Chromium shows them; the robots are on
-the page of `dxlrun view`, of a log or live; `drawn.py` draws the others. Needs the extra `report`, and leaves
-out what needs Chromium or `pip install ./plugins/dxlrun_view` where these are missing. All take some minutes,
-for robots run in real time; `--virtual` leaves out what only real time shows.
+A picture is named after its file. Pictures of a terminal are what commands print there. `report`,
+`arm_report`, `latency` and `characterize` are plots of pages of `--report`, as Chromium shows them. Robots
+are on the page of `dxlrun view`, of a log or live. `by_hand.py` answers the dialogues. It and `drawn.py` draw
+the others.
+
+Needs the extra `report`. Pictures that need Chromium or `pip install ./plugins/dxlrun_view` are omitted where
+these are missing. All take some minutes, because robots run in real time; `--virtual` omits what only real
+time shows.
+
+`inputs.json` has the hashes of what each picture is made from (`inputs.py`). It is written with the pictures;
+`--check` makes nothing, and exits with 1 when inputs have changed since.
 """
 
 from __future__ import annotations
@@ -21,62 +27,30 @@ import tempfile
 import time
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import ExitStack, contextmanager
+from functools import partial
 from importlib.resources import files
 from importlib.util import find_spec
 from pathlib import Path
-from typing import NamedTuple
 
 from PIL import Image, ImageChops  # comes with bokeh
 
 ROOT = Path(__file__).parents[2]
 sys.path[:0] = [str(ROOT), str(Path(__file__).parent)]
 
-from drawn import cycle, fall, key, motion, processes  # noqa: E402  # beside this file
+import by_hand  # noqa: E402  # in this folder
+import drawn  # noqa: E402
+import inputs  # noqa: E402
+from inputs import MISTAKES, PLAY, ROBOTS, first_lines, first_tables, lose_servo, prepare  # noqa: E402
 from terminal import printed, terminal  # noqa: E402
 
-RUN = ("robots/bioloid_torso.yaml", "--play", "robots/motions/three_parts.yaml")
-LEFT_OUT = re.compile("(\x1b\\[[0-9;]*m)*(Controllers|Servos)\\b")
-"""The README's terminal ends above these tables of `dxlrun analyze`."""
+PICTURES = Path(__file__).resolve().parent
+
 WIDTH, HEIGHT = 1040, 2600
 """Of a report's picture, px."""
 COLOURS = 48
 """Of a PNG, so that it is small."""
-MISTAKES = """name: arm
-buses:
-  main: {port: sim, protocol: 2.0, baud_rate: 1_000_000, adapter: {kind: fdti}, return_delay_time: 0 us}
-loop: {rate: 1000}
-joints:
-  base: {bus: main, id: "1", model: XL430-W250, reference: 180 deg, direction: 1}
-  elbow: {bus: main, id: 2, model: XL430-W250, reference: 180, direction: 1, limit: {velocity: 60 deg/s}}
-controllers:
-  arm: {type: joint_trajectory_controller, joints: [base, elbow], active: on}
-"""
-
-
 MOVE = "(time => { const at = document.querySelector('#time'); at.value = time; at.oninput(); })"
 """In the page of `dxlrun view`: go to a time of a log."""
-
-
-class Shown(NamedTuple):
-    """A robot on the page of `dxlrun view`, at a time of the log of a motion."""
-
-    robot: str
-    motion: str
-    at_s: float
-    arguments: tuple[str, ...] = ()
-    size: tuple[int, int] = (1100, 680)
-    turned: int = 0
-    """How far the mouse turns the scene, px."""
-
-
-ROBOTS = {
-    "koch": Shown("koch", "koch_wave", 3.4, ("leader_arm:=true", "leader_torque:=on"), turned=60),
-    "poppy_ergo_jr": Shown("poppy_ergo_jr", "poppy_ergo_jr_dance", 4.4),
-    "open_manipulator_x": Shown("open_manipulator_x", "open_manipulator_x_wave", 3.0),
-    "op3": Shown("op3", "op3_squat", 4.1),
-    "wolfgang": Shown("wolfgang", "wolfgang_squat", 0.66, ("rate:=50",)),
-    "humanoid_20": Shown("humanoid_20", "humanoid_20_squat", 2.0, ("rate:=200",)),
-}
 
 
 class Maker:
@@ -84,11 +58,7 @@ class Maker:
 
     def __init__(self, into: Path, place: Path, *, virtual: bool) -> None:
         self.into, self.place, self.virtual = into, place, virtual
-        (place / "robots").symlink_to(ROOT / "robots")
-        for title, text in re.findall(
-            r"^```yaml title=\"(.+?)\"\n(.*?)^```", (ROOT / "docs/tutorial/arm.md").read_text(), re.M | re.S
-        ):
-            (place / title).write_text(text)  # of two of a name the last one: the whole arm
+        prepare(place)
 
     def terminal(self, name: str, *commands: str, code: int = 0, columns: int = 104) -> None:
         """Take a picture of commands, one after the other."""
@@ -148,11 +118,13 @@ class Maker:
     def readme(self) -> None:
         """Run the README's first command, and analyze it: `terminal` and `report`."""
         more = ("--virtual",) if self.virtual else ()
-        ran = printed((*RUN, *more), self.place)
+        ran = printed((*PLAY, *more), self.place)
+        if any("too busy" in line for line in ran):
+            raise SystemExit("terminal: this machine is too busy for a run in real time; repeat it later")
         analyzed = printed(("analyze", "--report", "report.html"), self.place)
         self.figures("report", self.place / "report.html", "lateness", "steps", "joint-7")  # head_yaw_joint
-        end = next(number for number, line in enumerate(analyzed) if LEFT_OUT.match(line))
-        commands = [(f"dxlrun {' '.join((*RUN, *more))}", ran), ("dxlrun analyze", [*analyzed[:end], "..."])]
+        commands = [(f"dxlrun {' '.join((*PLAY, *more))}", ran)]
+        commands.append(("dxlrun analyze", [*first_tables(analyzed), "..."]))
         (self.into / "terminal.svg").write_text(terminal(commands))
 
     def check(self) -> None:
@@ -206,18 +178,9 @@ class Maker:
         self.figures("latency", self.place / "latency.html", "latency-histogram", "lateness")
 
     def lost(self) -> None:
-        """A servo that falls silent for a second, and what `dxlrun analyze` says of it."""
-        from dxlrun.testing import simulated_robot
-        from dxlsim.faults.fault import parse_fault
-        from dxlsim.faults.script import FaultScript
-
-        log = self.place / "arm.mcap"
-        play = [self.place / "wave.yaml"]
-        robot = simulated_robot(self.place / "arm.yaml", play=play, log=log)
-        FaultScript([parse_fault("silence servo=3 at=3s for=1s")]).attach(robot.buses)
-        robot.run()
-        lines = printed(("analyze", "arm.mcap"), self.place, code=1)
-        verdict = lines[: next(number for number, line in enumerate(lines) if not line.strip())]
+        """Analyze a run in which a servo was silent for a second."""
+        lose_servo(self.place, self.place / "arm.mcap")
+        verdict = first_lines(printed(("analyze", "arm.mcap"), self.place, code=1))
         (self.into / "lost.svg").write_text(terminal([("dxlrun analyze arm.mcap", [*verdict, "..."])]))
 
     def characterize(self) -> None:
@@ -230,17 +193,40 @@ class Maker:
         """Tip a torso over."""
         words = ("robots/fall_reflex.yaml", "--virtual", "--play", "robots/motions/fall_reflex_tip.yaml")
         printed(words, self.place)
-        (self.into / "fall.svg").write_text(fall(self._log))
+        (self.into / "fall.svg").write_text(drawn.fall(self._log))
 
     def cycle(self) -> None:
         """Look into a cycle of the torso."""
-        printed((*RUN, "--virtual", "--duration", "3"), self.place)
-        (self.into / "cycle.svg").write_text(cycle(self._log))
+        printed((PLAY[0], "--virtual", "--duration", "3"), self.place)
+        (self.into / "cycle.svg").write_text(drawn.cycle(self._log))
 
-    def drawings(self) -> None:
-        """Draw the processes of a run, and the two walks of architecture.md."""
-        for draw in (processes, motion, key):
-            (self.into / f"{draw.__name__}.svg").write_text(draw())
+    def drawing(self, name: str) -> None:
+        """Draw a picture that needs no run."""
+        (self.into / f"{name}.svg").write_text(DRAWINGS[name]())
+
+    def setup(self) -> None:
+        """Set a new servo up."""
+        place = self._of_one_joint("setup")
+        with self.running("sim", "--servo", "XL430-W250:1", "--link", str(place / "line")):
+            self._dialogue("setup", by_hand.setup(place))
+
+    def calibrate(self) -> None:
+        """Calibrate a joint."""
+        self._dialogue("calibrate", by_hand.calibrate(self._of_one_joint("calibrate")))
+
+    def teach(self) -> None:
+        """Show a motion."""
+        self._dialogue("teach", by_hand.teach(self._of_one_joint("teach")))
+
+    def _of_one_joint(self, name: str) -> Path:
+        """Return a new folder with the robot of the dialogues."""
+        place = self.place / name
+        place.mkdir()
+        (place / "arm.yaml").write_text(by_hand.ROBOT)
+        return place
+
+    def _dialogue(self, name: str, frame: by_hand.Frame) -> None:
+        (self.into / f"{name}.svg").write_text(terminal([frame]))
 
     @property
     def _log(self) -> Path:
@@ -299,8 +285,17 @@ class Maker:
             shown.convert("RGB").quantize(COLOURS * 2).save(self.into / f"{name}.png", optimize=True)
 
 
+DRAWINGS: dict[str, Callable[[], str]] = {
+    "processes": drawn.processes,
+    "motion": drawn.motion,
+    "key": drawn.key,
+    "setup_hands": by_hand.draw_setup,
+    "calibrate_hands": by_hand.draw_calibrate,
+    "teach_hands": by_hand.draw_teach,
+}
 MADE: dict[str, Callable[[Maker], None]] = {
     "terminal": Maker.readme,
+    "report": Maker.readme,
     "check": Maker.check,
     "mistakes": Maker.mistakes,
     "graph": Maker.graph,
@@ -308,37 +303,52 @@ MADE: dict[str, Callable[[Maker], None]] = {
     "lost": Maker.lost,
     "fall": Maker.fall,
     "cycle": Maker.cycle,
-    "drawings": Maker.drawings,
+    "setup": Maker.setup,
+    "calibrate": Maker.calibrate,
+    "teach": Maker.teach,
     "characterize": Maker.characterize,
     "arm_report": Maker.arm_report,
     "watch": Maker.watch,
     "doctor": Maker.doctor,
     "latency": Maker.latency,
+    **{name: partial(Maker.drawing, name=name) for name in DRAWINGS},
 }
+VIEWED = ("view", "view_phone", *ROBOTS)
+"""Pictures of the page of `dxlrun view`."""
 SLOW = ("watch", "doctor", "latency", "characterize")
-"""Left out with `--virtual`: real time, this machine, or minutes."""
+"""Omitted with `--virtual`: real time, this machine, or minutes."""
 
 
-def main() -> None:
-    """Make all pictures, or those that are named."""
+def main() -> int:
+    """Make all pictures, or those that are named; or check their inputs."""
     parser = argparse.ArgumentParser(description=__doc__.partition("\n")[0])
-    parser.add_argument("names", nargs="*", metavar="NAME", help=", ".join((*MADE, "view", *ROBOTS)))
-    parser.add_argument("--into", type=Path, default=Path(__file__).parent)
+    parser.add_argument("names", nargs="*", metavar="NAME", help=", ".join((*MADE, *VIEWED)))
+    parser.add_argument("--into", type=Path, default=PICTURES)
     parser.add_argument("--virtual", action="store_true")
+    parser.add_argument("--check", action="store_true", help="name the pictures whose inputs have changed")
     options = parser.parse_args()
     names = options.names or [
-        *(name for name in MADE if not (options.virtual and name in SLOW)),
-        "view",
-        *ROBOTS,
+        name for name in (*MADE, *VIEWED) if not (options.virtual and name in (*SLOW, *VIEWED[:2]))
     ]
+    if unknown := [name for name in names if name not in {*MADE, *VIEWED}]:
+        parser.error(f"there is no picture {unknown[0]}; the pictures are {', '.join((*MADE, *VIEWED))}")
     with tempfile.TemporaryDirectory() as directory:
         os.environ["XDG_RUNTIME_DIR"] = directory  # no other robot of this machine
+        if options.check:
+            print("\n".join(lines := inputs.stale()))
+            return 1 if lines else 0
+        began_ns = time.time_ns()
         maker = Maker(options.into.resolve(), Path(directory), virtual=options.virtual)
-        for name in names:
-            if name in MADE:
-                MADE[name](maker)
-        maker.viewed(names)
+        for make in dict.fromkeys(MADE[name] for name in names if name in MADE):
+            make(maker)
+        maker.viewed([name for name in names if name in VIEWED])
+    made = {path.stem for path in options.into.iterdir() if path.stat().st_mtime_ns >= began_ns}
+    if options.into == PICTURES and not options.virtual:
+        inputs.record(sorted(made & {*MADE, *VIEWED}))
+    for name in sorted({*names} - made):
+        print(f"{name}: not made; it needs Chromium, and some the package of dxlrun view")
+    return 0
 
 
 if __name__ == "__main__":
-    main()
+    sys.exit(main())

@@ -59,11 +59,17 @@ def printed(words: Sequence[str], directory: Path, *, code: int = 0, columns: in
             break
     os.close(ours)
     if process.wait() != code:
-        raise SystemExit(f"dxlrun {' '.join(words)} ended with {process.returncode}\n{received.decode()}")
+        last = "\n".join(lines_of(received.decode()))
+        raise SystemExit(f"dxlrun {' '.join(words)} ended with {process.returncode}\n{last}")
+    return lines_of(received.decode())
+
+
+def lines_of(received: str) -> list[str]:
+    """Return the lines that stay on a terminal: a line that is drawn again shows its last text."""
     lines: list[str] = []
-    for line in received.decode().split("\r\n"):
-        # a progress line is drawn over itself, and at last cleared
-        above, _, last = line.rpartition("\x1b[2K")
+    for line in received.split("\r\n"):
+        # A progress line is drawn over itself, and cleared at the end.
+        above, _, last = re.sub(r"\r\x1b\[K", "\x1b[2K", line).rpartition("\x1b[2K")
         if "\x1b[1A" in above:
             lines.pop()
         lines.append(re.sub(r"\x1b\[\?25[lh]|\r", "", last))

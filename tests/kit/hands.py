@@ -197,7 +197,8 @@ class Screen:
             [sys.executable, "-c", take, *command], cwd=directory, start_new_session=True, **streams
         )
         os.close(slave)
-        self.text = ""
+        self.text = self.shown = ""
+        """What was not waited for yet, and all that was shown."""
 
     def __enter__(self) -> Self:
         return self
@@ -240,5 +241,6 @@ class Screen:
             data = os.read(self._master, 4096)
         except OSError:  # its other end is closed
             return False
-        self.text += data.decode(errors="replace")
+        text = data.decode(errors="replace")
+        self.text, self.shown = self.text + text, self.shown + text
         return bool(data)
