@@ -8,17 +8,29 @@ from pathlib import Path
 from textwrap import dedent
 from typing import Any
 
+import numpy as np
 import pytest
 from tests.kit.pages import page_text
 
 from dxlrun import CONTRACT_VERSION
 from dxlrun.cli import main
+from dxlrun.testing import read_log, simulated_robot
 
 PAGE = page_text("controllers.md")
 BLOCKS = re.findall(r"```python\n(.*?)```", PAGE, re.DOTALL)
 COMMANDS = [
     line.strip() for line in PAGE.splitlines() if line.startswith("    ") and not line.startswith("     ")
 ]
+HEAD = """\
+name: head
+buses:
+  main: {port: sim, protocol: 2.0, baud_rate: 1_000_000, adapter: {kind: ftdi}, return_delay_time: 0 us}
+loop: {rate: 100}
+joints:
+  pan: {bus: main, id: 1, model: XM430-W350, reference: 180 deg, direction: 1}
+controllers:
+  wave: {type: ./wave.py:Wave, joints: [pan], amplitude: 20 deg}
+"""
 Shell = Callable[..., Any]
 pytestmark = pytest.mark.timeout(400)
 """Some build and install packages, with what they depend on from an index."""
@@ -61,6 +73,16 @@ def test_its_commands_end_well_in_their_order(fresh: Shell, tmp_path: Path) -> N
         fresh("python -m pytest -q && dxlrun example.yaml --virtual --play nod.yaml", place).returncode == 0
     )
     fresh("pip uninstall --yes my-robotics", place)
+
+
+def test_contract_example_runs_from_a_file(tmp_path: Path) -> None:
+    (class_,) = (block for block in BLOCKS if "class WaveParameters" in block)
+    (tmp_path / "wave.py").write_text(class_)
+    (tmp_path / "head.yaml").write_text(HEAD)
+    robot = simulated_robot(tmp_path / "head.yaml", duration_s=7.0, log=tmp_path / "head.mcap")
+    robot.run()
+    position = read_log(tmp_path / "head.mcap").cycles["position"]
+    assert np.ptp(np.degrees(position)) == pytest.approx(40, abs=2)
 
 
 def test_an_editable_install_finds_new_code_but_no_new_entry_point(fresh: Shell, package: Path) -> None:
