@@ -232,11 +232,11 @@ def record(names: Iterable[str]) -> None:
     HASHES.write_text(json.dumps({**kept, **hashes(names)}, indent=1, sort_keys=True) + "\n")
 
 
-def stale() -> list[str]:
-    """Return a line for each picture whose inputs have changed since it was made."""
-    kept, found = json.loads(HASHES.read_text()), hashes()
+def stale(names: Iterable[str] = ()) -> list[str]:
+    """Return a line for each picture, of all by default, whose inputs have changed since it was made."""
+    kept, found = json.loads(HASHES.read_text()), hashes(names)
     lines = []
-    for name in sorted({*kept, *found}):
+    for name in sorted(names or {*kept, *found}):
         before, now = kept.get(name, {}), found.get(name, {})
         changed = sorted(one for one in {*before, *now} if before.get(one) != now.get(one))
         if changed:

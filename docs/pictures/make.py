@@ -335,7 +335,7 @@ def main() -> int:
     with tempfile.TemporaryDirectory() as directory:
         os.environ["XDG_RUNTIME_DIR"] = directory  # no other robot of this machine
         if options.check:
-            print("\n".join(lines := inputs.stale()))
+            print("\n".join(lines := inputs.stale(options.names)))
             return 1 if lines else 0
         began_ns = time.time_ns()
         maker = Maker(options.into.resolve(), Path(directory), virtual=options.virtual)
