@@ -11,10 +11,10 @@ A small feature is one module with these objects in a tuple `STAGES`, but for `e
 
 from __future__ import annotations
 
+import os
 from collections.abc import Callable, Iterable, Mapping
 from functools import cache
 from importlib import import_module
-from importlib.resources import files
 from importlib.util import find_spec
 from types import FunctionType
 from typing import Any, ClassVar, Generic, Protocol, TypeVar, cast
@@ -185,11 +185,11 @@ _OF_PACKAGES = ("events", "process", "safe")
 
 @cache
 def _stage(package: str, kind: type[S]) -> S | None:
-    spec = find_spec(package)
-    if spec is not None and spec.submodule_search_locations is None:
+    names = _files(package)
+    if names is None:
         found = () if kind.FILE in _OF_PACKAGES else getattr(import_module(package), "STAGES", ())
         return next((each for each in found if isinstance(each, kind)), None)
-    if kind.FILE not in _files(package):
+    if kind.FILE not in names:
         return None
     module = f"{package}.{kind.FILE}"
     stage = import_module(module).STAGE
@@ -199,9 +199,14 @@ def _stage(package: str, kind: type[S]) -> S | None:
 
 
 @cache
-def _files(package: str) -> frozenset[str]:
-    """Return the names of the modules in a package.
+def _files(package: str) -> frozenset[str] | None:
+    """Return the names of the modules in a package; None for a module.
 
     A feature has few of the files, so one list costs less than a search for each missing file.
     """
-    return frozenset(entry.name.partition(".")[0] for entry in files(package).iterdir())
+    spec = find_spec(package)
+    if spec is None:
+        raise ModuleNotFoundError(f"No module named {package!r}", name=package)
+    if (folders := spec.submodule_search_locations) is None:
+        return None
+    return frozenset(name.partition(".")[0] for folder in folders for name in os.listdir(folder))
