@@ -273,11 +273,14 @@ class Maker:
             if "view" not in names or self.virtual:
                 return
             with self.running("robots/bioloid_torso_imu.yaml"):
-                printed(("play", "three_parts", "--no-wait"), self.place)
                 served = Served(LiveRobot("bioloid_torso_imu"), control=True)
                 for name, width, height in (("view", 1280, 760), ("view_phone", 390, 760)):
                     browser.open(served.address, width, height, dark=width < 600)
-                    browser.until("window.looked > 60")
+                    browser.until("window.looked > 20")
+                    if name == "view":
+                        # The page is open before the motion begins, so that its curves have no gap.
+                        printed(("play", "three_parts", "--no-wait"), self.place)
+                        browser.until("window.looked > 200")
                     self._kept(name, browser.picture())
                 served.close()
 

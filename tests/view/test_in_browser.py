@@ -226,7 +226,7 @@ def test_header_shows_voltage_hottest_servo_and_errors_first(serve: Serve, brows
     robot.events_ = (LiveEvent(1, 50.0, 40, "loop", "the bus was silent", 50.0),)
     browser.until(f"{figures}[2] === 'Errors 1 event'")
     robot.begin(hardware_error=(0, 32), torque=(1, 1))
-    browser.until(f"{figures}[2] === 'Errors error 0x20 wrist'")
+    browser.until(f"{figures}[2] === 'Errors Error 0x20 wrist'")
     browser.click("#figures div:nth-child(3)")
     assert browser.value(f"{VISIBLE}('#events')")
     assert errors(browser) == []
