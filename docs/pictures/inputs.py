@@ -124,7 +124,7 @@ class Reader:
         from dxlrun.cli import main
 
         printed = io.StringIO()
-        os.environ["COLUMNS"] = "150"
+        os.environ["COLUMNS"] = "130"
         with chdir(self.place), redirect_stdout(printed), redirect_stderr(printed):
             main(line.split())
         return VARYING.sub("", printed.getvalue())
