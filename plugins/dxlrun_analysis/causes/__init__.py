@@ -1,4 +1,5 @@
-"""Causes of late and long cycles, derived from the packets and the plan alone.
+"""Causes of late and long cycles of the control loop, derived from the packets and the plan in a log.
 
-This package builds on `servos`, which pairs packets with servos. Verdicts belong in `verdict.py`.
+This package builds on `servos`, which pairs requests with replies. Rules of the verdict about other parts
+belong in `verdict.py`.
 """

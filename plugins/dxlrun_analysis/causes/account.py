@@ -1,8 +1,9 @@
-"""Breakdown of one late or long cycle: its record, and its packets compared with the plan.
+"""Breakdown of the excess of one late or long cycle into causes: its times and packets, compared with the
+plan.
 
 A late wake-up is attributed to an exchange of the idle time that ended after the deadline, otherwise to the
-machine. A read waits for all buses at once, so the bus that was ready last counts. The planned time of its
-exchanges consists of wire time, return delays and the adapter's latency. The excess is split into
+machine. A read waits for all buses at once, so only the bus that was ready last counts. The planned time of
+its exchanges consists of wire time, return delays and the adapter's latency. The excess is split into
 
 - a write() of the instruction that returned later than the wire time requires;
 - a missing reply: from the last reply, or its due time, to the next instruction or the end of the read. It
@@ -10,7 +11,7 @@ exchanges consists of wire time, return delays and the adapter's latency. The ex
 - a late reply: lateness that later replies do not make up for. It is attributed to the bus, because a
   single late reply does not show whether servo, adapter, kernel or simulation delayed it;
   `servos/reply_times.py` compares the servos;
-- a retry: all of an exchange with a servo that was asked in the same read before.
+- a retry: the whole second exchange with a servo that was already asked in the same read.
 """
 
 from __future__ import annotations
@@ -30,7 +31,8 @@ _NEVER = np.iinfo(np.int64).max
 
 
 class CauseName(NamedTuple):
-    """Key of a cause. `servo_id` is -1 if the cause is not a servo."""
+    """Key of a cause: kind and subject. `bus` is an index, -1 if the cause is not on a bus; `servo_id` is
+    -1 if it is not a servo."""
 
     kind: CauseKind
     subject: str = ""
@@ -39,7 +41,7 @@ class CauseName(NamedTuple):
 
 
 class _Exchange(NamedTuple):
-    """One instruction that asks servos, and its replies; times in ns."""
+    """One instruction that requests replies of servos, with the times of its replies, ns."""
 
     bus: int
     servo_ids: tuple[int, ...]
@@ -49,21 +51,22 @@ class _Exchange(NamedTuple):
     planned_end: int
     last: int  # Time of the last reply; 0 without replies
     lacks: int | None
-    """First servo without a reply; -1: no reply of several came; None: all replies came."""
+    """ID of the first servo whose reply is missing; -1: no reply of a chain came; None: all replies came."""
 
     def end(self, given_up: int) -> int:
-        """Return the end of the exchange: its last reply, or with replies missing the next instruction or
-        `given_up`."""
+        """Return the time at which the exchange ended, ns: its last reply. With a reply missing, return
+        the time of the next instruction, or `given_up` if that is earlier."""
         return self.last if self.lacks is None else min(self.following, given_up)
 
     @property
     def unanswered(self) -> CauseName:
-        """Cause of a missing reply. If no reply of a chain came, the instruction itself may be lost."""
+        """Cause `missing reply` of this exchange: its first silent servo, or the bus if no reply of a
+        chain came, because then the instruction itself may be lost."""
         return CauseName("missing reply", bus=self.bus, servo_id=-1 if self.lacks is None else self.lacks)
 
 
 class Account:
-    """Breakdown of one cycle's excess by cause, ns."""
+    """Breakdown of one cycle's excess: the time of each cause in ns, in `shares`."""
 
     def __init__(
         self,
@@ -73,7 +76,15 @@ class Account:
         pairing: Pairing,
         controllers: Sequence[str],
     ) -> None:
-        """Split the excess of a cycle. `cycle` and `before` are rows of `causes.cycles_of`."""
+        """Split the excess of a cycle by cause.
+
+        Args:
+            cycle: The cycle, a row of `causes.cycles_of`.
+            before: Row of the preceding cycle; None for the first.
+            packets: Packets since the read of the preceding cycle.
+            pairing: Pairing of requests with replies for the log's buses.
+            controllers: Names of the controllers, in the order of the log.
+        """
         self._cycle = cycle
         self.shares: Counter[CauseName] = Counter()
 
@@ -92,7 +103,8 @@ class Account:
         self.shares = +self.shares
 
     def _read(self) -> tuple[int, int]:
-        """Split the read phase; return the planned and the actual time of its exchanges, ns."""
+        """Attribute the time that the read phase took beyond its plan; return the planned and the actual
+        time of the exchanges on the slowest bus, ns."""
         woken, read = int(self._cycle["woken"]), int(self._cycle["read"])
         within = [one for one in self._exchanges if woken <= one.asked <= read]
         if not within:
@@ -117,7 +129,8 @@ class Account:
         return sums[0], sums[1]
 
     def _beyond(self, one: _Exchange, beyond: int, read: int) -> None:
-        """Split the time that an exchange took beyond its plan."""
+        """Attribute the time that one exchange took beyond its plan (`beyond`, ns) to its write() call,
+        its missing or its late reply. `read` is the end of the read phase."""
         blocked = min(one.blocked, beyond)
         self.shares[CauseName("write call", bus=one.bus)] += blocked
         beyond -= blocked
@@ -132,7 +145,8 @@ class Account:
         self.shares[CauseName("unexplained")] += beyond - late
 
     def _writes(self, packets: PacketColumns) -> int:
-        """Attribute the write() calls of goals to their buses; return their total time, ns."""
+        """Attribute the write() calls that send the cycle's goals to their buses; return their total time,
+        ns."""
         goals = (packets.kind == PacketKind.INSTRUCTION) & (packets.first_ns >= self._cycle["updated"])
         goals &= packets.last_ns <= self._cycle["written"]
         took = packets.last_ns - packets.first_ns
@@ -142,8 +156,8 @@ class Account:
         return int(took[goals].sum())
 
     def _idle(self, before: np.void, late: int) -> int:
-        """Attribute lateness to the idle-time exchange that ended last after the deadline; return its share,
-        ns."""
+        """Attribute the lateness of the wake-up to the exchange of the idle time that ended last after the
+        deadline; return the attributed time, ns. `late` is the lateness in ns."""
         due = max(int(self._cycle["scheduled"]), int(before["written"]))
         over = [
             (min(one.end(one.planned_end + TIMEOUT_MARGIN_NS) - due, late), one)
@@ -163,7 +177,7 @@ class Account:
 
 
 def _exchanges(found: Exchanges) -> Iterator[_Exchange]:
-    """Yield the exchanges that ask servos."""
+    """Yield those paired exchanges whose instruction requests replies."""
     due, replies = found.due, found.replies
     following = np.append(found.asked_ns[1:], _NEVER)
     following[np.append(np.diff(found.bus), 1) > 0] = _NEVER

@@ -1,4 +1,4 @@
-"""Causes of late and long cycles, from packets and plan alone. The worst cycles are split into causes.
+"""Causes of late and long cycles, derived from the packets and the plan in a log.
 
 There are two kinds of cycles:
 
@@ -35,18 +35,19 @@ from dxlrun_analysis.plan import LoggedBus, plan_of
 from dxlrun_analysis.servos.exchanges import Pairing
 
 KEPT = 200
-"""Number of the worst cycles that are kept and split."""
+"""Number of the worst late and long cycles whose excess is split by cause."""
 WORST = 10
-"""Number of the worst cycles that are shown with their packets."""
+"""Number of the worst late and long cycles that are reported with their packets."""
 _MACHINE = (CauseName("late wake-up"), CauseName("own work"))
-"""Causes that the machine can account for, in the order of attribution."""
+"""Causes whose time is moved to the machine if a sample of /machine explains it, in this order."""
 _TIMES = ("scheduled", "woken", "read", "updated", "written")
 Cycles = NDArray[np.void]
 
 
 @dataclass(frozen=True, slots=True)
 class Causes:
-    """Totals of the late and long cycles of a run."""
+    """Result of the cause analysis of a run: number of late and long cycles, causes, worst cycles, load of
+    the machine."""
 
     late: int = 0  # Cycles that woke late, including long ones
     long: int = 0  # Cycles longer than their period, or so late that periods were skipped
@@ -58,10 +59,11 @@ class Causes:
 
 
 NO_CAUSES = Causes()
+"""Result for a log without late or long cycles."""
 
 
 class _Kept(NamedTuple):
-    """One of the worst cycles so far."""
+    """One of the worst late or long cycles so far, with the packets from the preceding cycle's read on."""
 
     cycle: np.void
     before: np.void | None  # The preceding cycle; None for the first
@@ -69,7 +71,8 @@ class _Kept(NamedTuple):
 
 
 class CycleCauses:
-    """Accumulator of causes, fed slice by slice. Its memory does not grow with the log."""
+    """Accumulator that finds late and long cycles and their causes, fed with the log slice by slice. Its
+    memory does not grow with the log."""
 
     def __init__(self) -> None:
         self._late = self._long = 0
@@ -87,10 +90,10 @@ class CycleCauses:
         self._end_ns = 0  # End of the last cycle
 
     def take(self, log: Log) -> None:
-        """Add the next slice.
+        """Add the cycles, packets and machine samples of the next slice of the log.
 
         Raises:
-            LogError: A packet in the slice cannot be read.
+            LogError: A packet or a machine sample in the slice cannot be read.
         """
         plan = plan_of(log)
         if self._newest is None:
@@ -108,7 +111,7 @@ class CycleCauses:
         self._advance(cycles if self._newest is None else np.concatenate([self._newest, cycles]))
 
     def finish(self) -> Causes:
-        """Return the causes of the whole run."""
+        """Split the worst cycles by cause, and return the causes of the whole run."""
         if self._newest is not None:
             self._advance(self._newest, final=True)
         pairing = Pairing(self._buses)
@@ -134,10 +137,9 @@ class CycleCauses:
         )
 
     def _advance(self, cycles: Cycles, *, final: bool = False) -> None:
-        """Process all cycles but the newest.
+        """Count all cycles but the newest; with `final` also the newest.
 
-        A cycle is complete once its successor is known, as the successor declares the periods skipped after
-        it.
+        The newest cycle waits for its successor, which declares the periods skipped between the two.
         """
         count = len(cycles) if final else max(len(cycles) - 1, 0)
         self._newest = cycles[count:].copy()
@@ -159,7 +161,7 @@ class CycleCauses:
         self._packets = [part.compact() for part in kept if len(part)]
 
     def _look(self, rows: Cycles, new: int) -> None:
-        """Count late and long cycles from row `new` on, and keep the worst."""
+        """Count late and long cycles from row `new` on, and keep the worst of the run with their packets."""
         begin = np.maximum(rows["scheduled"], np.append(rows["scheduled"][:1], rows["written"][:-1]))
         rows["late"], took = np.maximum(rows["woken"] - begin, 0), rows["written"] - rows["woken"]
         over = rows["written"] > rows["scheduled"] + rows["period"]
@@ -183,7 +185,8 @@ class CycleCauses:
         self._kept = sorted(self._kept, key=lambda one: -one.cycle["size"])[:KEPT]
 
     def _share_with_machine(self, accounts: Sequence[Account]) -> None:
-        """Move late wake-ups and own work to the machine, up to the time that each sample accounts for."""
+        """Move time of late wake-ups and own work to the machine, at most the time that the machine sample
+        of that second accounts for."""
         woken = np.array([int(one.cycle["woken"]) for one in self._kept], np.int64)
         for sample in self._samples:
             then = (woken > sample.begin_ns) & (woken <= sample.end_ns)
@@ -205,7 +208,7 @@ class CycleCauses:
     # Names of causes
 
     def _cause(self, name: CauseName, parts: list[tuple[int, bool]]) -> Cause:
-        """Return a cause over the run.
+        """Sum one cause over the worst cycles of the run.
 
         Args:
             name: Key of the cause.
@@ -217,7 +220,8 @@ class CycleCauses:
         return Cause(name.kind, subject, len(parts), total, most, long_ns, servo)
 
     def _subject(self, name: CauseName) -> tuple[str, str]:
-        """Return the subject of a cause in words, and the joint of its servo."""
+        """Return the subject of a cause as text (`servo 3 (knee)`, `bus main`, a controller), and the
+        joint of its servo, empty if the cause is not a servo."""
         if name.bus < 0:
             return name.subject, ""
         bus, servo = self._buses[name.bus], name.servo_id
@@ -227,7 +231,8 @@ class CycleCauses:
         return f"servo {servo} ({joint or bus.name})", joint or f"{bus.name} {servo}"
 
     def _worst(self, one: _Kept, account: Account) -> WorstCycle:
-        """Return a cycle with its causes, and the packets since the preceding cycle ended."""
+        """Return the record of a cycle for reports: its causes, and its packets since the preceding cycle
+        ended."""
         cycle, scheduled = one.cycle, int(one.cycle["scheduled"])
         shares = [
             CauseShare(name.kind, self._subject(name)[0], ns / 1e3)
@@ -254,9 +259,10 @@ class CycleCauses:
 
 
 def cycles_of(log: Log) -> Cycles:
-    """Return the times of cycles, ns. `skipped` is the number of periods skipped before each cycle.
+    """Return the cycles of a log as a table for the cause analysis: times in ns, and the number of periods
+    skipped before each cycle.
 
-    `late`, `long` and `size` (the sort key of the worst cycles) are filled in later.
+    The columns `late`, `long` and `size` (the sort key of the worst cycles) are filled in later.
     """
     names = ("cycle", *_TIMES, "period", "skipped", "late", "size")
     shape = log.cycles["controller_ns"].shape[1:]

@@ -1,4 +1,4 @@
-"""Share of the machine in late wake-ups, from samples of /machine."""
+"""Time that the machine withheld from the loop, from the samples on topic /machine."""
 
 from __future__ import annotations
 
@@ -19,16 +19,17 @@ OTHERS = "other processes on its core"
 INTERRUPTS = "interrupts on its core"
 TAKERS = (STEAL, OTHERS, INTERRUPTS)
 THROTTLED_SHARE = 0.6
-"""Share of the highest observed frequency. A slower core while the loop is late is throttled [i]."""
+"""Share of the highest observed clock frequency below which a hot processor counts as throttled [i]."""
 _WAITING_SHARE = 0.001
 _INTERRUPTS_SHARE = 0.05
-"""Shares of a second that also occur on a healthy machine [i]. /proc/stat counts in steps of 10 ms."""
+"""Shares of a second that waiting for a core and interrupts also take on a healthy machine [i]. /proc/stat
+counts in steps of 10 ms."""
 HOT = 80.0  # deg C from which processors are throttled [i]
 
 
 @dataclass(frozen=True, slots=True)
 class MachineSample:
-    """Time that the machine withheld from the loop in one sample."""
+    """Time that the machine withheld from the loop in the interval of one sample, about a second."""
 
     begin_ns: int
     end_ns: int
@@ -37,14 +38,14 @@ class MachineSample:
 
 @dataclass(slots=True)
 class MachineHistory:
-    """Accumulator of machine samples."""
+    """Accumulator of the samples of topic /machine: load, throttling, and time withheld from the loop."""
 
     _fastest: float = 0.0
     slow: int = 0  # Samples with a core that was hot and far below its highest frequency
     load_samples: list[LoadSample] = field(default_factory=list)
 
     def new(self, log: Log) -> list[MachineSample]:
-        """Return the samples of a slice.
+        """Add the machine samples in a slice of the log; return the time that each withheld from the loop.
 
         Raises:
             LogError: A sample cannot be read.
@@ -54,7 +55,7 @@ class MachineHistory:
         return [self._sample(message) for message in log.messages(LogTopic.MACHINE)]
 
     def load(self, begin_ns: int, end_ns: int) -> MachineLoad:
-        """Return the load of the machine in an interval of the samples so far."""
+        """Return the load of the machine between two times, from the samples added so far."""
         meter = LoadMeter(begin_ns, end_ns)
         for sample in self.load_samples:
             meter.add(sample)
@@ -85,7 +86,8 @@ class MachineHistory:
 
 
 def _of_core(values: object, core: int) -> float:
-    """Return the value of one core. If the core is unknown, return the greatest value; without values, 0."""
+    """Return the value of one core from an array with a value for each core. If the core is unknown,
+    return the greatest; without values, 0."""
     shares = np.nan_to_num(cast("NDArray[np.float64]", values))
     if 0 <= core < len(shares):
         return float(shares[core])

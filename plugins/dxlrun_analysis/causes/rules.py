@@ -1,7 +1,7 @@
-"""Rules of the verdict about the loop: causes of long cycles.
+"""Rule of the verdict about the loop: causes within the loop that made cycles too long.
 
-A cause is a finding if it has at least half of the excess of long cycles, and a share in at least three
-cycles: one stall of a machine is not evidence. Late and missing replies are judged by the rules about lines
+A cause is reported if it has at least half of the excess of all long cycles, and a share in at least three
+cycles: one stall of a machine is not evidence. Late and missing replies are judged by the rules about buses
 and servos, which know whether the other servos of the bus answered.
 """
 
@@ -25,7 +25,8 @@ _OWN: dict[CauseKind, str] = {
 
 
 def own_work(causes: Causes) -> Iterable[Finding]:
-    """Report causes within the loop that made cycles too long, the largest first."""
+    """Report each cause within the loop that made cycles too long, the largest first: a controller, own
+    work, write() calls, or a planned exchange longer than the period."""
     total_ns = sum(one.long_ns for one in causes.causes)
     for one in causes.causes:
         cycles = min(one.cycles, causes.long)
@@ -38,5 +39,6 @@ def own_work(causes: Causes) -> Iterable[Finding]:
 
 
 def _subject(one: Cause) -> str:
-    """Return the accused part as findings name it: the loop, a controller or a bus."""
+    """Return the part that a cause accuses, as findings name it: `loop`, or the name of a controller or a
+    bus."""
     return "loop" if one.kind in ("own work", "plan") else one.subject.removeprefix("bus ")

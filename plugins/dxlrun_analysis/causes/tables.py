@@ -1,4 +1,4 @@
-"""Tables of causes and of the worst cycles."""
+"""Tables of the causes of late and long cycles, and of the packets of the worst cycles."""
 
 from __future__ import annotations
 
@@ -14,7 +14,8 @@ _BROADCAST_ID = 0xFE
 
 
 def causes_table(causes: Causes) -> Table:
-    """Return the causes of late and long cycles, the largest first; without causes, a table without rows."""
+    """Return the table of the causes of late and long cycles, the largest first. It has no rows without
+    causes."""
     columns = [
         Column("cause", "name"),
         Column("of", "text"),
@@ -42,7 +43,8 @@ def causes_table(causes: Causes) -> Table:
 
 
 def worst_tables(worst: Iterable[WorstCycle]) -> tuple[Table, ...]:
-    """Return a timeline of each cycle in us since its deadline, with the planned times."""
+    """Return one table for each of the worst cycles: its steps and packets in order of time, in us since
+    its deadline, with their planned times."""
     return tuple(_timeline(one) for one in worst)
 
 
@@ -76,7 +78,8 @@ def _timeline(one: WorstCycle) -> Table:
 
 
 def worst_title(one: WorstCycle) -> str:
-    """Return the title of a cycle: number, excess beyond the plan, and main causes."""
+    """Return the title of a cycle's table: number, time in the run, excess beyond the plan, and main
+    causes."""
     causes = ", ".join(f"{share.name} {microseconds(share.us)}" for share in one.causes[:_MOST_NAMED])
     skipped = f", {counted(one.skipped, 'period', 'periods')} skipped behind it" if one.skipped else ""
     beyond = f"{microseconds(one.excess_us)} beyond the plan{skipped}"

@@ -1,4 +1,4 @@
-"""Packets of a cycle in order of time, with their planned times."""
+"""Packets of one cycle in order of time, each with the time at which the plan expects it."""
 
 from __future__ import annotations
 
@@ -24,7 +24,13 @@ _PLANNED = (PacketKind.INSTRUCTION, PacketKind.STATUS)
 def timeline(
     packets: PacketColumns, buses: tuple[LoggedBus, ...], scheduled_ns: int
 ) -> Iterator[TimelinePacket]:
-    """Yield packets in order of time, with the planned time of each; `buses` in the order of the log."""
+    """Yield the packets of a cycle in order of time, each with its planned time.
+
+    Args:
+        packets: The packets.
+        buses: Buses of the plan, in the order of the log.
+        scheduled_ns: Deadline of the cycle, from which the yielded times count.
+    """
     joints = [bus.names for bus in buses]
     due: list[float | None] = [None] * len(buses)
     for packet in sorted(packets, key=lambda one: (one.first_ns, one.last_ns)):

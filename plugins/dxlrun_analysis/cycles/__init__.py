@@ -1,4 +1,4 @@
-"""Cycles of a log: wake-up times, durations of their steps, and the worst cycles.
+"""Cycles of the control loop in a log: wake-up times, durations of their steps, and the worst cycles.
 
-Causes of late cycles belong in `causes`.
+The causes of late and long cycles are determined in `causes`.
 """

@@ -1,4 +1,5 @@
-"""Punctuality of the loop: wake-up latency, duration of each step, skipped periods."""
+"""Punctuality of the control loop: lateness of its wake-ups, duration of each step of a cycle, skipped
+periods."""
 
 from __future__ import annotations
 
@@ -15,11 +16,12 @@ from dxlrun_analysis.counts import Counts, median, quantile
 from dxlrun_analysis.plan import plan_of
 
 ROUGH_NS = 150_000
-"""Lateness that does not occur on a real-time Linux kernel (M. A. Araujo, UFU 2017)."""
+"""Bound above which a wake-up counts as late: 150 us, a lateness that does not occur on a real-time Linux
+kernel (M. A. Araujo, UFU 2017)."""
 
 DISORDER_NS = RING_SECONDS * 1_000_000_000
-"""Largest displacement between records of a log. The recorder drains several rings in turn, and each ring
-holds at most this time."""
+"""Greatest time by which a record of a log can be out of order. The recorder drains several rings in turn,
+and each ring holds at most this time."""
 _MS = 1_000_000
 LATE_BINS_US = 100_000  # Wake-ups are counted in bins of 1 us; the last bin has all later ones
 _TENTH_NS = 100  # Resolution of counted times: 0.1 us
@@ -31,7 +33,8 @@ _LOW = 20  # Bits of the low part; parts are squared separately so that sums fit
 
 @dataclass(frozen=True, slots=True)
 class Latency:
-    """Lateness of the wake-ups (woken - scheduled), us; shares from 0 to 1."""
+    """Lateness of the loop's wake-ups (actual minus scheduled time) over a run, us; shares of all
+    wake-ups, 0 to 1."""
 
     max_us: float
     mean_us: float
@@ -48,9 +51,9 @@ class Latency:
 
 @dataclass(frozen=True, slots=True)
 class Duration:
-    """Time of one step of the cycle, or of the update of one controller, us.
+    """Duration of one step of the cycle, or of the update of one controller, over all cycles of a run, us.
 
-    Counted in steps of 0.1 us; `counts.py` defines the quantiles.
+    Durations are counted in steps of 0.1 us; `counts.py` defines the quantiles.
     """
 
     name: str
@@ -62,7 +65,7 @@ class Duration:
 
 @dataclass(frozen=True, slots=True)
 class Slowest:
-    """Times of a cycle that was longer than its period, ns."""
+    """Durations of the steps of the cycle that exceeded its period most in a run, ns."""
 
     period_ns: int
     read_ns: int
@@ -71,18 +74,18 @@ class Slowest:
 
     @property
     def lasted_ns(self) -> int:
-        """Time from the wake-up to the last write."""
+        """Duration of the cycle, from its wake-up to its last write."""
         return self.read_ns + self.update_ns + self.write_ns
 
     @property
     def exceeded_ns(self) -> int:
-        """Excess over the period."""
+        """Duration of the cycle minus its period."""
         return self.lasted_ns - self.period_ns
 
 
 @dataclass(frozen=True, slots=True)
 class Periods:
-    """Account of the periods of a run: recorded, skipped and missing.
+    """Number of periods in a run that were recorded as cycles, skipped by the loop, or missing in the log.
 
     `elapsed` counts from the first deadline to the last record. If the first part of a log is missing, it
     counts from the first record.
@@ -100,7 +103,8 @@ class Periods:
 
     @property
     def rates(self) -> str:
-        """Rates in words."""
+        """Rates at which the loop ran, as text: `100 Hz and 50 Hz`, or their range if there are more than
+        four."""
         rates = self.rates_hz or (self.rate_hz,)
         if len(rates) > _MOST_RATES:
             return f"{len(rates)} rates from {min(rates):g} to {max(rates):g} Hz"
@@ -109,12 +113,13 @@ class Periods:
 
 
 def on_virtual_time(log: Log) -> bool:
-    """Return whether the run's clock was virtual: its times are computed, not measured."""
+    """Return whether the loop of the run had a virtual clock: its times are computed, not measured."""
     return log.metadata.get("run", {}).get("clock") == "virtual"
 
 
 def first_deadline_ns(log: Log) -> int:
-    """Return the loop's first deadline; in a log without cycles, the time of the first event."""
+    """Return the deadline of the loop's first cycle on the run's clock, ns. In a log without cycles,
+    return the time of the first event, or 0."""
     if log.activation is not None:
         return int(log.activation["scheduled_ns"][0])
     if len(log.cycles):
@@ -124,20 +129,22 @@ def first_deadline_ns(log: Log) -> int:
 
 
 def begins(log: Log) -> bool:
-    """Return whether this slice of a log determines the first deadline."""
+    """Return whether this slice of a log has a cycle or the activation of the controllers, so that
+    `first_deadline_ns` is exact."""
     return log.activation is not None or len(log.cycles) > 0
 
 
 def late_bins(late_ns: NDArray[np.int64]) -> NDArray[np.int64]:
-    """Return the number of wake-ups in each bin of 1 us, shape (LATE_BINS_US + 1,). Early ones count as 0."""
+    """Count wake-ups by lateness, in bins of 1 us; shape (LATE_BINS_US + 1,). Early wake-ups are in the
+    first bin, all beyond 100 ms in the last."""
     return np.bincount(np.clip(late_ns // 1000, 0, LATE_BINS_US), minlength=LATE_BINS_US + 1)
 
 
 def cycle_periods_ns(log: Log) -> NDArray[np.int64]:
-    """Return the period of each cycle, ns: the time to the next deadline, shape (cycles,).
+    """Return the period of each cycle, ns: the time from its deadline to the next one, shape (cycles,).
 
     A changed rate applies from the cycle that executed the change. Across missing cycles the period is a
-    mean.
+    mean. In a sequential schedule it counts from the wake-up, not from the deadline.
     """
     if len(log.cycles) < 2:
         return np.full(len(log.cycles), log.period_ns, dtype=np.int64)
@@ -146,9 +153,10 @@ def cycle_periods_ns(log: Log) -> NDArray[np.int64]:
 
 
 def _between_ns(log: Log, cycles: NDArray[np.void]) -> NDArray[np.int64]:
-    """Return the period from each cycle to the next, ns, shape (cycles - 1,).
+    """Return the time from each cycle's deadline to the next deadline, ns, shape (cycles - 1,); a mean across
+    missing cycles.
 
-    In a sequential schedule the period counts from the wake-up of a cycle, not from its deadline.
+    In a sequential schedule it counts from the wake-up of a cycle, not from its deadline.
     """
     due = cycles["scheduled_ns"]
     counted_from = cycles["woken_ns"] if plan_of(log).loop.schedule == "sequential" else due
@@ -162,7 +170,8 @@ STEPS = (
     ("write", "updated_ns", "written_ns"),
     ("cycle", "woken_ns", "written_ns"),
 )
-"""Name of each step, and the fields with its begin and end. The last step is the sum of the others."""
+"""Steps of a cycle: name, and the fields of the cycle record with its begin and end. The last, `cycle`, is
+the sum of the others."""
 
 
 class Durations:
@@ -173,7 +182,7 @@ class Durations:
         self._controllers: tuple[str, ...] = ()
 
     def take(self, log: Log) -> None:
-        """Add the cycles of the next slice."""
+        """Add the durations of all cycles in the next slice of the log."""
         self._controllers = tuple(controller.name for controller in log.controllers)
         cycles = log.cycles
         steps = [cycles[end] - cycles[begin] for _, begin, end in STEPS]
@@ -182,7 +191,7 @@ class Durations:
             self._took.take(np.full(len(took_ns), group), np.maximum(took_ns, 0) // _TENTH_NS)
 
     def finish(self) -> tuple[tuple[Duration, ...], tuple[Duration, ...]]:
-        """Return the durations of all steps and of all controllers.
+        """Return the durations of the steps of the cycle, and those of the controllers' updates.
 
         Returns:
             Read, update, write and their sum, empty without cycles; and the update of each controller
@@ -199,12 +208,13 @@ class Durations:
 
 
 _TIMES = ("cycle", "scheduled_ns", "woken_ns", "read_ns", "updated_ns", "written_ns", "skipped")
-"""Fields of cycles that are counted; the per-joint fields are not needed."""
+"""Fields of a cycle record that `Punctuality` uses; the fields per joint are not needed."""
 _WHOLE = np.dtype([(name, np.int64) for name in _TIMES])
 
 
 class Punctuality:
-    """Accumulator of the loop's punctuality, fed slice by slice. Its memory does not grow with the log."""
+    """Accumulator of the loop's wake-up latency and skipped periods, fed with the log slice by slice. Its
+    memory does not grow with the log."""
 
     def __init__(self) -> None:
         self._held: NDArray[np.void] | None = None  # Newest cycle: its period ends with the next one
@@ -222,7 +232,7 @@ class Punctuality:
         self.slowest: Slowest | None = None  # Cycle that exceeded its period most, or None
 
     def take(self, log: Log) -> None:
-        """Add the cycles of the next slice."""
+        """Add the cycles of the next slice of the log."""
         if self._first:
             self._begin_ns = self._from_ns = first_deadline_ns(log)
             self._nominal_ns = self._period_ns = log.period_ns
@@ -270,7 +280,8 @@ class Punctuality:
             self.slowest = Slowest(int(each[worst]), read, update, write)
 
     def finish(self) -> tuple[Periods, Latency | None]:
-        """Return the account of all periods, and the wake-up latency, which is None without cycles."""
+        """Return the number of recorded, skipped and missing periods, and the lateness of the wake-ups,
+        which is None without cycles."""
         if self._held is not None:
             self._count(self._held, np.full(1, self._period_ns, np.int64))
             self._held = None

@@ -1,6 +1,6 @@
-"""Records of late and long cycles: causes over a run, and the worst cycles as packet timelines.
+"""Record types for late and long cycles: causes summed over a run, and the worst cycles with their packets.
 
-These are only the types, for tables, plots and JSON; `dxlrun_analysis.causes` creates them.
+`dxlrun_analysis.causes` creates the records; tables, plots and JSON show them.
 """
 
 from __future__ import annotations
@@ -20,12 +20,13 @@ CauseKind = Literal[
     "plan",
     "unexplained",
 ]
-"""Kind of unplanned time in a cycle; analyze.md explains each."""
+"""Kind of cause to which a part of the unplanned time of a late or long cycle is attributed; analyze.md
+explains each."""
 
 
 @dataclass(frozen=True, slots=True)
 class Cause:
-    """One cause over a whole run."""
+    """One cause of late and long cycles: the time attributed to it, summed over the worst cycles of a run."""
 
     kind: CauseKind
     subject: str  # Servo with its joint, bus, controller or activity of the machine; empty for none
@@ -33,13 +34,14 @@ class Cause:
     total_ns: int
     worst_ns: int  # Greatest share in one cycle
     long_ns: int
-    """Share of the total in long cycles; the rest is in cycles that only woke late."""
+    """Part of `total_ns` that is in long cycles; the rest is in cycles that woke late but were not too
+    long."""
     servo: str = ""  # Joint of the servo, or its bus and ID; empty if the cause is not a servo
 
 
 @dataclass(frozen=True, slots=True)
 class CauseShare:
-    """Share of one cause in a cycle's excess, us."""
+    """Time of one cycle's excess that is attributed to one cause, us."""
 
     kind: CauseKind
     subject: str  # As in Cause
@@ -47,7 +49,8 @@ class CauseShare:
 
     @property
     def name(self) -> str:
-        """Cause with its subject, as in a sentence. An activity of the machine is its own name."""
+        """Cause with its subject, as text: `late reply of bus main`. For a cause of kind `machine`, only
+        its activity."""
         if self.kind == "machine":
             return self.subject
         return f"{self.kind} of {self.subject}" if self.subject else self.kind
@@ -58,7 +61,8 @@ TimelineKind = Literal["instruction", "status", "noise", "late", "other host", "
 
 @dataclass(frozen=True, slots=True)
 class TimelinePacket:
-    """One packet of a cycle; times in us since the cycle's deadline, negative in the idle time before."""
+    """One packet on a bus during one cycle. Times are in us since the cycle's deadline, negative in the
+    idle time before."""
 
     bus: str
     kind: TimelineKind
@@ -68,14 +72,15 @@ class TimelinePacket:
     begin_us: float  # Instruction: before its write(); else after the read() that returned the first byte
     end_us: float  # After the write(), or after the read() that returned the last byte
     planned_us: float | None
-    """Planned time of its last byte, relative to the actual begin of the exchange; None if it is not
-    planned."""
+    """Planned time at which its last byte is sent or read, counted from the actual begin of its exchange;
+    None for noise, late, foreign and echoed packets, and if the baud rate is unknown."""
     size: int  # Bytes
 
 
 @dataclass(frozen=True, slots=True)
 class WorstCycle:
-    """One cycle with its packets; times in us since its deadline (`scheduled_ns`)."""
+    """One late or long cycle with the causes of its excess and its packets. Times are in us since its
+    deadline (`scheduled_ns`)."""
 
     cycle: int
     seconds: float  # Deadline, since the first deadline

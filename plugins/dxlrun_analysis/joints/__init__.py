@@ -1,4 +1,4 @@
-"""Joints of a log: tracking error, delay, movement, health, and goals that they missed.
+"""Joints of a log: tracking error, delay, movement, temperature and voltage, and failures to follow commands.
 
-Servos and their packets belong in `servos`.
+Servos and their packets are the subject of `servos`.
 """

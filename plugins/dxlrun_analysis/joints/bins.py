@@ -1,4 +1,5 @@
-"""Quantities of joints over the run, in time bins that double in length when the run outgrows them."""
+"""Time series of joint quantities over a run, in time bins that double in length when the run outgrows
+them."""
 
 from __future__ import annotations
 
@@ -12,12 +13,13 @@ _FIRST_BIN_NS = 100_000_000
 
 
 _JOINS = ((np.minimum, np.inf), (np.maximum, -np.inf), (np.add, 0.0), (np.add, 0.0))
-"""Reduction and neutral element of each array: minimum, maximum, sum, and number of known cycles."""
+"""Reduction and neutral element of each array of `Bins`: minimum, maximum, sum, and number of finite
+values."""
 
 
 class Bins:
-    """Minimum, mean and maximum of joint quantities in time bins; arrays of shape (quantities, bins,
-    joints)."""
+    """Minimum, mean and maximum of several quantities of each joint in 512 time bins of 0.1 s or more.
+    Memory does not grow with the run."""
 
     def __init__(self, quantities: int = 0, joints: int = 0, begin_ns: int = 0) -> None:
         shape = (quantities, _BINS, joints)
@@ -25,10 +27,10 @@ class Bins:
         self._values = [np.full(shape, empty) for _, empty in _JOINS]
 
     def take(self, times: NDArray[np.int64], values: Floats) -> None:
-        """Add cycles.
+        """Add the values of some cycles to their bins.
 
         Args:
-            times: Times in ns, shape (cycles,).
+            times: Times of the cycles in ns, shape (cycles,).
             values: Values, NaN if unknown; shape (quantities, cycles, joints).
         """
         while int(times[-1]) - self.begin_ns >= _BINS * self.bin_ns:
@@ -51,11 +53,11 @@ class Bins:
         self.bin_ns *= 2
 
     def joined(self, seconds: float) -> tuple[float, Floats, Floats, Floats]:
-        """Merge bins into windows of about `seconds`, one bin at least.
+        """Return the time series in windows of about `seconds`, of one bin at least.
 
         Returns:
-            Length of the windows in s, then minimum, mean and maximum in each window. The windows cover
-                the run; a window without a value has NaN.
+            Length of the windows in s, then minimum, mean and maximum in each window, shape (quantities,
+                windows, joints). The windows cover the run; a window without a value has NaN.
         """
         used = int(np.max(np.nonzero(self._values[3].sum(axis=(0, 2)))[0], initial=-1)) + 1
         step = max(1, round(seconds * 1e9 / self.bin_ns))

@@ -1,4 +1,4 @@
-"""Delay with which a joint follows the goals as they were sent.
+"""Delay between the goals sent to a joint and its measured position, by least squares.
 
 Of 24 delays up to 0.3 s (up to 24 cycles if those take longer), the fit chooses the one with the least mean
 square difference between position and goal. A parabola through this delay and its neighbours refines it to
@@ -23,7 +23,8 @@ _EXPLAINED = 0.25  # Largest remaining share of the worst mean square
 
 @dataclass(slots=True)
 class DelayFit:
-    """Mean square differences between positions and earlier goals, by delay."""
+    """Accumulator that fits one joint's delay: sums of squared differences between its positions and
+    earlier goals, for each of 24 delays."""
 
     step: int = 0  # Cycles between consecutive delays
     period_s: float = 0.0
@@ -35,7 +36,14 @@ class DelayFit:
     highest: float = -math.inf
 
     def take(self, times: Floats, goal: Floats, position: Floats, known: int) -> None:
-        """Add cycles, of which the first `known` were added before."""
+        """Add the cycles from number `known` on; the first `known` were already added.
+
+        Args:
+            times: Times of the cycles, s; shape (cycles,).
+            goal: Goals sent to the joint, rad; NaN without one.
+            position: Measured positions, rad; NaN if not read.
+            known: Number of cycles that were added before.
+        """
         if not self.step:
             self.period_s = float(np.median(np.diff(times))) if len(times) > 1 else 0.0
             self.step = max(1, round(_LONGEST_S / max(self.period_s, 1e-6) / _DELAYS))

@@ -29,10 +29,11 @@ from dxlrun_analysis.finding import Finding, Rank
 from dxlrun_analysis.joints.planned import PlannedJoint
 
 ERROR, WAY, POSITION, SPEED, LOAD, AWAY, SWINGS, GOALS = range(8)
-"""Quantities: signed error, trajectory, position, speed of the trajectory, load, error that counts, swings of
-the error less those of the trajectory (1/s), and swings of the goal (1/s)."""
+"""Rows of `Windows` and `Bins`: signed error, reachable trajectory, position, speed of the trajectory,
+load, magnitude of the error that counts as failure, swings of the error less those of the trajectory
+(1/s), and swings of the goal (1/s)."""
 MOVED_RAD = 0.16
-"""9 deg: least movement of the trajectory, and least error, of a joint that stands still."""
+"""9 deg: least movement of the trajectory, and least error, of a joint that is reported to stand still."""
 AWAY_RAD = 0.08  # 4.6 deg: a joint that follows is nearer
 WORSE = 3.0  # Required ratio to the worst error of any earlier time
 BAD_S = 1.0  # From this duration on, a failure makes a run not good
@@ -54,7 +55,8 @@ Flags = NDArray[np.bool_]
 
 @dataclass(frozen=True, slots=True)
 class Windows:
-    """One joint in windows of time: minimum, mean and maximum of each quantity, NaN without torque."""
+    """Time series of one joint in windows of equal length: minimum, mean and maximum of each quantity; NaN
+    while the servo has no torque."""
 
     joint: PlannedJoint
     length_s: float
@@ -63,22 +65,25 @@ class Windows:
     most: Floats
 
     def reach(self, quantity: int, when: Flags) -> float:
-        """Return the range of a quantity over some windows, or 0 for none."""
+        """Return the greatest minus the smallest value of a quantity in the windows `when`, or 0 for no
+        windows."""
         most = np.fmax.reduce(self.most[quantity, when], initial=-math.inf)
         return max(0.0, float(most - np.fmin.reduce(self.least[quantity, when], initial=math.inf)))
 
     def typical(self, quantity: int, when: Flags) -> float:
-        """Return the mean magnitude of a quantity in some windows."""
+        """Return the mean magnitude of a quantity in the windows `when`; NaN if it is unknown in all of
+        them."""
         values = self.mean[quantity, when]
         values = values[np.isfinite(values)]
         return float(np.abs(values).mean()) if len(values) else math.nan
 
     def distance(self, way: float) -> str:
-        """Return a distance of the joint as text, in the unit of the joint."""
+        """Return a distance as text in the joint's unit, such as `3.2 deg`."""
         return distance(self.joint, way)
 
     def load_text(self, when: Flags, usual: Flags) -> str:
-        """Return the load in some windows as text, compared with its load in others while it moved."""
+        """Return the mean load in the windows `when` as text, compared with the load in the windows
+        `usual` in which the joint moved."""
         load, otherwise = self.typical(LOAD, when), self.typical(LOAD, usual & (self.mean[SPEED] > 0))
         if math.isnan(load):
             return "; its load is not read"
@@ -89,18 +94,20 @@ class Windows:
 
 @dataclass(frozen=True, slots=True)
 class Failing:
-    """Period in which one joint failed to follow its commands."""
+    """Failure of one joint to follow its commands: rule, description, and the windows of time in which it
+    failed."""
 
     code: str
     text: str  # Description, continues a sentence that begins with the joint's name
     when: Flags  # Windows in which the joint failed
     seconds: float  # Total duration of these windows
     shared: bool = False
-    """A healthy joint can also show this failure along with others, because it depends on load and motion."""
+    """True for failures that healthy joints also show if load or motion cause them. They are not reported
+    if many joints show them at once."""
     commanded: bool = False  # The commands are at fault, not the servo
 
     def finding(self, one: Windows) -> Finding:
-        """Return the finding about a joint, from the windows in which the failure was found."""
+        """Return the failure as a finding of the verdict; `one` is the time series in which it was found."""
         # The joint was possibly meant to stay there.
         away = self.when & (one.mean[AWAY] > AWAY_RAD * one.joint.share)
         since_s = float(np.flatnonzero(away if away.any() else self.when)[0]) * one.length_s
@@ -112,12 +119,12 @@ class Failing:
 
 
 def joint_finding(code: str, joint: PlannedJoint, text: str, since_s: float, *, brief: bool) -> Finding:
-    """Return a finding about a joint.
+    """Return a finding that accuses a joint, with rank SERVO, or CAUSE if the failure was brief.
 
     Args:
         code: Code of the rule.
         joint: The joint.
-        text: Description of the failure.
+        text: Description of the failure, which continues a sentence that begins with the joint's name.
         since_s: Start of the failure, s since the start of the run.
         brief: The failure lasted less than a second.
     """
@@ -126,13 +133,19 @@ def joint_finding(code: str, joint: PlannedJoint, text: str, since_s: float, *, 
 
 
 def distance(joint: PlannedJoint, way: float) -> str:
-    """Return a distance of a joint as text in the joint's unit."""
+    """Return a distance (rad, or m of a linear joint) as text in the joint's unit."""
     return joint.logged.unit.text(way, digits=1)
 
 
 def failure_of(brief: Windows, one: Windows) -> tuple[Windows, Failing | None]:
-    """Return the failure of a joint with the most direct evidence, and the short or long windows that show
-    it."""
+    """Return the failure of one joint, if any, and the time series that shows it.
+
+    A standstill precedes an oscillation, that a joint that follows worse, and that a joint far from its goal.
+
+    Args:
+        brief: The joint's time series in windows of 0.1 s or more.
+        one: The same in windows of about 0.5 s.
+    """
     if (still := _still(brief)) is not None:
         return brief, still
     if (found := _oscillates(one) or _worse(one)) is not None:
@@ -141,7 +154,8 @@ def failure_of(brief: Windows, one: Windows) -> tuple[Windows, Failing | None]:
 
 
 def _still(one: Windows) -> Failing | None:
-    """Return the longest standstill of a joint that should move."""
+    """Return the longest standstill of a joint whose trajectory moves, or None; see the module
+    docstring."""
     near, moves = max(_STILL_RAD * one.joint.share, 2 * one.joint.tick), MOVED_RAD * one.joint.share
     least, most = one.least[POSITION], one.most[POSITION]
     away = one.mean[AWAY] > AWAY_RAD * one.joint.share
@@ -170,7 +184,8 @@ def _still(one: Windows) -> Failing | None:
 
 
 def _stood(one: Windows, when: Flags, there: Flags, seconds: float) -> Failing:
-    """Describe a standstill; `there` are all windows in which the joint was at that place."""
+    """Return a standstill as a failure. The joint stood still in the windows `when`; `there` are all
+    windows at that position; `seconds` is their duration."""
     at = np.nanmedian(one.least[POSITION, when])
     same = (one.least[POSITION] == at) & (one.most[POSITION] == at)
     exact = ", to the tick," if same[when].mean() >= _MOSTLY else ""
@@ -185,7 +200,8 @@ def _stood(one: Windows, when: Flags, there: Flags, seconds: float) -> Failing:
 
 
 def _far(one: Windows) -> Failing | None:
-    """Return the time in which a joint is far from its goal and approaches it slower than it can."""
+    """Return the windows in which a joint is far from its goal and approaches it slower than it can, as a
+    failure; None if they last less than a second."""
     away, speed = one.mean[AWAY], one.mean[SPEED]
     if not len(away):
         return None
@@ -207,7 +223,8 @@ def _far(one: Windows) -> Failing | None:
 
 
 def _oscillates(one: Windows) -> Failing | None:
-    """Return the time in which a joint swings around its trajectory, or its goals swing."""
+    """Return the windows in which the joint's error or its goal swings, as a failure; None if they last
+    less than a second."""
     by_effort = np.isnan(one.mean[AWAY])
     shakes = one.mean[SWINGS] >= np.where(by_effort, _SHAKES_BY_EFFORT_HZ, _SHAKES_HZ)
     told = one.mean[GOALS] >= _SHAKES_HZ
@@ -226,7 +243,8 @@ def _oscillates(one: Windows) -> Failing | None:
 
 
 def _worse(one: Windows) -> Failing | None:
-    """Return the time in which a joint follows worse than ever before; see the module docstring."""
+    """Return the windows in which a joint follows worse than ever before, as a failure; None if they last
+    less than a second."""
     away = one.mean[AWAY]
     bad, well, before = (np.zeros(len(away), np.bool_) for _ in range(3))
     follows = True

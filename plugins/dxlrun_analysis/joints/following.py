@@ -38,16 +38,17 @@ _LOST = 0.02
 _QUICK = 0.6  # Share of the model's top speed above which a servo cannot follow closely
 _SETTLES_S = 0.3  # Time after fast movement in which the error does not count
 _GONE_S = 0.16
-"""Positions missing for longer are not lost replies: the joint had no torque."""
+"""A gap in the positions longer than this is not due to lost replies: the joint had no torque."""
 _NEAR_AGAIN_RAD = 0.035
-"""Distance from the trajectory at which a joint has caught up after that."""
+"""Distance from the trajectory at which a joint has caught up after a time without torque."""
 _PLACE_RAD = 0.05  # Width of a place: about 3 deg
 _AGAIN_S = 0.5  # Least time between a stay and a visit
 _CREEPS_RAD_S = 0.1  # Below this speed friction can act in either direction
 _FASTER = 1.5  # Speeds within this ratio are similar
 _MOST_BEFORE = 12  # Stays kept as reference per place, the first of the run
 _BENDS_RAD_S = 0.6
-"""Change of speed within 0.2 s, at least by half, that causes an error in a healthy joint."""
+"""Change of the trajectory's speed within 0.2 s, at least by half, that causes an error in a healthy
+joint."""
 _BENDS_S = 0.1  # Interval before and after, over which the change is measured
 _SWING_RAD, _SWING_TICKS = 0.01, 4  # 0.6 deg, or this number of ticks
 _SWING_S = 0.2  # Longest time between reversals of a series
@@ -65,8 +66,8 @@ Flags = NDArray[np.bool_]
 
 
 class Visit(NamedTuple):
-    """Stay at a place where the joint was before: the error now, and the nearest error of the earlier
-    stays."""
+    """Stay of a joint at a place where it was before: error (rad) and load now, and the nearest error and
+    load of the earlier stays."""
 
     at_s: float
     seconds: float
@@ -80,18 +81,20 @@ class Visit(NamedTuple):
 
     @property
     def change(self) -> float:
-        """Difference of the error from the earlier stays."""
+        """Magnitude of the difference between the error now and in the earlier stays, rad."""
         return abs(self.off - self.was)
 
     @property
     def load_change(self) -> float:
-        """Difference of the load; 0 if the load is not read, or the speed changes."""
+        """Magnitude of the difference between the load now and in the earlier stays, as share of its
+        torque; 0 if the load is not read, or the speed changes."""
         change = abs(self.load - self.load_was)
         return change if self.even and math.isfinite(change) else 0.0
 
 
 class _Stay(NamedTuple):
-    """Stay of a joint at a place."""
+    """Uninterrupted stay of a joint at one place (3 deg wide) in one direction, with its median speed,
+    error and load."""
 
     end_s: float
     direction: int  # 0: nearly at rest
@@ -100,7 +103,7 @@ class _Stay(NamedTuple):
     load: float
 
     def is_like(self, later: _Stay) -> bool:
-        """Return whether a later stay is comparable: same direction and similar speed."""
+        """Return whether a later stay is comparable with this one: same direction and similar speed."""
         if self.direction != later.direction:
             return False
         slow, fast = (self.speed, later.speed) if self.speed < later.speed else (later.speed, self.speed)
@@ -108,7 +111,8 @@ class _Stay(NamedTuple):
 
 
 class Followed(NamedTuple):
-    """Samples of one joint, in rad of its servo."""
+    """Samples of one joint, compared with its trajectory after the lag that is typical of its kind; rad of
+    its servo."""
 
     row: int
     joint: PlannedJoint
@@ -119,7 +123,7 @@ class Followed(NamedTuple):
     goal: Floats  # Expected position of a joint of its kind
     position: Floats
     off: Floats
-    """Position minus goal; NaN without a position, near top speed, or while catching up"""
+    """Position minus `goal`; NaN without a position, near top speed, or while catching up."""
     load: Floats  # Share of its torque
     speed: Floats
 
@@ -128,7 +132,7 @@ class Followed(NamedTuple):
         at rest.
 
         Stays whose error differs by less than `least` (rad) and whose load differs by less than `least_load`
-        become the reference of later ones.
+        (share of torque) become the reference of later ones.
         """
         speed = np.nan_to_num(self.speed)
         direction = np.where(np.abs(speed) < _CREEPS_RAD_S, 0, np.sign(speed)).astype(int)
@@ -165,7 +169,7 @@ class Followed(NamedTuple):
                 yield Visit(at_s, seconds, middle, stay.off, was, stay.load, took, even, stay.direction)
 
     def _load_at_rest(self) -> Floats:
-        """Return the load without the part that is proportional to speed."""
+        """Return the load of each sample without the part that is proportional to speed."""
         known = np.isfinite(self.off) & np.isfinite(self.load)
         speed, load = self.speed[known], self.load[known]
         moved = float(speed @ speed)
@@ -173,7 +177,8 @@ class Followed(NamedTuple):
         return self.load - taken * self.speed
 
     def swings(self) -> Floats:
-        """Return the reversals of the longest series of even swings, s; empty if its goal swings as well."""
+        """Return the times (s) at which the error reverses, in the longest series of even swings; empty if
+        the goal swings in that time as well."""
         least = max(_SWING_RAD, _SWING_TICKS * self.joint.tick / self.joint.share)
         turns = self._turns_of(self.off, least)
         parts = np.split(turns, np.flatnonzero(np.diff(turns) > _SWING_S) + 1)
@@ -184,14 +189,15 @@ class Followed(NamedTuple):
         return series
 
     def _turns_of(self, values: Floats, least: float) -> Floats:
-        """Return the times at which values reverse by `least` or more, s, where the error is known."""
+        """Return the times (s) at which `values` reverse by `least` or more, where the error is known."""
         edges = np.flatnonzero(np.diff(np.isfinite(self.off), prepend=False, append=False))
         pairs = zip(edges[::2], edges[1::2], strict=True)
         turns = [begin + at for begin, end in pairs for at in _turning(values[begin:end], least)[1:-1]]
         return self.at_s[turns]
 
     def _bends(self) -> Flags:
-        """Return where the speed of the trajectory changes within 0.2 s, or is unknown."""
+        """Return the samples at which the speed of the trajectory changes much within 0.2 s, or is
+        unknown."""
         bends = np.zeros(len(self.off), np.bool_)
         side = _samples(_BENDS_S, self.step_s)
         least = np.maximum(_BENDS_RAD_S, np.abs(self.speed[side:-side]) / 2)
@@ -200,7 +206,8 @@ class Followed(NamedTuple):
 
 
 def followed(joints: Sequence[PlannedJoint], samples: Samples) -> list[Followed]:
-    """Return the joints that moved with few lost replies, each compared with the joints of its kind."""
+    """Return the joints that moved and lost few replies, each compared with its trajectory after the
+    median lag of the joints of its kind."""
     lags: dict[str, dict[int, float]] = defaultdict(dict)
     for row, joint in enumerate(joints):
         way, position = samples.way[:, row] / joint.share, samples.position[:, row] / joint.share
@@ -234,13 +241,14 @@ def _followed(row: int, joint: PlannedJoint, alike: int, lag_s: float, samples: 
 
 
 def _late(at_s: Floats, way: Floats, lag_s: float) -> Floats:
-    """Return a delayed trajectory; NaN before its begin."""
+    """Return a trajectory delayed by `lag_s`; NaN before its begin."""
     late: Floats = np.interp(at_s - lag_s, at_s, way, left=np.nan)
     return late
 
 
 def _lag_s(at_s: Floats, way: Floats, position: Floats) -> float | None:
-    """Return the delay that best explains the position while the joint moves; None if it hardly moves."""
+    """Return the delay (s) of the trajectory that best explains the position while the joint moves; None
+    if it hardly moves."""
     moves = np.abs(np.gradient(way, at_s)) > _MOVES_RAD_S
     best, lag_s = math.inf, None
     for each in _LAGS_S.tolist():
@@ -252,18 +260,18 @@ def _lag_s(at_s: Floats, way: Floats, position: Floats) -> float | None:
 
 
 def _samples(seconds: float, step_s: float) -> int:
-    """Return the number of samples in a time, at least one."""
+    """Return the number of samples in `seconds`, at least one."""
     return max(1, round(seconds / step_s))
 
 
 def _gone(position: Floats, step_s: float) -> Flags:
-    """Return where a joint had no position for a long time."""
+    """Return the samples at which a joint had no position for 0.16 s or more."""
     lost, many = np.isnan(position).astype(float), _samples(_GONE_S, step_s)
     return np.convolve(lost, np.ones(many))[: len(lost)] >= many
 
 
 def _lossy(position: Floats, step_s: float) -> bool:
-    """Return whether single positions are missing too often."""
+    """Return whether more than 2 % of the positions are missing, without gaps of 0.16 s or more."""
     known = np.flatnonzero(np.isfinite(position))
     if not len(known):
         return True
@@ -272,7 +280,7 @@ def _lossy(position: Floats, step_s: float) -> bool:
 
 
 def _lasting(when: Flags, samples: int) -> Flags:
-    """Return where a condition holds, or held up to that number of samples before."""
+    """Return the samples at which a condition holds, or held less than `samples` samples before."""
     return np.convolve(when.astype(float), np.ones(samples))[: len(when)] > 0
 
 
@@ -302,7 +310,7 @@ def _even(at_s: Floats) -> bool:
 
 
 def _nearest(value: float, before: Sequence[float]) -> float:
-    """Return the value nearest to `value` within the range of `before`; `value` itself if there was none."""
+    """Return `value` clamped to the range of `before`; `value` itself if `before` is empty."""
     return min(max(value, min(before)), max(before)) if before else value
 
 
@@ -310,7 +318,8 @@ def _nearest(value: float, before: Sequence[float]) -> float:
 
 
 class _Shown(NamedTuple):
-    """Evidence about one joint: its visits and swings, with the maximum of each."""
+    """Evidence about one joint for the rules below: its visits and swings, with the greatest change of
+    error and load."""
 
     one: Followed
     visits: list[Visit]
@@ -326,11 +335,11 @@ class _Shown(NamedTuple):
 
 
 def changed(joints: Sequence[Followed], named: Set[int]) -> Iterator[Finding]:
-    """Report joints with changes that no other joint shows.
+    """Report each joint that follows worse or oscillates, by far more than any other joint does.
 
     Args:
         joints: The joints that moved.
-        named: Rows of joints that other rules report.
+        named: Rows of joints that other rules report; they are omitted.
     """
     seen = [
         _Shown(one, list(one.visits(_OFF_RAD / 2, _LOAD / 2)), one.swings())
@@ -345,10 +354,11 @@ def changed(joints: Sequence[Followed], named: Set[int]) -> Iterator[Finding]:
 
 
 def _most(values: Iterable[tuple[float, str]], name: str) -> float:
-    """Return the maximum of the other joints, 0.0 at least; `values` are pairs of value and joint name.
+    """Return the greatest of some values of other joints, 0.0 at least, to compare the joint `name` with;
+    `values` are pairs of value and joint name.
 
-    Among many joints, the greatest value may come from a second faulty joint, so it is skipped. It is kept if
-    it comes from the mirror image of this joint, to which the same can happen.
+    Among four or more joints the greatest value is skipped, because it may come from a second faulty joint.
+    It is kept if it comes from the mirror image of this joint (left and right), to which the same can happen.
     """
     ordered = sorted((value, _SIDE.sub("", other) == _SIDE.sub("", name)) for value, other in values)
     alone = len(ordered) >= _FEWEST_OTHERS and not ordered[-1][1]
@@ -374,7 +384,8 @@ def _lasts(visits: Sequence[Visit]) -> bool:
 
 
 def _compared(one: Followed, name: str, visits: Iterable[Visit], way: int) -> str:
-    """Describe error and load of a joint in one direction, or return an empty string without visits."""
+    """Return error and load at those visits with the direction `way`, next to those of the earlier stays,
+    as text. `name` is the direction in words; empty without such visits."""
     mine = [visit for visit in visits if visit.direction == way]
     if not mine:
         return ""

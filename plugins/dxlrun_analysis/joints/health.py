@@ -1,4 +1,4 @@
-"""Health of servos: temperature, overload, and supplies that are too high, too low or sag under load.
+"""Health of servos: temperature, overload, and supply voltages that are too high, too low or sag under load.
 
 The voltages of most servos on a bus fall together when the supply of the bus sags. The voltage of one servo
 falls alone when its own supply does. Limits are those of the models' control tables as shipped, or of the
@@ -39,7 +39,7 @@ _MOST_SAMPLES = 100_000  # Number of voltages that are kept
 
 @dataclass(frozen=True, slots=True)
 class Extremes:
-    """Highest temperature and lowest voltage of a joint in the run; None if never read."""
+    """Highest temperature and lowest supply voltage of a joint's servos in the run; None if never read."""
 
     joint: str
     hottest_c: float | None
@@ -47,7 +47,8 @@ class Extremes:
 
 
 class _Sample(NamedTuple):
-    """Changed voltage, with the total load of its bus at that time as share of the maximum."""
+    """New reading of a joint's voltage, with the total load of its bus at that time: sum of each joint's
+    share of its maximum."""
 
     joint: int
     volts: float
@@ -55,7 +56,8 @@ class _Sample(NamedTuple):
 
 
 class ServoHealth:
-    """Accumulator of temperatures, voltages and hardware errors. Its memory does not grow with the log."""
+    """Accumulator of temperatures, voltages and hardware errors of all joints. Its memory does not grow
+    with the log."""
 
     def __init__(self) -> None:
         self._joints: tuple[PlannedJoint, ...] = ()
@@ -65,7 +67,7 @@ class ServoHealth:
         self._samples: list[_Sample] = []
 
     def take(self, log: Log) -> None:
-        """Add the cycles of the next slice."""
+        """Add the cycles of the next slice of the log."""
         cycles = log.cycles
         if not len(cycles):
             return
@@ -81,7 +83,7 @@ class ServoHealth:
         self._keep_volts(cycles)
 
     def _keep_volts(self, cycles: NDArray[np.void]) -> None:
-        """Keep changed voltages, each with the load of its bus at that time."""
+        """Keep each voltage that differs from the one before, with the load of its bus at that time."""
         volts = cycles["voltage"]
         before = np.vstack([self._volts, volts[:-1]])
         rows, joints = np.nonzero(np.isfinite(volts) & (volts != before))
@@ -98,7 +100,7 @@ class ServoHealth:
     # Results
 
     def extremes(self) -> tuple[Extremes, ...]:
-        """Return the extremes of each joint, in the order of the joints."""
+        """Return highest temperature and lowest voltage of each joint, in the order of the joints."""
         if not self._joints:
             return ()
         _, least, _, most = self._bins.joined(0.0)
@@ -110,7 +112,8 @@ class ServoHealth:
         )
 
     def findings(self, movement: Sequence[Finding]) -> Iterable[Finding]:
-        """Report hot and overloaded servos, and supplies.
+        """Report hot and overloaded servos, impossible temperatures, and supply voltages that are too high,
+        too low or sag.
 
         Args:
             movement: Findings about movement. Overload of the joints that they accuse is not reported
@@ -152,7 +155,8 @@ class ServoHealth:
     def _supplies(
         self, bus: str, members: Numbers, least: Floats, mean: Floats, most: Floats
     ) -> Iterable[Finding]:
-        """Report the supply of a bus, or of one servo; voltages have shape (bins, members)."""
+        """Report a bad supply voltage of a bus, or of single servos on it; `members` are rows of joints,
+        voltages have shape (bins, members)."""
         lowest, highest = np.fmin.reduce(least, initial=np.inf), np.fmax.reduce(most, initial=-np.inf)
         reported = np.array(["voltage" in self._faults[index] for index in members])
         above = highest > np.array([self._joints[index].highest_volts for index in members]) + _STEP_V / 2
@@ -179,7 +183,8 @@ class ServoHealth:
                 return
 
     def _supply(self, bus: str, members: Numbers, least: Floats, most: Floats, how: str) -> Finding:
-        """Report the voltages of some servos of a bus; arrays of shape (bins, members)."""
+        """Return the finding about the voltages of some servos of a bus; arrays have shape (bins,
+        members), `how` continues the sentence."""
         joints = [self._joints[index] for index in members]
         alone = len(joints) == 1
         where = f"at {joints[0].name} ({joints[0].servos})" if alone else f"of bus {bus}"
@@ -195,7 +200,8 @@ class ServoHealth:
         return cause("supply", joints[0].name if alone else bus, sentence, share=4.0)
 
     def _has_own_supply(self, volts: Floats, others: Floats) -> bool:
-        """Return whether the voltage of a servo falls while the others stay constant."""
+        """Return whether the voltage of a servo falls while those of the others on its bus do not; `volts`
+        has shape (bins,), `others` (bins, servos)."""
         if others.shape[1] < _FEWEST_OTHERS or not np.isfinite(volts).any():
             return False
         with warnings.catch_warnings():
@@ -218,7 +224,7 @@ def _how_it_falls(samples: list[_Sample]) -> str:
 
 
 def _falls_with_load(samples: list[_Sample]) -> bool:
-    """Return whether the voltages of a bus are lower while its load is high."""
+    """Return whether the voltages of a bus are lower while its load is above the median."""
     if len(samples) < _FEWEST_VOLTAGES:
         return False
     table = np.array(samples)

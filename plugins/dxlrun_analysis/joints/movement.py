@@ -1,7 +1,8 @@
-"""Movement of the joints over the run, and findings about joints that failed to follow their commands.
+"""Movement of the joints over a run, and findings about joints that failed to follow their commands.
 
-The rules are in failing.py, with one exception: two positions within half a second, with torque throughout,
-are a *jump* if they are 9 deg and a quarter further apart than the model can turn in that time.
+The rules are in failing.py and following.py, with one exception: two positions within half a second, with
+torque throughout, are a *jump* if they are 9 deg and a quarter further apart than the model can turn in that
+time.
 """
 
 from __future__ import annotations
@@ -37,14 +38,15 @@ _JUMP_S = 0.5  # Positions further apart are not compared: the joint may have be
 _TOO_FAST = 1.25  # A supply at its limit and a pulling load make a servo slightly faster than its model
 _SWING_RAD = 0.035  # 2 deg: smallest swing that counts
 _FULL_SPEED = 0.8
-"""Share of the greatest observed speed from which a joint moves as fast as it can."""
+"""A joint moves as fast as it can from this share of its greatest speed so far on."""
 _SLOWEST_TOP = 0.4
-"""Least top speed, as share of the model's: a weak supply and a load make a servo slower."""
+"""Share of the model's top speed that a joint reaches at least: a weak supply and a load make a servo
+slower."""
 
 
 @dataclass(slots=True)
 class _Jumps:
-    """Implausible positions of one joint, and its last position with its time."""
+    """Accumulator of the jumps in one joint's position: their number, first time and greatest distance."""
 
     count: int = 0
     first_ns: int = 0
@@ -53,7 +55,8 @@ class _Jumps:
     position: float = math.nan
 
     def take(self, joint: PlannedJoint, at_ns: NDArray[np.int64], position: Floats) -> None:
-        """Add positions in order of time; NaN without torque, which also interrupts the comparison."""
+        """Add positions of the joint with their times; NaN while it has no torque, which also interrupts
+        the comparison."""
         at_ns, position = np.append(self.read_ns, at_ns), np.append(self.position, position)
         seconds, moved = np.diff(at_ns) * 1e-9, np.abs(np.diff(position))
         top = joint.logged.top_speed
@@ -66,7 +69,7 @@ class _Jumps:
         self.read_ns, self.position = int(at_ns[-1]), float(position[-1])
 
     def finding(self, joint: PlannedJoint, begin_ns: int) -> Finding:
-        """Return the finding about the jumps."""
+        """Return the finding that the joint's position jumped; `begin_ns` is the start of the run."""
         times = "" if self.count == 1 else f" {self.count} times"
         most, since_s = distance(joint, self.longest), (self.first_ns - begin_ns) * 1e-9
         text = f"shows a position that jumped{times}, by up to {most}, faster than its model turns"
@@ -74,7 +77,8 @@ class _Jumps:
 
 
 class Movement:
-    """Accumulator of joint movement. Its memory does not grow with the log."""
+    """Accumulator of the movement of all joints, which then reports failures to follow. Its memory does
+    not grow with the log."""
 
     def __init__(
         self, joints: Sequence[PlannedJoint] = (), begin_ns: int = 0, references: Sequence[str] = ()
@@ -90,7 +94,8 @@ class Movement:
         self._trail = Trail(len(joints), begin_ns)
 
     def take(self, cycles: NDArray[np.void], way: Floats, known: int) -> None:
-        """Add cycles, of which the first `known` were added before.
+        """Add the cycles from number `known` on; the first `known` were already added, and are used for
+        speeds only.
 
         Args:
             cycles: Cycles of the log.
@@ -143,7 +148,8 @@ class Movement:
         )
 
     def _sought(self, cycles: NDArray[np.void]) -> Floats:
-        """Return the reference positions of effort controllers, NaN elsewhere; shape (cycles, joints)."""
+        """Return the reference position of each joint while a controller moves it with an effort, NaN
+        otherwise; shape (cycles, joints)."""
         sought = np.full(cycles["position"].shape, np.nan)
         by_effort = (cycles["torque"] == Torque.ON) & cycles["valid"] & np.isfinite(cycles["goal_effort"])
         for row, column in self._references.items():
@@ -151,7 +157,8 @@ class Movement:
         return sought
 
     def _swings(self, cycles: NDArray[np.void], values: Floats) -> Floats:
-        """Return where a swing ends, as swings per second, shape (cycles, joints)."""
+        """Return an array (cycles, joints) that has the cycle rate in 1/s where a swing of `values` ends,
+        and 0 elsewhere. Its mean is the number of swings a second."""
         found = np.zeros_like(values)
         rate = 1e9 / max(float(np.median(np.diff(cycles["read_ns"]))), 1.0) if len(cycles) > 2 else 0.0
         for row, joint in enumerate(self._joints):
@@ -167,7 +174,8 @@ class Movement:
         return found
 
     def _told(self, cycles: NDArray[np.void], way: Floats) -> Floats:
-        """Return commanded swings: those of the trajectory, and steps of a goal that was constant before."""
+        """Return the same for commanded swings: those of the trajectory, and steps of a goal that was
+        constant before, which count as two."""
         steps = np.abs(np.diff(cycles["goal_position"], axis=0, prepend=np.nan))
         begins = steps >= _SWING_RAD * np.array([joint.share for joint in self._joints])
         begins[1:] &= steps[:-1] == 0.0
@@ -178,8 +186,8 @@ class Movement:
         """Report joints that stand still, oscillate, or follow worse than before, and positions that jumped.
 
         Args:
-            reached_off: Distance at which a goal of a joint was reached, rad or m. Errors within it, or
-                within the tolerance of the robot file, do not count.
+            reached_off: Distance from the goal at which each joint's goal counted as reached, rad or m, by
+                joint name. Smaller errors, or those within the tolerance of the robot file, do not count.
         """
         allowed = [max(reached_off.get(one.name, 0.0), one.logged.tolerance or 0.0) for one in self._joints]
         short, windows = self._windows(0.0, allowed), self._windows(_WINDOW_S, allowed)

@@ -1,4 +1,4 @@
-"""Joints of the plan in a log, with the limits of the servos that move them."""
+"""Joints as the plan in a log describes them, with the limits of the servos that move them."""
 
 from __future__ import annotations
 
@@ -19,7 +19,8 @@ _NEAREST = (
     (np.fmax, ("min_voltage_limit",)),
     (np.fmin, ("max_voltage_limit",)),
 )
-"""Limits of a joint: the first that one of its servos reaches."""
+"""Limits of a joint with several servos: the first limit that one of them reaches. Reduction, and names of
+the control table item."""
 _GAINS = ("position_p_gain", "p_gain")
 _SOFTEST = 3.0  # Bounds the influence of a very low gain
 _ACCELERATIONS = ("profile_acceleration", "goal_acceleration")
@@ -27,7 +28,7 @@ _ACCELERATIONS = ("profile_acceleration", "goal_acceleration")
 
 @dataclass(frozen=True, slots=True)
 class PlannedJoint:
-    """A joint as the plan of a recorded run has it, with the limits of its servos; rad, or m if linear."""
+    """A joint of the plan in a log, with its limits and those of its servos; rad, or m if linear."""
 
     name: str = ""
     bus: str = ""
@@ -49,15 +50,16 @@ class PlannedJoint:
     errors: tuple[HardwareErrors, ...] = ()  # Error bits of its servos' models, without duplicates
 
     def faults(self, value: int) -> frozenset[Fault]:
-        """Return the faults that a value of `hardware_error` reports.
+        """Return the faults that a raw value of the item `hardware_error` reports.
 
-        The value of a joint with servos of several models is ambiguous: a fault of any of them counts.
+        If a joint has servos of several models, a bit counts as a fault if any of the models defines it.
         """
         return frozenset(fault for errors in self.errors for fault in errors.faults(value))
 
 
 def planned_joints(log: Log) -> tuple[PlannedJoint, ...]:
-    """Return the joints in the order of the log. A joint that is not in the plan has only its name."""
+    """Return the planned joints in the order of the log's joints. A joint that is not in the plan has only
+    its name."""
     plan = plan_of(log)
     movers = plan.movers
     found = []
@@ -95,7 +97,8 @@ def planned_joints(log: Log) -> tuple[PlannedJoint, ...]:
 
 
 def _counts_one_turn(one: Mover) -> bool:
-    """Return whether a position has too few bytes to count turns; the same test as `ServoPlan.wraps`."""
+    """Return whether the servo's position item has fewer than 4 bytes, so that it cannot count turns; the
+    same test as `ServoPlan.wraps`."""
     table = _table(one)
     return table is not None and table.items["present_position"].size < 4
 
@@ -108,8 +111,8 @@ def _table(one: Mover) -> ControlTable | None:
 
 
 def _register(one: Mover, names: tuple[str, ...], otherwise: float, *, shipped: bool = False) -> float:
-    """Return the first register of `names` that the robot file declares, or with `shipped` the model, in its
-    unit."""
+    """Return the value, in its physical unit, of the first item of `names` that the robot file declares.
+    With `shipped`, the model's default also counts; without a value, return `otherwise`."""
     return _first_value(one, names, one.servo.declared, otherwise, shipped=shipped)
 
 

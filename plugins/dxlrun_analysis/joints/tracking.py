@@ -1,9 +1,9 @@
-"""Tracking of goals by the joints, and age of their states.
+"""Tracking error of each joint: comparison of its position with the trajectory that it could reach.
 
-A servo does not reach its goal in one cycle: it moves at the commanded speed, or at its top speed. Each joint
-is therefore compared with its reachable trajectory. This starts at the position of the joint and moves
-towards the goals that were sent, within the limits of velocity and acceleration, without delay. The
-difference consists of the servo's lag, its settling, and its error at rest.
+A servo does not reach its goal in one cycle: it moves at the commanded speed, or at its top speed. The
+*reachable trajectory* starts at the position of the joint and moves towards the goals that were sent, within
+the limits of velocity and acceleration, without delay. The error consists of the servo's lag, its settling,
+and its error at rest.
 
 Lag is the delay behind the reachable trajectory that explains most of the error by least squares, to first
 order: error = -lag * velocity. delay.py determines the delay behind the goals that were sent.
@@ -38,14 +38,15 @@ Flags = NDArray[np.bool_]
 
 @dataclass(frozen=True, slots=True)
 class JointTracking:
-    """Tracking of one joint over all cycles."""
+    """Tracking error of one joint over a run: error, lag, settling time, and quality of its states; rad,
+    or m if linear."""
 
     name: str
     invalid: int  # Cycles without an intact reply, except those of a requested reboot
     oldest_ms: float  # Greatest age of a state
     clamped: int  # Cycles in which the last gate changed the command
     rms_rad: float | None
-    """RMS of position minus reachable trajectory; None without a goal or a position.
+    """Root mean square of position minus reachable trajectory; None without a goal or a position.
 
     The servo's own lag is included: a moving joint is always behind.
     """
@@ -60,19 +61,20 @@ class JointTracking:
     """Delay of the joint behind the goals as they were sent; None if no delay explains the position."""
     unit: JointUnit = ROTARY  # Unit of the errors, whatever the field names say
     lost_at: float | None = None
-    """Position when its servo was lost for the first time; None if it was not lost, or the position is
-    unknown."""
+    """Position of the joint when its servo was lost for the first time; None if it was not lost, or the
+    position is unknown."""
 
 
 def tracking(log: Log) -> tuple[JointTracking, ...]:
-    """Return state age and tracking of each joint, in the order of the log."""
+    """Return the tracking error of each joint of a whole log, in the order of the log."""
     collected = Tracking()
     collected.take(log)
     return collected.finish(log)
 
 
 def reachable(log: Log, row: int) -> Floats:
-    """Return the reachable trajectory of a joint in each cycle, rad; NaN without a goal."""
+    """Return the reachable trajectory of the joint in column `row`, for each cycle, rad; NaN without a
+    goal."""
     limits = planned_joints(log)[row]
     return _reachable(_sent(log.cycles, row, limits), limits.acceleration, _Way())
 
@@ -82,7 +84,8 @@ def reachable(log: Log, row: int) -> Floats:
 
 @dataclass(slots=True)
 class _Way:
-    """State of a trajectory between slices: its last two points, and whether it is behind its goal."""
+    """State of a reachable trajectory between two slices of cycles: its last two points, its velocity, and
+    whether it is still behind its goal."""
 
     last: Floats = field(default_factory=lambda: np.zeros(0))
     behind: bool = False
@@ -102,7 +105,7 @@ def _sent(cycles: NDArray[np.void], row: int, limits: PlannedJoint) -> _Sent:
 
 
 def _reachable(sent: _Sent, acceleration: float, begun: _Way) -> Floats:
-    """Return the reachable trajectory.
+    """Return the reachable trajectory of a joint, one point per cycle.
 
     A goal holds until the next cycle. If it can be reached by then, the trajectory is the goal. `begun` has
     the points of the first cycles, and is updated.
@@ -134,7 +137,7 @@ def _reachable(sent: _Sent, acceleration: float, begun: _Way) -> Floats:
 
 @dataclass(frozen=True, slots=True)
 class _Sent:
-    """Goals of a joint in each cycle, with its positions."""
+    """Goals sent to one joint in some cycles, with its positions; columns of shape (cycles,)."""
 
     goal: Floats  # rad
     speed: Floats  # rad/s, commanded speed of the movement
@@ -143,7 +146,8 @@ class _Sent:
 
 
 def _go(start: int, way: Floats, sent: _Sent, acceleration: float, begun: _Way) -> int:
-    """Fill `way` from a cycle until it reaches its goal; return the index of the next cycle."""
+    """Fill the reachable trajectory `way` from cycle `start` until it reaches its goal; return the index
+    of the cycle after that."""
     at = float(way[start - 1]) if start else math.nan
     velocity = begun.velocity
     cycle = start
@@ -181,18 +185,19 @@ def _go(start: int, way: Floats, sent: _Sent, acceleration: float, begun: _Way) 
 
 @dataclass(frozen=True, slots=True)
 class _Rest:
-    """Interval in which a joint is expected to rest."""
+    """Interval in which a joint is expected to rest, because its trajectory is constant."""
 
     settling_s: float | None
-    """Time from the start until the joint stayed near its rest position; None if it did not move before."""
+    """Time from the start of the interval until the joint stayed near its rest position; None if it did
+    not move before."""
     error_rad: float  # Measured minus desired position at rest
 
 
 @dataclass(slots=True)
 class _OpenRest:
-    """Detector of rests in slices of cycles. It keeps the cycles of an open rest, 20 s at most.
+    """Detector of rests of one joint: intervals of 0.3 s or more in which its trajectory is constant.
 
-    A rest is an interval of 0.3 s or more with a constant desired position.
+    It is fed with slices of cycles, and keeps the cycles of a rest that has not ended, 20 s at most.
     """
 
     times: Floats = field(default_factory=lambda: np.zeros(0))
@@ -202,7 +207,7 @@ class _OpenRest:
     highest: float = -math.inf  # Range of the desired positions since the last rest, before the kept cycles
 
     def take(self, times: Floats, way: Floats, error: Floats, tick: float, *, final: bool) -> Iterator[_Rest]:
-        """Yield the rests that end in these cycles, and with `final` also the open one.
+        """Add cycles; yield the rests that end in them, and with `final` also the one that has not ended.
 
         A rest that is too short, or without any known error, is dropped. A long rest is yielded in pieces.
 
@@ -256,7 +261,8 @@ class _OpenRest:
 
 
 class Tracking:
-    """Accumulator of tracking, fed slice by slice. Its memory does not grow with the log."""
+    """Accumulator of the tracking errors of all joints, fed with the log slice by slice. Its memory does
+    not grow with the log."""
 
     def __init__(self) -> None:
         self._parts: list[NDArray[np.void]] = []
@@ -267,7 +273,7 @@ class Tracking:
         self.movement = Movement()  # Complete once `finish` was called
 
     def take(self, log: Log) -> None:
-        """Add the cycles of the next slice."""
+        """Add the cycles of the next slice of the log."""
         if not len(log.cycles):
             return
         if not self._rows:
@@ -280,7 +286,7 @@ class Tracking:
             self._work()
 
     def finish(self, log: Log) -> tuple[JointTracking, ...]:
-        """Return the tracking of each joint; `log` has the joint names."""
+        """Return the tracking error of each joint; `log` has the joint names."""
         self._work()
         nothing = np.zeros(0)
         for each in self._rows:
@@ -301,7 +307,7 @@ class Tracking:
 
 @dataclass(slots=True)
 class _Row:
-    """Accumulator of one joint."""
+    """Accumulator of the tracking error of one joint: column `row` of the log's cycles."""
 
     row: int
     limits: PlannedJoint
@@ -323,7 +329,8 @@ class _Row:
     delays: DelayFit = field(default_factory=DelayFit)
 
     def take(self, cycles: NDArray[np.void], known: int) -> Floats:
-        """Add cycles, of which the first `known` were added before; return the reachable trajectory."""
+        """Add the cycles from number `known` on; the first `known` were already added. Return the
+        reachable trajectory of all, rad."""
         new = cycles[known:]
         missing = ~new["valid"][:, self.row] & (new["torque"][:, self.row] != Torque.REBOOTING)
         self.invalid += int(np.count_nonzero(missing))
@@ -348,7 +355,8 @@ class _Row:
         return way
 
     def rested(self, times: Floats, way: Floats, error: Floats, *, final: bool) -> None:
-        """Evaluate the rests that these cycles complete; `final` also completes the open one."""
+        """Add the settling times and errors of the rests that end in these cycles; `final` also ends the
+        current one."""
         for rest in self.rest.take(times, way, error, self.limits.tick, final=final):
             self.rest_rad = max(abs(rest.error_rad), self.rest_rad or 0.0)
             if rest.settling_s is not None:

@@ -1,4 +1,7 @@
-"""Samples of desired and actual joint positions, at most 50 a second: the first of a run and the newest."""
+"""Samples of desired and actual joint positions and of loads, 50 a second at most.
+
+A run longer than three minutes keeps its first and its newest samples.
+"""
 
 from __future__ import annotations
 
@@ -14,7 +17,8 @@ _MOST = 8_192  # Samples kept, nearly three minutes. A longer run keeps the firs
 
 
 class Samples(NamedTuple):
-    """Quantities over time; NaN if unknown, and at the gap between first and newest samples."""
+    """Positions and loads of all joints over time; NaN if unknown, and at the gap between the first and
+    the newest samples."""
 
     step_s: float  # Time between samples; the period of a loop below 50 Hz
     at_s: Floats  # Time since the start, shape (samples,)
@@ -24,7 +28,7 @@ class Samples(NamedTuple):
 
 
 class Trail:
-    """Accumulator of samples. Its memory does not grow with the log."""
+    """Accumulator of position and load samples of all joints. Its memory does not grow with the log."""
 
     def __init__(self, joints: int = 0, begin_ns: int = 0) -> None:
         self._begin_ns, self._slot = begin_ns, -1
@@ -32,7 +36,7 @@ class Trail:
         self._rows = np.zeros((0, 1 + 3 * joints))
 
     def take(self, at_ns: NDArray[np.int64], way: Floats, position: Floats, load: Floats) -> None:
-        """Add cycles, shapes (cycles,) and (cycles, joints). The first cycle of each 20 ms is kept."""
+        """Add the first cycle of each 20 ms; `at_ns` has shape (cycles,), the others (cycles, joints)."""
         since_s = (at_ns - self._begin_ns) * 1e-9
         if len(at_ns) > 2:
             self._step_s = max(STEP_S, float(np.median(np.diff(since_s))))
@@ -47,5 +51,5 @@ class Trail:
             self._rows[half, 1:] = np.nan
 
     def samples(self) -> Samples:
-        """Return the samples."""
+        """Return the kept samples of the run."""
         return Samples(self._step_s, self._rows[:, 0], *np.split(self._rows[:, 1:], 3, axis=1))
