@@ -205,6 +205,8 @@ def test_controls_are_enabled_only_with_fresh_states(serve: Serve, browser: Brow
             "STOP is always sent"
         )
         assert browser.value("document.querySelector('#banner').textContent"), cause
+        browser.click("#stop")  # refused here, because no robot runs
+        browser.until("document.querySelector('#message').textContent.includes('switch off its power')")
         robot.moving, robot.problem = True, ""
         await_phase(browser, "live")
         assert not browser.value(f"{VISIBLE}('#banner')")
