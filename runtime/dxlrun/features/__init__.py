@@ -9,7 +9,7 @@ from __future__ import annotations
 from collections.abc import Container, Iterable, Iterator, Mapping
 from contextlib import suppress
 from functools import cache
-from typing import Any
+from typing import Any, cast
 
 from msgspec.structs import replace
 
@@ -126,7 +126,7 @@ def _build_form(form: object) -> None:
     # Imported here because most processes use no feature of a plug-in.
     from pydantic import TypeAdapter
 
-    TypeAdapter(type_of(form)).rebuild(force=True)
+    TypeAdapter(cast("type[object]", type_of(form))).rebuild(force=True)
 
 
 def _features_of(plugin: InstalledPlugin) -> Iterator[Feature]:
