@@ -210,7 +210,8 @@ def test_controls_are_enabled_only_with_fresh_states(serve: Serve, browser: Brow
         robot.moving, robot.problem = True, ""
         await_phase(browser, "live")
         assert not browser.value(f"{VISIBLE}('#banner')")
-    assert errors(browser) == []
+    # Chromium logs each refused STOP as a resource that failed to load.
+    assert [one for one in errors(browser) if "409 (Conflict)" not in str(one)] == []
 
 
 def test_header_shows_voltage_hottest_servo_and_errors_first(serve: Serve, browser: Browser) -> None:
