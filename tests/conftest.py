@@ -244,7 +244,7 @@ def pytest_configure(config: pytest.Config) -> None:
 
 
 def pytest_collection_finish() -> None:
-    """Take the tests out of the collector's sight: a full collection would look at them all again."""
+    """Remove the tests from the collector's sight: a full collection would look at them all again."""
     gc.collect()
     gc.freeze()
 

@@ -46,7 +46,7 @@ RULES: Mapping[str, Rule] = {
         "bus",
         "the system reports that the port is gone",
         "once",
-        "Check the adapter's plugs and cable; `dmesg` has what the system saw of it.",
+        "Check the adapter's plugs and cable; `dmesg` shows what the system reported.",
     ),
     "power_lost": Rule(
         "bus",
@@ -108,7 +108,7 @@ RULES: Mapping[str, Rule] = {
     ),
     "slow_servo": Rule(
         "servo",
-        "its own part of its reply time, beside that of the other servos of its bus",
+        "its own part of its reply time, compared with the other servos of its bus",
         "100 us later in three quarters of its replies; or five replies 300 us later, ten times as many as "
         "all others have, which chance makes once in 1000 runs",
         "Compare its Return Delay Time and firmware with those of the others "
@@ -168,7 +168,7 @@ RULES: Mapping[str, Rule] = {
     ),
     "follows_worse": Rule(
         "joint",
-        "error, lag and load beside those before, at the same places and in the same direction",
+        "error, lag and load compared with earlier, at the same places and in the same direction",
         "9 deg from its goal for a second; three times the error of before, and 4.6 deg; 2 deg more, or an "
         "eighth of its torque, and three times what any other joint shows",
         "Turn it by hand without torque, and compare gains and limits with the robot file "
@@ -185,7 +185,7 @@ RULES: Mapping[str, Rule] = {
     "own_work": Rule(
         "loop, or the controller or bus that took the time",
         "what long cycles took beyond their planned exchanges",
-        "half of it, in three cycles: one stall of a machine accuses nothing",
+        "half of that time, in three cycles; a single stall of a machine is not enough",
         "Make it faster, give it a lower rate (`{{rate: ...}}`), or lower the loop's.",
         Needs.MACHINE,
     ),
@@ -195,7 +195,7 @@ RULES: Mapping[str, Rule] = {
         "device or sensor",
         "the loop lost it",
         "once",
-        "Check its cable, plugs and supply; its states kept their last values meanwhile.",
+        "Check its cable, plugs and supply; until it is back, its states keep their last values.",
     ),
     "frozen": Rule(
         "device or sensor",

@@ -311,7 +311,9 @@ class DiffDriveController(Controller[DiffDriveParameters]):
             moved = linear * elapsed_ns * 1e-9, angular * elapsed_ns * 1e-9
             self._pose.move(*(self._rims(self._angles.turned) if by_position else moved))
         elif age_ns >= 0:
-            self.context.say(f"odometry goes on without the way of {age_ns * 1e-9:.2f} s without all replies")
+            self.context.say(
+                f"odometry continues without the distance of {age_ns * 1e-9:.2f} s with missing replies"
+            )
         self._holding = False
 
     def _hold(self, time_ns: int) -> None:

@@ -63,7 +63,7 @@ class FeedForwardParameters(JointsParameters):
         if self.pass_on and self.command_interface == "position":
             yield (
                 ("pass_on",),
-                "positions are commanded already; take pass_on out, or command effort or pwm",
+                "positions are commanded already; remove pass_on, or command effort or pwm",
             )
 
 
@@ -124,7 +124,7 @@ class FeedForward(Controller[FeedForwardParameters]):
         if len(motors) < len(joints):
             raise ValueError("there is a joint without a motor file; `dxlrun identify` writes one")
         if parameters.pass_on and not context.into:
-            raise ValueError("pass_on is for a controller below: write `into`, or take pass_on out")
+            raise ValueError("pass_on is for a controller below: write `into`, or remove pass_on")
         count, interface = len(joints), parameters.command_interface
         self._ahead = MotionAhead(
             count, finite_or(limits.velocity, np.inf), finite_or(limits.acceleration, np.inf)

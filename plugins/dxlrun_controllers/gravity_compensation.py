@@ -258,7 +258,7 @@ def _of_joint(bodies: Bodies, joint: str, unit: JointUnit) -> Iterator[Mismatch]
     elif not bodies.mass(joint):
         yield Mismatch(
             f"has nothing to hold at {joint}, which moves no mass in the URDF",
-            "write <inertial> into the links behind it, or take the joint out",
+            "write <inertial> into the links after it, or remove the joint",
             joint,
         )
 
@@ -269,10 +269,10 @@ def _of_payload(bodies: Bodies, parameters: GravityParameters, joints: Sequence[
     link, at = parameters.payload.link, "payload.link"
     if link not in bodies.masses:
         known = ", ".join(bodies.masses)
-        yield Mismatch(f"hangs its payload on {link}, which is no link of the URDF", f"it has {known}", at)
+        yield Mismatch(f"hangs its payload on {link}, which is not a link of the URDF", f"it has {known}", at)
     elif not any(link in bodies.moved(joint) for joint in joints if joint in bodies.joints):
         yield Mismatch(
             f"hangs its payload on {link}, which none of its joints moves",
-            "name a link behind one of them",
+            "name a link after one of them",
             at,
         )

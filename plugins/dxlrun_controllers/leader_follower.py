@@ -72,7 +72,7 @@ class LeaderFollowerParameters(ParametersModel):
                 what = f"{pair.joint} has no leader, other joints have one"
                 yield place, f"{what}; give it one, or none to all"
             if not led and (pair.scale != 1.0 or pair.offset):
-                yield place, "scale and offset are for a leader; name it, or take them out"
+                yield place, "scale and offset are for a leader; name it, or remove them"
             if pair.scale == 0.0:
                 what = "a scale of 0 follows nothing"
                 yield (*place, "scale"), f"{what}; write another number, -1 for the other way"

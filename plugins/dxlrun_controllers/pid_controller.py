@@ -62,7 +62,7 @@ class PidParameters(JointsParameters):
             what = "a velocity reference cannot be commanded as positions"
             yield ("command_interface",), f"{what}; command effort, velocity or pwm"
         if self.reference == "velocity" and self.wrap:
-            yield ("wrap",), "velocities do not wrap; take wrap out, or take the reference position"
+            yield ("wrap",), "velocities do not wrap; remove wrap, or take the reference position"
 
 
 _KIND: Final = {"position": "positions", "velocity": "velocities"}

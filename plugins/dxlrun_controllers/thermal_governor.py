@@ -103,7 +103,7 @@ class ThermalGovernor(Controller[ThermalParameters]):
         for joint, servo, motor in zip(robot.joints, robot.servos, robot.motors, strict=True):
             if servo is None:
                 yield Mismatch(
-                    f"cannot tell how warm the servos of {joint} become, as there are several",
+                    f"cannot limit the temperature of {joint}: it has several servos",
                     "leave the joint to the servos' own limits",
                     joint,
                 )

@@ -155,7 +155,7 @@ def _authority() -> tuple[x509.Certificate, ec.EllipticCurvePrivateKey]:
         _write(certificate, signed.public_bytes(Encoding.PEM))
     signer = load_pem_private_key(path.read_bytes(), None)
     if not isinstance(signer, ec.EllipticCurvePrivateKey):
-        raise InputError(f"{path} is no key of this version; move {place()} away to begin anew")
+        raise InputError(f"{path} is not a key of this version; move {place()} away to start over")
     return x509.load_pem_x509_certificate(certificate.read_bytes()), signer
 
 

@@ -65,7 +65,7 @@ def keys(
             )
         days = 365 if days is None else days
         if not 0 < days <= MOST_DAYS:
-            raise InputError(f"--days {days} is no time from 1 to {MOST_DAYS}")
+            raise InputError(f"--days {days} is not a time from 1 to {MOST_DAYS}")
         known = {one.name: one for one in authority.issued()}
         directory = keys_place() if output is None else output
         if action in ("robot", "client"):
@@ -125,7 +125,7 @@ def _refuse_unused(action: str, given: Mapping[str, object]) -> None:
     for option, value in given.items():
         if value is not None and action not in _ACTIONS_WITH[option]:
             actions = " and ".join(_ACTIONS_WITH[option])
-            raise InputError(f"`dxlrun keys {action}` does not use {option}, only {actions}; leave it out")
+            raise InputError(f"`dxlrun keys {action}` does not use {option}, only {actions}; omit it")
 
 
 def _state(one: Issued, refused: frozenset[str]) -> str:

@@ -63,7 +63,7 @@ class RobotText:
                 source, node, f"{_words(path)} is made of an argument", "write the value itself"
             )
         if at != path and not isinstance(node, yaml.MappingNode):
-            raise _refuse_node(source, node, f"{_words(at)} is no mapping", "write its keys below it")
+            raise _refuse_node(source, node, f"{_words(at)} is not a mapping", "write its keys below it")
 
     def put(self, path: KeyPath, value: str | Sequence[str]) -> None:
         """Plan a value, or the items of a list, for a path. Raises InputError as `check`."""
@@ -102,7 +102,9 @@ class RobotText:
         changed = {path.resolve(): path for path, edits in self._edits.items() if edits}
         for place, path in changed.items():
             if place.read_bytes() != self._before[path]:
-                raise InputError(f"{path} was changed meanwhile, so nothing was written; begin again")
+                raise InputError(
+                    f"{path} was changed by another program, so nothing was written; begin again"
+                )
         # Complete all new files before the first old one is replaced.
         besides = {place: place.with_name(f".{place.name}.{os.getpid()}") for place in changed}
         try:

@@ -225,7 +225,7 @@ class Teaching:
             return f"  {times[-1] - times[0]:.1f} s"
 
         look()
-        self._dialogue.ask_while("Recording: show the motion, and press Enter at its end", look)
+        self._dialogue.ask_while("Recording: show the motion, then press Enter", look)
         look()
         shown = Shown(np.array(times) - times[0], np.array(positions))
         shown = self._taught.smoothed(self._taught.trimmed(shown))

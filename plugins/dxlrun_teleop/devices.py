@@ -138,7 +138,7 @@ def chosen(path: str | None) -> Gamepad:
             device.close()
     if source is not None:
         return source
-    what = f"{path} is no gamepad or keyboard that can be read" if path else "no gamepad can be read"
+    what = f"{path} is not a gamepad or keyboard that can be read" if path else "no gamepad can be read"
     what = "several gamepads are there, choose one by --device" if pads and not path else what
     more = "; `sudo usermod -aG input $USER` and a new log-in show others"
     hint = more if len(devices) < len(paths) else ""

@@ -34,7 +34,8 @@ def load_compiled(source: Path, kind: type[Library], path: Path | None = None) -
         raise NotCompiled(f"the compiled {source.stem} is missing: {_HINT}") from None
     if known != crc32(source.read_bytes()):
         raise NotCompiled(
-            f"the compiled {source.stem} is of another source than {source.name} beside it: {_HINT}"
+            f"the compiled {source.stem} was built from another {source.name} than the one next to "
+            f"it: {_HINT}"
         )
     return library
 

@@ -64,7 +64,7 @@ def test_a_good_run_is_good() -> None:
     [
         (EventCode.PORT_LOST, "main", "main: the adapter is gone", "Bus main was lost: main: the adapter"),
         (EventCode.SERVO_LOST, "elbow", "missed 3", "Servos failed: elbow was lost."),
-        (EventCode.SERVO_REBOOTED, "elbow", "started anew", "Servos failed: elbow rebooted."),
+        (EventCode.SERVO_REBOOTED, "elbow", "rebooted", "Servos failed: elbow rebooted."),
         (EventCode.SERVO_LIMP, "elbow", "Torque Enable 0", "Servos failed: elbow lost its torque."),
         (EventCode.CONTROLLER_FAULT, "head", "no", "One error was logged; the first, of head: no"),
         (EventCode.WATCHDOG, "main", "stopped", "One error was logged; the first, of main: stopped"),
@@ -168,7 +168,7 @@ def test_invalid_states_are_those_of_the_first_servo_without_a_reply(
 @pytest.mark.parametrize("spoilt", ["", "noise", "another_host"])
 def test_positions_that_the_loop_did_not_believe_are_named_where_replies_are_intact(spoilt: str) -> None:
     plan = LoggedPlan(buses=[LoggedBus(name="main", servos=[LoggedServo("elbow", 1, row=0)])])
-    text = "elbow jumped by 60 deg in 10 ms, faster than it can turn: not believed"
+    text = "elbow jumped by 60 deg in 10 ms, faster than it can turn: the value is not used"
     events = (EventGroup(EventCode.IMPLAUSIBLE, Severity.WARNING, "elbow", 3, 5 * 10**9, text),)
     other = (accusing(spoilt, "main", share=9.0),) * bool(spoilt)
     run = totals(plan=plan, events=events, servos=on_bus("elbow", bus="main"), findings=other)
@@ -257,7 +257,9 @@ def test_a_servo_that_answers_again_and_is_not_taken_back_is_told_with_why() -> 
 
 @pytest.mark.parametrize("port", ["/dev/ttyUSB0", "sim"])
 def test_what_to_do_about_a_servo_that_answers_twice_is_told_of_a_real_one(port: str) -> None:
-    returns = {"elbow": ["answers garbled or twice: do two servos have its ID? If not, check its cable"]}
+    returns = {
+        "elbow": ["sends garbled or double replies: do two servos have its ID? If not, check its cable"]
+    }
     verdict = judge(totals(events=(lost("elbow"),), returns=returns, plan=plan(port, port)))
     told = " ".join(verdict.sentences)
     assert "elbow answers garbled or twice" in told

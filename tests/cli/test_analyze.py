@@ -13,7 +13,7 @@ from tests.kit.held_logs import being_written, cut_end
 
 ROBOT = Path(__file__).parents[2] / "robots" / "single_joint.yaml"
 """Of one joint, because a page has a figure for each."""
-NO_LOG = "this is no MCAP file, so it is no log of dxlrun"
+NO_LOG = "this is not an MCAP file, and a log of dxlrun is one"
 
 
 @pytest.fixture

@@ -57,7 +57,10 @@ def test_items_of_a_board_are_read_and_written(dxlrun, simulated_line):
     assert "9.80665 m/s^2" in said.out, said.err
     shown = result_of(dxlrun("servo", path, 42, "get", "--json", *NEW).out)
     assert (shown["registers"]["vdxl"], shown["servo"]["model"]) == (574, "bitbots-core")
-    assert "LED 0 Red (10) was 0 and is 200" in dxlrun("servo", path, 42, "set", "led_0_red", 200, *NEW).out
+    assert (
+        "LED 0 Red (10) was changed from 0 to 200"
+        in dxlrun("servo", path, 42, "set", "led_0_red", 200, *NEW).out
+    )
     assert "LED 0 Red (10) is 200 already" in dxlrun("servo", path, 42, "set", "led_0_red", 200, *NEW).out
     said = dxlrun("servo", path, 241, "set", "accel_gain", "0.25", "--yes", *NEW)
     assert said.code == 0, said.err
@@ -79,13 +82,13 @@ joints: {neck: {bus: main, id: 1, model: XL430-W250, reference: 180 deg, directi
 WRONG = (
     (
         (42, "reboot"),
-        "bitbots-core, ID 42 at 1000000 bit/s is no servo, so it cannot reboot; it has get",
+        "bitbots-core, ID 42 at 1000000 bit/s is not a servo, so it cannot reboot; it has get",
     ),
     ((42, "set", "vdxl", 3), "Vdxl (32) can only be read"),
     ((42, "set", "led", 2), "LED (22) of an bitbots-core is 0..1, not 2"),
     ((42, "set", "id", 9), "id of a device is not set by dxlrun"),
     ((42, "get", "vbatt"), "has no vbatt"),
-    ((241, "set", "accel_gain", "much"), "'much' is no number; Accel Gain (110) is a float32"),
+    ((241, "set", "accel_gain", "much"), "'much' is not a number; Accel Gain (110) is a float32"),
     ((241, "set", "gyro_range", 2), "not a terminal, cannot ask for confirmation"),
 )
 
@@ -110,7 +113,7 @@ def test_boards_of_protocol_1_are_found(dxlrun, simulated_line):
         (200, "CM-730"),
     ]
     assert (
-        "Dynamixel Power (24) was 0 and is 1"
+        "Dynamixel Power (24) was changed from 0 to 1"
         in dxlrun("servo", path, 200, "set", "dynamixel_power", 1, *OLD).out
     )
 

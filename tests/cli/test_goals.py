@@ -219,7 +219,7 @@ def test_what_is_no_goal_cannot_be_waited_for(dxlrun: Dxlrun, robot: Robot) -> N
     said = dxlrun(*SEND, "--wait")
     assert (said.code, said.errors) == (
         1,
-        ["dxlrun: arm accepted trajectory, which is no goal that could be waited for"],
+        ["dxlrun: arm accepted trajectory, but it is not a goal, so nothing can be awaited"],
     )
 
 
@@ -380,8 +380,8 @@ def test_motions_are_played_one_after_the_other_until_one_does_not_reach_its_end
         ((), "name a motion; `dxlrun play --list` shows those of the robot"),
         (("walk", "--list"), "--list shows what there is to play; leave walk out"),
         (("walk", "--loop", "0"), "--loop 0: give how often all is played, from 1 to 10000"),
-        (("walk", "bow", "--no-wait"), "--no-wait returns when one motion has begun; leave it out"),
-        (("walk", "--loop", "2", "--no-wait"), "--no-wait returns when one motion has begun; leave it out"),
+        (("walk", "bow", "--no-wait"), "--no-wait returns when one motion has begun; omit it"),
+        (("walk", "--loop", "2", "--no-wait"), "--no-wait returns when one motion has begun; omit it"),
         (("walk", "nowhere/wave.yaml"), "there is no motion file nowhere/wave.yaml; check the path"),
         (("walk", "wolk"), "knows no motion wolk, nor is it a file; did you mean walk?"),
     ],

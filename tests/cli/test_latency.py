@@ -108,7 +108,7 @@ def test_without_a_compiler_the_yardstick_is_refused(dxlrun: Dxlrun, monkeypatch
     assert found.code == 2
     assert found.errors == [
         "dxlrun: the yardstick c is compiled on the spot, and there is no C compiler cc; install one "
-        "(Debian, Ubuntu: `sudo apt install gcc`), or leave c out of --compare"
+        "(Debian, Ubuntu: `sudo apt install gcc`), or omit c of --compare"
     ]
     monkeypatch.setenv("CC", sys.executable)
     (error,) = dxlrun("latency", "--compare", "other,c").errors

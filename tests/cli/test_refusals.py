@@ -1,7 +1,7 @@
 """What is said of a wrong command line, in a line for a person and with --json: the cases of `refusals.txt`.
 
     rate 0
-      0 is no rate; give a number of Hz above 0
+      0 is not a rate; give a number of Hz above 0
 
 A command line, and what `dxlrun: ` then says, line by line; ` ...` ends one that goes on. The exit code is 2,
 or 1 below the line that says so. No robot runs, and `robots` lies in the working directory.

@@ -336,8 +336,8 @@ def test_duration_that_cuts_a_played_motion_fails_the_run(dxlrun: Callable, tors
     (sentence,) = [
         line for line in said.out.splitlines() if "by its duration at 1.5 s, before three" in line
     ][:1]
-    assert sentence.endswith(" s; leave out --duration.")
-    assert any("but the run ends at 1.5 s; leave out --duration" in line for line in said.errors)
+    assert sentence.endswith(" s; omit --duration.")
+    assert any("but the run ends at 1.5 s; omit --duration" in line for line in said.errors)
 
 
 def test_run_that_ends_before_a_motion_begins_fails(dxlrun: Callable, torso: Path, tmp_path: Path):

@@ -58,7 +58,7 @@ def test_registers_are_read_and_written_and_the_eeprom_only_when_it_was_asked_fo
     assert "add --yes" in refused.err
     done = servo(1, "set", "return_delay_time", "100 us", "--yes", "--json", *NEW)
     result = result_of(done.out)
-    assert result["done"] == ["Return Delay Time (9) was 250 and is 50"]
+    assert result["done"] == ["Return Delay Time (9) was changed from 250 to 50"]
     assert result["servo"]["model"] == "XM430-W350"
     again = servo(1, "set", "return_delay_time", "100 us", *NEW)  # nothing to confirm
     assert (again.code, "is 50 already" in again.out) == (0, True)
@@ -98,7 +98,7 @@ REFUSED = [
     (("set", "goal_position", "fast"), "fast"),
     (("get", "gaol"), "has no gaol"),
     (("baud", "12345"), "has no rate of 12345 bit/s; it has 9600, 57600"),
-    (("id", "253"), "253 is no ID of Protocol 2.0; they are 0..252"),
+    (("id", "253"), "253 is not an ID of Protocol 2.0; they are 0..252"),
 ]
 
 
@@ -116,7 +116,7 @@ def test_a_servo_moves_to_another_id_and_rate_and_is_started_anew_and_reset(one)
     assert "has ID 9; it had 1" in servo(1, "id", "9", "--yes", *NEW).out
     assert "talks at 2000000 bit/s; it did at 1000000" in servo(9, "baud", "2000000", "--yes", *NEW).out
     fast = ("--protocol", "2.0", "--baud", "2000000")
-    assert "started anew, and is limp" in servo(9, "reboot", *fast).out
+    assert "rebooted, and is limp" in servo(9, "reboot", *fast).out
     reset = servo(9, "factory-reset", "--except", "id", "--yes", *fast)
     assert "has the factory's values, ID 9 at 57600 bit/s" in reset.out
     missing = servo(9, "get", *fast)
@@ -189,7 +189,7 @@ def test_a_backup_of_another_model_is_refused(one, tmp_path):
     assert said.code == 2
     assert "is of a XM430-W350 of Protocol 2.0, not of a XL430-W250" in said.err
     path.write_text(json.dumps(kept | {"registers": {"led": 7, "lde": 1, "temperature_limit": "hot"}}))
-    assert "is no backup of a servo" in servo(1, "restore", path, "--yes", *NEW).err
+    assert "is not a backup of a servo" in servo(1, "restore", path, "--yes", *NEW).err
     path.write_text(json.dumps(kept | {"registers": {"led": 7, "lde": 1}}))
     said = servo(1, "restore", path, "--yes", *NEW)
     assert "led is 7, not in 0..1" in said.err
@@ -219,7 +219,7 @@ def test_only_yes_confirms(one, monkeypatch):
         monkeypatch.setattr(sys, "stdin", Terminal(answer))
         said = servo(1, "id", "3", *NEW)
         assert said.code == (0 if answer == "y\n" else 1)
-        assert "XM430-W350, ID 1 at 1000000 bit/s: its ID becomes 3 (EEPROM). Go on? [y/N]" in said.err
+        assert "XM430-W350, ID 1 at 1000000 bit/s: its ID becomes 3 (EEPROM). Continue? [y/N]" in said.err
         assert ("nothing was changed" in said.out) == bool(said.code)
     assert len(writes(finish())) == 1
 
@@ -237,7 +237,7 @@ def test_two_servos_of_one_id_are_not_dealt_with(one, simulated_line, dxlrun):
 def test_a_damaged_backup_is_one_sentence(tmp_path, content: bytes):
     path = tmp_path / "servo.json"
     path.write_bytes(content)
-    with pytest.raises(InputError, match=r"servo\.json is no backup of a servo: "):
+    with pytest.raises(InputError, match=r"servo\.json is not a backup of a servo: "):
         read_backup(path)
 
 

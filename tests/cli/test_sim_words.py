@@ -96,7 +96,7 @@ def test_what_is_no_link_is_never_replaced(tmp_path):
     (tmp_path / "file").write_text("precious")
     (tmp_path / "dangling").symlink_to("/dev/pts/nowhere")
 
-    with pytest.raises(InputError, match="exists and is no link"):
+    with pytest.raises(InputError, match="exists and is not a link"):
         link_of_each([BUS], tmp_path / "file")
     assert link_of_each([BUS], tmp_path / "dangling") == {"main": tmp_path / "dangling"}
 

@@ -183,7 +183,7 @@ def test_a_register_is_set_while_the_robot_runs(dxlrun, torso: RemoteRobot) -> N
     said = dxlrun("set", "head_yaw_joint", "ccw_compliance_slope", "64", "--debug")
     assert said == (0, "bioloid_torso: ccw_compliance_slope of head_yaw_joint is 32 -> 64\n", "")
     printed = [event["text"] for event in torso.events(last)["events"] if event["name"] == "register_written"]
-    assert printed == ["CCW Compliance Slope (29) was 32 and is 64"]
+    assert printed == ["CCW Compliance Slope (29) was changed from 32 to 64"]
     assert dxlrun("set", "head_yaw_joint", "ccw_compliance_slope", "64").code == 0
     said = dxlrun("set", "head_yaw_joint", "temperature_limit", "70 degC")
     assert said.code == 2
@@ -269,7 +269,7 @@ def test_a_motion_is_played_into_a_robot_that_runs(dxlrun, torso: RemoteRobot, t
 
 
 def test_a_joint_is_limp_and_holds_again_while_the_robot_runs(dxlrun, torso: RemoteRobot) -> None:
-    commanded = "head_yaw_joint: commanded by head; deactivate that first, or add --release"
+    commanded = "head_yaw_joint is commanded by head; deactivate head first, or add --release"
     assert dxlrun("torque", "off", "head_yaw_joint") == (1, "", f"dxlrun: {commanded}\n")
     limp = "bioloid_torso: head_yaw_joint is limp; deactivated head\n"
     assert dxlrun("torque", "off", "head_yaw_joint", "--release") == (0, limp, "")
@@ -439,7 +439,7 @@ def test_a_halted_robot_holds_until_a_controller_is_activated(dxlrun, torso: Rem
     assert (said.code, said.err) == (0, "")
     assert re.fullmatch(
         r"bioloid_torso stands still after \d\.\d\d s \(\w+: [\d.e-]+ rad/s\); "
-        r"`dxlrun switch --activate NAME` lets it go on\n",
+        r"`dxlrun switch --activate NAME` lets it continue\n",
         said.out,
     )
     active = [name for name, one in controllers(torso).items() if one["active"]]

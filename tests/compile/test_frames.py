@@ -54,7 +54,7 @@ def test_a_robot_without_a_urdf_has_no_frames() -> None:
             '"right_arm"/></joint>',
             '"right_arm"/><mimic joint="left_arm_joint"/></joint>',
             "right_arm_joint follows left_arm_joint in the URDF, but has a servo of its own, which is what "
-            "counts; take the mimic out of the URDF, or the joint out of this file",
+            "counts; remove the mimic from the URDF, or the joint out of this file",
         ),
         (
             '"right_arm_joint"',
@@ -74,8 +74,8 @@ def test_what_moves_otherwise_in_the_urdf_is_a_warning(right: str, wrong: str, e
 @pytest.mark.parametrize(
     ("imu", "expected"),
     [
-        ("gyro", "model.imu is gyro, which is no device, sensor or controller with states; there is none"),
-        ("arms", "model.imu is arms, which is no device, sensor or controller with states; there is none"),
+        ("gyro", "model.imu is gyro, which is not a device, sensor or controller with states; there is none"),
+        ("arms", "model.imu is arms, which is not a device, sensor or controller with states; there is none"),
     ],
 )
 def test_an_imu_that_is_no_source_is_an_error_at_its_place(imu: str, expected: str) -> None:
@@ -156,7 +156,7 @@ def test_a_source_without_orientation_turns_nothing() -> None:
     (error,) = [each for each in found if each.severity == "error"]
 
     assert error.what == "model.imu is gyro, which has no orientation (x, y, z, w)"
-    assert error.fix == "put an imu_sensor_broadcaster behind it, and name that"
+    assert error.fix == "add an imu_sensor_broadcaster that reads it, and name that"
 
 
 IMUS = """\
@@ -181,7 +181,7 @@ IMUS = """\
         ("tilted", "body, mounting: [0 deg, 30 deg, 0 deg]", "imu, imu_link: body", "imu", ""),
         ("rolled", "body, mounting: [30 deg, 30 deg, 0 deg]", "imu, imu_link: body", "imu", ""),
         ("tilted", "tilted, mounting: [0 deg, 0.5 deg, 0 deg]", "imu, imu_link: tilted", "none", ""),
-        ("body", "bdy", "", "none", "frame: the messages of imu have the frame bdy, which is no link of the URDF; did you mean body?"),
+        ("body", "bdy", "", "none", "frame: the messages of imu have the frame bdy, which is not a link of the URDF; did you mean body?"),
         ("left_arm", "body", "", "none", "frame: the messages of imu have the frame body, but unit is on left_arm, which moves against it; write `frame: left_arm`, or how it is turned there as `mounting`"),
         ("tilted", "body", "", "none", "frame: the messages of imu have the frame body, but unit is on tilted, which is turned by 30 deg against it; write"),
         ("body", "tilted, mounting: [0 deg, 30 deg, 0 deg]", "", "none", "frame: the messages of imu have the frame tilted, but unit is on body, which is turned by 60 deg against it and its mounting; write"),

@@ -70,7 +70,7 @@ def test_a_controller_that_reads_what_it_commands_is_warned_about(reads: str, wa
     found = [one for one in compiled.warnings if reads in one.what]
     assert [one.what for one in found] == ([f"arm reads {reads}, {warned}"] if warned else [])
     assert [one.fix for one in found] == (
-        ["read the state, shoulder/position, or take it out"] if warned else []
+        ["read the state, shoulder/position, or remove it"] if warned else []
     )
 
 
@@ -104,4 +104,4 @@ def test_a_mistake_has_its_path_in_the_file() -> None:
     plan = ControllerPlan("up", "part", "", "{}", ("j",), ("position",), (), True, 1, into=("low",))
     (mistake,) = ControllerGraph(("j",), (plan,)).mistakes()
     assert mistake.at == ("controllers", "up", "into", 0)
-    assert mistake.what == "up is into low, which is no controller of the robot"
+    assert mistake.what == "up is into low, which is not a controller of the robot"

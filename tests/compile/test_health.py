@@ -83,7 +83,7 @@ def test_check_shows_the_policies_of_groups_and_of_returned_servos() -> None:
     pair = "pair: {joints: [pan, tilt], on_lost_servo: limp, on_returned_servo: hold}"
     compiled = compile_text(text(policies=f"groups: {{{pair}}}"))
     shown = {row.name: row.does for row in compiled.report["policies"]}
-    assert shown["on_lost_servo of pair"] == "the group goes limp, the others go on"
+    assert shown["on_lost_servo of pair"] == "the group goes limp, the others continue"
     assert shown["on_returned_servo"] == "hold pan, tilt where they stand, the others limp"
 
 

@@ -195,7 +195,7 @@ def test_a_file_that_is_missing_or_something_else_is_one_error() -> None:
     MOTOR_FILE.mkdir()
     assert [each.what for each in problems_in(ROBOT)] == ["this is a directory"]
     (problem,) = problems_in(ROBOT.replace("shoulder.yaml", "robot.yaml"))
-    assert problem.what.startswith("this is no motor file")
+    assert problem.what.startswith("this is not a motor file")
 
 
 def test_a_controller_that_needs_motors_is_refused_where_there_are_none(part_plugins: object) -> None:

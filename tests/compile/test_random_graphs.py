@@ -348,7 +348,7 @@ def _above(graph: Graph, name: str) -> set[str]:
 
 SENTENCES = {
     "self": r" is into itself$",
-    "unknown": r" is into \w+, which is no controller of the robot$",
+    "unknown": r" is into \w+, which is not a controller of the robot$",
     "twice": r" is into \w+ twice$",
     "commands nothing": r" is into .*, but commands nothing$",
     "mute": r" is into \w+, which exports no reference$",
@@ -362,7 +362,7 @@ SENTENCES = {
     "together": r" needs .* together, and both command ",
     "circle": r"^controllers (command|wait for) each other.*: \w+( -> \w+)+$",
     "both active": r" are both active and both (claim|command) ",
-    "fallback unknown": r"^the fallback \w+ of \w+ is no controller of the robot$",
+    "fallback unknown": r"^the fallback \w+ of \w+ is not a controller of the robot$",
     "fallback itself": r" is its own fallback$",
     "fallback above": r"^the fallback \w+ of (\w+) commands \1 .*, which has failed then$",
     "fallback active": r"^the fallback .* is active from the start$",

@@ -128,7 +128,7 @@ def test_a_speed_toward_the_position_holds_for_the_goal_too():
 def test_what_is_held_back_is_flagged_once():
     rig = rig_of()
     assert [rig.apply(position=0.5).clamped for _ in range(2)] == [Clamp.STEP] * 2
-    assert rig.texts == ["j0, controller b: held to the step or acceleration limit"]
+    assert rig.texts == ["j0, controller b: goal held to the step or acceleration limit"]
 
 
 def test_a_goal_outside_of_the_limits_may_go_in_and_never_further_out():

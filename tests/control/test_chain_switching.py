@@ -359,7 +359,7 @@ def test_two_fallbacks_that_fail_in_turn_end_the_run(story):
 def test_the_gate_names_the_chain_whose_command_it_cuts(story):
     story.chain().own["upper"] = 3.0
     story.run(60)
-    cut = "j0, controller lower, commanded by upper: lowered to the upper position limit"
+    cut = "j0, controller lower, commanded by upper: goal lowered to the upper position limit"
     assert cut in story.events.texts(EventCode.GATE)
 
 

@@ -97,8 +97,8 @@ def test_a_joint_that_hangs_outside_its_limits_may_be_held_there(side):
         ((-3.0, 0.5), (-1.0, 0.5), Clamp.LOWER, "raised to the lower position limit"),
         ((3.0, 0.5), (1.0, 0.5), Clamp.UPPER, "lowered to the upper position limit"),
         ((0.01, 9.0), (0.01, 8.0), Clamp.VELOCITY, "held to the velocity limit"),
-        ((np.inf, 0.5), (0.0, SLOW_SPEED), Clamp.NOT_FINITE, "was not finite, the last goal is kept"),
-        ((0.01, np.inf), (0.01, np.nan), Clamp.NOT_FINITE, "was not finite, the last goal is kept"),
+        ((np.inf, 0.5), (0.0, SLOW_SPEED), Clamp.NOT_FINITE, "not finite; the last goal is kept"),
+        ((0.01, np.inf), (0.01, np.nan), Clamp.NOT_FINITE, "not finite; the last goal is kept"),
     ],
 )
 def test_each_clamping_is_flagged_told_and_counted(command, goal, clamp, words):
@@ -108,7 +108,7 @@ def test_each_clamping_is_flagged_told_and_counted(command, goal, clamp, words):
     assert flags == clamp
     # what is not finite may be of a controller that another one stands in for now
     by = "" if clamp == Clamp.NOT_FINITE else ", controller b"
-    assert rig.texts == [f"j0{by}: {words}"]
+    assert rig.texts == [f"j0{by}: goal {words}"]
     assert rig.gate.counts.sum() == 1
 
 
@@ -117,7 +117,7 @@ def test_a_step_beyond_the_velocity_limit_is_walked_in_steps():
     goals = [led(rig, 0.1) for _ in range(4)]
     np.testing.assert_allclose([goal for goal, _, _ in goals], [0.04, 0.08, 0.1, 0.1])
     assert [flags for *_, flags in goals] == [Clamp.STEP, Clamp.STEP, NONE, NONE]
-    assert rig.texts == ["j0, controller b: held to the step or acceleration limit"]
+    assert rig.texts == ["j0, controller b: goal held to the step or acceleration limit"]
 
 
 def test_a_clamp_has_one_event_at_its_beginning_and_one_after_its_end():
@@ -133,8 +133,8 @@ def test_a_clamp_has_one_event_at_its_beginning_and_one_after_its_end():
     for _ in range(2):
         led(rig, 0.0)
     assert rig.texts[2:] == [
-        "j0: lowered to the upper position limit; this ended after 0.1 s",
-        "j0: raised to the lower position limit; this ended after 0.0 s",
+        "j0: goal lowered to the upper position limit; this ended after 0.1 s",
+        "j0: goal raised to the lower position limit; this ended after 0.0 s",
     ]
     led(rig, 3.0)
     assert len(rig.texts) == 5
@@ -202,11 +202,11 @@ def test_a_command_of_a_device_beyond_its_range_is_held_at_the_end_and_told_once
     assert rig.texts == []
     assert lit(3.0, -7.0) == [1.0, -2.0]
     expected = [
-        "light (ID 102 on bus main): lamp was commanded 3, held to 0..1",
-        "light (ID 102 on bus main): level was commanded -7, held to -2..2.5",
+        "light (ID 102 on bus main): lamp = 3 is held to its range 0..1",
+        "light (ID 102 on bus main): level = -7 is held to its range -2..2.5",
     ]
     assert rig.texts == expected
     lit(4.0, 2.0)
     rig.apply()  # nothing was commanded anew
     lit(5.0, 9.0)
-    assert rig.texts == [*expected, "light (ID 102 on bus main): level was commanded 9, held to -2..2.5"]
+    assert rig.texts == [*expected, "light (ID 102 on bus main): level = 9 is held to its range -2..2.5"]

@@ -399,10 +399,10 @@ def test_changed_parameters_survive_a_switch_in_the_same_cycle_and_later_ones(st
 @pytest.mark.parametrize(
     ("values", "text"),
     [
-        ({"size": 4}, "arm: size is no live parameter"),
-        ({"speed": 2.0, "gains.q": 1.0}, "arm: gains.q is no live parameter"),
-        ({"speed": 2.0, "gains.d": 1.0}, "arm: gains.d is no live parameter"),
-        ({"gains": 1.0}, "arm: gains is no live parameter"),
+        ({"size": 4}, "arm: size is not a live parameter"),
+        ({"speed": 2.0, "gains.q": 1.0}, "arm: gains.q is not a live parameter"),
+        ({"speed": 2.0, "gains.d": 1.0}, "arm: gains.d is not a live parameter"),
+        ({"gains": 1.0}, "arm: gains is not a live parameter"),
         ({"speed": "fast"}, "the data of parameters do not fit"),
     ],
 )
@@ -521,7 +521,7 @@ def test_joint_with_a_velocity_command_is_not_at_rest(commanded, outcome):
     goals.time_ns = 2_000_000_000
     goals.judge_running()
     assert goal.outcome == outcome
-    assert ("j0 is left with a commanded velocity of 1.72 deg/s" in goal.text) == (commanded > 0)
+    assert ("j0 ends with a commanded velocity of 1.72 deg/s" in goal.text) == (commanded > 0)
 
 
 def test_a_goal_that_is_judged_is_cancelled_by_its_controller_and_the_runtime(story):
@@ -529,7 +529,7 @@ def test_a_goal_that_is_judged_is_cancelled_by_its_controller_and_the_runtime(st
     story.mover._done = lambda self: setattr(self, "goal", None)
     story.run(20, {2: story.moves(1), 8: story.cancels()})
     assert story.timed == [(2, "accepted"), (8, "cancelled")]
-    assert story.reports[-1][1].text == "stopped at its end"
+    assert story.reports[-1][1].text == "stopped at the end of the motion"
     assert story.done("cancel") == [(1,)]
 
 

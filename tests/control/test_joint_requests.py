@@ -82,7 +82,7 @@ def test_a_joint_that_is_commanded_is_refused_without_release(story):
     story.run(4, {1: story.torques("j2", "j1")})
     assert story.asked == []
     assert story.answer() == COMMANDED
-    assert story.refusals[1] == "j1: commanded by arm; deactivate that first, or add --release"
+    assert story.refusals[1] == "j1 is commanded by arm; deactivate arm first, or add --release"
     assert story.active(3) == ["arm"]
 
 

@@ -232,7 +232,7 @@ def test_what_cannot_be_configured_is_one_sentence(robot):
     robot._offers.clear()
     with pytest.raises(PlugInError, match=r"type present of controller present .*broken_one of x 1"):
         robot.build()
-    with pytest.raises(PlugInError, match=r"strict.* unknown key .surplus.; take it out"):
+    with pytest.raises(PlugInError, match=r"strict.* unknown key .surplus.; remove it"):
         Robot().add("strict", Scripted, parameters='{"surplus": 1}').build()
     with pytest.raises(ControllerFault, match="controller unready raised in on_configure: OSError: no file"):
         Robot().add("unready", Unready).build()
@@ -263,7 +263,7 @@ def test_every_event_leads_from_every_state_to_another_or_is_a_fault(robot, stat
 
 
 def test_a_command_for_a_controller_that_is_not_active_ends_no_loop_but_is_its_fault(robot):
-    """No way leads there; a mistake of this program is reported, and the run goes on."""
+    """No way leads there; a mistake of this program is reported, and the run continues."""
     robot.script("one").script("asleep", active=False).build()
     manager, asleep = robot.manager, robot.manager._named["asleep"]
     assert (

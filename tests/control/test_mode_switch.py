@@ -78,7 +78,7 @@ def test_controllers_of_one_switch_enter_in_the_same_cycle(story):
 
 def test_joints_that_never_come_into_their_modes_keep_the_controller_out(story):
     story.through(TOO_LONG, {2: story.switches(["press"], ["arm"])}, slow=10**6)
-    late = "press: press is not activated: j1 did not come into effort mode within 5 s"
+    late = "press: press is not activated: j1 did not enter effort mode within 5 s"
     assert (story.result.reason, story.refused()) == ("stopped", [late])
     (_, waiting), (_, given_up) = story.answered
     assert waiting == Waiting(("press",))
@@ -90,7 +90,7 @@ def test_joints_that_never_come_into_their_modes_keep_the_controller_out(story):
 def test_a_joint_that_refuses_its_mode_keeps_the_controller_out_at_once(story):
     story.build().hardware.stubborn = (0, 1)
     story.run(6, {2: story.switches(["wheels"], ["arm"])})
-    told = "j0 stays in position mode instead of velocity mode, nor did 1 more"
+    told = "j0 stays in position mode instead of velocity mode (and 1 more)"
     assert story.refused() == [f"wheels: wheels is not activated: {told}"]
     assert story.answer() == (Code.MODE_NOT_ENTERED, {"controller": ("wheels",), "problem": told})
     assert len(story.hardware.asked) == 1

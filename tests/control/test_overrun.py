@@ -23,7 +23,9 @@ def ran(robot, policy, *hooks, late=(1,), periods=6):
 @pytest.mark.parametrize("hooks", [(), (OverrunHook("silent", lambda *_: None),)], ids=["alone", "silent"])
 def test_the_robot_file_decides_where_no_plug_in_has_an_answer(robot, policy, cycles, hooks):
     assert ran(robot, policy, *hooks) == cycles
-    caught_up = "cycle 1 ended 50.000 ms after its deadline; 0 periods skipped, the next one follows at once"
+    caught_up = (
+        "cycle 1 ended 50.000 ms after its deadline; 0 periods skipped, the next cycle follows at once"
+    )
     assert policy != "catch_up" or robot.events.of(EventCode.OVERRUN) == [("loop", caught_up)]
 
 
@@ -41,7 +43,9 @@ def test_a_plug_in_without_an_answer_leaves_it_to_the_next_and_none_is_asked_in_
     silent = OverrunHook("silent", lambda *times: asked.append(times))
     assert ran(robot, "skip", silent, OverrunHook("stopper", lambda *_: "stop")) == [0, 1]
     assert len(asked) == 1
-    assert robot.result.detail == "cycle 1 ended after the next deadline; overrun: stop"
+    assert (
+        robot.result.detail == "cycle 1 ended after the next deadline, and the robot file has `overrun: stop`"
+    )
 
 
 def raises(*_):
@@ -57,9 +61,9 @@ def exits(*_):
     [
         (raises, "raised ZeroDivisionError: no time"),
         (exits, "raised SystemExit: 3"),
-        (lambda *_: "later", "returned 'later', which is none of skip, catch_up, stop"),
-        (lambda *_: [], "returned [], which is none of skip, catch_up, stop"),
-        (lambda *_: np.zeros(2), "returned array([0., 0.]), which is none of skip, catch_up, stop"),
+        (lambda *_: "later", "returned 'later', not one of skip, catch_up, stop"),
+        (lambda *_: [], "returned [], not one of skip, catch_up, stop"),
+        (lambda *_: np.zeros(2), "returned array([0., 0.]), not one of skip, catch_up, stop"),
     ],
 )
 def test_a_plug_in_that_fails_is_an_event_and_not_asked_again(robot, decide, why):
@@ -69,7 +73,11 @@ def test_a_plug_in_that_fails_is_an_event_and_not_asked_again(robot, decide, why
     assert len(asked) == 1
     told = [(*one[:2], one[3]) for one in robot.events.seen if one[2] == "mine (x 1)"]
     assert told == [
-        (EventCode.OVERRUN, Severity.ERROR, f"dxlrun_overrun {why}; it is not asked again in this run")
+        (
+            EventCode.OVERRUN,
+            Severity.ERROR,
+            f"the hook dxlrun_overrun {why}; it is not called again in this run",
+        )
     ]
 
 

@@ -88,19 +88,19 @@ BROKEN = {
     "raised in a hook (ZeroDivisionError: division by zero)": changed('{"TYPE": Mine}', "1 / 0"),
     "does not return a mapping": changed('{"TYPE": Mine}', "[Mine]"),
     "does not return a mapping of names": changed('{"TYPE": Mine}', "{5: Mine}"),
-    "offers dict as odd, which is no controller": changed('{"TYPE": Mine}', '{"odd": dict}'),
+    "offers dict as odd, which is not a controller": changed('{"TYPE": Mine}', '{"odd": dict}'),
     "which has no method update": changed("update", "renew"),
     "whose update(time_ns) cannot be called as update(time_ns, period_ns)": changed(
         "update(self, time_ns, period_ns)", "update(self, time_ns)"
     ),
-    "whose Parameters is no model of parameters": declares("Parameters = dict"),
+    "whose Parameters is not a model of parameters": declares("Parameters = dict"),
     "whose Commands is of a wrong type: Expected `object`": declares("Commands = ('move',)"),
-    "whose command move is no model of a command": declares("Commands = {'move': dict}"),
+    "whose command move is not a model of a command": declares("Commands = {'move': dict}"),
     "whose publishes is of a wrong type: Expected `array`, got `str`": declares(
         "publishes = '/joint_states'"
     ),
     "whose Topics is of a wrong type: Expected `object`": declares("Topics = ('state',)"),
-    "whose topic state has no message of ROS 2: dict is no dataclass; put @dataclass above": declares(
+    "whose topic state has no message of ROS 2: dict is not a dataclass; put @dataclass above": declares(
         "Topics = {'state': dict}"
     ),
 }
@@ -170,7 +170,7 @@ def test_all_classes_are_imported_before_the_loop_and_checked_each(install, tmp_
     [
         ("nowhere:Mine", "cannot be imported from nowhere:Mine (ModuleNotFoundError"),
         ("my_law:Other", "cannot be imported from my_law:Other (AttributeError"),
-        ("my_law:Wrong", "offers Wrong as my_type, which is no controller"),
+        ("my_law:Wrong", "offers Wrong as my_type, which is not a controller"),
     ],
 )
 def test_a_class_that_is_named_by_its_place_is_imported_when_it_is_used(install, tmp_path, place, says):

@@ -139,7 +139,9 @@ def test_a_goal_beyond_a_register_is_held_to_it_counted_and_named(case, tmp_path
     assert (clamped & case.clamp).any()
     texts = [event.text for event in log.events if event.code == EventCode.GATE]
     held = [text for text in texts if "clamped by register" in text]
-    assert [text.lower() for text in held] == [f"a, controller c: clamped by register {case.title}".lower()]
+    assert [text.lower() for text in held] == [
+        f"a, controller c: goal clamped by register {case.title}".lower()
+    ]
 
 
 @every_case
@@ -160,7 +162,7 @@ def test_a_velocity_register_limits_a_geared_joint_at_the_speed_of_its_output(sh
     assert (max(map(abs, sent)) == 50) is held
     assert (log.cycles["clamped"][:, 0] & Clamp.VELOCITY).any() == held
     told = [event.text for event in log.events if "clamped by register" in event.text]
-    assert told == ["a, controller c: clamped by register Velocity Limit (44) = 50, 34.3 deg/s"] * held
+    assert told == ["a, controller c: goal clamped by register Velocity Limit (44) = 50, 34.3 deg/s"] * held
 
 
 @pytest.mark.parametrize(

@@ -220,7 +220,7 @@ def test_another_rate_begins_at_the_next_deadline_and_controllers_keep_theirs():
 @pytest.mark.parametrize(
     ("rate", "code", "why"),
     [
-        (60.0, Code.RATE_NOT_DIVIDED, "60 Hz is no multiple of 25 Hz, the rate of controller right"),
+        (60.0, Code.RATE_NOT_DIVIDED, "60 Hz is not a multiple of 25 Hz, the rate of controller right"),
         (500.0, Code.RATE_OVER_BUSES, "at most 200 Hz"),
         *((rate, Code.RATE_OUT_OF_RANGE, "no rate") for rate in (0.1, 1e-3, 1e-300, 1e-320, 0.0, -3.0)),
     ],
@@ -249,7 +249,7 @@ def test_a_command_reaches_its_controller_and_the_log(steered):
     [
         ("whole", b"", (Code.NOT_ACTIVE, {"controller": "whole"})),
         ("nun", b"", (Code.UNKNOWN_CONTROLLER, {"controller": "nun"})),
-        ("left", b"abc", (Code.INVALID, {"problem": "3 bytes are no array of numbers"})),
+        ("left", b"abc", (Code.INVALID, {"problem": "3 bytes are not an array of numbers"})),
     ],
 )
 def test_a_command_that_cannot_be_is_refused(steered, name, data, why):
@@ -372,8 +372,8 @@ def test_a_controller_is_loaded_and_unloaded_in_a_pause_only(steered):
     }
     steered.run(10, at)
     assert {number: text for number, text in steered.refusals.items() if text} == {
-        1: "pause the loop first: it stands still meanwhile",
-        6: "pause the loop first: it stands still meanwhile",
+        1: "the loop must be paused for this; pause it first",
+        6: "the loop must be paused for this; pause it first",
         8: "extra is active; deactivate it first",
     }
     assert steered.column("active")[3:6] == [0b1010] * 3
@@ -418,7 +418,7 @@ def test_places_of_unloaded_controllers_are_used_again_under_whatever_name(steer
 def test_a_controller_is_loaded_with_the_period_that_the_loop_has_now(steered):
     loads = [steered.loads("extra", rate=rate, **LEFT) for rate in (30.0, 25.0)]
     steered.run(4, {1: [steered.asks("rate", rate=100.0), steered.asks("pause")], 2: loads})
-    refused = "100 Hz is no multiple of 30 Hz, the rate of controller extra"
+    refused = "100 Hz is not a multiple of 30 Hz, the rate of controller extra"
     assert steered.refusals == {1: "", 2: "", 3: refused, 4: ""}
     assert steered.manager._named["extra"].controller.context.period_ns == 40_000_000
 

@@ -153,8 +153,8 @@ def test_takeover_over_a_lower_controller_that_waits_for_its_mode_is_refused(sto
     story.controller("watch", None, falls, joints=(), command=(), takeovers=("safe",)).build()
     story.hardware.mode_cycles = lambda: 4
     story.run(10, {2: story.switches(["soft"])})
-    why = "takeover by safe refused: soft is not active yet: its joints change their modes"
-    assert story.events.texts(EventCode.COMMAND_REFUSED) == [f"{why} (requested because of it falls)"]
+    why = "takeover by safe refused: soft is not active yet; wait until its joints have changed their modes"
+    assert story.events.texts(EventCode.COMMAND_REFUSED) == [f"{why} (reason of the request: it falls)"]
     assert story.active(9) == ["soft", "watch"]
     assert story.order("activate") == ["watch", "soft"]
 

@@ -73,7 +73,7 @@ def test_without_an_arguments_block_there_are_none() -> None:
 def test_an_argument_without_default_must_be_given() -> None:
     text = TORSO.replace("rate: {default: 50, ", "rate: {")
     assert desk.refusals(text) == [
-        "robot.yaml:4:3: the argument rate has no value; write rate:=... behind the robot file, or give it a default"
+        "robot.yaml:4:3: the argument rate has no value; write rate:=... after the robot file, or give it a default"
     ]
     assert desk.robot(text, {"rate": "20"}).robot.loop.rate == 20.0
 
@@ -93,7 +93,7 @@ def test_an_argument_without_default_must_be_given() -> None:
             "2:26: arguments.a.default: the default of an argument is one value",
         ),
         ("arguments: {a: {default: 1, help: 5}}", "2:35: arguments.a.help is 5, but must be text"),
-        ("arguments: {a b: {default: 1}}", "2:13: 'a b' is no name of an argument"),
+        ("arguments: {a b: {default: 1}}", "2:13: 'a b' is not a name of an argument"),
         ("arguments: {a: {default: '${b}'}}", "2:26: an argument's default cannot use ${...}"),
         ("arguments: {a: {default: 1}, a: {default: 2}}", "2:30: arguments.a was already given in line 2"),
     ],

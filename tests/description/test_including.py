@@ -137,7 +137,7 @@ def test_a_cycle_is_refused_with_its_way() -> None:
     desk.write("include: [./a.yaml]\n", "b.yaml")
 
     assert desk.refusals(f"include: [a.yaml]\n{TORSO}") == [
-        "b.yaml:1:11: ./a.yaml includes itself (a.yaml -> b.yaml -> a.yaml); take one of these includes out"
+        "b.yaml:1:11: ./a.yaml includes itself (a.yaml -> b.yaml -> a.yaml); remove one of these includes"
     ]
 
 
@@ -190,7 +190,7 @@ def test_a_motion_includes_nothing() -> None:
         "name: m\ninclude: []\nmotions: [{controller: c, points: [{time: 0 s, joints: {j: "
         "{position: 1 rad}}}]}]\n"
     )
-    assert problem.startswith("motion.yaml:2:1: the file has an unknown key 'include'; take it out")
+    assert problem.startswith("motion.yaml:2:1: the file has an unknown key 'include'; remove it")
 
 
 KEYS = st.sampled_from(["a", "b", "c"])

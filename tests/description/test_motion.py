@@ -98,7 +98,7 @@ def test_a_part_that_is_neither_points_nor_formulas_is_refused() -> None:
     assert len(desk.motion_refusals("name: x\nmotions: [{controller: a}]\n")) == 3
     assert desk.motion_refusals("name: x\nmotions: [5]\n") == [
         "motion.yaml:2:11: motions[0] is 5, but must be a mapping;"
-        " write `key: value` lines below it, or {key: value, ...} behind it"
+        " write `key: value` lines below it, or {key: value, ...} after it"
     ]
     assert desk.motion_refusals("name: x\nmotions: []\n") == [
         "motion.yaml:2:10: motions has too few entries; write at least 1"

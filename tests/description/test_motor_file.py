@@ -114,7 +114,7 @@ def test_all_mistakes_are_told_at_once() -> None:
 def test_another_file_is_no_motor_file() -> None:
     path = desk.write(TORSO)
     assert desk.caught(lambda: read_motor(path)) == [
-        "robot.yaml:1:1: this is no motor file: it has none of voltage, torque_constant, resistance, inertia; "
+        "robot.yaml:1:1: this is not a motor file: it has none of voltage, torque_constant, resistance, inertia; "
         "name a file as `dxlrun identify` writes it"
     ]
 

@@ -62,14 +62,14 @@ def problems(text: str, *, model: type[BaseModel] | None = Parameters) -> list[s
         ("{joints: [a], gain: 1}", ["f:2:22: controllers.arm has an unknown key 'gain'; did you mean gains?"]),
         ("{joints: [a], gains: {a: {p: x}}}", ["f:2:37: controllers.arm.gains.a.p is the text 'x', but must be a number; write a number without quotes"]),
         ("{joints: [a], gains: {a: {p: -1}}}", ["f:2:37: controllers.arm.gains.a.p is -1, but must be at least 0; correct it"]),
-        ("{joints: [a], gains: {a: {p: 1, d: 2}}}", ["f:2:40: controllers.arm.gains.a has an unknown key 'd'; take it out; known keys: p, i"]),
+        ("{joints: [a], gains: {a: {p: 1, d: 2}}}", ["f:2:40: controllers.arm.gains.a has an unknown key 'd'; remove it; known keys: p, i"]),
         ("{joints: [a], period: fast}", ["f:2:30: controllers.arm.period is the text 'fast', but must be a number or auto; write a number without quotes"]),
-        ("{joints: [a], shape: 5}", ["f:2:29: controllers.arm.shape is 5, but must be a mapping or a list; write `key: value` lines below it, or {key: value, ...} behind it"]),
+        ("{joints: [a], shape: 5}", ["f:2:29: controllers.arm.shape is 5, but must be a mapping or a list; write `key: value` lines below it, or {key: value, ...} after it"]),
         ("{joints: [a], offset: 3}", ["f:2:30: controllers.arm.offset: 3 has no unit; write an angle with its unit, such as 60 deg or 1.05 rad"]),
         ("{joints: [a], count: 1.5}", ["f:2:29: controllers.arm.count is 1.5, but must be a whole number; write digits only, without quotes and without a point"]),
         ("{joints: [a], code: A1}", ["f:2:28: controllers.arm.code is the text 'A1', which does not match ^[a-z]+$; correct it"]),
         ("{joints: [a], code: abcde}", ["f:2:28: controllers.arm.code is too long; keep 4 at most"]),
-        ("5", ["f:2:8: controllers.arm is 5, but must be a mapping; write `key: value` lines below it, or {key: value, ...} behind it"]),
+        ("5", ["f:2:8: controllers.arm is 5, but must be a mapping; write `key: value` lines below it, or {key: value, ...} after it"]),
     ],
 )  # fmt: skip
 def test_findings_of_a_plug_ins_model_are_said_in_our_words(text: str, expected: list[str]) -> None:
@@ -78,7 +78,7 @@ def test_findings_of_a_plug_ins_model_are_said_in_our_words(text: str, expected:
 
 def test_without_the_model_there_is_no_suggestion() -> None:
     assert problems("{joints: [a], gain: 1}", model=None) == [
-        "f:2:22: controllers.arm has an unknown key 'gain'; take it out"
+        "f:2:22: controllers.arm has an unknown key 'gain'; remove it"
     ]
 
 

@@ -78,10 +78,10 @@ def test_a_missing_file_a_directory_and_a_pipe_are_refused() -> None:
 
 def test_other_encodings_and_control_characters_are_refused_where_they_stand() -> None:
     assert desk.refusals("a: 1\nb: é\n".encode("latin-1")) == [
-        "robot.yaml:2:4: the byte 0xe9 is no UTF-8; save the file as UTF-8"
+        "robot.yaml:2:4: the byte 0xe9 is not UTF-8; save the file as UTF-8"
     ]
     assert desk.refusals("é: 1\nb: x\0\n") == [
-        "robot.yaml:2:5: the character U+0000 cannot stand in YAML; take it out"
+        "robot.yaml:2:5: the character U+0000 cannot stand in YAML; remove it"
     ]
 
 
@@ -110,7 +110,7 @@ def test_duplicate_merge_empty_and_compound_keys_are_refused_together() -> None:
         "robot.yaml:20:3: a mapping or a list cannot be a key; write a word before the ':'",
         "robot.yaml:22:1: a key is empty; write a word before the ':'",
         "robot.yaml:23:1: arguments are not put into keys; write the key out",
-        "robot.yaml:24:1: the file has an unknown key '<<'; take it out",
+        "robot.yaml:24:1: the file has an unknown key '<<'; remove it",
     ]
 
 

@@ -218,7 +218,7 @@ def test_faults_happen_to_devices_too(line):
     inject(wire, "reboot servo=241 for=50ms")
     wire.wait(0.1)
     assert wire.read_bytes(241, 10, 1) == b"\x00", "RAM is lost"
-    with pytest.raises(InputError, match="241 on bus main is no servo, so turn cannot happen to it"):
+    with pytest.raises(InputError, match="241 on bus main is not a servo, so turn cannot happen to it"):
         inject(wire, "turn servo=241 by=10deg")
     with pytest.raises(InputError, match="its servos are 1, its other devices 241"):
         inject(wire, "lose servo=5")

@@ -55,7 +55,7 @@ def test_all_that_could_never_happen_is_reported_at_once_and_nothing_is_planned(
         "lose bus=middle servo=1: there is no bus 'middle'; write bus=left or bus=right or bus=bare",
         "lose bus=left servo=3: bus left has no servo 3; its servos are 1, 2",
         "storm bus=bare faults=3 within=1s: bus bare has no servos; name another one with bus=",
-        "unplug bus=right at=1s: it is 2.000 s after the start already; leave at= out for now",
+        "unplug bus=right at=1s: it is 2.000 s after the start already; omit at= for now",
     )
     assert all(bus.next_due_ns() is None for bus in buses)
     assert script.waiting == ()

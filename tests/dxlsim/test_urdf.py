@@ -53,7 +53,7 @@ def test_each_joint_stands_behind_the_one_above_it() -> None:
 
 
 TWO_ROOTS = "2 links have no parent: base, lonely; join them to one tree; a fixed joint moves nothing"
-CIRCLE = "links stand in a circle: upper -> thumb -> upper; take out one of the joints between them"
+CIRCLE = "links stand in a circle: upper -> thumb -> upper; remove one of the joints between them"
 
 
 @pytest.mark.parametrize(
@@ -94,7 +94,7 @@ CIRCLE = "links stand in a circle: upper -> thumb -> upper; take out one of the 
             'joint="finger_slide"',
             'joint="thumb_slide"',
             (8, 3),
-            "joint thumb_slide mimics itself: thumb_slide -> thumb_slide; let one of them move by itself",
+            "joint thumb_slide mimics itself: thumb_slide -> thumb_slide; remove the mimic of one of them",
         ),
         (
             '<joint name="finger_slide" type="prismatic">',

@@ -170,7 +170,7 @@ def test_nothing_in_the_eeprom_changes_while_the_servo_holds_torque(change):
 def test_a_register_is_written_only_where_it_differs():
     rig = Rig()
     wanted = [rig.one.register("return_delay_time", 0), rig.one.register("position_p_gain", 800)]
-    assert rig.one.write(wanted) == ("Return Delay Time (9) was 250 and is 0",)
+    assert rig.one.write(wanted) == ("Return Delay Time (9) was changed from 250 to 0",)
     assert rig.servo.registers["return_delay_time"] == 0
     assert rig.instructions().count(3) == 1
 
@@ -179,7 +179,7 @@ def test_a_reboot_is_waited_for():
     rig = Rig()
     rig.servo.boot_ns = 1_500_000_000
     rig.servo.poke("position_p_gain", 3)
-    assert rig.one.reboot() == "started anew, and is limp"
+    assert rig.one.reboot() == "rebooted, and is limp"
     assert rig.servo.registers["position_p_gain"] == 800
 
 
@@ -194,7 +194,7 @@ def test_a_reboot_that_did_not_happen_is_noticed():
     rig.wait(9)
     rig.line.bus.advance(rig.line.clock.now_ns())
     rig.line.bus.after(1, lambda: rig.line.bus.alter_next_instruction("lost", lambda data: b""))
-    rig.refused(OneServo.reboot, "did not start anew: its Realtime Tick is")
+    rig.refused(OneServo.reboot, "did not reboot: its Realtime Tick is")
 
 
 @pytest.mark.parametrize(
@@ -360,7 +360,7 @@ def test_a_goal_that_is_set_already_clears_a_tripped_bus_watchdog_too(torque):
     trip(rig, torque)
     asked = Asked(("goal_position", "3000"), None, yes=False)
     done = VERBS["set"].do(rig.one, asked)
-    moved = [STOOD, "Goal Position (116) was 1304 and is 3000"]
+    moved = [STOOD, "Goal Position (116) was changed from 1304 to 3000"]
     assert [*done] == [already, TRIPPED, *(moved if torque else [])]
     assert (rig.servo.registers["bus_watchdog"], rig.servo.registers["goal_position"]) == (0, 3000)
     rig.wait(6)
@@ -380,7 +380,7 @@ def test_other_registers_leave_a_tripped_bus_watchdog_and_a_register_of_it_is_sh
     rig = Rig()
     trip(rig, 0)
     done = rig.one.write([rig.one.register("position_p_gain", 500)])
-    assert done == ("Position P Gain (84) was 800 and is 500",)
+    assert done == ("Position P Gain (84) was changed from 800 to 500",)
     assert rig.one.torque(False) == ("is limp, as before",)
     assert rig.servo.registers["bus_watchdog"] == 255
 
@@ -391,7 +391,7 @@ def test_a_servo_whose_tripped_bus_watchdog_is_written_stays_where_it_stands(tor
     rig = Rig()
     trip(rig, torque)
     done = rig.one.write([rig.one.register("bus_watchdog", ticks)])
-    armed = ("Bus Watchdog (98) was 0 and is 100",) if ticks else ()
+    armed = ("Bus Watchdog (98) was changed from 0 to 100",) if ticks else ()
     assert done == ((TRIPPED, STOOD) if torque else (TRIPPED,)) + armed
     rig.wait()
     assert rig.servo.position == pytest.approx(2.0, abs=0.002)

@@ -226,7 +226,7 @@ def test_a_start_restores_a_torque_limit_and_reports_what_it_was(model, protocol
     bench.rig.hardware.start()
     assert bench.servo.registers[item] == full > 20
     title = bench.one.items[item].title
-    assert f"{title} was 20 and is {full} again" in bench.rig.events.texts(EventCode.SETUP)
+    assert f"{title} was restored from 20 to {full}" in bench.rig.events.texts(EventCode.SETUP)
     assert bench.rig.events.of(EventCode.REGISTER_DIFFERS) == []
 
 

@@ -154,7 +154,7 @@ def test_a_lost_device_costs_the_servos_nothing(fast, capabilities):
     assert rig.events.sources(EventCode.READ_LOST) == ["device_2"]
     (lost,), (back,) = rig.events.of(EventCode.DEVICE_LOST), rig.events.of(EventCode.DEVICE_BACK)
     assert lost[1].startswith("device_2 (ID 103 on bus main) missed ")
-    assert back == ("device_2", "device_2 (ID 103 on bus main) is in order and is read again")
+    assert back == ("device_2", "device_2 (ID 103 on bus main) is back, and is read again")
     assert rig.events.of(EventCode.SERVO_LOST) == []
 
 
@@ -202,7 +202,9 @@ def test_a_device_that_answers_only_alone_is_read_alone(monkeypatch, fast):
     assert rig.sources.values[0] == 29
     ((source, text),) = rig.events.of(EventCode.SETUP)[-1:]
     assert source == "device_0"
-    assert text.endswith("answers alone but not together with others, and is read by itself from now on")
+    assert text.endswith(
+        "answers single reads, but no reads together with others; it is read alone from now on"
+    )
     assert len(rig.events.of(EventCode.READ_LOST)) <= 2  # its silence may silence the one behind it once
 
 
@@ -216,7 +218,7 @@ def test_a_device_that_answers_only_between_the_cycles_is_asked_seldom(monkeypat
         rig.cycle()
         assert rig.states.valid.all()
     (lost, *_) = rig.events.of(EventCode.DEVICE_LOST)
-    assert "answers between the cycles, but not in them" in lost[1]
+    assert "answers in idle time, but not in cycles" in lost[1]
     assert len(rig.events.of(EventCode.DEVICE_LOST)) <= 3
 
 
@@ -256,7 +258,10 @@ def test_a_number_that_is_none_is_not_believed():
         assert not rig.sources.valid[0]
     assert rig.sources.age_ns[0] > 40_000_000
     (event,) = rig.events.of(EventCode.IMPLAUSIBLE)
-    assert event == ("device_0", "device_0 (ID 101 on bus main) sent no finite warm: not believed")
+    assert event == (
+        "device_0",
+        "device_0 (ID 101 on bus main) sent values that are not finite (warm): they are not used",
+    )
     assert rig.states.valid.all()
 
 

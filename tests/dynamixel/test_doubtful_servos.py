@@ -39,7 +39,7 @@ def test_a_joint_that_forgot_its_turns_over_a_reboot_does_not_wind_them_up_again
     assert servo.position == pytest.approx(standing, abs=0.1), "it wound up the turns that it had forgotten"
     assert rig.torque() == [False, True]
     (text,) = rig.events.texts(EventCode.SERVO_LIMP)
-    assert "lost count of its turns" in text
+    assert "lost its count of turns" in text
     assert "`dxlrun torque on main_1_joint` gives it torque" in text
     assert rig.events.of(EventCode.IMPLAUSIBLE) == [], "its position is another one for a known reason"
     rig.hardware.switch_torque(0, True)

@@ -125,7 +125,7 @@ def test_a_declared_register_that_older_firmware_does_not_have_is_refused():
     assert [packet for packet in rig.into_bus() if packet[7] not in (1, 2)] == []
     assert str(caught.value).splitlines()[1] == (
         "arm_12_joint (ID 12 on bus arm) has firmware 44, but Startup Configuration (60), which the robot "
-        "file declares, came with firmware 45: take it out of `registers`, or update the servo"
+        "file declares, came with firmware 45: remove it from `registers`, or update the servo"
     )
 
 

@@ -160,7 +160,7 @@ def test_a_servo_that_reboots_twice_in_a_minute_gets_no_torque_again():
         assert rig.torque() == [True, expected, True, True]
     texts = rig.events.texts(EventCode.SERVO_REBOOTED)
     assert len(texts) == 2
-    assert "rebooted twice within a minute" in texts[-1]
+    assert "rebooted for the second time within a minute" in texts[-1]
 
 
 @pytest.mark.parametrize(

@@ -75,8 +75,8 @@ def test_only_what_differs_is_written_and_it_is_read_back():
     found = settled(execute, plan)
     assert found.problems == []
     assert written(found) == [
-        "Return Delay Time (9) was 0 and is 250",
-        "Position P Gain (84) was 800 and is 900",
+        "Return Delay Time (9) was changed from 0 to 250",
+        "Position P Gain (84) was changed from 800 to 900",
     ]
     assert len(rig.writes()) == 2
     assert (held(rig, "return_delay_time"), held(rig, "position_p_gain")) == (250, 900)
@@ -128,7 +128,7 @@ def test_a_servo_that_was_reset_gets_its_registers_and_its_torque_again():
     assert held(rig, "position_p_gain") == 800
     torqued, found = rejoined(execute, plan, torque=True)
     assert (found.problems, torqued) == ([], True)
-    text = "Position P Gain (84) was 800 and is 900"
+    text = "Position P Gain (84) was changed from 800 to 900"
     assert found.texts(EventCode.REGISTER_WRITTEN) == [("arm_11_joint", text)]
     assert rig.torque() == [True, False]
     assert (
@@ -164,8 +164,8 @@ def test_a_factory_return_delay_is_mended_before_anybody_gets_torque():
     rig.servo(12).poke("return_delay_time", 250)
     rig.hardware.start()
     assert rig.events.of(EventCode.REGISTER_WRITTEN) == [
-        ("arm_12_joint", "Return Delay Time (9) was 250 and is 0"),
-        ("arm_12_joint", "Position P Gain (84) was 800 and is 850"),
+        ("arm_12_joint", "Return Delay Time (9) was changed from 250 to 0"),
+        ("arm_12_joint", "Position P Gain (84) was changed from 800 to 850"),
     ]
     assert rig.events.of(EventCode.REGISTER_DIFFERS) == []
     assert (held(rig, "return_delay_time", 1), held(rig, "position_p_gain", 1)) == (0, 850)
@@ -205,8 +205,8 @@ def test_a_difference_that_the_start_mends_does_not_forbid_it():
     rig.hardware.start()
     assert (held(rig, "status_return_level", 1), held(rig, "return_delay_time", 1)) == (2, 0)
     assert rig.events.texts(EventCode.REGISTER_WRITTEN) == [
-        "Status Return Level (16) was 1 and is 2",
-        "Return Delay Time (5) was 250 and is 0",
+        "Status Return Level (16) was changed from 1 to 2",
+        "Return Delay Time (5) was changed from 250 to 0",
     ]
     eeprom = [address for _, address, _ in rig.writes() if address < 24]
     assert eeprom == [16, 5]  # each once, though the first was not acknowledged

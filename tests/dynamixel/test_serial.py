@@ -204,7 +204,7 @@ def test_a_board_that_resets_when_it_is_opened_gets_time_once(terminal, monkeypa
 def test_a_file_is_no_serial_line(tmp_path):
     path = tmp_path / "file"
     path.touch()
-    with pytest.raises(PortError, match="is no serial line"):
+    with pytest.raises(PortError, match="is not a serial line"):
         open_serial(str(path), 1_000_000)
 
 

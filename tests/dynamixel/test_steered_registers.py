@@ -28,7 +28,7 @@ def test_a_gain_is_changed_between_cycles_read_back_and_reported(started):
     assert answers == [""]
     assert (gain_of(started, 0), gain_of(started, 1)) == (800, 900)
     assert started.events.of(EventCode.REGISTER_WRITTEN) == [
-        ("arm_12_joint", "Position P Gain (84) was 800 and is 900")
+        ("arm_12_joint", "Position P Gain (84) was changed from 800 to 900")
     ]
     assert started.writes(before) == [(12, 84, b"\x84\x03")]
     assert started.states.valid.all()
@@ -99,7 +99,10 @@ def test_what_was_set_in_the_run_is_set_again_after_a_reset(started):
         servo.reset()
         assert gain_of(started, 1) == 800
     assert gain_of(started, 1) == 900
-    assert started.events.texts(EventCode.REGISTER_WRITTEN) == ["Position P Gain (84) was 800 and is 900"] * 2
+    assert (
+        started.events.texts(EventCode.REGISTER_WRITTEN)
+        == ["Position P Gain (84) was changed from 800 to 900"] * 2
+    )
 
 
 @pytest.mark.parametrize("requested", ["before it was away", "while it was away"])

@@ -292,7 +292,7 @@ def test_a_servo_that_held_holds_again_after_its_reboot(watchdog):
     assert abs(arm.rig.states.position[1] - place) < 0.02
     assert arm.servo.registers["bus_watchdog"] == watchdog
     rebooted = [(s, t) for code, s, _, t in arm.rig.events.list if code == EventCode.SERVO_REBOOTED]
-    assert rebooted == [(Severity.INFO, "arm_12_joint (ID 12 on bus arm) started anew, as requested")] or [
+    assert rebooted == [(Severity.INFO, "arm_12_joint (ID 12 on bus arm) rebooted, as requested")] or [
         s for s, _ in rebooted
     ] == [Severity.INFO]
     assert not arm.rig.events.of(EventCode.SERVO_LOST)
@@ -446,7 +446,7 @@ def test_a_servo_that_reboots_while_it_is_checked_gets_no_torque():
         begun = len(arm.rig.into_bus())
         number = arm.switch(True)
         arm.rig.buses[0].after(packets, arm.servo.reset)
-        assert "started anew while it was checked" in arm.told(number), packets
+        assert "rebooted while it was checked" in arm.told(number), packets
         assert (12, 1) not in arm.torque_bytes(begun)
         arm.follow(100)
         assert not any(given)

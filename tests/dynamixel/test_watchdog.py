@@ -272,7 +272,7 @@ def test_a_ramp_that_the_watchdog_reset_is_written_again():
     assert rig.registers(item.name) == [100] * 4
     assert armed(rig) == [10] * 4
     written = rig.events.texts(EventCode.REGISTER_WRITTEN)
-    assert written[-4:] == ["Profile Acceleration (108) was 0 and is 100"] * 4
+    assert written[-4:] == ["Profile Acceleration (108) was changed from 0 to 100"] * 4
 
 
 def test_a_servo_that_is_revived_goes_on_slowly_though_its_profile_was_reset(started):

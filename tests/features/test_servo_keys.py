@@ -39,7 +39,7 @@ def glow(file, servo, table):
         return
     led = table.items.get("led")
     if led is None:
-        file.error(servo.mark(file.marks, "glow"), f"an {table.model} cannot glow", "take it out")
+        file.error(servo.mark(file.marks, "glow"), f"an {table.model} cannot glow", "remove it")
         return
     yield RegisterValue(led.address, led.size, 1, led.name)
 

@@ -262,7 +262,7 @@ def test_of_fuzzed_requests_without_the_role_admin_an_agent_starts_nothing(
 @pytest.mark.parametrize(
     ("text", "words", "sentence"),
     [
-        ("robots: {arm: lab3}", (), "lab.yaml:1:15: robots.arm: 'lab3' is no address"),
+        ("robots: {arm: lab3}", (), "lab.yaml:1:15: robots.arm: 'lab3' is not an address"),
         ("robots: {arm: lab3:7}\nagent: {}", (), "lab.yaml:2:1"),
         (
             "robots: {}\nagents: {a: {address: h:1, starts: {arm: servo /dev/ttyUSB0 1}}}",

@@ -287,7 +287,7 @@ def test_joints_with_several_servos_are_left_out_and_named(tmp_path: Path) -> No
     arm = Arm(tmp_path, text)
     with pytest.raises(InputError, match="no joint is left to be calibrated"):
         arm.do(joints=("elbow",))
-    assert "Left out, as several servos move them, is what is yours to measure: elbow" in arm.script.text
+    assert "Not calibrated, because several servos move them; measure them yourself: elbow" in arm.script.text
 
 
 def test_a_file_that_would_be_wrong_is_told_with_the_change(tmp_path: Path) -> None:

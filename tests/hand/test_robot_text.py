@@ -107,7 +107,7 @@ def test_what_an_included_file_has_is_changed_there(tmp_path: Path) -> None:
         ('{elbow: {reference: "${zero}"}}', "joints.elbow.reference is made of an argument; write the value"),
         ("{elbow: {reference: &r 1 deg}, wrist: {reference: *r}}", "reference is shared by an alias"),
         ("{elbow: &j {reference: 1 deg}, wrist: *j}", "joints.elbow.reference is shared by an alias"),
-        ("{elbow: 3}", "joints.elbow is no mapping; write its keys below it"),
+        ("{elbow: 3}", "joints.elbow is not a mapping; write its keys below it"),
     ],
 )
 def test_what_cannot_be_replaced_is_refused_at_its_place(tmp_path: Path, joints: str, said: str) -> None:
@@ -123,7 +123,7 @@ def test_a_file_that_was_changed_meanwhile_is_left_alone(tmp_path: Path) -> None
     text = RobotText(path)
     text.put(REFERENCE, "2 deg")
     path.write_text("name: other\n")
-    with pytest.raises(InputError, match="was changed meanwhile, so nothing was written"):
+    with pytest.raises(InputError, match="was changed by another program, so nothing was written"):
         text.write()
     assert path.read_text() == "name: other\n"
     assert list(tmp_path.iterdir()) == [path]

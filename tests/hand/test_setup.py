@@ -375,5 +375,5 @@ def test_a_servo_of_another_robot_gets_the_settings_of_the_factory_that_no_run_s
     assert bench.code == 0, script.text
     names = ("secondary_shadow_id", "homing_offset", "pwm_limit")
     assert [wrist.registers[name] for name in names] == [255, 0, 500]
-    assert "wrist: Secondary (Shadow) ID (12) was 2 and is 255" in script.text
+    assert "wrist: Secondary (Shadow) ID (12) was changed from 2 to 255" in script.text
     assert "wrist: ID 1 on bus main differs from the factory's settings: PWM Limit (36) = 500" in script.text

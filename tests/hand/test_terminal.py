@@ -1,4 +1,4 @@
-"""The dialogues at a terminal: the commands of docs/how-to/by-hand.md, Ctrl-C, and what is no terminal."""
+"""The dialogues at a terminal: the commands of docs/how-to/by-hand.md, Ctrl-C, and what is not a terminal."""
 
 from __future__ import annotations
 

@@ -204,7 +204,7 @@ class Stage:
         judged = self.goal.is_judged
         self.controller.on_cancel(self.goal, self.time_ns)
         if judged:
-            self.goal.end(Outcome.CANCELLED, "stopped at its end")
+            self.goal.end(Outcome.CANCELLED, "stopped at the end of the motion")
 
     def update(self, at_s: float, *, follow: bool = True) -> np.ndarray:
         """Update; return the positions that are commanded, where the servos are then if they follow."""

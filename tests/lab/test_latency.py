@@ -162,8 +162,8 @@ def test_the_yardstick_has_the_policy_of_what_it_is_compared_with(compare, polic
 @pytest.mark.parametrize(
     ("compare", "policy", "sentence"),
     [
-        ("other,fifu", None, "--compare: 'fifu' is no condition; did you mean fifo?"),
-        ("other,,c", None, "--compare: '' is no condition; known: c, fifo, other, round_robin"),
+        ("other,fifu", None, "--compare: 'fifu' is not a condition; did you mean fifo?"),
+        ("other,,c", None, "--compare: '' is not a condition; known: c, fifo, other, round_robin"),
         ("other,c,other", None, "--compare: other is named twice"),
         ("fifo", None, "--compare fifo: a comparison takes two; use --policy fifo for one"),
         ("other,fifo", "fifo", "--policy is for c where conditions are compared, and c is not among them"),

@@ -80,7 +80,7 @@ def test_included_and_motor_files_are_named_as_seen_from_the_robot_file(tmp_path
 def test_git_says_which_revision_and_whether_a_file_it_has_was_changed(repository: Path) -> None:
     revision = git(repository, "rev-parse", "HEAD")
     (repository / "logs").mkdir()
-    (repository / "logs/run.mcap").write_text("a log beside the robot file is no change")
+    (repository / "logs/run.mcap").write_text("a log next to the robot file is no change")
     assert git_state(repository, "robot.yaml") == {"git revision": revision, "git changed": "no"}
 
     (repository / "robot.yaml").write_text("name: b\n")

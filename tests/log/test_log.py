@@ -286,7 +286,7 @@ def test_a_chunk_that_cannot_be_read_is_left_out(
     log = read_log(rewritten(lambda chunk: [setattr(chunk, *each) for each in change.items()]))
 
     assert log.cycles["cycle"].tolist() == [0, 1, 3]
-    assert log.damage == (f"a chunk of messages is damaged and left out: {why}",)
+    assert log.damage == (f"a chunk of messages is damaged and skipped: {why}",)
 
 
 @pytest.mark.parametrize("compress", [zstandard.compress, lz4.frame.compress])
@@ -306,7 +306,9 @@ def test_a_chunk_that_is_longer_than_its_header_has_it_is_not_decompressed_furth
         tracemalloc.stop()
 
     assert log.cycles["cycle"].tolist() == [0, 1, 3]
-    assert log.damage == ("a chunk of messages is damaged and left out: it is not as long as it says",)
+    assert log.damage == (
+        "a chunk of messages is damaged and skipped: it has another length than it declares",
+    )
     assert most < 10 << 20
 
 

@@ -225,8 +225,8 @@ class Odd:
 @pytest.mark.parametrize(
     ("kind", "reason"),
     [
-        (dict, "dict is no dataclass"),
-        (3, "3 is no dataclass"),
+        (dict, "dict is not a dataclass"),
+        (3, "3 is not a dataclass"),
         (made(), "Made has no fields"),
         (made(amount=complex), "Made.amount is complex, for which ROS 2 has nothing"),
         (made(amount=float | None), "Made.amount is float | None, for which ROS 2 has nothing"),
@@ -238,11 +238,11 @@ class Odd:
         (made(amount=Annotated[float, Number("uint8")]), "Made.amount is .*, for which"),
         (made(amount=Annotated[int, Number("number")]), "Made.amount is .*, for which"),
         (made(amount=Annotated[str, Length(3)]), "Made.amount is .*, for which"),
-        (made(amountLeft=float), "Made.amountLeft is no name of a field"),
-        (made(left__amount=float), "Made.left__amount is no name of a field"),
+        (made(amountLeft=float), "Made.amountLeft is not a name of a field"),
+        (made(left__amount=float), "Made.left__amount is not a name of a field"),
         (Lazy, "the annotations of Lazy cannot be read .*Fraction"),
         (Endless, "Endless contains itself"),
-        (lower, "lower is no name of a message"),
+        (lower, "lower is not a name of a message"),
         (Odd, "Odd.ros_type is 'Odd'"),
     ],
 )

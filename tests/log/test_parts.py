@@ -238,7 +238,7 @@ def four(tmp_path: Path, start: Start) -> Path:
     [
         ((1,), "part_0001.mcap is missing"),
         ((0, 1), "part_0000.mcap to part_0001.mcap are missing"),
-        ((3,), "the parts behind part_0002.mcap are missing"),
+        ((3,), "the parts after part_0002.mcap are missing"),
     ],
 )
 def test_a_part_that_is_missing_is_damage(four: Path, removed: tuple[int, ...], sentence: str) -> None:
@@ -287,7 +287,7 @@ def test_an_empty_part_or_one_that_is_no_log_is_damage_and_the_others_are_read(f
     log = read_log(four)
     assert log.damage == (
         "part_0001.mcap: the file is empty; its recorder never began to write",
-        "part_0002.mcap: this is no MCAP file, so it is no log of dxlrun",
+        "part_0002.mcap: this is not an MCAP file, and a log of dxlrun is one",
     )
     assert len(log.cycles) > 60
 
@@ -297,7 +297,7 @@ def test_a_part_of_another_run_is_left_out(four: Path, tmp_path: Path, header: L
     other.close()
     shutil.copy(tmp_path / "other.mcap", four / "part_0002.mcap")
     log = read_log(four)
-    assert log.damage == ("part_0002.mcap is of another run and left out",)
+    assert log.damage == ("part_0002.mcap is of another run and was skipped",)
     assert log.header.robot == "torso"
 
 

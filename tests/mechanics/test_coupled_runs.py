@@ -363,4 +363,6 @@ def test_a_servo_that_shuts_itself_down_takes_the_torque_of_its_partner(plan, tm
     assert [value for t, value in torque_writes(robot, 3) if 400_000_000 < t < 900_000_000][:1] == [0]
     events = read_log(tmp_path / "run.mcap").events
     texts = [event.text for event in events if event.code == EventCode.TORQUE_OFF]
-    assert any("hip: ID 2 on bus main is limp, so ID 3 on bus main loses its torque" in one for one in texts)
+    assert any(
+        "hip: ID 2 on bus main is limp, so torque goes off on ID 3 on bus main" in one for one in texts
+    )

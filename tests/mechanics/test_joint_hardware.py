@@ -78,7 +78,7 @@ def test_a_servo_without_torque_takes_it_from_its_partner_once(joints: Joints, p
     assert joints.servos.switched == [(2, False)]
     ((name, text),) = joints.events.of(EventCode.TORQUE_OFF)
     assert name == "hip"
-    assert "ID 2 on bus main is limp, so ID 3 on bus main loses its torque" in text
+    assert "ID 2 on bus main is limp, so torque goes off on ID 3 on bus main" in text
 
 
 @pytest.mark.parametrize("partner", [Torque.LOST, Torque.REBOOTING, Torque.UNKNOWN])

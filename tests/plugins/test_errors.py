@@ -71,7 +71,7 @@ WRONG = {
     ),
     "return 4": (
         "return 7",
-        f"{WHO} was written for contract 7, this dxlrun has contract 4; install a version of it that fits",
+        f"{WHO} was written for contract 7, this dxlrun has contract 4; install a matching version",
     ),
     "def dxlrun_controllers()": (
         "def dxlrun_controllers(robot)",
@@ -96,7 +96,7 @@ WRONG = {
     ),
     "class EasingParameters(ParametersModel)": (
         "class EasingParameters",
-        f"{WHO} offers Easing as easing_position_controller, whose Parameters is no model of parameters; "
+        f"{WHO} offers Easing as easing_position_controller, whose Parameters is not a model of parameters; "
         "derive it from dxlrun.ParametersModel",
     ),
     '{"positions": PositionsCommand}': (
@@ -129,7 +129,7 @@ ASKED = {
     ', ("position",))': (
         ', ("position", "pwm"))',
         "asks for command interfaces that do not go together: no servo follows position and pwm together; "
-        "report it to its author: ask for position (with velocity or effort beside it), or for "
+        "report it to its author: ask for position (with velocity or effort in addition), or for "
         "velocity, effort or pwm alone",
     ),
     '("position",))': (

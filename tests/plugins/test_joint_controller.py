@@ -191,7 +191,7 @@ WRONG = {
     ),
     "no controller": (
         ("(JointController)", ""),
-        "; wave.py offers Wave as ./wave.py:Wave, which is no controller",
+        "; wave.py offers Wave as ./wave.py:Wave, which is not a controller",
     ),
     "no law": (
         ("def positions", "def position_s"),
@@ -214,7 +214,7 @@ WRONG = {
         (": Angle = 0.3", ": np.ndarray"),
         "wave.py:6: TypeError: Wave.amplitude has the type ",
     ),
-    "a default that is no number": (
+    "a default that is not a number": (
         ("= 0.3", "= '20 deg'"),
         "has the default '20 deg'; write a number, in SI units",
     ),
@@ -246,16 +246,19 @@ def test_a_wrong_class_is_one_sentence_at_its_place(written: Written, wrong: str
     [
         (
             "../wave.py:Wave",
-            "../wave.py:Wave of head is no class of a file beside the robot file; write ./wave.py:Wave",
+            "../wave.py:Wave of head is not a class of a file next to the robot file; write ./wave.py:Wave",
         ),
-        ("/home/wave.py:Wave", "/home/wave.py:Wave of head is no class of a file beside the robot file; "),
-        ("wave.py", "wave.py of head is no class of a file beside the robot file; "),
-        ("./out.py:Wave", "./out.py:Wave of head is no class of a file beside the robot file; "),
+        (
+            "/home/wave.py:Wave",
+            "/home/wave.py:Wave of head is not a class of a file next to the robot file; ",
+        ),
+        ("wave.py", "wave.py of head is not a class of a file next to the robot file; "),
+        ("./out.py:Wave", "./out.py:Wave of head is not a class of a file next to the robot file; "),
         (
             "./gone.py:Wave",
             "gone.py of controller head cannot be read (No such file or directory); its place is gone.py",
         ),
-        ("./bytes.py:Wave", "bytes.py of controller head cannot be read (it is no UTF-8); "),
+        ("./bytes.py:Wave", "bytes.py of controller head cannot be read (it is not UTF-8); "),
     ],
 )
 def test_only_files_beside_the_robot_file_are_read(

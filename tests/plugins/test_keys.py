@@ -151,7 +151,7 @@ WRONG_KEYS: Mapping[str, tuple[Keys, list[tuple[Keys, str]]]] = {
         ({"timeout": "0 s"}, "greater than 0"),
     ]),
     "feed_forward": (TWO, [
-        ({"pass_on": True}, "positions are commanded already; take pass_on out"),
+        ({"pass_on": True}, "positions are commanded already; remove pass_on"),
         ({"scale": 1.5}, "less than or equal to 1"),
         ({"scale": {"c": 1.0}}, "c is not one of its joints"),
         ({"most": 0.0}, "greater than 0"),

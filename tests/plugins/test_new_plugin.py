@@ -99,13 +99,16 @@ def test_each_file_of_the_template_is_made_but_the_licence(said: Said, tmp_path:
 @pytest.mark.parametrize(
     ("name", "sentence"),
     [
-        ("Arms", "dxlrun: 'Arms' is no name of a package; write small letters and digits, a letter first, "),
-        ("7arms", "dxlrun: '7arms' is no name of a package; "),
-        ("my arms", "dxlrun: 'my arms' is no name of a package; "),
-        ("../arms", "dxlrun: '../arms' is no name of a package; "),
-        ("arms_", "dxlrun: 'arms_' is no name of a package; "),
-        ("a" * 61, "is no name of a package; "),
-        ("", "dxlrun: '' is no name of a package; "),
+        (
+            "Arms",
+            "dxlrun: 'Arms' is not a name of a package; write small letters and digits, a letter first, ",
+        ),
+        ("7arms", "dxlrun: '7arms' is not a name of a package; "),
+        ("my arms", "dxlrun: 'my arms' is not a name of a package; "),
+        ("../arms", "dxlrun: '../arms' is not a name of a package; "),
+        ("arms_", "dxlrun: 'arms_' is not a name of a package; "),
+        ("a" * 61, "is not a name of a package; "),
+        ("", "dxlrun: '' is not a name of a package; "),
         ("json", "dxlrun: json is a module that Python knows already; choose another name: my_json\n"),
         ("numpy", "dxlrun: numpy is a module that Python knows already; choose another name: my_numpy\n"),
         ("dxlrun", "dxlrun: dxlrun is a module that Python knows already; choose another name: my_dxlrun\n"),
@@ -152,7 +155,7 @@ def test_plugins_are_listed_with_what_they_offer(said: Said, install: Callable[[
     assert ["joint_trajectory_controller", "chunk", "trajectory"] in [line[:3] for line in lines]
     assert (
         "broken: plug-in broken_one of broken_one 1.5 was written for contract 5, "
-        "this dxlrun has contract 4; install a version of it that fits"
+        "this dxlrun has contract 4; install a matching version"
     ) in out
 
 

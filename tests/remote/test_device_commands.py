@@ -64,8 +64,8 @@ def test_a_devices_commands_go_to_the_controller_that_has_them(board):
     [
         ("board", {"led": 2}, "led of board: 2 lies outside 0 to 1"),
         ("board", {"led": -0.5}, "led of board: -0.5 lies outside 0 to 1"),
-        ("board", {"led": True}, "board/led = True is no number"),
-        ("board", {"led": "on"}, "board/led = on is no number"),
+        ("board", {"led": True}, "board/led = True is not a number"),
+        ("board", {"led": "on"}, "board/led = on is not a number"),
         ("board", {"lde": 1}, "board takes no command lde; did you mean led?"),
         ("board", {}, "board (ID 102 on bus main): no command is named; it has led, register_7, register_8"),
         ("foot", {"led": 1}, "foot (ID 101 on bus main) has no commands"),
@@ -126,7 +126,8 @@ def test_states_of_a_device_are_asked_for_by_name_and_listened_to(board):
     assert (status, content["refused"]) == (404, "there is no joint foot/force.y; did you mean foot/force.x?")
     _, content = board.ask("GET", "/joints/board/registers/led")
     assert (
-        content["refused"] == "there is no joint board; it is no servo: `dxlrun get board` prints its states"
+        content["refused"]
+        == "there is no joint board; it is not a servo: `dxlrun get board` prints its states"
     )
     opened, sample = board.frames(board.link.listen(["/foot"], newest=False))
     assert (opened.type, sample.number) == ("dxlrun_msgs/msg/SourceStates", 2)

@@ -75,14 +75,14 @@ def test_what_the_loop_refuses_is_refused_with_its_code(desk):
 
 LOAD = {"name": "more", "type": "arm", "joints": ["pan"]}
 WRONG = [
-    ("GET", "/nothing", None, 404, "unknown_page", "GET /nothing is no request"),
+    ("GET", "/nothing", None, 404, "unknown_page", "GET /nothing is not a request"),
     ("POST", "/robot", None, 405, "wrong_method", "/robot takes no POST"),
     ("GET", "/robot/", None, 404, "unknown_page", "no request"),
     ("POST", "/controllers/lefty/commands/go", {}, 404, "unknown_controller", "did you mean left?"),
     ("POST", "/controllers/left/commands/goo", {}, 404, "unknown_command", "did you mean go?"),
     ("POST", "/controllers/%2e%2e/commands/go", {}, 404, "unknown_controller", "known: left, right, spare"),
-    ("POST", GO, b"", 422, "invalid", "go of left is no JSON"),
-    ("POST", GO, b"[" * 100_000, 422, "invalid", "go of left is no JSON (recursion limit"),
+    ("POST", GO, b"", 422, "invalid", "go of left is not JSON"),
+    ("POST", GO, b"[" * 100_000, 422, "invalid", "go of left is not JSON (recursion limit"),
     ("POST", GO, b'{"positions": [NaN]}', 422, "invalid", "must be a finite number"),
     ("POST", GO, b'{"positions": [1e999]}', 422, "invalid", "must be a finite number"),
     ("POST", GO, {"positions": [True]}, 422, "invalid", "positions"),
@@ -100,9 +100,9 @@ WRONG = [
     ("POST", "/controllers/spare/set-points/go", {"positions": [0]}, 409, "not_active", "not active; switch to it first"),
     ("POST", SET_POINT + "?lease=0", {"positions": [0]}, 422, "invalid", "a lease is 0.01 to 60 s, not 0"),
     ("POST", SET_POINT + "?lease=61", {"positions": [0]}, 422, "invalid", "a lease is 0.01 to 60 s, not 61"),
-    ("POST", SET_POINT + "?lease=inf", {"positions": [0]}, 422, "invalid", "lease=inf is no number"),
-    ("POST", SET_POINT + "?lease=long", {"positions": [0]}, 422, "invalid", "lease=long is no number"),
-    ("GET", "/events?after=x", None, 422, "invalid", "after=x is no number"),
+    ("POST", SET_POINT + "?lease=inf", {"positions": [0]}, 422, "invalid", "lease=inf is not a number"),
+    ("POST", SET_POINT + "?lease=long", {"positions": [0]}, 422, "invalid", "lease=long is not a number"),
+    ("GET", "/events?after=x", None, 422, "invalid", "after=x is not a number"),
     ("POST", "/switch", b"{", 422, "invalid", 'write for example {"activate": ["head"]'),
     ("POST", "/switch", b"[" * 100_000, 422, "invalid", "write for example"),
     ("POST", "/switch", {"activate": ["nun"]}, 404, "unknown_controller", "there is no controller nun"),
@@ -123,9 +123,9 @@ WRONG = [
     ("POST", "/controllers", LOAD | {"joints": 3}, 422, "invalid", "more.joints is 3"),
     ("POST", "/controllers", LOAD | {"rate": "x"}, 422, "invalid", "is not a rate"),
     ("POST", "/controllers", LOAD | {"active": True}, 422, "invalid", "load it, then switch to it"),
-    ("POST", "/controllers", LOAD | {"fallback": "nun"}, 422, "invalid", "the fallback nun of more is no controller"),
+    ("POST", "/controllers", LOAD | {"fallback": "nun"}, 422, "invalid", "the fallback nun of more is not a controller"),
     ("POST", "/controllers", LOAD | {"fallback": "more"}, 422, "invalid", "more is its own fallback; name another"),
-    ("POST", "/controllers", LOAD | {"into": "lefty"}, 422, "invalid", "more is into lefty, which is no controller of the robot; did you mean left?"),
+    ("POST", "/controllers", LOAD | {"into": "lefty"}, 422, "invalid", "more is into lefty, which is not a controller of the robot; did you mean left?"),
     ("POST", "/controllers", LOAD | {"into": ["left", "more"]}, 422, "invalid", "left, which exports no reference; no controller of the robot exports any"),
     ("POST", "/controllers", LOAD | {"into": ["left", "more"]}, 422, "invalid", "more is into itself"),
     ("POST", "/controllers", LOAD | {"into": 3}, 422, "invalid", "names no controller"),
@@ -393,7 +393,7 @@ def test_an_answer_that_comes_too_late_is_still_what_the_gateway_knows(desk, mon
 def test_a_run_at_its_end_refuses_everything_at_once(desk, phase):
     desk.heartbeat.enter(phase)
     for path, body in (("/pause", b""), (SET_POINT, {"positions": [0]})):
-        refused = {"refused": "the run is at its end", "code": "run_ending", "fields": {}}
+        refused = {"refused": "the run is ending", "code": "run_ending", "fields": {}}
         assert desk.ask("POST", path, body) == (503, refused)
     assert desk.taken == []
 

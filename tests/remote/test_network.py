@@ -283,7 +283,7 @@ def test_addresses(monkeypatch, tmp_path):
     assert Address.parse("[::1]:7660", "torso") == ("torso", "::1", 7660)
     assert str(Address.parse("t@[::1]:1")) == "t@[::1]:1"
     for wrong in ("lab3", "lab3:0", "a@b@c:1", "a@b:65536", "", "a@:1", "a@b:1 "):
-        with pytest.raises(InputError, match="is no address"):
+        with pytest.raises(InputError, match="is not an address"):
             Address.parse(wrong, "torso")
     monkeypatch.setenv("XDG_CONFIG_HOME", str(tmp_path))
     (tmp_path / "dxlrun").mkdir()

@@ -89,7 +89,7 @@ def test_another_servo_begins_anew_and_is_learned(tmp_path):
         learned(kept, path, **QUICK)
     swapped = learned(kept, path, p_gain="16", **QUICK)
     first, second = said(swapped)
-    assert first == f"begins anew: joint p_gain was 32 and is 16 ({kept}/arm.kept)"
+    assert first == f"starts without its kept state: joint p_gain was 32 and is 16 ({kept}/arm.kept)"
     assert "is not known: it is played without a correction" in second
     errors = [error_of(swapped), error_of(learned(kept, path, p_gain="16", **QUICK))]
     assert errors[1] < 0.7 * errors[0]
@@ -107,7 +107,7 @@ def test_it_learns_what_a_feed_forward_leaves(tmp_path):
     assert errors[0] < 0.5, "without it they are 2.8"
     assert errors[2] < 0.5 * errors[0]
     log = learned(tmp_path, path, robot=robot, scale="0.5")
-    assert said(log)[0].startswith("begins anew: below: feed_forward was feed_forward ")
+    assert said(log)[0].startswith("starts without its kept state: below: feed_forward was feed_forward ")
     assert replay_log(path).same
 
 

@@ -195,7 +195,7 @@ def test_a_fault_of_dxlrun_itself_is_a_sentence_and_a_traceback_only_for_debug(o
 
 STANDSTILL = "time_ns < 5e8 or time.sleep(60)"
 DEATHS = {
-    "os.kill(os.getpid(), signal.SIGSEGV)": r"the loop's process ended by itself \(signal SIGSEGV\)",
+    "os.kill(os.getpid(), signal.SIGSEGV)": r"the loop's process ended unexpectedly \(signal SIGSEGV\)",
     STANDSTILL: r"the loop stood still for more than 100 ms",
 }
 
@@ -218,7 +218,7 @@ def test_the_cause_of_death_names_the_controller_whose_code_ran(odd, all_limp, w
 @pytest.mark.parametrize(
     ("death", "cause"),
     [
-        ("os._exit(7)", "the loop's process ended by itself (exit code 7) in on_configure"),
+        ("os._exit(7)", "the loop's process ended unexpectedly (exit code 7) in on_configure"),
         (
             "signal.signal(signal.SIGTERM, signal.SIG_IGN); time.sleep(60)",
             "the loop did not stop within 2 s in on_configure",

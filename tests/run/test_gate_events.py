@@ -35,5 +35,5 @@ def test_an_effort_that_presses_a_joint_against_its_limit_has_one_event_and_one_
         if event.code == EventCode.GATE and "out of the position limits" in event.text
     ]
     assert len(texts) == 2
-    assert texts[0] == "g, controller arm: led out of the position limits"
-    assert texts[1].startswith("g: led out of the position limits; this ended after ")
+    assert texts[0] == "g, controller arm: goal stopped: it leads out of the position limits"
+    assert texts[1].startswith("g: goal stopped: it leads out of the position limits; this ended after ")

@@ -117,7 +117,7 @@ def test_a_tripped_servo_is_rebooted_and_gets_torque_in_the_run(run):
     log = one.run()
     assert isinstance(one.answer(refused), Refusal)
     assert "dxlrun reboot elbow" in one.answer(refused).text  # type: ignore[union-attr]  # a refusal
-    assert one.answer(commanded).text == "elbow: commanded by arm; deactivate that first, or add --release"  # type: ignore[union-attr]  # a refusal
+    assert one.answer(commanded).text == "elbow is commanded by arm; deactivate arm first, or add --release"  # type: ignore[union-attr]  # a refusal
     assert [isinstance(one.answer(number), Done) for number in (reboot, on, switch)] == [True] * 3
     assert one.torque(log, 1)[-1] is Torque.ON
     assert Torque.REBOOTING in one.torque(log, 1)

@@ -151,7 +151,7 @@ def test_a_state_goes_from_run_to_run_and_a_replay_begins_with_it(robot, tmp_pat
     assert number(run(robot, kept, log)) == 3
     ((severity, text),) = said(log)
     assert severity == Severity.INFO
-    assert text == f"begins with the 20008 bytes that it kept before ({kept}/runs.kept)"
+    assert text == f"begins with the 20008 bytes of its kept state ({kept}/runs.kept)"
     (kept / "runs.kept").unlink()  # the replay has what it needs in the log
     report = replay_log(log)
     assert report.same, report
@@ -189,7 +189,7 @@ def test_another_servo_begins_anew_and_says_why(robot, tmp_path, change, why):
     kept, log = tmp_path / "kept", tmp_path / "run.mcap"
     run(robot, kept)
     assert number(run(robot, kept, log, **change)) == 0
-    assert said(log) == [(Severity.WARNING, f"begins anew: {why} ({kept}/runs.kept)")]
+    assert said(log) == [(Severity.WARNING, f"starts without its kept state: {why} ({kept}/runs.kept)")]
     assert number(run(robot, kept, **change)) == 1, "its own state has taken the place"
 
 
@@ -223,18 +223,18 @@ def damaged(data: bytes) -> dict[str, tuple[bytes, str]]:
     middle = len(data) // 2
     foreign = b"".join(file_pieces("another", b"state", {})[1])
     return {
-        "empty": (b"", "is no kept state of this version"),
-        "cut": (data[:-1], "is damaged or not whole"),
-        "half": (data[:middle], "is damaged or not whole"),
-        "torn": (data[:middle] + bytes(len(data) - middle), "is damaged or not whole"),
+        "empty": (b"", "is not a kept state of this version"),
+        "cut": (data[:-1], "is damaged or incomplete"),
+        "half": (data[:middle], "is damaged or incomplete"),
+        "torn": (data[:middle] + bytes(len(data) - middle), "is damaged or incomplete"),
         "one bit": (
             data[:middle] + bytes([data[middle] ^ 4]) + data[middle + 1 :],
-            "is damaged or not whole",
+            "is damaged or incomplete",
         ),
-        "longer": (data + b"x", "is damaged or not whole"),
+        "longer": (data + b"x", "is damaged or incomplete"),
         "too long": (bytes(LONGEST_FILE + 1), f"is longer than {LONGEST_FILE} bytes"),
-        "noise": (random.Random(1).randbytes(5000), "is no kept state of this version"),
-        "version": (data.replace(b"state 1", b"state 2"), "is no kept state of this version"),
+        "noise": (random.Random(1).randbytes(5000), "is not a kept state of this version"),
+        "version": (data.replace(b"state 1", b"state 2"), "is not a kept state of this version"),
         "foreign": (foreign, "is of another controller, another"),
     }
 
@@ -247,7 +247,7 @@ def test_a_file_that_cannot_be_used_is_left_out_with_one_event(robot, tmp_path, 
     data, why = damaged(place.read_bytes())[how]
     place.write_bytes(data)
     assert number(run(robot, kept, log)) == 0
-    assert said(log) == [(Severity.WARNING, f"begins anew: its file {why} ({place})")]
+    assert said(log) == [(Severity.WARNING, f"starts without its kept state: its file {why} ({place})")]
     assert opened_file(place.read_bytes(), "runs")[0].startswith(b"00000001"), "a good one takes its place"
 
 
@@ -257,7 +257,7 @@ def test_what_is_no_file_does_not_block_the_start(robot, tmp_path):
     os.mkfifo(kept / "runs.kept")
     assert number(run(robot, kept, log)) == 0
     ((_, text),) = said(log)
-    assert "its file is no regular file" in text
+    assert "its file is not a regular file" in text
 
 
 def test_a_full_disk_leaves_the_old_file_and_says_so(robot, tmp_path):

@@ -23,9 +23,9 @@ def test_a_run_begins_with_the_registers_of_the_robot_file(tmp_path):
     robot.run()
     log = read_log(path)
     assert [(one.source, one.text) for one in log.events if one.name == "register_written"] == [
-        ("elbow", "Return Delay Time (9) was 250 and is 0"),
-        ("elbow", "Temperature Limit (31) was 80 and is 70"),
-        ("elbow", "Position P Gain (84) was 800 and is 900"),
+        ("elbow", "Return Delay Time (9) was changed from 250 to 0"),
+        ("elbow", "Temperature Limit (31) was changed from 80 to 70"),
+        ("elbow", "Position P Gain (84) was changed from 800 to 900"),
     ]
     names = [one.name for one in log.events]
     assert names.index("register_written") < names.index("torque_on")

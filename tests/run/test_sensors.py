@@ -167,13 +167,13 @@ def test_a_sensor_that_dies_sends_nan_or_stops_and_comes_back(tmp_path, unit, mo
     assert time.monotonic() - began < source_process.END_S
     assert events[:5] == [
         "its process ended (signal SIGKILL), another one is started",
-        "is gone; its values are not valid",
-        "brings samples again",
+        "has failed; its values are not valid",
+        "delivers samples again",
         "angular_velocity.z is nan; its values are not used",
-        "brings samples again",
+        "delivers samples again",
     ]
     assert len(events) == 6
-    assert events[5].startswith("brought no sample for 1")
+    assert events[5].startswith("delivered no sample for 1")
 
 
 @pytest.mark.campaign
@@ -215,14 +215,14 @@ def test_a_sensor_that_dies_sends_nan_or_stops_costs_the_run_nothing_but_its_row
     nan = "sensor imu: angular_velocity.z is nan; its values are not used"
     expected = [
         (SensorEvent.SENSOR, ended),
-        (SensorEvent.SENSOR_LOST, "sensor imu is gone; its values are not valid"),
-        (SensorEvent.SENSOR_BACK, "sensor imu brings samples again"),
+        (SensorEvent.SENSOR_LOST, "sensor imu has failed; its values are not valid"),
+        (SensorEvent.SENSOR_BACK, "sensor imu delivers samples again"),
         (SensorEvent.SENSOR_LOST, nan),
-        (SensorEvent.SENSOR_BACK, "sensor imu brings samples again"),
+        (SensorEvent.SENSOR_BACK, "sensor imu delivers samples again"),
     ]
     assert found[:-1] == expected
     assert found[-1][0] == SensorEvent.SENSOR_LOST
-    assert found[-1][1].startswith("sensor imu brought no sample for 1")
+    assert found[-1][1].startswith("sensor imu delivered no sample for 1")
     cycles = log.cycles
     valid = cycles["source_valid"][:, 0]
     assert cycles["valid"].all()  # of the servos

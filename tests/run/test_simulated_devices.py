@@ -112,7 +112,7 @@ def test_boards_on_two_lines_are_told_apart(robot):
         ("boards/mine.toml", "boards/yours.toml", "boards/yours.toml of mine cannot be read: No such file"),
         ("toe: -3.5", "heel: -3.5", "mine has no state heel"),
         ("halt: 1}}", "halt: 1}, noise: {toe: -1}}", "the noise of toe is below 0; write a standard"),
-        ("toe: -3.5", "toe: heavy", "'heavy' is no value of a state; write a number, in SI units"),
+        ("toe: -3.5", "toe: heavy", "'heavy' is not a value of a state; write a number, in SI units"),
         ("protocol: 2.0, baud", "protocol: 1.0, baud", "my-board of mine speaks Protocol 2.0, bus main"),
     ],
 )

@@ -164,7 +164,7 @@ def test_set_points_beyond_the_limits_are_clamped_and_the_log_counts_the_cycles(
     assert log.cycles["goal_velocity"][-1, row] == speed < 10
     told = [event.text for event in log.events if event.code == EventCode.GATE]
     assert any(
-        "head_yaw_joint, controller head: lowered to the upper position limit" in text for text in told
+        "head_yaw_joint, controller head: goal lowered to the upper position limit" in text for text in told
     )
 
 

@@ -79,12 +79,12 @@ def test_a_sample_is_valid_until_its_timeout_and_its_age_is_true(desk):
     assert desk.cycle() == ([1.0, 2.0], True, 43 * MS)
     assert desk.told() == []
     assert desk.cycle() == ([1.0, 2.0], False, 63 * MS)
-    assert desk.told() == [(SensorEvent.SENSOR_LOST, "sensor imu brought no sample for 63 ms")]
+    assert desk.told() == [(SensorEvent.SENSOR_LOST, "sensor imu delivered no sample for 63 ms")]
     assert desk.cycle()[1:] == (False, 83 * MS)
     assert desk.told() == []
     desk.sample(3.0)
     assert desk.cycle(5) == ([3.0, 0.0], True, 5 * MS)
-    assert desk.told() == [(SensorEvent.SENSOR_BACK, "sensor imu brings samples again")]
+    assert desk.told() == [(SensorEvent.SENSOR_BACK, "sensor imu delivers samples again")]
     assert math.isnan(desk.record.sources.values[0])
 
 
@@ -94,7 +94,7 @@ def test_before_the_first_sample_there_is_nothing_and_the_silence_is_an_event(de
     assert (valid, age_ns) == (False, -1)
     for _ in range(3):
         desk.cycle()
-    assert desk.told() == [(SensorEvent.SENSOR_LOST, "sensor imu brought no sample since the start")]
+    assert desk.told() == [(SensorEvent.SENSOR_LOST, "sensor imu delivered no sample since the start")]
 
 
 def bring(desk: Desk, x: float, y: float, seconds: float) -> list[tuple[bool, int]]:
@@ -214,7 +214,7 @@ def test_a_time_in_the_future_is_now_and_hides_no_silence(desk):
     desk.sample(1.0, age_ms=-5000)
     assert desk.cycle(0) == ([1.0, 0.0], True, 0)
     assert desk.cycle(60) == ([1.0, 0.0], False, 60 * MS)
-    assert desk.told() == [(SensorEvent.SENSOR_LOST, "sensor imu brought no sample for 60 ms")]
+    assert desk.told() == [(SensorEvent.SENSOR_LOST, "sensor imu delivered no sample for 60 ms")]
 
 
 def test_reading_allocates_nothing_that_stays(desk):

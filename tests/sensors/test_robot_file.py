@@ -29,7 +29,7 @@ WRONG = {
         "11:60: sensors.imu.gyroscope.bias[0]: "
     ),
     "{type: simulated_imu, link: tip, rate: 10, timeout: 100 ms}": (
-        "11:60: imu brings a sample every 100 ms, and is to be lost after 100 ms without one"
+        "11:60: imu delivers a sample every 100 ms, and is to be lost after 100 ms without one"
     ),
     "{type: serial_imu, port: /dev/imu, scale: {angular_velocty: 0.0174533}}": (
         "11:50: sensors.imu.scale: no column is a state of angular_velocty; "
@@ -40,7 +40,7 @@ WRONG = {
         "11:52: sensors.imu.columns: no column is a state; name one at least"
     ),
     "{type: serial_imu, port: /dev/imu, columns: [age]}": (
-        "11:52: sensors.imu.columns: 'age' is no name of a state; write one such as angular_velocity.x"
+        "11:52: sensors.imu.columns: 'age' is not a name of a state; write one such as angular_velocity.x"
     ),
     "{type: serial_imu, port: /dev/imu, columns: [a, a]}": (
         "11:52: sensors.imu.columns: a is there twice; name each state once"

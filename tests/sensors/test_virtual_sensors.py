@@ -158,16 +158,19 @@ def test_a_sensor_that_stops_ends_the_run_where_it_shall_and_a_replay_too(
     events = [(event.name, event.text) for event in found.events if event.source == "imu"]
     assert events[0][0] == "sensor_lost"
     assert re.fullmatch(
-        r"sensor imu brought no sample for (8\d|90) ms", events[0][1]
+        r"sensor imu delivered no sample for (8\d|90) ms", events[0][1]
     )  # in the first such cycle
     ages, valid = found.cycles["source_age_ns"][:, 0], found.cycles["source_valid"][:, 0]
     assert (valid == (ages <= 80_000_000)).all()
     if on_lost == "continue":
-        assert (result.reason, events[1:]) == ("ended", [("sensor_back", "sensor imu brings samples again")])
+        assert (result.reason, events[1:]) == (
+            "ended",
+            [("sensor_back", "sensor imu delivers samples again")],
+        )
         assert valid[-1]
     else:
         assert (result.reason, len(events)) == ("fault", 1)
-        assert "sensor imu brought nothing for 80 ms; on_fault: " in result.detail
+        assert "sensor imu delivered nothing for 80 ms; on_fault: " in result.detail
         assert 80_000_000 < ages[-1] <= 90_000_000
         assert not robot.failures
     replayed = replay_log(log)
@@ -226,7 +229,7 @@ def test_a_sensor_that_never_brought_a_sample_ends_the_run_too(crane, monkeypatc
     monkeypatch.setattr(robot.drivers["imu"], "read", lambda values: None)
     result = robot.run()
     assert (result.reason, result.cycles) == ("fault", 10)  # the one at 90 ms is the last
-    assert "sensor imu brought nothing for 80 ms; on_fault: " in result.detail
+    assert "sensor imu delivered nothing for 80 ms; on_fault: " in result.detail
 
 
 def test_a_driver_that_raises_is_an_event_and_is_opened_again(crane, tmp_path, monkeypatch):
@@ -246,9 +249,9 @@ def test_a_driver_that_raises_is_an_event_and_is_opened_again(crane, tmp_path, m
     texts = [event.text for event in read_log(log).events if event.source == "imu"]
     assert texts == [
         "sensor imu: Input/output error",
-        "sensor imu is gone; its values are not valid",
+        "sensor imu has failed; its values are not valid",
         "sensor imu: is open again",
-        "sensor imu brings samples again",
+        "sensor imu delivers samples again",
     ]
     assert len(closed) == 2  # then, and at the end
 

@@ -259,7 +259,7 @@ def joints_begin_softly(sent: Sequence[Any], witness: Any, bus: BusPlan, log: Lo
 
 
 def nothing_for_released_joints(sent: Sequence[Any], bus: BusPlan, log: Log) -> None:
-    """From torque off to the next torque on: no goal of any kind and no torque; no current is no goal."""
+    """From torque off to the next torque on: no goal of any kind and no torque; no current is not a goal."""
     requests = storms.torque_requests(log)
     wire = [
         (t_ns, servo.joint, item)

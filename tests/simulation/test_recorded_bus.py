@@ -272,7 +272,7 @@ def test_the_command_serves_the_buses_of_the_log(run, monkeypatch, capsys):
 @pytest.mark.parametrize(
     ("words", "said"),
     [
-        (["robot.yaml"], "--recorded and a robot file exclude each other; leave one of them out"),
+        (["robot.yaml"], "--recorded and a robot file exclude each other; omit one of them"),
         (["--servo", "AX-12A:1", "--baud", "57600"], "--recorded and --servo and --baud exclude each other"),
         ([], "wrong.mcap"),
     ],

@@ -173,8 +173,12 @@ def test_a_device_is_chosen_by_its_path(plugged_in: Callable[..., list[Fake]]) -
     [
         (None, 0, "no gamepad can be read; gamepads and keyboards: none"),
         (None, 2, "several gamepads are there, choose one by --device; gamepads and keyboards:\n  /dev/in"),
-        ("/dev/input/event1", 1, "/dev/input/event1 is no gamepad or keyboard that can be read; gamepads"),
-        ("pad", 1, "pad is no gamepad or keyboard that can be read; gamepads and keyboards:\n  /dev/input/e"),
+        ("/dev/input/event1", 1, "/dev/input/event1 is not a gamepad or keyboard that can be read; gamepads"),
+        (
+            "pad",
+            1,
+            "pad is not a gamepad or keyboard that can be read; gamepads and keyboards:\n  /dev/input/e",
+        ),
     ],
 )
 def test_what_cannot_be_chosen_is_refused_with_what_there_is(

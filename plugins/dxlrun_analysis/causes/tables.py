@@ -81,6 +81,6 @@ def worst_title(one: WorstCycle) -> str:
     """Return the title of a cycle's table: number, time in the run, excess beyond the plan, and main
     causes."""
     causes = ", ".join(f"{share.name} {microseconds(share.us)}" for share in one.causes[:_MOST_NAMED])
-    skipped = f", {counted(one.skipped, 'period', 'periods')} skipped behind it" if one.skipped else ""
+    skipped = f", {counted(one.skipped, 'period', 'periods')} skipped after it" if one.skipped else ""
     beyond = f"{microseconds(one.excess_us)} beyond the plan{skipped}"
     return f"Cycle {one.cycle}, {one.seconds:.3f} s, {beyond}: {causes}"

@@ -119,7 +119,9 @@ def _check(logs: Sequence[Path], *, report: Path | None, worst: int) -> None:
         option = next(name for name, there in given.items() if there)
         raise InputError(f"{option} is for one log, and {len(logs)} are given; give it once for each")
     missing = [
-        f"there is no log {log}; a run prints at its end where its log is" for log in logs if not log.exists()
+        f"there is no log {log}; a run prints the path of its log when it ends"
+        for log in logs
+        if not log.exists()
     ]
     if missing:
         raise InputError("\n".join(missing))

@@ -123,7 +123,7 @@ def upload(directory: Path, store: str, /, *, as_json: JsonFlag = False, debug: 
     others = [
         f"{store} has another run named {name}; give each robot a prefix of its own" for name in result.others
     ]
-    written = [f"{name} was left out: a run is writing it" for name in result.written]
+    written = [f"{name} was skipped: a run is writing it" for name in result.written]
     if as_json:
         show_json(result._asdict(), code=1 if others else 0, errors=others, warnings=written)
         return 1 if others else 0

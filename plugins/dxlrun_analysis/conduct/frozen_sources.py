@@ -190,7 +190,7 @@ class FrozenSources:
             else:
                 for state, stay in still.items():
                     if stay.values >= _FEWEST_ALONE and stay.inside and lively > len(still):
-                        others = ", while its other values went on"
+                        others = ", while its other values changed"
                         yield replace(self._frozen(name, state, stay, others), rank=Rank.CAUSE)
 
     def _frozen(self, name: str, values: str, stay: _Stay, then: str = "") -> Finding:

@@ -77,7 +77,7 @@ def topics_without_table(reader: LogReader, has_table: Callable[[str], bool]) ->
         has_table: Predicate that is true if the table of a topic was written.
     """
     return {
-        name: WITHOUT_TABLE.get(name, "the log has no message of it")
+        name: WITHOUT_TABLE.get(name, "the log has no message of this topic")
         for name in sorted(reader.topics)
         if name in WITHOUT_TABLE or not has_table(name)
     }

@@ -134,7 +134,7 @@ def conditions(compare: str | None, policy: Policy | None) -> tuple[Condition, .
     for number, name in enumerate(names):
         if name not in known:
             raise InputError(
-                f"--compare: {name!r} is no condition; "
+                f"--compare: {name!r} is not a condition; "
                 f"{suggestion(name, known)}, and write them like other,round_robin,c"
             )
         if name in names[:number]:

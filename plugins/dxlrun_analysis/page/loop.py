@@ -98,7 +98,7 @@ def typical_plot(canvas: Canvas, steps: Sequence[Duration], period_us: float) ->
     plot.reference(period_us / 1e3, "height", ERROR)
     words = "; ".join(f"{name} {microseconds(sum(values))}" for name, values in bars[:2])
     plot.text = (
-        f"{words[0].upper()}{words[1:]}. The dashed line is the period, {period_us / 1e3:g} ms; what is left "
-        "of it is idle. The steps' 99 % and their longest need not come in the same cycle."
+        f"{words[0].upper()}{words[1:]}. The dashed line is the period, {period_us / 1e3:g} ms; the rest "
+        "is idle time. The steps' 99 % and their longest need not come in the same cycle."
     )
     return plot

@@ -245,7 +245,7 @@ def _read(file: Path, recording: _Recording) -> None:
                 )
             else:
                 raise InputError(
-                    f"{file}: neither MCAP nor sqlite3, so it is no recording that can be played"
+                    f"{file}: neither MCAP nor sqlite3; only recordings of these formats can be played"
                 )
     except OSError as error:
         raise InputError(f"{file}: cannot be read: {error.strerror or error}") from error

@@ -103,7 +103,7 @@ def parse_names(words: Sequence[str]) -> dict[str, str]:
     for word in words:
         recorded, sign, joint = word.partition("=")
         if not (recorded and sign):
-            mistakes.append(f"--map {word}: write RECORDED=JOINT, or RECORDED= to leave a joint out")
+            mistakes.append(f"--map {word}: write RECORDED=JOINT, or RECORDED= to omit a joint")
         elif recorded in names:
             mistakes.append(f"--map {recorded} is given twice; give it once")
         names[recorded] = joint
@@ -144,7 +144,7 @@ def motion_of(
     known = {name: names.get(name, name) for name in series}
     taken = [joint for joint in known.values() if joint]
     wrong += [
-        f"{path}: --map leads several recorded joints to {joint}; leave all but one out by RECORDED="
+        f"{path}: --map leads several recorded joints to {joint}; omit all but one by RECORDED="
         for joint in dict.fromkeys(taken)
         if taken.count(joint) > 1
     ]

@@ -112,7 +112,7 @@ def _check_joints(motion: RecordedMotion, joints: Mapping[str, JointPlan]) -> No
         raise InputError(
             "\n".join(
                 f"{motion.path}: the robot has no joint {name}; {suggestion(name, known)}; write "
-                f"--map {name}=JOINT, or --map {name}= to leave it out"
+                f"--map {name}=JOINT, or --map {name}= to omit it"
                 for name in missing
             )
         )

@@ -54,7 +54,7 @@ def read_motion(
     """
     stretch.check()
     if not path.exists():
-        raise InputError(f"there is no log {path}; a run prints at its end where its log is")
+        raise InputError(f"there is no log {path}; a run prints the path of its log when it ends")
     plan = None
     if is_foreign(path):
         series, remarks = foreign_series(path, what, topic)

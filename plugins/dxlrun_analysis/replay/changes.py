@@ -39,7 +39,7 @@ class Setting(msgspec.Struct, frozen=True):
             return cls(controller, tuple(parameter), yaml.safe_load(value))
         except yaml.YAMLError as error:
             raise InputError(
-                f"the value {value!r} of {place} is no YAML ({getattr(error, 'problem', None) or error}); "
+                f"the value {value!r} of {place} is not YAML ({getattr(error, 'problem', None) or error}); "
                 "write it as in the robot file"
             ) from error
 

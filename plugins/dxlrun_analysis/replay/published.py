@@ -136,7 +136,7 @@ def _where(
     try:
         then, here = (_leaves(codec.unpack(data), "") for data in (recorded, replayed))
     except ValueError:
-        return "", f"{len(recorded)} bytes that are no {now.type.name}", f"{len(replayed)} bytes"
+        return "", f"{len(recorded)} bytes that are not a {now.type.name}", f"{len(replayed)} bytes"
     for place, value in then.items():
         if place not in here:
             return place, value, "nothing"

@@ -27,8 +27,8 @@ from dxlrun.tooling.verbs import missing_extra
 from dxlrun_analysis.season.runs import SCHEMA, Folder, FoundLog, Progress, Row, kept_table, table_of
 
 _ROW, _LOG = ".run.json", ".mcap"
-UNFINISHED = "its upload has not ended; `dxlrun upload` of its robot goes on with it"
-DAMAGED = f"its row in the store (NAME{_ROW}) is damaged; `dxlrun upload` of its robot writes it anew"
+UNFINISHED = "its upload has not ended; `dxlrun upload` of its robot continues it"
+DAMAGED = f"its row in the store (NAME{_ROW}) is damaged; `dxlrun upload` of its robot writes it again"
 _AT_ONCE = 500
 """Rows that are requested together."""
 _OPTIONS: Mapping[str, Mapping[str, object]] = {

@@ -318,7 +318,8 @@ class Occasions:
         where = self._where(base + servo)
         silent = f", and {mine.broken_off} chains of which it is the first" if mine.broken_off else ""
         sentence = f"{named} lost {mine.lost} of {mine.asked} replies{silent}, in "
-        sentence += f"{counted(times, 'episode', 'episodes')}{where}; others of its bus answered meanwhile."
+        sentence += f"{counted(times, 'episode', 'episodes')}{where}; "
+        sentence += "other servos of its bus answered at these times."
         share = (mine.lost + mine.broken_off) / max(mine.asked + mine.broken_off, 1)
         return cause("lossy_servo", name, sentence, share=share)
 

@@ -107,7 +107,7 @@ class IlcController(JointTrajectoryController):
         if not isinstance(command, TrajectoryCommand):
             return data
         if command.splice:
-            raise ValueError("a motion that is learned begins by itself; take splice out")
+            raise ValueError("a learned motion cannot be spliced; remove splice")
         # Start time, timeout and tolerances are not part of the motion: `dxlrun play` sets a start time so
         # that the joints can move to the first point, and the key must not depend on it.
         motion = command.model_copy(update=dict.fromkeys(_NOT_LEARNED) | {"start_in": 0.0})

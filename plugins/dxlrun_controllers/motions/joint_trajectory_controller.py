@@ -111,7 +111,7 @@ class TrajectoryParameters(JointsParameters):
         if tracks and self.gains is None:
             yield (), f"{self.command_interface} needs gains; add `gains: {{p: ..., d: ...}}`"
         if self.gains is not None and not tracks:
-            yield ("gains",), "gains count only for velocity and effort; take them out"
+            yield ("gains",), "gains count only for velocity and effort; remove them"
 
 
 @unique

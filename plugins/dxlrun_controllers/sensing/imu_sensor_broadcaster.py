@@ -84,10 +84,10 @@ class ImuParameters(ParametersModel):
         yield from super().mistakes()
         if self.orientation != "madgwick" and (self.magnetometer is not None or self.rest is not None):
             key = "rest" if self.magnetometer is None else "magnetometer"
-            yield (key,), "magnetometer and rest are for orientation: madgwick; write that, or take them out"
+            yield (key,), "magnetometer and rest are for orientation: madgwick; write that, or remove them"
         if self.declination and self.magnetometer is None:
             what = "declination is the angle from the magnetometer's north"
-            yield ("declination",), f"{what}; name a magnetometer, or take it out"
+            yield ("declination",), f"{what}; name a magnetometer, or remove it"
 
 
 class ImuSensorBroadcaster(Controller[ImuParameters]):
@@ -236,7 +236,7 @@ class ImuSensorBroadcaster(Controller[ImuParameters]):
             return True
         if not (self._wrong or math.isnan(values[own])):  # age NaN: the first sample is still to come
             self._wrong = True
-            self.context.say(f"{self.parameters.sensor} measured NaN or infinity: such samples are left out")
+            self.context.say(f"{self.parameters.sensor} measured NaN or infinity: these samples are skipped")
         return False
 
 

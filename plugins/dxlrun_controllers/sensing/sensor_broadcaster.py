@@ -67,7 +67,7 @@ class SensorParameters(ParametersModel):
         """Yield unknown fields of the message, values of the wrong type, and invalid names of states."""
         yield from super().mistakes()
         if self.cells and self.message != "WrenchStamped":
-            yield ("cells",), f"cells make a WrenchStamped, not a {self.message}; take them out"
+            yield ("cells",), f"cells make a WrenchStamped, not a {self.message}; remove them"
         kinds = _numbers(self.message)
         for path, value in self.fields.items():
             if path not in kinds:
@@ -85,7 +85,7 @@ class SensorParameters(ParametersModel):
                         f"{name} is not a state; write OWNER/STATE, such as sonar/range",
                     )
             if self.cells and path in self.fields and path in _OF_CELLS:
-                yield ("fields", path), f"{path} follows from the cells; take it out of the fields"
+                yield ("fields", path), f"{path} follows from the cells; remove it from the fields"
 
     @property
     def weights(self) -> dict[str, dict[str, float]]:
@@ -178,7 +178,7 @@ class SensorBroadcaster(Controller[SensorParameters]):
         if not self._silent:
             self._silent = True
             old = max(ages) * 1e9 > self.parameters.timeout
-            what = f"are older than {self.parameters.timeout * 1e-9:g} s" if old else "are no finite numbers"
+            what = f"are older than {self.parameters.timeout * 1e-9:g} s" if old else "are not finite numbers"
             self.context.say(f"states {what}: nothing is published")
 
 

@@ -69,7 +69,7 @@ class SerialImuParameters(ParametersModel):
         if not states:
             raise ValueError("no column is a state; name one at least")
         if wrong := [state for state in states if not state or "/" in state or state == "age"]:
-            raise ValueError(f"{wrong[0]!r} is no name of a state; write one such as angular_velocity.x")
+            raise ValueError(f"{wrong[0]!r} is not a name of a state; write one such as angular_velocity.x")
         if twice := [state for state in states if states.count(state) > 1]:
             raise ValueError(f"{twice[0]} is there twice; name each state once")
         return columns

@@ -86,7 +86,7 @@ def calibrated(
             dialogue.say(f"{robot} is as it was.")
             return 1
         text.write()
-    dialogue.say(f"{robot} is written; the joints are limp. `dxlrun check {robot}` looks at all of it.")
+    dialogue.say(f"{robot} is written; the joints are limp. `dxlrun check {robot}` checks the whole file.")
     return 0
 
 
@@ -107,7 +107,7 @@ def _joints(result: Compiled, words: Sequence[str], dialogue: Dialogue) -> dict[
     names = chosen_names(words, tuple(every), result.plan.groups)
     left = {name: every[name] for name in names if every[name].drive.own}
     if others := ", ".join(name for name in names if name not in left):
-        dialogue.say(f"Left out, as several servos move them, is what is yours to measure: {others}")
+        dialogue.say(f"Not calibrated, because several servos move them; measure them yourself: {others}")
     if not left:
         raise InputError("no joint is left to be calibrated; choose one with a servo of its own")
     return left

@@ -144,17 +144,17 @@ def dead_band(
     if len(changes) < 2:
         why = "the joint did not follow its goal back by enough to see where it began to"
         return band, not_measured(REVERSAL, "rad", why, how)
-    return band, mean_of(REVERSAL, "rad", changes, 0.5 * tick, f"{len(changes)} reversals after such a rest")
+    return band, mean_of(REVERSAL, "rad", changes, 0.5 * tick, f"{len(changes)} reversals after these rests")
 
 
 def _parts(whole: float, registers: Mapping[str, int], unit: float) -> str:
     """Describe the parts of a dead band that the servo's margin and the position gain cause."""
     margins = [registers[name] * unit for name in MARGINS if name in registers]
     if not margins:
-        return "all of it by friction over the position gain: the model has no margin"
+        return "all by friction over the position gain: the model has no margin"
     margin = sum(margins) / len(margins)
     left = max(0.0, whole - margin)
     return (
-        f"{math.degrees(margin):.2f} deg of it by the compliance margin, "
+        f"{math.degrees(margin):.2f} deg by the compliance margin, "
         f"{math.degrees(left):.2f} deg by friction over the position gain"
     )

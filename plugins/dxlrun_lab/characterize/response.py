@@ -170,7 +170,7 @@ def _pooled(
     """
     value, count = ways[0](pools), len(pools)
     if math.isnan(value):
-        return not_measured(name, "s", "the positions scatter too much to tell it", how)
+        return not_measured(name, "s", "the positions scatter too much to measure it", how)
     without = np.array([ways[0]([*pools[:at], *pools[at + 1 :]]) for at in range(count)])
     error = math.sqrt((count - 1) / count * float(np.nansum((without - np.nanmean(without)) ** 2)))
     others = [abs(way(pools) - value) for way in ways[1:]]

@@ -104,7 +104,7 @@ def _of_log(log: Path, words: tuple[str, ...], chosen: Options, options: OnRobot
     from dxlrun_lab.identify.experiment import from_log
 
     if not log.exists():
-        raise InputError(f"there is no log {log}; a run prints at its end where its log is")
+        raise InputError(f"there is no log {log}; a run prints the path of its log when it ends")
     if (
         options.virtual
         or options.robot

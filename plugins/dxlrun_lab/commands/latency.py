@@ -228,7 +228,7 @@ def _log_place(log: Path | None, record: bool) -> Path | None:
     if log.suffix == ".mcap":
         check_target(log)
     elif log.exists() and not log.is_dir():
-        raise InputError(f"--log {log}: this is no directory, and a log's name ends in .mcap")
+        raise InputError(f"--log {log}: this is not a directory, and a log's name ends in .mcap")
     return log
 
 

@@ -94,7 +94,7 @@ class Chosen(NamedTuple):
         if assignments and file is None:
             raise InputError(
                 f"{assignments[0]} is an argument of a robot file, and there is none; "
-                "write ROBOT.yaml before it, or leave it out"
+                "write ROBOT.yaml before it, or omit it"
             )
         return cls(file, assignments, joints)
 
@@ -205,7 +205,7 @@ def _ended(ran: Ran[R], performed: Performed, course: Course) -> Ran[R]:
     """Print the problems of an outcome, and return it."""
     if ran.why:
         kept = len(performed.recorded) if course.ranges is not None else 0
-        left = f"; {counted(kept, 'piece', 'pieces')} of it measured before" if kept else ""
+        left = f"; {counted(kept, 'piece', 'pieces')} measured before that" if kept else ""
         print_error(f"{ran.robot}: {course.name} ended early: {ran.why}{left}")
     for problem in ran.problems:
         print_warning(f"{ran.robot}: {problem}")
@@ -218,7 +218,7 @@ def _plan_of(chosen: Chosen, ranges: Mapping[str, tuple[float, float]], options:
 
     if chosen.file is not None:
         if options.robot is not None:
-            raise InputError("--robot names a robot that runs, the robot file starts one; leave one out")
+            raise InputError("--robot names a robot that runs, the robot file starts one; omit one")
         plan = compiled(chosen.file, chosen.assignments, (), None).plan
         check_joints(chosen.joints, ranges, plan.loop.joints)
         return plan
@@ -317,10 +317,10 @@ def _confirmed(plan: Plan, options: OnRobot, aborting: Aborting) -> bool:
         return True
     if not sys.stdin.isatty():
         raise InputError(
-            f"{plan.robot} has real servos, and this is no terminal, which could ask before they move; "
+            f"{plan.robot} has real servos, and without a terminal nobody can confirm that they may move; "
             "nothing was moved; add --yes"
         )
-    sys.stderr.write("Keep clear of the robot, and have its power switch at hand. Go on? [y/N] ")
+    sys.stderr.write("Keep clear of the robot, and have its power switch at hand. Continue? [y/N] ")
     sys.stderr.flush()
     while aborting() is None:
         if select.select([sys.stdin], [], [], _LOOK_S)[0]:

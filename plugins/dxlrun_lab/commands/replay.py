@@ -54,16 +54,14 @@ def replay(
     """
     if played_on.on is not None:
         if settings:
-            raise InputError(
-                "--set belongs to the controllers of the log, which --on does not run; leave one out"
-            )
+            raise InputError("--set belongs to the controllers of the log, which --on does not run; omit one")
         if code:
-            raise InputError("--code belongs to a replay, which --on is none of; leave one out")
+            raise InputError("--code belongs to a replay, which --on is none of; omit one")
         chosen = Chosen(played_on.on, assignments, ())
         return play_recorded(log, chosen, played_on, part, as_json=as_json)
     _refuse_playing(played_on, part)
     if not log.exists():
-        raise InputError(f"there is no log {log}; a run prints at its end where its log is")
+        raise InputError(f"there is no log {log}; a run prints the path of its log when it ends")
     arguments = parse_assignments(assignments)
     import msgspec
 

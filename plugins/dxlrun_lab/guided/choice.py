@@ -149,7 +149,7 @@ def _taken(rig: Rig, names: Sequence[str], controllers: Sequence[RunningControll
     """Return the conflicts of an experiment with other commands of the run, one sentence each."""
     robot = rig.plan.robot
     if rig.paused:
-        return [f"{robot} is paused; let it go on first: dxlrun resume --robot {robot}"]
+        return [f"{robot} is paused; resume it first: dxlrun resume --robot {robot}"]
     if other := [one.name for one in controllers if one.name.startswith(f"{PLAYER}_")]:
         return [
             f"another experiment works on {robot} ({other[0]} is loaded); wait for its end; of one that "

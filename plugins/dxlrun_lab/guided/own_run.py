@@ -17,7 +17,7 @@ from dxlrun.tooling.live import SocketLink, sockets
 
 _CODE = """
 import ctypes, signal, sys
-ctypes.CDLL(None).prctl(1, signal.SIGTERM)  # PR_SET_PDEATHSIG: it ends in order with the experiment
+ctypes.CDLL(None).prctl(1, signal.SIGTERM)  # PR_SET_PDEATHSIG: it ends with the experiment
 from dxlrun.cli import main
 sys.exit(main())
 """

@@ -271,5 +271,5 @@ def require_whole(recording: RecordingPlan, robot: str) -> None:
     if recording.keep_ns is not None:
         raise InputError(
             f"{robot} deletes the oldest parts of its log, and an experiment takes what it measures from the "
-            "log; take `keep` out of its `recording`"
+            "log; remove `keep` from its `recording`"
         )

@@ -77,7 +77,7 @@ def excitation(
     if room.upper - room.lower < 2 * LEAST_RANGE:
         raise InputError(
             f"{math.degrees(room.upper - room.lower):.1f} deg are too small a range to identify a servo; "
-            f"{math.degrees(2 * LEAST_RANGE):g} deg or more tell its motor from its friction"
+            f"{math.degrees(2 * LEAST_RANGE):g} deg or more separate its motor from its friction"
         )
     random = np.random.default_rng(seed)
     counts = {name: round(share * seconds / period_s) for name, share in _SHARES.items()}

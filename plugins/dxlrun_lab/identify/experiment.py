@@ -82,7 +82,7 @@ class Identification(msgspec.Struct, frozen=True):
         for joint in situation.joints:
             mine = [part for part in recorded if joint.name in part.segment.rows]
             if not mine:
-                results.append(JointResult(joint.name, None, f"{joint.name}: nothing of it was recorded"))
+                results.append(JointResult(joint.name, None, f"{joint.name}: nothing was recorded"))
                 continue
             cycles = np.concatenate([part.cycles for part in mine])
             row = mine[0].columns[mine[0].joints.index(joint.name)]

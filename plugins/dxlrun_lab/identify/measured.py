@@ -147,7 +147,7 @@ def measured(cycles: NDArray[np.void], row: int, servo: Servo, *, voltage: float
         group = _compared(run, sent, chosen, servo.control(by_position=mode))
         groups += [group] if group is not None else []
     if not groups:
-        raise InputError(f"{name}: too few samples of it arrived in this log; look at `dxlrun analyze`")
+        raise InputError(f"{name}: too few samples arrived in this log; look at `dxlrun analyze`")
     return replace(run, groups=tuple(groups))
 
 
@@ -177,8 +177,8 @@ def _voltage(cycles: NDArray[np.void], row: int, given: float | None, name: str)
     known = np.flatnonzero(np.isfinite(read))
     if not len(known):
         raise InputError(
-            f"{name}: this log has no voltage of it, without which a duty is no torque; record it with the "
-            "default `slow_registers`, or give it: --voltage 12"
+            f"{name}: this log has no voltage of its servo, so the torque of a duty is unknown; record it "
+            "with the default `slow_registers`, or give the voltage: --voltage 12"
         )
     t = cycles["woken_ns"] * 1e-9
     t = t - t[0]

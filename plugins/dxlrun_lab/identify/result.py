@@ -311,7 +311,7 @@ def _notes(  # noqa: PLR0917  all that a sentence may be about
         if both and abs(covariance[i, j] / (spread[i] * spread[j])) > _CORRELATED:
             notes.append(f"{first} and {second} are hardly told apart in this run: their sum is known better")
     if run.lost_s > 0.05 * run.seconds:
-        notes.append(f"{run.lost_s:.1f} s of the run were left out: limp, lost, or in another mode")
+        notes.append(f"{run.lost_s:.1f} s of the run were skipped: limp, lost, or in another mode")
     if fit.held_out_rms > 1.5 * fit.position_rms:
         notes.append(
             f"the model is worse in what was held out ({fit.held_out_rms:.2g} rad) than in what was fitted "

@@ -69,7 +69,7 @@ def compiled_yardstick(settings: Settings) -> Iterator[str]:
     if not compiler:
         raise InputError(
             "the yardstick c is compiled on the spot, and there is no C compiler cc; install one (Debian, "
-            "Ubuntu: `sudo apt install gcc`), or leave c out of --compare"
+            "Ubuntu: `sudo apt install gcc`), or omit c of --compare"
         )
     with tempfile.TemporaryDirectory(prefix="dxlrun-latency-") as folder:
         target = Path(folder) / "yardstick"

@@ -97,7 +97,7 @@ class _SetupPlot(msgspec.Struct, frozen=True):
             f"{self.motion.joint} over the time since the motion began, s: {late}.",
             f"{late}. Red: from when a late cycle was due to when it began. Desired is where the joint "
             "should be by the clock; sent is the goal that was written last. The thesis has "
-            f"{tracked.thesis} of it.",
+            f"{tracked.thesis}.",
             7.4,
             self._fill,
         )

@@ -36,17 +36,20 @@ class Code(StrEnum):
         return member
 
     # the run
-    RUN_ENDING = "run_ending", "the run is at its end"
+    RUN_ENDING = "run_ending", "the run is ending"
     NO_CYCLE = "no_cycle", "the loop has run no cycle yet; ask again"
     NO_ANSWER = (
         "no_answer",
-        "the loop did not answer within {seconds:.1f} s; it may still do it",
+        "the loop did not answer within {seconds:.1f} s; the request may still be executed",
     )
     # controllers
     UNKNOWN_CONTROLLER = "unknown_controller", "there is no controller {controller}"
     NAMED_TWICE = "named_twice", "{controller} is named twice; name it once"
     NOT_ACTIVE = "not_active", "{controller} is not active; switch to it first"
-    NOT_ACTIVE_YET = "not_active_yet", "{controller} is not active yet: its joints change their modes"
+    NOT_ACTIVE_YET = (
+        "not_active_yet",
+        "{controller} is not active yet; wait until its joints have changed their modes",
+    )
     INACTIVE_ALREADY = "inactive_already", "{controller} is not active"
     ACTIVE_ALREADY = "active_already", "{controller} is active already"
     STILL_ACTIVE = "still_active", "{controller} is active; deactivate it first"
@@ -54,15 +57,18 @@ class Code(StrEnum):
     COMMANDED = "commanded", "{controller} is commanded by {upper}"
     NO_NEW_REFERENCES = (
         "no_new_references",
-        "{controller} exports references or provides states that the robot file does not have; write it "
-        "there and start anew",
+        "{controller} exports references or provides states, so it must be in the robot file; add it there "
+        "and start the run again",
     )
     MODE_NOT_ENTERED = "mode_not_entered", "{controller} is not activated: {problem}"
     SWITCHED_AGAIN = "switched_again", "another switch deactivated {controller} before it was active"
     CONTROLLER_FAULT = "controller_fault", "{problem}"
     NAME_TAKEN = "name_taken", "there is a controller {controller} already"
-    TOO_MANY_CONTROLLERS = "too_many_controllers", "there are {most} controllers, which is the most"
-    NOT_IN_PAUSE = "not_in_pause", "pause the loop first: it stands still meanwhile"
+    TOO_MANY_CONTROLLERS = (
+        "too_many_controllers",
+        "the run has {most} controllers already, and cannot have more; unload one",
+    )
+    NOT_IN_PAUSE = "not_in_pause", "the loop must be paused for this; pause it first"
     # goals and parameters
     UNKNOWN_TOPIC = "unknown_topic", "there is no topic {topic}; there are {topics}"
     UNKNOWN_GOAL = "unknown_goal", "there is no goal {goal}; the newest is {last}"
@@ -77,7 +83,7 @@ class Code(StrEnum):
     NOT_PAUSED = "not_paused", "the loop is not paused"
     RATE_OUT_OF_RANGE = (
         "rate_out_of_range",
-        "{rate:g} Hz is no rate of a loop; write {lowest:g} to {highest:.0f}",
+        "{rate:g} Hz is not a possible rate of the loop; write {lowest:g} to {highest:.0f} Hz",
     )
     RATE_OVER_BUSES = "rate_over_buses", "the buses allow at most {highest:.4g} Hz"
     RATE_UNDER_WATCHDOG = "rate_under_watchdog", "the Bus Watchdog needs at least {lowest:.4g} Hz"
@@ -87,11 +93,11 @@ class Code(StrEnum):
     )
     RATE_NOT_DIVIDED = (
         "rate_not_divided",
-        "{rate:g} Hz is no multiple of {controller_rate:g} Hz, the rate of controller {controller}",
+        "{rate:g} Hz is not a multiple of {controller_rate:g} Hz, the rate of controller {controller}",
     )
     RATE_BELOW_UPPER = (
         "rate_below_upper",
-        "at {rate:g} Hz {controller} would not be updated whenever {upper} is, which commands it",
+        "at {rate:g} Hz {upper} would command {controller} in cycles without an update of {controller}",
     )
     # joints
     UNKNOWN_JOINT = "unknown_joint", "there is no joint {joint}"
@@ -101,15 +107,15 @@ class Code(StrEnum):
     REGISTER_NOT_READ = "register_not_read", "{problem}"
     JOINT_COMMANDED = (
         "joint_commanded",
-        "{joint}: commanded by {controller}; deactivate that first, or add --release",
+        "{joint} is commanded by {controller}; deactivate {controller} first, or add --release",
     )
     JOINT_LIMP = "joint_limp", "{servo} is limp"
     JOINT_LOST = "joint_lost", "{servo} does not answer"
     HARDWARE_ERROR = "hardware_error", "{servo} has a hardware error, and gets no torque"
     STILL_MOVING = (
         "still_moving",
-        "no controller commands any more, but {joint} does not stand still after {seconds:.1f} s: "
-        "at most {velocity:.2g} rad/s",
+        "all controllers are deactivated, but after {seconds:.1f} s {joint} still moves at "
+        "{velocity:.2g} rad/s",
     )
     TORQUE_NOT_SWITCHED = "torque_not_switched", "{problem}"
     NOT_REBOOTED = "not_rebooted", "{problem}"
@@ -124,19 +130,22 @@ class Code(StrEnum):
         "{controller} computed for more than {seconds:g} s; send less at once",
     )
     # clients
-    NOT_ALLOWED = "not_allowed", "{client} may {role}, and this needs the role {needed}"
+    NOT_ALLOWED = "not_allowed", "{client} has the role {role}, but this needs the role {needed}"
     COMMANDED_BY = (
         "commanded_by",
-        "{commander} commands this robot, until it sends no command for {seconds:g} s; "
-        "`dxlrun take-over` does not wait",
+        "{commander} commands this robot; wait until it has sent no command for {seconds:g} s, or use "
+        "`dxlrun take-over`",
     )
     # requests
-    UNKNOWN_PAGE = "unknown_page", "{method} {path} is no request of this version"
+    UNKNOWN_PAGE = "unknown_page", "{method} {path} is not a request of this version of dxlrun"
     WRONG_METHOD = "wrong_method", "{path} takes no {method}"
     TOO_LONG = "too_long", "{size} bytes are too many, at most {most}; send less at once"
     BODY_TIMEOUT = "body_timeout", "the request did not arrive within {seconds:g} s"
-    TOO_OFTEN = "too_often", "more than {rate:g} a second, or too much in them; reduce the request rate"
-    QUEUE_FULL = "queue_full", "command queue full; reduce the request rate"
+    TOO_OFTEN = (
+        "too_often",
+        "more than {rate:g} requests a second, or too many bytes in them; reduce the request rate",
+    )
+    QUEUE_FULL = "queue_full", "the command queue is full; reduce the request rate"
     GATEWAY_FAILED = "gateway_failed", "the gateway failed: {problem}; --debug shows where"
 
 

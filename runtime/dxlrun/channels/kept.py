@@ -94,10 +94,10 @@ def opened_file(data: bytes, controller: str) -> tuple[bytes, Facts]:
     if len(data) > LONGEST_FILE:
         raise ValueError(f"is longer than {LONGEST_FILE} bytes")
     if not data.startswith(_MAGIC):
-        raise ValueError("is no kept state of this version")
+        raise ValueError("is not a kept state of this version")
     end = data.find(b"\n")
     if end < 0 or crc32(data[:-_CRC_BYTES]).to_bytes(_CRC_BYTES, "little") != data[-_CRC_BYTES:]:
-        raise ValueError("is damaged or not whole")
+        raise ValueError("is damaged or incomplete")
     try:
         line = msgspec.json.decode(data[len(_MAGIC) : end], type=_FirstLine)
     except (msgspec.MsgspecError, ValueError, RecursionError) as error:
@@ -106,7 +106,7 @@ def opened_file(data: bytes, controller: str) -> tuple[bytes, Facts]:
     if line.controller != controller:
         raise ValueError(f"is of another controller, {line.controller}")
     if len(state) != line.bytes or len(state) > MOST_KEPT:
-        raise ValueError("is not as long as it says")
+        raise ValueError("has another length than it declares")
     return state, line.made_with
 
 

@@ -103,7 +103,7 @@ def compiled(
         # Also refuses NaN.
         if not SHORTEST_S <= duration <= LONGEST_S:
             raise InputError(
-                f"--duration {duration:g} is no time to run; "
+                f"--duration {duration:g} is not a valid duration; "
                 f"give a number of seconds from {SHORTEST_S:g} to {LONGEST_S:g}"
             )
         duration_ns = round(duration * 1e9)

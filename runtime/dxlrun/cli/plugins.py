@@ -188,8 +188,8 @@ def _module(name: str) -> str:
     module = name.replace("-", "_")
     if not _NAME.fullmatch(name) or len(name) > _LONGEST_NAME:
         raise InputError(
-            f"{name[:80]!r} is no name of a package; write small letters and digits, a letter first, - or _ "
-            f"between them, at most {_LONGEST_NAME}: my_robotics"
+            f"{name[:80]!r} is not a name of a package; write small letters and digits, a letter first, - or "
+            f"_ between them, at most {_LONGEST_NAME}: my_robotics"
         )
     if keyword.iskeyword(module) or module in sys.stdlib_module_names or _known(module):
         raise InputError(f"{module} is a module that Python knows already; choose another name: my_{module}")
@@ -209,7 +209,7 @@ def _template() -> Path:
     for place in (package / "plugin_template", package.parents[1] / "plugins" / "example"):
         if place.is_dir():
             return place
-    raise DxlrunError("this installation of dxlrun has no template of a plug-in; install it anew")
+    raise DxlrunError("this installation of dxlrun has no template of a plug-in; install it again")
 
 
 def _files(template: Path, module: str) -> Iterator[tuple[Path, str]]:

@@ -107,7 +107,7 @@ def run(
         if not result.plan.simulated:
             raise InputError(
                 f"a ledger records what simulated buses saw, and {result.plan.robot} has none: give the "
-                "argument port:=sim, or leave out --ledger"
+                "argument port:=sim, or omit --ledger"
             )
         check_target(ledger)
     if listen is not None:
@@ -200,9 +200,7 @@ def _check_listen(text: str, plan: Plan, *, served: bool) -> None:
 
     address = Address.parse(text, plan.robot)
     if not (served and plan.gateway):
-        raise InputError(
-            "--listen needs the gateway of a run in real time: leave out --no-gateway, --virtual"
-        )
+        raise InputError("--listen needs the gateway of a run in real time: omit --no-gateway, --virtual")
     try:
         Listener.secured(address).close()
     except OSError as error:

@@ -56,7 +56,7 @@ def compile_buses(
         used = {servo.bus for servo in described_servos(file.description)}
         used.update(*(each.buses for each in contributions))
         if name not in used:
-            file.warning(mark, f"bus {name} has no joint", "it will not be opened; take it out")
+            file.warning(mark, f"bus {name} has no joint", "it will not be opened; remove it")
         wirings = [
             _wiring(servo, row, joints, modes)
             for row, servo in enumerate(servos)
@@ -269,7 +269,7 @@ def _watchdog_ticks(file: RobotFile, plan: BusPlan) -> int:
         return 0
     mark = file.at("buses", plan.name, "bus_watchdog")
     if plan.protocol != 2.0:
-        fix = "take it out; the guardian switches the torque off when the loop dies"
+        fix = "remove it; the guardian switches the torque off when the loop dies"
         file.error(mark, f"bus {plan.name} has Protocol 1.0, which has no Bus Watchdog", fix)
         return 0
     if written < least_ns:

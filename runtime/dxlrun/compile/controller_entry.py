@@ -32,7 +32,7 @@ _OFFERED = (
     "`dxlrun plugins` lists the types that there are"
 )
 _REMOVED = {
-    "joint_limiter": "take it out: the gate keeps all goals within `limits` of their joints",
+    "joint_limiter": "remove it: the gate keeps all goals within `limits` of their joints",
 }
 """Types of earlier versions, each with the fix."""
 Parameters = TypeVar("Parameters", bound=ParametersModel)

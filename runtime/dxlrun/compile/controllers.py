@@ -57,13 +57,13 @@ def read_controller_files(file: RobotFile) -> dict[str, str]:
         mark, name = file.at("controllers", controller, "type"), file_of(entry.type)
         path = folder / (name or "")
         if name is None or path.resolve().parent != folder.resolve():
-            what = f"{entry.type} of {controller} is no class of a file beside the robot file"
+            what = f"{entry.type} of {controller} is not a class of a file next to the robot file"
             file.error(mark, what, "write ./wave.py:Wave for the class Wave of wave.py in the same folder")
             continue
         try:
             texts[name] = read_file(path).decode("utf-8")
         except (OSError, UnicodeDecodeError) as error:
-            why = error.strerror if isinstance(error, OSError) else "it is no UTF-8"
+            why = error.strerror if isinstance(error, OSError) else "it is not UTF-8"
             what = f"{name} of controller {controller} cannot be read ({why})"
             file.error(mark, what, f"its place is {path}")
     return texts
@@ -94,7 +94,7 @@ def compile_controllers(
         file.error(
             file.key("controllers"),
             f"the file has {len(file.robot.controllers)} controllers, the most are {MOST_CONTROLLERS}",
-            "take some out",
+            "remove some",
         )
     return compiled
 
@@ -298,7 +298,7 @@ def compile_modes(
             file.error(
                 file.at("joints", name, "continuous"),
                 f"{joint.table.model} of {name} {LACKS[joint.plan.rest]}, so {name} cannot be continuous",
-                "take `continuous` out, or use another model",
+                "remove `continuous`, or use another model",
             )
     for name, controller in controllers.items():
         _check(file, name, controller, joints, able)
@@ -362,10 +362,10 @@ def _check(
             within_a_turn = model_modes(joints[joint].table, continuous=False)
             if mode is Mode.EFFORT_POSITION and mode in within_a_turn:
                 lacks = f"{joint} is continuous, for which it is not offered"
-                known = f"take `continuous` out, or {known}"
+                known = f"remove `continuous`, or {known}"
             elif mode is Mode.EFFORT_POSITION and (key := controller.asked_by.get("effort")):
                 mark = file.key("controllers", name, *key)
-                known = f"take {key[-1]} out, or use a model that has it"
+                known = f"remove {key[-1]}, or use a model that has it"
             file.error(mark, f"{name} commands {_INTERFACE[mode]}, but {lacks}", known)
         elif mode is Mode.VELOCITY and not controls_speed(joints[joint].table):
             file.warning(

@@ -117,12 +117,12 @@ class ControllerGraph:
                 "keep it in the controller",
             )
         if owner == plan.name and joint:
-            return "its own reference, which it has without", "take it out"
+            return "its own reference, which it has without", "remove it"
         commanded = name in plan.command and joint in plan.joints
         if commanded and owner in [lower.name for lower in self._exporters(plan, joint)]:
             return (
                 "which it commands itself: it gets its value of the cycle before",
-                f"read the state, {joint}/{name}, or take it out",
+                f"read the state, {joint}/{name}, or remove it",
             )
         return None
 
@@ -233,7 +233,7 @@ class ControllerGraph:
                 )
             elif target not in self._named:
                 known = tuple(one.name for one in self.controllers if one.reference and one.name != name)
-                what = f"{name} is into {target}, which is no controller of the robot"
+                what = f"{name} is into {target}, which is not a controller of the robot"
                 yield Mistake(at, what, suggestion(target, known or tuple(self._named)))
             elif target in plan.into[:index]:
                 yield Mistake(at, f"{name} is into {target} twice", "name it once")
@@ -245,7 +245,7 @@ class ControllerGraph:
             return
         if not plan.command:
             what = f"{name} is into {_listed(plan.into)}, but commands nothing"
-            yield Mistake((*_path(name), "into"), what, "take `into` out, or use a controller that commands")
+            yield Mistake((*_path(name), "into"), what, "remove `into`, or use a controller that commands")
             return
         mute = [
             one for one in lowers if not (one.reference and one.joints) and one.name not in self._incomplete
@@ -278,7 +278,7 @@ class ControllerGraph:
             exported = dict.fromkeys(joint for one in lowers for joint in one.joints)
             what = f"{name} commands {_names(missing)}, which {_listed(one.name for one in lowers)} "
             what += "does not export" if len(lowers) == 1 else "do not export"
-            fix = f"take {_it(missing)} out; exported: {_listed(exported)}"
+            fix = f"remove {_it(missing)}; exported: {_listed(exported)}"
             yield Mistake(_joint(name, missing[0][0]), what, fix)
         for lower, joints in partial.items():
             exported_interfaces = self._named[lower].reference
@@ -291,12 +291,12 @@ class ControllerGraph:
         for pair, joints in double.items():
             what = f"{_names(joints)} of {name} is exported by {' and '.join(pair)}"
             yield Mistake(
-                _joint(name, joints[0][0]), what, "let one of them export it, or take one out of `into`"
+                _joint(name, joints[0][0]), what, "let one of them export it, or remove one from `into`"
             )
         idle_ones = [one for one in lowers if one.name not in used and not missing]
         for idle in idle_ones:
             what = f"{name} is into {idle.name}, which exports none of its joints"
-            yield Mistake(self._at_into(plan, idle), what, f"take {idle.name} out of `into`")
+            yield Mistake(self._at_into(plan, idle), what, f"remove {idle.name} from `into`")
 
     def _activity(self, plan: ControllerPlan) -> Iterator[Mistake]:
         """Check that a controller that is active from the start commands only active controllers."""
@@ -319,7 +319,7 @@ class ControllerGraph:
                 yield Mistake(
                     (*_path(plan.name), key),
                     what,
-                    f"give {plan.name} the rate of {lower.name} or a whole fraction of it"
+                    f"give {plan.name} the rate of {lower.name} or a whole fraction of that rate"
                     + (f": {lower.rate:g}" if lower.rate is not None else ""),
                 )
 
@@ -333,7 +333,7 @@ class ControllerGraph:
                 missing.setdefault(source, []).append(index)
         for source, indices in missing.items():
             interface = plan.reads[indices[0]]
-            more = f" and {len(indices) - 1} more of it" if indices[1:] else ""
+            more = f" and {len(indices) - 1} more of this source" if indices[1:] else ""
             what, fix = self._unreadable(interface, source, interface.rpartition("/")[2])
             at = (*_path(plan.name), "reads", indices[0])
             yield Mistake(at, f"{plan.name} reads {interface}{more}, but {what}", fix)
@@ -344,7 +344,7 @@ class ControllerGraph:
         plan = self._named.get(owner)
         if interface.count("/") not in {1, 2} or "" in interface.split("/"):
             return (
-                "that is no interface",
+                "that is not an interface",
                 "write JOINT/position, or CONTROLLER/JOINT/position for a reference",
             )
         if source in self._readable:
@@ -363,7 +363,7 @@ class ControllerGraph:
         known = [f"{one.name}/{command}" for one in self.sources for command in one.commands]
         for index, name in enumerate(plan.source_commands):
             if name not in known and name.partition("/")[0] not in self._incomplete:
-                what = f"{plan.name} commands {name}, which is no command of a device"
+                what = f"{plan.name} commands {name}, which is not a command of a device"
                 fix = suggestion(name, known) if known else "name it under `commands` of the device"
                 yield Mistake((*_path(plan.name), "source_commands", index), what, fix)
 
@@ -382,7 +382,7 @@ class ControllerGraph:
         known = [self._named[name] for name in names if name in self._named and name not in self._incomplete]
         if found := conflicts_text(conflicts(known)):
             what = f"{plan.name} activates what cannot be active together: {found}"
-            yield Mistake((*_path(plan.name), "takeovers", 0), what, "take one of them out")
+            yield Mistake((*_path(plan.name), "takeovers", 0), what, "remove one of them")
 
     def _needed_together(self, plan: ControllerPlan) -> Iterator[Mistake]:
         """Check that the controllers below a controller can be active together."""
@@ -392,7 +392,7 @@ class ControllerGraph:
         for (holder, other), clashes in found.items():
             what = f"{plan.name} needs {self._way(plan, holder)} and {self._way(plan, other)} together, "
             what += f"and both command {_claimed(clashes)}"
-            fix = "take these joints out of one of the two, or let one end in the other"
+            fix = "remove these joints from one of the two, or let one end in the other"
             yield Mistake((*_path(plan.name), "into"), what, fix)
 
     def _clashes_below(self, plan: ControllerPlan) -> dict[tuple[str, str], list[Conflict]]:
@@ -427,7 +427,7 @@ class ControllerGraph:
             what = f"controllers command each other in a circle: {drawn(circle)}"
             if not all(after in self._named[one].into for one, after in following.items()):
                 what = f"controllers wait for each other, by `into` and by `reads`: {drawn(circle)}"
-            yield Mistake(at, what, "take one of these steps out")
+            yield Mistake(at, what, "remove one of these steps")
 
     def _active_claims(self) -> Iterator[Mistake]:
         """Check that controllers that are active from the start claim each servo and reference only once."""
@@ -443,7 +443,7 @@ class ControllerGraph:
                 what += f" (chain{'s' * (len(ways) > 1)} {' and '.join(ways)})"
             joints = [joint for joint in dict.fromkeys(clash.joint for clash in clashes) if joint]
             of = f"joint{'s' * (len(joints) > 1)}" if joints else "device"
-            fix = f"write active: false in one of the two, or take the {of} out"
+            fix = f"write active: false in one of the two, or remove the {of}"
             at = self._named[other].joints.index(joints[0]) if joints else None
             yield Mistake(_path(other) if at is None else _joint(other, at), what, fix)
 
@@ -463,10 +463,10 @@ class ControllerGraph:
             return
         other = self._named.get(plan.fallback)
         if other is None:
-            what = f"the fallback {plan.fallback} of {name} is no controller of the robot"
+            what = f"the fallback {plan.fallback} of {name} is not a controller of the robot"
             yield Mistake(at, what, suggestion(plan.fallback, tuple(self._named)))
         elif other is plan:
-            yield Mistake(at, f"{name} is its own fallback", "name another controller, or take it out")
+            yield Mistake(at, f"{name} is its own fallback", "name another controller, or remove it")
         elif name in below(self.controllers, other.name):
             what = f"the fallback {other.name} of {name} commands {name} ({self._way(other, name)})"
             yield Mistake(at, f"{what}, which has failed then", "name a controller that is not above it")
@@ -493,7 +493,7 @@ class ControllerGraph:
         for holder, other in dict.fromkeys((one.holder, one.other) for one in clashes):
             through = "" if other == fallback.name else f" through {other}"
             what = f"fallback {fallback.name} of {plan.name} claims joints of {holder}{through}"
-            fix = "take these joints out of it, or name another controller"
+            fix = "remove these joints from it, or name another controller"
             yield Mistake(at, f"{what}, which stays active", fix)
 
     # Words

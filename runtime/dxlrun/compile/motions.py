@@ -131,7 +131,7 @@ def check_times(parts: Sequence[MotionPart], duration_ns: int | None, problems: 
                 part.mark,
                 f"the motion of {part.controller} ends at {_seconds(part.motion_end_ns)}, but the run ends "
                 f"at {_seconds(duration_ns)}",
-                "leave out --duration",
+                "omit --duration",
             )
 
 
@@ -443,7 +443,7 @@ def group_command(
                 raise refusal(
                     target.mark,
                     f"{joint} has a target {quantity}, which this controller does not take",
-                    f"take the {quantity} out, or choose another controller",
+                    f"remove the {quantity}, or choose another controller",
                 )
     return {
         _FIELDS[quantity]: [_value(sample, joint, quantity) for joint in joints] for quantity in quantities

@@ -60,7 +60,7 @@ def _check_frame(
     frame, source = _text(controller, "frame"), controller.plan.reads[0].partition("/")[0]
     mark = file.at("controllers", name, "frame")
     if frame not in urdf.links:
-        what = f"the messages of {name} have the frame {frame}, which is no link of the URDF"
+        what = f"the messages of {name} have the frame {frame}, which is not a link of the URDF"
         file.warning(mark, what, suggestion(frame, urdf.links))
     elif links.get(source) in urdf.links:
         mounting = getattr(controller.parameters, "mounting", (0.0, 0.0, 0.0))
@@ -90,8 +90,8 @@ def _turn(urdf: Urdf, link: str, other: str, expected: Quaternion = NO_TURN) -> 
     angle = 2 * math.acos(min(1.0, abs(product(conjugate(expected), found)[3])))
     if angle <= _ALIKE_RAD:
         return ""
-    beside = " and its mounting" * (expected != NO_TURN)
-    return f"which is turned by {math.degrees(angle):.0f} deg against it{beside}"
+    mounting = " and its mounting" * (expected != NO_TURN)
+    return f"which is turned by {math.degrees(angle):.0f} deg against it{mounting}"
 
 
 def _fixed(urdf: Urdf, link: str) -> tuple[str, Transform]:

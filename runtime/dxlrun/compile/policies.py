@@ -140,7 +140,7 @@ def _check_torque(file: RobotFile, name: str, steps: WrittenPolicy, buses: Seque
             file.error(
                 file.key("policies", name, index, "reduce_torque"),
                 f"{name} reduces torque, but the {servo.model} of {servo.joint} has no torque limit in RAM",
-                "take reduce_torque out",
+                "remove reduce_torque",
             )
 
 

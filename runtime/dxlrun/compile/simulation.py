@@ -118,7 +118,7 @@ def _check_load(file: RobotFile, name: str, joint: CompiledJoint, motor: MotorDe
         file.warning(
             file.at("joints", name, "simulation", "gravity_angle"),
             f"gravity_angle is where the weight of {name} hangs down, but it has none",
-            "give its weight as `gravity: ... Nm`, or take gravity_angle out",
+            "give its weight as `gravity: ... Nm`, or remove gravity_angle",
         )
     stall, unit = _stall(joint), joint.plan.unit
     models = ", ".join(dict.fromkeys(servo.table.model for servo in joint.servos))
@@ -140,7 +140,7 @@ def _check_load(file: RobotFile, name: str, joint: CompiledJoint, motor: MotorDe
                 file.warning(
                     file.at("joints", name, "simulation", key),
                     f"with physics: mujoco the URDF defines the {key} of {name}",
-                    f"take {key} out; it counts only for joints that the URDF does not turn",
+                    f"remove {key}; it counts only for joints that the URDF does not turn",
                 )
 
 
@@ -158,13 +158,13 @@ def _check_buses(file: RobotFile) -> None:
             file.warning(
                 file.at("buses", name, "simulation", "absent"),
                 f"absent: slot is for servos of Protocol 2.0, bus {name} speaks Protocol 1.0",
-                "take it out",
+                "remove it",
             )
         if bus.simulation.echo and bus.port == SIMULATED:
             file.warning(
                 file.at("buses", name, "simulation", "echo"),
                 f"dxlrun does not run on an adapter that echoes, as bus {name} then does",
-                "echo is for other programs, through `dxlrun sim`; take it out",
+                "echo is for other programs, through `dxlrun sim`; remove it",
             )
 
 

@@ -253,7 +253,7 @@ def _take_nothing_over(controllers: Sequence[str], why: str) -> None:
 
 
 def _end_nothing(why: str) -> None:
-    raise ControllerFault("requested the end of what is no run")
+    raise ControllerFault("requested the end of the run outside of a run")
 
 
 def _keep_nothing(state: bytes) -> None:

@@ -35,10 +35,10 @@ _WHAT = {
     Clamp.UPPER: "lowered to the upper position limit",
     Clamp.STEP: "held to the step or acceleration limit",
     Clamp.VELOCITY: "held to the velocity limit",
-    Clamp.NOT_FINITE: "was not finite, the last goal is kept",
+    Clamp.NOT_FINITE: "not finite; the last goal is kept",
     Clamp.EFFORT: "held to the effort limit",
     Clamp.PWM: "held to the full voltage",
-    Clamp.OUTWARD: "led out of the position limits",
+    Clamp.OUTWARD: "stopped: it leads out of the position limits",
 }
 _LIMITED: Mapping[Clamp, LimitedInterface] = {
     Clamp.VELOCITY: "velocity",

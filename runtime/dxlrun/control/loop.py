@@ -172,7 +172,7 @@ class Loop:
                 return "fault", self._actions.ending[1]
             self._one()
             if self._next():
-                return "fault", f"cycle {self.record.cycle} ended after the next deadline; overrun: stop"
+                return "fault", texts.overrun_ends_run(self.record.cycle)
         return "fault", self.manager.switching.fault
 
     def _one(self) -> None:
@@ -235,8 +235,7 @@ class Loop:
             except PortError:
                 raise
             except (Exception, SystemExit) as error:  # foreign code: the run ends by the steps of its policy
-                kind, what = type(monitor), f"raised {type(error).__name__}: {error}"
-                self._actions.end_run("on_fault", f"the monitor {kind.__name__} of {kind.__module__} {what}")
+                self._actions.end_run("on_fault", texts.monitor_failed(type(monitor), error))
         commands = steering.inbox.take()
         if commands or steering.paused_until_ns or steering.halt.waiting or manager.streams:
             record.command_count = steering.execute_commands(commands)
@@ -342,13 +341,13 @@ class Overruns:
             except BaseException as error:  # foreign code must not end the loop
                 if is_interrupt(error):
                     raise
-                self._dismiss(hook, f"raised {type(error).__name__}: {error}")
+                self._dismiss(hook, texts.raised(error))
                 continue
             if answer is None:
                 continue
             if isinstance(answer, str) and answer in get_args(OverrunPolicy):
                 return cast("OverrunPolicy", answer)
-            self._dismiss(hook, f"returned {answer!r}, which is none of {', '.join(get_args(OverrunPolicy))}")
+            self._dismiss(hook, texts.wrong_overrun_policy(answer, get_args(OverrunPolicy)))
         return self._policy
 
     def _dismiss(self, hook: OverrunHook, why: str) -> None:

@@ -222,7 +222,7 @@ def _stay_on(cores: Sequence[int]) -> str:
         found, missing = sorted(before), list(cores)
     else:
         found = sorted(os.sched_getaffinity(0))
-        missing, fix = sorted(set(cores) - set(found)), "take it out of loop.scheduler.cores"
+        missing, fix = sorted(set(cores) - set(found)), "remove it from loop.scheduler.cores"
     if missing:
         raise _Refused(
             f"there is no core {_listed(missing)} for this process, it runs on {_listed(found)}", fix

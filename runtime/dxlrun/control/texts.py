@@ -38,13 +38,13 @@ def cycle_overran(cycle: int, late_ns: int, skipped: int, catches_up: bool) -> s
     return (
         f"cycle {cycle} ended {late_ns / 1e6:.3f} ms after its deadline; "
         f"{counted(skipped, 'period', 'periods')} skipped"
-        f"{', the next one follows at once' if catches_up else ''}"
+        f"{', the next cycle follows at once' if catches_up else ''}"
     )
 
 
 @event_text(EventCode.OVERRUN, Severity.ERROR)
 def overrun_hook_dismissed(problem: str) -> str:
-    return f"dxlrun_overrun {problem}; it is not asked again in this run"
+    return f"the hook dxlrun_overrun {problem}; it is not called again in this run"
 
 
 @event_text(EventCode.SCHEDULER, Severity.INFO)
@@ -125,7 +125,7 @@ def command_refused(kind: str, origin: str, refusal: str) -> str:
 
 @event_text(EventCode.COMMAND_REFUSED, Severity.WARNING)
 def takeover_refused(controllers: str, refusal: str, because: str) -> str:
-    return f"takeover by {controllers} refused: {refusal} (requested because of {because})"
+    return f"takeover by {controllers} refused: {refusal} (reason of the request: {because})"
 
 
 @event_text(EventCode.COMMAND_REFUSED, Severity.WARNING)
@@ -143,12 +143,12 @@ def fallback_refused(controller: str, refusal: str) -> str:
 
 @event_text(EventCode.CONTROLLER_LOADED, Severity.INFO)
 def controller_loaded(duration_ns: int) -> str:
-    return f"loaded in {duration_ns / 1e6:.1f} ms, while the loop stood still"
+    return f"loaded in {duration_ns / 1e6:.1f} ms, with the loop paused"
 
 
 @event_text(EventCode.CONTROLLER_LOADED, Severity.INFO)
 def controller_unloaded(duration_ns: int) -> str:
-    return f"unloaded in {duration_ns / 1e6:.1f} ms, while the loop stood still"
+    return f"unloaded in {duration_ns / 1e6:.1f} ms, with the loop paused"
 
 
 @event_text(EventCode.CONTROLLER_ACTIVATED, Severity.INFO)
@@ -190,12 +190,12 @@ def controllers_take_over(names: Sequence[str], replaced: Sequence[str], because
 
 @event_text(EventCode.KEPT, Severity.INFO)
 def kept_state_used(size: int, file: str) -> str:
-    return f"begins with the {size} bytes that it kept before ({file})"
+    return f"starts with the {size} bytes of its kept state ({file})"
 
 
 @event_text(EventCode.KEPT, Severity.WARNING)
 def kept_state_unusable(problem: str, file: str) -> str:
-    return f"begins anew: {problem} ({file})"
+    return f"starts without its kept state: {problem} ({file})"
 
 
 # Goals
@@ -221,17 +221,17 @@ def goal_failed(goal: int, outcome: str, reason: str) -> str:
 
 @event_text(EventCode.GATE, Severity.WARNING)
 def goal_clamped(joint: str, controller: str, clamp: str) -> str:
-    return f"{joint}{f', {controller}' if controller else ''}: {clamp}"
+    return f"{joint}{f', {controller}' if controller else ''}: goal {clamp}"
 
 
 @event_text(EventCode.GATE, Severity.INFO)
 def clamp_ended(joint: str, clamp: str, lasted_ns: int) -> str:
-    return f"{joint}: {clamp}; this ended after {lasted_ns * 1e-9:.1f} s"
+    return f"{joint}: goal {clamp}; this ended after {lasted_ns * 1e-9:.1f} s"
 
 
 @event_text(EventCode.GATE, Severity.WARNING)
 def source_command_clamped(source: str, command: str, value: float, lowest: float, highest: float) -> str:
-    return f"{source}: {command} was commanded {value:.6g}, held to {lowest:.6g}..{highest:.6g}"
+    return f"{source}: {command} = {value:.6g} is held to its range {lowest:.6g}..{highest:.6g}"
 
 
 @event_text(EventCode.SERVO_LIMITS, Severity.INFO)
@@ -247,3 +247,26 @@ def servo_limits_tighter_than_file(joint: str, limits: str) -> str:
 @event_text(EventCode.SERVO_LIMITS, Severity.INFO)
 def servo_limits_gone(joint: str) -> str:
     return f"{joint}: registers of its servo no longer limit goals"
+
+
+# Reasons: the end of a run, and of a hook
+
+
+def overrun_ends_run(cycle: int) -> str:
+    return f"cycle {cycle} ended after the next deadline, and the robot file has `overrun: stop`"
+
+
+def monitor_failed(monitor: type, error: BaseException) -> str:
+    return f"the monitor {monitor.__name__} of {monitor.__module__} {raised(error)}"
+
+
+def raised(error: BaseException) -> str:
+    return f"raised {type(error).__name__}: {error}"
+
+
+def wrong_overrun_policy(answer: object, known: Sequence[str]) -> str:
+    return f"returned {answer!r}, not one of {', '.join(known)}"
+
+
+def run_ended_by(controller: str, because: str) -> str:
+    return f"controller {controller} ended the run: {because}"

@@ -74,7 +74,7 @@ class Arguments:
     def _declare(self, name: str, entry: object) -> None:
         path = ("arguments", name)
         if not _NAME.fullmatch(name):
-            self._problem(path, f"{name!r} is no name of an argument", "use letters, digits and _")
+            self._problem(path, f"{name!r} is not a name of an argument", "use letters, digits and _")
         try:
             default = Argument.model_validate(entry).default
         except ValidationError as error:
@@ -92,7 +92,7 @@ class Arguments:
             self._problem(
                 path,
                 f"the argument {name} has no value",
-                f"write {name}:=... behind the robot file, or give it a default",
+                f"write {name}:=... after the robot file, or give it a default",
             )
 
     def _problem(self, path: KeyPath, what: str, fix: str) -> None:
@@ -139,5 +139,5 @@ def _unusable(what: str, fix: str) -> Filled:
 
 def _suggestion(name: str, known: Sequence[str]) -> str:
     if not known:
-        return "take it out, or declare it: arguments: {NAME: {default: ..., help: ...}}"
+        return "remove it, or declare it: arguments: {NAME: {default: ..., help: ...}}"
     return suggestion(name, known, f"the arguments are {', '.join(known)}")

@@ -170,11 +170,11 @@ def _decoded(data: bytes, file: str, language: str) -> str:
         text = data.decode("utf-8-sig")
     except UnicodeDecodeError as error:
         before = error.object[: error.start].decode("utf-8")
-        what = f"the byte 0x{error.object[error.start]:02x} is no UTF-8"
+        what = f"the byte 0x{error.object[error.start]:02x} is not UTF-8"
         raise refusal(_mark_at(before, len(before), file), what, "save the file as UTF-8") from None
     if found := Reader.NON_PRINTABLE.search(text):
         what = f"the character U+{ord(found[0]):04X} cannot stand in {language}"
-        raise refusal(_mark_at(text, found.start(), file), what, "take it out")
+        raise refusal(_mark_at(text, found.start(), file), what, "remove it")
     return text
 
 
@@ -270,7 +270,7 @@ _WORDS = (
         "there is a ':' where none can be",
         "indent the keys of a mapping alike, and put a text with ': ' in quotes",
     ),
-    ("unexpected ':'", "a ':' stands where none can be", "write `key: value` with a space behind the ':'"),
+    ("unexpected ':'", "a ':' stands where none can be", "write `key: value` with a space after the ':'"),
     ("entries are not allowed", "a list cannot start here", "start it on a new line, or write [a, b]"),
     ("unexpected end of stream", "a quote is opened here and never closed", "close it"),
     ("expected ',' or", "a comma is missing before this, in the brackets{since}", "add it"),
@@ -351,7 +351,7 @@ class _Grower:
         if not self._merge_keys:
             return self._problems
         more = len(self._merge_keys) - 1
-        what = f"the merge key << is not YAML 1.2{f' (and {more} more of it)' * bool(more)}"
+        what = f"the merge key << is not YAML 1.2{f' (and {more} more)' * bool(more)}"
         fix = "write what joints share into joint_defaults or groups, and parts of files into an include"
         return [*self._problems, Problem(self._merge_keys[0], what, fix)]
 

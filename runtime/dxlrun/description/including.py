@@ -107,7 +107,7 @@ class _Collector:
         place = fragment.resolve()
         if place in above:
             chain = " -> ".join(each.name for each in (*above[above.index(place) :], place))
-            self._refuse(mark, f"{entry} includes itself ({chain})", "take one of these includes out")
+            self._refuse(mark, f"{entry} includes itself ({chain})", "remove one of these includes")
         elif place in self._done:
             return
         elif len(above) >= MOST_LEVELS:

@@ -76,7 +76,7 @@ class PointsPart(Form):
 
     refused: ClassVar[Mapping[str, str]] = dict.fromkeys(
         ("duration", "samples", "joints"),
-        "a part has either points, or duration, samples and joints; take one of the two out",
+        "a part has either points, or duration, samples and joints; remove one of the two",
     )
 
     controller: str = key("Name of the controller.", "head", min_length=1)

@@ -384,7 +384,7 @@ _REMEDIES: Mapping[str, str] = {
     _NUMBER: "write a number without quotes",
     _BOOL: "write true or false without quotes (yes, no, on and off are text)",
     _TEXT: "put it in quotes",
-    "a mapping": "write `key: value` lines below it, or {key: value, ...} behind it",
+    "a mapping": "write `key: value` lines below it, or {key: value, ...} after it",
     "a list": "write [a, b, ...]",
 }
 
@@ -475,7 +475,7 @@ def _sentence_unknown(error: _Error) -> tuple[str, str]:
         keys = error.remedy.keys
         named = f"an unknown key {key!r}" if len(keys) == 1 else f"unknown keys {keys[0]!r} and {keys[1]!r}"
         return f"{parent} has {named}", error.remedy.fix
-    otherwise = f"take it out; known keys: {', '.join(known)}" if known else "take it out"
+    otherwise = f"remove it; known keys: {', '.join(known)}" if known else "remove it"
     return f"{parent} has an unknown key {key!r}", suggestion(key, known, otherwise)
 
 
@@ -498,7 +498,7 @@ def _sentence_own(error: _Error) -> tuple[str, str]:
 
 
 def _sentence_json(error: _Error) -> tuple[str, str]:
-    return f"{error.name} is no JSON ({error.context.get('error')})", "correct it"
+    return f"{error.name} is not JSON ({error.context.get('error')})", "correct it"
 
 
 def _sentence_pattern(error: _Error) -> tuple[str, str]:

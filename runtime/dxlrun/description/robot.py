@@ -255,7 +255,7 @@ class Gateway(Form):
 class Processes(Form):
     """Processes next to the loop."""
 
-    refused: ClassVar[Mapping[str, str]] = {"view": "take it out; `dxlrun view` shows a run"}
+    refused: ClassVar[Mapping[str, str]] = {"view": "remove it; `dxlrun view` shows a run"}
 
     gateway: Gateway = key(
         "Access for programs that steer the run, over a Unix socket.",

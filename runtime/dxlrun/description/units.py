@@ -90,7 +90,7 @@ class Quantity:
             raise refuse(f"{text!r} is too large", f"write {self.what} such as {self.examples}")
         if not self._least <= value <= self._most:
             raise refuse(
-                f"{text!r} is no {self.what.split(' ', 1)[1]} from {self._least:.0%} to {self._most:.0%}",
+                f"{text!r} is not {self.what} from {self._least:.0%} to {self._most:.0%}",
                 f"write one such as {self.examples}",
             )
         return value
@@ -134,8 +134,7 @@ class Either(Quantity):
         number, unit = split(text, self.what, self.units, self.examples)
         value = float(number) * self.units[unit]
         if self._above_zero and not 0 < value < math.inf:
-            name = self.what.split(" ")[1]
-            raise refuse(f"{text!r} is no {name} above 0", f"write one such as {self.examples}")
+            raise refuse(f"{text!r} is not above 0", f"write one such as {self.examples}")
         if not math.isfinite(value):
             raise refuse(f"{text!r} is too large", f"write {self.what} such as {self.examples}")
         return Measure(value, self._kinds[unit].si)
@@ -261,7 +260,7 @@ def duration(text: object, *, bare: str = "") -> int:
     number, unit = split(text, "a duration", DURATION_NS, written, bare=bare)
     value = nanoseconds(number, unit)
     if value is None:
-        raise refuse(f"{text!r} is no duration from 0 s to 31 years", f"write one such as {written}")
+        raise refuse(f"{text!r} is not a duration from 0 s to 31 years", f"write one such as {written}")
     return value
 
 

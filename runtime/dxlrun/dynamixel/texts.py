@@ -20,29 +20,28 @@ def servo_found(model: str, servo_id: int, bus: str, firmware: int) -> str:
 
 @event_text(EventCode.SETUP, Severity.INFO)
 def torque_limit_restored(register: str, before: int, now: int) -> str:
-    return f"{register} was {before} and is {now} again"
+    return f"{register} was restored from {before} to {now}"
 
 
 @event_text(EventCode.SETUP, Severity.WARNING)
 def fast_reads_refused(bus: str, refusals: str, total_ns: int, planned_ns: int) -> str:
     return (
-        f"bus {bus} is not read by a fast form, {refusals}: a cycle "
-        f"takes {total_ns / 1e6:.2f} ms instead of {planned_ns / 1e6:.2f} ms, at most "
-        f"{1e9 / total_ns:.0f} Hz"
+        f"bus {bus} is read without fast reads: {refusals}; a cycle takes {total_ns / 1e6:.2f} ms instead of "
+        f"{planned_ns / 1e6:.2f} ms, at most {1e9 / total_ns:.0f} Hz"
     )
 
 
 @event_text(EventCode.SETUP, Severity.WARNING)
 def fast_reads_given_up(bus: str, count: int, servos: str) -> str:
     return (
-        f"bus {bus}: {count} fast reads in a row stayed incomplete, so {servos} are "
-        "read without them from now on: does one have another firmware, or a loose contact?"
+        f"bus {bus}: {count} fast reads in a row stayed incomplete, so {servos} are read without fast reads "
+        "from now on: does one of them have another firmware, or a loose contact?"
     )
 
 
 @event_text(EventCode.MODE, Severity.WARNING)
 def start_mode_set(servo: str, before: str, mode: str) -> str:
-    return f"{before}: {servo} was brought into {mode} mode"
+    return f"{servo} was set to {mode} mode ({before})"
 
 
 @event_text(EventCode.TORQUE_ON, Severity.INFO)
@@ -52,7 +51,7 @@ def torque_is_on(joints: str) -> str:
 
 @event_text(EventCode.TORQUE_OFF, Severity.INFO)
 def joints_start_limp(joints: str) -> str:
-    return f"limp, as the robot file says: {joints}"
+    return f"limp by `torque: off` in the robot file: {joints}"
 
 
 # Registers
@@ -60,12 +59,12 @@ def joints_start_limp(joints: str) -> str:
 
 @event_text(EventCode.REGISTER_WRITTEN, Severity.INFO)
 def register_written(register: str, before: str, now: int) -> str:
-    return f"{register} was {before} and is {now}"
+    return f"{register} was changed from {before} to {now}"
 
 
 @event_text(EventCode.REGISTER_DIFFERS, Severity.INFO)
 def register_changed(servo: str, register: str, before: int, now: int) -> str:
-    return f"{servo} {register} was {before}, is {now}"
+    return f"{servo}: {register} changed from {before} to {now}"
 
 
 @event_text(EventCode.REGISTER_DIFFERS, Severity.WARNING)
@@ -86,14 +85,14 @@ def settings_differ(servo: str, settings: str, remedies: str) -> str:
 @event_text(EventCode.SERVO_HOT, Severity.WARNING)
 def servo_hot(servo: str, celsius: float, register: str, limit: float) -> str:
     return (
-        f"{servo} is at {celsius:.0f} deg C; its {register} is {limit:.0f} deg C, "
-        "beyond which it cuts its torque: let it rest"
+        f"{servo} is at {celsius:.0f} deg C; it cuts its torque above its {register}, {limit:.0f} deg C: "
+        "let it rest"
     )
 
 
 @event_text(EventCode.SERVO_HOT, Severity.INFO)
 def servo_cooled(servo: str, celsius: float, register: str, limit: float) -> str:
-    return f"{servo} is at {celsius:.0f} deg C; its {register} is {limit:.0f} deg C"
+    return f"{servo} has cooled down to {celsius:.0f} deg C; its {register} is {limit:.0f} deg C"
 
 
 # Replies
@@ -116,12 +115,12 @@ def servo_answers_again(servo: str, lost: int) -> str:
 
 @event_text(EventCode.SERVO_LOST, Severity.ERROR)
 def servo_lost(servo: str, missed: int) -> str:
-    return f"{servo} missed {missed} replies in a row; it is probed once a second until it is in order"
+    return f"{servo} missed {missed} replies in a row; it is probed once a second until it is ready"
 
 
 @event_text(EventCode.SERVO_LOST, Severity.ERROR)
 def servo_garbled(servo: str, remedy: str) -> str:
-    return f"{servo} answers garbled or twice: do two servos have its ID?{remedy}"
+    return f"{servo} sends garbled or double replies: do two servos have its ID?{remedy}"
 
 
 @event_text(EventCode.SERVO_LOST, Severity.ERROR)
@@ -136,34 +135,34 @@ def unfit_clause(problems: Sequence[str]) -> str:
 
 @event_text(EventCode.SERVO_BACK, Severity.INFO)
 def servo_back_limp(servo: str) -> str:
-    return f"{servo} is in order and takes part again, limp: it gets no goals"
+    return f"{servo} is back, limp: it gets no goals"
 
 
 @event_text(EventCode.SERVO_BACK, Severity.INFO)
 def servo_back_with_goal(servo: str) -> str:
-    return f"{servo} is in order and takes part again, with the torque and the goal that it kept"
+    return f"{servo} is back, with its torque and its goal as before"
 
 
 @event_text(EventCode.SERVO_BACK, Severity.INFO)
 def servo_back_holding(servo: str) -> str:
-    return f"{servo} is in order and takes part again, holding where it is"
+    return f"{servo} is back, and holds its position"
 
 
 @event_text(EventCode.SERVO_REBOOTED, Severity.INFO)
 def servo_rebooted_on_request(servo: str) -> str:
-    return f"{servo} started anew, as requested"
+    return f"{servo} rebooted, as requested"
 
 
 @event_text(EventCode.SERVO_REBOOTED, Severity.ERROR)
 def servo_rebooted(servo: str) -> str:
-    return f"{servo} started anew: it was without power, or something rebooted it"
+    return f"{servo} rebooted: it was without power, or another program rebooted it"
 
 
 @event_text(EventCode.SERVO_REBOOTED, Severity.ERROR)
 def servo_reboots_repeatedly(servo: str, remedy: str) -> str:
     return (
-        f"{servo} started anew: it was without power, or something rebooted it; it rebooted twice within a "
-        f"minute, so no policy gives it torque again: {remedy}"
+        f"{servo} rebooted for the second time within a minute, so no policy gives it torque again: it was "
+        f"without power, or another program rebooted it: {remedy}"
     )
 
 
@@ -206,8 +205,8 @@ def servo_shut_down(servo: str, register: str) -> str:
 @event_text(EventCode.SERVO_LIMP, Severity.ERROR)
 def turns_lost(servo: str, joint: str) -> str:
     return (
-        f"{servo} lost count of its turns when it rebooted, so it stays limp where it is and counts from "
-        f"there; `dxlrun torque on {joint}` gives it torque"
+        f"{servo} lost its count of turns in a reboot, so it stays limp and counts from its present "
+        f"position; `dxlrun torque on {joint}` gives it torque"
     )
 
 
@@ -251,7 +250,10 @@ def output_not_made_safe(problem: str) -> str:
 
 @event_text(EventCode.WATCHDOG, Severity.ERROR)
 def watchdog_stopped_servos(silent_ms: int) -> str:
-    return f"no instruction for {silent_ms} ms: the Bus Watchdog has stopped the servos; they are revived"
+    return (
+        f"no instruction for {silent_ms} ms: the Bus Watchdog has stopped the servos; "
+        "they are being enabled again"
+    )
 
 
 @event_text(EventCode.WATCHDOG, Severity.ERROR)
@@ -274,7 +276,7 @@ def line_lost(error: str) -> str:
 
 @event_text(EventCode.PORT_BACK, Severity.WARNING)
 def line_back(bus: str) -> str:
-    return f"bus {bus} is back; its servos count as rebooted"
+    return f"bus {bus} is back; its servos are treated as rebooted"
 
 
 @event_text(EventCode.BUS_NOISE, Severity.WARNING)

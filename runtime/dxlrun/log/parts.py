@@ -31,7 +31,7 @@ def log_files(path: Path) -> LogFiles:
     """
     if not path.is_dir():
         if path.exists() and not path.is_file():
-            raise LogError(f"{path}: a pipe or a device, no file, so it is no log")
+            raise LogError(f"{path}: a pipe or a device, not a file; a log is a file")
         return LogFiles((path,))
     try:
         found = {

@@ -166,9 +166,9 @@ class _Annotations:
         """Return the full name of a dataclass's message, and add its definition."""
         shown = getattr(cls, "__name__", repr(cls))
         if not (isinstance(cls, type) and _is_message(cls)):
-            raise WrongMessage(f"{shown} is no dataclass", "put @dataclass above the class of the message")
+            raise WrongMessage(f"{shown} is not a dataclass", "put @dataclass above the class of the message")
         if cls in inside or len(inside) >= _DEEPEST:
-            raise WrongMessage(f"{shown} contains itself", "a message of ROS 2 cannot: take the field out")
+            raise WrongMessage(f"{shown} contains itself", "a message of ROS 2 cannot: remove the field")
         name = self._name(cls)
         short = short_name(name)
         if self._classes.setdefault(short, cls) is not cls:
@@ -212,7 +212,8 @@ class _Annotations:
             return given
         if not _CLASS.fullmatch(cls.__name__):
             raise WrongMessage(
-                f"{cls.__name__} is no name of a message", "name the class like WaveState: letters and digits"
+                f"{cls.__name__} is not a name of a message",
+                "name the class like WaveState: letters and digits",
             )
         return f"{self._package}/msg/{cls.__name__}"
 
@@ -222,7 +223,7 @@ class _Annotations:
         field = f"{cls.__name__}.{name}"
         if not _NAME.fullmatch(name):
             raise WrongMessage(
-                f"{field} is no name of a field", "ROS 2 takes lower case, digits, and single _"
+                f"{field} is not a name of a field", "ROS 2 takes lower case, digits, and single _"
             )
         found = self._kind(annotation, inside)
         if found is None:

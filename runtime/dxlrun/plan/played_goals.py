@@ -69,7 +69,7 @@ def _describe_end(
     if duration_ns is None or not duration_ns <= ran_ns + loop.period_ns or duration_ns >= (end_ns or 0):
         return f"The run ended at {ran_ns / 1e9:.4g} s, before {name} ended{end}", ""
     ended = f"The run ended by its duration at {duration_ns / 1e9:.4g} s"
-    return f"{ended}, before {name} ended{end}", "leave out --duration"
+    return f"{ended}, before {name} ended{end}", "omit --duration"
 
 
 def played_name(origin: str, controller: str) -> str:

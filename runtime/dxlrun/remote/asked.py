@@ -49,7 +49,7 @@ class Asked(Generic[Body]):
         except ValueError:
             value = math.nan
         if not math.isfinite(value):
-            raise invalid(f"{name}={str(text)[:40]} is no number")
+            raise invalid(f"{name}={str(text)[:40]} is not a number")
         return value
 
     @property
@@ -65,7 +65,7 @@ class Asked(Generic[Body]):
         """Goal number in the path; raises RefusedRequest."""
         text = self.part("number")
         if not (text.isdecimal() and text.isascii() and len(text) < 16):
-            raise invalid(f"{text[:40]!r} is no number of a goal")
+            raise invalid(f"{text[:40]!r} is not a number of a goal")
         return int(text)
 
     @property

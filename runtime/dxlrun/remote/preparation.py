@@ -404,7 +404,7 @@ def in_si(body: bytes, what: str, joints: Sequence[JointPlan] = ()) -> bytes:
     try:
         data = msgspec.json.decode(body)
     except (msgspec.MsgspecError, RecursionError) as error:
-        raise invalid(f"{what} is no JSON: {error}") from error
+        raise invalid(f"{what} is not JSON: {error}") from error
     mistaken: list[tuple[str, str]] = []
     plain = _plain(data, (), mistaken, _units_of(data, joints))
     if mistaken:

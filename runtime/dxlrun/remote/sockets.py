@@ -168,7 +168,9 @@ class Address(NamedTuple):
         """Parse `[NAME@]HOST:PORT`, with a default for NAME; raises InputError."""
         found = _ADDRESS.fullmatch(text)
         if not found or not 0 < int(found[3]) < 1 << 16 or not (found[1] or name):
-            raise InputError(f"{text[:80]!r} is no address; write [NAME@]HOST:PORT, such as torso@lab3:7660")
+            raise InputError(
+                f"{text[:80]!r} is not an address; write [NAME@]HOST:PORT, such as torso@lab3:7660"
+            )
         return cls(found[1] or name, found[2].strip("[]"), int(found[3]))
 
     def __str__(self) -> str:
@@ -314,7 +316,7 @@ def _answer(end: socket.socket) -> tuple[int, bytes, bool]:
             raise ConnectionResetError("the connection was closed without an answer")
         data += more
         if not data.startswith(b"HTTP/1."[: len(data)]):
-            raise ValueError(f"{data[:40]!r} is no answer of HTTP")
+            raise ValueError(f"{data[:40]!r} is not an answer of HTTP")
     head, content = found[0].lower(), bytearray(data[found.end() :])
     length = _LENGTH.search(head)
     while length and len(content) < int(length[1]):

@@ -298,7 +298,7 @@ def _priority(machine: Machine) -> Finding:
         return check.worse(found, _raise_limit(machine, "rtprio", 98))
     if not machine.may_schedule():
         return check.worse(
-            "it is allowed, but the kernel refuses it: this group of processes has no share of it",
+            "it is allowed, but the kernel refuses it: this group of processes has no real-time share",
             _CONTAINER if machine.container else _DEFAULT_SHARE,
         )
     return check.good(f"up to {highest}, {_by(machine, 'CAP_SYS_NICE', 'rtprio')}")
@@ -308,7 +308,7 @@ def _locked_memory(machine: Machine) -> Finding:
     """Check that a run may lock all of its memory (RLIMIT_MEMLOCK, CAP_IPC_LOCK)."""
     check = _Check("locked memory", "a page that was swapped out delays the loop by milliseconds")
     if machine.lockable == UNLIMITED:
-        return check.good(f"all of it, {_by(machine, 'CAP_IPC_LOCK', 'memlock')}")
+        return check.good(f"all memory, {_by(machine, 'CAP_IPC_LOCK', 'memlock')}")
     return check.worse(
         f"only {machine.lockable >> 10} KiB may be locked", _raise_limit(machine, "memlock", "unlimited")
     )
@@ -424,7 +424,7 @@ def _clock_source(machine: Machine) -> Finding:
 
 def _cores(machine: Machine) -> Finding:
     """Check that the loop can have its own core."""
-    check = _Check("cores", "guardian, recorder and gateway work beside the loop")
+    check = _Check("cores", "guardian, recorder and gateway work next to the loop")
     if machine.cores < 2:
         return check.worse(
             "there is one core for all processes", "use a machine, or allow this process, two cores or more"

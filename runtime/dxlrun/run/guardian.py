@@ -429,7 +429,7 @@ class Guardian:
         if self._killed == "late":
             limit = _duration(self._job.plan.exit_timeout_ns)
             return f"the loop did not stop within {limit}{where} and was killed"
-        return f"the loop's process ended by itself ({_manner(loop.returncode)}){where}"
+        return f"the loop's process ended unexpectedly ({_manner(loop.returncode)}){where}"
 
     def _starved(self) -> str:
         """Return a clause about a loop that was ready to run but got no processor; empty when not known."""

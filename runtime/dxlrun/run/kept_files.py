@@ -117,7 +117,7 @@ def _read(path: Path) -> KeptFile:
         descriptor = os.open(path, os.O_RDONLY | os.O_CLOEXEC | os.O_NONBLOCK)
         with open(descriptor, "rb") as file:
             if not stat.S_ISREG(os.fstat(descriptor).st_mode):
-                return KeptFile(str(path), problem="its file is no regular file")
+                return KeptFile(str(path), problem="its file is not a regular file")
             state, made_with = opened_file(file.read(LONGEST_FILE + 1), path.stem)
     except OSError as error:
         return KeptFile(str(path), problem=f"its file cannot be read: {error.strerror or error}")

@@ -26,7 +26,7 @@ def line_problem(problem: str) -> str:
 
 @event_text(EventCode.GUARDIAN, Severity.ERROR)
 def line_gone() -> str:
-    return "a line is gone and is not opened again"
+    return "a line is lost and will not be opened again"
 
 
 @event_text(EventCode.GUARDIAN, Severity.ERROR)
@@ -59,7 +59,7 @@ def simulation_stalled(waits: str) -> str:
 
 @event_text(EventCode.SETUP, Severity.INFO)
 def set_up_aborted() -> str:
-    return "the set-up was given up on request"
+    return "the start was aborted on request"
 
 
 @event_text(EventCode.SETUP, Severity.ERROR)

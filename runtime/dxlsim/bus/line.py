@@ -114,7 +114,7 @@ class SimulatedLine:
             last = min(len(sent), -(-(each.due_ns - start_ns) // byte_ns))
             sent[first:last] = bytes(last - first)
             kept = max(0, (begin_ns - each.first_ns) // byte_ns)
-            self._note(f"collision: the host sends into {each.data.hex(' ')}, {kept} bytes of it arrive")
+            self._note(f"collision: the host sends into {each.data.hex(' ')}, {kept} bytes arrive")
             self.passing.remove(each)
             if kept:
                 due_ns = each.first_ns + self.duration_ns(kept)

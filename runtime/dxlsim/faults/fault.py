@@ -67,12 +67,12 @@ def parse_fault(text: str) -> Fault:
     for word in words[1:]:
         key, equals, value = word.partition("=")
         if not equals:
-            raise InputError(f"{name}: {word!r} is no key=value; write it as in: {usage(name)}")
+            raise InputError(f"{name}: {word!r} is not key=value; write it as in: {usage(name)}")
         if key not in kind.readers:
             known = suggestion(key, tuple(kind.readers), f"it takes {', '.join(kind.readers)}")
             raise InputError(f"{name} takes no {key!r}; {known}")
         if key in given:
-            raise InputError(f"{name}: {key}= is there twice; leave one of them out")
+            raise InputError(f"{name}: {key}= is there twice; omit one of them")
         try:
             given[key] = kind.readers[key].read(value)
         except ValueError as error:
@@ -99,7 +99,7 @@ def _check(name: str, kind: Kind, given: Mapping[str, Value]) -> None:
         raise InputError(f"{name} needs {' and '.join(missing)}; write it as in: {usage(name)}")
     for one, other in (("at", "packet"), ("data", "size")):
         if one in given and other in given:
-            raise InputError(f"{name} has both {one}= and {other}=; leave one of them out")
+            raise InputError(f"{name} has both {one}= and {other}=; omit one of them")
     if "from" in kind.readers and ("servo" in given) == ("from" in given):
         raise InputError(f"{name} needs either servo=ID, for its reply, or from=host, for an instruction")
     low, high = given.get("low"), given.get("high")

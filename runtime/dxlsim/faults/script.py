@@ -90,7 +90,7 @@ class FaultScript:
         """
         buses = _chosen(fault, self._buses)
         if fault.at_ns is not None and fault.at_ns < since_ns:
-            raise InputError(f"it is {since_ns / 1e9:.3f} s after the start already; leave at= out for now")
+            raise InputError(f"it is {since_ns / 1e9:.3f} s after the start already; omit at= for now")
         random = self._random(fault, index)
         if fault.kind != "storm":
             return [(fault, Happening(fault.kind, str(fault), buses[0], random, self._holds))]

@@ -137,7 +137,7 @@ def _parsed(text: str, file: str) -> _Element:
     def doctype(*_: object) -> None:
         before = text.encode()[: parser.CurrentByteIndex].rpartition(b"<!DOCTYPE")[0].decode()
         mark = Mark(file, before.count("\n") + 1, len(before.rpartition("\n")[2]) + 1)
-        raise InputError([Problem(mark, "a DOCTYPE is refused", "take it out")])
+        raise InputError([Problem(mark, "a DOCTYPE is refused", "remove it")])
 
     parser.StartElementHandler, parser.EndElementHandler = start, end
     parser.StartDoctypeDeclHandler = doctype
@@ -315,7 +315,7 @@ class _Reading:
             if following is not None and following.name in way:  # Otherwise this circle was already reported
                 circle = [*way][[*way].index(following.name) :]
                 what = f"joint {circle[0]} mimics itself: {' -> '.join((*circle, circle[0]))}"
-                self._add(following.mark, what, "let one of them move by itself")
+                self._add(following.mark, what, "remove the mimic of one of them")
 
     def _root(self) -> str:
         """Return the link without a parent; add a problem unless the links form one tree."""
@@ -342,7 +342,7 @@ class _Reading:
                 way.append(above[way[-1]].parent)
             circle = way[way.index(way[-1]) :][::-1]
             what = f"links stand in a circle: {' -> '.join(circle)}"
-            self._add(above[circle[-1]].mark, what, "take out one of the joints between them")
+            self._add(above[circle[-1]].mark, what, "remove one of the joints between them")
         return roots[0] if roots else ""
 
 

@@ -165,7 +165,7 @@ class DeviceLink:
             OSError: The link cannot be created.
         """
         if os.path.lexists(self._path) and not self._path.is_symlink():
-            raise FileExistsError(f"{self._path} is no link; it is not replaced")
+            raise FileExistsError(f"{self._path} is not a link; it is not replaced")
         # A rename replaces the link atomically, so the path always leads to a terminal.
         new = self._path.with_name(f"{self._path.name}.{os.getpid()}")
         new.symlink_to(target)

@@ -237,7 +237,7 @@ class SimulatedServo(SimulatedNode):
         """
 
         def gives_way(turned: float) -> None:
-            came = f"gives way after {math.degrees(turned):.1f} of {math.degrees(by):g} deg"
+            came = f"yields after {math.degrees(turned):.1f} of {math.degrees(by):g} deg"
             self.note(f"servo {self.servo_id}: holds or drives its shaft, so the hand that turns it {came}")
 
         self.shaft.mechanics.turn(self.shaft.index, by, duration_ns, gives_way)

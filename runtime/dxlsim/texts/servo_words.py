@@ -85,7 +85,9 @@ def _ids(text: str) -> list[int]:
     for part in text.split(","):
         low, _, high = part.partition("-")
         if max(len(low), len(high)) > _MOST_DIGITS or int(high or low) > max(_HIGHEST_ID.values()):
-            raise ValueError(f"{part} is no ID of a servo; IDs go from 0 to 252, with Protocol 1.0 to 253")
+            raise ValueError(
+                f"{part} is not an ID of a servo; IDs go from 0 to 252, with Protocol 1.0 to 253"
+            )
         if high and int(high) < int(low):
             raise ValueError(f"{part} is empty; write the lower ID first")
         ids += range(int(low), int(high or low) + 1)
@@ -110,7 +112,7 @@ def _protocol(models: Sequence[str], chosen: float | None) -> float:
         if strange:
             raise InputError(
                 "\n".join(
-                    f"{model} speaks Protocol {spoken[model][0]:.1f}, not {chosen:.1f}; leave --protocol out"
+                    f"{model} speaks Protocol {spoken[model][0]:.1f}, not {chosen:.1f}; omit --protocol"
                     for model in strange
                 )
             )

@@ -45,7 +45,7 @@ CAPABILITIES: Mapping[str, str] = {
         for name in ("bulk_read", "bulk_write", "fast_sync_read", "reboot", "sync_read", "sync_write")
     },
     "broadcast_ping": "a reply to a ping to all IDs",
-    WAITS: "in a sync or bulk read it waits for the status ahead of its own, and obeys nothing meanwhile",
+    WAITS: "in a sync or bulk read it waits for the status ahead of its own, and executes nothing until then",
 }
 """Capabilities of devices in data files, in addition to ping, read and write."""
 _SIZES = (1, 2, 4)
@@ -200,7 +200,7 @@ def _check_item(item: ControlItem) -> None:
         raise ValueError(f"{item.name}: address {item.address} is none; they are 0..{_HIGHEST_ADDRESS}")
     for key, value in (("initial value", item.initial), ("safe value", item.safe)):
         if value is not None and not item.minimum <= value <= item.maximum:
-            raise ValueError(f"{item.name}: the {key} {value} lies outside its range")
+            raise ValueError(f"{item.name}: the {key} {value} is outside its range")
     if item.safe is not None and (item.access == "R" or item.area == "EEPROM"):
         raise ValueError(f"{item.name}: only an item in RAM that can be written has a safe value")
     if item.encoding == "float32" and (item.initial or item.safe):
@@ -211,7 +211,7 @@ def _check_item(item: ControlItem) -> None:
         raise ValueError(f"{item.name}: a tick of 0 would mean nothing")
     if not STATE_NAME.fullmatch(item.state):
         raise ValueError(
-            f"{item.name}: {item.state!r} is no name of a state; start with a letter, and use letters, "
+            f"{item.name}: {item.state!r} is not a name of a state; start with a letter, and use letters, "
             "digits and _, such as angular_velocity.x"
         )
     if item.bit is None:

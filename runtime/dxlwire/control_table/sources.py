@@ -215,7 +215,7 @@ def _figure(data: Entry, key: str, unit: str) -> float:
     """Return a quantity of the motor. Raises ValueError if it is negative or has another unit."""
     found, value = quantity(str(data[key]))
     if found != unit or not value >= 0:
-        raise ValueError(f"{key}: {data[key]!r} is no quantity in {unit} from 0 on")
+        raise ValueError(f"{key}: {data[key]!r} is not a quantity in {unit} from 0 on")
     return value
 
 
@@ -228,7 +228,7 @@ def _ratio(value: object) -> float:
 def section(value: object) -> Entry:
     """Return a table of a data file. Raises ValueError if the value is not a table."""
     if not isinstance(value, Mapping):
-        raise ValueError(f"{value!r} is no table")
+        raise ValueError(f"{value!r} is not a table")
     return value
 
 
@@ -243,7 +243,7 @@ def whole(entry: Entry, key: str) -> int:
 def words(value: object) -> list[str]:
     """Return a list of words. Raises ValueError if the value is not one."""
     if not isinstance(value, list) or not all(isinstance(word, str) for word in value):
-        raise ValueError(f"{value!r} is no list of words")
+        raise ValueError(f"{value!r} is not a list of words")
     return value
 
 
@@ -266,7 +266,7 @@ def quantity(text: str, own: Collection[str] = ()) -> tuple[str, float]:
         raise ValueError(f"{text!r} divides by 0")
     value = float(numerator) * factor / float(denominator or "1")
     if not math.isfinite(value):
-        raise ValueError(f"{text!r} is no finite number")
+        raise ValueError(f"{text!r} is not a finite number")
     return si, value
 
 
@@ -353,5 +353,5 @@ def _check(items: tuple[ControlItem, ...]) -> None:
         if not -item.signed << bits <= item.minimum <= item.maximum < 1 << bits:
             raise ValueError(f"{item.name}: {item.minimum}..{item.maximum} does not fit into its bytes")
         if item.initial is not None and not item.minimum <= item.initial <= item.maximum:
-            raise ValueError(f"{item.name}: the initial value {item.initial} lies outside its range")
+            raise ValueError(f"{item.name}: the initial value {item.initial} is outside its range")
         end = item.address + item.size

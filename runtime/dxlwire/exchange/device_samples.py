@@ -8,6 +8,7 @@ from collections.abc import Sequence
 import numpy as np
 
 from dxlwire.bus_plan import BusPlan
+from dxlwire.exchange import reports
 from dxlwire.exchange.arrays import Floats, SourceArrays
 from dxlwire.exchange.reports import Reason, ReportSink
 
@@ -63,5 +64,4 @@ class DeviceSamples:
                 for field in fields
                 if not math.isfinite(self.values[field.column])
             ]
-            text = f"{label} sent no finite {', '.join(wrong)}: not believed"
-            self._reports.report(Reason.IMPLAUSIBLE, name, text)
+            self._reports.report(Reason.IMPLAUSIBLE, name, reports.not_finite(label, wrong))

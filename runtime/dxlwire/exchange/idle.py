@@ -12,6 +12,7 @@ from enum import IntEnum, unique
 from msgspec import structs
 from msgspec.structs import replace
 
+from dxlwire.exchange import reports
 from dxlwire.exchange.bus import NEVER, Bus
 from dxlwire.exchange.reports import Reason, ReportSink
 from dxlwire.plan.line import SHORT_TIMEOUT_MARGIN_NS
@@ -229,9 +230,7 @@ class IdleScheduler:
             task.reported = True
             servos = self.plan.servos
             source = self.plan.name if task.servo == WHOLE_BUS else servos[task.servo].joint
-            need, left = need_ns * 1e-6, max(left_ns, 0) * 1e-6
-            text = f"{task.name} waits for idle time: it may take {need:.1f} ms, of which the cycle leaves"
-            text = f"{text} {left:.1f} ms; periods may be skipped"
+            text = reports.idle_time_short(task.name, need_ns, max(left_ns, 0))
             self._reports.report(Reason.NO_IDLE_TIME, source, text)
         return True
 

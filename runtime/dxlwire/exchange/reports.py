@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from enum import Enum, unique
 from typing import Protocol
 
@@ -14,6 +15,27 @@ class Reason(Enum):
     """Implausible values of a servo or device, which were not used."""
     NO_IDLE_TIME = "no_idle_time"
     """A program waits for more idle time than the cycle has; later cycles may be late."""
+
+
+# Texts
+
+
+def jumped(joint: str, jump: str, elapsed_ns: int) -> str:
+    """Return the text about a position that its servo cannot have."""
+    return f"{joint} jumped by {jump} in {elapsed_ns * 1e-6:.0f} ms, faster than it can turn: the value is not used"
+
+
+def not_finite(device: str, states: Sequence[str]) -> str:
+    """Return the text about values of a device that are NaN or infinite."""
+    return f"{device} sent values that are not finite ({', '.join(states)}): they are not used"
+
+
+def idle_time_short(program: str, needed_ns: int, left_ns: int) -> str:
+    """Return the text about a program that a cycle has too little idle time for."""
+    return (
+        f"{program} waits for idle time: it may take {needed_ns * 1e-6:.1f} ms, and a cycle leaves "
+        f"{left_ns * 1e-6:.1f} ms; periods may be skipped"
+    )
 
 
 class ReportSink(Protocol):

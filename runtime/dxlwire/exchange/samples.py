@@ -9,6 +9,7 @@ from numpy.typing import NDArray
 
 from dxlwire.bus_plan import BusPlan, ServoPlan
 from dxlwire.control_table import find_table
+from dxlwire.exchange import reports
 from dxlwire.exchange.arrays import Floats, JointArrays, SourceArrays
 from dxlwire.exchange.device_samples import DeviceSamples
 from dxlwire.exchange.reports import Reason, ReportSink
@@ -181,10 +182,9 @@ class Jumps:
             return True
         if now_ns - self._reported_ns[index] >= REPORT_AGAIN_NS:
             self._reported_ns[index] = now_ns
-            servo, time = self._servos[index], elapsed_ns * 1e-6
-            name, jump = servo.joint, servo.step_text(abs(step))
-            text = f"{name} jumped by {jump} in {time:.0f} ms, faster than it can turn: not believed"
-            self._reports.report(Reason.IMPLAUSIBLE, name, text)
+            servo = self._servos[index]
+            text = reports.jumped(servo.joint, servo.step_text(abs(step)), elapsed_ns)
+            self._reports.report(Reason.IMPLAUSIBLE, servo.joint, text)
         return False
 
 

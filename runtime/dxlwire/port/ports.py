@@ -134,7 +134,7 @@ class Ports(Protocol):
         """Request a lost line again; return True if its port is replaced in `ports`. Never waits.
 
         From the first call on, the lost line is no longer part of `wait`. The devices on a reopened line were
-        without a host, and possibly without power, so all its servos count as rebooted.
+        without a host, and possibly without power, so all its servos are treated as rebooted.
         """
         ...
 

@@ -150,7 +150,7 @@ def open_serial(
         except OSError as error:
             line.close()
             raise PortError(
-                f"the driver of {path} has no RS-485 mode ({error.strerror}): leave out `adapter: {{rs485: "
+                f"the driver of {path} has no RS-485 mode ({error.strerror}): omit `adapter: {{rs485: "
                 "true}`, and use an adapter that switches the direction itself"
             ) from error
     if line.set_dtr and boot_ns:
@@ -186,7 +186,7 @@ def _sentence(path: str, baud_rate: int, error: OSError, describe_holder: Descri
     if number in (errno.EBUSY, errno.EAGAIN, errno.EWOULDBLOCK):
         return f"{path} is in use by {_holder(path, describe_holder)}"
     if number == errno.ENOTTY:
-        return f"{path} is no serial line"
+        return f"{path} is not a serial line"
     if number == errno.EINVAL:
         return f"{path} cannot run at {baud_rate} bit/s: {error.strerror}"
     return f"{path} cannot be opened: {error}"

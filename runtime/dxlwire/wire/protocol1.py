@@ -154,7 +154,7 @@ def instruction_packet(servo_id: int, instruction: int, parameters: bytes = b"")
         ValueError: `servo_id` is neither 0..253 nor broadcast, or the parameters do not fit.
     """
     if not (0 <= servo_id <= HIGHEST_ID or servo_id == BROADCAST_ID):
-        raise ValueError(f"{servo_id} is no ID: a servo has 0..{HIGHEST_ID}, broadcast is {BROADCAST_ID}")
+        raise ValueError(f"{servo_id} is not an ID: a servo has 0..{HIGHEST_ID}, broadcast is {BROADCAST_ID}")
     return _packet(servo_id, instruction, parameters)
 
 

@@ -83,7 +83,7 @@ def test_parquet_names_topics_without_a_file_and_the_reason(
         if not name.startswith("/bus/") and name.strip("/").replace("cycle", "cycles") not in files
     }
     assert missing["/joint_states"] == "the states are in /cycle"
-    reasons = {WITHOUT_TABLE.get(name, "the log has no message of it") for name in missing}
+    reasons = {WITHOUT_TABLE.get(name, "the log has no message of this topic") for name in missing}
     assert set(missing.values()) == reasons
     code, said, _ = export(run, tmp_path / "again", "--format", "parquet")
     assert (code, said.count("no file for ")) == (0, len(missing))
@@ -174,7 +174,7 @@ def test_nothing_is_written_over_and_a_log_that_cannot_be_read_leaves_nothing(
     broken.write_bytes(b"not a log")
     code, _, (error,) = export(broken, tmp_path / "out", "--format", to)
     assert (code, sorted(tmp_path.iterdir())) == (2, [broken, there])
-    assert f"{broken}: this is no MCAP file" in error
+    assert f"{broken}: this is not an MCAP file" in error
 
     code, _, (error,) = export(run, tmp_path / "nowhere" / "out", "--format", to)
     assert code == 2

@@ -85,7 +85,7 @@ def test_joints_that_the_robot_lacks_are_named_with_near_ones(
     other = (place / "pair.yaml").read_text().replace("pan", "pen").replace("tilt", "lift")
     (place / "other.yaml").write_text(other)
     pan, tilt = refused(dxlrun, swing, "--on", "other.yaml")
-    fix = "write --map pan=JOINT, or --map pan= to leave it out"
+    fix = "write --map pan=JOINT, or --map pan= to omit it"
     assert pan == f"dxlrun: {swing}: the robot has no joint pan; did you mean pen?; {fix}"
     assert tilt.endswith(f"no joint tilt; known: lift, pen; {fix.replace('pan', 'tilt')}")
 

@@ -66,7 +66,7 @@ def test_remarks_go_to_stderr(
     ("arguments", "says"),
     [
         (["missing.mcap"], "there is no log missing.mcap"),
-        ([__file__], "this is no MCAP file"),
+        ([__file__], "this is not an MCAP file"),
         (["{log}", "fast"], "'fast' is not an argument of the robot file"),
         (["{log}", "--set", "neck.gain=1"], "the log has no such controller"),
         (["{log}", "--set", "all_inputs.gian=1"], "dxlrun: --set all_inputs has an unknown key 'gian'; did"),

@@ -121,7 +121,7 @@ def test_a_parameter_that_ends_the_replay_early(pair_log: Path) -> None:
         ("all_inputs.joints.low=1", "joints has no parts"),
         ("all_inputs.joints=[tail]", "claims joint tail, which is not defined"),
         ("all_inputs.joints=[nod, nod]", "names joint nod twice"),
-        ("all_inputs.gain=[", "is no YAML"),
+        ("all_inputs.gain=[", "is not YAML"),
         ("all_inputs.gain", "sets nothing"),
         ("gain=1", "sets nothing"),
     ],

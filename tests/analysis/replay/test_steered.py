@@ -139,8 +139,8 @@ def test_the_stories_do_what_they_are_there_for(tell: Callable[[str], Path]) -> 
     log = read_log(tell("registers"))
     written = [(one.source, one.text) for one in log.events if one.name == "register_written"]
     assert written == [
-        ("nod", "CW Compliance Slope (28) was 32 and is 64"),
-        ("nod", "CCW Compliance Slope (29) was 32 and is 16"),
+        ("nod", "CW Compliance Slope (28) was changed from 32 to 64"),
+        ("nod", "CCW Compliance Slope (29) was changed from 32 to 16"),
     ]
     log = read_log(tell("torque off and on"))
     shown = log.cycles["torque"]

@@ -62,7 +62,7 @@ REFUSED: dict[str, tuple[Change, str]] = {
     ),
     "no plan": (plan(None), "no attachment plan.json"),
     "a plan that is none": (plan(b'{"robot": 5}'), NO_PLAN),
-    "a plan that is no text": (
+    "a plan that is not text": (
         plan_text((b'"main"', b'"m\xffin"'), (b'"robot":"pair"', b'"robot":"p\xffir"')),
         NO_PLAN,
     ),

@@ -110,7 +110,7 @@ def test_rows_are_what_the_analysis_of_each_log_has(season: Path, here: Here, dx
 
     assert list(found) == NAMES
     broken = found.pop("may/broken.mcap")
-    assert broken["unreadable"] == "this is no MCAP file, so it is no log of dxlrun"
+    assert broken["unreadable"] == "this is not an MCAP file, and a log of dxlrun is one"
     assert (broken["robot"], broken["bytes"]) == (None, 13)
     for name, row in found.items():
         report = analyze_log(season / name)
@@ -226,7 +226,7 @@ def test_the_table_for_people(known: Path, dxlrun: Dxlrun) -> None:
     said = dxlrun("logs", known)
     assert said.errors == [f"1 other file is in {known}: notes.txt"]
     assert "unreadable" in said.out
-    assert "this is no MCAP file" in " ".join(said.out.split())
+    assert "this is not an MCAP file" in " ".join(said.out.split())
     assert said.out.rstrip().endswith("5 of 5 logs")
     assert dxlrun("logs", known, "--where", "lost > 5").out.strip() == "0 of 5 logs"
 

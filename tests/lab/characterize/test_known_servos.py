@@ -282,7 +282,7 @@ def test_the_dead_band_is_margin_and_friction_over_the_gain(measures, model, fri
     if model == "AX-12A":
         tick = done.result.joints[0].joint.servo.rad_per_tick
         margin = math.degrees(registers.get("cw_compliance_margin", 1) * tick)
-        assert band.limit.startswith(f"{margin:.2f} deg of it by the compliance margin")
+        assert band.limit.startswith(f"{margin:.2f} deg by the compliance margin")
     else:
         assert "the model has no margin" in band.limit
 

@@ -122,7 +122,7 @@ def test_a_joint_that_a_controller_commands_is_refused_with_what_frees_it(rig):
 def test_a_paused_robot_and_a_second_experiment_are_refused(rig, robot):
     robot.pause()
     try:
-        with pytest.raises(InputError, match="pair is paused; let it go on first: dxlrun resume"):
+        with pytest.raises(InputError, match="pair is paused; resume it first: dxlrun resume"):
             situation_of(rig, ["tilt"], {})
         rig.load("experiment_pwm", {"type": "sample_player", "joints": ["tilt"]})
     finally:
@@ -190,7 +190,7 @@ def test_a_key_is_an_abort_with_the_rest_kept(robot, stage, monkeypatch, capsys)
     said = capsys.readouterr().err
     assert "tilt (ID 7 on bus main) moves within -15 to 15 deg (--range); it is at" in said
     assert "any key ends it" in said
-    assert "pair: the experiment ended early: aborted by a key; 2 pieces of it measured before" in said
+    assert "pair: the experiment ended early: aborted by a key; 2 pieces measured before that" in said
     assert termios.tcgetattr(theirs) == before
     assert signal.getsignal(signal.SIGINT) is signal.default_int_handler
 
@@ -246,7 +246,7 @@ def test_a_part_without_a_result_is_one_more_sentence(place, stage, capsys):
     ran = run_on_robot(Asks(gives_up), ["pair.yaml", "pan"], OnRobot(virtual=True))
     assert (ran.result, ran.exit_code) == (None, 1)
     assert capsys.readouterr().err.splitlines()[-2:] == [
-        "pair: the experiment ended early: no two responses are alike; 1 piece of it measured before",
+        "pair: the experiment ended early: no two responses are alike; 1 piece measured before that",
         "pair: too short",
     ]
     with pytest.raises(InputError, match="too short"):
@@ -286,7 +286,7 @@ def test_without_a_yes_no_run_is_started(place, stage, monkeypatch, capsys, answ
             threading.Timer(0.3, os.kill, (os.getpid(), signal.SIGINT)).start()
         words, options = ["pair.yaml", "tilt"], OnRobot(range=("tilt=-15deg..15deg",))
         if answer is None:
-            with pytest.raises(InputError, match="this is no terminal, which could ask before they move"):
+            with pytest.raises(InputError, match="this is not a terminal, which could ask before they move"):
                 run_on_robot(plays, words, options)
         else:
             ran = run_on_robot(plays, words, options)

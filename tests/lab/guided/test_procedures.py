@@ -69,7 +69,9 @@ def test_a_rate_that_the_run_refuses_comes_back_to_the_procedure(stage):
         "elbow",
         lambda joint: iter([stage.sine(joint, loop_rate=160), stage.sine(joint, loop_rate=200)]),
     )
-    assert plays.refused == ["160 Hz is no multiple of 50 Hz, the rate of controller joint_state_broadcaster"]
+    assert plays.refused == [
+        "160 Hz is not a multiple of 50 Hz, the rate of controller joint_state_broadcaster"
+    ]
     assert (done.why, len(plays.got)) == ("", 1)
 
 

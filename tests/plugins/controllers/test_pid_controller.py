@@ -207,7 +207,7 @@ def test_gains_are_live_each_by_its_name_and_those_of_a_mapping_by_joint():
     assert model.gains.p == {"a": 1.0, "b": 2.0}
     assert value_of(changed, "gains.p.b") == 3.0
     for unknown in ("gains.p", "gains.p.c", "gains.i.a", "output_limit"):
-        with pytest.raises(ValueError, match="is no live parameter"):
+        with pytest.raises(ValueError, match="is not a live parameter"):
             with_values(model, {unknown: 1.0})
 
 

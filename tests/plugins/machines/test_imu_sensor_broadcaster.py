@@ -94,7 +94,7 @@ def test_a_sample_that_is_no_number_counts_as_lost(wrong: float, place: int) -> 
         assert np.isnan(bench.provided).all() == (cycle in {2, 3})
     assert len(bench.stage.messages) == 4
     assert bench.orientation == pytest.approx(about(2, math.degrees(0.1)), abs=1e-4)
-    assert bench.stage.said == ["chip measured NaN or infinity: such samples are left out"]
+    assert bench.stage.said == ["chip measured NaN or infinity: these samples are skipped"]
 
 
 def test_a_silent_sensor_is_reported_once_and_the_filter_begins_anew() -> None:

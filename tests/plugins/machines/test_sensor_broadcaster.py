@@ -88,8 +88,8 @@ def test_only_new_values_are_published_and_each_once() -> None:
 @pytest.mark.parametrize(
     ("value", "age_s", "what"),
     [
-        (math.nan, 0.0, "are no finite numbers"),
-        (math.inf, 0.0, "are no finite numbers"),
+        (math.nan, 0.0, "are not finite numbers"),
+        (math.inf, 0.0, "are not finite numbers"),
         (1.0, 0.6, "are older than 0.5 s"),
     ],
 )

@@ -194,7 +194,7 @@ class Page:
         name = request.query_params.get("name", "")
         path = await run_in_threadpool(self._mesh, name)
         if path is None:
-            return _refused(404, f"there is no mesh {name} beside the robot file")
+            return _refused(404, f"there is no mesh {name} next to the robot file")
         return Response(path.read_bytes(), media_type="application/octet-stream")
 
     def _mesh(self, name: str) -> Path | None:

@@ -97,7 +97,7 @@ def _source(what: str | None) -> Source:
         from dxlrun_view.recorded import RecordedRobot
 
         if not path.exists():
-            raise InputError(f"there is no log {path}; a run prints at its end where its log is")
+            raise InputError(f"there is no log {path}; a run prints the path of its log when it ends")
         with progress_bar(hidden=False) as draw:
             return RecordedRobot(path, lambda share: draw(f"reading {path.name}", share))
     if path.suffix in (".yaml", ".yml"):

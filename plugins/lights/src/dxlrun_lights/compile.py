@@ -29,7 +29,7 @@ def compile_lights(compilation: Compilation) -> Contribution:
                 )
             elif (other := owners.setdefault(place, name)) != name:
                 what = f"light {name} is on {light.joint}, whose LED is light {other}"
-                file.error(mark, what, "name another joint, or take one of the lights out")
+                file.error(mark, what, "name another joint, or remove one of the lights")
             else:
                 found[name] = Light(light.joint, *place, led.address)
     if len(found) < len(lights):  # without the source, controllers with these commands get no error

@@ -185,9 +185,9 @@ def _simulated(
     options = {"--servo": servo or None, "--baud": baud, "--protocol": protocol}
     given = [name for name, value in options.items() if value is not None]
     if servo and not robot.is_file():
-        raise InputError(f"{robot} is no robot file; if it is a servo, give it a --servo of its own")
+        raise InputError(f"{robot} is not a robot file; if it is a servo, give it a --servo of its own")
     if given:
-        raise InputError(f"{' and '.join(given)} and a robot file exclude each other; leave one of them out")
+        raise InputError(f"{' and '.join(given)} and a robot file exclude each other; omit one of them")
     result = compiled(robot, assignments, (), None)
     for warning in result.warnings:
         print_warning(str(warning))
@@ -213,9 +213,9 @@ def _recorded(log: Path, others: Sequence[str]) -> _Simulated:
     Raises InputError and LogError.
     """
     if others:
-        raise InputError(f"--recorded and {' and '.join(others)} exclude each other; leave one of them out")
+        raise InputError(f"--recorded and {' and '.join(others)} exclude each other; omit one of them")
     if not log.exists():
-        raise InputError(f"there is no log {log}; a run prints at its end where its log is")
+        raise InputError(f"there is no log {log}; a run prints the path of its log when it ends")
     from dxlrun.log.reader import open_log
     from dxlrun.plan.robot_plan import from_json
     from dxlsim.simulation_plan import BusConfig, SimulationConfig
@@ -269,7 +269,7 @@ def link_of_each(buses: Sequence[BusConfig], link: Path | None) -> dict[str, Pat
     if not link.parent.is_dir():
         wrong.append(f"--link {link}: there is no directory {link.parent}; make it first")
     wrong += [
-        f"--link {path} exists and is no link; it is not replaced, choose another --link"
+        f"--link {path} exists and is not a link; it is not replaced, choose another --link"
         for path in links.values()
         if path.exists() and not path.is_symlink()
     ]

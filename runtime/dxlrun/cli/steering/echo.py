@@ -42,10 +42,10 @@ def echo(
         Largest number of messages per second, Hz. Older messages are skipped. Default: no limit.
     """
     if count is not None and count < 1:
-        raise InputError(f"--count {count} is no number of messages; give 1 or more")
+        raise InputError(f"--count {count} is not a number of messages; give 1 or more")
     # Also refuses NaN.
     if rate is not None and not 0 < rate < math.inf:
-        raise InputError(f"--rate {rate:g} is no rate; give a number of Hz above 0")
+        raise InputError(f"--rate {rate:g} is not a rate; give a number of Hz above 0")
     with connect_robot(chosen.robot, "echo") as robot:
         if topic is None:
             states = robot.topics()

@@ -92,7 +92,9 @@ def send(
             what = " ".join(words) if for_device else kind
             return report_done(robot, chosen, done, f"{robot.name}: {controller} accepted {what}{as_goal}")
         if done.goal is None:
-            raise DxlrunError(f"{controller} accepted {kind}, which is no goal that could be waited for")
+            raise DxlrunError(
+                f"{controller} accepted {kind}, but it is not a goal, so nothing can be awaited"
+            )
         return follow(robot, chosen, done, [done.goal.number])
 
 

@@ -81,7 +81,7 @@ def reboot(*joints: Joints, release: Flag = False, chosen: Chosen = ONLY_ONE) ->
     names = _named(joints)
     with connect_robot(chosen.robot, "reboot") as robot:
         done = robot.reboot(names, release=release)
-        text = f"{', '.join(names)} rebooted, in order again{_others(done)}"
+        text = f"{', '.join(names)} rebooted, and ready again{_others(done)}"
         return report_done(robot, chosen, done, f"{robot.name}: {text}")
 
 

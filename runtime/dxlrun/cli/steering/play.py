@@ -90,13 +90,13 @@ def play(
 
 def _check(motions: Sequence[str], loop: int, *, listed: bool, wait: bool) -> None:
     if listed and motions:
-        raise InputError(f"--list shows what there is to play; leave {' '.join(motions)} out")
+        raise InputError(f"--list shows what there is to play; omit {' '.join(motions)}")
     if not (listed or motions):
         raise InputError("name a motion; `dxlrun play --list` shows those of the robot")
     if not 1 <= loop <= MOST_LOOPS:
         raise InputError(f"--loop {loop}: give how often all is played, from 1 to {MOST_LOOPS}")
     if not wait and loop * len(motions) > 1:
-        raise InputError("--no-wait returns when one motion has begun; leave it out to play several")
+        raise InputError("--no-wait returns when one motion has begun; omit it to play several")
     for motion in motions:
         path = Path(motion)
         if not path.is_file() and (path.suffix or path.name != motion):

@@ -166,7 +166,7 @@ def rate(hz: Hertz, /, *, chosen: Chosen = ONLY_ONE) -> int:
     """
     # Also refuses NaN.
     if not 0 < hz < float("inf"):
-        raise InputError(f"{hz:g} is no rate; give a number of Hz above 0")
+        raise InputError(f"{hz:g} is not a rate; give a number of Hz above 0")
     with connect_robot(chosen.robot, "rate") as robot:
         done = robot.rate(hz)
         return report_done(robot, chosen, done, f"{robot.name} runs at {hz:g} Hz")
@@ -182,7 +182,7 @@ def halt(*, chosen: Chosen = ONLY_ONE) -> int:
         text = f"{robot.name} stands still"
         if (found := done.halted) is not None:
             text += f" after {found.seconds:.2f} s ({found.joint}: {found.velocity:.2g} rad/s)"
-        return report_done(robot, chosen, done, f"{text}; `dxlrun switch --activate NAME` lets it go on")
+        return report_done(robot, chosen, done, f"{text}; `dxlrun switch --activate NAME` lets it continue")
 
 
 def take_over(*, chosen: Chosen = ONLY_ONE) -> int:

@@ -176,7 +176,7 @@ def _devices(tables: Sequence[DeviceTable]) -> Table:
         (Column("states", "text"), lambda one: ", ".join(one.items[name].state for name in one.cyclic)),
         (Column("can be commanded", "text"), lambda one: ", ".join(_commands(one))),
     ]
-    return Table.listing("Devices that are no servos", columns, tables)
+    return Table.listing("Devices other than servos", columns, tables)
 
 
 def _commands(table: DeviceTable) -> list[str]:

@@ -101,7 +101,7 @@ def read_search(protocol: float | None, baud: Sequence[int], ids: str | None) ->
     if protocol not in (None, 1.0, 2.0):
         wrong.append(f"there is no Protocol {protocol:g}; --protocol is 1.0 or 2.0")
     wrong += [
-        f"--baud {rate} is no rate of a servo; give bit/s from 9600 to {_FASTEST}"
+        f"--baud {rate} is not a rate of a servo; give bit/s from 9600 to {_FASTEST}"
         for rate in baud
         if not 9_600 <= rate <= _FASTEST
     ]
@@ -121,10 +121,10 @@ def read_ids(text: str) -> tuple[int, ...]:
     for part in text.split(","):
         first, dash, last = part.partition("-")
         if not first.strip().isdecimal() or (dash and not last.strip().isdecimal()):
-            raise InputError(f"--ids {text}: {part!r} is no ID; give for example 1-20 or 1,4,7")
+            raise InputError(f"--ids {text}: {part!r} is not an ID; give for example 1-20 or 1,4,7")
         span = range(int(first), int(last if dash else first) + 1)
         if not span or span[-1] > HIGHEST_ID:
-            raise InputError(f"--ids {text}: {part} is no ID of a servo; they are 0..{HIGHEST_ID}")
+            raise InputError(f"--ids {text}: {part} is not an ID of a servo; they are 0..{HIGHEST_ID}")
         found.update(span)
     return tuple(sorted(found))
 
@@ -149,7 +149,7 @@ def _show(port: str, scanned: Scanned, rates: Mapping[int, int], *, narrowed: bo
     errors = [] if scanned.servos else [nothing]
     set_as = {rate: f": its driver set {real}" for rate, real in rates.items()}
     warnings = [
-        f"{port} cannot run at {rate} bit/s{set_as.get(rate, '')}; this rate was left out"
+        f"{port} cannot run at {rate} bit/s{set_as.get(rate, '')}; this rate was skipped"
         for rate in scanned.left_out
     ]
     warnings += warnings_for(port)
@@ -219,7 +219,7 @@ def check_draft(path: Path) -> None:
     """Raise InputError when `draft_file` could not write the file."""
     check_target(path)
     if path.suffix not in (".yaml", ".yml"):
-        raise InputError(f"{path} is no name for a robot file; end it in .yaml")
+        raise InputError(f"{path} is not a name for a robot file; end it in .yaml")
 
 
 def draft(stem: str, port: str, servos: Sequence[FoundServo], latency_ns: int) -> str:

@@ -94,7 +94,7 @@ def servo(
         elif verb in _OF_DEVICES:
             done = _OF_DEVICES[verb](one, asked)
         else:
-            raise InputError(f"{one.called} is no servo, so it cannot {verb}; it has get and set")
+            raise InputError(f"{one.called} is not a servo, so it cannot {verb}; it has get and set")
         asked.done += filter(None, done)
     _show(one, verb, asked, as_json=as_json)
     return 1 if asked.declined else 0
@@ -103,7 +103,7 @@ def servo(
 def _check(servo_id: int, verb: str, asked: Asked) -> None:
     """Refuse invalid words before the port is opened; raises InputError."""
     if not 0 <= servo_id <= HIGHEST_ID:
-        raise InputError(f"{servo_id} is no ID of a servo; they are 0..{HIGHEST_ID}")
+        raise InputError(f"{servo_id} is not an ID of a servo; they are 0..{HIGHEST_ID}")
     found = VERBS.get(verb)
     if found is None:
         from dxlrun.errors import suggestion
@@ -113,7 +113,7 @@ def _check(servo_id: int, verb: str, asked: Asked) -> None:
         given = " ".join(asked.words) or "nothing"
         raise InputError(f"{verb} takes {found.usage or 'no words'}, not {given}")
     if asked.keep is not None and verb != "factory-reset":
-        raise InputError(f"--except belongs to factory-reset, not to {verb}; leave it out")
+        raise InputError(f"--except belongs to factory-reset, not to {verb}; omit it")
     found.check(asked)
 
 
@@ -216,7 +216,7 @@ class Asked:
             raise InputError(
                 f"{question}: not a terminal, cannot ask for confirmation, nothing was changed; add --yes"
             )
-        sys.stderr.write(f"{question}. Go on? [y/N] ")
+        sys.stderr.write(f"{question}. Continue? [y/N] ")
         sys.stderr.flush()
         self.declined = sys.stdin.readline().strip().lower() not in ("y", "yes")
         return not self.declined
@@ -322,7 +322,9 @@ def _whole(what: str, lowest: int, highest: int) -> Callable[[Asked], None]:
     def check(asked: Asked) -> None:
         for word in asked.words:
             if not word.isdecimal() or not lowest <= int(word) <= highest:
-                raise InputError(f"{word!r} is no {what}; give a whole number from {lowest} to {highest}")
+                raise InputError(
+                    f"{word!r} is not a possible {what}; give a whole number from {lowest} to {highest}"
+                )
 
     return check
 

@@ -195,7 +195,7 @@ def check_limp_joints(file: RobotFile, controllers: Iterable[ControllerPlan]) ->
                 f"controller {plan.name} is active from the start and commands {', '.join(limp)}, which has "
                 "torque: off",
                 f"write active: false, and `dxlrun torque on {' '.join(limp)}` before it is activated, or "
-                "take torque: off out",
+                "remove torque: off",
             )
 
 
@@ -285,7 +285,7 @@ def _check_acceleration(file: RobotFile, plan: JointPlan) -> None:
             mark,
             f"{acceleration:.4g} {unit}^2 limits nothing: {plan.name} may reach its highest speed, "
             f"{speed:.3g} {unit}, within one cycle of {1e3 / rate:.3g} ms",
-            f"write less than {speed * rate:.3g} {unit}^2, or take it out",
+            f"write less than {speed * rate:.3g} {unit}^2, or remove it",
         )
 
 

@@ -120,7 +120,7 @@ def compile_motor(
             else f"an {table.model} has no P gain",
             f"write p_gain: {item.initial or 32}, the value of {item.name} then"
             if item is not None
-            else "take it out; position_gain is then the whole duty for each rad of error",
+            else "remove it; position_gain is then the whole duty for each rad of error",
         )
         return None
     if item is None or motor.p_gain is None:

@@ -37,7 +37,7 @@ def any_value(table: Table, name: str, value: int | str) -> RegisterValue:
         names = tuple(each.name for each in table.items.values() if each.access == "RW")
         raise UnfitRegister(f"an {table.model} has no register {name}", suggestion(name, names))
     if item.access == "R":
-        raise UnfitRegister(f"{item.title} can only be read", "take it out")
+        raise UnfitRegister(f"{item.title} can only be read", "remove it")
     raw = _raw(item, value)
     if not item.minimum <= raw <= item.maximum:
         raise UnfitRegister(
@@ -52,7 +52,7 @@ def _raw(item: ControlItem, value: int | str) -> int:
         try:
             return int.from_bytes(struct.pack("<f", (float(value) - item.offset) / item.scale), "little")
         except (ValueError, OverflowError):
-            raise UnfitRegister(f"{value!r} is no number", f"{item.title} is a float32") from None
+            raise UnfitRegister(f"{value!r} is not a number", f"{item.title} is a float32") from None
     if isinstance(value, int):
         return value
     if not item.unit:

@@ -87,14 +87,14 @@ def compile_frames(
     imu, mark = model.imu or "", file.at("model", "imu")
     if imu and imu not in states:
         turning = [name for name, own in states.items() if set(ORIENTATION) <= set(own)]
-        what = f"model.imu is {imu}, which is no device, sensor or controller with states"
+        what = f"model.imu is {imu}, which is not a device, sensor or controller with states"
         file.error(mark, what, suggestion(imu, turning))
         return None
     if imu and not set(ORIENTATION) <= set(states[imu]):
         file.error(
             mark,
             f"model.imu is {imu}, which has no orientation (x, y, z, w)",
-            "put an imu_sensor_broadcaster behind it, and name that",
+            "add an imu_sensor_broadcaster that reads it, and name that",
         )
         return None
     try:
@@ -107,7 +107,7 @@ def compile_frames(
         file.warning(
             file.at("model", "imu_link"),
             "model.imu_link is the link of an IMU, and model.imu names none",
-            "name it, or take imu_link out",
+            "name it, or remove imu_link",
         )
     return FramesPlan(model.frames_rate, body.moved, imu, tree.imu_link)
 
@@ -144,7 +144,7 @@ def _check_names(
             file.warning(
                 file.key("joints", name),
                 f"{name} follows {mimic.joint} in the URDF, but has a servo of its own, which is what counts",
-                "take the mimic out of the URDF, or the joint out of this file",
+                "remove the mimic from the URDF, or the joint out of this file",
             )
 
 

@@ -382,7 +382,7 @@ class Goals:
             elif commanded > 0 and target.rest_speed < UNLIMITED:
                 rank, off = 1, commanded
                 shown = plan.unit.speed_text(commanded)
-                reason = f"joint {plan.name} is left with a commanded velocity of {shown}"
+                reason = f"joint {plan.name} ends with a commanded velocity of {shown}"
             if (rank, off) > worst[:2]:
                 name = "" if math.isnan(error) and not reason else plan.name
                 worst = rank, off, name, error, reason

@@ -44,7 +44,7 @@ def with_values(model: _Model, values: LiveValues) -> _Model:
     """
     known = frozenset(live_names(model))
     if unknown := [name for name in values if name not in known]:
-        raise ValueError(f"{unknown[0]} is no live parameter")
+        raise ValueError(f"{unknown[0]} is not a live parameter")
     for name, value in values.items():
         first, *rest = name.split(".")
         model = model.model_copy(update={first: _changed(getattr(model, first), rest, value)})

@@ -334,7 +334,7 @@ class Managed:
         on_cancel, time_ns = self.controller.on_cancel, self._schedule.time_ns
         self._call(ControllerMethod.ON_CANCEL, "", on_cancel, goal, time_ns)
         if judged:  # the controller has requested a judgement and does not end it
-            goal.end(Outcome.CANCELLED, "stopped at its end")
+            goal.end(Outcome.CANCELLED, "stopped at the end of the motion")
 
     def change_parameters(self, values: LiveValues) -> None:
         """Replace live parameters in one step.

@@ -194,7 +194,7 @@ class Manager:
         """
         self._goals.time_ns = self._schedule.time_ns
         if len(command.data) % 8:
-            problem = f"{len(command.data)} bytes are no array of numbers"
+            problem = f"{len(command.data)} bytes are not an array of numbers"
             return Refusal(Code.INVALID, {"problem": problem})
         managed = self._commandable(command.controller)
         if isinstance(managed, Refusal):
@@ -473,7 +473,7 @@ class Manager:
             yield Refusal(Code.UNKNOWN_JOINT, {"joint": unknown})
         if (parted := plan.split_group(self._plan.joints)) is not None:
             joint, others = parted[0], " and ".join(parted[1])
-            problem = f"it commands another mode of {joint} without {others}, which the same servos move"
+            problem = f"it needs another mode of {joint}, but not of {others}: the same servos move both"
             yield Refusal(Code.CONTROLLER_FAULT, {"controller": plan.name, "problem": problem})
         if unknown := tuple(lower for lower in plan.into if lower not in known):
             yield Refusal(Code.UNKNOWN_CONTROLLER, {"controller": unknown})

@@ -392,7 +392,7 @@ def _load(plugin: InstalledPlugin) -> LoadedPlugIn:
     if not (type(contract) is int and 1 <= contract <= CONTRACT_VERSION):
         raise refuse(
             f"was written for contract {contract!r}, this dxlrun has contract {CONTRACT_VERSION}",
-            "install a version of it that fits",
+            "install a matching version",
         )
     return LoadedPlugIn(
         plugin.name,
@@ -517,11 +517,11 @@ def _check(breach: Breach | None, kind: object, name: str, refuse: Refuse) -> No
 def controller_breach(controller: object) -> Breach | None:
     """Check a class that is offered as a controller; return the first problem."""
     if not (isinstance(controller, type) and issubclass(controller, Controller)):
-        return "which is no controller", "derive a class from dxlrun.Controller"
+        return "which is not a controller", "derive a class from dxlrun.Controller"
     if breach := methods_breach(controller, Controller, _METHODS) or _laws_breach(controller):
         return breach
     if not is_model(controller.Parameters, ParametersModel):
-        return "whose Parameters is no model of parameters", "derive it from dxlrun.ParametersModel"
+        return "whose Parameters is not a model of parameters", "derive it from dxlrun.ParametersModel"
     for name, (kind, fix) in _DECLARED.items():
         try:
             msgspec.convert(getattr(controller, name), kind)
@@ -541,7 +541,7 @@ def _laws_breach(controller: ControllerClass) -> Breach | None:
 def _commands_breach(controller: ControllerClass) -> Breach | None:
     commands, goals = controller.Commands, controller.Goals
     if wrong := [kind for kind, model in commands.items() if not is_model(model, CommandModel)]:
-        return f"whose command {wrong[0]} is no model of a command", "derive it from dxlrun.CommandModel"
+        return f"whose command {wrong[0]} is not a model of a command", "derive it from dxlrun.CommandModel"
     if goals and controller.on_goal is Controller.on_goal:
         return "which has Goals and no method on_goal", "write it"
     return None
@@ -573,7 +573,7 @@ def interfaces_breach(interfaces: object, *, chained: bool = False) -> Breach | 
     except ValueError as error:
         return (
             f"asks for command interfaces that do not go together: {error}",
-            "ask for position (with velocity or effort beside it), or for velocity, effort or pwm alone",
+            "ask for position (with velocity or effort in addition), or for velocity, effort or pwm alone",
         )
     return None
 

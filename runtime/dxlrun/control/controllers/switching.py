@@ -116,7 +116,7 @@ class Switching:
         """
         requester, names, why = request
         if not names:
-            self.fault = self.fault or f"controller {requester} ended the run: {why}"
+            self.fault = self.fault or texts.run_ended_by(requester, why)
             return
         step = self.standing.request(names)
         if isinstance(step, Step) and not step.enter:
@@ -298,11 +298,11 @@ class Switching:
             if now != Mode.UNKNOWN
         ]
         late = [
-            f"{joint} did not come into {_shown(mode)} mode within {MODE_TIMEOUT_NS * 1e-9:g} s"
+            f"{joint} did not enter {_shown(mode)} mode within {MODE_TIMEOUT_NS * 1e-9:g} s"
             for joint, (mode, now) in missing.items()
             if now == Mode.UNKNOWN
         ]
-        return (stays or late)[0] + (f", nor did {len(missing) - 1} more" if len(missing) > 1 else "")
+        return (stays or late)[0] + (f" (and {len(missing) - 1} more)" if len(missing) > 1 else "")
 
     def _await_no_more(self, managed: Managed) -> Group | None:
         """Remove a controller from its group, and return the remaining group; None if it does not wait."""
@@ -389,7 +389,7 @@ class Switching:
             active = {one.plan.name for one in lowers}
             if missing := [lower for lower in into if lower not in active]:
                 managed.on(Event.LEAVE)
-                problem = f"{missing[0]}, whose references it commands, is not active"
+                problem = f"{missing[0]} below it is not active"
                 event = texts.controller_not_activated(name, problem)
                 self._report_left_out(name, event, fault_of(managed, problem))
                 continue
@@ -436,7 +436,7 @@ class Switching:
         uppers = [self.named[name] for name in above(engaged, managed.plan.name)]
         self._take_out(managed, fault)
         self._drop_group(managed, str(fault))
-        why = f"{managed.plan.name}, whose references it commands, broke its contract"
+        why = f"{managed.plan.name} below it broke its contract"
         for upper in reversed(uppers):
             if upper.active:
                 self._deactivate(upper, why)

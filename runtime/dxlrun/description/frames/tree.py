@@ -116,7 +116,7 @@ class FrameTree:
         if fixed is not None:
             raise _refused(
                 f"the URDF has a frame {fixed}, and the IMU's link {self.imu_link} does not hang from {ODOM}",
-                f"make it the child of {ODOM} by a fixed joint, or take {fixed} out",
+                f"make it the child of {ODOM} by a fixed joint, or remove {fixed}",
             )
         self._turned = urdf.root
         return [Frame(ODOM, "", None, "root"), Frame(urdf.root, ODOM, None, "imu"), *frames[1:]]

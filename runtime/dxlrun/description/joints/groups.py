@@ -101,8 +101,8 @@ class _Places:
             self.moves[*path, key] = [(*path, one) for one in names]
             for one in names:
                 if one in result:
-                    what = f"{path_text(path)} has {one} twice, in the groups {origin[one]} and {key}"
-                    fix = f"write {one} by itself too: that counts"
+                    what = f"{path_text(path)} has {one} twice, by the groups {origin[one]} and {key}"
+                    fix = f"write {one} outside of its groups too: that value counts"
                     self.problems.append(Problem(self._marks.key(*path, key), what, fix))
                 result[one], origin[one] = item, key
         return result
@@ -153,7 +153,7 @@ def _mistakes(grown: Grown) -> Iterator[Problem]:
     for name, entry in _mapping(_mapping(grown.data.get("policies")).get(GROUPS)).items():
         if name in entries and "joints" in _mapping(entry):
             what = f"{name} is a group of the robot, whose joints it has"
-            yield Problem(grown.marks.key("policies", GROUPS, name, "joints"), what, "take joints out")
+            yield Problem(grown.marks.key("policies", GROUPS, name, "joints"), what, "remove joints")
     for name in _mapping(grown.data.get(GROUPS)):
         if name not in entries:
             means = "every joint" if name == ALL else "a joint"
@@ -167,7 +167,7 @@ def _mistakes(grown: Grown) -> Iterator[Problem]:
                 yield Problem(mark, what, suggestion(one, (*joints, *entries)))
             elif circle := _circle(entries, (name, one)):
                 what = f"the group {name} contains itself ({' -> '.join(circle)})"
-                yield Problem(mark, what, "take one of these names out")
+                yield Problem(mark, what, "remove one of these names")
 
 
 def _circle(entries: Mapping[str, object], way: tuple[str, ...]) -> tuple[str, ...]:

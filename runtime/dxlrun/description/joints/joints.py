@@ -124,7 +124,7 @@ class BareJoint(Form):
         if self.wrap and not self.continuous:
             raise refuse(
                 "wrap is for continuous joints: another joint has one way alone",
-                "write continuous: true, or take wrap out",
+                "write continuous: true, or remove wrap",
             )
         return self
 
@@ -301,9 +301,9 @@ Features have further keys, see `JointKey.examples`.
 _OF_OTHER_JOINTS: Mapping[JointUnit, Mapping[KeyPath, str]] = {
     ROTARY: {("simulation", "mass"): "write `inertia: 0.01 kg m^2`"},
     LINEAR: {
-        ("gear_ratio",): "take it out; travel_per_turn is its gear",
+        ("gear_ratio",): "remove it; travel_per_turn is its gear",
         ("simulation", "inertia"): "a linear joint has a mass; write `mass: 0.2 kg`",
-        ("simulation", "gravity_angle"): "a linear joint has its weight everywhere; take gravity_angle out",
+        ("simulation", "gravity_angle"): "a linear joint has its weight everywhere; remove gravity_angle",
     },
 }
 """Keys that joints with this unit do not have, each with a fix."""

@@ -167,7 +167,7 @@ def read_motor(path: Path) -> MotorDescription:
     file, text = str(path), read_text(path)
     grown = grow(parse(text, file), file, refuse_arguments)
     if not any(key in grown.data for key in _ESSENTIAL):
-        what = f"this is no motor file: it has none of {', '.join(_ESSENTIAL)}"
+        what = f"this is not a motor file: it has none of {', '.join(_ESSENTIAL)}"
         raise refusal(Mark(file), what, "name a file as `dxlrun identify` writes it")
     form = read_form(grown, MotorForm)
     found = {name: float(value) for name, value in form.uncertainty if value is not None}

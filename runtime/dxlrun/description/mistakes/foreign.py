@@ -14,7 +14,7 @@ Kind = tuple[str, str]
 _DRAFT = "`dxlrun scan PORT --output robot.yaml` writes a first robot file of the servos at a port"
 _ROSBAGS = (
     "`rosbags-convert --src {path} --dst {stem} --dst-storage mcap` (of `pip install rosbags`) makes an MCAP "
-    "file of it, which `dxlrun replay --on` and `dxlrun convert` read"
+    "file for `dxlrun replay --on` and `dxlrun convert`"
 )
 _MAGIC: Mapping[bytes, Kind] = {
     b"\x89MCAP0\r\n": (

@@ -126,9 +126,7 @@ def _scanned(lines: list[str], file: str, *, by_keys: bool) -> list[Problem]:
                 pass
         elif opened or before in ("]", "}"):  # else it is part of a text
             mark = Mark(file, number + 1, column + 1)
-            problems.append(
-                Problem(mark, f"this {character} closes nothing", "take it out, or open it before")
-            )
+            problems.append(Problem(mark, f"this {character} closes nothing", "remove it, or open it before"))
     if opened:
         same = [each for each in opened if each.line == opened[-1].line]
         problems.append(_not_closed(same, lines, len(lines), file))

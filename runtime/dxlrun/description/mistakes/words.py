@@ -38,13 +38,13 @@ _SERVO_FORM = "ServoEntry"  # base of the forms of servos with keys of a joint
 
 
 _NEEDLESS = {
-    "type": "take it out: the type of the controller decides that",
-    "model": "take it out: the mode of a servo follows from what the joint's controller commands",
-    "revolute": "take it out: a joint that is not linear turns",
+    "type": "remove it: the type of the controller decides that",
+    "model": "remove it: the mode of a servo follows from what the joint's controller commands",
+    "revolute": "remove it: a joint that is not linear turns",
     "continuous": "write `continuous: true`",
     "prismatic": "write `travel_per_turn: 94.2 mm`, how far it moves in a turn of the servo",
-    "fixed": "take the joint out: one without a servo is in the URDF only",
-    "position": "take it out: the mode of a servo follows from what the joint's controller commands",
+    "fixed": "remove the joint: one without a servo is in the URDF only",
+    "position": "remove it: the mode of a servo follows from what the joint's controller commands",
 }
 """Values of keys that a joint does not have, each with the fix."""
 
@@ -157,7 +157,7 @@ class Context(msgspec.Struct, frozen=True):
         if key in self.present and len(place) == 1:
             if elsewhere := places_of(self.root, folded(word), value):
                 return self._moved(folded(word), value, elsewhere)
-            return f"it is called `{key}` here, which is given already: take one of the two out"
+            return f"it is called `{key}` here, which is given already: remove one of the two"
         if (
             isinstance(value, dict | list)
             and not meaning.kind
@@ -176,7 +176,7 @@ class Context(msgspec.Struct, frozen=True):
     def _reference(self) -> str:
         measure = "`dxlrun calibrate ROBOT.yaml` measures it"
         if "reference" in self.present:
-            return f"take it out: the zero of the joint is its `reference`; {measure}"
+            return f"remove it: the zero of the joint is its `reference`; {measure}"
         return f"write `reference`, the servo's angle where the joint is at zero, such as 180 deg; {measure}"
 
     def _misplaced(self, key: str, value: object) -> str:
@@ -196,7 +196,7 @@ class Context(msgspec.Struct, frozen=True):
     def _miswritten(self, key: str, value: object) -> str:
         """Return the fix for a text that is not a key at all; empty: it may be a key."""
         word, sign, rest = (part.strip() for part in re.split(r"([:=]|$)", key, maxsplit=1))
-        named = f"take it out: the entry is called {self.path[1]} already" if len(self.path) == 2 else ""
+        named = f"remove it: the entry is called {self.path[1]} already" if len(self.path) == 2 else ""
         if key.endswith((")", "]")) and value is None:
             fix = "write a list in square brackets: [a, b]"
         elif sign and word in self.known and value is None:
@@ -244,7 +244,7 @@ def misplaced_sections(
         inner = value if isinstance(value, dict) else {}
         own = [name for name in inner if name in root.model_fields and name not in data]
         if key not in root.model_fields and len(own) > 1:
-            fix = f"take `{key}:` out, and write what is in it without indentation"
+            fix = f"remove `{key}:`, and write what is in it without indentation"
             yield from (((key, name), fix) for name in own)
             continue
         for name in own if entries_of(root, key) is not None else ():

@@ -104,7 +104,7 @@ def _newer_sentence(found: Inspected, firmware: int) -> str:
     newer = _newer(found, firmware)
     return (
         f"has firmware {firmware}, but {' and '.join(item.title for item in newer)}, which the robot file "
-        f"declares, came with firmware {max(item.firmware for item in newer)}: take it out of `registers`, "
+        f"declares, came with firmware {max(item.firmware for item in newer)}: remove it from `registers`, "
         "or update the servo"
     )
 
@@ -323,7 +323,7 @@ def inspect_states(servos: Sequence[tuple[Access, Mode]], found: Findings) -> Pr
             reply = yield from retry(servo_read(one.line, servo))
             problem = ""
             if not reply.answered:
-                problem = "answers the reading of its state garbled: do two servos have its ID?"
+                problem = "sends garbled replies when its state is read: do two servos have its ID?"
                 if reply.outcome is Outcome.TIMEOUT:
                     problem = f"does not answer any more: {choose_remedy(one.plan.port, CHECK)}"
             else:
@@ -407,7 +407,7 @@ def _unreadable(one: Access, title: str, reply: Reply) -> str:
     if reply.outcome is Outcome.REFUSED:
         return f"refuses to be read{one.reason(reply)}"
     remedy = choose_remedy(one.plan.port, " If not, check cable and ground", simulated="")
-    return f"answers reads garbled: do two servos have its ID?{remedy}"
+    return f"sends garbled replies to reads: do two servos have its ID?{remedy}"
 
 
 def _misplaced(servo: ServoPlan, raw: int, mode: Mode) -> str:

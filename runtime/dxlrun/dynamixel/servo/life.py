@@ -279,14 +279,14 @@ class Life:
             self.on(index, ServoEvent.TORQUE_GIVEN)
 
     def lose(self, index: int, probe_after_ns: int = 0) -> Loss:
-        """Take a servo out of the exchange. It is probed after a delay, until it passes the checks."""
+        """Remove a servo from the exchange. It is probed after a delay, until it passes the checks."""
         self.on(index, ServoEvent.LOST)
         loss = self.losses[index]
         loss.probe_at_ns += probe_after_ns
         return loss
 
     def reboot(self, index: int, request: RequestedReboot, probe_after_ns: int) -> Loss:
-        """Take a servo out of the exchange for a requested reboot, until its return or `answered`."""
+        """Remove a servo from the exchange for a requested reboot, until its return or `answered`."""
         loss = self.lose(index, probe_after_ns)
         loss.reboot = request
         self._show(index, Torque.REBOOTING)

@@ -31,7 +31,7 @@ FARTHEST_INWARD = 1.0
 """rad [i]. A continuous servo is not moved back into its limits from farther away: after more turns than its
 counter holds it would unwind all of them."""
 LONGEST_BACK = 64  # bytes; items farther apart are read back one by one
-STARTED_ANEW = "started anew while its mode was changed"
+STARTED_ANEW = "rebooted while its mode was changed"
 _RESET = (
     "velocity_i_gain",
     "velocity_p_gain",

@@ -42,7 +42,7 @@ class Offline:
         self.desired = desired
 
     def lose(self, index: int) -> None:
-        """Take a silent servo out of the exchange, and stop it if it follows no position."""
+        """Remove a silent servo from the exchange, and stop it if it follows no position."""
         loss = self.life.lose(index, FIRST_PROBE_NS)
         if loss.had_torque and self.desired.resting(index) is not None:
             loss.kept_goal = False
@@ -74,7 +74,7 @@ class Offline:
             if loss.reboot is not None and loss.reboot.until_ns <= now:
                 text = f"did not come back within {REBOOT_NS * 1e-9:g} s after its reboot"
                 remedy = choose_remedy(self.life.plan.port, CHECK)
-                self._answer(index, loss, f"{text}: {remedy}; it is probed until it is in order")
+                self._answer(index, loss, f"{text}: {remedy}; it is probed until it is ready")
 
     def switch_off(self, index: int, done: Done) -> None:
         """Switch off the torque of a RELEASED servo in idle time."""
@@ -196,7 +196,7 @@ class Offline:
                 self.switch_off(index, ignore)
         if not (torqued or loss.limp_reported or loss.released):
             life.report_limp(index, 0)
-        problem = "" if loss.rebooted else "answers, but did not start anew"
+        problem = "" if loss.rebooted else "answers, but did not reboot"
         if loss.reboot is not None and loss.reboot.had_torque and not (torqued or loss.released):
             joint = life.plan.servos[index].joint
             problem = problem or f"is back, limp; `dxlrun torque on {joint}` gives it torque"

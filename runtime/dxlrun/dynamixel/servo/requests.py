@@ -68,7 +68,7 @@ class Requests:
             return
         problem, mode = yield from self._hold(index)
         if life.states[index] is not ServoState.LIMP:
-            problem = problem or "was lost or switched off again meanwhile"
+            problem = problem or "was lost or switched off again during the request"
         elif problem:
             life.on(index, ServoEvent.RELEASE)
             yield from self._offline.limp(index)
@@ -83,9 +83,9 @@ class Requests:
     def _torqued(self, index: int) -> Program[str]:
         life, name = self._life, self._life.name(index)
         if life.offline(index):
-            return f"{name} was lost meanwhile"
+            return f"{name} was lost during the request"
         if life.states[index] is ServoState.RELEASED:
-            return f"{name} was switched off again meanwhile"
+            return f"{name} was switched off again during the request"
         if life.states[index] not in IN_DOUBT:
             return ""
         back = yield from life.reach(index).read_torque()
@@ -104,7 +104,7 @@ class Requests:
         if found.problems:
             return "; ".join(problem.removeprefix(name) for problem in found.problems), mode
         if (yield from self._reboots.tick(index)):
-            return "started anew while it was checked; ask again", mode
+            return "rebooted while it was checked; ask again", mode
         problem = (yield from modes.hold(one, mode)).problem or (yield from watchdog.arm(one))
         return problem.removeprefix(name), mode
 

@@ -110,7 +110,7 @@ def release_all(plan: BusPlan) -> Program[list[str]]:
         one, item = armed.pop(0)
         reply = yield from one.read_bytes(item.address, item.size)
         if not reply.answered:
-            problem = f"did not answer when its {item.title} was read: it may stop by itself"
+            problem = f"did not answer when its {item.title} was read: it may stop on its own"
             problems.append(f"{one} {problem}")
         elif tripped(item, reply.word(item.size)):
             problems.append(f"{one} was stopped by its {item.title} and stays where it stopped")

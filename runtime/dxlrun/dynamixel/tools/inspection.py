@@ -280,7 +280,7 @@ def _identity(plan: BusPlan, servo: ServoPlan, reply: Reply) -> Identity:
         how = (
             f"does not answer at {plan.baud_rate} bit/s: {remedy}"
             if reply.outcome is Outcome.TIMEOUT
-            else "answers garbled: do two servos have its ID?"
+            else "sends garbled replies: do two servos have its ID?"
         )
         problem = f"{name} {how}; its model is not known, so write it in the robot file"
         return Identity(servo.joint, "", problem)

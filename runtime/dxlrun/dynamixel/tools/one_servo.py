@@ -234,7 +234,7 @@ class OneServo(OneNode):
             InputError: The protocol does not have the ID.
         """
         if new > (highest := self.tool.line.dialect.HIGHEST_ID):
-            raise InputError(f"{new} is no ID of Protocol {self.table.protocol}; they are 0..{highest}")
+            raise InputError(f"{new} is not an ID of Protocol {self.table.protocol}; they are 0..{highest}")
         if new == self.servo_id:
             return f"has ID {new} already"
         if not confirm(f"{self.called}: its ID becomes {new} (EEPROM)"):
@@ -316,9 +316,9 @@ class OneServo(OneNode):
             # After a turn of the counter the tick does not show a reboot.
             if tick > passed_ms + _TICK_SPARE_MS and passed_ms < _TICK_MODULUS:
                 raise self.fail(
-                    f"did not start anew: its Realtime Tick is {tick} ms, {passed_ms} ms after the reboot"
+                    f"did not reboot: its Realtime Tick is {tick} ms, {passed_ms} ms after the reboot"
                 )
-        return f"started anew, and {'holds torque' if self.holds_torque() else 'is limp'}"
+        return f"rebooted, and {'holds torque' if self.holds_torque() else 'is limp'}"
 
     def factory_reset(self, keep: Reset | None = None, confirm: Confirm = agree) -> str:
         """Reset the control table to the factory's values.
@@ -379,7 +379,7 @@ class OneServo(OneNode):
         )
         self._await()
         self._same()
-        return "took its EEPROM back from its own backup, and started anew"
+        return "took its EEPROM back from its own backup, and rebooted"
 
     def restore(
         self, desired: Sequence[RegisterValue], path: Path, confirm: Confirm = agree

@@ -286,7 +286,7 @@ def _look_closer(
     remarks = list(servo.remarks)
     if garbled:
         remedy = choose_remedy(port, " If not, check its cable", simulated="")
-        remarks.append(f"answers garbled now and then: do two servos have this ID?{remedy}")
+        remarks.append(f"sends garbled replies now and then: do two servos have this ID?{remedy}")
     elif silent:
         remedy = choose_remedy(port, CHECK)
         remarks.append(f"did not answer {ATTEMPTS} reads of {', '.join(silent)}: {remedy}")
@@ -306,7 +306,7 @@ def _look_closer(
 def _mute(ping: Reply, reply: Reply, line: Line, port: str) -> str:
     if Outcome.GARBLED in (ping.outcome, reply.outcome):
         remedy = choose_remedy(port, " If not, check cable and ground", simulated="")
-        return f"answers garbled: do two servos have this ID?{remedy}"
+        return f"sends garbled replies: do two servos have this ID?{remedy}"
     if not ping.answered:
         return f"answered once, and then no more: {choose_remedy(port, CHECK)}"
     if reply.outcome is Outcome.REFUSED:

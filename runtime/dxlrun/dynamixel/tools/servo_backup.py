@@ -60,7 +60,7 @@ def read_backup(path: Path) -> ServoBackup:
         raise InputError(f"{path} cannot be read ({error.strerror}); check the path") from None
     except (msgspec.DecodeError, ValueError, RecursionError) as error:  # also bytes that are not UTF-8
         raise InputError(
-            f"{path} is no backup of a servo: {error}; `dxlrun servo backup` writes one"
+            f"{path} is not a backup of a servo: {error}; `dxlrun servo backup` writes one"
         ) from None
 
 
@@ -74,13 +74,13 @@ def registers_to_restore(path: Path, backup: ServoBackup, table: ControlTable) -
     if (backup.model_number, backup.protocol) != (table.model_number, table.protocol):
         raise InputError(
             f"{path} is of a {backup.model} of Protocol {backup.protocol}, not of a {table.model} of "
-            f"Protocol {table.protocol}; give the backup of such a servo"
+            f"Protocol {table.protocol}; give a backup of the same model"
         )
     found: list[RegisterValue] = []
     for name, value in backup.registers.items():
         item = table.items.get(name)
         if item is None or item.access != "RW":
-            wrong.append(f"{path}: a {table.model} has no register {name} to be written; take it out")
+            wrong.append(f"{path}: a {table.model} has no register {name} to be written; remove it")
         elif _stays(name):
             continue
         elif not item.minimum <= value <= item.maximum and value != item.initial:

@@ -48,7 +48,7 @@ def inspect_device(plan: BusPlan, device: DevicePlan, line: Line) -> Program[str
         return f"does not answer: {remedy}"
     if reply.outcome is Outcome.GARBLED:
         remedy = choose_remedy(plan.port, " If not, check its cable", simulated="")
-        return f"answers garbled or twice: does something else have its ID?{remedy}"
+        return f"sends garbled or double replies: does something else have its ID?{remedy}"
     if device.model_number is not None:
         reply = yield from retry(line.read(device.servo_id, *_MODEL_NUMBER))
         if not reply.answered:

@@ -131,7 +131,7 @@ def _table(file: RobotFile, name: str, device: Device) -> DeviceTable | None:
         file.error(mark, what, "check the name, which counts from the folder of this file")
         return None
     except ValueError as error:
-        what = f"{device.model} of {name} is no control table of a device: {error}"
+        what = f"{device.model} of {name} is not a control table of a device: {error}"
         file.error(mark, what, "correct that file; docs/how-to/devices.md has its form")
         return None
     if bus is not None and table.protocol != bus.protocol:
@@ -185,7 +185,7 @@ def _written_items(file: RobotFile, name: str, device: Device, table: DeviceTabl
                 for one in table.items.values()
                 if (one.access, one.area, one.bit) == ("RW", "RAM", None)
             ]
-            fix = f"take one of {', '.join(writable)}" if writable else "take it out"
+            fix = f"take one of {', '.join(writable)}" if writable else "remove it"
             file.error(mark, f"{item.name} of {name} ({table.model}) {why}", fix)
     return found
 
@@ -199,10 +199,10 @@ def _with_safe_values(
         mark = file.at("devices", name, "safe", each)
         if (command := commands.get(each)) is None:
             fix = suggestion(each, tuple(commands)) if commands else "name its item under commands"
-            file.error(mark, f"{each} is no command of {name}", fix)
+            file.error(mark, f"{each} is not a command of {name}", fix)
         elif not command.lowest <= value <= command.highest:
             ends = f"{command.lowest:g} to {command.highest:g}"
-            file.error(mark, f"{name}/{each} = {value:g} lies outside its range", f"give it {ends}")
+            file.error(mark, f"{name}/{each} = {value:g} is outside its range", f"give it {ends}")
         else:
             found[each] = replace(command, safe=value)
     return tuple(found.values())

@@ -27,10 +27,10 @@ def _items(value: object) -> tuple[tuple[str, str], ...]:
         )
     for name, item in pairs:
         if not isinstance(item, str) or not _ITEM.fullmatch(item):
-            raise refuse(f"{item!r} is no name of an item", "`dxlrun models MODEL` lists the items")
+            raise refuse(f"{item!r} is not a name of an item", "`dxlrun models MODEL` lists the items")
         if name and not _STATE.fullmatch(name):
             raise refuse(
-                f"{name!r} is no name of a state",
+                f"{name!r} is not a name of a state",
                 "start with a letter, and use letters, digits and _, such as angular_velocity.x",
             )
         if name == "age":
@@ -71,9 +71,9 @@ def _numbers(value: object) -> dict[str, float]:
         raise refuse("this gives no values of states", "write STATE: NUMBER for each, in SI units")
     for name, number in value.items():
         if not isinstance(name, str) or isinstance(number, bool) or not isinstance(number, int | float):
-            raise refuse(f"{number!r} is no value of a state", "write a number, in SI units")
+            raise refuse(f"{number!r} is not a value of a state", "write a number, in SI units")
         if not math.isfinite(number):
-            raise refuse(f"{number!r} is no value of a state", "write a finite number, in SI units")
+            raise refuse(f"{number!r} is not a value of a state", "write a finite number, in SI units")
     return {name: float(number) for name, number in value.items()}
 
 

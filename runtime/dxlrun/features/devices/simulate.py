@@ -40,7 +40,7 @@ def simulated_states(
         mark = file.at("devices", name, "simulation", "link")
         if links is None:
             what = f"{name} is on link {keys.link}, and the file names no URDF"
-            file.error(mark, what, "write `model: {urdf: ...}`, or take link out")
+            file.error(mark, what, "write `model: {urdf: ...}`, or remove link")
         else:
             what = f"{name} is on link {keys.link}, which the URDF does not have"
             file.error(mark, what, suggestion(keys.link, tuple(links)))

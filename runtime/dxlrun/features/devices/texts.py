@@ -12,7 +12,7 @@ def device_found(model: str, device_id: int, bus: str) -> str:
 
 @event_text(EventCode.SETUP, Severity.WARNING)
 def device_read_apart(device: str) -> str:
-    return f"{device} answers alone but not together with others, and is read by itself from now on"
+    return f"{device} answers single reads, but no reads together with others; it is read alone from now on"
 
 
 @event_text(EventCode.READ_LOST, Severity.WARNING)
@@ -32,12 +32,12 @@ def device_answers_again(device: str, lost: int) -> str:
 
 @event_text(EventCode.DEVICE_LOST, Severity.ERROR)
 def device_lost(device: str, missed: int) -> str:
-    return f"{device} missed {missed} replies in a row; it is asked once a second until it is back"
+    return f"{device} missed {missed} replies in a row; it is probed once a second until it is back"
 
 
 @event_text(EventCode.DEVICE_LOST, Severity.ERROR)
 def device_silent_in_cycles(device: str) -> str:
-    return f"{device} answers between the cycles, but not in them; it is asked once a second"
+    return f"{device} answers in idle time, but not in cycles; it is probed once a second"
 
 
 @event_text(EventCode.DEVICE_LOST, Severity.ERROR)
@@ -47,7 +47,7 @@ def device_unfit(device: str, problem: str) -> str:
 
 @event_text(EventCode.DEVICE_BACK, Severity.INFO)
 def device_back(device: str) -> str:
-    return f"{device} is in order and is read again"
+    return f"{device} is back, and is read again"
 
 
 @event_text(EventCode.SERVO_ERROR, Severity.WARNING)

@@ -180,9 +180,7 @@ def _matrix(file: RobotFile, name: str, transmission: Transmission) -> tuple[Row
         return None
     if named is not None and transmission.matrix is not None:
         what = f"{name} is a {transmission.type}, whose matrix is known"
-        file.error(
-            file.key("transmissions", name, "matrix"), what, "take matrix out, or write `type: matrix`"
-        )
+        file.error(file.key("transmissions", name, "matrix"), what, "remove matrix, or write `type: matrix`")
         return None
     if named is not None and (servos, joints) != (len(named[0]), len(named)):
         what = f"{name} is a {transmission.type} with {servos} servos and {joints} joints"

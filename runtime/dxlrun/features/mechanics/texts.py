@@ -15,7 +15,7 @@ def torque_refused(coupling: str, problem: str) -> str:
 @event_text(EventCode.TORQUE_OFF, Severity.WARNING)
 def partners_released(coupling: str, limp: Sequence[str], others: Sequence[str]) -> str:
     return (
-        f"{coupling}: {' and '.join(limp)} is limp, so {' and '.join(others)} loses its torque: "
+        f"{coupling}: {' and '.join(limp)} is limp, so torque goes off on {' and '.join(others)}: "
         "they move one mechanism"
     )
 

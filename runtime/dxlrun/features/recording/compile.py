@@ -26,7 +26,7 @@ def compile_recording(compilation: Compilation) -> Contribution:
         file.error(
             marks.key("recording", "keep"),
             "keep needs parts: a log in one file is kept whole",
-            "write `split: 1 min` beside it, or a size, or take keep out",
+            "add `split: 1 min`, or a size, or remove keep",
         )
     limits = amount.get("bytes"), amount.get("ns"), kept.get("ns"), kept.get("bytes")
     return Contribution(recording=RecordingPlan(written.directory, *limits))

@@ -14,7 +14,7 @@ from dxlrun.features.feature import ServoKey
 def _register(value: object) -> object:
     if isinstance(value, bool) or not isinstance(value, int | str):
         raise refuse(
-            "this is no value of a register", "write the raw integer, or a quantity with its unit: 500 us"
+            "this is not a value of a register", "write the raw integer, or a quantity with its unit: 500 us"
         )
     return value
 

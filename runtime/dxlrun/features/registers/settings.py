@@ -21,11 +21,11 @@ from dxlwire.control_table import ControlItem, ControlTable
 _LEVEL = "status_return_level"
 _LOWER = ("min_position_limit", "cw_angle_limit")
 _UPPER = ("max_position_limit", "ccw_angle_limit")
-_COMMANDED = ("controllers command it", "take it out; a controller sends it")
-_MODE = ("the interfaces of the active controllers choose the mode", "take it out; claim other interfaces")
-_ADDRESS = ("dxlrun finds the servo by it", "take it out; `dxlrun servo` changes it")
-_SECOND_ID = ("a servo with a second ID executes the goals of another one", "take it out")
-_TICK = ("it changes the size of a tick", "take it out")
+_COMMANDED = ("controllers command it", "remove it; a controller sends it")
+_MODE = ("the interfaces of the active controllers choose the mode", "remove it; claim other interfaces")
+_ADDRESS = ("dxlrun finds the servo by it", "remove it; `dxlrun servo` changes it")
+_SECOND_ID = ("a servo with a second ID executes the goals of another one", "remove it")
+_TICK = ("it changes the size of a tick", "remove it")
 _OWN: Mapping[str, tuple[str, str]] = MappingProxyType(
     {
         "id": _ADDRESS,
@@ -34,7 +34,7 @@ _OWN: Mapping[str, tuple[str, str]] = MappingProxyType(
         "protocol_type": _ADDRESS,
         "secondary_id": _SECOND_ID,
         "secondary_shadow_id": _SECOND_ID,
-        "torque_enable": ("dxlrun switches the torque, after its checks", "take it out"),
+        "torque_enable": ("dxlrun switches the torque, after its checks", "remove it"),
         "operating_mode": _MODE,
         "control_mode": _MODE,
         "torque_ctrl_mode_enable": _MODE,
@@ -45,14 +45,14 @@ _OWN: Mapping[str, tuple[str, str]] = MappingProxyType(
         "goal_torque": _COMMANDED,
         "moving_speed": _COMMANDED,
         "profile_velocity": _COMMANDED,
-        "current": ("it is measured", "take it out"),
+        "current": ("it is measured", "remove it"),
         "torque_limit": (
             "policies reduce it, and a start restores it",
             "declare max_torque, its value after power-on",
         ),
-        "bus_watchdog": ("dxlrun arms it", "take it out; the bus' key `bus_watchdog` is its time"),
-        "lock": ("it closes the EEPROM until power-off", "take it out"),
-        "hybrid_save": ("it stores RAM values in the EEPROM", "take it out"),
+        "bus_watchdog": ("dxlrun arms it", "remove it; the bus' key `bus_watchdog` is its time"),
+        "lock": ("it closes the EEPROM until power-off", "remove it"),
+        "hybrid_save": ("it stores RAM values in the EEPROM", "remove it"),
         "electronic_gearratio_numerator": _TICK,
         "electronic_gearratio_denominator": _TICK,
     }
@@ -177,7 +177,7 @@ def declarable(table: ControlTable) -> tuple[str, ...]:
 def own_reason(table: ControlTable, item: ControlItem) -> tuple[str, str] | None:
     """Return the reason why an item is reserved for dxlrun, and the fix; None if it is not."""
     if item.name.startswith("indirect_"):
-        return "a reboot resets it", "take it out"
+        return "a reboot resets it", "remove it"
     if item.name in _ANGLE_LIMITS and table.protocol == 1.0:
         return (
             "both angle limits choose the mode, which dxlrun sets",
@@ -195,7 +195,7 @@ def _check_meaning(item: ControlItem, raw: int) -> None:
     if rule is None or rule.planned or factory is None or rule.judge(raw, factory) != "refuse":
         return
     raise UnfitRegister(
-        f"{item.title} cannot be {raw}, which {rule.effect_of(raw)}", f"write {factory}, or take it out"
+        f"{item.title} cannot be {raw}, which {rule.effect_of(raw)}", f"write {factory}, or remove it"
     )
 
 

@@ -37,7 +37,7 @@ class NeededSensors:
         for row, sensor in self.needed:
             age_ns = ages_ns.item(row)
             if (age_ns if age_ns >= 0 else time_ns) > sensor.timeout_ns:
-                nothing = f"sensor {sensor.name} brought nothing for {sensor.timeout_ns / 1e6:g} ms"
+                nothing = f"sensor {sensor.name} delivered nothing for {sensor.timeout_ns / 1e6:g} ms"
                 self.actions.end_run("on_fault", nothing)
 
 

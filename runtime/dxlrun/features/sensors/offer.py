@@ -17,11 +17,11 @@ _METHODS = ("__init__", "states", "units", "links", "noisy", "open", "read", "cl
 def sensor_breach(sensor: object) -> Breach | None:
     """Check a class that is offered as a sensor."""
     if not is_model(sensor, Sensor):
-        return "which is no sensor", "derive a class from dxlrun.Sensor"
+        return "which is not a sensor", "derive a class from dxlrun.Sensor"
     if breach := methods_breach(sensor, Sensor, _METHODS):
         return breach
     if not is_model(getattr(sensor, "Parameters", None), ParametersModel):
-        return "whose Parameters is no model of parameters", "derive it from dxlrun.ParametersModel"
+        return "whose Parameters is not a model of parameters", "derive it from dxlrun.ParametersModel"
     for flag in ("waits", "simulated"):
         if not isinstance(getattr(sensor, flag), bool):
             return f"whose {flag} is neither True nor False", "write one of them"

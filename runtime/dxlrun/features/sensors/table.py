@@ -26,7 +26,7 @@ def sensor_table(sensors: Sequence[Row]) -> Table:
         (Column("timeout", form="{:g} ms"), lambda row: row["timeout"] * 1e3),
         (
             Column("when lost", "text"),
-            lambda row: "the run ends" if row["on_lost"] == "stop" else "the run goes on",
+            lambda row: "the run ends" if row["on_lost"] == "stop" else "the run continues",
         ),
         (Column("states", "text"), lambda row: names_with_units(row["states"], row["units"])),
         *[(Column("senses link", "text"), lambda row: ", ".join(row["links"]))]

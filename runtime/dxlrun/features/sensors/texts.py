@@ -31,19 +31,19 @@ def sensor_stuck(sensor: str, lasted_ns: int) -> str:
 
 @event_text(SensorEvent.SENSOR_LOST, Severity.ERROR)
 def sensor_silent(sensor: str, age_ns: int) -> str:
-    return f"sensor {sensor} brought no sample for {age_ns / 1e6:.0f} ms"
+    return f"sensor {sensor} delivered no sample for {age_ns / 1e6:.0f} ms"
 
 
 @event_text(SensorEvent.SENSOR_LOST, Severity.ERROR)
 def sensor_never_answered(sensor: str) -> str:
-    return f"sensor {sensor} brought no sample since the start"
+    return f"sensor {sensor} delivered no sample since the start"
 
 
 @event_text(SensorEvent.SENSOR_LOST, Severity.ERROR)
 def sensor_gone(sensor: str) -> str:
-    return f"sensor {sensor} is gone; its values are not valid"
+    return f"sensor {sensor} has failed; its values are not valid"
 
 
 @event_text(SensorEvent.SENSOR_BACK, Severity.INFO)
 def sensor_back(sensor: str) -> str:
-    return f"sensor {sensor} brings samples again"
+    return f"sensor {sensor} delivers samples again"

@@ -233,11 +233,11 @@ class McapFile:
             # A wrong length may have skipped the next chunk.
             begin = min(begin, self._anchor)
             self.end, self._anchor = found, found + 1
-            self.damage.append(f"what lies between byte {begin} and byte {found}{self._of} cannot be read")
+            self.damage.append(f"the data between byte {begin} and byte {found}{self._of} cannot be read")
             return True
         stream.seek(begin)
         if stream.read(1) == b"\0":
-            self.damage.append(f"what lies behind byte {begin}{self._of} cannot be read: it is no record")
+            self.damage.append(f"the data after byte {begin}{self._of} cannot be read: it is not a record")
         return False
 
     @property
@@ -253,7 +253,7 @@ class McapFile:
             return None
 
     def _damaged_chunk(self, error: Exception) -> None:
-        damage = f"a chunk of messages is damaged and left out: {_reason(error)}"
+        damage = f"a chunk of messages is damaged and skipped: {_reason(error)}"
         if damage not in self.damage:
             self.damage.append(damage)
 
@@ -310,7 +310,7 @@ class McapFile:
         else:
             raise EOFError(f"its compression {chunk.compression!r} is not known")
         if len(data) != size:
-            raise EOFError("it is not as long as it says")
+            raise EOFError("it has another length than it declares")
         if chunk.uncompressed_crc not in (0, zlib.crc32(data)):
             raise EOFError("its bytes do not agree with their CRC")
         return data
@@ -352,7 +352,7 @@ class McapFile:
             self._take_room(size)
             name, data = name.removesuffix(COMPRESSED_SUFFIX), _of_zstd(data, size + 1)
             if len(data) != size:
-                raise EOFError("it is not as long as it says")
+                raise EOFError("it has another length than it declares")
         self.attachments[name] = data
 
     def _take_metadata(self, body: ReadDataStream) -> None:

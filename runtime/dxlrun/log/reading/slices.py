@@ -200,7 +200,7 @@ class Slicer:
         damage = list(self._file.damage)
         if self.wrong:
             them = counted(self.wrong, "message of packets is", "messages of packets are")
-            damage.append(f"{them} damaged and left out")
+            damage.append(f"{them} damaged and skipped")
         if not self._file.finished:
             damage.append(f"{self._walk.no_end}; {self._span.last_cycle_text}")
         empty = self._log(self._cycles[:0], _NO_PACKETS)

@@ -71,7 +71,7 @@ class LogWalk:
                         yield messages
                 refused = None
             except _OtherRunError:
-                found.damage.append(f"{file.name} is of another run and left out")
+                found.damage.append(f"{file.name} is of another run and was skipped")
                 found.finished = True
             except LogError as error:
                 if len(log.files) == 1:
@@ -82,7 +82,7 @@ class LogWalk:
             raise refused
         last = found.metadata.get(PART_END_NAME, {}).get("last")
         if found.name and found.finished and last == "no":
-            found.damage.append(f"the parts behind {found.name} are missing")
+            found.damage.append(f"the parts after {found.name} are missing")
 
     @property
     def is_being_written(self) -> bool:
@@ -124,7 +124,7 @@ def _opened(path: Path) -> Iterator[tuple[IO[bytes], int]]:
             if not start.startswith(MAGIC):
                 if kind := kind_of_bytes(start, path):
                     raise LogError(f"{path}: {'; '.join(kind)}")
-                raise LogError(f"{path}: this is no MCAP file, so it is no log of dxlrun")
+                raise LogError(f"{path}: this is not an MCAP file, and a log of dxlrun is one")
             yield stream, size
     except OSError as error:
         raise LogError(f"{path}: cannot be read: {error.strerror or error}") from error

@@ -186,7 +186,7 @@ def _servo(plan: Plan, name: str, item: str) -> tuple[ServoPlan, ControlTable, d
     mine = [known[name]] if name in known else [*joints.get(name, ())]
     if not mine:
         hint = (
-            f"it is no servo: `dxlrun get {name}` prints its states"
+            f"it is not a servo: `dxlrun get {name}` prints its states"
             if name in plan.loop.source_states
             else suggestion(name[:_LONGEST], tuple(known))
         )

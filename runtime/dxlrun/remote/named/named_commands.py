@@ -100,7 +100,7 @@ def joint_command(
         named_too = {"joints": [joint.name for joint in joints]} if partial else {}
         return JointCommand(chosen, msgspec.json.encode({"points": [point], "start_in": 0.0} | named_too))
     if seconds is not None:
-        raise invalid(f"{plan.name} takes no time, it goes there at once; leave it out")
+        raise invalid(f"{plan.name} takes no time, it goes there at once; omit it")
     # With a position, a velocity or an effort is an upper limit.
     still = "positions" not in fields_of
     content = {
@@ -232,7 +232,7 @@ def source_command(
             raise refused(Code.UNKNOWN_COMMAND, fields | {"hint": suggestion(name[:80], source.commands)})
         lowest, highest = ranges[name]
         if isinstance(value, bool) or not isinstance(value, int | float):
-            raise invalid(f"{source.name}/{name} = {str(value)[:40]} is no number")
+            raise invalid(f"{source.name}/{name} = {str(value)[:40]} is not a number")
         if not lowest <= value <= highest:
             problem = f"{value:g} lies outside {lowest:g} to {highest:g}"
             raise refused(Code.BEYOND_LIMITS, {"controller": source.name, "kind": name, "problem": problem})

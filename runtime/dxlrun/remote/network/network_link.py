@@ -33,7 +33,7 @@ class NetworkLink(SocketLink):
         # asyncio does not send the reason.
         except ConnectionResetError as error:
             raise ConnectionResetError(
-                f"{error}; the run may be at its end, or {keys_place() / CLIENT}.crt is expired, revoked "
+                f"{error}; the run may have ended, or {keys_place() / CLIENT}.crt is expired, revoked "
                 "or of another authority"
             ) from error
 

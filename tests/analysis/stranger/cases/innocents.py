@@ -78,7 +78,7 @@ def very_fast_motion(story: Story) -> None:
 
 @case("fine", "mx_bulk x_three", good=True)
 def paused_and_resumed(story: Story) -> None:
-    """A client pauses the run for a second and lets it go on."""
+    """A client pauses the run for a second and lets it continue."""
     story.asks += [(2.0, "", "pause", {}), (3.0, "", "resume", {})]
     story.play()
     story.evidence["paused"] += 1
