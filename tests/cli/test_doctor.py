@@ -368,8 +368,8 @@ def test_what_a_machine_hides_is_not_called_bad(tmp_path: Path) -> None:
 @pytest.mark.parametrize(
     ("capabilities", "priority", "memory"),
     [
-        ((), "up to 99, by the limit rtprio", "all of it, by the limit memlock"),
-        (("CAP_SYS_NICE", "CAP_IPC_LOCK"), "up to 99, by CAP_SYS_NICE", "all of it, by CAP_IPC_LOCK"),
+        ((), "up to 99, by the limit rtprio", "all memory, by the limit memlock"),
+        (("CAP_SYS_NICE", "CAP_IPC_LOCK"), "up to 99, by CAP_SYS_NICE", "all memory, by CAP_IPC_LOCK"),
     ],
 )
 def test_a_right_names_its_source(

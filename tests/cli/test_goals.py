@@ -378,7 +378,7 @@ def test_motions_are_played_one_after_the_other_until_one_does_not_reach_its_end
     ("words", "said"),
     [
         ((), "name a motion; `dxlrun play --list` shows those of the robot"),
-        (("walk", "--list"), "--list shows what there is to play; leave walk out"),
+        (("walk", "--list"), "--list shows what there is to play; omit walk"),
         (("walk", "--loop", "0"), "--loop 0: give how often all is played, from 1 to 10000"),
         (("walk", "bow", "--no-wait"), "--no-wait returns when one motion has begun; omit it"),
         (("walk", "--loop", "2", "--no-wait"), "--no-wait returns when one motion has begun; omit it"),

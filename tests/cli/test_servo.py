@@ -51,7 +51,7 @@ def test_registers_are_read_and_written_and_the_eeprom_only_when_it_was_asked_fo
     assert ["return_delay_time", "9", "EEPROM", "RW", "250", "500", "us"] in [
         line.split() for line in table.out.splitlines()
     ]
-    assert servo(1, "set", "position_p_gain", "900", *NEW).out.strip().endswith("was 800 and is 900")
+    assert servo(1, "set", "position_p_gain", "900", *NEW).out.strip().endswith("was changed from 800 to 900")
     refused = servo(1, "set", "return_delay_time", "0", *NEW)
     assert refused.code == 2
     assert "Return Delay Time (9) is 250 and becomes 0 (EEPROM): not a terminal, cannot ask" in refused.err
@@ -63,7 +63,7 @@ def test_registers_are_read_and_written_and_the_eeprom_only_when_it_was_asked_fo
     again = servo(1, "set", "return_delay_time", "100 us", *NEW)  # nothing to confirm
     assert (again.code, "is 50 already" in again.out) == (0, True)
     offset = servo(1, "set", "homing_offset", "-100", "--yes", *NEW)
-    assert (offset.code, "was 0 and is -100" in offset.out) == (0, True)
+    assert (offset.code, "was changed from 0 to -100" in offset.out) == (0, True)
     read = result_of(servo(1, "get", "return_delay_time", "homing_offset", "--json", *NEW).out)
     assert read["registers"] == {"return_delay_time": 50, "homing_offset": -100}
     assert len(writes(finish())) == 3

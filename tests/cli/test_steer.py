@@ -402,7 +402,7 @@ def test_a_refusal_has_its_code_and_its_fields_for_programs(dxlrun, torso: Remot
         ),
         ("switch --activate head", "head is active already"),
         ("resume", "the loop is not paused"),
-        ("load spare type=joint_state_broadcaster", "pause the loop first"),
+        ("load spare type=joint_state_broadcaster", "the loop must be paused for this"),
         ("rate 100000", "Hz"),
     ],
 )

@@ -124,7 +124,7 @@ def test_a_clamp_has_one_event_at_its_beginning_and_one_after_its_end():
     rig = GateRig()
     for position in (3.0, 3.0, 0.0, 3.0, -3.0):
         led(rig, position)
-    assert [text.split()[3] for text in rig.texts] == ["lowered", "raised"]
+    assert [text.split()[4] for text in rig.texts] == ["lowered", "raised"]
     assert rig.gate.counts[0].tolist() == [1, 3, 0, 0, 0, 0, 0, 0]
     cycles = CLAMP_ENDS_NS // PERIOD_NS
     for _ in range(cycles - 2):

@@ -65,7 +65,7 @@ def test_an_unknown_argument_is_answered_with_the_nearest() -> None:
 def test_without_an_arguments_block_there_are_none() -> None:
     (first, second, *_) = desk.refusals("name: x\nloop: {rate: '${rate}'}\n", {"rate": "1"})
     assert first.startswith(
-        "command line:1:1: rate:=1 was given, but the robot file has no argument 'rate'; take it"
+        "command line:1:1: rate:=1 was given, but the robot file has no argument 'rate'; remove it"
     )
     assert "has no" in second
 

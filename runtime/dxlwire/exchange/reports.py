@@ -22,7 +22,8 @@ class Reason(Enum):
 
 def jumped(joint: str, jump: str, elapsed_ns: int) -> str:
     """Return the text about a position that its servo cannot have."""
-    return f"{joint} jumped by {jump} in {elapsed_ns * 1e-6:.0f} ms, faster than it can turn: the value is not used"
+    time = f"{elapsed_ns * 1e-6:.0f} ms"
+    return f"{joint} jumped by {jump} in {time}, faster than it can turn: the value is not used"
 
 
 def not_finite(device: str, states: Sequence[str]) -> str:
