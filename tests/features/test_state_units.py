@@ -88,7 +88,9 @@ def test_check_shows_units_of_a_device(robot: Path, capsys: pytest.CaptureFixtur
 def test_unknown_unit_of_a_table_is_refused(robot: Path, capsys: pytest.CaptureFixture[str]) -> None:
     (robot.parent / "board.toml").write_text(BOARD.replace('units = ["lx"]', ""))
     assert main(["check", str(robot)]) == 2
-    assert "light: tick: '0.5 lx': the unit is none of rad, deg" in " ".join(capsys.readouterr().err.split())
+    assert "light: tick: '0.5 lx': the unit is not one of rad, deg" in " ".join(
+        capsys.readouterr().err.split()
+    )
 
 
 def test_sensor_has_the_units_of_known_quantities_unless_it_names_its_own() -> None:

@@ -53,7 +53,7 @@ class DeviceCommandController(Controller[DeviceCommandParameters]):
             return super().prepare(kind, command, parameters)
         known = parameters.commands
         if unknown := [name for name in command.values if name not in known]:
-            raise ValueError(f"{unknown[0]} is none of its commands ({', '.join(known)})")
+            raise ValueError(f"{unknown[0]} is not one of its commands ({', '.join(known)})")
         if not np.isfinite(list(command.values.values())).all():
             raise ValueError("a value is not finite")
         return np.array([command.values.get(name, np.nan) for name in known])

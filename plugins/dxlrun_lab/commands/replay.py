@@ -56,7 +56,7 @@ def replay(
         if settings:
             raise InputError("--set belongs to the controllers of the log, which --on does not run; omit one")
         if code:
-            raise InputError("--code belongs to a replay, which --on is none of; omit one")
+            raise InputError("--code belongs to a replay without --on; omit one")
         chosen = Chosen(played_on.on, assignments, ())
         return play_recorded(log, chosen, played_on, part, as_json=as_json)
     _refuse_playing(played_on, part)

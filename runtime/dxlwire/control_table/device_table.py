@@ -116,7 +116,7 @@ def build_device_table(data: Entry) -> DeviceTable:
     cyclic = tuple(words(data.get("cyclic", [])))
     for name in cyclic:
         if name not in by_name:
-            raise ValueError(f"cyclic: {name} is none of the items")
+            raise ValueError(f"cyclic: {name} is not one of the items")
     capabilities = frozenset(words(data.get("capabilities", [])))
     if wrong := capabilities - CAPABILITIES.keys():
         raise ValueError(f"capabilities that a device cannot have: {', '.join(sorted(wrong))}")
@@ -217,7 +217,7 @@ def _check_item(item: ControlItem) -> None:
     if item.bit is None:
         return
     if not 0 <= item.bit < 8 * item.size:
-        raise ValueError(f"{item.name}: bit {item.bit} is none of its {8 * item.size} bits")
+        raise ValueError(f"{item.name}: bit {item.bit} is not one of its {8 * item.size} bits")
     if item.access != "R" or item.unit or item.encoding != "unsigned":
         raise ValueError(f"{item.name}: a bit is unsigned, has no unit, and cannot be written alone")
 

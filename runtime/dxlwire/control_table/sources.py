@@ -259,7 +259,7 @@ def quantity(text: str, own: Collection[str] = ()) -> tuple[str, float]:
     """
     number, _, unit = text.partition(" ")
     if unit not in _SI and unit not in own:
-        raise ValueError(f"{text!r}: the unit is none of {', '.join((*_SI, *own))}")
+        raise ValueError(f"{text!r}: the unit is not one of {', '.join((*_SI, *own))}")
     numerator, _, denominator = number.partition("/")
     si, factor = _SI.get(unit, (unit, 1.0))
     if not float(denominator or "1"):

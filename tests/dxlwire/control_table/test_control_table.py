@@ -99,7 +99,7 @@ def test_a_reply_of_the_wrong_length_is_refused() -> None:
         ),
         ("address = 5,", 'address = "5",', "return_delay_time: address: Expected `int`, got `str`"),
         ("size = 2", "size = 3", "model_number: an item has 1, 2 or 4 bytes"),
-        ("59 rpm", "59 turns", "the unit is none of"),
+        ("59 rpm", "59 turns", "the unit is not one of"),
     ],
 )
 def test_a_broken_data_file_is_refused(old: str, new: str, complaint: str) -> None:

@@ -123,7 +123,7 @@ class ControllerTopics:
         publisher = self._publishers.get(topic)
         if publisher is None:
             known = ", ".join(self._publishers) or "none"
-            raise ControllerFault(f"published on {topic}, which is none of its Topics ({known})")
+            raise ControllerFault(f"published on {topic}, which is not one of its Topics ({known})")
         if not record.woken_ns:
             raise ControllerFault(f"published on {topic} before it was activated")
         cycle = record.cycle
