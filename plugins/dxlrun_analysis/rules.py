@@ -110,7 +110,7 @@ RULES: Mapping[str, Rule] = {
         "servo",
         "its own part of its reply time, compared with the other servos of its bus",
         "100 us later in three quarters of its replies; or five replies 300 us later, ten times as many as "
-        "all others have, which chance makes once in 1000 runs",
+        "all others have (by chance once in 1000 runs)",
         "Compare its Return Delay Time and firmware with those of the others "
         "(`dxlrun servo {port} {servo_id} get`), and check its supply.",
         _REPLIES,

@@ -79,7 +79,7 @@ class Teaching:
 
     def teach(self) -> list[Shown]:
         """Run the teaching dialogue; return the poses and motions, or an empty list if the user quits."""
-        self._dialogue.ask(f"Limp become: {', '.join(self._asked)}. Hold them, and press Enter ")
+        self._dialogue.ask(f"These joints become limp: {', '.join(self._asked)}. Hold them, and press Enter ")
         self._let_go(self._asked)
         shown: list[Shown] = []
         while True:

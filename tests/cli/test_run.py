@@ -171,8 +171,8 @@ def test_wait_for_simulated_servos_names_the_machine(dxlrun: Callable, runs: Run
     runs.answer = RunSummary(0, "ended", 100, 3, 2.0, (), simulation_wait=wait)
 
     assert dxlrun(torso).out.splitlines()[1] == (
-        "  The machine was too busy: the loop waited 3 times, 210 ms in all, for the process of the "
-        "simulated servos, which did not run. End other programs, or use --virtual."
+        "  The machine was too busy: the loop waited 3 times, 210 ms in all, because the process of the "
+        "simulated servos did not run. End other programs, or use --virtual."
     )
 
 

@@ -111,7 +111,7 @@ def test_a_joint_without_torque_or_one_that_was_unloaded_refuses_it_and_all_stay
 def test_a_controller_that_was_not_declared_is_a_fault_of_the_one_that_requests_it(story):
     story.controller("safe", 0.5, **SPARE).watched(falls, takeovers=("other",))
     assert story.result.reason == "fault"
-    assert "watch requested that safe takes over, which is not one of its takeovers" in story.result.detail
+    assert "watch requested that safe takes over, but that is not one of its takeovers" in story.result.detail
 
 
 def test_the_one_that_requests_leaves_where_it_commands_the_same(story):

@@ -171,7 +171,7 @@ def test_fragments_that_cannot_be_read_are_named_at_the_include() -> None:
 
     assert desk.refusals(f"include: [gone.yaml, broken.yaml, folder.yaml]\n{TORSO}") == [
         "robot.yaml:1:11: there is no file gone.yaml; "
-        "check the name, which counts from the folder of this file",
+        "check the name; it is relative to the folder of this file",
         "broken.yaml:1:4: the [ that is opened here is not closed; write ] at the end",
         "robot.yaml:1:35: folder.yaml: this is a directory; name a YAML file",
     ]

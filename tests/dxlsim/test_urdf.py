@@ -76,7 +76,7 @@ CIRCLE = "links stand in a circle: upper -> thumb -> upper; remove one of the jo
             'link="base"',
             'link="bas"',
             (4, 5),
-            "the parent of joint elbow is the link bas, which is not there; did you mean base?",
+            "the parent of joint elbow is the link bas, which does not exist; did you mean base?",
         ),
         ('xyz="0 3 4"', 'xyz="0 0 0"', (5, 44), "the axis of joint elbow has no length; write"),
         ('xyz="1 2 3"', 'xyz="1 2"', (5, 5), "xyz of the origin of joint elbow is '1 2', not three"),
@@ -88,7 +88,7 @@ CIRCLE = "links stand in a circle: upper -> thumb -> upper; remove one of the jo
             'joint="finger_slide"',
             'joint="finger_slid"',
             (8, 3),
-            "joint thumb_slide mimics finger_slid, which is not there; did you mean finger_slide?",
+            "joint thumb_slide mimics finger_slid, which does not exist; did you mean finger_slide?",
         ),
         (
             'joint="finger_slide"',

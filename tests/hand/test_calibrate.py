@@ -295,5 +295,5 @@ def test_a_file_that_would_be_wrong_is_told_with_the_change(tmp_path: Path) -> N
     arm = Arm(tmp_path, text)
     moves = [("positive", arm.move(1, 20)), ("other", arm.move(1, -50))]
     script = arm.do(("hold", ""), ("zero", ""), *moves, ("Write", "n"), joints=("elbow",))
-    assert "With this something else in the robot file is wrong:" in script.text
+    assert "With these values the robot file has other mistakes:" in script.text
     assert "home" in script.text

@@ -194,9 +194,9 @@ def test_a_servo_that_dies_in_the_middle_is_set_up_again(
 @pytest.mark.parametrize(
     ("steps", "said"),
     [
-        ([interrupt], "no servo was set up; all others are as they were\n"),
-        ([(0,), interrupt], "set up: elbow; all others are as they were\n"),
-        ([(0,), (1,), interrupt], "set up: elbow, wrist; all others are as they were\n"),
+        ([interrupt], "no servo was set up; all others are unchanged\n"),
+        ([(0,), interrupt], "set up: elbow; all others are unchanged\n"),
+        ([(0,), (1,), interrupt], "set up: elbow, wrist; all others are unchanged\n"),
     ],
 )
 def test_after_ctrl_c_it_is_said_what_was_done(

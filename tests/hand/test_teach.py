@@ -85,7 +85,7 @@ def test_poses_and_a_recorded_motion_are_saved_and_played(
 ) -> None:
     before, target = positions(robot), tmp_path / "wave.yaml"
     script = Script(
-        ("Limp become: elbow, wrist.", ""),
+        ("These joints become limp: elbow, wrist.", ""),
         ("0 shown", after(live, POSE, id5=30, id2=-20)),
         ("1 shown", after(live, "hold elbow")),
         ("1 shown", after(live, "limp elbow hand")),
@@ -115,7 +115,7 @@ def test_a_joint_beyond_its_limits_is_kept_at_them(
 ) -> None:
     target, there = tmp_path / "far.yaml", positions(robot)["elbow"]
     script = Script(
-        ("Limp become: elbow.", ""),
+        ("These joints become limp: elbow.", ""),
         ("0 shown", after(live, POSE, id5=70 - there)),
         ("1 shown", "hold elbow"),
         ("1 shown", DONE),

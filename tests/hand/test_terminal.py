@@ -114,4 +114,4 @@ def test_what_was_typed_before_a_question_does_not_answer_it(robot: Path, tmp_pa
         screen.sees("(s: skip it)")
         screen.types("\x03")
         assert screen.ended() == 130
-        assert "no servo was set up; all others are as they were" in screen.text
+        assert "no servo was set up; all others are unchanged" in screen.text

@@ -29,7 +29,7 @@ WRONG = {
         "11:60: sensors.imu.gyroscope.bias[0]: "
     ),
     "{type: simulated_imu, link: tip, rate: 10, timeout: 100 ms}": (
-        "11:60: imu delivers a sample every 100 ms, and is to be lost after 100 ms without one"
+        "11:60: imu delivers a sample every 100 ms, but counts as lost after 100 ms without one"
     ),
     "{type: serial_imu, port: /dev/imu, scale: {angular_velocty: 0.0174533}}": (
         "11:50: sensors.imu.scale: no column is a state of angular_velocty; "

@@ -123,15 +123,11 @@ def with_arguments(plan: RecordedPlan, loop: LoopPlan, arguments: Mapping[str, s
     names = [tuple(one.name for one in each) for each in (other.joints, loop.joints)]
     others = [tuple(one.name for one in each) for each in (other.controllers, loop.controllers)]
     if names[0] != names[1] or others[0] != others[1]:
-        raise InputError(
-            "the arguments change which joints or controllers there are; the log has the old ones"
-        )
+        raise InputError("the arguments change the joints or controllers; the log has the old ones")
     if other.references != loop.references:
-        raise InputError("the arguments change which references there are; the log has the old ones")
+        raise InputError("the arguments change the references; the log has the old ones")
     if other.source_states != loop.source_states:
-        raise InputError(
-            "the arguments change which devices, sensors and states there are; the log has the old ones"
-        )
+        raise InputError("the arguments change the devices, sensors or states; the log has the old ones")
     return replace(loop, joints=other.joints, controllers=other.controllers)
 
 

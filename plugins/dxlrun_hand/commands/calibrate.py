@@ -81,7 +81,7 @@ def calibrated(
         try:
             compile_robot(read_robot(robot, parse_assignments(assignments), changes), [])
         except InputError as error:
-            dialogue.say("With this something else in the robot file is wrong:", *error.sentences)
+            dialogue.say("With these values the robot file has other mistakes:", *error.sentences)
         if not yes(dialogue, f"Write this into {robot}?"):
             dialogue.say(f"{robot} is as it was.")
             return 1

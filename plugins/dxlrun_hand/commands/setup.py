@@ -76,7 +76,7 @@ def _left(task: SetUp) -> str:
     """Return the state of the servos if the dialogue ends early."""
     done = f"set up: {', '.join(task.done)}" if task.done else "no servo was set up"
     if not task.changing:
-        return f"{done}; all others are as they were"
+        return f"{done}; all others are unchanged"
     return f"{done}; the one for {task.changing} may have its new ID or rate already: set it up again"
 
 

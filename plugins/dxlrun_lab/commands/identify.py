@@ -111,7 +111,7 @@ def _of_log(log: Path, words: tuple[str, ...], chosen: Options, options: OnRobot
         or options.range
         or any(":=" in word or "." in word for word in words)
     ):
-        raise InputError("--recorded takes an earlier run, in which nothing moves any more; name joints only")
+        raise InputError("--recorded evaluates an earlier run, and nothing moves; name joints only")
     with err().status("computing the result"):
         return from_log(read_log(log), words, chosen)
 

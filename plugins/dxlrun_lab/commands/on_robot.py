@@ -253,7 +253,7 @@ def _rig(chosen: Chosen, plan: Plan | None, options: OnRobot, aborting: Aborting
             raise
     if not plan.gateway:
         raise InputError(
-            f"{chosen.file} switches the gateway off, by which an experiment steers its run: "
+            f"{chosen.file} switches the gateway off, but an experiment needs it: "
             "write `processes: {gateway: {enabled: true}}`"
         )
     require_whole(plan.recording, str(chosen.file))
@@ -303,7 +303,7 @@ def _start_confirmed(
         for name in names
     ]
     sys.stderr.write("".join(f"{line}\n" for line in lines))
-    sys.stderr.write(f"{plan.robot} is started for it, which switches torque on as its file says\n")
+    sys.stderr.write(f"{plan.robot} is started for it, and switches torque on as its file says\n")
     return _confirmed(plan, options, aborting)
 
 

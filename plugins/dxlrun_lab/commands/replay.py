@@ -54,7 +54,7 @@ def replay(
     """
     if played_on.on is not None:
         if settings:
-            raise InputError("--set belongs to the controllers of the log, which --on does not run; omit one")
+            raise InputError("--set is for the controllers of the log, and --on does not run them; omit one")
         if code:
             raise InputError("--code belongs to a replay without --on; omit one")
         chosen = Chosen(played_on.on, assignments, ())

@@ -252,8 +252,7 @@ def live_rig(robot: RemoteRobot, run: OwnRun | None = None) -> Rig:
     log = robot.info()["log"]
     if log is None:
         raise InputError(
-            f"{robot.name} records no log, from which an experiment takes what it measures; "
-            "start it without --no-record"
+            f"{robot.name} records no log, but an experiment needs it; start it without --no-record"
         )
     follower = LogFollower(str(log))
     plan = from_json(follower.new().attachments["plan.json"])

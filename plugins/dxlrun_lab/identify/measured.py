@@ -237,19 +237,19 @@ def _require_motion(name: str, time_s: Floats, position: Floats, servo: Servo) -
     if not len(position) or np.ptp(position) < _LEAST_MOVED * servo.tick:
         raise InputError(
             f"{name}: never moved in this log (by {_LEAST_MOVED} ticks), so nothing of its motor shows; "
-            f"run `dxlrun identify {name}`, which moves it"
+            f"run `dxlrun identify {name}` to move it"
         )
     velocity = _slopes(time_s, position, time_s)
     moving = np.abs(velocity[np.abs(velocity) > _SLOW])
     if len(moving) < 100:
         raise InputError(
             f"{name}: hardly moved in this log (below {_SLOW:g} rad/s), so friction hides its motor; run "
-            f"`dxlrun identify {name}`, which moves it"
+            f"`dxlrun identify {name}` to move it"
         )
     if np.std(moving) < _EVEN * np.mean(moving):
         raise InputError(
             f"{name}: moved at one speed only in this log ({np.mean(moving):.2g} rad/s), so friction, "
-            f"back-EMF and inertia cannot be told apart; run `dxlrun identify {name}`, which varies it"
+            f"back-EMF and inertia cannot be told apart; run `dxlrun identify {name}` to vary it"
         )
 
 

@@ -166,7 +166,7 @@ def _scale_of(fit: Fit, servo: Servo, load: KnownLoad) -> tuple[Scale, str]:
     if servo.table.stall_torque and servo.table.nominal_voltage:
         return "manual", (
             f"torques are from the manual's stall torque, {servo.table.stall_torque:g} Nm at "
-            f"{servo.table.nominal_voltage:g} V, whose error is in no interval; "
+            f"{servo.table.nominal_voltage:g} V; no interval contains its error; "
             "--load-gravity gives them their own scale"
         )
     raise InputError(
@@ -221,7 +221,7 @@ def _check_load(values: Mapping[str, float], load: KnownLoad, joint: str) -> Non
     if values["inertia"] <= 0.0:
         raise InputError(
             f"{joint}: motor and load have {values['inertia'] + (load.inertia or 0.0):.3g} kg m^2 in "
-            f"this run, which is less than --load-inertia {load.inertia:g} alone; check the load"
+            f"this run, less than --load-inertia {load.inertia:g} alone; check the load"
         )
 
 

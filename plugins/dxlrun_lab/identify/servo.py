@@ -144,9 +144,7 @@ def servos_in(log: Log, joints: Sequence[str]) -> list[Servo]:
     try:
         plan = from_json(log.attachments.get("plan.json", b"{}"))
     except UNREADABLE as error:
-        raise InputError(
-            f"{log.path}: its plan cannot be read, which says what its joints are: {error}"
-        ) from error
+        raise InputError(f"{log.path}: its plan with its joints cannot be read: {error}") from error
     require_own_servos(plan, joints, "identify", gears=False)
     try:
         return [servo_of(plan, joint) for joint in joints]

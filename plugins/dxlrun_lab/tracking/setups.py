@@ -66,6 +66,6 @@ def require_right(setups: Sequence[Setup], plan: Plan) -> None:
     refused = " and ".join(one.name for one in real_time)
     normal = ",".join(one.name for one in SETUPS if not one.real_time)
     raise InputError(
-        f"{refused} would run with real-time priority, which this user may not take: allow it with "
+        f"{refused} needs real-time priority, and this user has no right to it: allow it with "
         f"`{missing[0]}` and log in again, or measure the others with --setups {normal}"
     )

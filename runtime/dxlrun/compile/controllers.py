@@ -89,7 +89,7 @@ def compile_controllers(
         own = compiled[name].plan if name in compiled else None
         if own is not None and own.command and set(own.joints) != set(joints):
             what = f"group {name} has other joints than controller {name}, and both names mean joints"
-            file.error(file.key("groups", name), what, "call one of them otherwise")
+            file.error(file.key("groups", name), what, "rename one of them")
     if len(file.robot.controllers) > MOST_CONTROLLERS:
         file.error(
             file.key("controllers"),

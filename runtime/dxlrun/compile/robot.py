@@ -285,14 +285,14 @@ def _check_scheduler(file: RobotFile) -> None:
     if 1e9 / loop.rate >= timeout_ns:
         file.warning(
             file.at("loop", "rate"),
-            f"at {loop.rate:g} Hz a request to stop is seen up to {1 / loop.rate:.3g} s late, when the "
-            f"guardian has ended the loop, as exit_timeout is {timeout_ns * 1e-9:g} s",
+            f"at {loop.rate:g} Hz the loop sees a request to stop up to {1 / loop.rate:.3g} s late; by then "
+            f"the guardian has ended it, because exit_timeout is {timeout_ns * 1e-9:g} s",
             "raise policies.exit_timeout, or the rate",
         )
     if scheduler.policy != "other" and scheduler.priority > _HIGHEST:
         file.warning(
             file.at("loop", "scheduler", "priority"),
-            f"priority {scheduler.priority} leaves none above it for the guardian",
+            f"the guardian needs a higher priority than {scheduler.priority}, and there is none",
             f"write {_HIGHEST} at most",
         )
     if scheduler.polling != "auto" and scheduler.polling * MOST_SHARE > round(1e9 / loop.rate):

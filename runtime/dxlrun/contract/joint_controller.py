@@ -190,7 +190,7 @@ def _shown(name: str, place: int | None) -> property:
         return getattr(self.parameters, name) if place is None else float(self.context.reads[place])
 
     def refuse(self: JointController, value: object) -> None:
-        raise AttributeError(f"{name} is a parameter, which only the robot file and clients change")
+        raise AttributeError(f"{name} is a parameter; only the robot file and clients change it")
 
     return property(value, refuse)
 

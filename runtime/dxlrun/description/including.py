@@ -115,7 +115,7 @@ class _Collector:
         elif len(self._done) >= MOST_FILES:
             self._refuse(mark, f"more than {MOST_FILES} files are included", "put some of them together")
         elif not fragment.exists():
-            fix = "check the name, which counts from the folder of this file"
+            fix = "check the name; it is relative to the folder of this file"
             self._refuse(mark, f"there is no file {entry}", fix)
         else:
             self._read(fragment, entry, mark, above)

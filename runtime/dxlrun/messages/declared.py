@@ -229,7 +229,8 @@ class _Annotations:
         if found is None:
             shown = getattr(annotation, "__name__", None) if isinstance(annotation, type) else None
             raise WrongMessage(
-                f"{field} is {shown or str(annotation).removeprefix('typing.')}, for which ROS 2 has nothing",
+                f"{field} is {shown or str(annotation).removeprefix('typing.')}, and ROS 2 has no type for "
+                "it",
                 "use float, int, bool, str, dxlrun.Floats, a dataclass, or tuple[X, ...] of one of them",
             )
         kind, sequence, length, plain = found

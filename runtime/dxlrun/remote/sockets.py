@@ -286,7 +286,9 @@ def _connected(path: Path) -> socket.socket:
         end.connect(str(path))
     except BlockingIOError:
         end.close()
-        raise TimeoutError(f"too many connect to it, its queue was full for {TIMEOUT_S:g} s") from None
+        raise TimeoutError(
+            f"too many clients connect to it, and its queue was full for {TIMEOUT_S:g} s"
+        ) from None
     except BaseException:
         end.close()
         raise

@@ -234,7 +234,9 @@ def _ports(machine: Machine) -> Iterator[Finding]:
         for patterns in (USB_PORTS, ONBOARD_PORTS)
     )
     if not usb:
-        yield _Check("ports", "servos hang on a serial port").good("no USB serial adapter is plugged in")
+        yield _Check("ports", "servos are connected to a serial port").good(
+            "no USB serial adapter is plugged in"
+        )
     for path in usb:
         yield _port(machine, path)
     for path in onboard:

@@ -236,5 +236,5 @@ class KeptStateWriter(threading.Thread):
         self._ended.set()
         self.join(_WRITING_TIMEOUT_S)
         if self.is_alive():
-            return ("the disk takes what controllers learned too slowly; it is not kept",)
+            return ("the disk is too slow for what controllers learned; it is not kept",)
         return self._files.sentences

@@ -431,7 +431,7 @@ class _Run:
                     self.messages = message.summary.messages
                     if gaps := message.summary.gaps:
                         self.sentences.append(
-                            f"the log lacks {counted(gaps, 'record', 'records')}, which is declared in it: "
+                            f"the log lacks {counted(gaps, 'record', 'records')}, and declares that: "
                             "the recorder was too slow"
                         )
             recorder.end()

@@ -230,7 +230,7 @@ class _Reading:
         if not link:
             self._add(mark, f"joint {name} has no {tag}", f'write <{tag} link="..."/> into it')
         elif link not in self._links:
-            what = f"the {tag} of joint {name} is the link {link}, which is not there"
+            what = f"the {tag} of joint {name} is the link {link}, which does not exist"
             self._add(mark, what, suggestion(link, tuple(self._links)))
         return link
 
@@ -297,7 +297,7 @@ class _Reading:
             name, mark = joint.mimic.joint, joint.mark
             followed = self._joints.get(name)
             if followed is None:
-                what = f"joint {joint.name} mimics {name}, which is not there"
+                what = f"joint {joint.name} mimics {name}, which does not exist"
                 self._add(mark, what, suggestion(name, [each for each in self._joints if each != joint.name]))
             elif not followed.moves:
                 self._add(mark, f"joint {joint.name} mimics {name}, which is fixed", "name one that moves")

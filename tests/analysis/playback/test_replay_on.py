@@ -177,7 +177,7 @@ def test_real_joints_are_asked_about_before_a_run_is_started(
         in done.err
     )
     assert "moves 46 deg, pan at up to 9" in done.err
-    assert "pair is started for it, which switches torque on as its file says" in done.err
+    assert "pair is started for it, and switches torque on as its file says" in done.err
     assert "nothing was moved; add --yes" in done.err
 
 

@@ -153,7 +153,7 @@ def logging_to(log: Path | None) -> Any:
 @pytest.mark.needs("identify")
 def test_a_robot_without_its_whole_log_is_refused(tmp_path, monkeypatch, capsys):
     """One that records none; one that deletes parts and runs, and one that would have to be started."""
-    with pytest.raises(InputError, match="pair records no log, from which an experiment takes"):
+    with pytest.raises(InputError, match="pair records no log, but an experiment needs it"):
         live_rig(logging_to(None))
     file = tmp_path / "robot.yaml"
     file.write_text(ROBOT + "recording: {split: 1 min, keep: 10 min}\n")

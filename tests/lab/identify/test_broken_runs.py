@@ -105,7 +105,7 @@ def test_an_ax_12_without_a_current_has_the_manuals_scale(record):
     data = measured(run.cycles, 0, run.servo)
     found = identified(data, fit_run(data), KnownLoad(), "test")
     assert found.scale == "manual"
-    assert "whose error is in no interval" in found.scale_sentence
+    assert "no interval contains its error" in found.scale_sentence
     assert "viscous_friction" not in {value.name for value in found.values}
     assert any("viscous friction and back-EMF are one" in note for note in found.notes)
     figures = {value.name: value for value in found.values}

@@ -134,7 +134,7 @@ class Page:
             host = request.headers.get("host", "")
             origin = request.headers.get("origin")
             if host not in self._hosts or origin not in self._origins:
-                return _refused(403, "this page answers itself alone, and no other web site")
+                return _refused(403, "this page accepts requests only from itself, not from other web sites")
             given = request.headers.get(HEADER, "")
             if token and not secrets.compare_digest(given.encode(), self.token.encode()):
                 return _refused(401, "open the address that `dxlrun view` printed: it has the page's token")

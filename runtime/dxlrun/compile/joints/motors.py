@@ -77,7 +77,7 @@ def _read(path: Path, written: str, mark: Mark, problems: Problems) -> MotorDesc
         problems.error(
             mark,
             f"there is no motor file {written}",
-            "check the name, which counts from the folder of this file, or let `dxlrun identify` write it",
+            "check the name; it is relative to the folder of this file, or let `dxlrun identify` write it",
         )
         return None
     try:

@@ -53,7 +53,7 @@ def compile_urdf(file: RobotFile, joints: Mapping[str, CompiledJoint]) -> Compil
         file.error(
             mark,
             f"there is no URDF {model.urdf}",
-            "check the name, which counts from the folder of this file",
+            "check the name; it is relative to the folder of this file",
         )
         return None
     try:
@@ -143,7 +143,7 @@ def _check_names(
         if mimic is not None:
             file.warning(
                 file.key("joints", name),
-                f"{name} follows {mimic.joint} in the URDF, but has a servo of its own, which is what counts",
+                f"{name} follows {mimic.joint} in the URDF, but has a servo of its own, and the servo counts",
                 "remove the mimic from the URDF, or the joint out of this file",
             )
 
@@ -161,7 +161,7 @@ def _check_limits(file: RobotFile, joint: CompiledJoint, drawn: UrdfJoint) -> No
             file.warning(
                 marks.value("joints", name, "limits", "position"),
                 f"{name} may move {allowed}, beyond its limits in the URDF, {shown}",
-                "make both alike",
+                "make them equal",
             )
     own = joint.described.limits.velocity
     unit = joint.plan.unit.speed
@@ -169,5 +169,5 @@ def _check_limits(file: RobotFile, joint: CompiledJoint, drawn: UrdfJoint) -> No
         file.warning(
             marks.value("joints", name, "limits", "velocity"),
             f"{name} may move at {own:g} {unit}, faster than in the URDF, {limits.velocity:g} {unit}",
-            "make both alike",
+            "make them equal",
         )

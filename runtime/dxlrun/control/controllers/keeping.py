@@ -91,7 +91,7 @@ class Keeping:
     def _keep(self, controller: str, state: bytes) -> None:
         """Store a state for publication. Raises ControllerFault for a wrong type or size."""
         if not isinstance(state, bytes):
-            raise ControllerFault(f"kept {type(state).__name__}, which is not bytes")
+            raise ControllerFault(f"kept {type(state).__name__}, not bytes")
         if len(state) > MOST_KEPT:
             raise ControllerFault(f"kept {len(state)} bytes; {MOST_KEPT} is the most")
         self._waiting[controller] = self._newest[controller] = state

@@ -429,7 +429,7 @@ class Managed:
 def _take_over(requests: list[Request], plan: ControllerPlan, controllers: Sequence[str], why: str) -> None:
     """Record a takeover request. Raises ControllerFault for a controller that is not in `takeovers`."""
     if other := [name for name in controllers if name not in plan.takeovers]:
-        raise ControllerFault(f"requested that {other[0]} takes over, which is not one of its takeovers")
+        raise ControllerFault(f"requested that {other[0]} takes over, but that is not one of its takeovers")
     if controllers:
         requests.append(Request(plan.name, tuple(controllers), why))
 

@@ -101,7 +101,7 @@ class Inputs:
         self._reads = np.full(len(plan.reads), np.nan)
         places = dict(_readable(record.layout)) if plan.reads else {}
         if missing := [name for name in plan.reads if name not in places]:
-            raise ControllerFault(f"controller {plan.name} reads {missing[0]}, which is not there")
+            raise ControllerFault(f"controller {plan.name} reads {missing[0]}, which does not exist")
         at = np.array([places[name] for name in plan.reads], dtype=np.intp)
         if at.size:
             self._pairs.append((record.floats, self._reads, at))

@@ -152,13 +152,13 @@ def _mistakes(grown: Grown) -> Iterator[Problem]:
         yield Problem(grown.marks.value(DEFAULTS), what, "write keys of a joint in it")
     for name, entry in _mapping(_mapping(grown.data.get("policies")).get(GROUPS)).items():
         if name in entries and "joints" in _mapping(entry):
-            what = f"{name} is a group of the robot, whose joints it has"
+            what = f"{name} is a group of the robot already, and has its joints"
             yield Problem(grown.marks.key("policies", GROUPS, name, "joints"), what, "remove joints")
     for name in _mapping(grown.data.get(GROUPS)):
         if name not in entries:
             means = "every joint" if name == ALL else "a joint"
             what = f"{name} is the name of a group, and means {means} already"
-            yield Problem(grown.marks.key(GROUPS, name), what, "call the group otherwise")
+            yield Problem(grown.marks.key(GROUPS, name), what, "rename the group")
     for name in entries:
         for index, one in _written(entries, name):
             mark = grown.marks.value(GROUPS, name, "joints", index)

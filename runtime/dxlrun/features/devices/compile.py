@@ -128,7 +128,7 @@ def _table(file: RobotFile, name: str, device: Device) -> DeviceTable | None:
         return None
     except OSError as error:
         what = f"the control table {device.model} of {name} cannot be read: {error.strerror}"
-        file.error(mark, what, "check the name, which counts from the folder of this file")
+        file.error(mark, what, "check the name; it is relative to the folder of this file")
         return None
     except ValueError as error:
         what = f"{device.model} of {name} is not a control table of a device: {error}"
@@ -177,7 +177,11 @@ def _written_items(file: RobotFile, name: str, device: Device, table: DeviceTabl
     found = _named(file, ("devices", name, "commands"), device.commands, table)
     for index, (command, item) in enumerate(found.items()):
         if item.access == "R" or item.area == "EEPROM" or item.bit is not None:
-            why = "stands in EEPROM, which wears out" if item.area == "EEPROM" else "is a bit among others"
+            why = (
+                "is in the EEPROM, and the EEPROM wears out"
+                if item.area == "EEPROM"
+                else "is a bit among others"
+            )
             why = "cannot be written" if item.access == "R" else why
             mark = _item_mark(file.description, ("devices", name, "commands"), index, command)
             writable = [

@@ -145,7 +145,7 @@ def _check_joints(file: RobotFile, name: str, transmission: Transmission, owners
             one = next(j for j, entry in zip(transmission.joints, entries, strict=True) if _set(entry, key))
             file.error(
                 file.at("joints", one, key),
-                f"{key} of {one} is another than that of the other joints of transmission {name}, whose "
+                f"{key} of {one} differs from that of the other joints of transmission {name}; its "
                 "servos move them together",
                 f"write {key} alike for {', '.join(transmission.joints)}",
             )

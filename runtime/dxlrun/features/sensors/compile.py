@@ -70,7 +70,7 @@ def _compiled(
     if entry.timeout is not None and entry.timeout <= period_ns:
         file.error(
             marks.value("sensors", name, "timeout"),
-            f"{name} delivers a sample every {period_ns / 1e6:g} ms, and is to be lost after "
+            f"{name} delivers a sample every {period_ns / 1e6:g} ms, but counts as lost after "
             f"{entry.timeout / 1e6:g} ms without one",
             "write a longer timeout, such as five periods, or the rate that it has",
         )

@@ -63,7 +63,7 @@ def refuse_virtual_time(plan: bytes) -> str:
     names = ", ".join(f"{sensor.name} ({sensor.type})" for sensor in measuring)
     return names and (
         f"virtual time needs simulated sensors, but {names} measures the real world: "
-        "omit --virtual, or remove the sensor and what reads it from the file that runs so"
+        "omit --virtual, or remove the sensor and what reads it from this file"
     )
 
 
