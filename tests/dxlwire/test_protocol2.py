@@ -171,7 +171,7 @@ def test_a_status_that_is_none():
 
 @pytest.mark.parametrize("servo_id", [253, 255, -1, 300])
 def test_ids_that_could_be_taken_for_a_header_are_refused(servo_id):
-    with pytest.raises(ValueError, match="no ID"):
+    with pytest.raises(ValueError, match="not an ID"):
         p2.ping(servo_id)
 
 

@@ -128,7 +128,7 @@ def test_a_rate_is_not_given_that_the_adapter_or_the_model_does_not_have_or_some
 
 
 def test_two_servos_of_one_id_are_not_dealt_with():
-    with pytest.raises(ServoFault, match="garbled now and then: do two servos have this ID"):
+    with pytest.raises(ServoFault, match="sends garbled replies now and then: do two servos have this ID"):
         Rig(others=(1,))
 
 
@@ -349,7 +349,7 @@ def test_a_goal_that_is_written_clears_a_tripped_bus_watchdog(torque):
     trip(rig, torque)
     done = rig.one.write([rig.one.register("goal_position", 1500)])
     assert done[0] == TRIPPED
-    assert done[-1].endswith("and is 1500")
+    assert done[-1].endswith(" to 1500")
     assert (STOOD in done) == bool(torque)
     assert (rig.servo.registers["bus_watchdog"], rig.servo.registers["goal_position"]) == (0, 1500)
 

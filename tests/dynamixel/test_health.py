@@ -146,7 +146,7 @@ def test_a_servo_whose_clock_was_not_read_has_not_started_anew_before_it_was(reb
             rig.cycle()
         rig.cycles(10)
         assert rig.events.of(EventCode.SERVO_REBOOTED) == []
-        assert "answers garbled or twice" in rig.events.texts(EventCode.SERVO_LOST)[-1]
+        assert "sends garbled or double replies" in rig.events.texts(EventCode.SERVO_LOST)[-1]
     assert len(asked) == 4
     assert len(rig.events.of(EventCode.SERVO_REBOOTED)) == rebooted
     assert rig.events.sources(EventCode.SERVO_LIMP) == ["arm_13_joint"]
@@ -300,7 +300,7 @@ def test_returned_wheel_is_given_torque_at_rest(hears_stop):
     assert servo.registers["goal_velocity"] == 0
     assert rig.states.torque.tolist() == [Torque.GIVEN]
     ((_, text),) = rig.events.of(EventCode.SERVO_BACK)
-    assert text.endswith("holding where it is")
+    assert text.endswith("and holds its position")
 
 
 def test_returned_servo_reports_settings_that_differ_but_those_of_the_run():

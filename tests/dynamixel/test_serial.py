@@ -177,7 +177,7 @@ def test_rs485_is_switched_on_or_refused(terminal, monkeypatch):
     with open_serial(path, 1_000_000, rs485=True):
         assert driver.rs485 == [(3, 0, 0, 0, 0, 0, 0, 0)]  # SER_RS485_ENABLED | SER_RS485_RTS_ON_SEND
     Driver(monkeypatch, rs485=False)
-    with pytest.raises(PortError, match=rf"the driver of {path} has no RS-485 mode .*: leave out"):
+    with pytest.raises(PortError, match=rf"the driver of {path} has no RS-485 mode .*: omit"):
         open_serial(path, 1_000_000, rs485=True)
     with open_serial(path, 1_000_000):
         pass  # what was refused let go of it

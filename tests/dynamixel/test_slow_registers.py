@@ -65,7 +65,7 @@ def test_a_hot_servo_is_reported_ten_degrees_before_its_limit_and_when_it_has_co
     rig.cycles(70)
     ((source, text),) = rig.events.of(EventCode.SERVO_HOT)
     assert source == "main_12_joint"
-    assert "its Temperature Limit (31) is 80 deg C" in text
+    assert "above its Temperature Limit (31), 80 deg C" in text
     servo.temperature = servo.registers["temperature_limit"] - 12
     rig.cycles(70)
     assert len(rig.events.of(EventCode.SERVO_HOT)) == 1, "it is not cooled yet"
@@ -81,7 +81,7 @@ def test_another_item_is_reported_when_it_changes():
     rig.cycles(60)
     ((source, text),) = rig.events.of(EventCode.REGISTER_DIFFERS)
     assert source == "main_12_joint"
-    assert "Position P Gain (84) was 800, is 640" in text
+    assert "Position P Gain (84) changed from 800 to 640" in text
 
 
 @pytest.mark.parametrize("returning", [False, True])

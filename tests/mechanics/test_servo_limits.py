@@ -48,7 +48,7 @@ def test_two_servos_of_a_joint_give_what_the_weaker_one_may(
     effort = "{type: joint_group_effort_controller, joints: [hip]}"
     texts, goals = run(plan, tmp_path, effort, ("efforts", 0.3), current_limit=20)
     assert max(map(abs, goals[2])) == max(map(abs, goals[3])) == 20
-    held = "clamped by register Current Limit (38) = 20, 0.0538 A (ID 3 on bus main)"
+    held = "goal clamped by register Current Limit (38) = 20, 0.0538 A (ID 3 on bus main)"
     assert texts[0] == f"hip, controller c: {held}"
 
 

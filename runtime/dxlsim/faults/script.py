@@ -139,7 +139,7 @@ def _chosen(fault: Fault, buses: Sequence[SimulatedBus]) -> Sequence[SimulatedBu
         ids = sorted({servo.servo_id for servo in bus.servos})
         others = sorted({device.servo_id for device in bus.devices} - set(ids))
         if (fault.servo in others and of == SERVO) or (fault.servo in ids and of == DEVICE):
-            what = "no servo" if of == SERVO else "a servo"
+            what = "not a servo" if of == SERVO else "a servo"
             raise InputError(
                 f"{fault.servo} on bus {bus.name} is {what}, so {fault.kind} cannot happen to it"
             )

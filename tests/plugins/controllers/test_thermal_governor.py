@@ -157,7 +157,7 @@ def test_what_fits_is_accepted(tmp_path: Path, change: tuple[str, str]) -> None:
         ((PARTS, f"{PARTS}, limit: {{j: 95}}"), "{j: 95}", "beyond 80; write limit: 75 at most"),
         ((PARTS, f"{PARTS}, warn: 75"), "75", "warn of j at 75 deg C, not below its limit of 75"),
         ((PARTS, f"{PARTS}, limit: 60"), "60", "warn of j at 65 deg C, not below its limit of 60"),
-        (("id: 1,", "servos: [{id: 1}, {id: 2}],"), "j]", "cannot limit the temperature of j become"),
+        (("id: 1,", "servos: [{id: 1}, {id: 2}],"), "j]", "cannot limit the temperature of j: it has"),
     ],
 )
 def test_what_does_not_fit_is_one_sentence_at_its_place(
