@@ -28,7 +28,7 @@ ROOT = Path(__file__).parents[2]
 Dxlrun = Callable[..., Any]
 CODE = "import sys; from dxlrun.cli import main; sys.exit(main())"
 STEP = re.compile(r"^```(\w*)(?: title=\"(.+?)\")?\n(.*?)^```$|^    (\S[^\n]*)$", re.MULTILINE | re.DOTALL)
-DELAYS = (" lost at ", " brought no sample ")
+DELAYS = (" lost at ", " delivered no sample ")
 """Signs of a busy machine, which delays replies and samples: the run is then not good."""
 PROGRESS = re.compile(r"^\w+: [\d.]+( of [\d.]+)? s, .* skipped\n", re.MULTILINE)
 """Lines that a run in a pipe prints from time to time."""

@@ -43,13 +43,13 @@ ON_LOST_SERVO: PolicyKey[WrittenPolicy] = PolicyKey(
         "hold",
         "hold",
     ),
-    does="hold its controllers until it answers, the others go on",
+    does="hold its controllers until it answers, the others continue",
     before="on_returned_servo",
     group=OF_GROUP,
 )
 _ACTIONS = {
-    "hold": "hold their controllers until it answers, the others go on",
-    "limp": "the group goes limp, the others go on",
+    "hold": "hold their controllers until it answers, the others continue",
+    "limp": "the group goes limp, the others continue",
     "stop": "end the run by on_fault",
 }
 
