@@ -1,4 +1,4 @@
-"""Client commands in a log, each with the reason of its refusal, if any."""
+"""Client commands in a log, each matched with the event that reports its execution or refusal."""
 
 from __future__ import annotations
 
@@ -16,7 +16,10 @@ _LOOP = "loop"
 
 
 def client_commands(log: Log) -> tuple[ClientCommand, ...]:
-    """Return the commands of all clients, in order of the cycles."""
+    """Return the commands of all clients in order of the cycles, each with the reason of its refusal, if any.
+
+    Planned commands of the robot file, and the record of a policy's begin, are omitted.
+    """
     answers = _answers(log)
     last = policy_begun(log)
     found: list[ClientCommand] = []
@@ -44,7 +47,8 @@ def policy_begun(log: Log) -> TakenCommand | None:
 
 
 def unlogged_commands(log: Log) -> tuple[int, ...]:
-    """Return the cycles with more answers to loop commands than logged loop commands."""
+    """Return the cycles in which the loop answered more commands than the log has, so that commands are
+    missing."""
     named_loop = any(controller.name == _LOOP for controller in log.controllers)
     held: dict[int, int] = {}
     for command in log.commands:
@@ -59,7 +63,7 @@ def unlogged_commands(log: Log) -> tuple[int, ...]:
 
 
 def _answers(log: Log) -> dict[int, deque[Event]]:
-    """Return the events that answer commands, by cycle."""
+    """Return the events that report an executed or refused command, by number of the cycle."""
     woken, updated, numbers = (log.cycles[name] for name in ("woken_ns", "updated_ns", "cycle"))
     answers: dict[int, deque[Event]] = {}
     for event in log.events:
@@ -72,9 +76,10 @@ def _answers(log: Log) -> dict[int, deque[Event]]:
 
 
 def _refusal(command: TakenCommand, place: int, answers: deque[Event]) -> str:
-    """Remove the answer to a command from the answers of its cycle; return its refusal, or an empty string.
+    """Remove the answer to a command from the answers of its cycle; return the reason of its refusal, empty
+    if there is none.
 
-    Controllers answer only commands that they refuse.
+    `place` counts the client commands of the cycle from 1. Controllers answer only commands that they refuse.
     """
     source = command.controller or _LOOP
     for event in answers:

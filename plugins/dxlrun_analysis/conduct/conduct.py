@@ -1,4 +1,4 @@
-"""Conduct of the robot: goals, takeovers, failed controllers and their fallbacks, and falls.
+"""Behaviour of the robot in a run: goals, failed controllers and their fallbacks, falls.
 
 A robot fell if a fall_reflex had other controllers take over. It is down at the end if gravity, in the frame
 of its IMU, ended more than 60 deg from its direction at the start, unless the robot began lying and ended
@@ -33,7 +33,8 @@ Floats = NDArray[np.float64]
 
 
 class Takeover(NamedTuple):
-    """Takeover by other controllers, after a failure or on request."""
+    """Moment at which other controllers replaced one: its fallback after a failure, or those that it
+    requested, such as after a fall."""
 
     time_s: float  # Since the first deadline
     controller: str  # Controller that failed or requested the takeover
@@ -44,7 +45,7 @@ class Takeover(NamedTuple):
 
 @dataclass(frozen=True, slots=True)
 class Conduct:
-    """Behaviour of the robot in a run."""
+    """Behaviour of the robot in a run: its goals, takeovers, and whether it fell."""
 
     begin_ns: int = 0  # First deadline, on the run's clock
     goals: GoalTotals = field(default_factory=GoalTotals)
@@ -56,10 +57,12 @@ class Conduct:
 
 
 NO_CONDUCT = Conduct()
+"""Behaviour in a log without goals, takeovers and IMU."""
 
 
 class ConductHistory:
-    """Accumulator of the robot's behaviour, fed slice by slice. Its memory does not grow with the log."""
+    """Accumulator of the robot's behaviour, fed with the log slice by slice. Its memory does not grow with
+    the log."""
 
     def __init__(self) -> None:
         self._begin_ns: int | None = None
@@ -70,7 +73,7 @@ class ConductHistory:
         self._first, self._last = np.zeros((0, 3)), np.zeros((0, 3))  # Gravity in the frame of the IMU
 
     def take(self, log: Log) -> None:
-        """Add the next slice."""
+        """Add the events and IMU values of the next slice of the log."""
         if self._begin_ns is None and begins(log):
             self._begin_ns = first_deadline_ns(log)
         plan = plan_of(log)
@@ -93,7 +96,8 @@ class ConductHistory:
         self._last = np.concatenate([self._last, gravity[-_SOME:]])[-_SOME:]
 
     def _activated(self, event: Event, plan: LoggedPlan) -> None:
-        """Record a takeover by the fallback of the failed controller, or by that of one above it."""
+        """Record a takeover if the activated controller is the fallback of a failed one, or the fallback
+        of another controller in its place."""
         fallbacks = {one.fallback for one in plan.loop.controllers}
         for failed in self._pending:
             own = plan.controller(failed.source).fallback
@@ -129,7 +133,8 @@ class ConductHistory:
 
 
 def _gravity(log: Log) -> Floats:
-    """Return the direction of gravity in the frame of the first IMU, for each cycle with valid values."""
+    """Return the direction of gravity in the frame of the first IMU, for each cycle with valid values;
+    shape (cycles, 3), empty without an IMU."""
     sources = log.header.sources
     for names in (("x", "y", "z", "w"), ("x", "y", "z")):
         item = "orientation" if len(names) > 3 else "linear_acceleration"

@@ -1,4 +1,4 @@
-"""Detection of frozen sources, such as sensors and devices: their samples are identical to the bit.
+"""Frozen sources: sensors and devices whose samples stopped changing, identical to the bit.
 
 Times count only cycles with valid values. A standstill is reported only if it lasts a second, and ten times
 as long as any standstill before.
@@ -42,7 +42,8 @@ Times = NDArray[np.int64]
 
 @dataclass(frozen=True, slots=True)
 class _Stay:
-    """Longest standstill of a value or source."""
+    """Longest time for which a value (or all values of a source) did not change, with the conditions at
+    that time."""
 
     hung_s: float = 0.0
     from_s: float = 0.0
@@ -55,7 +56,7 @@ class _Stay:
 
 @dataclass(slots=True)
 class _Watched:
-    """Change history of one value, or of a whole source."""
+    """Recent changes of one value of a source, or of all its values together, and its longest standstill."""
 
     since_ns: int  # Time of the last change
     position: Floats  # Joint positions at that change
@@ -64,17 +65,17 @@ class _Watched:
     low: float = np.inf
     high: float = -np.inf
     recent: Floats = field(default_factory=lambda: np.zeros(0))
-    """Values at the last changes."""
+    """The value after each of its last 40 changes."""
     places: Floats = field(default_factory=lambda: np.zeros((0, 0)))
-    """Joint positions at these changes, shape (changes, joints)."""
+    """Joint positions at each of the last 40 changes, shape (changes, joints)."""
     stay: _Stay = field(default_factory=_Stay)
 
     def take(self, at_ns: Times, values: Floats, changed: NDArray[np.bool_], position: Floats) -> None:
-        """Add cycles.
+        """Add cycles in which the source was valid.
 
         Args:
             at_ns: Valid time since the first cycle, ns; shape (cycles,).
-            values: Values of one quantity; zeros for a whole source.
+            values: The value in each cycle; zeros for a whole source.
             changed: Cycles in which the value changed.
             position: Joint positions, rad; shape (cycles, joints).
         """
@@ -116,7 +117,7 @@ class _Watched:
 
 
 class _Source:
-    """Values of one source."""
+    """Change history of one source: of each value, and of all values together."""
 
     def __init__(self, at_ns: int, values: Floats, position: Floats) -> None:
         self._at_ns, self._lived_ns, self._was_valid, self._last = at_ns, 0, True, values
@@ -124,7 +125,7 @@ class _Source:
         self.each = [_Watched(0, position) for _ in values]
 
     def take(self, at_ns: Times, valid: NDArray[np.bool_], values: Floats, position: Floats) -> None:
-        """Add cycles, shape (cycles, values), with the joint positions."""
+        """Add cycles: times in ns, validity, values of shape (cycles, values), and joint positions."""
         between = np.diff(at_ns, prepend=self._at_ns)
         between[~valid | ~np.append(self._was_valid, valid[:-1])] = 0
         lived = (self._lived_ns + np.cumsum(between))[valid]
@@ -141,14 +142,14 @@ class _Source:
 
 
 class FrozenSources:
-    """Accumulator that finds frozen sources. Its memory does not grow with the log."""
+    """Accumulator that finds frozen sensors and devices. Its memory does not grow with the log."""
 
     def __init__(self) -> None:
         self._sources: dict[str, _Source] = {}
         self._plan, self._states = LoggedPlan(), dict[str, tuple[str, ...]]()
 
     def take(self, log: Log) -> None:
-        """Add the cycles of the next slice."""
+        """Add the source values in the cycles of the next slice of the log."""
         if not len(log.cycles):
             return
         self._plan, self._states = plan_of(log), dict(log.header.sources)
@@ -170,7 +171,7 @@ class FrozenSources:
                 self._sources[name].take(at_ns, valid, values, position)
 
     def findings(self) -> Iterable[Finding]:
-        """Report frozen sources."""
+        """Report each sensor or device that was frozen as a whole, and single values that were."""
         sampled = self._plan.sampled
         for name, one in self._sources.items():
             whole, stays = one.all.stay, [each.stay for each in one.each]
@@ -206,7 +207,7 @@ class FrozenSources:
 
 
 def _trembled(values: Floats) -> int:
-    """Return the number of distinct values of a trembling value; 0 if it does not tremble."""
+    """Return the number of distinct values among the last 40 changes of a value; 0 if it does not tremble."""
     values = values[-_CHANGES:]
     steps = np.diff(values)
     if len(values) < _CHANGES or np.count_nonzero(steps[1:] * steps[:-1] < 0) < _REVERSALS:
@@ -215,6 +216,7 @@ def _trembled(values: Floats) -> int:
 
 
 def _at_once(stays: Collection[_Stay]) -> bool:
-    """Return whether values froze at the same time, within the intervals of their changes before."""
+    """Return whether the standstills of several values began at the same time, up to 0.1 s and the longest
+    standstill before."""
     begins = [stay.from_s for stay in stays]
     return max(begins) - min(begins) <= max(stay.usual_s for stay in stays) + 0.1

@@ -1,4 +1,5 @@
-"""Steering history: client commands, streams combined into one entry, and pauses of the loop."""
+"""Requests of clients in a run: one entry for each command or stream of set-points, and pauses of the
+loop."""
 
 from __future__ import annotations
 
@@ -22,7 +23,8 @@ _CYCLE = np.dtype([(name, "i8") for name in ("cycle", "scheduled_ns", "woken_ns"
 
 
 class _Data(msgspec.Struct):
-    """Keys of the loop's commands. A command has those of its kind."""
+    """Data of a command that the loop executes itself, with the keys of all kinds. A command has those of
+    its kind."""
 
     activate: tuple[str, ...] = ()
     deactivate: tuple[str, ...] = ()
@@ -39,7 +41,7 @@ class _Data(msgspec.Struct):
 
 @dataclass(frozen=True, slots=True)
 class Act:
-    """One client command, or a stream of set-points."""
+    """One client command, or a whole stream of set-points from one client."""
 
     time_s: float  # Time since the first deadline
     cycle: int
@@ -57,7 +59,7 @@ class Act:
 
 @dataclass(frozen=True, slots=True)
 class Pause:
-    """One pause of the controllers' time."""
+    """One pause of the loop, in which the time of the controllers stood still."""
 
     begin_s: float  # Time since the first deadline
     end_s: float
@@ -65,7 +67,8 @@ class Pause:
 
 
 class SteeringHistory:
-    """Accumulator of client commands, fed slice by slice. A stream is one entry, so memory use stays small.
+    """Accumulator of client commands, fed with the log slice by slice. A stream is one entry, so memory use
+    stays small.
 
     An answer and its cycle can be in a later slice than the command. The newest commands are kept until their
     answers are complete.
@@ -90,7 +93,7 @@ class SteeringHistory:
         """Time at which a controller whose last stream ran out was deactivated."""
 
     def take(self, log: Log) -> None:
-        """Add the next slice."""
+        """Add the commands and their answers in the next slice of the log."""
         if not self._begun:
             self._start_ns = first_deadline_ns(log)
             self._begun = begins(log)
@@ -138,7 +141,8 @@ class SteeringHistory:
         return tuple(self._acts), tuple(self._pauses)
 
     def _digest(self, until_ns: int | None) -> None:
-        """Process the commands before a time with their answers; None: all commands."""
+        """Match the commands before a time (ns) with their answers, and add them to the entries; None: all
+        commands."""
         log = self._log
         if log is None:
             return
@@ -183,7 +187,8 @@ class SteeringHistory:
 
 
 def _continues(last: TakenCommand, command: TakenCommand) -> bool:
-    """Return whether a set-point continues the stream of the one before."""
+    """Return whether a set-point continues the stream of the one before: same kind and client, within its
+    lease."""
     return (
         bool(command.lease_ns)
         and (command.kind, command.origin) == (last.kind, last.origin)
@@ -217,7 +222,7 @@ def _stream(command: TakenCommand, count: int) -> str:
 
 
 def _words(command: TakenCommand) -> str:
-    """Return a command in words; unreadable data are returned as text."""
+    """Return a command as text, such as `torque off: knee`; unreadable data are appended as they are."""
     if not command.for_loop:
         return f"{command.kind} for {command.controller}"
     try:

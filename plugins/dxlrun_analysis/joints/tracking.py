@@ -268,7 +268,7 @@ class Tracking:
         self._parts: list[NDArray[np.void]] = []
         self._count = 0
         self._held: NDArray[np.void] | None = None
-        """Last two processed cycles, which the next ones depend on."""
+        """Last two processed cycles, from which the trajectories of the next cycles continue."""
         self._rows: list[_Row] = []
         self.movement = Movement()  # Complete once `finish` was called
 

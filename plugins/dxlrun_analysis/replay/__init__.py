@@ -1,4 +1,4 @@
-"""Replay: the controllers of a log, run again on its inputs, and a comparison of their commands.
+"""Replay: run the controllers of a log again on its recorded inputs, and compare their commands with the log.
 
 Playback of a recorded motion on a robot is not a replay; it belongs in `playback`.
 """

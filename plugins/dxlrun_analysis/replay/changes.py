@@ -1,4 +1,5 @@
-"""Changes: intended differences between a replay and its run: parameters, arguments of the robot file."""
+"""Intended differences between a replay and its run: changed parameters, code, and arguments of the robot
+file."""
 
 from __future__ import annotations
 
@@ -18,7 +19,7 @@ from dxlrun_analysis.replay.recorded import RecordedPlan
 
 
 class Setting(msgspec.Struct, frozen=True):
-    """New value of one parameter: `--set left_arm.tolerances.path=0.1`."""
+    """Changed value of one controller parameter for a replay: `--set left_arm.tolerances.path=0.1`."""
 
     controller: str
     parameter: tuple[str, ...]
@@ -45,7 +46,7 @@ class Setting(msgspec.Struct, frozen=True):
 
 
 def with_settings(loop: LoopPlan, settings: Sequence[Setting], plugins: PlugIns) -> LoopPlan:
-    """Return the plan with changed parameters.
+    """Return the loop's plan with changed parameters of its controllers.
 
     Raises:
         InputError: A controller does not exist, or a value does not fit.
@@ -66,7 +67,8 @@ def with_settings(loop: LoopPlan, settings: Sequence[Setting], plugins: PlugIns)
 
 
 def with_changed_code(loop: LoopPlan, then: LoopPlan, plugins: PlugIns) -> LoopPlan:
-    """Return the plan with the current claims of controllers from changed files.
+    """Return the loop's plan in which controllers from changed files are planned again with the joints and
+    interfaces that their code now claims.
 
     Args:
         loop: Plan with the current code.
@@ -100,7 +102,10 @@ def _changed(plan: ControllerPlan, setting: Setting) -> ControllerPlan:
 
 
 def with_arguments(plan: RecordedPlan, loop: LoopPlan, arguments: Mapping[str, str]) -> LoopPlan:
-    """Return the loop of the log's robot file with changed arguments. Its cycles and commands stay.
+    """Return the loop's plan, with joints and controllers compiled from the log's robot file with changed
+    arguments.
+
+    Cycles and commands stay as recorded.
 
     Raises:
         InputError: The file does not compile with the arguments, or the recorded inputs do not fit the

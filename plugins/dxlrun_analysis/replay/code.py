@@ -1,4 +1,5 @@
-"""Code: the single files that a replay executes.
+"""Choice of the Python files next to the robot file that a replay executes: those on disk, or those in the
+log.
 
 A log can come from an untrusted source, so the Python text in it is executed only on request.
 """
@@ -15,11 +16,13 @@ from dxlrun.tooling.robots import published_by, read_file
 from dxlrun_analysis.replay.recorded import RecordedPlan
 
 CodeChoice = Literal["current", "log"]
-"""`current`: the files next to the robot file as they are now. `log`: the texts in the log."""
+"""Python files that a replay executes. `current`: those next to the robot file, as they are now. `log`:
+the texts in the log."""
 
 
 def with_code(plan: RecordedPlan, choice: CodeChoice | None) -> tuple[RecordedPlan, tuple[str, ...]]:
-    """Return the plan with the code that the replay executes, and remarks on changes since the run.
+    """Return the plan with the Python files that the replay executes, and a remark on each that has changed
+    since the run.
 
     Without a choice, the files on disk must equal those in the log.
 

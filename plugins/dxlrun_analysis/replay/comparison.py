@@ -1,4 +1,5 @@
-"""Comparison of the commands of a replayed loop with the log, cycle by cycle and bit by bit."""
+"""Comparison of the commands and goals of a replayed loop with those in the log, cycle by cycle and bit by
+bit."""
 
 from __future__ import annotations
 
@@ -17,7 +18,8 @@ from dxlwire import COMMAND_INTERFACES
 _COMMANDS = tuple(f"command_{interface}" for interface in COMMAND_INTERFACES)
 _GOALS = tuple(f"goal_{interface}" for interface in COMMAND_INTERFACES)
 _COMPARED = (*CycleRecord.COMPUTED, *_COMMANDS, *_GOALS)
-"""Compared fields in order of computation. The first difference causes the later ones."""
+"""Fields of a cycle that are compared, in order of computation. The first difference causes the later
+ones."""
 _WHAT = {
     **{f"command_{interface}": f"command of the {interface}" for interface in COMMAND_INTERFACES},
     **{
@@ -30,7 +32,7 @@ _MASK = 0xFFFFFFFFFFFFFFFF  # Width of the mask in the log
 
 
 class JointDifferences(msgspec.Struct, frozen=True):
-    """Number of cycles in which the values of one joint differ."""
+    """Number of cycles in which command, goal or reference of one joint differ between run and replay."""
 
     joint: str
     commands: int
@@ -39,12 +41,13 @@ class JointDifferences(msgspec.Struct, frozen=True):
 
 
 class Comparison:
-    """Comparison of a replay with the recorded cycles. NaN and zero are compared by their bits."""
+    """Counter of the differences between replayed and recorded cycles. NaN and zero are compared by their
+    bits."""
 
     def __init__(
         self, plan: LoopPlan, inputs: RecordedInputs, controllers: Callable[[], Sequence[ControllerPlan]]
     ) -> None:
-        """Create a comparison.
+        """Create a comparison without cycles.
 
         Args:
             plan: Plan of the replayed loop.
@@ -65,7 +68,7 @@ class Comparison:
         )
 
     def joints(self) -> tuple[JointDifferences, ...]:
-        """Return the joints with differences, in order of rows."""
+        """Return the joints with differences, in the order of the log."""
         found = (
             JointDifferences(joint.name, int(command), int(goal), int(reference))
             for joint, command, goal, reference in zip(
@@ -79,10 +82,10 @@ class Comparison:
         return tuple(one for one in found if one.commands or one.goals or one.references)
 
     def compare(self, record: CycleRecord, row: np.void, index: int) -> None:
-        """Compare one finished cycle.
+        """Compare one replayed cycle with the recorded row of the same index.
 
         Raises:
-            LogError: The inputs of the cycle are not the recorded ones.
+            LogError: Number, deadline or period of the cycle are not the recorded ones.
         """
         if record.cycle == row["cycle"] and record.scheduled_ns != row["scheduled_ns"]:
             raise LogError(
@@ -135,7 +138,7 @@ class Comparison:
         return self._inputs.difference(index, "active", None, name, *states)
 
     def _named(self, field: str, place: int, active: int) -> tuple[str, str | None, str | None]:
-        """Return the name of an element of a cycle's field, its joint, and the controller that commands it.
+        """Return name, joint and commanding controller of one element of a cycle's field, for a message.
 
         Args:
             field: Name of the field.
@@ -171,6 +174,6 @@ def _values(record: CycleRecord) -> tuple[Floats, ...]:
 
 
 def shown_bits(bits: int) -> str:
-    """Return a float64 as text that preserves its bits; a bare `nan` would hide its payload."""
+    """Return the float64 with these bits as text that preserves them; a bare `nan` would hide its payload."""
     value = float(np.uint64(bits).view(np.float64))
     return repr(value) if np.isfinite(value) else f"{value} (bits {bits:#018x})"

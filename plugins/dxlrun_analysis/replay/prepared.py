@@ -1,7 +1,8 @@
-"""Prepared commands: arrays that `prepare` makes again from logged requests, compared with those of the run.
+"""Prepared commands: arrays that a controller's `prepare` makes again from logged requests, compared with the
+log.
 
-A controller's `prepare` ran outside of the loop: at compilation for a planned command, in the gateway for the
-command of a client.
+`prepare` ran outside of the loop: at compilation for a planned command, in the gateway for the command of a
+client.
 """
 
 from __future__ import annotations
@@ -31,9 +32,9 @@ _LONGEST_REASON = 200  # Characters
 
 
 class PreparedComparison:
-    """Prepares commands again and compares each array bit by bit.
+    """Prepares the commands of a log again and compares each array with the recorded one bit by bit.
 
-    The replay executes its own arrays. A command without a request in the log is executed as recorded.
+    The replay executes the new arrays. A command without a request in the log is executed as recorded.
     """
 
     def __init__(self, inputs: RecordedInputs) -> None:
@@ -43,11 +44,11 @@ class PreparedComparison:
         self.different = 0
         self.without_request = 0  # Commands whose request is not in the log
         self._parameters: dict[str, list[ParametersModel]] = {}
-        """All parameters of a controller so far. A client's command may have been prepared shortly before a
-        change of parameters."""
+        """All parameters that each controller has had so far. A client's command may have been prepared
+        shortly before a change of parameters."""
 
     def of_plan(self, plan: LoopPlan, plugins: PlugIns) -> LoopPlan:
-        """Return the plan with its commands prepared again."""
+        """Return the plan with the data of its commands prepared again."""
         cycles = [one.cycle for one in self._inputs.log.commands if one.planned >= 0]
         known: dict[str, tuple[type[Controller[Any]], ParametersModel]] = {}
         for one in plan.controllers:
@@ -129,7 +130,8 @@ class PreparedComparison:
         recorded: bytes,
         cycle: int,
     ) -> bytes:
-        """Prepare a request again and compare the result; return the data for the replay."""
+        """Prepare a command's request again and compare the array with the recorded one; return the array
+        for the replay."""
         if not request:
             self.without_request += 1
             return recorded
@@ -153,7 +155,8 @@ class PreparedComparison:
 def _prepared(
     cls: type[Controller[Any]], parameters: ParametersModel, kind: str, request: bytes
 ) -> bytes | str:
-    """Return the array of a request, little-endian, or the reason of a failure."""
+    """Return the array that `prepare` makes of a request, as little-endian float64 bytes, or the reason of
+    its failure as text."""
     try:
         command = cls.Commands[kind].model_validate_json(request)
         return np.ascontiguousarray(cls.prepare(kind, command, parameters), dtype="<f8").tobytes()
@@ -166,7 +169,7 @@ def _prepared(
 
 
 def _where(kind: str, recorded: bytes, replayed: bytes | str) -> tuple[str, str, str]:
-    """Return the place of the first difference, and both values."""
+    """Return the place of the first element that differs, and its recorded and replayed value, as text."""
     what = f"array that prepare made of {kind}"
     then = np.frombuffer(recorded[: len(recorded) // 8 * 8], "<u8")
     if isinstance(replayed, str):

@@ -1,4 +1,4 @@
-"""Published messages of a replay, compared with those in the log byte by byte."""
+"""Messages that controllers publish in a replay, compared with those in the log byte by byte."""
 
 from __future__ import annotations
 
@@ -24,22 +24,22 @@ _LONGEST_SHOWN = 120  # Characters
 
 @dataclass(slots=True)
 class _Pending:
-    """Topic of the log, with its messages that are not compared yet."""
+    """Topic of the log, with its recorded messages that were not compared yet."""
 
     type: MessageType
     waiting: deque[tuple[int, bytes]] = field(default_factory=deque)
-    """Times and messages that were read but not compared."""
+    """Time (ns) and data of each recorded message that was not compared yet."""
 
 
 class MessageComparison(MessageSink):
-    """Receiver of the messages of a replayed loop, which compares each with the log.
+    """Receiver of the messages that a replayed loop publishes; compares each with the log.
 
     Topics that the log does not have are not compared: they are from an earlier dxlrun that did not publish
     them.
     """
 
     def __init__(self, inputs: RecordedInputs) -> None:
-        """Create a comparison; `feed` adds the messages of the log."""
+        """Create a comparison without recorded messages; `feed` adds them."""
         self.first: ReplayDifference | None = None
         self._first_ns = 0
         self.compared = 0
@@ -51,20 +51,21 @@ class MessageComparison(MessageSink):
         self._whole = inputs.end == len(inputs.log.cycles) and any(
             event.code == EventCode.LOOP_STOPPED for event in inputs.log.events
         )
-        """The run stopped normally with the last compared cycle."""
+        """True if the run stopped normally with the last compared cycle, so that its messages are
+        complete."""
         self.lost = _lost(inputs.log)
-        """Number of messages that the recorder lost. Without them, a message of the replay can lack its
-        counterpart."""
+        """Number of messages that the recorder lost. If there are any, a message that only the replay has
+        is not a difference."""
 
     @property
     def remarks(self) -> tuple[str, ...]:
-        """Remarks on the comparison for the user."""
+        """Sentence about messages that the log lacks; empty if it has all."""
         if not self.lost:
             return ()
         return (f"the log misses {counted(self.lost, 'message', 'messages')} of topics",)
 
     def feed(self, part: Log) -> None:
-        """Add the messages of a slice of the log."""
+        """Add the recorded messages of a slice of the log."""
         for name, logged in part.topics.items():
             if name in _NOT_COMPARED:
                 continue
@@ -72,12 +73,12 @@ class MessageComparison(MessageSink):
             pending.waiting += zip(logged.t_ns.tolist(), logged.data, strict=True)
 
     def announce(self, topic: PublishedTopic) -> int:
-        """Register a topic; return its number."""
+        """Register a topic that the replayed loop publishes; return its number for `message`."""
         self._announced.append(topic)
         return len(self._announced) - 1
 
     def message(self, topic: int, t_ns: int, data: bytes) -> None:
-        """Compare one message."""
+        """Compare one message of the replay with the recorded message of the same topic and time."""
         announced = self._announced[topic]
         name = announced.name
         pending = self._topics.get(name)
@@ -94,12 +95,13 @@ class MessageComparison(MessageSink):
             self._differs(t_ns, name, "", "no message", "a message")
 
     def finish(self, reached_ns: int) -> None:
-        """Report messages up to the last replayed cycle that the replay did not publish."""
+        """Count recorded messages up to the time `reached_ns` that the replay did not publish as
+        differences."""
         for name, pending in self._topics.items():
             self._pass(name, pending, min(reached_ns, self._until_ns) + 1)
 
     def _pass(self, name: str, pending: _Pending, t_ns: int) -> None:
-        """Report recorded messages from before a time: the replay did not publish them."""
+        """Count recorded messages from before a time as differences: the replay did not publish them."""
         while pending.waiting and pending.waiting[0][0] < t_ns:
             at_ns, _ = pending.waiting.popleft()
             self.compared += 1
@@ -129,7 +131,7 @@ def _lost(log: Log) -> int:
 def _where(
     logged: MessageType, now: PublishedTopic, recorded: bytes, replayed: bytes
 ) -> tuple[str, str, str]:
-    """Return the first field that differs, and its values."""
+    """Return the first field of a message that differs, and its recorded and replayed value, as text."""
     if (logged.name, logged.text) != (now.type.name, now.type.text):
         return "", f"type {logged.name}", f"another definition of {now.type.name}"
     codec = Codec(now.type)
@@ -147,7 +149,7 @@ def _where(
 
 
 def _leaves(value: object, place: str) -> dict[str, str]:
-    """Return all leaf values of a message as text, by path: `error[1]`."""
+    """Return all single values of a message as text, by their path: `error[1]`."""
     if isinstance(value, Mapping):
         parts = [(f"{place}.{name}" if place else str(name), one) for name, one in value.items()]
     elif isinstance(value, np.ndarray | list):

@@ -1,4 +1,4 @@
-"""Recorded inputs of a replay, validated: the plan, each cycle's inputs, and the end of usable cycles."""
+"""Recorded inputs of a replay: the plan and each cycle's inputs, validated, up to the first missing data."""
 
 from __future__ import annotations
 
@@ -24,7 +24,7 @@ _LIBRARIES = ("dxlrun", "numpy")  # Another version of these libraries can chang
 
 
 class _Begun(msgspec.Struct):
-    """Data of the command that marks the begin of a policy."""
+    """Data of the logged command with which a policy begins."""
 
     policy: str
 
@@ -48,14 +48,16 @@ class ReplayDifference(msgspec.Struct, frozen=True):
     what: str
     """`command of the position`, `goal of the velocity ...`, `reference arm_pid/j0/position`, `active`."""
     joint: str | None
-    """None if a controller was active in only one of run and replay, or if a message differs."""
+    """Joint of the value; None if a controller was active in only one of run and replay, or if a message
+    differs."""
     controller: str | None  # Controller that claims the joint or commands the reference; None without one
     recorded: str  # Shortest decimal number with these bits; if it is not finite, also the bits
     replayed: str
 
 
 class RecordedInputs(RunInputs, frozen=True, eq=False):
-    """Inputs of one run, with its plan and the reason why some cycles cannot be compared."""
+    """Inputs of a recorded run for its replay, with the plan, and the reason why some cycles cannot be
+    compared."""
 
     plan: RecordedPlan
     stopped: str  # Reason why some cycles cannot be compared; empty if all can
@@ -63,14 +65,15 @@ class RecordedInputs(RunInputs, frozen=True, eq=False):
     def difference(  # noqa: PLR0917  what a difference is made of
         self, index: int, what: str, joint: str | None, controller: str | None, recorded: str, replayed: str
     ) -> ReplayDifference:
-        """Return a difference in a cycle, by the cycle's index; -1: before the first cycle."""
+        """Make the record of one value that differs, in the cycle with this index; -1: before the first
+        cycle."""
         cycle = self.activation if index < 0 else self.log.cycles[index]
         time_s = (int(cycle["woken_ns"]) - self.start_ns) * 1e-9
         return ReplayDifference(int(cycle["cycle"]), time_s, what, joint, controller, recorded, replayed)
 
 
 def recorded(log: Log) -> RecordedInputs:
-    """Return the inputs in a log that `overview` has read.
+    """Validate and return the inputs of a replay; `log` is the result of `overview`.
 
     Raises:
         LogError: The log has no usable inputs.
@@ -101,7 +104,7 @@ def recorded(log: Log) -> RecordedInputs:
 
 
 def _beginning(log: Log) -> np.void:
-    """Return states and goals at the activation of the controllers.
+    """Return the activation record of a log: states and goals when the controllers were activated.
 
     Raises:
         LogError: The log begins later, so the state of its controllers is unknown.
@@ -123,7 +126,8 @@ def _beginning(log: Log) -> np.void:
 
 
 def version_remarks(inputs: RecordedInputs, plugins: PlugIns) -> tuple[str, ...]:
-    """Return a sentence for each component with another version than in the recorded run."""
+    """Return a sentence for dxlrun, numpy, and each controller type that has another version than in the
+    run."""
     then = inputs.log.metadata.get("versions", {})
     sentences = []
     for name in _LIBRARIES:
@@ -141,7 +145,8 @@ def version_remarks(inputs: RecordedInputs, plugins: PlugIns) -> tuple[str, ...]
 
 
 def code_remarks(inputs: RecordedInputs) -> tuple[str, ...]:
-    """Return a sentence for dxlrun, and each plug-in of these controllers, if its files have changed."""
+    """Return a sentence for dxlrun, and for each plug-in of these controllers, if its files have changed
+    since the run."""
     publishers = [plan.distribution for plan in inputs.plan.loop.controllers]
     return changed_code(inputs.log.metadata.get(IDENTITY_NAME, {}), publishers)
 
@@ -178,7 +183,8 @@ def _plan(log: Log) -> RecordedPlan:
 
 
 def _check_controllers(log: Log, loop: LoopPlan) -> None:
-    """Refuse controllers that a compiler cannot produce: with an unknown joint, or a rate divider below 1."""
+    """Raise LogError if a controller of the plan has an unknown joint, or a rate divider below 1, which no
+    compiler produces."""
     for controller in loop.controllers:
         unknown = set(controller.joints) - set(log.joints)
         if unknown or controller.every < 1:
@@ -194,7 +200,8 @@ def _version(log: Log) -> str:
 
 
 def _check_times(log: Log, start_ns: int, period_ns: int) -> None:
-    """Refuse times that contradict a periodic loop; a replay would follow them without an end.
+    """Raise LogError if the cycles' times contradict a periodic loop; a replay would follow them without an
+    end.
 
     The time between two deadlines is the difference of their numbers times the period. The period changes
     only in a cycle that executed a change of the rate. Across missing cycles it is unknown.
@@ -218,8 +225,8 @@ def _check_times(log: Log, start_ns: int, period_ns: int) -> None:
 
 
 def _check_sequence(log: Log, start_ns: int, period_ns: int) -> None:
-    """Refuse times that contradict a sequential schedule: a deadline is a period after the preceding
-    wake-up."""
+    """Raise LogError if the cycles' times contradict a sequential schedule: a deadline is a period after
+    the preceding wake-up."""
     cycles = log.cycles
     number, due, woken = cycles["cycle"], cycles["scheduled_ns"], cycles["woken_ns"]
     before = np.roll(woken, 1)
@@ -235,7 +242,7 @@ def _refuse_wrong(log: Log, wrong: NDArray[np.bool_]) -> None:
 
 
 def _check_commands(log: Log) -> None:
-    """Refuse a command whose time is not that of the cycle that executed it."""
+    """Raise LogError if a command has another time than the wake-up of the cycle that executed it."""
     policy = policy_begun(log)
     for command in log.commands:
         at = _index_of(log, command.cycle)
@@ -254,7 +261,8 @@ def _index_of(log: Log, cycle: int) -> int | None:
 
 
 def _until_hole(log: Log) -> tuple[int, int, str]:
-    """Return the number of usable cycles, the first cycle of a policy, and the reason for the end.
+    """Return the number of cycles that can be compared, the index of the first cycle of a policy, and why
+    later cycles cannot be compared.
 
     After a missing cycle or command, the state of the controllers is unknown.
     """
@@ -268,7 +276,8 @@ def _until_hole(log: Log) -> tuple[int, int, str]:
 
 
 def _first_hole(log: Log) -> tuple[int, str]:
-    """Return the index of the first cycle with missing data before it, and the reason.
+    """Return the index of the first cycle before or in which cycles or commands are missing in the log, and
+    the reason as text.
 
     Without missing data, the index is the number of cycles.
     """
@@ -294,7 +303,8 @@ def _first_hole(log: Log) -> tuple[int, str]:
 
 
 def _until_policy(log: Log, usable: int) -> tuple[int, int, str]:
-    """Return the number of usable cycles, the number without a policy, and the reason for the end.
+    """Return the number of usable cycles, the number of those before a policy began, and why later cycles
+    cannot be compared.
 
     A cycle in which a bus failed is not in the log, although the time of the next cycle depends on it.
     """
@@ -316,7 +326,8 @@ def _until_policy(log: Log, usable: int) -> tuple[int, int, str]:
 
 
 def _loop(log: Log, plan: LoopPlan) -> LoopPlan:
-    """Return the loop of the replay. Time and signals do not end it, because their effects are in the log."""
+    """Return the loop's plan for the replay, with the commands that the run executed. Time and signals do
+    not end it, because their effects are in the log."""
     taken = {command.planned for command in log.commands if command.planned >= 0}
     if beyond := sorted(number for number in taken if number >= len(plan.commands)):
         cycle = next(command.cycle for command in log.commands if command.planned == beyond[0])
@@ -331,7 +342,7 @@ def _loop(log: Log, plan: LoopPlan) -> LoopPlan:
 
 
 def _policies(log: Log, policies: PolicyPlan) -> PolicyPlan:
-    """Make the policy of the run begin at the end of its cycles."""
+    """Return the policies so that the policy that began in the run begins after the replay's last cycle."""
     begun = policy_begun(log)
     if begun is None:
         return policies

@@ -1,4 +1,4 @@
-"""Replay: run the controllers of a log again on its inputs, and compare their commands."""
+"""`dxlrun replay`: run the controllers of a log again on its recorded inputs, and compare their commands."""
 
 from __future__ import annotations
 
@@ -23,7 +23,7 @@ from dxlrun_analysis.replay.tape import Tape, overview
 
 
 class ReplayReport(msgspec.Struct, frozen=True):
-    """Result of `dxlrun replay`."""
+    """Result of `dxlrun replay`: numbers of compared and different cycles, messages and prepared commands."""
 
     log: str
     robot: str
@@ -41,17 +41,18 @@ class ReplayReport(msgspec.Struct, frozen=True):
     prepared: int = 0  # Commands that were prepared again
     different_prepared: int = 0
     unprepared: int = 0
-    """Commands without a request in the log: it was too long, or the log is from an earlier dxlrun."""
+    """Commands that were not prepared again because the log lacks their request: it was too long, or the
+    log is from an earlier dxlrun."""
 
     @property
     def same(self) -> bool:
-        """True if everything comparable was compared and nothing differs."""
+        """True if no compared value differs and the replay did not end before the run."""
         differ = self.different or self.different_messages or self.different_prepared
         return not differ and not self.fault
 
     @property
     def sentence(self) -> str:
-        """Result in one sentence."""
+        """Result in one sentence, with the numbers of cycles and differences."""
         cycles = counted(self.compared, "cycle", "cycles")
         if self.compared < self.cycles:
             cycles = f"cycles 0 to {self.last} ({self.compared} of {self.cycles})"
@@ -79,7 +80,7 @@ def replay_log(
     arguments: Mapping[str, str] | None = None,
     code: CodeChoice | None = None,
 ) -> ReplayReport:
-    """Run the controllers of a log on its inputs and compare their commands.
+    """Run the controllers of a log on its recorded inputs and compare their commands with the log.
 
     Memory does not grow with packets, states and messages of the log.
 
@@ -87,7 +88,7 @@ def replay_log(
         log: The log.
         settings: Changed parameters.
         arguments: Changed arguments of the robot file.
-        code: Source of the single files to execute, if those on disk differ from the log.
+        code: Source of the controllers' Python files, if those on disk differ from the log.
 
     Raises:
         LogError: The log does not hold the inputs.
@@ -147,7 +148,8 @@ def replay_log(
 
 
 def _offered(log: Path, loop: LoopPlan, plugins: PlugIns) -> None:
-    """Raise PlugInError with a line for each controller of the log whose type no plug-in offers here."""
+    """Raise PlugInError if no installed plug-in offers the type of a controller in the log, with a line
+    for each."""
     missing = [
         f"{log}: no plug-in offers the type {one.type} of controller {one.name}; the run had it from "
         f"{one.distribution or 'another package'}: install that"

@@ -1,4 +1,4 @@
-"""Tape: a log read twice in constant memory: first an overview of the whole log, then cycle by cycle."""
+"""Tape: read a log twice in constant memory, first an overview of the whole, then cycle by cycle."""
 
 from __future__ import annotations
 
@@ -36,11 +36,12 @@ _EVENTS = frozenset(
     )
 )
 AHEAD_NS = 5_000_000_000
-"""Largest delay of messages behind their cycle in the log. The recorder drains one ring after the other."""
+"""Time that the tape reads ahead: the largest delay of messages behind their cycle in the log. The
+recorder drains one ring after the other."""
 
 
 def overview(reader: LogReader) -> Log:
-    """Return the data of a whole log that a replay needs before the cycles.
+    """Read a whole log, but return only the data that a replay needs before the first cycle.
 
     These are the scalar fields of the cycles, the relevant events, and all commands, without packets and
     topics.
@@ -82,7 +83,8 @@ def _scalars(cycles: NDArray[np.void]) -> NDArray[np.void]:
 
 
 class Tape:
-    """Cycles of a log in sequence, with a few seconds of following records."""
+    """Reader that returns the cycles of a log one after the other, and reads the messages a few seconds
+    ahead."""
 
     def __init__(
         self, reader: LogReader, woken_ns: NDArray[np.int64], messages: Callable[[Log], None]
@@ -103,7 +105,7 @@ class Tape:
         self._read_all = False
 
     def row(self, index: int) -> np.void:
-        """Return a cycle. Only the preceding cycle is guaranteed to be available again.
+        """Return the cycle with this index. Indices must ascend; only the preceding cycle can be read again.
 
         Raises:
             LogError: The log cannot be read, or has changed.

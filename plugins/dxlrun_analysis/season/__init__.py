@@ -1,4 +1,4 @@
-"""Many logs: the runs of a season as tables, in a folder or an object store, and queries on them.
+"""Tables of many logs, one row per run: in a directory or an object store, with queries on them.
 
 The analysis of one log belongs in the packages next to this one.
 """

@@ -1,4 +1,5 @@
-"""Pools of processes on this machine, connected by pipes without a listening socket."""
+"""Pool of processes on this machine that analyze logs in parallel, connected by pipes without a listening
+socket."""
 
 from __future__ import annotations
 
@@ -15,8 +16,8 @@ _PR_SET_PDEATHSIG = 1  # linux/prctl.h
 
 @contextmanager
 def processes(count: int) -> Iterator[Executor]:
-    """Yield a pool of processes, which are killed when the context is left with an error, or this process
-    exits."""
+    """Yield a pool of `count` processes. They are killed when the context is left with an error, or this
+    process exits."""
     # Do not fork: Arrow has threads in this process, and a forked child could deadlock on their locks.
     pool = ProcessPoolExecutor(count, get_context("spawn"), initializer=_follow)
     before = set(active_children())
@@ -38,6 +39,7 @@ def processes(count: int) -> Iterator[Executor]:
 
 
 def _follow() -> None:
-    """Exit with the parent process, and run at low priority, because a robot may run on this machine."""
+    """Initialize a process of the pool: it exits with its parent, and has low priority because a robot may
+    run on this machine."""
     os.nice(10)
     ctypes.CDLL(None).prctl(_PR_SET_PDEATHSIG, signal.SIGKILL)

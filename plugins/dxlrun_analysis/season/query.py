@@ -1,4 +1,4 @@
-"""Query: filter and sort a table of runs by SQL expressions, with DuckDB.
+"""Query: filter and sort the table of logs by SQL expressions, with DuckDB.
 
 Expressions can only read the table. They cannot access files, extensions or settings.
 """
@@ -28,7 +28,8 @@ _READ_ONLY: dict[str, str | bool | int | float | list[str]] = {
 
 
 def select_runs(runs: pa.Table, where: str | None, sort: str | None) -> list[dict[str, object]]:
-    """Return the rows that meet the condition `where`, ordered by `sort`, by default by name.
+    """Return those rows of the table of logs that meet the SQL condition `where`, ordered by `sort`, by
+    default by name.
 
     Raises:
         InputError: An expression is wrong; the message names its option of the command line.
@@ -47,7 +48,7 @@ def select_runs(runs: pa.Table, where: str | None, sort: str | None) -> list[dic
 
 @contextmanager
 def _input_errors(option: str, runs: pa.Table) -> Iterator[None]:
-    """Convert an error of DuckDB to one sentence without error class, candidates and position."""
+    """Convert an error of DuckDB to an InputError of one sentence that names the option."""
     try:
         yield
     except duckdb.Error as error:

@@ -1,4 +1,4 @@
-"""Runs below a directory as one table, one row per log with results of its report, kept as Parquet.
+"""Table of the logs below a directory, one row per log with results of its report, cached as Parquet.
 
 A log is read again only if size, inode or a time of its files has changed.
 """
@@ -33,13 +33,14 @@ _MEASUREMENT = "latency"  # Metadata record of a log that `dxlrun latency` wrote
 _LOG, _LEDGER = ".mcap", ".ledger.jsonl"
 _ENDED = "the process that read it ended: it crashed, or had too little memory"
 _SETTLED_NS = 2_000_000_000
-"""Coarsest time resolution of file systems (2 s of FAT). A file that changed more recently can change again
-without a new time stamp."""
+"""Age from which a file's state counts as final: the coarsest time resolution of file systems (2 s of
+FAT). A file that changed more recently can change again without a new time stamp."""
 _TEXT, _WHOLE, _NUMBER, _YES = pa.string(), pa.int64(), pa.float64(), pa.bool_()
 
 
 def _began(report: Report, log: Log) -> datetime | None:
-    """Return the wall-clock time of the first deadline, in UTC without a time zone; None on virtual time."""
+    """Return the wall-clock time of the run's first deadline, in UTC without a time zone; None on virtual
+    time."""
     offset_ns = log.header.epoch_offset_ns
     if not offset_ns:
         return None
@@ -109,7 +110,7 @@ COLUMNS: Mapping[str, tuple[pa.DataType, Value]] = {
     "kernel": (_TEXT, lambda _, log: log.metadata.get("kernel", {}).get("release")),
     "version": (_TEXT, lambda _, log: log.metadata.get("versions", {}).get("dxlrun")),
 }
-"""Columns that come from the report on a log, with their types."""
+"""Columns of the table that come from the report on a log: type, and function that returns the value."""
 SCHEMA = pa.schema(
     [
         ("log", _TEXT),
@@ -122,7 +123,7 @@ _KEPT = SCHEMA.append(pa.field("stamp", _TEXT))
 
 
 class FoundLog(NamedTuple):
-    """One log below the directory."""
+    """One log below a directory: a file, or a directory with a log in parts."""
 
     name: str  # Path relative to the directory
     path: Path  # A file, or the directory of a log in parts
@@ -130,7 +131,8 @@ class FoundLog(NamedTuple):
 
     @property
     def stamp(self) -> str:
-        """State of its files; empty while they can change unnoticed, or a run writes them."""
+        """Size, inode and times of its files as text, to recognize a change; empty while they can change
+        unnoticed, or a run writes them."""
         try:
             found = [file.stat() for file in self.files]
         except OSError:  # It is deleted or not accessible, which reading reports
@@ -141,7 +143,7 @@ class FoundLog(NamedTuple):
 
 
 class Folder(NamedTuple):
-    """Logs below a directory."""
+    """Logs found below a directory, and its other files."""
 
     directory: Path
     logs: tuple[FoundLog, ...]
@@ -149,7 +151,7 @@ class Folder(NamedTuple):
 
 
 def find_logs(directory: Path) -> Folder:
-    """Return the logs below a directory, by name.
+    """Find all logs below a directory, in order of their names. Hidden directories are skipped.
 
     Raises:
         InputError: The directory has no logs.
@@ -187,7 +189,8 @@ def _belongs(name: str, files: Sequence[str]) -> bool:
 
 
 def row_of(log: FoundLog) -> Row:
-    """Return the row of a log. The row of an unreadable log has the reason."""
+    """Analyze a log and return its row of the table. If it cannot be read, the row has the reason in
+    `unreadable`."""
     row: Row = {"log": log.name, "bytes": sum(file.stat().st_size for file in log.files if file.is_file())}
     try:
         reader = open_log(log.path)
@@ -203,7 +206,8 @@ def row_of(log: FoundLog) -> Row:
 
 
 def cache_directory() -> Path:
-    """Return `$XDG_CACHE_HOME/dxlrun/logs` (XDG Base Directory Specification; ~/.cache by default).
+    """Return the directory of the cached tables: `$XDG_CACHE_HOME/dxlrun/logs` (XDG Base Directory
+    Specification; ~/.cache by default).
 
     Raises:
         RuntimeError: The user has no home directory.
@@ -213,25 +217,26 @@ def cache_directory() -> Path:
 
 
 def table_of(folder: Folder, progress: Progress) -> tuple[pa.Table, int]:
-    """Return the table of all logs, and how many of them were read this time, several in parallel.
+    """Return the table of all logs below a directory, and how many of them were read now; the rest come from
+    the cached table.
 
     Raises:
-        OSError: The table cannot be kept for the next time.
+        OSError: The table cannot be written to the cache.
     """
     place = os.fsencode(folder.directory.resolve())
     return kept_table(place, folder.logs, lambda missing: _rows(missing, progress))
 
 
 class Stamped(Protocol):
-    """Log in a table that is kept."""
+    """Log that can have a row in a cached table."""
 
     @property
     def name(self) -> str:
-        """Name in the table."""
+        """Name of the log in the table."""
 
     @property
     def stamp(self) -> str:
-        """Version of the content; empty if it can change without a new stamp."""
+        """Version of the log's content, to recognize a change; empty if it can change without a new stamp."""
 
 
 AnyLog = TypeVar("AnyLog", bound=Stamped)
@@ -240,17 +245,17 @@ AnyLog = TypeVar("AnyLog", bound=Stamped)
 def kept_table(
     place: bytes, logs: Sequence[AnyLog], read: Callable[[Sequence[AnyLog]], Mapping[str, Row]]
 ) -> tuple[pa.Table, int]:
-    """Return the table of the logs of a place, and the number of rows that were read.
+    """Return the table of some logs, and the number of rows that were read now.
 
-    Rows are read if their stamp has changed.
+    A row is read if the cached table does not have it with the same stamp. The cache is then updated.
 
     Args:
-        place: Key of the kept table: path of a directory or URL of a store.
+        place: Key of the cached table: path of a directory or URL of a store.
         logs: The logs.
         read: Function that returns the rows of logs by name.
 
     Raises:
-        OSError: The table cannot be kept for the next time.
+        OSError: The table cannot be written to the cache.
     """
     name = blake2b(place, digest_size=16).hexdigest()
     # Another version of the code can compute other values, so it keeps tables of its own.
@@ -288,7 +293,8 @@ def _rows(logs: Sequence[FoundLog], progress: Progress) -> dict[str, Row]:
 
 
 def _together(logs: Sequence[FoundLog], count: int, progress: Progress) -> dict[str, Row]:
-    """Return the rows that a pool of processes reads before one of them crashes."""
+    """Analyze logs in a pool of `count` processes; return their rows by name. If a process crashes, the
+    rows not read by then are missing."""
     found: dict[str, Row] = {}
     with suppress(BrokenExecutor), processes(count) as pool:
         running = [pool.submit(row_of, log) for log in logs]

@@ -30,7 +30,7 @@ _ROW, _LOG = ".run.json", ".mcap"
 UNFINISHED = "its upload has not ended; `dxlrun upload` of its robot continues it"
 DAMAGED = f"its row in the store (NAME{_ROW}) is damaged; `dxlrun upload` of its robot writes it again"
 _AT_ONCE = 500
-"""Rows that are requested together."""
+"""Number of rows that are requested from the store together."""
 _OPTIONS: Mapping[str, Mapping[str, object]] = {
     "s3": {
         "skip_instance_cache": True,
@@ -43,7 +43,7 @@ _OPTIONS: Mapping[str, Mapping[str, object]] = {
 
 
 class StoredLog(NamedTuple):
-    """One log of a store."""
+    """One log in an object store; without a row if its upload has not ended."""
 
     name: str
     row: str  # Path of its row; empty if the row does not exist yet
@@ -51,7 +51,7 @@ class StoredLog(NamedTuple):
 
 
 class Store(NamedTuple):
-    """Logs of a store below a prefix."""
+    """An object store below a prefix: its logs, and the names of other files."""
 
     directory: str  # URL
     files: fsspec.AbstractFileSystem
@@ -60,10 +60,11 @@ class Store(NamedTuple):
     others: tuple[str, ...]
 
     def table(self, progress: Progress) -> tuple[pa.Table, int]:
-        """Return the table of all logs, and how many rows were read this time.
+        """Return the table of all logs in the store, and how many rows were fetched now; the rest come from
+        the cached table.
 
         Raises:
-            OSError: The table cannot be kept for the next time.
+            OSError: The table cannot be written to the cache.
         """
         return kept_table(self.directory.encode(), self.logs, lambda missing: self._rows(missing, progress))
 
@@ -80,7 +81,7 @@ class Store(NamedTuple):
 
 
 def find_store(url: str) -> Store:
-    """List the logs of a store.
+    """List the logs below the URL of an object store.
 
     Raises:
         InputError: The URL is wrong.
@@ -106,7 +107,8 @@ def find_store(url: str) -> Store:
 
 
 def fetch(url: str) -> Path:
-    """Return a local copy of one log of a store, which is deleted when the process exits."""
+    """Download one log from a store to a temporary directory, which is deleted when the process exits;
+    return its path."""
     files, root = _opened(url)
     copy = Path(mkdtemp(prefix="dxlrun-")) / root.rpartition("/")[2]
     atexit.register(shutil.rmtree, copy.parent, ignore_errors=True)
@@ -116,7 +118,7 @@ def fetch(url: str) -> Path:
 
 
 class Upload(NamedTuple):
-    """Result of an upload, as names of logs."""
+    """Result of an upload: names of the logs that were copied, and of those that were not."""
 
     uploaded: tuple[str, ...]
     there: tuple[str, ...]  # Already complete in the store
@@ -125,8 +127,8 @@ class Upload(NamedTuple):
 
 
 def upload(folder: Folder, url: str, progress: Progress) -> Upload:
-    """Copy the logs of finished runs to a store, each with its row. Complete logs in the store are not
-    copied.
+    """Copy the logs of finished runs to a store, each with its row. Logs that are complete in the store are
+    not copied again.
 
     Raises:
         DxlrunError: The store cannot be reached. The next call continues after the last complete log.
@@ -161,7 +163,7 @@ def upload(folder: Folder, url: str, progress: Progress) -> Upload:
 
 
 def _put(store: Store, file: Path, log: FoundLog) -> int:
-    """Copy one file; return its size in the store, bytes."""
+    """Copy one file of a log to the store; return its size there, bytes."""
     to = f"{store.root}/{log.name}" + ("" if file == log.path else f"/{file.name}")
     store.files.put_file(str(file), to)
     return int(store.files.info(to)["size"])
@@ -181,7 +183,7 @@ def _stamp(about: Mapping[str, object]) -> str:
 
 
 def _opened(url: str) -> tuple[fsspec.AbstractFileSystem, str]:
-    """Return the file system of a store and the path in it."""
+    """Return the file system of a store's URL, and the path in it."""
     protocol, _, path = url.partition("://")
     if protocol not in _OPTIONS:
         raise InputError(f"{url}: no such store; write s3://BUCKET/PREFIX or file:///DIRECTORY")
@@ -195,8 +197,8 @@ def _opened(url: str) -> tuple[fsspec.AbstractFileSystem, str]:
 
 @contextmanager
 def _reached(url: str) -> Iterator[None]:
-    """Raise DxlrunError with the URL for any exception, because the exceptions of store libraries have no
-    common class."""
+    """Convert any exception of a store library to a DxlrunError with the URL; the libraries have no common
+    base class."""
     try:
         yield
     except Exception as error:

@@ -1,4 +1,5 @@
-"""Buses and servos of a log: traffic, reply times, losses, broken replies, other hosts on the line.
+"""Buses and servos of a log: their requests and replies, reply times, missing and broken replies, other
+hosts.
 
-Joints, which controllers command, belong in `joints`.
+Joints, which controllers command, are the subject of `joints`.
 """

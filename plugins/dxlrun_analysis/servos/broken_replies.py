@@ -1,4 +1,4 @@
-"""Bytes that belong to no packet: in place of the replies of one ID, or as noise anywhere on a bus."""
+"""Bytes on a bus that belong to no intact packet: in place of the replies of one servo, or as noise."""
 
 from __future__ import annotations
 
@@ -22,7 +22,8 @@ _ALONE = 0.7  # Share of the exchanges of a bus with stray bytes from which a si
 
 
 class BrokenReplies:
-    """Counter of broken replies by ID, and of noise by bus."""
+    """Counter of exchanges with bytes that belong to no intact packet, by servo and by bus; reports the
+    cause."""
 
     def __init__(self, buses: int) -> None:
         self._broken, self._first, self._cut = np.zeros((3, buses * IDS), np.int64)
@@ -32,7 +33,7 @@ class BrokenReplies:
         """Exchanges by bus: those with stray bytes; those whose stray bytes are not cut replies; all."""
 
     def take(self, exchanges: Exchanges) -> None:
-        """Count the stray bytes of some exchanges."""
+        """Count the stray bytes in some exchanges."""
         due, buses = exchanges.due, len(self._noisy)
         # Count the first servo of a chain without an intact reply, if the bytes fit into its reply alone.
         longest = np.array([max(kind.sizes, default=0) + _BESIDE for kind in exchanges.requests.kinds])
@@ -55,7 +56,8 @@ class BrokenReplies:
         self._asked += np.bincount(exchanges.bus[exchanges.request > 0], minlength=buses)
 
     def findings(self, index: int, bus: LoggedBus, losses: Mapping[int, ServoLosses]) -> Sequence[Finding]:
-        """Report the single ID of a bus whose replies are broken, or noise on the bus."""
+        """Report the one servo of a bus whose replies are broken, or else noise on the bus; `losses` has
+        its servos by ID."""
         return self._broken_ones(index, bus, losses) or self._noise(index, bus)
 
     def _noise(self, index: int, bus: LoggedBus) -> Sequence[Finding]:

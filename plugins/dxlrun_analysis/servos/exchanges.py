@@ -1,6 +1,5 @@
 """Exchanges: the instructions of a log paired with their replies, as columns of one table.
 
-
 Pairing is vectorized, without a loop over packets. The packets are parsed again here, so that nothing depends
 on the interpretation of the run. A reply belongs to the last instruction before it on its bus. Sources:
 ROBOTIS e-Manual, Protocol 1.0 and Protocol 2.0, instruction and status packets.
@@ -45,7 +44,8 @@ class Exchanges(NamedTuple):
     sent_ns: Numbers  # End of the instruction on the wire, from its rate
     last_ns: Numbers  # After the last reply; equals `sent_ns` without replies
     ended: Flags
-    """False if the log ends before the next instruction. A missing reply may then have come after the end."""
+    """False if the log ends before the next instruction on the bus. A missing reply may then have come
+    after the end of the log."""
     noise: Numbers  # Bytes that belong to no intact packet
     replies: Replies
     due: Due
@@ -57,7 +57,8 @@ class Exchanges(NamedTuple):
 
 
 class Replies(NamedTuple):
-    """Replies of single servos; a fast status packet has several. Shape (replies,), in order of time."""
+    """Replies of single servos as columns, shape (replies,), in order of time. A fast status packet has
+    several replies."""
 
     exchange: Numbers  # Index in the exchanges
     servo: Numbers
@@ -70,13 +71,15 @@ class Replies(NamedTuple):
     """`last_ns` of the preceding status packet in the exchange; for the first one, the end of the
     instruction."""
     due_ns: Numbers  # Planned time by wire time and return delay, with all replies before it
+    """Planned time of the reply's last byte, from the end of the instruction, and wire time and return
+    delay of this and the preceding replies."""
     answers: Flags  # True: requested, in time, and the first reply of the servo in the exchange
     strange: Flags  # True: a complete status packet of one servo that the exchange does not request
 
 
 @unique
 class Loss(IntEnum):
-    """Attribution of a missing reply, as far as its exchange shows it."""
+    """Reason of a missing reply, as far as its exchange shows it."""
 
     NONE = -1  # Not missing
     OWN = 0  # Of the servo: asked alone, or the first of several without an intact reply
@@ -86,7 +89,8 @@ class Loss(IntEnum):
 
 
 class Due(NamedTuple):
-    """Requested replies, exchange by exchange and in order of places; shape (due replies,)."""
+    """Replies that instructions request, as columns of shape (due replies,); ordered by exchange, then by
+    place in the chain."""
 
     exchange: Numbers  # Index in the exchanges
     servo: Numbers
@@ -94,11 +98,11 @@ class Due(NamedTuple):
     reply: Numbers  # Index in the replies; -1: missing
     loss: Numbers  # A `Loss`
     broken: Flags
-    """Stray bytes came in place of the reply; always False if `loss` is not OWN."""
+    """True if stray bytes came in place of the reply; always False if `loss` is not OWN."""
 
 
 class Late(NamedTuple):
-    """Intact replies that came after they were given up; shape (late replies,)."""
+    """Intact replies that came after the loop had given them up, as columns of shape (late replies,)."""
 
     servo: Numbers  # ID 254: the replies of several servos in one fast status packet
     exchange: Numbers  # Newest exchange that lacks the reply; -1: not among these exchanges
@@ -107,16 +111,17 @@ class Late(NamedTuple):
 
 
 class Pairing:
-    """Pairs packets slice by slice. Its memory does not grow with the log.
+    """Pairs instructions with their replies, fed with the log slice by slice. Its memory does not grow with
+    the log.
 
-    Packets that are possibly not in order of time yet are held back.
+    The newest packets are held back, because records of a log are not strictly in order of time.
     """
 
     def __init__(self, buses: tuple[LoggedBus, ...] = ()) -> None:
-        """Create a pairing.
+        """Create a pairing without packets.
 
         Args:
-            buses: Buses of the log; without them, those of the first slice.
+            buses: Buses of the log as its plan describes them; without them, those of the first slice.
         """
         self.buses = buses  # Buses of the log, as its plan describes them
         self._waiting: list[PacketColumns] = []
@@ -125,7 +130,7 @@ class Pairing:
         """Time at which the line of each bus has carried everything that was sent."""
 
     def take(self, log: Log) -> Exchanges | None:
-        """Add the packets of the next slice; return exchanges that are certain to be complete.
+        """Add the packets of the next slice; return the exchanges that are now complete, or None.
 
         Raises:
             LogError: A packet cannot be read.
@@ -151,7 +156,7 @@ class Pairing:
         return self._paired(packets.take(certain))
 
     def finish(self) -> Exchanges | None:
-        """Return the remaining exchanges."""
+        """Return the exchanges of the packets that were held back, or None; no more slices follow."""
         if not self._waiting:
             return None
         packets = ordered(PacketColumns.joined(self._waiting))
@@ -159,12 +164,13 @@ class Pairing:
         return self._paired(packets, final=True)
 
     def alone(self, packets: PacketColumns) -> Exchanges:
-        """Return the exchanges of some packets without history. All of them count as ended."""
+        """Return the exchanges of these packets alone, such as those of one cycle. All of them count as
+        ended."""
         self._free_ns[:] = 0
         return self._paired(packets)
 
     def _paired(self, packets: PacketColumns, *, final: bool = False) -> Exchanges:
-        """Return the exchanges of the next packets, by bus and time; `final` if no packets follow."""
+        """Pair the next packets, which are sorted by bus and time; `final` if no packets follow."""
         count, kind = len(self.buses), packets.kind
         bus = packets.bus.astype(np.int64)
         instructs = kind == PacketKind.INSTRUCTION
@@ -277,7 +283,8 @@ class Pairing:
     def _blocks(
         self, status: PacketColumns, rows: Numbers, request: Numbers
     ) -> list[tuple[Numbers, Numbers, NDArray[np.uint8], NDArray[np.uint8]]]:
-        """Return the replies in fast status packets: row, number of the block, servo, error byte."""
+        """Split fast status packets (`rows` of `status`) into the replies of single servos: row, number of
+        the block, ID, error byte."""
         pieces = []
         for index in np.unique(request[rows]).tolist():
             mine = rows[request[rows] == index]
@@ -313,7 +320,8 @@ class Pairing:
     def _late_blocks(
         self, noise: PacketColumns, exchange: Numbers, request: Numbers, asked_ns: Numbers, due: Due
     ) -> tuple[Numbers, NDArray[np.uint8]]:
-        """Return noise that is the missing block of a fast status packet and came late: row and ID."""
+        """Return the noise packets that are the missing block of a fast status packet and came late: row
+        in `noise`, and ID."""
         lacks = np.flatnonzero((due.loss == Loss.OWN) & self._requests.all.fast[request[due.exchange]])
         at = np.searchsorted(due.exchange[lacks], exchange) - 1
         rows = np.flatnonzero(at >= 0)
@@ -331,7 +339,8 @@ class Pairing:
 
 
 def _unasked(replies: Replies, due: Due, to: Numbers) -> Numbers:
-    """Return the servo of each reply that no instruction requests; `to` is the ID of each instruction, or -1.
+    """Return the servo of each reply that no instruction of this host requests; `to` is the ID of each
+    instruction, or -1.
 
     Two kinds of replies are excluded: acknowledged writes, and the late reply of a servo whose last reply is
     missing.
@@ -356,7 +365,7 @@ def _last_ns(sent_ns: Numbers, replies: Replies) -> Numbers:
 
 
 def _late(servo: Numbers, exchange: Numbers, at_ns: Numbers, sent_ns: Numbers, due: Due) -> Late:
-    """Match late replies to the exchanges that lack them, and set `loss` there to LATE."""
+    """Match late replies to the exchanges that lack them, and set `due.loss` there to LATE."""
     missing = np.flatnonzero(due.reply < 0)
     # The late reply of a fast status packet covers all its servos; its first one represents them.
     whole = np.flatnonzero((due.loss == Loss.LINE) & (due.place == 0))
@@ -378,7 +387,7 @@ def _late(servo: Numbers, exchange: Numbers, at_ns: Numbers, sent_ns: Numbers, d
 
 
 def _came_back(packets: PacketColumns, others: Numbers, rows: Numbers, sent: Numbers) -> Flags:
-    """Return which instructions of `others` equal one of the last two instructions of this host.
+    """Return which foreign instructions are echoes: equal to one of the last two instructions of this host.
 
     Args:
         packets: All packets.
@@ -397,14 +406,15 @@ def _came_back(packets: PacketColumns, others: Numbers, rows: Numbers, sent: Num
 
 
 def _free_ns(first_ns: Numbers, wire_ns: Numbers, free_ns: np.int64) -> Numbers:
-    """Return the end of each instruction on the wire: it begins when it is written and the line is free."""
+    """Return the time at which each instruction of a bus has left the wire, ns: transmission begins when
+    it is written and the line is free. `free_ns` is that time for the preceding instruction."""
     sent = np.cumsum(wire_ns)
     begin: Numbers = np.maximum(np.maximum.accumulate(first_ns - sent + wire_ns), free_ns)
     return begin + sent
 
 
 def ordered(packets: PacketColumns) -> PacketColumns:
-    """Return packets bus by bus in order of time. Packets with equal times keep their order."""
+    """Return the packets sorted by bus, then by time. Packets with equal times keep their order."""
     order = np.argsort(packets.bus, kind="stable")
     bus, first_ns = packets.bus[order], packets.first_ns[order]
     if ((np.diff(first_ns) < 0) & (np.diff(bus) == 0)).any():

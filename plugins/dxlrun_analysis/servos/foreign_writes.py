@@ -1,4 +1,5 @@
-"""Writes of other hosts to servos of the plan: items and servos, and subsequent failures.
+"""Writes of other hosts to servos of the plan: written items, servos, and failures of these servos
+afterwards.
 
 A single instruction is sufficient evidence, because noise hardly looks like one: it is intact, has the ID of
 a servo, and begins and ends at items of its control table. Sources: ROBOTIS e-Manual, Protocol 1.0 and 2.0,
@@ -27,7 +28,7 @@ _RESETS = {
 
 
 class _Write(NamedTuple):
-    """Write of one item of one servo."""
+    """Write of one control table item of one servo by another host, or a reboot or factory reset."""
 
     t_ns: int
     bus: int
@@ -38,24 +39,25 @@ class _Write(NamedTuple):
 
 
 class ForeignWrites:
-    """Accumulator of writes by other hosts, and of servo failures."""
+    """Accumulator of writes by other hosts, and of servo failures that may result from them."""
 
     def __init__(self) -> None:
         self._writes: list[_Write] = []
         self._failures: list[Event] = []
 
     def take(self, bus: int, plan: LoggedBus, packet: LoggedPacket) -> None:
-        """Add an instruction that this run did not send."""
+        """Add the writes in an instruction packet of another host."""
         if len(self._writes) < _MOST_KEPT:
             self._writes += _written(bus, plan, packet)
 
     def failed(self, event: Event) -> None:
-        """Keep an event if it reports the failure of a servo."""
+        """Keep an event that reports a lost, rebooted or limp servo; ignore others."""
         if event.code in HURTS and len(self._failures) < _MOST_KEPT:
             self._failures.append(event)
 
     def of(self, bus: int) -> tuple[str, bool]:
-        """Return the writes on a bus as the end of a sentence, and whether they made a servo fail."""
+        """Return the writes on a bus as the end of a sentence, empty without any; and whether a written
+        servo failed within 2 s."""
         writes = [one for one in self._writes if one.bus == bus]
         ends = {
             one.name: event
@@ -87,7 +89,8 @@ class ForeignWrites:
 
 
 def _written(bus: int, plan: LoggedBus, packet: LoggedPacket) -> Iterator[_Write]:
-    """Yield the items of the plan's servos that an instruction writes, and resets."""
+    """Yield the control table items of the plan's servos that an instruction writes, and their reboots and
+    resets."""
     data = packet.data
     second = data.startswith(_HEADER_2)
     at = 4 if second else 2
@@ -107,7 +110,8 @@ def _written(bus: int, plan: LoggedBus, packet: LoggedPacket) -> Iterator[_Write
 
 
 def _parts(servo_id: int, code: int, body: bytes, width: int) -> Iterator[tuple[int, int, bytes]]:
-    """Yield ID, address and data of each write; addresses and sizes have `width` bytes."""
+    """Yield ID, address and data of each write in an instruction with this code and body; addresses and
+    sizes have `width` bytes."""
     if code in _WRITES:
         yield servo_id, int.from_bytes(body[:width], "little"), body[width:]
     elif code == protocol2.Instruction.SYNC_WRITE:
@@ -127,7 +131,8 @@ def _addressed(plan: LoggedBus, servo_id: int) -> list[LoggedServo]:
 
 
 def _items(plan: LoggedBus, servo: LoggedServo, address: int, data: bytes) -> list[tuple[str, int]]:
-    """Return the control table items that exactly cover the bytes, or an empty list."""
+    """Return name and value of the control table items that exactly cover the written bytes, or an empty
+    list."""
     try:
         items = find_table(servo.model, plan.protocol).items
     except LookupError:  # The model of a plug-in that is not installed here

@@ -1,4 +1,4 @@
-"""Angle, speed and temperature of each joint by cycle, and the time spent in each bin of them."""
+"""Angle, speed and temperature of each joint in each cycle as bins, to relate missing replies to them."""
 
 from __future__ import annotations
 
@@ -25,16 +25,17 @@ _MOST_HELD = 200_000  # Cycles that wait for their exchanges; in a complete log 
 
 @dataclass(frozen=True, slots=True)
 class Places:
-    """States of the joints in some cycles, as bins."""
+    """Angle, speed and temperature of all joints in some cycles, as bin numbers."""
 
     cycle: Numbers = field(default_factory=lambda: np.zeros(0, np.int64))
-    """Cycle numbers, ascending; shape (cycles,)."""
+    """Numbers of the cycles, ascending; shape (cycles,)."""
     bins: Numbers = field(default_factory=lambda: np.zeros((0, len(QUANTITIES), 0), np.int64))
-    """Bin of each quantity; -1: unknown or offline; shape (cycles, quantities, joints)."""
+    """Bin of each quantity; -1 if unknown or offline; shape (cycles, quantities, joints)."""
 
 
 class JointStates:
-    """Buffer of joint states until the exchanges of their cycles are paired.
+    """Buffer of joint states until the exchanges of their cycles are paired, and counter of the time spent in
+    each bin.
 
     Its memory does not grow with the log.
     """
@@ -59,7 +60,7 @@ class JointStates:
                     self.share[rows[name]] = share
 
     def take(self, log: Log) -> None:
-        """Keep the states of the next slice."""
+        """Keep the joint states of the next slice of the log."""
         cycles = log.cycles
         if not len(cycles):
             return
@@ -71,7 +72,8 @@ class JointStates:
             self._held.pop(0)
 
     def until(self, cycle: int, *, everything: bool = False) -> Places:
-        """Return the states up to and including a cycle. Missing angles are interpolated."""
+        """Remove the states up to and including a cycle (or `everything`) from the buffer, count them, and
+        return them as bins. Missing angles are interpolated."""
         if not self._held:
             return Places()
         numbers, period_ns, angle, usable, heat = (
@@ -95,7 +97,8 @@ class JointStates:
         return Places(numbers[:end], bins)
 
     def range_text(self, joint: int, quantity: int, low: int, high: int) -> str:
-        """Return a range of bins as text in the unit of the joint; `high` is included."""
+        """Return a range of bins of one quantity as text, such as `between 30 and 45 deg`; bin `high` is
+        included."""
         begin, end = ((at + _FIRST[quantity]) * _STEPS[quantity] for at in (low, high + 1))
         if quantity == TEMPERATURE:
             return f"from {begin:.0f} deg C on" if high == BINS - 1 else f"at {begin:.0f} to {end:.0f} deg C"
@@ -107,7 +110,8 @@ class JointStates:
 
 
 def _speeds(numbers: Numbers, period_ns: Numbers, angle: Floats) -> Floats:
-    """Return the speed of each joint between its neighbouring cycles, rad/s, shape (cycles, joints)."""
+    """Return the speed of each joint in each cycle, from its angles in the two neighbouring cycles, rad/s,
+    shape (cycles, joints)."""
     found = np.full(angle.shape, np.nan)
     if len(numbers) > 2:
         took_s = np.maximum((numbers[2:] - numbers[:-2]) * period_ns[1:-1] * 1e-9, 1e-9)

@@ -1,4 +1,5 @@
-"""Missing replies: coincident losses over all buses, and replies of other servos at the same time.
+"""Missing replies: which servo, bus or machine they are attributed to, from the other replies at the same
+time.
 
 An *outage* lasts from the first missing reply of a servo until its next answer. It begins with a loss that
 may be the servo's own: in a chain only the first missing reply is, because the following servos wait for it
@@ -48,7 +49,8 @@ _CHANCE = 1e-3  # Probability of this concentration if losses were independent o
 
 @dataclass(frozen=True, slots=True)
 class ServoLosses:
-    """Own missing replies of one servo."""
+    """Numbers of requests to one servo and of missing replies that are its own, not due to a servo before
+    it in a chain."""
 
     asked: int  # Requests that it could have answered: no reply before its own in the chain was missing
     lost: int
@@ -57,7 +59,8 @@ class ServoLosses:
 
 @dataclass(slots=True)
 class _Outage:
-    """Outage of one servo, until it answers again."""
+    """Outage of one servo: from its first missing reply until it answers again. With `late`, one cycle
+    with late replies instead."""
 
     servo: int
     at_ns: int
@@ -73,7 +76,8 @@ class _Outage:
 
 @dataclass(slots=True)
 class _Count:
-    """Occasions of one part that are far enough apart to count separately."""
+    """Counter of the occasions of one part. An occasion within 0.2 s of the preceding counted one is not
+    counted."""
 
     apart: int = 0
     last_ns: int = -(1 << 62)
@@ -86,7 +90,8 @@ class _Count:
 
 
 class Losses:
-    """Accumulator of outages, and of cycles with late replies. Its memory does not grow with the log."""
+    """Accumulator of outages of servos, and of cycles with late replies. Its memory does not grow with the
+    log."""
 
     def __init__(self, states: JointStates) -> None:
         self._states, servos = states, len(states.joint_of)
@@ -101,7 +106,7 @@ class Losses:
     # Collection
 
     def take(self, exchanges: Exchanges, places: Places) -> None:
-        """Add the missing replies of some exchanges; `places` are the joint states in their cycles."""
+        """Add the missing replies of some exchanges; `places` has the joint states in their cycles."""
         due, count = exchanges.due, exchanges.requests.servos[exchanges.request]
         ended, exchange, bus = exchanges.ended[due.exchange], due.exchange, due.servo // IDS
         cycles = _moments(exchanges)
@@ -143,7 +148,8 @@ class Losses:
                 self._outages.append(out)
 
     def late(self, bus: Numbers, exchanges: Exchanges, rows: Numbers) -> None:
-        """Add exchanges with late replies and their buses, one for each cycle."""
+        """Add exchanges with late replies: their rows and the bus of each. Several in one cycle count
+        once."""
         if len(self._answers) < 2:
             return
         cycles = _moments(exchanges)[rows]
@@ -156,7 +162,7 @@ class Losses:
     # Results
 
     def finish(self) -> dict[tuple[int, int], ServoLosses]:
-        """Return the losses of each servo that was asked, by index of the bus and ID."""
+        """Return the missing replies of each servo that was asked, by index of the bus and ID."""
         return {
             divmod(servo, IDS): ServoLosses(
                 int(self._asked[servo]), int(self._lost[servo]), int(self._broken_off[servo])
@@ -165,10 +171,11 @@ class Losses:
         }
 
     def occasions(self, always_late: Iterable[int] = ()) -> Occasions:
-        """Return the occasions with their attribution.
+        """Combine overlapping outages into occasions, and return them attributed to servos, buses or the
+        machine.
 
         Args:
-            always_late: Buses with constantly late replies, which do not count as occasions.
+            always_late: Indices of buses with constantly late replies, which do not count as occasions.
         """
         found = Occasions(self._states, self._heads())
         skipped = set(always_late)
@@ -186,7 +193,8 @@ class Losses:
         return found
 
     def _heads(self) -> set[int]:
-        """Return first servos of silent chains for which lost instructions are not a plausible cause."""
+        """Return first servos of chains without any reply for which lost instructions are not a plausible
+        cause."""
         found = set()
         for servo in np.flatnonzero(self._broken_off).tolist():
             ids = slice(servo // IDS * IDS, (servo // IDS + 1) * IDS)
@@ -198,10 +206,12 @@ class Losses:
 
 
 class Occasions:
-    """Counter of occasions by part."""
+    """Counter of the occasions attributed to each servo, each bus and the machine; see the module
+    docstring."""
 
     def __init__(self, states: JointStates, heads: set[int]) -> None:
-        """Create an empty counter; `heads` are first servos that cause the silence of their chains."""
+        """Create an empty counter; `heads` are first servos that are themselves the cause if no reply of
+        their chain came."""
         self._states, self._heads = states, heads
         self._all: Counter[int] = Counter()  # Occasions by bus, and below those shared with other buses
         self._shared: Counter[int] = Counter()
@@ -213,7 +223,7 @@ class Occasions:
         """Common occasions of two servos, or all occasions of one; not only those far apart."""
 
     def add(self, outages: Sequence[_Outage]) -> None:
-        """Count one occasion."""
+        """Attribute one occasion, given by its overlapping outages, and count it."""
         buses, begin = {one.servo // IDS for one in outages}, outages[0]
         self._all.update(buses)
         if len(buses) > 1:
@@ -234,8 +244,8 @@ class Occasions:
             self._pairs.update((one.servo, servo) for servo in {each.servo for each in lost})
 
     def together(self) -> tuple[tuple[int, ...], bool]:
-        """Return the buses that lost replies, or had late ones, in the same cycles; and whether they were
-        mostly late."""
+        """Return the indices of the buses that lost replies, or had late ones, in the same cycles; and
+        whether most of them were late, not lost."""
         found = tuple(
             bus
             for bus, shared in sorted(self._shared.items())
@@ -245,7 +255,8 @@ class Occasions:
         return (found if len(found) > 1 else ()), late
 
     def machine(self, buses: Sequence[LoggedBus], longest_ms: float) -> Iterator[Finding]:
-        """Report the machine, or a part that buses share, if buses fail in the same cycles."""
+        """Report the machine, or a part that buses share, if several buses lost replies or had late ones
+        in the same cycles."""
         shared, late = self.together()
         if not shared:
             return
@@ -294,7 +305,8 @@ class Occasions:
             yield cause("lossy_line", bus.name, sentence, share=(whole + sum(left)) / max(asked, 1))
 
     def _group(self, base: int, servo: int, times: dict[int, int]) -> set[int]:
-        """Return a servo together with those that lose replies on the same occasions."""
+        """Return the IDs of a servo and of those that lose replies on mostly the same occasions; `times`
+        has the occasions by ID."""
         own = self._pairs[base + servo, base + servo]
         return {servo} | {
             other
@@ -324,8 +336,8 @@ class Occasions:
         return cause("lossy_servo", name, sentence, share=share)
 
     def _where(self, servo: int) -> str:
-        """Return the angles, speeds or temperatures of its joint to which a servo's losses are confined, as
-        text."""
+        """Return the range of angles, speeds or temperatures of the joint in which nearly all losses of
+        its servo began, as text; empty if there is none."""
         joint = int(self._states.joint_of[servo])
         if joint < 0:
             return ""
@@ -342,7 +354,7 @@ class Occasions:
 
 
 def narrowest(time: Numbers, begun: Numbers, *, open_above: bool) -> tuple[int, int, int, float] | None:
-    """Return the narrowest range of bins that contains nearly all losses.
+    """Return the narrowest range of bins in which nearly all (90 %) losses began.
 
     Args:
         time: Time spent in each bin.
@@ -372,13 +384,15 @@ def narrowest(time: Numbers, begun: Numbers, *, open_above: bool) -> tuple[int, 
 
 
 def _moments(exchanges: Exchanges) -> Numbers:
-    """Return the cycle of each exchange; if it is unknown, a distinct number for each 10 ms."""
+    """Return the cycle number of each exchange; before the first cycle, a distinct negative number for
+    each 10 ms."""
     before = exchanges.asked_ns // _UNKNOWN_NS - (1 << 60)
     return np.where(exchanges.cycle > BEFORE_FIRST_CYCLE, exchanges.cycle, before)
 
 
 def _before(group: Numbers, came: Flags, so_far: Numbers) -> Numbers:
-    """Return the replies of each row's group before that row, and update the totals in `so_far`."""
+    """Return, for each due reply, how many replies of the same group (bus or servo) came before it, and
+    add the new ones to the totals in `so_far`."""
     order = np.argsort(group, kind="stable")
     count = np.cumsum(came[order])
     begins = np.flatnonzero(np.diff(group[order], prepend=-1))

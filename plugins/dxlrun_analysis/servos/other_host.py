@@ -1,4 +1,4 @@
-"""Other hosts on a bus: number, kind and IDs of their instructions.
+"""Other hosts on a bus, found by their instructions or by replies that this run did not request.
 
 A host that sends at the same time as a servo spoils the servo's reply and its own instruction. The end of the
 instruction remains recognizable by its length and code: a reply has its error, or 0x55, in place of a code.
@@ -38,7 +38,8 @@ _PING, _READ, _WRITE, _SYNC_WRITE, _BULK_READ = 0x01, 0x02, 0x03, 0x83, 0x92
 
 
 class OtherHosts:
-    """Accumulator of instructions of other hosts. Its memory does not grow with the log."""
+    """Accumulator of instructions that this run did not send, and of replies that it did not request. Its
+    memory does not grow with the log."""
 
     def __init__(self, buses: int) -> None:
         self._sent, self._pieces, self._unasked = Counts(), Counts(), Counts()
@@ -46,7 +47,8 @@ class OtherHosts:
         self.writes = ForeignWrites()
 
     def take(self, exchanges: Exchanges) -> None:
-        """Add the foreign instructions in some exchanges, and count the missing replies."""
+        """Add the foreign instructions, echoes and unrequested replies in some exchanges, and count the
+        missing replies."""
         others, due = exchanges.others, exchanges.due
         self._sent.take(others.bus.astype(np.int64), instruction_of(others) * IDS + others.servo_id)
         for packet in others:
@@ -64,7 +66,7 @@ class OtherHosts:
             np.add(counts, np.bincount(buses, minlength=len(counts)), out=counts)
 
     def _of(self, index: int) -> tuple[Numbers, Numbers]:
-        """Return code and ID of the instructions on a bus as one number, with their counts."""
+        """Return the foreign instructions on a bus: code times 256 plus ID of each kind, and its count."""
         pieces = int(self._pieces.of(index)[1].sum())
         enough = pieces >= max(_FEWEST, _PIECES * self._stray[index])
         found = [self._sent, self._pieces] if enough else [self._sent]
@@ -74,13 +76,14 @@ class OtherHosts:
         return values, counts
 
     def explains(self, index: int) -> bool:
-        """Return whether another host on the bus explains its missing replies."""
+        """Return whether foreign instructions or unrequested replies on the bus are so many that they
+        explain its missing replies."""
         sent, unasked = int(self._of(index)[1].sum()), int(self._unasked.of(index)[1].sum())
         seen = max(sent if sent >= _FEWEST else 0, unasked if unasked >= _FEWEST_UNASKED else 0)
         return seen > 0 and 2 * seen >= int(self._lost[index])
 
     def findings(self, index: int, bus: LoggedBus) -> Sequence[Finding]:
-        """Report another host on a bus, or an adapter that echoed some of the instructions."""
+        """Report another host on a bus, or an adapter that echoed some of this run's instructions."""
         echoes, asked = self._echoes[index], self._asked[index]
         if _FEWEST <= echoes < _ALL * asked:
             sentence = (
@@ -110,7 +113,7 @@ class OtherHosts:
         return (cause("another_host", bus.name, sentence, share=share),)
 
     def _by_replies(self, index: int, bus: LoggedBus) -> Iterable[Finding]:
-        """Report another host of which only the replies are visible."""
+        """Report another host on a bus of which only the replies are visible."""
         ids, counts = self._unasked.of(index)
         if (total := int(counts.sum())) >= _FEWEST_UNASKED:
             sentence = (
@@ -121,7 +124,8 @@ class OtherHosts:
 
 
 def _ends(stray: PacketColumns, second: Flags) -> tuple[Numbers, Numbers]:
-    """Return bus, and code and ID as one number, of stray bytes that end like an instruction."""
+    """Find stray bytes that end like an instruction: return the bus of each, and its code times 256 plus
+    ID. `second` is true for Protocol 2.0."""
 
     def from_end(count: int) -> Numbers:
         found = np.zeros(len(stray), np.int64)

@@ -47,11 +47,13 @@ _LATE_NS = 2_000_000  # Threshold of a late adapter over the planned latency
 _LATE_SHARE = 0.1  # Share of its exchanges from which a bus is late
 
 _Values = tuple[Numbers, Numbers]
-"""Distinct own times of replies of one kind, us, ascending, and their counts."""
+"""Own times (see the module docstring) of a servo's replies of one kind: distinct values in us, ascending,
+and the count of each."""
 
 
 class ReplyTimes:
-    """Accumulator of own reply times, and of late exchanges. Its memory does not grow with the log."""
+    """Accumulator of the own reply times of servos, and of late exchanges by bus. Its memory does not grow
+    with the log."""
 
     def __init__(self, buses: int) -> None:
         self._own_us = Counts()
@@ -62,7 +64,7 @@ class ReplyTimes:
         self._exchanges = np.zeros(buses, np.int64)
 
     def take(self, exchanges: Exchanges, losses: Losses) -> None:
-        """Add the replies of some exchanges, and report late ones to `losses`."""
+        """Add the replies of some exchanges; late exchanges are also added to `losses`."""
         replies, late = exchanges.replies, exchanges.late
         count, requests = len(replies.exchange), exchanges.requests
         self._exchanges += np.bincount(
@@ -97,7 +99,14 @@ class ReplyTimes:
     def _take_late(
         self, exchanges: Exchanges, own_ns: Numbers, given_up: tuple[Numbers, ...], losses: Losses
     ) -> None:
-        """Count exchanges that were late as a whole, each with the servo whose reply took longest."""
+        """Count exchanges that were late as a whole, each for the servo whose reply took longest.
+
+        Args:
+            exchanges: The exchanges.
+            own_ns: Own time of each reply.
+            given_up: Exchange, servo and lateness (ns) of each late reply that was given up.
+            losses: Receives the late exchanges.
+        """
         replies, count = exchanges.replies, len(exchanges.request)
         due = exchanges.requests.servos[exchanges.request]
         answers = np.flatnonzero(replies.answers)
@@ -127,16 +136,17 @@ class ReplyTimes:
     # Results
 
     def always_late(self) -> list[int]:
-        """Return buses with at least half of their exchanges late. Constant lateness is not an occasion."""
+        """Return the indices of buses with at least half of their exchanges late. Constant lateness is not
+        an occasion."""
         return [bus for bus in range(len(self._exchanges)) if self._share(bus, set()) >= 1 / 2]
 
     def longest_ms(self) -> float:
-        """Return the greatest lateness of any reply."""
+        """Return the greatest lateness of any exchange of the run, ms."""
         return max((self._late_us.of(group)[0][-1] / 1e3 for group in self._late_us.groups), default=0.0)
 
     def servos(self, index: int, bus: LoggedBus, *, now_and_then: bool) -> Iterator[Finding]:
-        """Report servos that answer later than the others of their bus, always or with `now_and_then` also at
-        times."""
+        """Report servos of one bus that always answer later than its others; with `now_and_then`, also
+        those that do so at times."""
         samples: dict[int, dict[int, _Values]] = {}
         for group in self._own_us.groups:
             servo, kind = divmod(group, len(_KINDS))
@@ -145,7 +155,8 @@ class ReplyTimes:
         return _slow_servos(bus, samples, now_and_then=now_and_then)
 
     def line(self, index: int, bus: LoggedBus, slow: Iterable[str]) -> Iterator[Finding]:
-        """Report a bus with late replies; `slow` are names of its servos that are already reported."""
+        """Report a bus whose exchanges are late; those of its servos named in `slow` are already reported
+        and do not count."""
         of_servos = {servo for servo, name in bus.names.items() if name in set(slow)}
         of_servos |= {BROADCAST_ID} if of_servos else set()
         ids = slice(index * IDS, (index + 1) * IDS)
@@ -191,7 +202,7 @@ def _rested(exchanges: Exchanges) -> Flags:
 
 
 def _in_time(exchanges: Exchanges) -> Flags:
-    """Return which late replies took no longer than the slowest timely reply to the same request.
+    """Return which of the late replies took no longer than the slowest timely reply to the same request.
 
     They were given up for another reason, such as lost bytes before them.
     """
@@ -245,13 +256,13 @@ def _slow_servos(
 
 
 def _usual(others: list[_Values]) -> float:
-    """Return the median of the medians of some servos, us."""
+    """Return the median of the servos' median own times, us."""
     return float(np.median([median(*each) for each in others]))
 
 
 def _always_later(own: _Values, others: list[_Values]) -> bool:
-    """Return whether three quarters of a servo's replies are later than three quarters of those of the
-    others."""
+    """Return whether a servo's replies are later than those of the others by 100 us in the median, and
+    three quarters of them later than three quarters of the others'."""
     late = float(np.median([quantile(*each, _MOST) for each in others]))
     return median(*own) - _usual(others) >= _ODD_US and quantile(*own, 1 - _MOST) > late
 

@@ -1,4 +1,4 @@
-"""Requests of instructions: servos that answer, order of their replies, and number of data bytes.
+"""Requests: which servos an instruction asks for a reply, in which order, and for how many bytes of data.
 
 Sources: ROBOTIS e-Manual, Protocol 1.0 and Protocol 2.0, instruction packets.
 """
@@ -28,7 +28,8 @@ Flags = NDArray[np.bool_]
 
 
 class LoggedRequest(NamedTuple):
-    """Replies that one instruction requests."""
+    """Replies that one instruction requests: IDs in the order of the replies, empty for an instruction
+    without replies."""
 
     servo_ids: tuple[int, ...] = ()
     sizes: tuple[int, ...] = ()  # Data bytes per servo; only for reads of several servos
@@ -36,18 +37,22 @@ class LoggedRequest(NamedTuple):
 
 
 class Requests(NamedTuple):
-    """All distinct requests: none, single servos by ID, then as found; columns of shape (requests,)."""
+    """Table of all distinct requests of a log; columns of shape (requests,).
+
+    Row 0 requests nothing, rows 1 to 256 ask one servo by ID, then follow reads of several servos.
+    """
 
     kinds: tuple[LoggedRequest, ...] = ()
     servos: Numbers = np.zeros(0, np.int64)  # Number of servos that each request asks
     fast: Flags = np.zeros(0, np.bool_)
     places: Numbers = np.zeros((0, IDS), np.int64)
-    """Place of each servo in the replies; -1: not asked; shape (requests, 256)."""
+    """Place of each ID in the chain of replies; -1: not asked; shape (requests, 256)."""
     ids: Numbers = np.zeros((0, IDS), np.int64)
-    """IDs with those that are asked at the end, in order of places; shape (requests, 256)."""
+    """All 256 IDs; the last `servos` of them are asked, in the order of their replies; shape (requests,
+    256)."""
 
     def and_more(self, kinds: tuple[LoggedRequest, ...]) -> Requests:
-        """Return a table with additional requests."""
+        """Return a copy of the table with requests appended."""
         places = np.full((len(kinds), IDS), -1, np.int64)
         for row, one in zip(places, kinds, strict=True):
             row[list(one.servo_ids)] = np.arange(len(one.servo_ids))
@@ -64,14 +69,15 @@ _ALONE = Requests().and_more((LoggedRequest(), *(LoggedRequest((servo_id,)) for 
 
 
 class RequestTable:
-    """Table of the requests of a log. Each distinct instruction is parsed once."""
+    """Table of the requests of a log, which grows as instructions are looked up. Each distinct instruction
+    is parsed once."""
 
     def __init__(self) -> None:
         self.all = _ALONE
         self._known: dict[bytes, int] = {}
 
     def of(self, packets: PacketColumns) -> Numbers:
-        """Return the index of the request of each instruction."""
+        """Return the row of `all` for each instruction packet; add new requests to the table."""
         second, code = second_of(packets), instruction_of(packets)
         servo_id = np.where(second, packets.byte(4), packets.byte(2)).astype(np.int64)
         found = np.zeros(len(packets), np.int64)
@@ -95,7 +101,7 @@ class RequestTable:
 
 
 def instruction_of(packets: PacketColumns) -> Numbers:
-    """Return the code of each instruction packet."""
+    """Return the instruction code of each packet, such as 0x02 for Read."""
     return np.where(second_of(packets), packets.byte(7), packets.byte(4)).astype(np.int64)
 
 
@@ -111,7 +117,8 @@ def second_of(packets: PacketColumns) -> Flags:
 
 
 def request_of(data: bytes) -> LoggedRequest:
-    """Return the servos that answer an instruction at every status return level: pings and reads."""
+    """Parse one instruction packet: return the servos that it asks. Only pings and reads count, which
+    servos answer at every status return level."""
     second = data.startswith(_HEADER_2)
     servo_id, code = (_byte(data, 4), _byte(data, 7)) if second else (_byte(data, 2), _byte(data, 4))
     if code in (PING, _READ):
@@ -127,7 +134,7 @@ def request_of(data: bytes) -> LoggedRequest:
 
 
 def _entries(body: bytes, width: int, at: int, *, fast: bool) -> LoggedRequest:
-    """Return the servos of a bulk read.
+    """Parse the body of a bulk read.
 
     Entries have `width` bytes, the ID at `at`, and the size first or last.
     """

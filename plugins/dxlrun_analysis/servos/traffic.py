@@ -1,4 +1,7 @@
-"""Traffic of buses and servos: requests, replies, reply times, error bits; from the bytes in the log."""
+"""Traffic of each bus and servo over a run: numbers of requests and replies, reply times, error bits.
+
+Everything is computed from the bytes of the packets in the log.
+"""
 
 from __future__ import annotations
 
@@ -26,39 +29,41 @@ _KINDS = max(PacketKind) + 1
 
 @dataclass(frozen=True, slots=True)
 class ServoTraffic:
-    """Traffic of one servo over the whole log, set-up and shutdown included."""
+    """Requests, replies, reply times and error bits of one servo or device over the whole log, set-up and
+    shutdown included."""
 
     bus: str
     servo_id: int
     joint: str  # Joint or device; empty if the log's plan names none
     instructions: int  # Instructions addressed to it alone
     asked: int
-    """Pings and reads, including those of several servos: requests that it answers at every status return
-    level."""
+    """Number of pings and reads of the servo, including those of several servos: the requests that it
+    answers at every status return level."""
     lost: int
-    """Requests of `asked` without a status packet of this servo before the next instruction on the bus. A
+    """Number of those requests that this servo did not answer before the next instruction on the bus. A
     request that is open at the end of the log is in neither count, as its reply may have come later."""
     replies: int  # Status packets, acknowledged writes included
     errors: int  # Replies with any error bit
     error_names: tuple[str, ...]
     reply_median_us: float
-    """Time from before the write() of a ping or read to after the read() of the reply's last byte. In a read
-    of several servos it includes the preceding replies."""
+    """Median reply time: from before the write() of a ping or read to after the read() of the reply's last
+    byte. In a read of several servos it includes the preceding replies."""
     reply_max_us: float
     reply_p99_us: float = 0.0
     losses: ServoLosses | None = None
-    """Share of `lost` that is its own and not caused by a preceding servo of a chain."""
+    """Missing replies that are the servo's own, not caused by a preceding servo of a chain; None if it was
+    never asked."""
     device: bool = False  # A device of the plan, not a servo
 
     @property
     def subject(self) -> str:
-        """Name that findings accuse: its joint, or its bus and ID."""
+        """Name with which findings accuse the servo: its joint or device, or its bus and ID."""
         return self.joint or f"{self.bus} {self.servo_id}"
 
 
 @dataclass(frozen=True, slots=True)
 class BusTraffic:
-    """Traffic of one bus over the whole log."""
+    """Packets and bytes of one bus over the whole log, and the latency of its adapter."""
 
     name: str
     instructions: int
@@ -68,20 +73,21 @@ class BusTraffic:
     bytes_out: int
     bytes_in: int
     extra_us: float | None = None
-    """Median excess of a complete exchange over wire time and return delay: the latency of the adapter. None
-    if the log's plan lacks the bus, or if replies wait for the next cycle."""
+    """Measured latency of the adapter: median time of a complete exchange beyond wire time and return
+    delay. None if the log's plan lacks the bus."""
     planned_latency_us: float | None = None  # Planned value of `extra_us`
     port: str = ""
 
 
 class Traffic:
-    """Accumulator of packets, fed slice by slice. Its memory does not grow with the log."""
+    """Accumulator of the traffic of all buses and servos, fed with the log slice by slice. Its memory does
+    not grow with the log."""
 
     def __init__(self, watch: Callable[[Exchanges], None] = lambda _: None) -> None:
         """Create the accumulator.
 
         Args:
-            watch: Function that also receives the exchanges, so that packets are paired once.
+            watch: Function that also receives the paired packets, so that packets are paired only once.
         """
         self._pairing, self._watch = Pairing(), watch
         self._extra_us, self._reply_us = Counts(), Counts()
@@ -101,7 +107,7 @@ class Traffic:
         self._errors = np.zeros((servos, _BYTES), np.int64)  # By error byte
 
     def take(self, log: Log) -> None:
-        """Count the packets of the next slice.
+        """Count the packets of the next slice of the log.
 
         Raises:
             LogError: A packet cannot be read.
@@ -125,7 +131,8 @@ class Traffic:
         self._count(exchanges)
 
     def finish(self) -> tuple[tuple[ServoTraffic, ...], tuple[BusTraffic, ...]]:
-        """Return the traffic of each servo and of each bus."""
+        """Return the traffic of each servo that was asked or replied, and of each bus; then `findings` is
+        complete."""
         self._count(self._pairing.finish(), final=True)
         addressed = self._instructions.copy()
         addressed[BROADCAST_ID::IDS] = 0
@@ -139,7 +146,8 @@ class Traffic:
     def _findings(
         self, plans: Sequence[LoggedBus], losses: Mapping[tuple[int, int], ServoLosses]
     ) -> Iterator[Finding]:
-        """Report problems with replies: first those that several buses share, then bus by bus."""
+        """Report problems with replies: first those that several buses share, then bus by bus. Later rules
+        of a bus are omitted if an earlier one explains their symptoms."""
         occasions = self._losses.occasions(self._reply_times.always_late())
         shared, are_late = occasions.together()
         yield from occasions.machine(plans, self._reply_times.longest_ms())
@@ -194,7 +202,7 @@ class Traffic:
         self._extra(exchanges, of, answers)
 
     def _extra(self, exchanges: Exchanges, of: Numbers, answers: Numbers) -> None:
-        """Count the excess of each complete exchange over wire time and return delay."""
+        """Count the time of each complete exchange beyond wire time and return delay, by bus."""
         replies, count = exchanges.replies, len(exchanges.request)
         due = exchanges.requests.servos[exchanges.request]
         complete = (np.bincount(of, minlength=count) == due) & (due > 0)
@@ -243,7 +251,7 @@ class Traffic:
 
 
 def error_names(protocol: int, errors: set[int]) -> tuple[str, ...]:
-    """Return the names of all errors in these error bytes."""
+    """Return the names of all errors that occur in a set of error bytes; `protocol` is 1 or 2."""
     if protocol == 1:
         return tuple(_word(bit) for bit in protocol1.StatusError if any(error & bit for error in errors))
     numbers = {error & ~protocol2.ALERT for error in errors}
