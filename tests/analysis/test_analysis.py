@@ -276,7 +276,7 @@ def test_json_carries_the_whole_report(write: Make) -> None:
 
 def test_what_is_no_log_is_refused(tmp_path: Path) -> None:
     (tmp_path / "robot.yaml").write_text("name: torso\n")
-    with pytest.raises(LogError, match="no MCAP file"):
+    with pytest.raises(LogError, match="not an MCAP file"):
         analyze_log(tmp_path / "robot.yaml")
 
 

@@ -247,7 +247,7 @@ def test_why_the_start_was_refused_is_said_first() -> None:
 def test_a_servo_that_answers_again_and_is_not_taken_back_is_told_with_why() -> None:
     again, buses = lost("elbow", count=3), plan(REAL, REAL)
     why = "answers again, but cannot take part: elbow is model number 1030, not a XM430-W350 (1020)"
-    returns = {"elbow": ["answers garbled or twice", why]}
+    returns = {"elbow": ["sends garbled or double replies", why]}
     verdict = judge(totals(events=(lost("wrist"), again), returns=returns, plan=buses))
     (servo,) = (one for one in verdict.findings if one.code == "servo_lost")
     told = f"Servos failed: elbow was lost; wrist was lost. elbow {why}."
@@ -262,7 +262,7 @@ def test_what_to_do_about_a_servo_that_answers_twice_is_told_of_a_real_one(port:
     }
     verdict = judge(totals(events=(lost("elbow"),), returns=returns, plan=plan(port, port)))
     told = " ".join(verdict.sentences)
-    assert "elbow answers garbled or twice" in told
+    assert "elbow sends garbled or double replies" in told
     assert ("check its cable" in told.lower()) is (port != "sim")
 
 
@@ -324,7 +324,7 @@ def test_servos_that_are_lost_at_once_share_a_cable(events: tuple[EventGroup, ..
 
 def test_why_a_servo_did_not_come_back_is_told_where_few_were_lost() -> None:
     for joints in (("elbow", "wrist"), ("elbow", "wrist", "hand")):
-        returns = {"elbow": ["answers garbled or twice", "answers too late"]}
+        returns = {"elbow": ["sends garbled or double replies", "answers too late"]}
         servos = on_bus("elbow", "wrist", "hand", "head")
         events = tuple(lost(joint, 400 * at) for at, joint in enumerate(joints))
         verdict = judge(totals(events=events, returns=returns, servos=servos, plan=plan(REAL)))

@@ -174,7 +174,7 @@ def test_a_gap_is_an_event_and_counted(log: LogWriter, tmp_path: Path, cycle: Cy
     ("content", "sentence"),
     [
         (b"", "the file is empty"),
-        (b"name: torso\n", "no MCAP file"),
+        (b"name: torso\n", "not an MCAP file"),
         (b"\x89MCAP0\r\n", "not written by dxlrun"),
     ],
 )

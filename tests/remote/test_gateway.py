@@ -77,7 +77,7 @@ LOAD = {"name": "more", "type": "arm", "joints": ["pan"]}
 WRONG = [
     ("GET", "/nothing", None, 404, "unknown_page", "GET /nothing is not a request"),
     ("POST", "/robot", None, 405, "wrong_method", "/robot takes no POST"),
-    ("GET", "/robot/", None, 404, "unknown_page", "no request"),
+    ("GET", "/robot/", None, 404, "unknown_page", "not a request"),
     ("POST", "/controllers/lefty/commands/go", {}, 404, "unknown_controller", "did you mean left?"),
     ("POST", "/controllers/left/commands/goo", {}, 404, "unknown_command", "did you mean go?"),
     ("POST", "/controllers/%2e%2e/commands/go", {}, 404, "unknown_controller", "known: left, right, spare"),
