@@ -1,4 +1,5 @@
-"""Counts of integers and their exact quantiles. Memory grows with the number of distinct values.
+"""Exact quantiles of integers, from the count of each distinct value. Memory grows with the number of
+distinct values.
 
 `quantile` and `median` define every percentile that is shown (docs/reference/analyze.md).
 """
@@ -18,7 +19,7 @@ _TIMES_MORE = 10
 
 
 class Counts:
-    """Counter of integer values in several groups, for example reply times in us by servo."""
+    """Counter of each distinct integer value in several groups, for example reply times in us by servo."""
 
     def __init__(self) -> None:
         self._keys = np.zeros(0, np.int64)
@@ -39,14 +40,14 @@ class Counts:
             self._merge()
 
     def of(self, group: int) -> tuple[Numbers, Numbers]:
-        """Return the distinct values of a group, ascending, and the count of each value."""
+        """Return the distinct values that were counted in a group, ascending, and the count of each value."""
         self._merge()
         begin, end = np.searchsorted(self._keys, [group << _GROUP, (group + 1) << _GROUP])
         return self._keys[begin:end] - (group << _GROUP) - _ZERO, self._counts[begin:end]
 
     @property
     def groups(self) -> list[int]:
-        """Groups that have values, ascending."""
+        """Numbers of the groups that have values, ascending."""
         self._merge()
         return sorted(set((self._keys >> _GROUP).tolist()))
 
@@ -62,7 +63,8 @@ class Counts:
 
 
 def quantile(values: Numbers, counts: Numbers, share: float) -> float:
-    """Return a quantile by nearest rank: the smallest value whose cumulative share reaches `share`.
+    """Return a quantile of counted values by nearest rank: the smallest value whose cumulative share reaches
+    `share`.
 
     The result is an observed value, never an interpolated one. Its rank among n observations is ceil(share *
     n).
@@ -83,7 +85,7 @@ def quantile(values: Numbers, counts: Numbers, share: float) -> float:
 
 
 def median(values: Numbers, counts: Numbers) -> float:
-    """Return the median, or 0 without values.
+    """Return the median of counted values (distinct, ascending), or 0 without values.
 
     The median of an even number is the mean of the two middle values.
     """
@@ -96,9 +98,10 @@ def median(values: Numbers, counts: Numbers) -> float:
 
 
 def has_them_alone(own: int, others: int) -> bool:
-    """Return whether one part accounts for nearly all occurrences, so that a finding may name it.
+    """Return whether one part accounts for nearly all occurrences of a problem, so that a finding may name
+    it.
 
-    This needs at least ten occurrences, and ten times as many as in all other parts together. The bounds are
-    plain counts, so a sentence can quote them.
+    It needs at least ten occurrences, and ten times as many as all other parts together. The bounds are plain
+    counts, so a sentence can quote them.
     """
     return own >= max(_FEWEST, _TIMES_MORE * others)

@@ -1,4 +1,4 @@
-"""Evidence gate of all rules: drop findings whose evidence is incomplete or explained by another finding.
+"""Evidence gate of the verdict: drop findings whose evidence is incomplete or that another finding explains.
 
 A rule applies only if the evidence that it needs (`Needs` in rules.py) is complete, start-up included. A busy
 machine is always reported. It explains late and missing replies, also those of real servos, because replies
@@ -26,12 +26,12 @@ _REPLIES = (
     *("power_lost", "another_host", "late_replies", "broken_replies", "slow_servo", "noise", "lossy_servo"),
     "lossy_line",
 )
-"""Codes of problems with replies, the most direct evidence first."""
+"""Codes of findings about replies, those with the most direct evidence first."""
 _WEAK = ("noise", "lossy_line")
-"""Codes of indirect evidence: bytes that belong to no packet, or missing replies."""
+"""Codes of findings with indirect evidence: bytes that belong to no packet, or missing replies."""
 _SPOILT = frozenset(("power_lost", "noise", "broken_replies", "lossy_line", "bus_lost"))
-"""Codes of faults that delay goals and make healthy joints follow worse. Another host has the same effect if
-its goals or replies are mixed into those of this run."""
+"""Codes of faults of a bus that delay goals and make healthy joints follow worse. Another host has the
+same effect if its goals or replies are mixed into those of this run."""
 _UNANSWERED = frozenset(("servo_lost", "silent"))
 """Codes of failures inferred from missing replies, which a busy machine can also cause."""
 _FAILED = _UNANSWERED | {"servo_rebooted", "torque_lost"}
@@ -46,7 +46,8 @@ _PART = 5  # Causes below a fifth of the excess of long cycles are not reported
 
 
 def busy_machine(totals: RunTotals) -> list[str]:
-    """Return the evidence of a busy machine in words, or an empty list.
+    """Return the evidence that the machine was too busy for the loop, as phrases, or an empty list if it was
+    not.
 
     The evidence consists of machine samples, waits for simulated servos, late wake-ups, and the causes of
     late wake-ups if they account for most of the time of long cycles. Wake-ups of a sequential loop have no
@@ -76,7 +77,8 @@ def busy_machine(totals: RunTotals) -> list[str]:
 
 
 def complete(totals: RunTotals) -> Needs:
-    """Return the evidence that is complete for a whole run. States and replies are checked joint by joint."""
+    """Return the conditions of rules that a run meets as a whole. STATES and INTACT are included;
+    `accused` checks them joint by joint."""
     found = Needs.STATES | Needs.INTACT
     if not busy_machine(totals):
         found |= Needs.MACHINE
@@ -88,7 +90,8 @@ def complete(totals: RunTotals) -> Needs:
 
 
 def accused(totals: RunTotals, found: Iterable[Finding]) -> tuple[Finding, ...]:
-    """Return the findings with complete evidence, with their rank and remedy."""
+    """Drop findings whose evidence is incomplete or that others explain; return the rest with their final
+    rank and remedy."""
     found = tuple(found)
     there, load = complete(totals), totals.causes.load
     spoilt = {one.subject for one in found if one.code in _SPOILT}
@@ -121,7 +124,7 @@ def accused(totals: RunTotals, found: Iterable[Finding]) -> tuple[Finding, ...]:
 
 
 def _is_explained(totals: RunTotals, failed: Finding, found: Iterable[Finding]) -> bool:
-    """Return whether another finding accuses the bus of a failed servo, or a part that all buses share."""
+    """Return whether another finding accuses the bus of a failed servo, or the machine."""
     return any(
         one is not failed
         and RULES[one.code].accuses
@@ -148,7 +151,8 @@ def _one_accused(totals: RunTotals, found: Iterable[Finding]) -> tuple[Finding, 
 
 
 def _explaining(totals: RunTotals, found: tuple[Finding, ...]) -> tuple[Finding, ...]:
-    """Rank each cause before its effect: a servo failure, or invalid states, skipped periods and errors."""
+    """Raise the rank of each finding that explains a servo failure, or invalid states, skipped periods or
+    errors, so that it precedes them."""
     failed = {group.source for group in severe_of(totals.events, *HURTS, EventCode.DEVICE_LOST)}
     failed |= {finding.subject for finding in found if finding.rank == Rank.SERVO}
     failed |= {servo.bus for servo in totals.servos if servo.joint in failed}
@@ -166,10 +170,10 @@ def _explaining(totals: RunTotals, found: tuple[Finding, ...]) -> tuple[Finding,
 
 
 def remedy(finding: Finding, totals: RunTotals) -> str:
-    """Return the remedy of a finding; the only function that depends on whether the accused part is
-    simulated.
+    """Return the recommended action of a finding, adapted to whether the accused part is simulated.
 
-    A simulated part has nothing to check or to exchange, so the remedy for a real part does not apply.
+    A simulated part has nothing to check or to exchange, so the remedy for a real part does not apply. No
+    other function depends on simulation.
     """
     rule = RULES[finding.code]
     if finding.code == "busy_machine":
@@ -189,7 +193,8 @@ def _sentence(text: str) -> str:
 
 
 def _names(subject: str, totals: RunTotals) -> dict[str, str]:
-    """Return the values of the placeholders in remedies: name, bus, port and ID of the accused servo."""
+    """Return the values of the placeholders in a remedy: name, bus, port and ID of the servo that a
+    finding accuses."""
     for bus in totals.plan.buses:
         ids = [str(servo_id) for servo_id, name in bus.names.items() if name == subject]
         if ids or subject in (bus.name, *(servo.joint for servo in bus.servos)):
@@ -200,7 +205,7 @@ def _names(subject: str, totals: RunTotals) -> dict[str, str]:
 
 
 def wake_up_remedy(real_time: RealTime) -> str:
-    """Return the next step towards punctual wake-ups: scheduler, kernel or machine."""
+    """Return a sentence with the next step towards punctual wake-ups: scheduler, kernel or machine."""
     if not real_time.requested:
         return "`loop: {scheduler: {policy: round_robin}}` in the robot file helps."
     if not real_time.granted:

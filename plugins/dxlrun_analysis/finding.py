@@ -1,4 +1,5 @@
-"""Finding: one observation about a run, as data for programs and as a sentence for a person."""
+"""Finding: one observation about a run that the verdict reports, as data for programs and as a sentence
+for a person."""
 
 from __future__ import annotations
 
@@ -9,7 +10,8 @@ from enum import IntEnum, unique
 from dxlrun.tooling.records import EventCode
 
 ROBOT = "robot"
-"""Code of the first line, the summary of the robot. It accuses nothing and precedes all other findings."""
+"""Code of the verdict's first line, the summary of the robot's behaviour. It accuses nothing and precedes
+all other findings."""
 
 
 HURTS = {
@@ -17,12 +19,12 @@ HURTS = {
     EventCode.SERVO_LOST: "was lost",
     EventCode.SERVO_LIMP: "lost its torque",
 }
-"""Severe events of servos, with the verb that reports them."""
+"""Events of severe failures of servos, with the verb phrase that reports each."""
 
 
 @unique
 class Rank(IntEnum):
-    """Severity of a finding, the worst first."""
+    """Severity of a finding, the worst first. A run is good if no finding is worse than CAUSE."""
 
     NEVER_RAN = 0  # The run did not start, or one of its processes failed
     LINE = 1
@@ -38,9 +40,9 @@ class Rank(IntEnum):
 
 @dataclass(frozen=True, slots=True)
 class Finding:
-    """One finding.
+    """One observation about a run, which may accuse a part of the robot.
 
-    Rules of all rooms of the analysis create findings; `judge` sorts them, the worst first.
+    Rules of all rooms of the analysis create findings; `judge` in verdict.py sorts them, the worst first.
     """
 
     code: str
@@ -49,29 +51,30 @@ class Finding:
     sentence: str  # Observation, for a person
     remedy: str = ""
     """Recommended action, a sentence or a command. Rules leave it empty unless they measured a remedy;
-    `judge` then uses the remedy of the table."""
+    `judge` then uses that of the rule in `RULES`."""
     rank: Rank = Rank.REMARK
     share: float = 0.0
     """Sort key within a rank, the greatest first. Findings with equal shares keep their order."""
 
     @property
     def order(self) -> tuple[int, float]:
-        """Sort key: rank, then descending share."""
+        """Sort key of the finding: rank, then descending share."""
         return self.rank, -self.share
 
     @property
     def line(self) -> str:
-        """Sentence followed by the remedy."""
+        """Sentence of the finding, followed by its remedy."""
         return f"{self.sentence} {self.remedy}".rstrip()
 
 
 def listed(names: Iterable[str], most: int = 3) -> str:
-    """Return the first `most` distinct names, and the number of further ones."""
+    """Return names as text: the first `most` distinct ones, and the number of further ones (`a, b, c and 2
+    more`)."""
     shown = list(dict.fromkeys(names))
     more = len(shown) - most
     return ", ".join(shown[:most]) + (f" and {more} more" if more > 0 else "")
 
 
 def cause(code: str, subject: str, sentence: str, remedy: str = "", share: float = 1.0) -> Finding:
-    """Return a finding of rank CAUSE."""
+    """Return a finding of rank CAUSE: one that can explain a failure, but alone does not make a run bad."""
     return Finding(code, subject, sentence, remedy, Rank.CAUSE, share)

@@ -1,4 +1,5 @@
-"""Losses in a run: buses, servos, devices, states and replies; rules of the verdict."""
+"""Rules of the verdict about losses in a run: lost buses, servos and devices, invalid states, missing
+replies."""
 
 from __future__ import annotations
 
@@ -21,12 +22,12 @@ _MOST_NAMED = 3
 
 
 def severe_of(events: Iterable[EventGroup], *codes: EventCode) -> list[EventGroup]:
-    """Return the event groups of some codes with severity error or above."""
+    """Return the event groups that have one of the codes, and severity error or above."""
     return [group for group in events if group.code in codes and group.severity >= Severity.ERROR]
 
 
 def lost_lines(totals: RunTotals) -> Iterable[Finding]:
-    """Report each bus whose port was lost."""
+    """Report each bus whose port was lost, as the system reported it."""
     for group in severe_of(totals.events, EventCode.PORT_LOST):
         times = "" if group.count == 1 else f" {group.count} times"
         line = sentence_of(group)
@@ -48,7 +49,8 @@ _AT_ONCE_NS = 500_000_000  # Failures within half a second are simultaneous
 
 
 def lost_servos(totals: RunTotals) -> Iterable[Finding]:
-    """Report each servo that was lost, rebooted or lost its torque; the worst ones first."""
+    """Report all servos that were lost, rebooted or lost their torque, in one finding that accuses the
+    worst."""
     by_source: dict[str, list[EventGroup]] = {}
     for group in severe_of(totals.events, *HURTS):
         by_source.setdefault(group.source, []).append(group)
@@ -89,7 +91,8 @@ def lost_servos(totals: RunTotals) -> Iterable[Finding]:
 
 
 def _failed_together(totals: RunTotals, failed: Mapping[str, Sequence[EventGroup]]) -> bool:
-    """Return whether several but not all servos of a bus failed at once in the same way, equally often."""
+    """Return whether several but not all servos of one bus failed within half a second in the same way,
+    equally often."""
     bus_of = {servo.joint: servo.bus for servo in totals.servos if servo.joint and not servo.device}
     bus, *others = {bus_of.get(source, "") for source in failed}
     first = [min(groups, key=lambda group: group.t_ns) for groups in failed.values()]
@@ -101,7 +104,7 @@ def _failed_together(totals: RunTotals, failed: Mapping[str, Sequence[EventGroup
 
 
 def lost_devices(totals: RunTotals) -> Iterable[Finding]:
-    """Report each device that was lost; the worst ones first."""
+    """Report all devices and sensors that were lost, in one finding that accuses the one lost most often."""
     lost: dict[str, int] = {}
     for group in severe_of(totals.events, EventCode.DEVICE_LOST):
         lost[group.source] = lost.get(group.source, 0) + group.count
@@ -115,7 +118,8 @@ def lost_devices(totals: RunTotals) -> Iterable[Finding]:
 
 
 def whole_buses(totals: RunTotals) -> Iterable[Finding]:
-    """Report events that affected all servos of a bus, or several buses, at once.
+    """Report each bus whose servos all rebooted or were lost at once, and several buses that lost all servos
+    at once.
 
     Servos of a bus share supply and adapter.
     """
@@ -142,9 +146,9 @@ def whole_buses(totals: RunTotals) -> Iterable[Finding]:
 
 
 def _all_at_once(totals: RunTotals, code: EventCode, joints: set[str]) -> int | None:
-    """Return the time (ns) of the first of simultaneous events on all given joints.
+    """Return the time (ns) of the first event of a code, if all these joints had one within half a second.
 
-    None: the events were not simultaneous, or some joints had none.
+    None: the events were not simultaneous, some joints had none, or there is only one joint.
     """
     times = {group.source: group.t_ns for group in severe_of(totals.events, code) if group.source in joints}
     if len(joints) < _FEWEST_OF_BUS or set(times) != joints:
@@ -159,7 +163,8 @@ def _joined(parts: Sequence[str]) -> str:
 
 
 def invalid_states(totals: RunTotals) -> Iterable[Finding]:
-    """Report joints whose states were invalid too often. Skipped cycles have no states."""
+    """Report joints whose states were invalid in too many cycles, in one finding. Skipped cycles have no
+    states."""
     cycles, counts = totals.periods.records, invalid_joints(totals)
     if not counts:
         return
@@ -175,7 +180,8 @@ def invalid_states(totals: RunTotals) -> Iterable[Finding]:
 
 
 def invalid_joints(totals: RunTotals) -> dict[str, int]:
-    """Return the number of invalid states of each joint that exceeds the tolerance."""
+    """Return the number of cycles with an invalid state, for each joint with more than the tolerated
+    number."""
     cycles = totals.periods.records
     return {
         joint: count
@@ -185,7 +191,8 @@ def invalid_joints(totals: RunTotals) -> dict[str, int]:
 
 
 def waited_in_vain(totals: RunTotals) -> set[str]:
-    """Return joints with too many invalid states that lost replies of their own servos do not explain."""
+    """Return the joints with too many invalid states because replies before those of their servos were
+    missing, not their own."""
     counts = invalid_joints(totals)
     servos = {(servo.bus, servo.servo_id): servo for servo in totals.servos}
     found = set()
@@ -199,7 +206,7 @@ def waited_in_vain(totals: RunTotals) -> set[str]:
 
 
 def implausible(totals: RunTotals) -> Iterable[Finding]:
-    """Report joints with positions that the loop rejected as implausible."""
+    """Report each joint with positions that the loop rejected as implausible."""
     named = {one.subject for one in totals.findings if one.code == "position_jumped"}
     for group in totals.events:
         if group.code == EventCode.IMPLAUSIBLE and group.source in totals.plan.movers.keys() - named:
@@ -207,7 +214,7 @@ def implausible(totals: RunTotals) -> Iterable[Finding]:
 
 
 def missing_replies(totals: RunTotals) -> Iterable[Finding]:
-    """Report servos with missing replies, or that all servos answered."""
+    """Report the servos and devices with missing replies, or that all answered every time, in one finding."""
     asked = [servo for servo in totals.servos if servo.asked]
     if not asked:
         return
@@ -239,7 +246,7 @@ def _kinds(asked: Sequence[ServoTraffic]) -> str:
 
 
 def servo_errors(totals: RunTotals) -> Iterable[Finding]:
-    """Report servos with error bits."""
+    """Report the servos and devices whose replies had error bits, in one finding."""
     troubled = [servo for servo in totals.servos if servo.errors]
     if not troubled:
         return
@@ -254,7 +261,8 @@ def servo_errors(totals: RunTotals) -> Iterable[Finding]:
 
 
 def _more(joining: str, count: int, one: str = "more servo", many: str = "more servos") -> str:
-    """Return the count of names beyond those that are listed."""
+    """Return `joining` and the number of names beyond the three that a sentence lists, as text; empty if
+    there are none."""
     beyond = count - _MOST_NAMED
     return f"{joining} {counted(beyond, one, many)}" if beyond > 0 else ""
 
@@ -265,6 +273,7 @@ def _name(servo: ServoTraffic) -> str:
 
 
 def sentence_of(group: EventGroup) -> str:
-    """Return an event's text in one line: all problems of a start-up, or the last line of a traceback."""
+    """Return an event's text in one line: all problems of a refused start-up, otherwise the last line,
+    such as that of a traceback."""
     lines = group.text.strip().splitlines() or [group.name]
     return "; ".join(lines) if group.code == EventCode.SETUP else lines[-1]

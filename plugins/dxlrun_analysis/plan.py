@@ -1,4 +1,4 @@
-"""Plan in a log, as far as the analysis reads it."""
+"""Types for the robot's plan in a log (plan.json): only the fields that the analysis reads."""
 
 from __future__ import annotations
 
@@ -23,14 +23,14 @@ from dxlwire import is_simulated
 
 
 class LoggedRegister(msgspec.Struct):
-    """A register that the robot file declares."""
+    """A control table item that the robot file sets in a servo's `registers`, with its raw value."""
 
     name: str
     value: int
 
 
 class LoggedServo(msgspec.Struct):
-    """One servo of the plan."""
+    """One servo of the plan in a log: joint, ID, model, and units of its raw values."""
 
     joint: str = ""
     servo_id: int = -1
@@ -44,17 +44,18 @@ class LoggedServo(msgspec.Struct):
 
     @property
     def own_name(self) -> str:
-        """Name that is unique among servos."""
+        """Name that is unique among the robot's servos: its joint, or its own if several servos move one
+        joint."""
         return self.name or self.joint
 
     @property
     def declared(self) -> dict[str, int]:
-        """Raw value that the robot file gives each control table item, by item name."""
+        """Raw value of each control table item that the robot file sets in the servo, by item name."""
         return {register.name: register.value for register in self.registers}
 
 
 class LoggedDevice(msgspec.Struct):
-    """One device of the plan: a node on a bus that is not a servo."""
+    """One device of the plan in a log: a node on a bus that is not a servo, such as an IMU."""
 
     name: str = ""
     servo_id: int = -1
@@ -62,7 +63,7 @@ class LoggedDevice(msgspec.Struct):
 
 
 class LoggedBus(msgspec.Struct):
-    """One bus of the plan."""
+    """One bus of the plan in a log, with its port, rate, servos and devices."""
 
     name: str = ""
     port: str = ""
@@ -73,12 +74,12 @@ class LoggedBus(msgspec.Struct):
     servos: list[LoggedServo] = []
     devices: list[LoggedDevice] = []
     noted: bool = False
-    """Mark of the run that this bus is simulated. The link to the port of `dxlrun sim` may no longer
-    exist."""
+    """True if the log's metadata say that this bus was simulated. The link to the port of `dxlrun sim` may
+    no longer exist."""
 
     @property
     def simulated(self) -> bool:
-        """True if all servos of the bus are simulated."""
+        """True if the bus was simulated in the run."""
         return self.noted or is_simulated(self.port)
 
     @property
@@ -88,13 +89,14 @@ class LoggedBus(msgspec.Struct):
         return joints | {device.servo_id: device.name for device in self.devices}
 
     def called(self, servo_id: int) -> tuple[str, str]:
-        """Return the name of a servo as findings use it, and the name with ID and bus."""
+        """Return the name of a servo or device as findings use it, and the name with ID and bus: `knee
+        (servo 3 on bus main)`."""
         name = self.names.get(servo_id) or f"servo {servo_id}"
         return name, f"{name} (servo {servo_id} on bus {self.name})"
 
 
 class Mover(NamedTuple):
-    """A servo that moves a joint."""
+    """One servo that moves a certain joint, with its bus."""
 
     bus: LoggedBus
     servo: LoggedServo
@@ -102,12 +104,12 @@ class Mover(NamedTuple):
 
 
 NO_LOOP = LoopPlan(0, SchedulerPlan("other", 0, lock_memory=False), (), (), (), None)
-"""Loop plan of a log without a plan."""
+"""Empty loop plan, used for a log without a plan."""
 UNKNOWN_JOINT = JointPlan("", -math.inf, math.inf, None)
 
 
 class LoggedPlan(msgspec.Struct):
-    """Plan of the loop, and those parts of the buses that the analysis reads."""
+    """Plan in a log: that of the loop, and the fields of buses and mechanisms that the analysis reads."""
 
     loop: LoopPlan = NO_LOOP
     buses: list[LoggedBus] = []
@@ -125,7 +127,7 @@ class LoggedPlan(msgspec.Struct):
 
     @property
     def movers(self) -> dict[str, tuple[Mover, ...]]:
-        """Servos that move each joint, by joint name."""
+        """Servos that move each joint, by joint name; several if the joint is part of a mechanism."""
         servos = {servo.row: (bus, servo) for bus in self.buses for servo in bus.servos}
         # Use names because the plan of a damaged log may lack the joints.
         found: dict[str, tuple[Mover, ...]] = {
@@ -146,7 +148,8 @@ class LoggedPlan(msgspec.Struct):
         return found
 
     def is_simulated(self, subject: str) -> bool:
-        """Return whether the subject of a finding is simulated.
+        """Return whether the part that a finding accuses is simulated, so that nothing on it can be checked
+        or exchanged.
 
         In a robot with a simulated bus, every subject counts as simulated unless the plan has it on a real
         bus, as a controller, or as a source that a process samples. If a controller and a bus have the same
@@ -164,13 +167,13 @@ class LoggedPlan(msgspec.Struct):
 
     @property
     def sampled(self) -> set[str]:
-        """Names of the sources that separate processes sample, because they are not on a bus."""
+        """Names of the sensors that separate processes sample, because they are not on a bus."""
         on_bus = {device.name for bus in self.buses for device in bus.devices}
         return {source.name for source in self.loop.sources} - on_bus
 
     @property
     def by_name(self) -> dict[str, LoggedBus]:
-        """Buses by name."""
+        """Buses of the plan by name."""
         return {bus.name: bus for bus in self.buses}
 
 
@@ -182,7 +185,7 @@ def plan_of(log: Log) -> LoggedPlan:
 
 @lru_cache(maxsize=8)
 def _decoded(data: bytes, noted: str) -> LoggedPlan:
-    """Decode a plan, and mark the buses that the run recorded as simulated.
+    """Decode a plan, and mark the simulated buses; `noted` has their names, separated by spaces.
 
     The result is cached because every slice of a log requests the plan.
     """

@@ -1,4 +1,4 @@
-"""Commands of the analysis, registered by the same hooks as those of any other package."""
+"""Plug-in of this package: registers the commands that read logs, by the same hooks as any other package."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ def dxlrun_contract() -> int:
 
 @hookimpl
 def dxlrun_commands() -> Sequence[Command]:
-    """Return the commands that read logs."""
+    """Return the commands `analyze`, `export`, `logs` and `upload`."""
     return (
         Command("analyze", f"{_PLACE}.analyze:analyze", group="Every day"),
         Command("export", f"{_PLACE}.export:export", group="Logs"),

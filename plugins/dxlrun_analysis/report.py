@@ -1,4 +1,4 @@
-"""Report on one log: its parts, the verdict in words, and their tables."""
+"""Report of `dxlrun analyze` on one log: its parts, the verdict in words, and their tables."""
 
 from __future__ import annotations
 
@@ -47,11 +47,11 @@ PARTS: tuple[ReportPart[Any], ...] = (
     ReportPart("being_written", lambda report: report.about.being_written),
     SOURCES,
 )
-"""Parts in the order of `--json` and of the tables."""
+"""Parts of the report, in the order of `--json` and of the tables."""
 
 
 def analyze_log(path: str | Path) -> Report:
-    """Analyze one log.
+    """Analyze the log at a path.
 
     Raises:
         LogError: The log cannot be read; the message is one sentence.
@@ -64,7 +64,7 @@ def analyze(
     *watching: Callable[[Log], None],
     exchanges: Callable[[Exchanges], None] = lambda _: None,
 ) -> Report:
-    """Analyze a log slice by slice.
+    """Analyze a log slice by slice, and return the report with numbers and verdict.
 
     The log is decompressed once, and each packet is paired once.
 
@@ -90,7 +90,7 @@ def analyze(
 
 
 def parts(report: Report) -> tuple[Part, ...]:
-    """Return the terminal output: the verdict, then the tables."""
+    """Return the terminal output of `dxlrun analyze`: the verdict, then the tables."""
     tone: Tone = "good" if report.verdict.good else "warning"
     return (
         *(Sentence(sentence, tone) for sentence in report.verdict.sentences),
@@ -99,7 +99,8 @@ def parts(report: Report) -> tuple[Part, ...]:
 
 
 def tables(report: Report, section: str = "") -> dict[str, Table]:
-    """Return the tables that have rows, by name: those of one section of the page, or all."""
+    """Return the tables of the report that have rows, by name of their part: those of one section of the
+    page, or all."""
     chosen = sorted(
         (part for part in PARTS if part.section == section or not section),
         key=lambda part: not part.first if section else part.late,
@@ -121,7 +122,8 @@ def began(log: Log, report: Report) -> str:
 
 
 def facts(log: Log, report: Report) -> tuple[Table, ...]:
-    """Return the tables about the run that have rows: robot, buses, real time, software."""
+    """Return the tables about the circumstances of the run that have rows: robot, buses, real time,
+    software."""
     planned = plan_of(log).by_name
     buses = ((f"bus {name}", _bus(planned.get(name))) for name in log.buses)
     found = (
@@ -173,7 +175,8 @@ def _bus(bus: LoggedBus | None) -> str:
 
 
 def _real_time(log: Log) -> Iterator[tuple[str, Value]]:
-    """Yield the requested real-time settings, and the result of each request."""
+    """Yield the real-time settings that the robot file requests, and the result of each request, as rows
+    of a table."""
     requested = log.metadata.get("scheduler", {})
     if requested:
         locked = ", memory locked" if requested.get("lock_memory") == "true" else ""

@@ -39,15 +39,15 @@ _REASONS = {
     "invalid_states": "states of {subject} were often invalid",
     "log_not_whole": "the log is not whole",
 }
-"""Reason by code; the code itself is the reason for all others (`stood still`). Missed goals have a clause of
-their own."""
+"""Reason in the first line by the code of a finding; for all others the code itself (`stood still`).
+Missed goals have a clause of their own."""
 _RELEASED = "torque off: "
 _FACTS = (Rank.NEVER_RAN, Rank.LINE, Rank.SERVO, Rank.SHARE, Rank.ERROR, Rank.LOG)
 _LONGEST = 100  # Characters of a reason
 
 
 def robot_line(totals: RunTotals, word: str, found: Sequence[Finding]) -> Finding:
-    """Return the first line.
+    """Return the first line of the verdict, as a finding.
 
     Args:
         totals: Totals of the run.
@@ -80,7 +80,7 @@ def _reason(worst: Finding) -> str:
 
 
 def _failures(totals: RunTotals) -> Iterator[str]:
-    """Yield a fall, then joints that went limp, were lost or rebooted.
+    """Yield clauses about a fall, lost buses, and joints that went limp, were lost or rebooted.
 
     Events are in order of time; those of the same joints are combined.
     """
@@ -113,14 +113,15 @@ def _what(groups: Sequence[EventGroup]) -> str:
 
 
 def _when(groups: Sequence[EventGroup], begin_ns: int) -> str:
-    """Return the time of simultaneous events, or the time of the first if they followed one another."""
+    """Return the time of the first event as text: ` at 2.0 s`, or ` from 2.0 s on` if not all came within
+    half a second."""
     first = _at(groups[0].t_ns, begin_ns)
     later = first and groups[-1].t_ns - groups[0].t_ns > _AT_ONCE_NS
     return f"{first.replace(' at ', ' from ')} on" if later else first
 
 
 def _at(t_ns: int, begin_ns: int) -> str:
-    """Return the time since the first deadline as text; empty without a first deadline."""
+    """Return a time as text, s since the first deadline; empty without a first deadline."""
     return f" at {max((t_ns - begin_ns) / 1e9, 0.0):.1f} s" if begin_ns else ""
 
 
@@ -151,7 +152,8 @@ def _off(report: GoalReport, unit: JointUnit) -> str:
 
 
 def _takeovers(totals: RunTotals) -> Iterator[str]:
-    """Yield controllers that failed, with their fallbacks, and takeovers that controllers requested."""
+    """Yield clauses about controllers that failed, with their fallbacks, takeovers that controllers
+    requested, and torque that clients switched off."""
     yield from (f"{name} failed" for name in totals.conduct.unanswered[:_MOST_NAMED])
     for one in [one for one in totals.conduct.takeovers if not one.fell][:_MOST_NAMED]:
         if one.by:
@@ -166,7 +168,8 @@ def _takeovers(totals: RunTotals) -> Iterator[str]:
 
 
 def _played(totals: RunTotals) -> str:
-    """Return the motions played, or another source of motion, and the largest tracking error."""
+    """Return a clause about the motions played, or another source of motion, with the largest tracking
+    error."""
     until_ns = totals.periods.seconds * 1e9
     begun = [one for one in totals.plan.loop.commands if one.at_ns <= until_ns and totals.periods.records]
     motions = sum(one.goal is not None for one in begun) or len({one.controller for one in begun})
@@ -182,7 +185,8 @@ def _played(totals: RunTotals) -> str:
 
 
 def _within(totals: RunTotals) -> str:
-    """Return the joint with the largest tracking error, excluding joints that failed."""
+    """Return the largest tracking error and its joint as text, excluding joints that failed; empty if it
+    is negligible."""
     failed = {group.source for group in totals.events if group.code in _FAILED}
     worst = max(
         (one for one in totals.tracking if one.worst_rad is not None and one.name not in failed),

@@ -13,7 +13,8 @@ from typing import NamedTuple
 
 
 class Needs(Flag):
-    """Evidence that must be complete before a rule may accuse a part."""
+    """Conditions that a run must meet before a rule may accuse a part; otherwise something else can be the
+    cause."""
 
     NOTHING = 0
     MACHINE = auto()
@@ -30,13 +31,14 @@ _JOINT = Needs.MACHINE | Needs.LOOP | Needs.STATES | Needs.INTACT | Needs.LOG
 
 
 class Rule(NamedTuple):
-    """One rule about a part of the robot, the machine or the run."""
+    """Description of one rule of the verdict, for the reference and for the evidence gate."""
 
     accuses: str  # Accused part in words, for the reference
     signal: str
     bound: str  # Threshold and its reason
     remedy: str = ""
-    """Placeholders `{name}`, `{bus}`, `{port}` and `{servo_id}` describe the accused part."""
+    """Recommended action for the user. Placeholders `{name}`, `{bus}`, `{port}` and `{servo_id}` are
+    replaced by those of the accused part."""
     needs: Needs = Needs.NOTHING
 
 
@@ -217,4 +219,5 @@ RULES: Mapping[str, Rule] = {
     "steered": Rule("", "requests of clients", "one"),
     "replies": Rule("", "servos that answered, and the worst three of those that did not", "always told"),
 }
-"""Rules by code: lines first, then servos, supply, joints, the loop, sensors and devices, and the run."""
+"""All rules by the code of their findings: buses first, then servos, supply, joints, the loop, sensors and
+devices, and the run."""

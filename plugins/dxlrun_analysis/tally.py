@@ -1,4 +1,5 @@
-"""Totals of a run, the input of the verdict, counted slice by slice from a log of any length."""
+"""Totals of a run, the input of the rules of the verdict, collected slice by slice from a log of any
+length."""
 
 from __future__ import annotations
 
@@ -34,8 +35,8 @@ from dxlrun_analysis.servos.exchanges import Exchanges
 from dxlrun_analysis.servos.traffic import BusTraffic, ServoTraffic, Traffic
 
 _SHORT_RUN_S = 2.0
-"""Length of the run that the tolerance of a shorter run is based on. One stall does not overload a
-machine."""
+"""Run length from which the number of tolerated skips grows with the run; a shorter run may skip as many.
+One stall does not overload a machine."""
 _ANSWERS = " answers "  # Event text about a lost servo that answers again but cannot be taken back
 
 
@@ -50,7 +51,7 @@ class RealTime:
 
 @dataclass(frozen=True, slots=True)
 class RunTotals:
-    """Totals of one run: the complete input of the rules of the verdict."""
+    """Totals of one run: everything that the rules of the verdict need."""
 
     periods: Periods
     latency: Latency | None = None  # None if the loop never ran a cycle, and without a log
@@ -61,12 +62,12 @@ class RunTotals:
     real_time: RealTime = RealTime()
     joints: tuple[str, ...] = ()
     invalid: tuple[int, ...] = ()
-    """Cycles in which the state of each joint was invalid, except those of a requested reboot."""
+    """Number of cycles in which the state of each joint was invalid, except those of a requested reboot."""
     servos: tuple[ServoTraffic, ...] = ()
     buses: tuple[BusTraffic, ...] = ()
     events: tuple[EventGroup, ...] = ()  # In order of the first event of each group
     returns: dict[str, list[str]] = field(default_factory=dict)
-    """Reasons why lost servos that answer again were not taken back, by joint."""
+    """Reasons why lost servos that answered again could not be taken back, by joint."""
     acts: tuple[Act, ...] = ()
     pauses: tuple[Pause, ...] = ()
     failures: tuple[str, ...] = ()  # Failures outside the loop, one sentence each
@@ -80,9 +81,9 @@ class RunTotals:
 
     @property
     def unreached_goals(self) -> list[UnreachedGoal]:
-        """Goals of played motions that the run missed, judged as in the run itself.
+        """Goals of played motions that the run did not reach, judged as at the end of the run itself.
 
-        Excludes motions that begin in another part of the log.
+        Motions that begin in a part of the log that is not given are excluded.
         """
         conduct, ran_ns = self.conduct, round(self.periods.seconds * 1e9)
         found = find_unreached_goals(self.plan.loop, conduct.goals, ran_ns)
@@ -90,7 +91,7 @@ class RunTotals:
 
     @property
     def tolerated_skips(self) -> float:
-        """Number of periods that the run may skip."""
+        """Number of periods that the run may skip, by `loop: {tolerated_skips: ...}` of the robot file."""
         fewest = _SHORT_RUN_S * self.periods.rate_hz
         return self.plan.loop.tolerated_skips * max(self.periods.elapsed, fewest)
 
@@ -100,7 +101,7 @@ class RunTotals:
         return bool(self.periods.records) and self.periods.skipped <= self.tolerated_skips
 
     def bus_of(self, subject: str) -> str:
-        """Return the bus of an accused servo or joint, or `subject` itself if it is neither."""
+        """Return the name of the bus of an accused servo or joint, or `subject` itself if it is neither."""
         # A joint of several servos is not the subject of any one of them.
         movers = (mover.bus.name for mover in self.plan.movers.get(subject, ()))
         return next((servo.bus for servo in self.servos if servo.subject == subject), next(movers, subject))
@@ -110,14 +111,15 @@ class Collector(Protocol):
     """Accumulator that collects one subject of a log, slice by slice."""
 
     def take(self, log: Log) -> None:
-        """Add the next slice."""
+        """Add the next slice of the log."""
 
 
 C = TypeVar("C", bound=Collector)
 
 
 class Tally:
-    """Accumulator of a log, whole or slice by slice. Its memory does not grow with the log."""
+    """Set of all accumulators for the report, fed with a log slice by slice. Its memory does not grow with
+    the log."""
 
     def __init__(
         self, watch: Callable[[Exchanges], None] = lambda _: None, others: Iterable[type[Collector]] = ()
@@ -141,11 +143,11 @@ class Tally:
         self._wait = SimulationWait()
 
     def of(self, kind: type[C]) -> C:
-        """Return the collector of a class."""
+        """Return the accumulator of a class."""
         return cast("C", self._collectors[kind])
 
     def take(self, log: Log) -> None:
-        """Count the next slice.
+        """Give the next slice of the log to all accumulators.
 
         Raises:
             LogError: A packet in the slice cannot be read.
@@ -168,7 +170,7 @@ class Tally:
                     self._wait = SimulationWait(wait.waited_ns + data.waited_ns, wait.times + data.times)
 
     def totals(self, log: Log) -> RunTotals:
-        """Return the totals of all slices.
+        """Return the totals of all slices, when none follows.
 
         Args:
             log: Metadata of the file, which the last slice completes.

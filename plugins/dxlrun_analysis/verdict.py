@@ -65,11 +65,12 @@ _OF_LOOP = [
     "reboot",
     "stop",
 ]
-"""Kinds of commands that the loop executes itself."""
+"""Kinds of client commands that the loop executes itself, not a controller."""
 
 
 class Verdict(msgspec.Struct, frozen=True):
-    """Verdict of a run: summary of the robot's behaviour, then findings, the most severe first."""
+    """Verdict on a run: whether it was good, and its findings, the summary of the robot's behaviour first,
+    then the most severe."""
 
     good: bool  # No finding that makes a run not good
     word: str  # The verdict in words: good; good, with fallbacks; good, with missed goals; not good
@@ -78,7 +79,7 @@ class Verdict(msgspec.Struct, frozen=True):
 
 
 def judge(totals: RunTotals) -> Verdict:
-    """Judge a run: combine the findings of all rules into a verdict."""
+    """Judge a run: combine the findings of all rules, sort them and decide whether the run was good."""
     judged = accused(
         totals,
         (
@@ -113,7 +114,8 @@ def judge(totals: RunTotals) -> Verdict:
 
 
 def _robot(totals: RunTotals) -> Iterable[Finding]:
-    """Report a robot that was down at the end of the run, and missed goals of played motions."""
+    """Report a robot that was down at the end of the run, and each goal of a played motion that was not
+    reached."""
     if totals.conduct.lies:
         turned = totals.conduct.turned_rad
         how = "its fall_reflex had others take over" if turned is None else "gravity is "
@@ -137,7 +139,7 @@ def _never_ran(totals: RunTotals) -> Iterable[Finding]:
 
 
 def _loop(totals: RunTotals) -> Iterable[Finding]:
-    """Report whether the loop kept its rate, how late it woke, and its longest cycle."""
+    """Report whether the loop kept its rate, how late it woke at most, and its longest cycle."""
     account = totals.periods
     if not account.records:
         return
@@ -166,7 +168,8 @@ def _loop(totals: RunTotals) -> Iterable[Finding]:
 
 
 def _longest(totals: RunTotals) -> str:
-    """Return the length and the main cause of the longest cycle, or an empty string if it fits its period."""
+    """Return length and main cause of the longest cycle as the end of a sentence, or an empty string if no
+    cycle exceeded its period."""
     slowest = totals.slowest
     if slowest is None:
         return ""
@@ -185,7 +188,7 @@ def _machine(totals: RunTotals) -> Iterable[Finding]:
 
 
 def _steered(acts: Sequence[Act], pauses: Sequence[Pause]) -> Iterable[Finding]:
-    """Report commands from clients."""
+    """Report how many commands and streams clients sent, and how many were refused."""
     asked = [act for act in acts if act.origin != "loop"]
     if not asked:
         return
@@ -216,11 +219,12 @@ def _steered(acts: Sequence[Act], pauses: Sequence[Pause]) -> Iterable[Finding]:
 
 
 _OTHER_RULES = frozenset((*HURTS, EventCode.DEVICE_LOST, EventCode.PORT_LOST, EventCode.RECORDER_GAP))
-"""Event codes that other rules report."""
+"""Event codes that rules in other modules report."""
 
 
 def _events(totals: RunTotals) -> Iterable[Finding]:
-    """Report logged errors, except those of controllers whose fallbacks took over."""
+    """Report logged errors that no other rule reports, except those of controllers whose fallbacks took
+    over."""
     taken_over = {one.controller for one in totals.conduct.takeovers} - set(totals.conduct.unanswered)
     severe = [
         group

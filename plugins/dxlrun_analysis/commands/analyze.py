@@ -1,4 +1,4 @@
-"""`dxlrun analyze`: report on a log."""
+"""`dxlrun analyze`: report on one log, or one line for each of several."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ MOST_WORST = 10  # Number of cycles whose packets the analysis keeps
 
 
 def _log(_: object, tokens: Sequence[Token]) -> Path:
-    """Return the path of a log. A log in a store is copied to a local file first."""
+    """Return the path of a log on the command line. A log in a store is copied to a local file first."""
     place = tokens[0].value
     if "://" not in place:
         return Path(place)
@@ -107,7 +107,7 @@ def analyze(
 
 
 def _check(logs: Sequence[Path], *, report: Path | None, worst: int) -> None:
-    """Validate the command line before any file is read.
+    """Check the arguments before any file is read.
 
     Raises:
         InputError: Some options or logs cannot be used.
@@ -128,7 +128,7 @@ def _check(logs: Sequence[Path], *, report: Path | None, worst: int) -> None:
 
 
 def _analyze_measurement(log: LogReader, report: Path | None, *, as_json: bool) -> int:
-    """Show the result of `dxlrun latency` in the same form as that command."""
+    """Show the result of `dxlrun latency` from its log, in the same form as that command."""
     from dxlrun_analysis.latency.latency_log import machine_of, measurement
     from dxlrun_analysis.latency.tables import parts
 
@@ -173,7 +173,7 @@ def newest_log() -> Path:
 
 
 def _analyze_each(logs: Sequence[Path], *, as_json: bool) -> int:
-    """Print a line for each log, or all as JSON.
+    """Print a line for each log, or all as JSON; return the exit code.
 
     An unreadable log does not stop the analysis of later ones.
     """

@@ -1,4 +1,4 @@
-"""`dxlrun export`: conversion of a log to another format."""
+"""`dxlrun export`: conversion of a log to CSV, Parquet or a LeRobot data set."""
 
 from __future__ import annotations
 
@@ -70,7 +70,7 @@ def export(
 
 
 def _without_table(reader: LogReader, target: Path, to: Format) -> dict[str, str] | None:
-    """Return the topics without a table, with reasons; None if the format has no tables."""
+    """Return the topics of the log that were not exported as a table, with reasons; None for LeRobot."""
     if to not in ("csv", "parquet"):
         return None
     from dxlrun_analysis.export.parquet import has_file
@@ -81,7 +81,7 @@ def _without_table(reader: LogReader, target: Path, to: Format) -> dict[str, str
 
 
 def _write(reader: LogReader, target: Path, to: Format, topic: str | None) -> int:
-    """Write the log in a format; return the number of records."""
+    """Write the log in a format to `target`; return the number of rows or frames. `topic` is for CSV."""
     if to == "csv":
         from dxlrun_analysis.export.csv_file import write_csv
 

@@ -137,7 +137,8 @@ def upload(directory: Path, store: str, /, *, as_json: JsonFlag = False, debug: 
 
 
 def _prune(directory: Path, keep: str, *, as_json: bool) -> int:
-    """List the oldest logs beyond a total size, and delete them after confirmation."""
+    """List the oldest logs so that the rest is within the size `keep`, and delete them after confirmation;
+    return the exit code."""
     from rich.filesize import decimal
 
     from dxlrun.tooling.logs import oldest_beyond, stored_logs
@@ -177,7 +178,7 @@ def _prune(directory: Path, keep: str, *, as_json: bool) -> int:
 
 
 def _found(place: str) -> Folder | Store:
-    """Return the logs of a directory or a store.
+    """Find the logs below a directory or in a store.
 
     Raises:
         InputError: The place has no logs.
@@ -195,7 +196,8 @@ def _found(place: str) -> Folder | Store:
 
 
 def _check(place: str) -> None:
-    """Check that a place is a directory or the address of a store, and that its extras are installed.
+    """Check that the argument is a directory or the address of a store, and that the needed packages are
+    installed.
 
     Raises:
         InputError: One line for each problem.

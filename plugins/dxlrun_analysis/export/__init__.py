@@ -1,4 +1,4 @@
-"""Exports of a log: CSV, Parquet, LeRobot data sets.
+"""Exports of a log to other formats: CSV, Parquet, LeRobot data sets.
 
-All formats are written from the same tables (`tables.py`). The logs of many runs belong in `season`.
+CSV and Parquet are written from the same tables (`tables.py`). The logs of many runs belong in `season`.
 """

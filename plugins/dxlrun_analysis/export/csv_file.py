@@ -1,4 +1,4 @@
-"""CSV: one topic of a log, a line for each record, column names in the first line."""
+"""CSV export: the records of one topic of a log, a line for each record, column names in the first line."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ from dxlrun_analysis.export.tables import COMMANDS, CYCLES, EVENTS, WITHOUT_TABL
 
 
 def write_csv(reader: LogReader, target: Path, topic: str) -> int:
-    """Write the records of a topic. Unknown values are empty, bytes are hexadecimal.
+    """Write the records of one topic of a log to a CSV file. Unknown values are empty, bytes are hexadecimal.
 
     Returns:
         Number of records.
@@ -45,7 +45,7 @@ def write_csv(reader: LogReader, target: Path, topic: str) -> int:
 
 
 def _plain(column: pa.ChunkedArray) -> pa.ChunkedArray:
-    """Return a column in a form that CSV can hold: lists as JSON, bytes in hexadecimal."""
+    """Convert an Arrow column to a form that CSV can hold: lists as JSON, bytes in hexadecimal."""
     kind = column.type
     if pa.types.is_dictionary(kind):
         return column.cast(kind.value_type)

@@ -1,4 +1,4 @@
-"""LeRobot: a log as a data set, in the layout of LeRobotDataset v3.0.
+"""LeRobot export: joint states and goals of a log as a data set, in the layout of LeRobotDataset v3.0.
 
 Source: Hugging Face LeRobot, docs "LeRobotDataset v3.0", and the names and types of columns that lerobot 0.4
 writes: data/chunk-000/file-000.parquet with a row per frame, meta/info.json with features and rate,
@@ -47,7 +47,7 @@ Floats = NDArray[np.float64]
 
 @dataclass(slots=True)
 class _Statistics:
-    """Minimum, maximum, mean and standard deviation of rows, updated in batches."""
+    """Minimum, maximum, mean and standard deviation of one feature of the data set, updated in batches."""
 
     count: int = 0
     low: Floats = field(default_factory=lambda: np.full(1, np.inf))
@@ -57,7 +57,7 @@ class _Statistics:
     """Sum of squared differences from the mean (Chan, Golub, LeVeque 1983: pairwise updates)."""
 
     def take(self, rows: NDArray[np.generic]) -> None:
-        """Add rows, shape (rows, elements)."""
+        """Add the feature's values in some frames, shape (frames, elements)."""
         values = rows.astype(np.float64)
         mean = values.mean(axis=0)
         total, shift = self.count + len(values), mean - self.mean
@@ -80,7 +80,7 @@ class _Statistics:
 
 
 def write_dataset(reader: LogReader, directory: Path) -> int:
-    """Write the data set into a new directory; return the number of frames.
+    """Write a log as a LeRobot data set into a new directory; return the number of frames.
 
     Raises:
         LogError: The log has no frames, or its rate is not a whole number of Hz.
@@ -102,7 +102,7 @@ def write_dataset(reader: LogReader, directory: Path) -> int:
 
 
 class _Stretch(msgspec.Struct, frozen=True, eq=False):
-    """Consecutive frames."""
+    """Consecutive frames of one slice of the log: states and goals of all joints."""
 
     log: Log
     states: Frames  # Shape (frames, joints)
@@ -112,7 +112,7 @@ class _Stretch(msgspec.Struct, frozen=True, eq=False):
 
 @dataclass(slots=True)
 class _Episode:
-    """One episode: its range of frames in the data set, and the statistics of its features."""
+    """One episode of the data set: its range of frames, and the statistics of its features."""
 
     begin: int
     end: int
@@ -120,7 +120,7 @@ class _Episode:
 
 
 class _Dataset:
-    """Writer of frames. Keeps the episodes and statistics for the metadata."""
+    """Writer of the frames of a data set. Keeps the episodes and statistics for the metadata."""
 
     def __init__(self, file: Path) -> None:
         self._file = file
@@ -131,11 +131,11 @@ class _Dataset:
 
     @property
     def frames(self) -> int:
-        """Number of frames so far."""
+        """Number of frames written so far."""
         return self.episodes[-1].end if self.episodes else 0
 
     def take(self, stretch: _Stretch) -> None:
-        """Write frames. Raises OSError."""
+        """Write frames to the data file. Raises OSError."""
         self.last = stretch.log
         if stretch.begins:
             self.episodes.append(_Episode(self.frames, self.frames))
@@ -152,13 +152,14 @@ class _Dataset:
         episode.end += len(index)
 
     def close(self) -> None:
-        """Close the file. Raises OSError."""
+        """Close the data file. Raises OSError."""
         if self._writer is not None:
             self._writer.close()
 
 
 def _commanded(reader: LogReader) -> dict[str, str]:
-    """Return the first command interface that each joint received goals for; omits joints without goals."""
+    """Return the command interface of each joint that received goals: position if any was sent, else
+    velocity, effort or PWM."""
     seen: dict[str, NDArray[np.bool_]] = {}
     joints: tuple[str, ...] = ()
     for log in reader.slices():
@@ -174,7 +175,7 @@ def _commanded(reader: LogReader) -> dict[str, str]:
 
 
 def _stretches(reader: LogReader, goals: Mapping[str, str]) -> Iterator[_Stretch]:
-    """Yield the frames of a log, slice by slice.
+    """Yield the frames of a log, slice by slice; `goals` has the command interface of each joint.
 
     Raises:
         LogError: A data set cannot have this rate.
@@ -215,7 +216,7 @@ def _stretches(reader: LogReader, goals: Mapping[str, str]) -> Iterator[_Stretch
 
 
 def _filled(values: NDArray[np.floating]) -> Frames:
-    """Return rows in which unknown values are replaced by those of the preceding row."""
+    """Return rows in which each unknown value is replaced by that of the preceding row."""
     rows = np.where(np.isfinite(values), np.arange(len(values))[:, None], 0)
     np.maximum.accumulate(rows, axis=0, out=rows)
     filled: Frames = np.take_along_axis(values, rows, axis=0).astype(np.float32)
@@ -250,7 +251,7 @@ def _numbers(index: NDArray[np.int64], begin: int, episode: int, rate: int) -> d
 
 
 def _vectors(values: Frames) -> pa.Array:
-    """Return rows of numbers.
+    """Convert rows of numbers to an Arrow column of vectors.
 
     A row of one number becomes a plain number, as LeRobot has features of shape (1,).
     """
@@ -314,7 +315,8 @@ def _write_meta(directory: Path, log: Log, features: Mapping[str, object], made:
 
 
 def _tasks(task: str) -> pa.Table:
-    """Return the table of tasks. Its metadata make pandas use the task as index, which LeRobot looks up."""
+    """Return the content of meta/tasks.parquet. Its metadata make pandas use the task as index, which
+    LeRobot looks up."""
     pandas = {
         "index_columns": ["task"],
         "column_indexes": [],

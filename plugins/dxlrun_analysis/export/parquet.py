@@ -1,4 +1,5 @@
-"""Parquet: a directory with a file for cycles, packets, events, commands, and each topic of controllers."""
+"""Parquet export: a directory with a file each for cycles, packets, events, commands and every topic of
+controllers."""
 
 from __future__ import annotations
 
@@ -15,13 +16,13 @@ from dxlrun_analysis.export.tables import PACKETS, tables_of
 
 _NAMES = {"/cycle": "cycles"}
 _ODD = re.compile(r"[^\w.-]|^\.")
-"""Characters to replace in file names. Logs of other programs can have them in topic names."""
+"""Characters of a topic name that are replaced in its file name. Logs of other programs can have them."""
 _LONGEST = 100  # Characters of a file name, which has at most 255 bytes of UTF-8 with its suffix
 _GROUP_BYTES = 32 << 20  # Size of a table in memory that is written as one row group
 
 
 def write_parquet(reader: LogReader, directory: Path) -> int:
-    """Write all tables of a log into a new directory; return their number of rows.
+    """Write all tables of a log as Parquet files into a new directory; return their number of rows.
 
     Memory does not grow with the log.
 
@@ -55,12 +56,14 @@ def write_parquet(reader: LogReader, directory: Path) -> int:
 
 
 def has_file(directory: Path, topic: str) -> bool:
-    """Return whether a directory has the table of a topic. The packets of all buses share one table."""
+    """Return whether `write_parquet` wrote the table of a topic into a directory. The packets of all buses
+    share one table."""
     table = PACKETS if topic.startswith(BUS_PREFIX) else topic
     return (directory / file_name(table)).exists()
 
 
 def file_name(topic: str) -> str:
-    """Return the file name of a topic: `cycles.parquet`, `arm.error.parquet` for `/arm/error`."""
+    """Return the name of the Parquet file of a topic: `cycles.parquet`, `arm.error.parquet` for
+    `/arm/error`."""
     name = _NAMES.get(topic, topic.strip("/").replace("/", "."))
     return f"{_ODD.sub('_', name)[:_LONGEST] or '_'}.parquet"

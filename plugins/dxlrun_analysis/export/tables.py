@@ -31,9 +31,10 @@ WITHOUT_TABLE: Mapping[str, str] = {
     LogTopic.ROSOUT: "the same events are in /events",
     LogTopic.ACTIVATION: "it is one message, the states and goals before the first cycle",
 }
-"""Topics without a table, and the reason."""
+"""Topics of a log that are not exported as a table, and the reason for each."""
 _ROWS = 4096
-"""Cycles per table. A slice can have only a few cycles, and each table costs some time per column."""
+"""Number of cycles in an Arrow table. A slice of the log can have only a few cycles, and each table costs
+some time per column."""
 
 _JOINT_COLUMNS: tuple[tuple[str, str], ...] = (
     ("position", "position_rad"),
@@ -63,7 +64,7 @@ _KINDS = ["", *(kind.name.lower() for kind in PacketKind)]
 
 
 class Rows(msgspec.Struct, frozen=True, eq=False):
-    """Some rows of one table."""
+    """Some consecutive rows of one exported table."""
 
     name: str  # Topic: `/cycle`, `/packets`, `/bus/NAME`, `/events`, `/commands`, or one of a controller
     table: pa.Table
@@ -84,7 +85,7 @@ def topics_without_table(reader: LogReader, has_table: Callable[[str], bool]) ->
 
 
 def tables_of(slices: Iterable[Log], only: Container[str] | None = None) -> Iterator[Rows]:
-    """Yield the rows of a log, slice by slice, in memory that does not grow with the log.
+    """Yield the tables of a log, slice by slice, in memory that does not grow with the log.
 
     Args:
         slices: Slices of the log.
@@ -137,7 +138,7 @@ def _packets(log: Log, begin_ns: int, only: Container[str] | None) -> Iterator[R
 
 
 def _cycle_table(log: Log, parts: Sequence[NDArray[np.void]], begin_ns: int) -> pa.Table:
-    """Return cycles as a table.
+    """Convert cycles to an Arrow table.
 
     The columns are the times of each cycle, controllers, joints, references, the states of devices, sensors
     and controllers, and the commands of devices.
@@ -250,7 +251,8 @@ def _commands(log: Log, begin_ns: int) -> pa.Table:
 
 
 def _messages(log: Log, topic: LoggedTopic, begin_ns: int) -> pa.Table:
-    """Return messages with a column for each field; fields of nested messages are named `a.b`."""
+    """Convert the messages of a topic to an Arrow table with a column for each field; fields of nested
+    messages are named `a.b`."""
     try:
         codec = Codec(topic.type)
         values = [codec.unpack(data) for data in topic.data]

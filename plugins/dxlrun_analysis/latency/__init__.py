@@ -1,4 +1,4 @@
-"""Evaluation of a latency measurement: statistics, tables, page.
+"""Evaluation of a measurement by `dxlrun latency`: log, statistics, tables, page.
 
 The measurement itself is in `dxlrun_lab.latency`.
 """

@@ -20,7 +20,8 @@ POLICIES: tuple[Policy, ...] = ("other", "round_robin", "fifo")
 REAL_TIME: Policy = "round_robin"
 
 SHORTEST_NS, LONGEST_NS = 10_000, 1_000_000_000
-"""Range of a period: from the highest rate of a robot file, 100 kHz, to the lowest that a run accepts."""
+"""Shortest and longest period of a measurement: from the highest rate of a robot file, 100 kHz, to the
+lowest that a run accepts."""
 MOST_ITERATIONS = 10_000_000  # Per condition; 16 bytes each
 LONGEST_S = 24 * 3600.0  # One day
 MOST_BLOCKS = 1000
@@ -28,7 +29,8 @@ MOST_BLOCKS = 1000
 
 @dataclass(frozen=True, slots=True)
 class Condition:
-    """Method of waiting for a deadline: that of dxlrun or the C program, with a scheduling policy."""
+    """Way of waiting for a deadline that is measured: by dxlrun's loop or by a C program, with a
+    scheduling policy."""
 
     name: str  # Name in --compare: other, round_robin, fifo, c
     policy: Policy
@@ -46,7 +48,7 @@ class Condition:
 
 @dataclass(frozen=True, slots=True)
 class Settings:
-    """Settings of a measurement."""
+    """Settings of a latency measurement."""
 
     iterations: int  # Per condition, over all blocks
     period_ns: int
@@ -55,21 +57,24 @@ class Settings:
     blocks: int
     cores: tuple[int, ...] = ()  # Cores of all conditions; empty for any core
     polling_ns: int | None = None
-    """Longest time that the clock is polled before a deadline; None: a tenth of the period, as in a run."""
+    """Longest time that the clock is polled before a deadline, ns; None: a tenth of the period, as in a
+    run."""
     idle_latency: bool = False  # Keep the cores from deep idle states during the measurement
 
     @property
     def seconds(self) -> float:
-        """Duration of all wake-ups."""
+        """Duration of the measurement, over all conditions, s."""
         return self.iterations * self.period_ns * len(self.conditions) / 1e9
 
     def share(self, block: int) -> int:
-        """Return the wake-ups of a condition in a block. A remainder is spread over the first blocks."""
+        """Return the number of wake-ups of each condition in a block. A remainder is spread over the first
+        blocks."""
         whole, rest = divmod(self.iterations, self.blocks)
         return whole + (block < rest)
 
     def scheduler(self, condition: Condition, lock_memory: bool) -> SchedulerPlan:
-        """Return the scheduling request of a condition in the form of a robot file."""
+        """Return the scheduler settings of the process that measures a condition, in the form of a robot
+        file's plan."""
         return SchedulerPlan(
             policy=condition.policy,
             priority=self.priority,
@@ -79,7 +84,8 @@ class Settings:
         )
 
     def check(self, allowed_cores: frozenset[int]) -> None:
-        """Validate the settings.
+        """Check that a measurement with these settings is possible. `allowed_cores` are the cores that the
+        process may use.
 
         Raises:
             InputError: One sentence for each value that does not allow a measurement.
@@ -162,7 +168,8 @@ def _policy(name: str) -> Policy:
 
 
 def order(conditions: Sequence[Condition], block: int) -> tuple[Condition, ...]:
-    """Return the order of the conditions in a block: rotated, and reversed after a whole round.
+    """Return the order in which a block measures the conditions: rotated from block to block, and reversed
+    after a whole round.
 
     In 2 n blocks of n conditions, each condition is in each place twice. With up to three conditions, each
     one precedes any other as often as it follows it.

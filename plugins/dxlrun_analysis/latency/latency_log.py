@@ -25,12 +25,14 @@ ROBOT = "latency"  # Takes the place of the robot's name in logs of runs
 METADATA_NAME = "latency"  # Metadata record that marks the log of a measurement
 _TOPIC = "/latency/"
 _AT_ONCE = 10_000
-"""Wake-ups that are converted to Python integers at a time; ten millions of them take over a gigabyte."""
+"""Number of wake-ups that are converted to Python integers at a time; ten millions of them take over a
+gigabyte."""
 
 
 @dataclass(slots=True)
 class WakeUp:
-    """One wake-up: deadline and actual time, ns of the monotonic clock, and its block."""
+    """Message of one wake-up: deadline and actual time, ns of the monotonic clock, and number of its
+    block."""
 
     scheduled_ns: int
     woken_ns: int
@@ -38,7 +40,7 @@ class WakeUp:
 
 
 class About(msgspec.Struct, frozen=True):
-    """Data about the measurement other than its wake-ups."""
+    """Metadata in the log of a measurement: settings, load, remarks, and processor time of each block."""
 
     settings: Settings
     load: str
@@ -50,7 +52,7 @@ class About(msgspec.Struct, frozen=True):
 def write(
     path: Path, settings: Settings, blocks: Sequence[Block], load: str, remarks: Sequence[str]
 ) -> LogSummary:
-    """Write the log of a measurement into a new or empty file.
+    """Write the log of a latency measurement into a new or empty file.
 
     Raises:
         OSError: The file cannot be opened.
@@ -69,13 +71,13 @@ def write(
 
 
 def machine() -> str:
-    """Return a description of this machine for a report."""
+    """Return a description of this machine's kernel and architecture for a report."""
     here = platform.uname()
     return f"{here.system} {here.release}, {here.version}, {here.machine}"
 
 
 def machine_of(log: LogReader) -> str:
-    """Return a description of the machine on which a log was made."""
+    """Return a description of the kernel and architecture of the machine on which a log was made."""
     kernel = log.metadata.get("kernel", {})
     system = f"{kernel.get('system', '')} {kernel.get('release', '')}".strip()
     return ", ".join(filter(None, (system, kernel.get("version"), kernel.get("machine"))))
@@ -87,7 +89,7 @@ def is_measurement(log: LogReader) -> bool:
 
 
 def measurement(log: LogReader) -> tuple[tuple[Block, ...], Result]:
-    """Return the blocks and the statistics in the log of a measurement.
+    """Return the blocks of wake-ups in the log of a measurement, and their statistics.
 
     Raises:
         LogError: The log is damaged.
@@ -109,7 +111,8 @@ def measurement(log: LogReader) -> tuple[tuple[Block, ...], Result]:
 
 
 def _rows(log: LogReader, topic: str) -> tuple[Times, NDArray[np.int64]]:
-    """Return deadlines and wake-ups of a condition, shape (wake-ups, 2), and the block of each wake-up."""
+    """Return deadline and wake-up time of each wake-up of a condition, shape (wake-ups, 2), and the block
+    of each."""
     if topic not in log.topics:  # A topic exists from its first message on, which a full disk can prevent
         return np.zeros((0, 2), np.int64), np.zeros(0, np.int64)
     found = log.columns(topic, "scheduled_ns", "woken_ns", "block")

@@ -1,4 +1,4 @@
-"""Page of a latency measurement with the thesis' three plots; needs bokeh."""
+"""HTML page of a latency measurement with the thesis' three plots; needs bokeh."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ _MOST_ROWS = 6000
 
 
 def page(result: Result, blocks: Sequence[Block], machine: str) -> str:
-    """Return the page of a measurement that has wake-ups; `machine` describes the machine."""
+    """Return the HTML page of a measurement that has wake-ups; `machine` describes the machine."""
     top = header(
         "Wake-up latency",
         machine,

@@ -1,4 +1,4 @@
-"""Statistics of wake-ups: the thesis' table, intervals over blocks, ratios of conditions block by block."""
+"""Statistics of a latency measurement: the thesis' table, intervals over blocks, ratios of conditions."""
 
 from __future__ import annotations
 
@@ -23,7 +23,7 @@ Times = NDArray[np.int64]
 
 @dataclass(frozen=True, slots=True)
 class Block:
-    """Consecutive wake-ups that one process measured."""
+    """Consecutive wake-ups of one condition that one process measured."""
 
     condition: str  # Name
     number: int
@@ -47,7 +47,7 @@ class Block:
 
 @dataclass(frozen=True, slots=True)
 class Interval:
-    """Mean of the blocks' values, with the 95 % confidence interval of Student's t."""
+    """Mean of a quantity over the blocks, with its 95 % confidence interval by Student's t."""
 
     mean: float
     low: float | None  # None with a single block
@@ -56,7 +56,7 @@ class Interval:
 
 @dataclass(frozen=True, slots=True)
 class Figures:
-    """The thesis' table for one condition; us, shares from 0 to 1."""
+    """Statistics of one condition's wake-ups, as in the thesis' table; us, shares from 0 to 1."""
 
     name: str
     label: str
@@ -74,16 +74,17 @@ class Figures:
     p999_us: float
     processor_share: float | None  # Share of one core, over completed blocks; None if there was none
     polling_us: float
-    """Polling time before each deadline, on average over the blocks; 0 without polling."""
+    """Time that the clock was polled before each deadline, on average over the blocks; 0 without polling."""
     # mean_us, median_us, p99_us of complete blocks, or of interrupted ones if none is complete.
     over_blocks: dict[str, Interval]
     ratios: dict[str, Interval]
-    """Ratios of mean_us and p99_us to those of the reference in the same block."""
+    """Ratios of this condition's mean_us and p99_us to those of the reference condition (the C program, or
+    the first) in the same block; empty for the reference."""
 
 
 @dataclass(frozen=True, slots=True)
 class Result:
-    """Result of a measurement; its fields are those of --json."""
+    """Result of a latency measurement; its fields are those of --json."""
 
     iterations: int
     period_us: float
@@ -98,7 +99,7 @@ class Result:
 def figures(
     settings: Settings, blocks: Sequence[Block], load: str = "", remarks: Sequence[str] = ()
 ) -> Result:
-    """Return the statistics of all conditions that have wake-ups."""
+    """Compute the statistics of all conditions that have wake-ups."""
     kept = [block for block in blocks if len(block.times)]
     measured = [
         condition
@@ -186,7 +187,7 @@ def _figures(
 
 
 def _over_blocks(settings: Settings, blocks: Sequence[Block]) -> dict[int, dict[str, float]]:
-    """Return the values of each block.
+    """Return mean, median and 99 % of the lateness in each block, by its number.
 
     Interrupted blocks would weigh too much and count only if none is complete.
     """
@@ -213,13 +214,14 @@ def _skipped(times: Times, period_ns: int) -> int:
 
 
 def mode_us(late_ns: NDArray[np.int64]) -> int:
-    """Return the lower edge of the fullest bin of 1 us, the smallest of equal ones."""
+    """Return the most frequent lateness: the lower edge of the fullest bin of 1 us, the smallest of equal
+    ones."""
     bins, counts = np.unique(late_ns // 1000, return_counts=True)
     return int(bins[int(np.argmax(counts))])
 
 
 def interval(values: Sequence[float]) -> Interval:
-    """Return mean and confidence interval of independently measured values (Student's t)."""
+    """Return mean and 95 % confidence interval of independently measured values (Student's t)."""
     number = len(values)
     mean = math.fsum(values) / number
     if number < 2:
@@ -230,7 +232,8 @@ def interval(values: Sequence[float]) -> Interval:
 
 
 def t_quantile(freedom: int, confidence: float = CONFIDENCE) -> float:
-    """Return t with P(|T| < t) = confidence for whole degrees of freedom."""
+    """Return the two-sided quantile of Student's t: t with P(|T| < t) = confidence, for whole degrees of
+    freedom."""
     low, high = 0.0, 1.0
     while _t_probability(high, freedom) < confidence:
         high *= 2
@@ -241,7 +244,7 @@ def t_quantile(freedom: int, confidence: float = CONFIDENCE) -> float:
 
 
 def _t_probability(t: float, freedom: int) -> float:
-    """Return P(|T| < t) (Abramowitz and Stegun, 26.7.3 and 26.7.4)."""
+    """Return P(|T| < t) of Student's t (Abramowitz and Stegun, 26.7.3 and 26.7.4)."""
     angle = math.atan(t / math.sqrt(freedom))
     sine, square = math.sin(angle), math.cos(angle) ** 2
     odd = freedom % 2

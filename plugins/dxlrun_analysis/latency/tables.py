@@ -11,7 +11,7 @@ _OVER_BLOCKS = {"mean_us": "mean", "median_us": "median", "p99_us": "99 %"}
 
 
 def parts(result: Result) -> tuple[Part, ...]:
-    """Return the terminal output."""
+    """Return the terminal output of `dxlrun latency`: its tables and remarks."""
     return (
         statistics_table(result),
         *((blocks_table(result),) if result.blocks > 1 else ()),
@@ -20,7 +20,7 @@ def parts(result: Result) -> tuple[Part, ...]:
 
 
 def line(result: Result) -> str:
-    """Return a summary in one line."""
+    """Return the result of a measurement in one line."""
     each = (
         f"{one.label} {duration(one.mean_us)} late on average, at most {duration(one.max_us)}"
         for one in result.conditions
@@ -29,14 +29,14 @@ def line(result: Result) -> str:
 
 
 def title(result: Result) -> str:
-    """Return the title: period, number of blocks and load."""
+    """Return the title of a measurement's tables: period, number of blocks and load."""
     load = f"; load: {result.load}" if result.load else "; no load"
     period = f"{result.period_us / 1e3:g} ms" if result.period_us >= 1e3 else f"{result.period_us:g} us"
     return f"Wake-up latency, period {period}, {counted(result.blocks, 'block', 'blocks')}{load}"
 
 
 def statistics_table(result: Result) -> Table:
-    """Return the statistics of all wake-ups of each condition."""
+    """Return the table with the statistics of each condition over all its wake-ups."""
     rows: tuple[tuple[str, Callable[[Figures], Value]], ...] = (
         ("wake-ups", lambda one: one.wake_ups),
         ("maximum", lambda one: duration(one.max_us)),
@@ -61,7 +61,8 @@ def statistics_table(result: Result) -> Table:
 
 
 def blocks_table(result: Result) -> Table:
-    """Return mean and 95 % interval over the blocks, and the ratios to the reference, block by block."""
+    """Return the table with mean and 95 % interval over the blocks, and the ratios to the reference, block
+    by block."""
     columns = (Column("", "name"), *(Column(one.label) for one in result.conditions))
     rows: list[tuple[Value, ...]] = [
         (words, *(_interval(one.over_blocks[name], duration) for one in result.conditions))

@@ -1,4 +1,5 @@
-"""Page of `analyze --report`: curves of a whole run in bounded size, zoomable plots by Bokeh, tables.
+"""HTML page of `dxlrun analyze --report`: zoomable plots of a whole run by Bokeh, in bounded size, and
+tables.
 
 It shows results of other packages, and computes only the data of its plots.
 """

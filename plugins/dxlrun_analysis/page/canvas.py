@@ -1,4 +1,4 @@
-"""Zoomable plots: Bokeh figures that share the time axis of the run, and their script.
+"""Plots of a page: Bokeh figures, which share the time axis of the run, and the script that draws them.
 
 Only this room imports Bokeh, because the import takes a second. The page embeds Bokeh's script and loads
 nothing; it needs only a short script of ours that starts Bokeh.
@@ -62,7 +62,7 @@ document.addEventListener("click", ({target}) => {
 
 @dataclass(frozen=True, slots=True)
 class Line:
-    """Curve in a plot."""
+    """Appearance of one curve in a plot: legend, colour, dashes and width."""
 
     curve: str  # Name of the curve in `Curves`
     name: str  # Text in the legend
@@ -72,7 +72,8 @@ class Line:
 
 
 def many_lines(curves: Curves, named: Iterable[tuple[str, str]]) -> list[Line]:
-    """Return lines for those of the named curves that exist: ten colours, then the same ones dashed.
+    """Return a line for each curve that has values, in ten colours, then the same ones dashed; `named` are
+    pairs of curve and legend.
 
     Equal curves become one line with all their names, because they would hide each other.
     """
@@ -97,12 +98,12 @@ def _alike(curves: Curves, one: str, other: str) -> bool:
 
 @dataclass(slots=True)
 class Plot:
-    """One plot with its texts."""
+    """One plot of a page: Bokeh figure, title, caption and legend."""
 
     name: str
     title: str
     label: str
-    """Description for screen readers if the plot has no title; initially the label of the vertical axis."""
+    """Description for screen readers if the plot has no title; by default the label of the vertical axis."""
     text: str  # Caption: content of the plot and results
     model: bokeh_figure
     _legend: list[Element] = field(default_factory=list)
@@ -114,13 +115,13 @@ class Plot:
         one.major_label_overrides = dict(names)
 
     def rows(self, names: Sequence[str]) -> None:
-        """Make the vertical axis one of named rows, the first at the top."""
+        """Make the vertical axis a list of named rows, the first at the top."""
         self.model.y_range = Range1d(len(names) - 0.5, -0.5)
         self.ticks("y", dict(enumerate(names)))
         self.model.ygrid.grid_line_color = None
 
     def durations(self, axis: str) -> None:
-        """Label the ticks of a logarithmic axis in us with readable units: 100 us, 1 ms."""
+        """Label the ticks of a logarithmic axis (`x` or `y`) in us with readable units: 100 us, 1 ms."""
         names = {
             us: f"{us // 10**6} s" if us >= 10**6 else f"{us // 1000} ms" if us >= 1000 else f"{us} us"
             for us in _DURATIONS
@@ -128,15 +129,17 @@ class Plot:
         self.ticks(axis, names, [part * us for us in _DURATIONS for part in (2, 5)])
 
     def reference(self, at: float, dimension: str, colour: str = MUTED) -> None:
-        """Draw a dashed line across the plot's `width` or `height`."""
+        """Draw a dashed line at a value, across the plot's `width` or `height`."""
         self.model.add_layout(Span(location=at, dimension=dimension, line_color=colour, line_dash="dashed"))
 
     def hover(self, drawn: GlyphRenderer, *tips: tuple[str, str]) -> None:
-        """Show names and values when the mouse is over a glyph."""
+        """Show a tooltip when the mouse is over a drawn element; each tip is a pair of name and Bokeh
+        format."""
         self.model.add_tools(HoverTool(renderers=[drawn], tooltips=list(tips)))
 
     def named(self, name: str, *drawn: GlyphRenderer) -> None:
-        """Add a legend entry for glyphs in the colour of the first. A click on the entry hides them."""
+        """Add a legend entry for drawn elements, in the colour of the first. A click on the entry hides
+        them."""
         for one in drawn:
             one.name = name
         glyph = drawn[0].glyph
@@ -146,11 +149,11 @@ class Plot:
 
     @property
     def place_name(self) -> str:
-        """Identifier of the element that the plot is drawn in."""
+        """Identifier of the HTML element that the plot is drawn in."""
         return f"plot-{self.name}"
 
     def place(self) -> Element:
-        """Return the legend, and the element that the plot is drawn in."""
+        """Return the HTML element with the legend, and the empty element that the plot is drawn in."""
         about = {
             "id": self.place_name,
             "class": "plot",
@@ -167,7 +170,8 @@ class Plot:
 
 @dataclass(slots=True)
 class Canvas:
-    """Plots of one page. Times are ns of the run's clock; plots show s since the first deadline."""
+    """All plots of one page, with their common time axis. Times are ns of the run's clock; plots show s
+    since the first deadline."""
 
     start_ns: int  # First deadline
     begin_ns: int
@@ -184,17 +188,18 @@ class Canvas:
         self.time = Range1d(begin - margin, end + margin, name=TIME)
 
     def seconds(self, t_ns: NDArray[np.int64]) -> Floats:
-        """Return times in s since the first deadline."""
+        """Convert times in ns of the run's clock to s since the first deadline."""
         since: Floats = (t_ns - self.start_ns) / 1e9
         return since
 
     @property
     def names(self) -> frozenset[str]:
-        """Names of the plots."""
+        """Names of the plots that were added to the page."""
         return frozenset(plot.name for plot in self._plots)
 
     def timed(self, name: str, title: str, label: str, height: int, *, log: bool = False) -> Plot:
-        """Return an empty plot over the time of the run, without a caption."""
+        """Add an empty plot over the time of the run, without a caption, to the page; with `log`, its
+        vertical axis is logarithmic."""
         plot = self.free(name, title, (_TIME_LABEL, label), height, "y" if log else "", self.time)
         for begin, end in self.pauses:
             box = BoxAnnotation(left=begin, right=end, fill_color=MUTED, fill_alpha=0.13, line_color=None)
@@ -213,7 +218,8 @@ class Canvas:
         log: str = "",
         time: Range1d | None = None,
     ) -> Plot:
-        """Return an empty plot with its own labelled axes; `log` contains the logarithmic ones of `xy`."""
+        """Add an empty plot with axis labels for x and y to the page; `log` names the logarithmic axes
+        (`x`, `y`, `xy`), `time` a shared x range."""
         model = bokeh_figure(
             name=name,
             height=height,
@@ -251,7 +257,8 @@ class Canvas:
     def curves(  # noqa: PLR0917  what is drawn, and how its axis is laid out
         self, plot: Plot, curves: Curves, lines: Sequence[Line], unit: str, least: float, scale: float = 1.0
     ) -> None:
-        """Draw the lines that have values, later ones on top, with a band from smallest to largest value.
+        """Draw curves that have values into a plot, later ones on top, with a band from smallest to largest
+        value.
 
         Args:
             plot: The plot.
@@ -292,7 +299,8 @@ class Canvas:
         plot.model.y_range = Range1d(low_end - missing, high_end + missing)
 
     def marks(self, plot: Plot, curves: Curves, lines: Sequence[Line]) -> None:
-        """Draw a row of ticks below the curves of a plot for each line that marks some rows."""
+        """Draw a row of ticks at the bottom of a plot for each line: one at each time at which its curve
+        has a value."""
         shown = [line for line in lines if line.curve in curves]
         if not shown:
             return
@@ -320,7 +328,8 @@ class Canvas:
         return source
 
     def _column(self, source: ColumnDataSource, curves: Curves, name: str, side: str, scale: float) -> str:
-        """Return the column of a curve's smallest or largest values; one column if they are equal."""
+        """Add the smallest (`low`) or largest (`high`) values of a curve to a Bokeh source, and return the
+        column's name; equal ones share a column."""
         if side == "high" and curves.only_samples(name):
             side = "low"
         column = f"{side}{curves.columns[name]}"
@@ -332,11 +341,12 @@ class Canvas:
     # Output
 
     def elements(self, plots: Iterable[Plot]) -> list[Element]:
-        """Return the elements of plots in the page, each with its title and caption."""
+        """Return the HTML elements of plots, each with its title and caption."""
         return [figure(plot.name, plot.title, plot.place(), plot.text) for plot in plots]
 
     def scripts(self) -> list[Element]:
-        """Return the end of the page: the plots as JSON, Bokeh's script, and the script that starts it."""
+        """Return the script elements at the end of the page: the plots as JSON, Bokeh's script, and the
+        script that starts it."""
         if not self._plots:
             return []
         document = Document()
@@ -354,7 +364,8 @@ class Canvas:
 
 
 def _renamed(value: object, names: dict[str, str]) -> object:
-    """Renumber the identifiers of models from 0, which makes the page reproducible.
+    """Return Bokeh's JSON with the identifiers of models renumbered from 0, which makes the page
+    reproducible.
 
     Bokeh counts identifiers over the lifetime of a process.
     """

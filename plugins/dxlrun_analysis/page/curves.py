@@ -1,4 +1,4 @@
-"""Curves of a run over time in bounded size, collected slice by slice.
+"""Curves of the cycles of a run over time, in bounded size, collected slice by slice.
 
 Each curve is an envelope of the whole run, with every sample in the windows around its worst cycles.
 """
@@ -16,7 +16,8 @@ from dxlrun_analysis.cycles.latency import LATE_BINS_US, ROUGH_NS, STEPS, cycle_
 from dxlrun_analysis.page.envelope import Envelope, Rows, Samples, Times
 
 BYTES_OF_CURVES = 7_000_000
-"""Size of all curves of cycles in a page before conversion to text: 4 bytes a number, two numbers a row."""
+"""Size of all curves of cycles in a page before conversion to text, bytes: 4 a number, two numbers per row
+and curve."""
 _FEWEST_ROWS, _MOST_ROWS = 100, 6000
 _BYTES_A_VALUE = 8  # Smallest and largest value, float32 each
 _PART_OF_WINDOWS = 2 / 3  # Share of the rows for windows; the rest are bins of the whole run
@@ -37,15 +38,15 @@ _GOAL = "goal_position"  # Name of a cycle's field and of its curves
 
 @dataclass(frozen=True, slots=True)
 class Curves:
-    """Curves over common times."""
+    """Named curves over common times, with the smallest and largest value in each row."""
 
     rows: Rows
     columns: Mapping[str, int]
-    """Column of each curve; curves without any value are omitted."""
+    """Column of each curve in `rows`, by name; curves without any value are omitted."""
 
     @classmethod
     def of(cls, rows: Rows, names: Iterable[str]) -> Curves:
-        """Return the curves that have any value; `names` has one name per column."""
+        """Name the columns of `rows`, one name per column, and omit curves without any value."""
         there: NDArray[np.bool_] = np.asarray(np.isfinite(rows.low).any(axis=0))
         return cls(rows, {name: index for index, name in enumerate(names) if there[index]})
 
@@ -67,7 +68,7 @@ class Curves:
 
 @dataclass(frozen=True, slots=True)
 class CurvesOfRun:
-    """All curves of a run, and the distribution of its wake-ups."""
+    """Curves of all quantities of the cycles of a run, and the distribution of its wake-ups."""
 
     cycles: Curves
     late_bins: NDArray[np.int64]
@@ -79,14 +80,19 @@ class CurvesOfRun:
 
 
 def joint_curve(field: str, joint: str) -> str:
-    """Return the name of a joint's curve."""
+    """Return the name of the curve of a joint's field, such as `position knee`."""
     return f"{field} {joint}"
 
 
 class CurveCollector:
-    """Accumulator of curves; `worst_ns` are deadlines around which every sample is kept."""
+    """Accumulator of the curves of a run: steps of the cycle, controllers and joints."""
 
     def __init__(self, worst_ns: Iterable[int] = ()) -> None:
+        """Create the accumulator.
+
+        Args:
+            worst_ns: Deadlines of the worst cycles, around which every sample is kept.
+        """
         self._worst_ns = tuple(worst_ns)
         self._names: tuple[str, ...] = ()
         self._envelope: Envelope | None = None
@@ -102,7 +108,7 @@ class CurveCollector:
         """Position goals of the preceding cycle, shape (joints,), or None."""
 
     def take(self, log: Log) -> None:
-        """Add the next slice."""
+        """Add the cycles of the next slice of the log."""
         if self._envelope is None:
             self._begin(log)
         if len(log.cycles):
@@ -112,7 +118,7 @@ class CurveCollector:
                 self._digest()
 
     def finish(self) -> CurvesOfRun:
-        """Return the curves; for a log without slices, no curves."""
+        """Return the curves of the whole run; for a log without cycles, no curves."""
         self._digest()
         rows = Envelope(0, 2, 1).rows()
         if self._envelope is not None and self._log is not None:
@@ -168,8 +174,8 @@ class CurveCollector:
 
 
 def windows(worst_ns: Iterable[int], most: int, period_ns: int) -> list[tuple[int, int]]:
-    """Return disjoint ascending windows around cycles: a second each, or shorter to hold `most` cycles at
-    most."""
+    """Return disjoint ascending windows of time around the deadlines of the worst cycles: a second each,
+    or shorter to hold `most` cycles together."""
     worst = list(worst_ns)
     if not worst:
         return []
@@ -185,7 +191,8 @@ def windows(worst_ns: Iterable[int], most: int, period_ns: int) -> list[tuple[in
 
 
 def _values(log: Log, goals: NDArray[np.float64]) -> Samples:
-    """Return the values of all curves, shape (cycles, curves), in the order of their names; times in us.
+    """Return the values of all curves in each cycle, shape (cycles, curves), in the order of their names;
+    durations in us.
 
     Args:
         log: Log with the cycles.

@@ -1,4 +1,4 @@
-"""Envelope: curves of a run in bounded memory, as the smallest and the largest value in each time bin."""
+"""Envelope: curves of a run in bounded memory, by the smallest and the largest value in each time bin."""
 
 from __future__ import annotations
 
@@ -13,9 +13,9 @@ Times = NDArray[np.int64]  # Shape (rows,), ns
 
 @dataclass(frozen=True, slots=True)
 class Rows:
-    """Curves over common times.
+    """Smallest and largest value of several curves at common times, a row for each time bin.
 
-    All samples of a row are between `low` and `high`; equal bounds are one sample.
+    Equal values are a single sample.
     """
 
     t_ns: Times
@@ -23,7 +23,7 @@ class Rows:
     high: Samples
 
     def and_samples(self, times: Times, values: Samples, windows: list[tuple[int, int]]) -> Rows:
-        """Return rows in which all samples replace the bins within windows.
+        """Return a copy in which single samples replace the time bins within windows.
 
         A bin that extends beyond the end of a window is drawn from that end on.
 
@@ -44,7 +44,8 @@ class Rows:
         return Rows(t_ns[order], low, high)
 
     def with_gaps(self, longest_ns: int) -> Rows:
-        """Return rows with a row of NaN in each longer gap, so that no line crosses it."""
+        """Return a copy with a row of NaN in each gap longer than `longest_ns`, so that no line is drawn
+        across it."""
         before = np.flatnonzero(np.diff(self.t_ns) > longest_ns) + 1
         if not len(before):
             return self
@@ -57,7 +58,8 @@ class Rows:
 
 
 class Envelope:
-    """Accumulator of samples of several curves in at most `most` bins.
+    """Accumulator of samples of several curves: keeps the smallest and largest value in each of a bounded
+    number of time bins.
 
     When the bins do not suffice, pairs of bins are merged, which doubles their width.
     """
@@ -98,7 +100,7 @@ class Envelope:
 
     @property
     def apart_ns(self) -> int:
-        """Largest distance of rows within continuous samples, ns; a longer interval has no samples."""
+        """Greatest time between two rows that have no gap in the samples between them, ns."""
         return 2 * self._width_ns
 
     def rows(self) -> Rows:

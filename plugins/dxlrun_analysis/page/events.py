@@ -1,4 +1,4 @@
-"""Events of a run: selection for a page, and their plot over time."""
+"""Plot of the events of a run over time, and selection of the events that the page shows."""
 
 from __future__ import annotations
 
@@ -21,30 +21,31 @@ _ROW = 17  # Pixels per row
 
 
 class EventCollector:
-    """Accumulator of the first events of each grade."""
+    """Accumulator of the first 1500 events each of information, warnings and errors."""
 
     def __init__(self) -> None:
         self._kept: tuple[list[Event], ...] = tuple([] for _ in _GRADES)
 
     def take(self, log: Log) -> None:
-        """Add the events of the next slice."""
+        """Add the events in the next slice of the log."""
         for event in log.events:
             of_grade = self._kept[grade(event.severity)]
             if len(of_grade) < MOST_EVENTS:
                 of_grade.append(event)
 
     def finish(self) -> tuple[Event, ...]:
-        """Return the events in order of time."""
+        """Return the kept events in order of time."""
         return tuple(sorted((one for kept in self._kept for one in kept), key=lambda event: event.t_ns))
 
 
 def grade(severity: int) -> int:
-    """Return 0 for information, 1 for a warning, 2 for an error."""
+    """Return the grade of an event's severity: 0 for information, 1 for a warning, 2 for an error."""
     return (severity >= Severity.WARNING) + (severity >= Severity.ERROR)
 
 
 def events_plot(canvas: Canvas, events: tuple[Event, ...], number: int) -> Plot:
-    """Return a plot of events over the run, one row per kind; `number` is the count before selection."""
+    """Return the plot of events over the run, one row per kind; `number` is the count of all events, also
+    those not drawn."""
     kinds = list(dict.fromkeys(event.name for event in events))
     plot = canvas.timed("events-timeline", "Events over the run", "", 90 + _ROW * len(kinds))
     times = canvas.seconds(np.array([event.t_ns for event in events], np.int64))

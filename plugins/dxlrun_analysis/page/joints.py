@@ -9,7 +9,8 @@ from dxlrun_analysis.page.canvas import BLUE, ERROR, INK, ORANGE, PURPLE, Canvas
 from dxlrun_analysis.page.curves import Curves, joint_curve
 
 _LEAST, _LEAST_SPEED, _LEAST_ERROR, _LEAST_EFFORT = 5.0, 25.0, 1.0, 0.1
-"""Least span of an axis: deg or mm, deg/s or mm/s, effort."""
+"""Least span of the vertical axis of a joint's plots: position in deg or mm, speed in deg/s or mm/s,
+error, effort."""
 _ALL = (
     ("temperature", "Temperature of the servos", "temperature, deg C", "deg C", 4.0),
     ("voltage", "Voltage at the servos", "voltage, V", "V", 1.0),
@@ -18,7 +19,7 @@ _ALL = (
 
 
 def joint_plots(canvas: Canvas, cycles: Curves, row: int, joint: JointTracking) -> list[Plot]:
-    """Return the plots of one joint that have content."""
+    """Return the plots of the joint in row `row` that have content: position, error, velocity, effort."""
     unit, scale = joint.unit.shown, joint.unit.factor
     position = canvas.timed(f"joint-{row}", joint.name, f"position, {unit}", 210)
     canvas.curves(position, cycles, _lines(joint.name, "position"), unit, _LEAST, scale)
@@ -49,7 +50,8 @@ def joint_plots(canvas: Canvas, cycles: Curves, row: int, joint: JointTracking) 
 
 
 def _lines(joint: str, quantity: str) -> list[Line]:
-    """Return a broad curve, a thinner one and a dashed one, which stay visible where they coincide."""
+    """Return the lines of one quantity of a joint: read (broad), sent (thinner), desired (dashed). They
+    stay visible where they coincide."""
     return [
         Line(joint_curve(quantity, joint), "read", BLUE, width=4.0),
         Line(joint_curve(f"goal_{quantity}", joint), "sent", ORANGE, width=1.8),
@@ -58,7 +60,8 @@ def _lines(joint: str, quantity: str) -> list[Line]:
 
 
 def _followed(joint: JointTracking) -> str:
-    """Return error, lag, settling and error at rest in words, as far as they are known."""
+    """Return a joint's tracking error, lag, settling time and error at rest as a caption, as far as they
+    are known."""
     if joint.rms_rad is None or joint.worst_rad is None:
         return "No goal was sent, or no position was read."
     unit, scale = joint.unit.shown, joint.unit.factor
@@ -76,7 +79,8 @@ def _followed(joint: JointTracking) -> str:
 
 
 def state_plots(canvas: Canvas, cycles: Curves, joints: Sequence[str]) -> list[Plot]:
-    """Return plots of temperature, voltage and load of all joints, as far as they were read."""
+    """Return plots of temperature, voltage and load of all joints, without quantities that were never
+    read."""
     plots = []
     for field, title, label, unit, least in _ALL:
         lines = many_lines(cycles, ((joint_curve(field, joint), joint) for joint in joints))

@@ -1,4 +1,4 @@
-"""Plots of the loop's time: wake-up latency and its distribution, the steps of a cycle, controllers."""
+"""Plots of the loop's time: wake-up latency, steps of a cycle, updates of the controllers."""
 
 from __future__ import annotations
 
@@ -27,7 +27,7 @@ _COLOURS = {"read": BLUE, "update": GREEN, "write": ORANGE, "cycle": INK}
 
 
 def latency_plots(canvas: Canvas, run: CurvesOfRun, latency: Latency) -> tuple[Plot, ...]:
-    """Return the plots of the wake-ups of a run."""
+    """Return the three plots of a run's wake-up latency."""
     summary = (
         f"{run.late_bins.sum()} wake-ups; median {latency.median_us:.1f} us, 99 % {latency.p99_us:.1f} us, "
         f"99.9 % {latency.p999_us:.1f} us, mean {latency.mean_us:.2f} us, standard deviation "
@@ -38,7 +38,7 @@ def latency_plots(canvas: Canvas, run: CurvesOfRun, latency: Latency) -> tuple[P
 
 
 def steps_plot(canvas: Canvas, cycles: Curves) -> Plot:
-    """Return the duration of each step over the run, with the period as a line."""
+    """Return the plot of the duration of each step of the cycle over the run, with the period as a line."""
     plot = canvas.timed("steps", "Duration of the steps", "duration", 260, log=True)
     lines = [
         Line(name, name, _COLOURS[name], width=3.5 if name == "cycle" else 1.2)
@@ -63,7 +63,8 @@ def steps_plot(canvas: Canvas, cycles: Curves) -> Plot:
 
 
 def controllers_plot(canvas: Canvas, cycles: Curves, controllers: Sequence[Duration]) -> Plot | None:
-    """Return the duration of each controller's update; None if none took any time."""
+    """Return the plot of the duration of each controller's update over the run; None if no update took any
+    time."""
     lines = many_lines(cycles, ((f"controller {one.name}", one.name) for one in controllers))
     if not lines:
         return None
@@ -78,7 +79,7 @@ def controllers_plot(canvas: Canvas, cycles: Curves, controllers: Sequence[Durat
 
 
 def typical_plot(canvas: Canvas, steps: Sequence[Duration], period_us: float) -> Plot:
-    """Return the steps of a typical cycle as stacked bars, compared with the period."""
+    """Return the plot of a typical cycle: its steps as stacked bars, compared with the period."""
     bars = (
         ("median of each step", [step.median_us for step in steps[:-1]]),
         ("99 % of each step", [step.p99_us for step in steps[:-1]]),

@@ -1,4 +1,4 @@
-"""Machine plots: activity, frequency and temperature of its cores over the run."""
+"""Plots of the machine: activity, frequency and temperature of its cores over the run."""
 
 from __future__ import annotations
 
@@ -35,7 +35,8 @@ Numbers = NDArray[np.float64]
 
 
 class MachineCollector:
-    """Accumulator of the samples of `/machine`; `busy 0` is a curve of core 0."""
+    """Accumulator of the samples of topic /machine as curves: `busy 0` for core 0, `waiting` for the whole
+    machine."""
 
     def __init__(self) -> None:
         self._cores = 0
@@ -43,7 +44,7 @@ class MachineCollector:
         self._loop: dict[int, int] = {}  # Number of samples with the loop on each core
 
     def take(self, log: Log) -> None:
-        """Add the samples of the next slice.
+        """Add the machine samples in the next slice of the log.
 
         Raises:
             LogError: A sample cannot be read.
@@ -54,7 +55,8 @@ class MachineCollector:
             self._add(message)
 
     def finish(self) -> tuple[Curves, tuple[int, ...]]:
-        """Return the curves, and the cores to draw: those where the loop ran first, then the busiest."""
+        """Return the curves, and the numbers of at most ten cores to draw: those where the loop ran first,
+        then the busiest."""
         if self._envelope is None:
             return Curves.of(Envelope(0, 2, 1).rows(), ()), ()
         names = (*(f"{kind} {core}" for kind in _OF_A_CORE for core in range(self._cores)), *_OF_ALL)
@@ -87,7 +89,7 @@ class MachineCollector:
 
 
 def _of(cores: int, values: Numbers) -> Numbers:
-    """Return a number for each core; NaN for a core that went offline.
+    """Return an array with a value for each of `cores` cores; NaN for a core that went offline.
 
     Cores that were added later are ignored.
     """
@@ -97,7 +99,7 @@ def _of(cores: int, values: Numbers) -> Numbers:
 
 
 def machine_plots(canvas: Canvas, machine: Curves, cores: Iterable[int]) -> list[Plot]:
-    """Return the plots of the machine that have content."""
+    """Return the plots of the machine that have content; `cores` are those to draw."""
     plots = []
     if "waiting" in machine:
         plot = canvas.timed("machine-waiting", "The loop waited for a core", "ms in each second", 150)

@@ -1,4 +1,4 @@
-"""Report as one page: HTML with zoomable plots, style and numbers inside; it loads nothing."""
+"""HTML page of the report on a log, with plots, style and numbers inside; it loads nothing from a network."""
 
 from __future__ import annotations
 
@@ -38,11 +38,11 @@ _PLOTS = {
     "all-voltage": "supply power_lost",
     "events-timeline": "servo_error errors_logged another_host",
 }
-"""Plots of the page with the codes of the findings that they show."""
+"""Plots of the page to which findings link: name, and codes of the findings that the plot shows."""
 
 
 def analyzed_page(reader: LogReader | Log, *watching: Callable[[Log], None]) -> tuple[Report, str]:
-    """Analyze a log, and also return its page; needs bokeh.
+    """Analyze a log; return the report and its HTML page. `watching` also receive each slice. Needs bokeh.
 
     Raises:
         LogError: As in `analyze`.
@@ -53,7 +53,7 @@ def analyzed_page(reader: LogReader | Log, *watching: Callable[[Log], None]) -> 
 
 
 def page(reader: LogReader | Log, report: Report, replies: Curves) -> str:
-    """Return the page of a log and its report: well-formed, self-contained and reproducible to the byte.
+    """Return the HTML page of a log and its report: well-formed, self-contained and reproducible to the byte.
 
     This reads the cycles of the log once more, slice by slice.
 
@@ -76,7 +76,7 @@ def page(reader: LogReader | Log, report: Report, replies: Curves) -> str:
 
 
 class _Run(NamedTuple):
-    """Content of a log that the page shows."""
+    """Data of one log for the page: curves, events, and the canvas for its plots."""
 
     log: Log  # Without cycles, with the events that the page can name
     curves: CurvesOfRun
@@ -126,12 +126,12 @@ def _header(report: Report, when: str, plots: Collection[str]) -> Element:
 
 
 def _plot_of(code: str) -> str:
-    """Return the name of the plot that shows findings of a code, or an empty string."""
+    """Return the name of the plot that shows findings with this code, or an empty string."""
     return next((plot for plot, codes in _PLOTS.items() if code in codes.split()), "")
 
 
 def _key_numbers(report: Report) -> list[tuple[str, str]]:
-    """Return the numbers that a reader compares between runs."""
+    """Return the numbers below the header, with names, that a reader compares between runs."""
     account, late = report.totals.periods, report.totals.latency
     numbers = [
         ("rate", account.rates),
@@ -149,7 +149,7 @@ def _key_numbers(report: Report) -> list[tuple[str, str]]:
 
 
 def _sections(run: _Run, report: Report) -> list[Element]:
-    """Return the sections in the order of the page."""
+    """Return the sections of the page, in their order, as HTML elements."""
     canvas, totals = run.canvas, report.totals
 
     def shown(section: str) -> list[Element]:
@@ -237,7 +237,7 @@ def _events(run: _Run, report: Report, table: list[Element]) -> list[Element]:
 
 
 def _each_event(run: _Run, number: int) -> list[Element]:
-    """Return a table of single events; of a long list only the first warnings and errors."""
+    """Return the table of single events; of more than a hundred, only the first warnings and errors."""
     chosen, title = run.log.events, "Each event"
     if number > _MOST_EVENTS:
         severe = [event for event in chosen if event.severity >= Severity.WARNING]

@@ -1,4 +1,4 @@
-"""Reply times and lost replies of each servo over a run, collected slice by slice."""
+"""Curves of the reply times and lost replies of each servo over a run, collected slice by slice."""
 
 from __future__ import annotations
 
@@ -20,16 +20,17 @@ _BIN_NS = 1_000_000  # Initial width of a bin
 
 
 class ReplyCollector:
-    """Accumulator of exchanges. Its curves are `reply BUS ID`, us, and `lost BUS ID`, 1 for a lost reply."""
+    """Accumulator of replies as curves: `reply BUS ID` is a reply time in us, `lost BUS ID` is 1 for a
+    lost reply."""
 
     def __init__(self) -> None:
         self._columns = np.zeros(0, np.int64)
-        """Column of each servo by bus and ID; -1: not in the plan."""
+        """Column of the curves of each servo, by bus and ID; -1: not in the plan."""
         self._names: tuple[str, ...] = ()
         self._envelope = Envelope(0, 2, 1)
 
     def take(self, exchanges: Exchanges) -> None:
-        """Add the next exchanges."""
+        """Add the replies of the next exchanges."""
         if not len(self._columns):
             self._begin(exchanges.buses)
         count, due = len(self._names), exchanges.due
@@ -60,11 +61,12 @@ class ReplyCollector:
         self._envelope = Envelope(2 * len(servos), rows_of_replies(len(servos)), _BIN_NS)
 
     def finish(self) -> Curves:
-        """Return the curves of all servos of the log's plan."""
+        """Return the curves of all servos and devices of the log's plan."""
         names = tuple(f"{kind} {name}" for kind in ("reply", "lost") for name in self._names)
         return Curves.of(self._envelope.rows(), names)
 
 
 def rows_of_replies(servos: int) -> int:
-    """Return the number of bins that the curves of some servos may have."""
+    """Return the number of time bins that the reply curves of this many servos may have, for a page of
+    bounded size."""
     return min(max(BYTES_OF_REPLIES // (2 * _BYTES_A_VALUE * max(servos, 1)), _FEWEST_ROWS), _MOST_ROWS)

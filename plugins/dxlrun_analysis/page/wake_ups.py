@@ -23,7 +23,7 @@ _SHARES = (1e-6, 1e-5, 1e-4, 1e-3, 0.01, 0.1, 0.5, 0.9, 0.99, 0.999, 0.9999, 0.9
 
 
 class WakeUps(NamedTuple):
-    """Series of wake-ups with one line."""
+    """Wake-ups of a run or of one measured condition: their line in the plots, and their distribution."""
 
     line: Line  # Line of their lateness in us
     bins: NDArray[np.int64]  # Output of `late_bins`
@@ -32,7 +32,8 @@ class WakeUps(NamedTuple):
 def wake_up_plots(
     canvas: Canvas, curves: Curves, series: Sequence[WakeUps], summary: str
 ) -> tuple[Plot, ...]:
-    """Return the three plots."""
+    """Return the plots of wake-up latency: over time, as a histogram, and cumulative. `summary` is the
+    caption of the first."""
     lines = [one.line for one in series]
     return _lateness(canvas, curves, lines, summary), _histogram(canvas, series), _cumulative(canvas, series)
 

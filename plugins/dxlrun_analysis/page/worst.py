@@ -1,4 +1,4 @@
-"""Worst cycles as packet timelines: activity of loop, servos and wire, with the planned times."""
+"""Plots of the worst cycles: timelines of loop and packets, with the planned times of replies."""
 
 from __future__ import annotations
 
@@ -27,7 +27,7 @@ _KINDS = (
 
 
 def worst_plots(canvas: Canvas, worst: Sequence[WorstCycle]) -> list[Plot]:
-    """Return a timeline of each of the worst cycles, the worst first."""
+    """Return the timeline plots of the five worst cycles, the worst first."""
     return [_timeline(canvas, number, one) for number, one in enumerate(worst[:MOST_CYCLES])]
 
 
@@ -60,7 +60,7 @@ def _name(bus: str, servo: int, joint: str) -> str:
 
 
 def _loop(plot: Plot, one: WorstCycle, scale: float, unit: str) -> None:
-    """Draw the steps of the loop in the top row."""
+    """Draw the steps of the loop as bars in the top row of a timeline."""
     steps = (
         ("late wake-up", 0.0, one.woken_us, WARNING),
         ("read", one.woken_us, one.read_us, BLUE),
@@ -80,7 +80,8 @@ def _loop(plot: Plot, one: WorstCycle, scale: float, unit: str) -> None:
 def _packets(
     plot: Plot, packets: Sequence[TimelinePacket], rows: Sequence[int], scale: float, unit: str
 ) -> None:
-    """Draw packets in the rows of their servos: a bar with a tick for the last byte, and the planned time."""
+    """Draw packets into a timeline, in the rows of their servos: a bar with a tick at the last byte, and
+    the planned time."""
     for kind, name, colour in _KINDS:
         mine = [(packet, row) for packet, row in zip(packets, rows, strict=True) if packet.kind == kind]
         if not mine:

@@ -1,4 +1,4 @@
-"""Parts of the report about the course of a run: events, client requests, messages of controllers."""
+"""Parts of the report about the course of a run: events, client requests, pauses, messages of controllers."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ _MOST_ACTS = 100
 
 
 class EventCount(msgspec.Struct, frozen=True):
-    """Number of events of one kind in the log."""
+    """Number of events with one name and severity in the log, and the first of them."""
 
     name: str
     severity: int
@@ -26,7 +26,7 @@ class EventCount(msgspec.Struct, frozen=True):
 
 
 class TopicCount(msgspec.Struct, frozen=True):
-    """Number of messages of one topic of a controller in the log."""
+    """Number and rate of the messages that a controller published on one topic in the log."""
 
     name: str
     type: str
@@ -35,21 +35,22 @@ class TopicCount(msgspec.Struct, frozen=True):
 
 
 class TopicCounts:
-    """Counter of the messages of each topic."""
+    """Counter of the messages on each topic of controllers, fed with the log slice by slice."""
 
     def __init__(self) -> None:
         self._found: dict[str, tuple[str, int, int, int]] = {}
-        """Type, number of messages, and times of the first and the last; in order of the first message."""
+        """Type, number of messages, and times of the first and the last (ns), by topic; in order of the
+        first message."""
 
     def take(self, log: Log) -> None:
-        """Count the messages of the next slice."""
+        """Count the messages in the next slice of the log."""
         for one in log.topics.values():
             if one.data:
                 _, count, first_ns, _ = self._found.get(one.name, ("", 0, int(one.t_ns[0]), 0))
                 self._found[one.name] = one.type.name, count + len(one.data), first_ns, int(one.t_ns[-1])
 
     def finish(self) -> tuple[TopicCount, ...]:
-        """Return the topics, in the order of their first messages."""
+        """Return the counted topics, in the order of their first messages."""
         return tuple(
             TopicCount(name, kind, count, (count - 1) * 1e9 / (last - first) if last > first else None)
             for name, (kind, count, first, last) in self._found.items()
@@ -57,7 +58,7 @@ class TopicCounts:
 
 
 def _count_events(events: Sequence[EventGroup]) -> tuple[EventCount, ...]:
-    """Return the events by kind, the most severe first."""
+    """Count events by name and severity, the most severe first."""
     counts: Counter[tuple[str, int]] = Counter()
     first: dict[tuple[str, int], EventGroup] = {}
     for group in events:
@@ -81,7 +82,8 @@ def tone_of(severity: int) -> Tone:
 
 
 def _once(text: str) -> str:
-    """Return `source: text` for a cell, without repeating the source; of a traceback, only its last line."""
+    """Return the text `source: text` of an event for a table cell, without a repeated source; of several
+    lines, only the last."""
     source, _, rest = text.partition(": ")
     line = rest.strip().splitlines()[-1].strip() if rest.strip() else ""
     return line if line.startswith(source) else f"{source}: {line}"

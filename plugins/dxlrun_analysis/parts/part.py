@@ -1,4 +1,4 @@
-"""Part: numbers of a log under one name of the report, and their table."""
+"""Part of the report: numbers of a log under one key of `--json`, and the table that shows them."""
 
 from __future__ import annotations
 
@@ -32,7 +32,7 @@ class Report:
 
 @dataclass(frozen=True, slots=True)
 class ReportPart(Generic[T]):
-    """One part of the report."""
+    """One part of the report of `dxlrun analyze`: functions that return its numbers and its table."""
 
     name: str  # Key of `--json`, and name of its table
     numbers: Callable[[Report], T]
@@ -44,15 +44,16 @@ class ReportPart(Generic[T]):
     late: int = 0  # In a terminal, tables with a higher number come later
 
     def of(self, report: Report) -> T:
-        """Return the numbers of this part."""
+        """Return the numbers of this part from a finished report."""
         return cast("T", report.numbers[self.name])
 
     def table_of(self, report: Report) -> Table | None:
-        """Return the table of this part, or None without a table or rows."""
+        """Return the table of this part for a report, or None without a table or rows."""
         found = self.table and self.table(report, self.of(report))
         return found if found and found.rows else None
 
 
 def listing(title: str, columns: Columns[T]) -> Callable[[Report, Sequence[T]], Table]:
-    """Return a function that makes a table with a row for each item."""
+    """Return a function for `ReportPart.table` that makes a table with a row for each item of the part's
+    numbers."""
     return lambda _, things: Table.listing(title, columns, things)

@@ -13,7 +13,8 @@ from dxlrun_analysis.servos.traffic import BusTraffic, ServoTraffic
 
 
 def _error(name: str) -> Callable[[JointTracking], Value]:
-    """Return a function that formats an error: deg, or value with unit for a linear joint."""
+    """Return a function that formats one error of a joint (the field `name`) for a table: in deg, or with
+    unit for a linear joint."""
 
     def error(joint: JointTracking) -> Value:
         value = getattr(joint, name)

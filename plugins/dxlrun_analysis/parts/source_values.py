@@ -1,4 +1,5 @@
-"""Source values: minimum, mean and maximum of each state of a device, sensor or controller over a run."""
+"""Part of the report: minimum, mean and maximum of each state of a device, sensor or controller over a
+run."""
 
 from __future__ import annotations
 
@@ -14,7 +15,8 @@ _DIGITS = 4
 
 
 class SourceValues(msgspec.Struct, frozen=True):
-    """One state of a source over a run, SI units; None if it was never valid."""
+    """Minimum, mean and maximum of one state of a device, sensor or controller over a run, SI units; None
+    if it was never valid."""
 
     name: str  # `imu/angular_velocity.x`
     unit: str  # Empty if the state has no unit, or the log does not record it
@@ -25,7 +27,7 @@ class SourceValues(msgspec.Struct, frozen=True):
 
 
 class SourceHistory:
-    """Accumulator of the states of sources."""
+    """Accumulator of minimum, mean and maximum of the states of devices, sensors and controllers."""
 
     def __init__(self) -> None:
         self._names: tuple[str, ...] = ()
@@ -36,7 +38,7 @@ class SourceHistory:
         self._greatest: Floats = np.zeros(0)
 
     def take(self, log: Log) -> None:
-        """Add the cycles of the next slice."""
+        """Add the source values in the cycles of the next slice of the log."""
         layout = log.header.layout
         if not len(log.cycles) or not layout.source_states:
             return
@@ -55,7 +57,7 @@ class SourceHistory:
         self._greatest = np.fmax(self._greatest, np.max(values, axis=0, where=known, initial=-np.inf))
 
     def finish(self) -> tuple[SourceValues, ...]:
-        """Return the states in the order of the cycle's record."""
+        """Return the values of all states, in the order of the cycle's record."""
         rows = zip(self._names, self._counts.tolist(), self._sums, self._least, self._greatest, strict=True)
         return tuple(
             SourceValues(

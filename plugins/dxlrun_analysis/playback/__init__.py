@@ -1,4 +1,4 @@
-"""Recorded motions, read from logs, foreign recordings and ROS 2 bags, and written as motion files.
+"""Recorded motions: read from logs, foreign recordings and ROS 2 bags, and converted to motion files.
 
-`dxlrun_lab` runs robots with them.
+`dxlrun_lab` plays them on robots.
 """

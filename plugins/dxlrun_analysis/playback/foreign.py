@@ -1,4 +1,4 @@
-"""Foreign recordings: JointState and JointTrajectory messages of MCAP files and ROS 2 bags.
+"""Reader of foreign recordings: JointState and JointTrajectory messages in MCAP files and ROS 2 bags.
 
 A bag is a directory with metadata.yaml and files of one of rosbag2's two storages, MCAP or sqlite3. Messages
 are CDR. The time of a JointState is that of its header, or the recording time if the header has 0. A
@@ -26,7 +26,7 @@ from dxlrun_analysis.playback.recorded_motion import Floats, Series, What
 
 
 class JointTrajectory(msgspec.Struct):
-    """trajectory_msgs/msg/JointTrajectory."""
+    """Fields of the ROS 2 message trajectory_msgs/msg/JointTrajectory."""
 
     ros_type: ClassVar[str] = "trajectory_msgs/msg/JointTrajectory"
     header: Header
@@ -47,7 +47,7 @@ _CDR = b"\x00\x01"  # CDR, little-endian; the next two bytes are the number of p
 
 
 class _Found(NamedTuple):
-    """Message with joint positions."""
+    """JointState or JointTrajectory message, still as bytes."""
 
     topic: str
     type: str
@@ -56,7 +56,7 @@ class _Found(NamedTuple):
 
 
 class _Recording(msgspec.Struct, frozen=True):
-    """Content of a foreign recording."""
+    """Content of a foreign recording: messages with joint positions, and all topics."""
 
     path: Path
     messages: list[_Found]
@@ -65,7 +65,8 @@ class _Recording(msgspec.Struct, frozen=True):
 
 
 class _Moments(NamedTuple):
-    """Positions in one message."""
+    """Positions and their times from one message: one moment for a JointState, all points for a
+    JointTrajectory."""
 
     topic: str
     what: What
@@ -95,7 +96,13 @@ def is_foreign(path: Path) -> bool:
 def foreign_series(
     path: Path, what: What | None, topic: str | None
 ) -> tuple[dict[str, Series], tuple[str, ...]]:
-    """Return the joints of a foreign recording, and a sentence for each problem of reading.
+    """Return the positions over time of each joint in a foreign recording, and a sentence for each problem of
+    reading.
+
+    Args:
+        path: The recording.
+        what: Goals or states; None: states if it has any.
+        topic: Topic to read; None: all.
 
     Raises:
         InputError: The recording has no joints, or a joint is in several topics and none was chosen.
@@ -190,7 +197,8 @@ def _series(path: Path, moments: Sequence[_Moments]) -> dict[str, Series]:
 
 
 def _end_before(times: list[Floats], positions: list[Floats], start_s: float) -> None:
-    """Truncate the trajectories so far where another one begins, and add the position reached by then."""
+    """Truncate a joint's trajectory so far at the start of the next one, and add the position reached by
+    then."""
     if not times:
         return
     time, position = np.concatenate(times), np.concatenate(positions)
@@ -206,7 +214,7 @@ def _end_before(times: list[Floats], positions: list[Floats], start_s: float) ->
 
 
 def _files(path: Path) -> list[Path]:
-    """Return the files of a recording, in order of time.
+    """Return the files with messages of a recording, in order of time.
 
     Raises:
         InputError: The directory is not a ROS 2 bag.
@@ -227,7 +235,7 @@ def _files(path: Path) -> list[Path]:
 
 
 def _read(file: Path, recording: _Recording) -> None:
-    """Add the messages of a file.
+    """Add the messages of one MCAP or sqlite3 file to a recording.
 
     Raises:
         InputError: The file has an unknown format.
@@ -255,7 +263,8 @@ _ZSTD = b"\x28\xb5\x2f\xfd"
 
 
 def _read_sqlite(file: Path, recording: _Recording) -> None:
-    """Add the messages of a bag file of rosbag2's sqlite3 storage (rosbag2_storage_sqlite3, its schema)."""
+    """Add the messages of one file of rosbag2's sqlite3 storage (rosbag2_storage_sqlite3, its schema) to a
+    recording."""
     try:
         with closing(
             sqlite3.connect(f"{file.absolute().as_uri()}?mode=ro&immutable=1", uri=True)

@@ -1,4 +1,4 @@
-"""Motion file of a recorded motion: points for the controllers that moved its joints, or for another one."""
+"""Conversion of a recorded motion to a motion file, with points for the controllers that move its joints."""
 
 from __future__ import annotations
 
@@ -23,14 +23,14 @@ _STEP_S = 0.02  # Between points of a controller that accepts single positions
 
 
 class MotionFile(msgspec.Struct, frozen=True):
-    """Text of a motion file, with the number of points by controller."""
+    """Text of a motion file, and the number of points in it for each controller."""
 
     text: str
     points: Mapping[str, int]  # By controller
 
 
 class _Part(msgspec.Struct, frozen=True):
-    """Share of a motion for one controller."""
+    """Joints of a recorded motion that one controller plays, and the form of points that it accepts."""
 
     controller: str
     joints: tuple[str, ...]
@@ -48,7 +48,7 @@ def motion_file(
     plans: Sequence[ControllerPlan] | None = None,
     speeds: Mapping[str, float] | None = None,
 ) -> MotionFile:
-    """Return the motion file of a recorded motion.
+    """Convert a recorded motion to the text of a motion file.
 
     It has points for the controllers that moved the joints in the log, for `controller`, or for the active
     ones of `plans`.
@@ -93,7 +93,8 @@ def _path_of(part: _Part, motion: RecordedMotion, allowed: Floats) -> SplinePath
 
 
 def _closing_speed(joint: str, unit: JointUnit, speeds: Mapping[str, float]) -> float:
-    """Return the least speed to send with a position. A slower servo would not arrive within the step."""
+    """Return the least speed to send to a joint with a position, rad/s or m/s. A slower servo would not
+    arrive within the step."""
     speed = CLOSING_SPEED * TURN_SIZES[unit]
     return min(speed, speeds.get(joint, speed))
 
@@ -131,7 +132,8 @@ def _targets(
 
 
 def player_of(joint: str, plans: Sequence[ControllerPlan]) -> str | None:
-    """Return the controller for motions of a joint, or None: an active one, preferably for trajectories."""
+    """Return the name of an active controller that can play motions of a joint, preferably one that
+    accepts trajectories; None if there is none."""
     part = _part_of(joint, plans)
     return None if part is None else part.controller
 
@@ -146,7 +148,7 @@ def _plans_of(motion: RecordedMotion) -> Sequence[ControllerPlan]:
 
 
 def _logged_loop(motion: RecordedMotion) -> LoopPlan:
-    """Return the loop's plan in a log of dxlrun.
+    """Return the loop's plan from the log that a motion was read from.
 
     Raises:
         LogError: The plan cannot be read.
@@ -158,7 +160,8 @@ def _logged_loop(motion: RecordedMotion) -> LoopPlan:
 
 
 def _parts(motion: RecordedMotion, plans: Sequence[ControllerPlan] | None) -> list[_Part]:
-    """Return a part for each controller that moved some of the joints, by the plan of the log."""
+    """Assign each joint of the motion to an active controller of `plans`, by default of the log; return a
+    part for each controller."""
     plans = _plans_of(motion) if plans is None else plans
     parts: dict[str, _Part] = {}
     missing = []
@@ -191,7 +194,8 @@ def _parts(motion: RecordedMotion, plans: Sequence[ControllerPlan] | None) -> li
 
 
 def _part_of(joint: str, plans: Sequence[ControllerPlan]) -> _Part | None:
-    """Return the part of one joint, for a controller that accepts trajectories if there is one."""
+    """Return a part with one joint and a controller that can play it, preferably one that accepts
+    trajectories; None if there is none."""
     offers = load_plugins().controllers
     found = None
     for plan in plans:

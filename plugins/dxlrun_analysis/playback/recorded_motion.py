@@ -1,4 +1,7 @@
-"""Recorded motion: joint positions or goals over time. Input errors are reported all at once."""
+"""Recorded motion: positions or goals of several joints over time, cut and renamed by the user's options.
+
+Input errors are reported all at once.
+"""
 
 from __future__ import annotations
 
@@ -19,22 +22,23 @@ Floats: TypeAlias = NDArray[np.float64]
 What: TypeAlias = Literal["goals", "states"]
 
 LONGEST_HOLE_S = 1.0
-"""Longest time between two positions of a joint in a motion; a longer hole is an error."""
+"""Longest time without a recorded position of a joint in a motion; a longer hole is an error."""
 MOST_NUMBERS = 8_000_000  # Moments x joints of a motion: 64 MB, 20 joints at 100 Hz for an hour
 
 
 class Series(msgspec.Struct, frozen=True, eq=False):
-    """Positions of one joint over time."""
+    """Recorded positions or goals of one joint over time."""
 
     time_s: Floats  # Shape (moments,), s since the start of the recording
     position: Floats  # Shape (moments,), rad (m for a linear joint)
     what: What  # Goals that were sent, or measured states
     continued: bool = False
-    """True if the joint moves from one position to the next however long that takes."""
+    """True if positions are interpolated however far apart they are, as between points of a trajectory;
+    otherwise a long hole is an error."""
     unit: JointUnit = ROTARY  # Unit of the positions
 
     def ordered(self) -> Series:
-        """Return the finite positions in order of time; of several at one time, the last."""
+        """Return a copy with the finite positions in order of time; of several at one time, the last."""
         known = np.flatnonzero(np.isfinite(self.position) & np.isfinite(self.time_s))
         order = known[np.argsort(self.time_s[known], kind="stable")]
         time = self.time_s[order]
@@ -43,13 +47,13 @@ class Series(msgspec.Struct, frozen=True, eq=False):
         return replace(self, time_s=time[last], position=self.position[order][last])
 
     def between(self, begin_s: float, end_s: float) -> Series:
-        """Return the part between two times, both included."""
+        """Return the positions between two times (s), both included."""
         inside = slice(*np.searchsorted(self.time_s, (begin_s, np.nextafter(end_s, math.inf))))
         return replace(self, time_s=self.time_s[inside], position=self.position[inside])
 
 
 class RecordedMotion(msgspec.Struct, frozen=True, eq=False):
-    """Positions of several joints at common times."""
+    """Positions of several joints at common times, with the recording that they come from."""
 
     path: Path
     joints: tuple[str, ...]
@@ -63,18 +67,19 @@ class RecordedMotion(msgspec.Struct, frozen=True, eq=False):
 
     @property
     def duration_s(self) -> float:
-        """Time from the first moment to the last."""
+        """Time from the first moment to the last, s."""
         return float(self.time_s[-1])
 
 
 class Stretch(msgspec.Struct, frozen=True):
-    """Part of a recording, s since its start. None means the start or the end of the recording."""
+    """Part of a recording that the options `--from` and `--to` select, s since its start. None means its
+    start or end."""
 
     begin_s: float | None = None
     end_s: float | None = None
 
     def check(self) -> None:
-        """Validate the times.
+        """Check that the times are valid.
 
         Raises:
             InputError: A time is negative or not finite, or the start is not before the end.
@@ -90,7 +95,7 @@ WHOLE = Stretch()
 
 
 def parse_names(words: Sequence[str]) -> dict[str, str]:
-    """Parse `--map RECORDED=JOINT`.
+    """Parse the values of the option `--map RECORDED=JOINT`.
 
     Returns:
         Joint by recorded name; an empty joint omits the recorded one.
@@ -113,10 +118,10 @@ def parse_names(words: Sequence[str]) -> dict[str, str]:
 
 
 def chosen(path: Path, series: Mapping[str, Series], only: Sequence[str]) -> dict[str, Series]:
-    """Return the series of the recorded joints in `only`, or of all if it is empty.
+    """Return those series whose joints the option `--joint` names (`only`), or all if it is empty.
 
     Raises:
-        InputError: Unknown joints.
+        InputError: The recording has no joint of a name.
     """
     wrong = [
         f"{path}: --joint {name}: the recording has no joint {name}; {suggestion(name, tuple(series))}"
@@ -131,7 +136,8 @@ def chosen(path: Path, series: Mapping[str, Series], only: Sequence[str]) -> dic
 def motion_of(
     path: Path, series: Mapping[str, Series], stretch: Stretch, names: Mapping[str, str]
 ) -> RecordedMotion:
-    """Return a motion of series by recorded joint, renamed by `names`.
+    """Combine series by recorded joint into one motion over their common time, within `stretch`, with joints
+    renamed by `names`.
 
     Raises:
         InputError: All reasons why the series do not form one motion.

@@ -1,4 +1,4 @@
-"""Rows of a recorded motion for playback: positions of all joints per period, within their limits."""
+"""Rows of a recorded motion for playback on a robot: positions of all joints for each period of its loop."""
 
 from __future__ import annotations
 
@@ -20,11 +20,12 @@ MOST_NUMBERS = 500_000  # Numbers in all rows: the most that a sample_player kee
 LONGEST_PERIOD_S = 0.02  # Longest time between rows, if one row per cycle would be too many
 WINDOW_S = 0.05  # Interval over which speeds and accelerations are measured
 RAMP_S = 0.3
-"""Ramp of the speed at both ends of a motion, wherever it was cut."""
+"""Time in which the speed of a played motion ramps up from 0 at the start and down to 0 at the end."""
 
 
 class Rows(msgspec.Struct, frozen=True, eq=False):
-    """Motion at a given speed, which ramps up from 0 at the start and down to 0 at the end."""
+    """Table of positions that plays a motion at a given speed, which ramps up from 0 at the start and down
+    to 0 at the end."""
 
     motion: RecordedMotion
     speed: float
@@ -35,17 +36,18 @@ class Rows(msgspec.Struct, frozen=True, eq=False):
 
     @property
     def joints(self) -> tuple[str, ...]:
-        """Joints in the order of the columns."""
+        """Names of the joints, in the order of the columns."""
         return self.motion.joints
 
     @property
     def duration_s(self) -> float:
-        """Duration of the playback."""
+        """Duration of the playback, s."""
         return len(self.positions) * self.period_s
 
     @classmethod
     def of(cls, motion: RecordedMotion, path: SplinePath, speed: float, period_s: float) -> Self:
-        """Return the rows of a motion's path, without regard to limits."""
+        """Sample a motion's path at a speed factor into rows, without regard to the limits of joints. A
+        long motion has several periods per row."""
         duration_s = path.duration_s
         ramp_s = min(RAMP_S, duration_s / speed)
         seconds = duration_s / speed + ramp_s
@@ -67,7 +69,8 @@ def rows_of(
     tolerance: float | None,
     period_s: float,
 ) -> Rows:
-    """Return the rows of a motion for a robot, one row per cycle of `period_s`.
+    """Return the rows of a motion for a robot, one row per cycle of `period_s`, after a check of all joint
+    limits.
 
     Args:
         motion: The recorded motion.
@@ -119,7 +122,8 @@ def _check_joints(motion: RecordedMotion, joints: Mapping[str, JointPlan]) -> No
 
 
 def _all_beyond(plans: Sequence[JointPlan], played: Rows, allowed: Floats) -> list[str]:
-    """Return a sentence for each joint and quantity beyond a limit, at the greatest excess."""
+    """Return a sentence for each joint and each quantity (position, speed, acceleration) beyond its limit,
+    at the greatest excess."""
     return [
         f"at {played.motion.begin_s + played.recorded_s[row]:.3f} s {plan.name} {text}"
         for column, plan in enumerate(plans)
@@ -130,7 +134,8 @@ def _all_beyond(plans: Sequence[JointPlan], played: Rows, allowed: Floats) -> li
 def _beyond(
     plan: JointPlan, positions: Floats, period_s: float, tolerance: float
 ) -> Iterator[tuple[int, str]]:
-    """Yield row and sentence for each quantity so far beyond its limit that the joint errs by `tolerance`.
+    """Yield row and sentence for each quantity of a joint that exceeds its limit so far that the joint errs
+    by `tolerance`.
 
     Speeds and accelerations are averaged over WINDOW_S: shorter peaks do not move a joint off its path. The
     joint is at rest before and after the rows.
@@ -164,7 +169,8 @@ def _beyond(
 def _slow_enough(
     plans: Sequence[JointPlan], played: Rows, path: SplinePath, period_s: float, allowed: Floats
 ) -> float | None:
-    """Return the highest lower speed without a limit exceeded, in steps of 0.01, or None."""
+    """Return the highest speed factor below the given one at which no limit is exceeded, in steps of 0.01,
+    or None."""
     low, high = 0, math.ceil(played.speed * 100)
     while high - low > 1:
         middle = (low + high) // 2

@@ -1,4 +1,4 @@
-"""Sources of recorded motions: logs of dxlrun whole or in parts, foreign MCAP files, ROS 2 bags."""
+"""Reader of recorded motions from logs of dxlrun, whole or in parts, foreign MCAP files and ROS 2 bags."""
 
 from __future__ import annotations
 
@@ -71,7 +71,8 @@ def read_motion(
 def _own_series(
     path: Path, what: What | None, stretch: Stretch
 ) -> tuple[dict[str, Series], tuple[str, ...], bytes | None]:
-    """Return the joints of a log of dxlrun over the times of its cycles, its damage, and its plan."""
+    """Return the positions or goals of the joints in a log of dxlrun over time, sentences about damage,
+    and its plan as JSON."""
     joints: tuple[str, ...] = ()
     columns: dict[str, list[NDArray[np.generic]]] = {field: [] for field in _FIELDS}
     reader = open_log(path)

@@ -21,16 +21,18 @@ from dxlrun_analysis.playback.recorded_motion import Floats, RecordedMotion
 
 GOAL_TOLERANCE = math.radians(0.1)
 TURN_SIZES: Mapping[JointUnit, float] = {ROTARY: 1.0, LINEAR: 0.01}
-"""Movement of a joint, rad or m, equivalent to 1 rad: 10 mm, as of a pinion with this radius. [i]"""
+"""Movement of a joint that counts as much as 1 rad, by unit: 1 rad, or 10 mm of a linear joint, as of a
+pinion with this radius. [i]"""
 STATE_TOLERANCE = math.radians(0.5)
-"""More than half a unit of the coarsest encoder, an AX-12A's with 0.29 deg."""
+"""Default tolerance of a path for measured positions: more than half a unit of the coarsest encoder, an
+AX-12A's with 0.29 deg."""
 _OVERSHOOT = 27 / 8
 """A cubic piece of length L with slope v at one end and otherwise flat overshoots by 4/27 v L. With v = 27/8
 tolerance / L this is half the tolerance."""
 
 
 class SplinePath(msgspec.Struct, frozen=True, eq=False):
-    """Motion as knots with cubic pieces between them."""
+    """Smoothed motion of several joints: knots with cubic pieces between them."""
 
     time_s: Floats  # Shape (knots,), ascending, from 0
     position: Floats  # Shape (knots, joints), rad
@@ -42,7 +44,7 @@ class SplinePath(msgspec.Struct, frozen=True, eq=False):
         return float(self.time_s[-1])
 
     def at(self, time_s: Floats) -> Floats:
-        """Return the positions at times, shape (times, joints)."""
+        """Return the positions of all joints at the given times, shape (times, joints)."""
         knots, position = self.time_s, self.position
         piece = np.clip(np.searchsorted(knots, time_s, side="right") - 1, 0, len(knots) - 2)
         width = (knots[piece + 1] - knots[piece])[:, None]
@@ -56,7 +58,8 @@ class SplinePath(msgspec.Struct, frozen=True, eq=False):
 
 
 def tolerances(motion: RecordedMotion, given: float | None) -> Floats:
-    """Return the tolerance of each joint: the given one, or the default for goals and measured states.
+    """Return the tolerance of each joint for `fit`: `given` (rad), or the default for goals or measured
+    states.
 
     The tolerance of a linear joint is in m: its movement for that angle (`TURN_SIZES`).
     """
@@ -66,7 +69,8 @@ def tolerances(motion: RecordedMotion, given: float | None) -> Floats:
 
 
 def fit(motion: RecordedMotion, tolerance: Floats) -> SplinePath:
-    """Fit a path to a recorded motion that stays within `tolerance`, rad or m, shape (joints,)."""
+    """Fit a path with few knots to a recorded motion, within `tolerance` at each recorded moment; rad or
+    m, shape (joints,)."""
     times, positions = motion.time_s, motion.position
     chosen = np.zeros(len(times), dtype=np.bool_)
     chosen[[0, -1]] = True
