@@ -62,12 +62,16 @@ def test_a_devices_commands_go_to_the_controller_that_has_them(board):
 @pytest.mark.parametrize(
     ("device", "values", "said"),
     [
-        ("board", {"led": 2}, "led of board: 2 lies outside 0 to 1"),
-        ("board", {"led": -0.5}, "led of board: -0.5 lies outside 0 to 1"),
+        ("board", {"led": 2}, "led of board: 2 is outside 0 to 1"),
+        ("board", {"led": -0.5}, "led of board: -0.5 is outside 0 to 1"),
         ("board", {"led": True}, "board/led = True is not a number"),
         ("board", {"led": "on"}, "board/led = on is not a number"),
         ("board", {"lde": 1}, "board takes no command lde; did you mean led?"),
-        ("board", {}, "board (ID 102 on bus main): no command is named; it has led, register_7, register_8"),
+        (
+            "board",
+            {},
+            "no command of board (ID 102 on bus main) is named; name one of led, register_7, register_8",
+        ),
         ("foot", {"led": 1}, "foot (ID 101 on bus main) has no commands"),
         ("board", {"register_8": 1}, "commanded by no controller; `dxlrun switch --activate away`"),
         ("bord", {"led": 1}, "there is no controller bord; did you mean board?"),

@@ -98,8 +98,8 @@ WRONG = [
     ("POST", "/controllers/left/commands/many", {"count": 40_000}, 413, "too_long", "320000 bytes are too many"),
     ("POST", "/controllers/left/set-points/many", {"count": 600}, 413, "too_long", "send it as a command"),
     ("POST", "/controllers/spare/set-points/go", {"positions": [0]}, 409, "not_active", "not active; switch to it first"),
-    ("POST", SET_POINT + "?lease=0", {"positions": [0]}, 422, "invalid", "a lease is 0.01 to 60 s, not 0"),
-    ("POST", SET_POINT + "?lease=61", {"positions": [0]}, 422, "invalid", "a lease is 0.01 to 60 s, not 61"),
+    ("POST", SET_POINT + "?lease=0", {"positions": [0]}, 422, "invalid", "a lease of 0 s is out of range; write 0.01 to 60 s"),
+    ("POST", SET_POINT + "?lease=61", {"positions": [0]}, 422, "invalid", "a lease of 61 s is out of range; write 0.01 to 60 s"),
     ("POST", SET_POINT + "?lease=inf", {"positions": [0]}, 422, "invalid", "lease=inf is not a number"),
     ("POST", SET_POINT + "?lease=long", {"positions": [0]}, 422, "invalid", "lease=long is not a number"),
     ("GET", "/events?after=x", None, 422, "invalid", "after=x is not a number"),
@@ -642,7 +642,11 @@ def test_what_is_too_deep_or_too_large_for_a_number_is_wrong_input(desk, kind, q
 
 def test_a_body_that_is_too_deep_is_named_so(desk):
     status, answer = desk.ask("POST", "/controllers/left/commands/positions?units=true", DEEP)
-    assert (status, answer["code"], answer["refused"]) == (422, "invalid", "the body is nested too deeply")
+    assert (status, answer["code"], answer["refused"]) == (
+        422,
+        "invalid",
+        "the body is nested too deeply; make it flatter",
+    )
 
 
 def test_of_thousands_of_wrong_names_an_answer_has_some(desk):

@@ -199,7 +199,7 @@ def test_all_mistakes_come_together(head):
 def test_a_speed_that_is_none_is_refused(head, speed):
     status, answer, taken = play(head, NOD, speed)
     assert (status, taken) == (422, [])
-    assert "speed is a factor from 0.01 to 10" in answer["refused"]
+    assert "write a factor from 0.01 to 10" in answer["refused"]
 
 
 def test_a_joint_that_has_not_answered_yet_is_named(head):

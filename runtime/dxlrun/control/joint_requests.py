@@ -14,6 +14,7 @@ import msgspec
 from dxlrun.channels.answers import Answer, Code, Done, Refusal, Waiting
 from dxlrun.channels.cycle import LIMP, OFFLINE, Torque
 from dxlrun.channels.loop_requests import RebootRequest, Register, RegisterReading, TorqueRequest
+from dxlrun.control import texts
 from dxlrun.control.context import ControlContext
 from dxlrun.control.controllers.switching import Switching
 
@@ -145,9 +146,9 @@ class JointRequests:
         if not lost:
             return None
         reboots = all(torque[rows[joint]] == Torque.REBOOTING for joint in lost)
-        hint = "try again when it is back; it is probed once a second"
+        hint = texts.WAIT_FOR_JOINT
         if reboots:
-            hint = "it reboots as requested: try again when it is back"
+            hint = texts.WAIT_FOR_REBOOT
         return Refusal(Code.JOINT_LOST, {"joint": lost, "servo": self._labels(lost), "hint": hint})
 
     def _refuse_broken(self, rows: dict[str, int]) -> Refusal | None:
@@ -157,7 +158,7 @@ class JointRequests:
         )
         if not broken:
             return None
-        hint = f"find the cause, then `dxlrun reboot {' '.join(broken)}` (Protocol 1.0: power off and on)"
+        hint = texts.reboot_after_cause(broken)
         return Refusal(Code.HARDWARE_ERROR, {"joint": broken, "servo": self._labels(broken), "hint": hint})
 
     def _labels(self, joints: Sequence[str]) -> tuple[str, ...]:

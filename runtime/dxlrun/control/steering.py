@@ -157,7 +157,7 @@ class Steering:
                 self.inbox.answer(command.number, answer)
         if 0 < self.paused_until_ns < record.woken_ns:
             self.resume()
-            what = "its controllers are deactivated, and the joints are held"
+            what = texts.PAUSE_ENDED
             if not (ends := self._stale("no client ended the pause")):
                 commanding = manager.switching.commanding(record.layout.joints)
                 manager.switching.switch_controllers((), commanding)
@@ -165,7 +165,7 @@ class Steering:
         for name in manager.stale(record.woken_ns) if manager.streams else ():
             if not (ends := self._stale(f"the stream of commands for {name} ended")):
                 manager.hold_controller(name)
-            self._context.events.emit(name, texts.stream_expired(ends or "its joints are held"))
+            self._context.events.emit(name, texts.stream_expired(ends or texts.JOINTS_HELD))
         return count
 
     def refuse(self) -> None:
@@ -260,7 +260,7 @@ class Steering:
         """Execute a command for the loop itself; return None if it is answered later."""
         kind, data, numbers = command.kind, command.data, b""
         if kind not in FORMS:
-            problem = f"the loop has no command {kind}; known: {', '.join(FORMS)}"
+            problem = texts.unknown_loop_command(kind, FORMS)
             return Refusal(Code.INVALID, {"problem": problem})
         if kind in ("load", "unload") and not self.paused:
             return Refusal(Code.NOT_IN_PAUSE)
@@ -270,7 +270,7 @@ class Steering:
         try:
             request = None if form is None else msgspec.json.decode(data, type=form)
         except (msgspec.MsgspecError, UnicodeDecodeError, RecursionError) as error:
-            return Refusal(Code.INVALID, {"problem": f"the data of {kind} do not fit: {error}"})
+            return Refusal(Code.INVALID, {"problem": texts.wrong_command_data(kind, error)})
         if isinstance(request, TorqueRequest | RebootRequest | Register | RegisterReading):
             return self.joints.execute_request(command.number, request)
         return self._execute(command, request, numbers) or Done(self._record.cycle)

@@ -5,7 +5,7 @@ Each row has the code, the severity and the fields of one event. Refusals are in
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 
 from dxlrun.channels.events import EventCode, Severity, event_text
 from dxlrun.errors import counted
@@ -270,3 +270,64 @@ def wrong_overrun_policy(answer: object, known: Sequence[str]) -> str:
 
 def run_ended_by(controller: str, because: str) -> str:
     return f"controller {controller} ended the run: {because}"
+
+
+# Refusals: problems and hints; their sentences are in `channels/answers.py`
+
+WRONG_MOTION_SIZES = "the motion's array does not have the sizes of its parts"
+WAIT_FOR_JOINT = "try again when it is back; it is probed once a second"
+WAIT_FOR_REBOOT = "it reboots as requested: try again when it is back"
+
+
+def unknown_loop_command(kind: str, known: Iterable[str]) -> str:
+    return f"the loop has no command {kind}; known: {', '.join(known)}"
+
+
+def wrong_command_data(kind: str, error: object) -> str:
+    return f"the data of {kind} do not fit: {error}"
+
+
+def not_numbers(size: int) -> str:
+    return f"{size} bytes are not an array of numbers"
+
+
+def no_single_goal(controller: str) -> str:
+    return f"the part of {controller} has no single goal"
+
+
+def command_upper(upper: str) -> str:
+    return f"command {upper}, or deactivate it"
+
+
+def deactivate_upper(upper: str) -> str:
+    return f"deactivate {upper} in the same switch"
+
+
+def mode_of_one_joint(joint: str, others: str) -> str:
+    return f"it needs another mode of {joint}, but not of {others}: the same servos move both"
+
+
+def torque_on(names: Sequence[str]) -> str:
+    return f"`dxlrun torque on {' '.join(names)}` gives it torque"
+
+
+def move_inside_first(joints: Sequence[str], hint: str) -> str:
+    return f"move {' and '.join(joints)} inside the limits by hand, then {hint}"
+
+
+def reboot_after_cause(joints: Sequence[str]) -> str:
+    return f"find the cause, then `dxlrun reboot {' '.join(joints)}` (Protocol 1.0: power off and on)"
+
+
+def lower_not_active(controller: str) -> str:
+    return f"{controller} below it is not active"
+
+
+def lower_failed(controller: str) -> str:
+    return f"{controller} below it broke its contract"
+
+
+# Consequences of commands that do not come any more
+
+PAUSE_ENDED = "its controllers are deactivated, and the joints are held"
+JOINTS_HELD = "its joints are held"

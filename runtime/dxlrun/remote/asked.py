@@ -13,6 +13,7 @@ import msgspec
 import starlette.requests
 
 from dxlrun.channels.answers import Code
+from dxlrun.remote import texts
 from dxlrun.remote.network.commander import HERE, Client
 from dxlrun.remote.preparation import invalid, refused
 from dxlrun.remote.requests.table import EXAMPLES, Answer, Body, Request, Role
@@ -49,7 +50,7 @@ class Asked(Generic[Body]):
         except ValueError:
             value = math.nan
         if not math.isfinite(value):
-            raise invalid(f"{name}={str(text)[:40]} is not a number")
+            raise invalid(texts.not_a_number(name, text))
         return value
 
     @property
@@ -57,7 +58,7 @@ class Asked(Generic[Body]):
         """Time that the client waits, s; raises RefusedRequest outside 0 to LONGEST_WAIT_S."""
         wait = self.number("wait", 0.0)
         if not 0 <= wait <= LONGEST_WAIT_S:
-            raise invalid(f"wait is 0 to {LONGEST_WAIT_S:g} s, not {wait:g}")
+            raise invalid(texts.wait_out_of_range(wait, LONGEST_WAIT_S))
         return wait
 
     @property
@@ -65,7 +66,7 @@ class Asked(Generic[Body]):
         """Goal number in the path; raises RefusedRequest."""
         text = self.part("number")
         if not (text.isdecimal() and text.isascii() and len(text) < 16):
-            raise invalid(f"{text[:40]!r} is not a number of a goal")
+            raise invalid(texts.not_a_goal_number(text))
         return int(text)
 
     @property
@@ -127,7 +128,7 @@ async def received(
     try:
         return Asked(http, msgspec.json.decode(content, type=request.body))
     except (msgspec.MsgspecError, RecursionError) as error:
-        raise invalid(f"{error}; write for example {EXAMPLES[request.body]}") from error
+        raise invalid(texts.no_body(error, EXAMPLES[request.body])) from error
 
 
 async def _content(http: starlette.requests.Request, allowance: Allowance | None) -> bytes:

@@ -46,6 +46,7 @@ from dxlrun.description.source_names import SOURCE_COMMANDS
 from dxlrun.errors import InputError
 from dxlrun.log.schemas import LogHeader
 from dxlrun.plan.loop_plan import ControllerPlan, JointValues
+from dxlrun.remote import texts
 from dxlrun.remote.asked import Allowance, Asked, client_of, peer, received
 from dxlrun.remote.computation import computed
 from dxlrun.remote.goals import LOST
@@ -209,7 +210,7 @@ class GatewayApp:
                 return Response(status_code=400)
             # Only a deeply nested body causes this.
             except RecursionError:
-                return _refused(Refusal(Code.INVALID, {"problem": "the body is nested too deeply"}))
+                return _refused(Refusal(Code.INVALID, {"problem": texts.BODY_TOO_DEEP}))
             # Last resort: one request fails, and the gateway serves the next one.
             except Exception as error:
                 traceback.print_exc()
@@ -309,9 +310,7 @@ class GatewayApp:
         query, rate = asked.http.query_params, asked.number("rate", requests.MOST_LOOKS)
         topics = query.getlist("topic")
         if not topics or rate <= 0:
-            raise invalid(
-                "name a topic, and a rate above 0 Hz; write for example /stream?topic=/joint_states"
-            )
+            raise invalid(texts.NO_TOPIC)
         stream = self._link.listen(topics, newest="newest" in query)
         frames = self._frames(stream, rate, once="once" in query)
         return StreamingResponse(frames, media_type="application/octet-stream")
@@ -386,7 +385,7 @@ class GatewayApp:
         """Play a motion file: all its controllers begin in one cycle; reply with their goals."""
         given = asked.body
         if not LEAST_SPEED <= given.speed <= MOST_SPEED:
-            raise invalid(f"speed is a factor from {LEAST_SPEED:g} to {MOST_SPEED:g}, not {given.speed:g}")
+            raise invalid(texts.speed_out_of_range(given.speed, LEAST_SPEED, MOST_SPEED))
         self._newest()
         file = given.file[:LONGEST_FILE]
         # One at a time, because a check may need a core and about 100 MB.
@@ -467,7 +466,7 @@ class GatewayApp:
         units = query.get("units") == "true" and source is None
         seconds = asked.number("in", 0.0) if "in" in query else None
         if seconds is not None and not 0 < seconds <= LONGEST_WAY_S:
-            raise invalid(f"in is a time above 0 s, at most {LONGEST_WAY_S:g} s, not {seconds:g}")
+            raise invalid(texts.duration_out_of_range(seconds, LONGEST_WAY_S))
         if kind in INTERFACES and loaded.plan.joints and (newest := self._link.newest()) is not None:
             known = self._preparation.known(loaded.plan)
             found = joint_command(
@@ -476,7 +475,7 @@ class GatewayApp:
             if found is not None:
                 kind, content, units, seconds = found.kind, found.content, False, None
         if seconds is not None:
-            raise invalid(f"in is for joints by name; {kind} of {loaded.plan.name} has its own times")
+            raise invalid(texts.has_own_times(loaded.plan.name, kind))
         prepared = self._preparation.command(loaded.plan, kind, content, units=units)
         prepared.require_within_limits()
         goal = None
@@ -499,7 +498,7 @@ class GatewayApp:
         shortest, usual, longest = LEASE_S
         lease = asked.number("lease", usual)
         if not shortest <= lease <= longest:
-            raise invalid(f"a lease is {shortest:g} to {longest:g} s, not {lease:g}")
+            raise invalid(texts.lease_out_of_range(lease, shortest, longest))
         loaded, kind = self._known(asked), asked.part("kind")
         name = loaded.plan.name
         if kind in self._preparation.goals(loaded.plan):

@@ -25,6 +25,7 @@ from dxlrun.control.controllers.goals import GOALS_TOPIC
 from dxlrun.messages.cdr import Codec
 from dxlrun.plan.loop_plan import ControllerPlan, ServoLimit
 from dxlrun.plan.robot_plan import Plan
+from dxlrun.remote import texts
 from dxlrun.remote.goals import LOST, GoalBook
 from dxlrun.remote.job import Descriptors
 from dxlrun.remote.live.topics import LiveTopics, TopicStream
@@ -217,7 +218,7 @@ class Link:
         number = next(self._numbers)
         command = Command(number, loaded.plan.name, kind, data, origin, lease_ns, request)
         if not self._mailbox.set_point(loaded.place, command):
-            hint = "send it as a command"
+            hint = texts.SEND_AS_COMMAND
             raise RefusedRequest(
                 Refusal(Code.TOO_LONG, {"size": len(data), "most": LONGEST_SET_POINT, "hint": hint})
             )

@@ -44,6 +44,7 @@ from dxlrun.description.units import (
 )
 from dxlrun.errors import suggestion
 from dxlrun.plan.loop_plan import ControllerPlan, JointPlan, ServoLimit, SourcePlan
+from dxlrun.remote import texts
 from dxlwire.joint_unit import LINEAR, ROTARY, JointUnit
 
 LONGEST_NAME = 64
@@ -82,7 +83,7 @@ def travel_s(joint: JointPlan, distance: float, speed: float) -> float:
         return distance / speed
     if distance <= joint.goal_tolerance:
         return 0.0
-    raise invalid(f"{joint.immovable}; write a value above 0 there")
+    raise invalid(texts.joint_cannot_move(joint.immovable))
 
 
 def invalid(problem: str) -> RefusedRequest:
@@ -274,7 +275,7 @@ class Preparation:
             return known
         offer = self.plugins.controllers.get(plan.type)
         if offer is None:
-            raise invalid(f"no plug-in offers the type {plan.type} of {plan.name} any more")
+            raise invalid(texts.type_missing(plan.name, plan.type))
         with plugin_code(plan.name, f"the parameters of {plan.name}"):
             parameters = offer.controller.Parameters.model_validate_json(plan.parameters)
         joints = tuple(self.joints[joint] for joint in plan.joints)
@@ -295,12 +296,11 @@ class Preparation:
         except ValidationError as error:
             raise invalid(mistakes(error, "the controller's entry", ControllerEntry)) from error
         if len(name) > LONGEST_NAME:
-            raise invalid(f"a name has at most {LONGEST_NAME} characters; choose a shorter one")
+            raise invalid(texts.name_too_long(LONGEST_NAME))
         if name in others:
-            hint = "choose another name, or unload it"
-            raise refused(Code.NAME_TAKEN, {"controller": name, "hint": hint})
+            raise refused(Code.NAME_TAKEN, {"controller": name, "hint": texts.OTHER_NAME})
         if entry.get("active"):
-            raise invalid(f"{name} cannot be active at once; load it, then switch to it")
+            raise invalid(texts.active_at_once(name))
         # The divider is 1 here; the loop computes it for its own rate.
         plan = self._compiled(replace(plan_entry(name, written, every=1), active=False))
         # Ignore mistakes that exist without the new controller, such as an unloaded lower controller.
@@ -404,7 +404,7 @@ def in_si(body: bytes, what: str, joints: Sequence[JointPlan] = ()) -> bytes:
     try:
         data = msgspec.json.decode(body)
     except (msgspec.MsgspecError, RecursionError) as error:
-        raise invalid(f"{what} is not JSON: {error}") from error
+        raise invalid(texts.not_json(what, error)) from error
     mistaken: list[tuple[str, str]] = []
     plain = _plain(data, (), mistaken, _units_of(data, joints))
     if mistaken:

@@ -88,7 +88,7 @@ def test_a_servo_that_is_lost_in_the_middle(xl330):
     if RUNS:
         found = identified(run, fit_run(run), LOAD, "test")
         assert found.motor.torque_constant == pytest.approx(0.38042, rel=0.08)
-        assert any("left out" in note for note in found.notes)
+        assert any("were skipped" in note for note in found.notes)
 
 
 def test_a_servo_with_an_integral_part(xl330):

@@ -11,6 +11,7 @@ from collections.abc import Collection, Iterable, Iterator, Sequence
 import msgspec
 
 from dxlrun.channels.answers import Code, Field, Refusal
+from dxlrun.control import texts
 from dxlrun.control.controllers.graph import Plans, below, commander, lowers_first, uppers_first
 from dxlrun.plan.loop_plan import ControllerPlan, JointPlan
 from dxlwire.modes import Mode, mode_of
@@ -144,7 +145,7 @@ class Standing(msgspec.Struct, frozen=True):
         for name in deactivate:
             upper = commander(name, [*staying.values(), *(() if name in activate else fresh)])
             if upper:
-                hint = f"deactivate {upper} in the same switch"
+                hint = texts.deactivate_upper(upper)
                 return Refusal(Code.COMMANDED, {"controller": name, "upper": upper, "hint": hint})
         for lower in (lower for name in enter for lower in known[name].into):
             if lower not in known:

@@ -194,7 +194,7 @@ class Manager:
         """
         self._goals.time_ns = self._schedule.time_ns
         if len(command.data) % 8:
-            problem = f"{len(command.data)} bytes are not an array of numbers"
+            problem = texts.not_numbers(len(command.data))
             return Refusal(Code.INVALID, {"problem": problem})
         managed = self._commandable(command.controller)
         if isinstance(managed, Refusal):
@@ -251,7 +251,7 @@ class Manager:
             return Refusal(code, {"controller": controller})
         for upper in managed.uppers:
             if upper.active:
-                hint = f"command {upper.plan.name}, or deactivate it"
+                hint = texts.command_upper(upper.plan.name)
                 return _commanded_by(controller, upper.plan.name, hint)
         return managed
 
@@ -390,15 +390,13 @@ class Manager:
         sizes = [size for part in parts for size in part.sizes]
         fits = all(size >= 0 for size in sizes) and 8 * sum(sizes) == len(numbers)
         if not fits or any(len(part.at_ns) != len(part.sizes) for part in parts):
-            return Refusal(
-                Code.INVALID, {"problem": "the motion's array does not have the sizes of its parts"}
-            )
+            return Refusal(Code.INVALID, {"problem": texts.WRONG_MOTION_SIZES})
         for part in parts:
             managed = self._commandable(part.controller)
             if isinstance(managed, Refusal):
                 return managed
             if not part.sizes or (part.kind in managed.controller.Goals and part.at_ns != (0,)):
-                return Refusal(Code.INVALID, {"problem": f"the part of {part.controller} has no single goal"})
+                return Refusal(Code.INVALID, {"problem": texts.no_single_goal(part.controller)})
         commands = np.split(np.frombuffer(numbers, dtype="<f8"), np.cumsum(sizes)[:-1])
         begun: list[int] = []
         for part in parts:
@@ -473,7 +471,7 @@ class Manager:
             yield Refusal(Code.UNKNOWN_JOINT, {"joint": unknown})
         if (parted := plan.split_group(self._plan.joints)) is not None:
             joint, others = parted[0], " and ".join(parted[1])
-            problem = f"it needs another mode of {joint}, but not of {others}: the same servos move both"
+            problem = texts.mode_of_one_joint(joint, others)
             yield Refusal(Code.CONTROLLER_FAULT, {"controller": plan.name, "problem": problem})
         if unknown := tuple(lower for lower in plan.into if lower not in known):
             yield Refusal(Code.UNKNOWN_CONTROLLER, {"controller": unknown})

@@ -226,10 +226,10 @@ class Switching:
         if not limp:
             return None
         named = list(limp) if len(limp) <= MOST_NAMED else names  # too many joints: name the controllers
-        hint = f"`dxlrun torque on {' '.join(named)}` gives it torque"
+        hint = texts.torque_on(named)
         outside = [self._joints[row].name for row in limp_rows if self._is_outside(row)]
         if outside:
-            hint = f"move {' and '.join(outside)} inside the limits by hand, then {hint}"
+            hint = texts.move_inside_first(outside, hint)
         return Refusal(Code.JOINT_LIMP, {"joint": tuple(limp), "servo": tuple(limp.values()), "hint": hint})
 
     def _is_outside(self, row: int) -> bool:
@@ -319,7 +319,7 @@ class Switching:
         for group in self.groups:
             if managed in group.entering:
                 self.groups = [one for one in self.groups if one is not group]
-                problem = f"{managed.plan.name} is not activated: {why}"
+                problem = texts.controller_not_activated(managed.plan.name, why).text
                 self._give_up(group, fault_of(managed, problem), why)
 
     def _give_up(self, group: Group, refusal: Refusal, problem: str) -> None:
@@ -389,7 +389,7 @@ class Switching:
             active = {one.plan.name for one in lowers}
             if missing := [lower for lower in into if lower not in active]:
                 managed.on(Event.LEAVE)
-                problem = f"{missing[0]} below it is not active"
+                problem = texts.lower_not_active(missing[0])
                 event = texts.controller_not_activated(name, problem)
                 self._report_left_out(name, event, fault_of(managed, problem))
                 continue
@@ -436,7 +436,7 @@ class Switching:
         uppers = [self.named[name] for name in above(engaged, managed.plan.name)]
         self._take_out(managed, fault)
         self._drop_group(managed, str(fault))
-        why = f"{managed.plan.name} below it broke its contract"
+        why = texts.lower_failed(managed.plan.name)
         for upper in reversed(uppers):
             if upper.active:
                 self._deactivate(upper, why)

@@ -22,6 +22,7 @@ from dxlrun.description.joints.groups import NO_GROUPS, Groups
 from dxlrun.description.source_names import SOURCE_COMMANDS
 from dxlrun.errors import suggestion
 from dxlrun.plan.loop_plan import ControllerPlan, JointPlan, SourcePlan
+from dxlrun.remote import texts
 from dxlrun.remote.preparation import Known, invalid, plain_quantities, refused, travel_s
 
 POINT_SPEED = 0.5
@@ -85,7 +86,7 @@ def joint_command(
     if strangers and set(named) <= set(_FIELDS.values()):
         return None
     if not named:
-        raise invalid(f"{kind} of {plan.name} names no joint; write for example {plan.joints[0]}=20deg")
+        raise invalid(texts.no_joint_named(plan.name, kind, plan.joints[0]))
     if strangers:
         fields: dict[str, Field] = {"joint": strangers[0][:80], "controller": plan.name}
         raise refused(Code.UNKNOWN_JOINT, fields | {"hint": suggestion(strangers[0][:80], plan.joints)})
@@ -100,7 +101,7 @@ def joint_command(
         named_too = {"joints": [joint.name for joint in joints]} if partial else {}
         return JointCommand(chosen, msgspec.json.encode({"points": [point], "start_in": 0.0} | named_too))
     if seconds is not None:
-        raise invalid(f"{plan.name} takes no time, it goes there at once; omit it")
+        raise invalid(texts.takes_no_time(plan.name))
     # With a position, a velocity or an effort is an upper limit.
     still = "positions" not in fields_of
     content = {
@@ -118,9 +119,7 @@ def _numbers(
     for joint, value in si.items():
         # An integer of JSON may exceed the range of float.
         if isinstance(value, bool) or not isinstance(value, int | float) or not -1e300 < value < 1e300:
-            raise invalid(
-                f"{kind} of {known.plan.name}: {joint} is {str(value)[:40]!r}, but must be a finite number"
-            )
+            raise invalid(texts.value_not_finite(known.plan.name, kind, joint, value))
     return {joint: float(value) for joint, value in si.items() if isinstance(value, int | float)}
 
 
@@ -144,7 +143,7 @@ def _command_for(known: Known, interface: str) -> tuple[str, tuple[str, ...] | N
         if any(each in model.model_fields for model in commands.values())
         or (name == "position" and TRAJECTORY in commands)
     ]
-    hint = f"joints of {known.plan.name} take {', '.join(offered) or 'nothing by name'}"
+    hint = texts.quantities_of_joints(known.plan.name, offered)
     fields_of: dict[str, Field] = {"controller": known.plan.name, "kind": interface, "known": tuple(commands)}
     raise refused(Code.UNKNOWN_COMMAND, fields_of | {"hint": hint})
 
@@ -182,7 +181,7 @@ def _present(joint: JointPlan, field: str, record: CycleRecord, *, still: bool =
     if not math.isfinite(value):
         value = otherwise
     if not math.isfinite(value):
-        raise invalid(f"the {field} of {joint.name} are not known yet; name it in the command too")
+        raise invalid(texts.value_not_known(joint.name, field))
     return value
 
 
@@ -216,12 +215,12 @@ def source_command(
     try:
         given = msgspec.json.decode(body, type=dict[str, object])
     except (msgspec.MsgspecError, RecursionError) as error:
-        raise invalid(f"{error}; write for example led=1") from error
+        raise invalid(texts.no_body(error, "led=1")) from error
     ranges = dict(zip(source.commands, source.ranges, strict=True))
     if not ranges:
-        raise invalid(f"{source.label} has no commands; name items under its `commands` in the robot file")
+        raise invalid(texts.source_without_commands(source.label))
     if not given:
-        raise invalid(f"{source.label}: no command is named; it has {', '.join(ranges)}")
+        raise invalid(texts.no_command_named(source.label, ranges))
     for name, value in given.items():
         if name not in ranges:
             fields: dict[str, Field] = {
@@ -232,14 +231,14 @@ def source_command(
             raise refused(Code.UNKNOWN_COMMAND, fields | {"hint": suggestion(name[:80], source.commands)})
         lowest, highest = ranges[name]
         if isinstance(value, bool) or not isinstance(value, int | float):
-            raise invalid(f"{source.name}/{name} = {str(value)[:40]} is not a number")
+            raise invalid(texts.source_value_not_a_number(source.name, name, value))
         if not lowest <= value <= highest:
-            problem = f"{value:g} lies outside {lowest:g} to {highest:g}"
+            problem = texts.outside(value, lowest, highest)
             raise refused(Code.BEYOND_LIMITS, {"controller": source.name, "kind": name, "problem": problem})
     values = {f"{source.name}/{name}": value for name, value in given.items()}
     chosen = {_commander(name, controllers, active, takes) for name in values}
     if len(chosen) > 1:
-        raise invalid(f"{', '.join(values)} are commanded by {', '.join(sorted(chosen))}: send one at a time")
+        raise invalid(texts.several_commanders(values, chosen))
     return chosen.pop(), msgspec.json.encode({"values": values})
 
 
@@ -255,11 +254,5 @@ def _commander(
     if now and SOURCE_COMMANDS in takes(now[0]):
         return now[0].name
     able = [plan.name for plan in claiming if SOURCE_COMMANDS in takes(plan)]
-    if able:
-        hint = f"`dxlrun switch --activate {able[0]}"
-        hint += f" --deactivate {now[0].name}`" if now else "`"
-    else:
-        hint = "write into the robot file, under controllers, "
-        hint += f"NAME: {{type: device_command_controller, commands: [{name}]}}"
-    by = f"commanded by {now[0].name}, which takes no values for it" if now else "commanded by no controller"
-    raise invalid(f"{name} is {by}; {hint}")
+    commander, other = now[0].name if now else "", able[0] if able else ""
+    raise invalid(texts.not_commandable(name, commander, other))

@@ -16,6 +16,7 @@ from dxlrun.control.controllers.live_parameters import live_names, value_of
 from dxlrun.description.form import ParametersModel
 from dxlrun.errors import suggestion
 from dxlrun.plan.loop_plan import ControllerPlan
+from dxlrun.remote import texts
 from dxlrun.remote.preparation import invalid, mistakes, plugin_code, refused
 from dxlrun.remote.requests.replies import NewValue, Parameter, Written
 
@@ -57,7 +58,7 @@ def _range(field: FieldInfo) -> str:
 def changed(plan: ControllerPlan, now: ParametersModel, values: Mapping[str, Written]) -> Change:
     """Return a change of live parameters with the present values `now`; raises RefusedRequest."""
     if not values:
-        raise invalid('nothing to change; write for example {"values": {"speed": "20 deg/s"}}')
+        raise invalid(texts.NO_PARAMETER)
     known = {parameter.name: parameter for parameter in parameters_of(now)}
     for name in values:
         _require_live(plan.name, name[:80], known)
@@ -90,12 +91,11 @@ def _require_live(controller: str, name: str, known: Mapping[str, Parameter]) ->
     fields: dict[str, Field] = {"controller": controller, "parameter": name}
     if name not in known:
         inner = [one for one in known if one.startswith(f"{name}.")]
-        hint = f"name its parts: {', '.join(inner)}" if inner else suggestion(name, tuple(known))
+        hint = texts.parameter_parts(inner) if inner else suggestion(name, tuple(known))
         raise refused(Code.UNKNOWN_PARAMETER, fields | {"hint": hint})
     if not known[name].live:
         live = [one.name for one in known.values() if one.live]
-        shown = f"live are {', '.join(live)}" if live else "it has no live parameters"
-        raise refused(Code.NOT_LIVE, fields | {"known": shown})
+        raise refused(Code.NOT_LIVE, fields | {"known": texts.live_parameters(live)})
 
 
 def _put(written: dict[str, object], path: list[str], value: Written, now: object) -> None:
@@ -113,5 +113,5 @@ def _put(written: dict[str, object], path: list[str], value: Written, now: objec
 def _number(name: str, value: object) -> bool | int | float:
     # A plug-in can mark a parameter of any type as live.
     if not isinstance(value, bool | int | float):
-        raise invalid(f"{name} = {value!r} is neither a number nor a bool, so it cannot change in a run")
+        raise invalid(texts.parameter_not_a_number(name, value))
     return value
