@@ -222,7 +222,10 @@ def test_another_rate_begins_at_the_next_deadline_and_controllers_keep_theirs():
     [
         (60.0, Code.RATE_NOT_DIVIDED, "60 Hz is not a multiple of 25 Hz, the rate of controller right"),
         (500.0, Code.RATE_OVER_BUSES, "at most 200 Hz"),
-        *((rate, Code.RATE_OUT_OF_RANGE, "not a possible rate") for rate in (0.1, 1e-3, 1e-300, 1e-320, 0.0, -3.0)),
+        *(
+            (rate, Code.RATE_OUT_OF_RANGE, "not a possible rate")
+            for rate in (0.1, 1e-3, 1e-300, 1e-320, 0.0, -3.0)
+        ),
     ],
 )
 def test_a_rate_that_cannot_be_is_refused(rate, code, why):

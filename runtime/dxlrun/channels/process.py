@@ -103,7 +103,7 @@ class Printed(io.TextIOBase):
         with suppress(OSError):
             os.write(self._descriptor, data)
             if data and not self._room:
-                os.write(self._descriptor, b"\n(what was printed after this is left out)\n")
+                os.write(self._descriptor, b"\n(later output is omitted)\n")
         return len(text)
 
 
