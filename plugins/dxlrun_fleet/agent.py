@@ -24,23 +24,31 @@ from dxlrun_fleet.fleet_file import Agent
 START = "/robots/"
 """Path prefix before a robot's name. POST starts the robot; GET returns 200 if it runs."""
 _MOST_TOLD, _LINES_TOLD = 4096, 6  # Bytes and lines of a run's output in an answer
+# Program of `python -c` that runs the `dxlrun` command
 _MAIN = "from dxlrun.cli import main; raise SystemExit(main())"
 
 
 class Starter:
-    """ASGI application that starts the robots of an agent, each once."""
+    """ASGI application of the agent: starts a robot on POST, and reports on GET whether its run lives.
+
+    `directory` is that of the fleet file; runs are started in it, and their output files are in it.
+    """
 
     def __init__(self, agent: Agent, directory: Path) -> None:
         self._agent, self._directory = agent, directory
         self._runs: list[subprocess.Popen[bytes]] = []
 
     async def __call__(self, scope: Scope, receive: Receive, send: Send) -> None:
-        """Answer one request (ASGI)."""
+        """Answer one HTTP request with the status and text of `answer`, for the role of the client."""
         status, text = self.answer(scope["method"], unquote(scope["path"]), scope["client"].role)
         await PlainTextResponse(text, status)(scope, receive, send)
 
     def answer(self, method: str, path: str, role: Role) -> tuple[int, str]:
-        """Return status and text: 200 runs or was started, 409 ran already, 410 does not run."""
+        """Execute a request; return HTTP status and text.
+
+        200: the robot was started (POST) or runs (GET); 403: the client is not an admin; 404: the agent does
+        not start this robot; 409: it ran before the POST; 410: it does not run, with its last output.
+        """
         name = path.removeprefix(START)
         if role < Role.ADMIN:
             return 403, "only a client with the role admin may start robots"
@@ -76,7 +84,7 @@ class Starter:
 
 
 async def serve(agent: Agent, directory: Path) -> None:
-    """Serve until the process ends.
+    """Run the agent of a fleet file, whose directory is given, until the process ends.
 
     Raises:
         InputError: The certificates are refused.

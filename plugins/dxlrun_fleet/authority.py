@@ -34,16 +34,17 @@ _EARLIER = timedelta(minutes=5)
 
 
 class Issued(NamedTuple):
-    """Certificates that the authority signed for one robot or client."""
+    """All certificates that the authority has signed for one robot or client, by its name."""
 
     name: str
     certificate: x509.Certificate
     """Newest certificate."""
     earlier: tuple[x509.Certificate, ...] = ()
+    """Certificates that were signed for this name before, oldest first."""
 
     @property
     def role(self) -> str:
-        """Role of a client; `robot` for a robot."""
+        """Role in the newest certificate: observe, command or admin of a client; `robot` for a robot."""
         found = self.certificate.subject.get_attributes_for_oid(NameOID.ORGANIZATIONAL_UNIT_NAME)
         return str(found[0].value) if found else "robot"
 
@@ -55,34 +56,35 @@ class Issued(NamedTuple):
 
 
 def place() -> Path:
-    """Return the directory of the authority."""
+    """Return the directory with the authority's private key and all certificates that it signed."""
     return keys_place() / "authority"
 
 
 def issued() -> Iterator[Issued]:
-    """Yield the issued certificates by name, in order of the names."""
+    """Yield the certificates of each robot and client, in alphabetical order of their names."""
     for path in sorted(place().glob("issued/*.crt")):
         *earlier, newest = x509.load_pem_x509_certificates(path.read_bytes())
         yield Issued(path.stem, newest, (*earlier,))
 
 
 def revoke(one: Issued) -> None:
-    """Make the robots of this computer refuse all certificates of a name from now on."""
+    """Add all certificates of a robot or client to the file `revoked`, so that this computer's robots refuse
+    them."""
     lines = "".join(f"{serial}\n" for serial in sorted(revoked().union(one.serials)))
     _write(keys_place() / "revoked", lines.encode())
 
 
 def issue(name: str, role: Role | None, days: int, to: Path) -> Issued:
-    """Sign a certificate, and write it with its key and the authority's certificate to a directory.
+    """Sign a certificate for a new key, and write both with the authority's certificate to a directory.
 
     Args:
         name: Name of the robot or client.
         role: Role of a client; None for a robot.
         days: Validity from now, days.
-        to: Directory of the files.
+        to: Directory of the files, which is created.
 
     Raises:
-        InputError: A file to be overwritten belongs to another name or another authority.
+        InputError: The directory has files of another name or another authority, or cannot be written.
     """
     file = name if role is None else CLIENT
     try:
@@ -126,7 +128,7 @@ def _is_named(path: Path, name: str) -> bool:
 
 
 def _authority() -> tuple[x509.Certificate, ec.EllipticCurvePrivateKey]:
-    """Return the authority's certificate and key. The first call creates them."""
+    """Return the authority's certificate and private key. The first call on a computer creates both files."""
     certificate, path = keys_place() / "ca.crt", place() / "ca.key"
     if not path.exists():
         if certificate.exists():

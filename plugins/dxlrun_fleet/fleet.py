@@ -22,7 +22,8 @@ if TYPE_CHECKING:
     from dxlrun_fleet.fleet_file import Fleet
 
 _START_S = 300.0
-"""Ten robots that start together on a small computer take minutes; one that cannot listen exits before."""
+"""Timeout from a robot's start to its first connection, s. Ten robots that start together on a small computer
+take minutes; a robot that cannot listen exits before."""
 _POLL_S = 0.2
 Names = Annotated[tuple[str, ...], Parameter(negative=(), show_default=False, consume_multiple=True)]
 
@@ -89,7 +90,7 @@ def _serve(fleet: Fleet, name: str) -> int:
 
 
 def _change(fleet: Fleet, start: tuple[str, ...], stop: tuple[str, ...], *, as_json: bool) -> int:
-    """Start and stop robots in parallel, so that an unresponsive robot does not delay another."""
+    """Start and stop robots in parallel, and print the result of each; return 1 if any failed, else 0."""
     work = {
         **{name: partial(_start, fleet) for name in start},
         **{name: partial(_stop, fleet) for name in stop},
@@ -113,7 +114,11 @@ def _change(fleet: Fleet, start: tuple[str, ...], stop: tuple[str, ...], *, as_j
 
 
 def _start(fleet: Fleet, name: str) -> str:
-    """Request a robot's start from its agent; return when the robot accepts connections."""
+    """Request a robot's start from its agent; when the robot accepts connections, return a sentence.
+
+    Raises:
+        DxlrunError: The agent refused, the run ended, or the robot accepted no connection in _START_S.
+    """
     from dxlrun.tooling.live import NetworkLink
     from dxlrun_fleet.agent import START
 

@@ -1,4 +1,7 @@
-"""Fleet file: addresses of robots, and the agents that start them."""
+"""Fleet file, the argument of `dxlrun fleet`: addresses of robots, and the agents that start them.
+
+The Form classes describe the YAML file for validation; Agent and Fleet are its parsed content.
+"""
 
 from __future__ import annotations
 
@@ -24,7 +27,7 @@ def _line(text: str) -> str:
 
 
 class AgentForm(Form):
-    """A computer where `dxlrun fleet FILE --serve NAME` starts robots."""
+    """Entry of an agent in the file: a computer where `dxlrun fleet FILE --serve NAME` starts robots."""
 
     address: ListedAddress = key("Address of the agent.", "lab3:7659")
     starts: dict[str, Annotated[str, AfterValidator(_line)]] = key(
@@ -34,25 +37,27 @@ class AgentForm(Form):
 
 
 class FleetForm(Form):
-    """Robots, and the agents that start them."""
+    """Top level of the file: robots, and the agents that start them."""
 
     robots: dict[str, ListedAddress] = key("Addresses by the names of certificates.", "{torso: lab3:7660}")
     agents: dict[str, AgentForm] = key("Agents by the names of their certificates.", "{lab3: {}}", {})
 
 
 class Agent(NamedTuple):
-    """Agent, with the arguments of `dxlrun` for each robot that it starts."""
+    """Agent of a fleet file: the address where it listens, and the robots that it starts."""
 
     address: Address
     starts: dict[str, tuple[str, ...]]
+    """Arguments of `dxlrun` that start each robot, by its name: the robot file and what follows it."""
 
 
 class Fleet(NamedTuple):
-    """Robots and agents by name."""
+    """Content of a fleet file: robots and agents by name."""
 
     robots: dict[str, Address]
     agents: dict[str, Agent]
     directory: Path
+    """Directory of the fleet file, to which the paths of robot files are relative."""
 
     def agent_of(self, robot: str) -> Agent:
         """Return the agent that starts a robot.
@@ -66,17 +71,17 @@ class Fleet(NamedTuple):
         raise InputError(f"no agent of the file starts {robot}; name it under agents: NAME: starts")
 
     def require(self, names: tuple[str, ...]) -> None:
-        """Raise InputError for the first name that is not a robot."""
+        """Raise InputError for the first name that is not a robot of the fleet file."""
         for name in names:
             if name not in self.robots:
                 raise InputError(f"the file has no robot {name}; {suggestion(name, tuple(self.robots))}")
 
 
 def read_fleet(path: Path) -> Fleet:
-    """Return the fleet of a file.
+    """Read and validate a fleet file.
 
     Raises:
-        InputError: The file has mistakes; the message has the place of each.
+        InputError: The file has mistakes; the message has the line and column of each.
     """
     form = read_yaml(path, FleetForm)
     return Fleet(

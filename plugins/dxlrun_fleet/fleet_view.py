@@ -1,4 +1,4 @@
-"""Fleet view: the last reply of each robot, polled by one thread per robot so that none delays another."""
+"""Live table of `dxlrun fleet`: the last reply of each robot, polled by one thread per robot."""
 
 from __future__ import annotations
 
@@ -13,34 +13,37 @@ from dxlrun import DxlrunError, Refused, RemoteRobot
 from dxlrun.tooling.live import Address, Events, NetworkLink, RobotInfo
 from dxlrun.tooling.output import Cell, Column, Columns, Table
 
-LOOK_S = 0.5  # Polling interval
+LOOK_S = 0.5  # Polling interval of each robot
 SILENT_S = 1.5
-"""A robot that has not replied for this time is unreachable."""
+"""Time without a reply after which the table shows a robot as unreachable, s."""
 _ERROR = 40
-"""Least severity of an error event."""
+"""Lowest severity of an event that the table shows as an error (warnings are below)."""
 
 
 class Seen(msgspec.Struct, frozen=True):
-    """State of one robot at its last reply."""
+    """Row of the fleet table: one robot at its last reply."""
 
     robot: str
     state: str = "connecting"
-    """connecting, starting, running, paused, unreachable"""
+    """connecting, starting (no cycle yet), running, paused or unreachable."""
     since: str = ""
-    """Wall-clock time of the last reply of an unreachable robot, or of the first attempt."""
+    """Only of an unreachable robot: ISO 8601 local time of its last reply, or of the first attempt."""
     reason: str = ""
+    """Only of an unreachable robot: error of the last attempt."""
     voltage: float | None = None
-    """Lowest voltage of its servos, V"""
+    """Lowest voltage of the robot's servos, V; None if unknown."""
     temperature: float | None = None
-    """Highest temperature of its servos, deg C"""
+    """Highest temperature of the robot's servos, deg C; None if unknown."""
     hottest: str = ""
+    """Joint whose servo has this temperature."""
     error: str = ""
-    """Text of its last error."""
+    """Text of the run's last event that is an error; empty without one."""
     log: str | None = None
+    """Log file that the run writes."""
 
 
 class RobotView:
-    """Poller of one robot, twice a second."""
+    """Thread that polls one robot twice a second over the network, and reconnects after an error."""
 
     def __init__(self, name: str, address: Address) -> None:
         self._address = address
@@ -56,7 +59,7 @@ class RobotView:
         self._ended.set()
 
     def seen(self) -> Seen:
-        """Return the current state of the robot."""
+        """Return the robot's row at its last reply; unreachable and without measurements after SILENT_S."""
         seen, silent = self._seen, time.monotonic() - self._replied
         if seen.state != "unreachable" and silent <= SILENT_S:
             return seen
@@ -80,7 +83,7 @@ class RobotView:
             self.tried.set()
 
     def _look(self, robot: RemoteRobot, last: int) -> int:
-        """Poll the robot; return the number of its last event."""
+        """Poll the robot's state and its events after number `last`; return the number of its last event."""
         info = msgspec.convert(robot.info(), RobotInfo)
         events = msgspec.convert(robot.events(last), Events)
         errors = [event.text for event in events.events if event.severity >= _ERROR]
@@ -110,12 +113,12 @@ class RobotView:
 
 
 def _at_most(values: np.ndarray[tuple[int, ...], np.dtype[np.float64]]) -> int | None:
-    """Return the index of the highest value, or None if all are unknown."""
+    """Return the index of the highest value, or None if none is finite."""
     return int(np.nanargmax(values)) if np.isfinite(values).any() else None
 
 
 def fleet_table(robots: list[Seen]) -> Table:
-    """Return a table with a row for each robot."""
+    """Return the table of `dxlrun fleet`: state, battery, hottest servo, last error and log of each robot."""
     columns: Columns[Seen] = [
         (Column("robot", "name"), lambda one: one.robot),
         (Column("state", "name"), _state),

@@ -1,4 +1,4 @@
-"""`dxlrun keys`: certificates for the gateways of robots and for their clients."""
+"""`dxlrun keys`: certificates that robots and their network clients present to each other (mutual TLS)."""
 
 from __future__ import annotations
 
@@ -121,7 +121,7 @@ _ACTIONS_WITH = {
 
 
 def _refuse_unused(action: str, given: Mapping[str, object]) -> None:
-    """Raise InputError for an option that this action does not use."""
+    """Raise InputError for an option that was given a value but that the action does not use."""
     for option, value in given.items():
         if value is not None and action not in _ACTIONS_WITH[option]:
             actions = " and ".join(_ACTIONS_WITH[option])

@@ -1,4 +1,4 @@
-"""Commands for several robots and computers, registered by the same hooks as those of any other package."""
+"""Plug-in that adds the commands `dxlrun fleet` and `dxlrun keys`, by the same hooks as any other package."""
 
 from __future__ import annotations
 
@@ -9,13 +9,13 @@ from dxlrun import CONTRACT_VERSION, Command, hookimpl
 
 @hookimpl
 def dxlrun_contract() -> int:
-    """Return the contract that this package was written for: the one it is published with."""
+    """Return the version of the plug-in contract; this package is published together with the runtime."""
     return CONTRACT_VERSION
 
 
 @hookimpl
 def dxlrun_commands() -> Sequence[Command]:
-    """Return the commands."""
+    """Return the commands `fleet` and `keys`, each with the function that is imported on use."""
     return (
         Command("fleet", "dxlrun_fleet.fleet:fleet", group="Robots that run"),
         Command("keys", "dxlrun_fleet.keys:keys", group="Robots that run"),

@@ -1,4 +1,4 @@
-"""`dxlrun foxglove`: server that shows a running robot in Foxglove or Lichtblick."""
+"""`dxlrun foxglove`: WebSocket server that shows a running robot in Foxglove or Lichtblick."""
 
 from __future__ import annotations
 
@@ -23,9 +23,9 @@ if TYPE_CHECKING:
 
 PORT = 8765  # Default port of Foxglove's WebSocket connections
 NICENESS = 10
-"""As the gateway: viewers use processor time that the robot leaves."""
+"""Niceness of this process, as of the gateway: viewers use only processor time that the robot leaves."""
 APP = "https://app.foxglove.dev"
-"""The viewer on the web, the only page that may connect without `--origin`."""
+"""Origin of Foxglove's web viewer, the only web page that may connect without `--origin`."""
 
 
 def foxglove(
@@ -83,7 +83,7 @@ def foxglove(
 
 
 async def _serve(served: FoxgloveServer, listener: Listener, tls: ssl.SSLContext | None) -> None:
-    """Serve until Ctrl-C or SIGTERM."""
+    """Accept viewers until Ctrl-C or SIGTERM. The address with its token is printed at the start."""
     ended = asyncio.Event()
     for number in (signal.SIGINT, signal.SIGTERM):
         asyncio.get_running_loop().add_signal_handler(number, ended.set)
@@ -98,7 +98,7 @@ async def _serve(served: FoxgloveServer, listener: Listener, tls: ssl.SSLContext
 
 
 def tls_of(cert: Path | None, key: Path | None) -> ssl.SSLContext | None:
-    """Return the TLS context, or None without a certificate.
+    """Return the server's TLS context, or None without a certificate. `key` defaults to the file of `cert`.
 
     Raises:
         InputError: The certificate or the key cannot be used.

@@ -1,4 +1,4 @@
-"""Command that serves Foxglove and Lichtblick, registered by the same hooks as that of any other package."""
+"""Plug-in that adds the command `dxlrun foxglove`, by the same hooks as any other package."""
 
 from __future__ import annotations
 
@@ -9,11 +9,11 @@ from dxlrun import CONTRACT_VERSION, Command, hookimpl
 
 @hookimpl
 def dxlrun_contract() -> int:
-    """Return the contract that this package was written for: the one it is published with."""
+    """Return the version of the plug-in contract; this package is published together with the runtime."""
     return CONTRACT_VERSION
 
 
 @hookimpl
 def dxlrun_commands() -> Sequence[Command]:
-    """Return the command."""
+    """Return the command `foxglove`, with the function that is imported on use."""
     return (Command("foxglove", "dxlrun_foxglove.command:foxglove", group="Robots that run"),)

@@ -1,4 +1,4 @@
-"""Frames of `foxglove.websocket.v1`, the protocol of live viewers, in both directions.
+"""Frames of `foxglove.websocket.v1`, the WebSocket protocol between viewers such as Foxglove and the server.
 
 The specification is in github.com/foxglove/ws-protocol. `foxglove.sdk.v1` has the same frames.
 """
@@ -15,11 +15,12 @@ SUBPROTOCOLS = ("foxglove.websocket.v1", "foxglove.sdk.v1")
 MESSAGE, CALL, RESPONSE = 1, 2, 3
 """Opcodes of binary frames; viewers send CALL, the server MESSAGE and RESPONSE."""
 MESSAGE_HEAD = struct.Struct("<BIQ")
-"""Opcode, subscription, time (ns since 1970); the message follows."""
+"""Header of a MESSAGE: opcode, number of the subscription, time (ns since 1970); the message follows."""
 _CALL_HEAD = struct.Struct("<BIII")
-"""Opcode, service, number of the call, length of the encoding's name; name and body follow."""
+"""Header of CALL and RESPONSE: opcode, number of the service, number of the call, length of the encoding's
+name; the encoding's name and the body follow."""
 WARNING, ERROR = 1, 2
-"""Levels of a status."""
+"""Levels of a status frame, which a viewer shows as a message."""
 Operation = Literal[
     "subscribe",
     "unsubscribe",
@@ -34,21 +35,22 @@ Number = Annotated[int, msgspec.Meta(ge=0, lt=1 << 32)]
 
 
 class Subscription(msgspec.Struct, frozen=True, rename="camel"):
-    """Subscription of a viewer: its own number for a channel."""
+    """Subscription of a viewer: `id` is the viewer's own number for the server's channel `channel_id`."""
 
     id: Number
     channel_id: Number
 
 
 class Parameter(msgspec.Struct, frozen=True):
-    """A parameter of a controller: `arm.gains.p`."""
+    """Value of a controller's parameter."""
 
     name: str
+    """Controller and parameter: `arm.gains.p` is `gains.p` of the controller `arm`."""
     value: bool | int | float | str
 
 
 class Words(msgspec.Struct, frozen=True, rename="camel"):
-    """Text frame of a viewer. Each operation uses some of the fields."""
+    """Text frame (JSON) from a viewer. Each operation `op` uses some of the fields."""
 
     op: Operation
     subscriptions: list[Subscription] = []
@@ -56,16 +58,19 @@ class Words(msgspec.Struct, frozen=True, rename="camel"):
     parameters: list[Parameter] = []
     parameter_names: list[str] = []
     id: str | None = None
-    """Number of the request, which its answer repeats."""
+    """Viewer's name for the request, which the answer repeats."""
 
 
 class Call(msgspec.Struct, frozen=True):
-    """Service call."""
+    """Service call from a viewer (binary frame)."""
 
     service: int
+    """Number of the service, as advertised."""
     number: int
+    """Viewer's number for the call, which the response repeats."""
     encoding: str
     body: bytes
+    """Arguments in this encoding."""
 
 
 _decode = msgspec.json.Decoder(Words).decode
@@ -90,28 +95,28 @@ def received(frame: str | bytes) -> Words | Call:
 
 
 def response(call: Call, body: bytes) -> bytes:
-    """Return the frame that answers a call."""
+    """Return the binary frame that answers a service call with the result `body`."""
     name = call.encoding.encode()
     return _CALL_HEAD.pack(RESPONSE, call.service, call.number, len(name)) + name + body
 
 
 def failure(request: Words | Call, why: str) -> str:
-    """Return the frame that refuses a request, with the reason."""
+    """Return the text frame that refuses a request or a call with the reason."""
     if isinstance(request, Call):
         return text("serviceCallFailure", serviceId=request.service, callId=request.number, message=why)
     return status(ERROR, why)
 
 
 def values(parameters: Sequence[Parameter], number: str | None) -> str:
-    """Return the frame with values of parameters; `number` is that of the request."""
+    """Return the text frame with the values of parameters; `number` repeats the `id` of the request."""
     return text("parameterValues", parameters=parameters, **({"id": number} if number else {}))
 
 
 def text(operation: str, **fields: object) -> str:
-    """Return a text frame."""
+    """Return a text frame to a viewer: JSON with the operation as `op`, and the fields."""
     return msgspec.json.encode({"op": operation, **fields}).decode()
 
 
 def status(level: int, message: str) -> str:
-    """Return a frame that a viewer shows as a message."""
+    """Return a text frame whose message a viewer shows to its user; `level` is WARNING or ERROR."""
     return text("status", level=level, message=message)

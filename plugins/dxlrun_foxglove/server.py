@@ -1,4 +1,4 @@
-"""Server for live viewers, with access control.
+"""WebSocket server of `dxlrun foxglove`, with access control.
 
 A viewer presents the token of the address. If it sends the web page that it belongs to (Origin, as every
 browser does), this page must be an allowed one. A connection without a token is closed after five seconds,
@@ -38,13 +38,13 @@ PING_S = 10.0
 """Interval between pings; a viewer that does not answer for twice as long is disconnected."""
 MOST_BYTES = 1 << 16
 """Largest frame from a viewer."""
-GOING_AWAY, TRY_AGAIN = 1001, 1013  # Close codes of RFC 6455 and its IANA registry
+GOING_AWAY, TRY_AGAIN = 1001, 1013  # Close codes of RFC 6455 and its IANA registry: run ended, no run
 ONLY_SHOWN = "this only shows the robot: start `dxlrun foxglove --control` to change it"
 _SILENT = logging.Logger("dxlrun foxglove", logging.CRITICAL)
 
 
 class FoxgloveServer:
-    """Server of the consecutive runs of one robot to viewers."""
+    """Server that shows one robot to viewers. It connects to the robot's current run while viewers exist."""
 
     def __init__(self, name: str, origins: Sequence[str], *, control: bool = False) -> None:
         """Create a server.
@@ -63,7 +63,7 @@ class FoxgloveServer:
         self._beginning = asyncio.Lock()
 
     async def serve(self, listener: Listener, tls: ssl.SSLContext | None = None) -> Server:
-        """Start accepting viewers."""
+        """Start accepting viewers at a listening socket; return the running WebSocket server."""
         # Enough threads that no request waits for another.
         workers = ThreadPoolExecutor(2 * MOST_VIEWERS * MOST_REQUESTS)
         asyncio.get_running_loop().set_default_executor(workers)
@@ -89,7 +89,10 @@ class FoxgloveServer:
     # Access
 
     def _let_in(self, connection: ServerConnection, request: Request) -> Response | None:
-        """Return the refusal of a request without the token, or None. The origin is checked separately."""
+        """Return the HTTP refusal of a connection without the token or beyond MOST_VIEWERS, else None.
+
+        The library checks the origin.
+        """
         given = parse_qs(urlsplit(request.path).query).get("token", [""])[0]
         # A constant-time comparison does not reveal a partly correct token.
         if not secrets.compare_digest(given.encode(), self.token.encode()):
@@ -101,7 +104,7 @@ class FoxgloveServer:
         return None
 
     async def _served(self, connection: ServerConnection) -> None:
-        """Serve a viewer until it disconnects or the run ends."""
+        """Serve a viewer until it disconnects or the run ends. The last viewer ends the link to the run."""
         self._listener.admit(connection.remote_address)
         viewer = Viewer(connection)
         self._viewers.add(viewer)
@@ -129,7 +132,7 @@ class FoxgloveServer:
     # Run
 
     async def _begun(self) -> ViewedRun:
-        """Return the run that viewers see.
+        """Return the run that viewers see; the first viewer connects to it.
 
         Raises:
             DxlrunError: The robot does not run.
@@ -174,7 +177,7 @@ class FoxgloveServer:
     # Requests
 
     def _take(self, viewer: Viewer, run: ViewedRun, frame: str | bytes) -> None:
-        """Process a frame. An invalid frame results in a status for the viewer."""
+        """Process a frame from a viewer. The viewer gets an error status for an invalid frame."""
         try:
             received = protocol.received(frame)
         except ValueError as error:
@@ -203,9 +206,9 @@ class FoxgloveServer:
                 self._ask(viewer, run, received)
 
     def _ask(self, viewer: Viewer, run: ViewedRun, request: Words | Call) -> None:
-        """Answer a request in a task of its own, so that messages continue.
+        """Start a task that sends a request to the robot and answers it, so that messages continue.
 
-        Further requests of a viewer are refused beyond MOST_REQUESTS, a halt beyond twice as many.
+        A request is refused while the viewer has MOST_REQUESTS unanswered, a halt while it has twice as many.
         """
         halts = isinstance(request, Call) and request.service == HALT
         if len(viewer.requests) >= MOST_REQUESTS * (1 + halts):
@@ -235,7 +238,7 @@ class FoxgloveServer:
             viewer.reply(protocol.failure(request, str(error)))
 
     def _tell_parameters(self, run: ViewedRun, controller: str) -> None:
-        """Send changed parameters to the viewers that subscribed to them."""
+        """Send a controller's parameters after a change to the viewers that subscribed to them."""
         for viewer in run.viewers:
             names = [one for one in viewer.parameters if one.startswith(f"{controller}.")]
             if names:

@@ -15,22 +15,22 @@ from dxlrun_foxglove.protocol import WARNING, Call, Parameter, status, text
 from dxlrun_foxglove.viewer import Channel, Viewer
 
 ENCODING = "json"
-"""Encoding of service calls."""
+"""Encoding of the arguments and results of services."""
 RATE = 50.0
-"""Hz, rate of receiving messages; a higher rate costs processor time without a visible effect on a screen."""
+"""Rate at which the robot's messages are received, Hz; more costs processor time without a visible effect."""
 LOOK_S = 2.0
-"""Interval between checks for new topics."""
+"""Interval between checks for new topics of the run, s."""
 
 
 class Switch(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
-    """Data of `switch`: names of controllers. The whole switch happens in one cycle, or is refused."""
+    """Arguments of the service `/switch`: controllers to activate and to deactivate, all in one cycle."""
 
     activate: tuple[str, ...] = ()
     deactivate: tuple[str, ...] = ()
 
 
 class TorqueRequest(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
-    """Data of `torque`."""
+    """Arguments of the service `/torque`, which enables or disables the torque of joints."""
 
     joints: tuple[str, ...]
     on: bool
@@ -40,19 +40,19 @@ class TorqueRequest(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
 
 
 class Nothing(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
-    """Body of a service without arguments."""
+    """Arguments of a service without arguments, `/halt`."""
 
 
 SERVICES = (("/halt", Nothing), ("/switch", Switch), ("/torque", TorqueRequest))
-"""Services of the server; the number of a service is its index."""
-HALT = 0
+"""Name and argument type of each service of the server; the number of a service is its index."""
+HALT = 0  # Number of `/halt`
 
 
 class ViewedRun(LiveMessages):
-    """One run of a robot, while it has viewers."""
+    """One run of a robot: sends its messages to the viewers, and their requests to the robot."""
 
     def __init__(self, name: str) -> None:
-        """Connect to the current run of a robot. Raises DxlrunError."""
+        """Read the log header of the robot's current run. Raises DxlrunError if the robot does not run."""
         with _robot(name) as robot:
             super().__init__(robot.log_header())
         self._name = name
@@ -92,12 +92,12 @@ class ViewedRun(LiveMessages):
         return why
 
     def _topics(self) -> set[str]:
-        """Return the topics that the log has as well, or from whose messages others are derived."""
+        """Return the run's topics that are in its log, or from which topics of the log are derived."""
         with _robot(self._name) as robot:
             return self.heard(robot.topics())
 
     async def _listen(self, topics: set[str]) -> None:
-        """Receive the messages of topics until the run ends, which raises DxlrunError."""
+        """Forward the messages of topics until the run ends, which raises DxlrunError."""
         with _robot(self._name) as robot:
             listen = partial(robot.listen, *topics, rate=RATE, newest=False)
             async for message in await asyncio.to_thread(listen):
@@ -105,7 +105,7 @@ class ViewedRun(LiveMessages):
         raise DxlrunError(f"the run of {self._name} has ended")
 
     def take(self, message: TopicMessage) -> None:
-        """Forward a message, and report messages that were lost before it."""
+        """Forward a message to the viewers; warn them if messages of its topic were lost before it."""
         if message.lost:
             lost = f"{message.lost} messages of {message.topic} were lost before they came here"
             for viewer in self.viewers:
@@ -121,7 +121,7 @@ class ViewedRun(LiveMessages):
 
     @property
     def graph(self) -> str:
-        """Frame with the publisher of each topic: controllers, or the robot itself."""
+        """Text frame with the publishers of each announced topic: controllers, or else the robot."""
         names = [one.name for one in self.header.controllers]
         rows = []
         for topic in [one.topic for one in self.channels]:
@@ -134,7 +134,10 @@ class ViewedRun(LiveMessages):
         return text("connectionGraphUpdate", publishedTopics=rows, **dict.fromkeys(others, ()))
 
     def parameters(self, names: Collection[str]) -> list[Parameter]:
-        """Return these parameters, or all without names. Raises DxlrunError."""
+        """Return the values of these parameters of controllers, or of all without names.
+
+        Parameters that are neither numbers nor texts are omitted. Raises DxlrunError.
+        """
         with _robot(self._name) as robot:
             return [
                 Parameter(f"{controller}.{one.name}", one.value)
@@ -145,7 +148,7 @@ class ViewedRun(LiveMessages):
             ]
 
     def set_parameters(self, parameters: Sequence[Parameter]) -> None:
-        """Change parameters; those of a controller change in one cycle. Raises DxlrunError."""
+        """Change parameters of controllers, those of one controller in one cycle. Raises DxlrunError."""
         with _robot(self._name) as robot:
             for controller in _controllers(robot, [one.name for one in parameters]):
                 begin = f"{controller}."
@@ -153,7 +156,10 @@ class ViewedRun(LiveMessages):
                 robot.set_parameters(controller, {one.name.removeprefix(begin): one.value for one in own})
 
     def call(self, call: Call) -> bytes:
-        """Execute a service; return its answer as JSON. Raises DxlrunError."""
+        """Send the request of a service call to the robot; return its answer as JSON.
+
+        Raises DxlrunError if the call is invalid or the robot refuses it.
+        """
         if call.service >= len(SERVICES) or call.encoding != ENCODING:
             raise InputError(f"there is no service {call.service} that takes {call.encoding}")
         name, kind = SERVICES[call.service]
@@ -177,13 +183,13 @@ def _robot(name: str) -> RemoteRobot:
 
 
 def _controllers(robot: RemoteRobot, names: Collection[str]) -> list[str]:
-    """Return the controllers that have parameters of these names; without names, all."""
+    """Return the controllers whose parameters are among these names; without names, all controllers."""
     every = [one.name for one in msgspec.convert(robot.info(), RobotInfo).controllers]
     return [one for one in every if not names or any(name.startswith(f"{one}.") for name in names)]
 
 
 def advertised(channels: Sequence[Channel]) -> str:
-    """Return the frame that announces channels."""
+    """Return the text frame that announces channels to a viewer, with the ROS 2 schema of each topic."""
     rows = [
         {
             "id": one.number,
@@ -199,7 +205,7 @@ def advertised(channels: Sequence[Channel]) -> str:
 
 
 def advertised_services() -> str:
-    """Return the frame that announces the services."""
+    """Return the text frame that announces all SERVICES to a viewer, with the JSON schema of each."""
     form = {"encoding": ENCODING, "schemaName": "Executed", "schemaEncoding": "jsonschema", "schema": "{}"}
     rows = []
     for number, (name, kind) in enumerate(SERVICES):

@@ -1,4 +1,4 @@
-"""Viewer: one connection with its send queues, in bounded memory."""
+"""Viewer: one WebSocket connection of Foxglove or Lichtblick, with its send queues of bounded size."""
 
 from __future__ import annotations
 
@@ -12,25 +12,25 @@ from dxlrun.tooling.topics import MessageType
 from dxlrun_foxglove.protocol import MESSAGE, MESSAGE_HEAD, WARNING, status
 
 MOST_BYTES = 4 << 20
-"""Size of the queue of messages for a slow viewer; the oldest messages are dropped."""
+"""Largest size of a viewer's queue of messages, bytes. Beyond it, the oldest messages are dropped."""
 MOST_REPLIES = 1000
-"""Length of the queue of all other frames; a viewer that does not receive them is disconnected."""
+"""Largest number of other queued frames. A viewer that lets more of them pile up is disconnected."""
 MOST_REQUESTS = 4
 """Simultaneous requests of one viewer. A halt is accepted up to twice this number."""
 SLOW = "Send buffer limit reached"
-"""Lichtblick shows an explanation for exactly this sentence."""
+"""Warning to a slow viewer. Lichtblick shows an explanation for exactly this sentence."""
 
 
 class Channel(msgspec.Struct, eq=False):
-    """Topic as announced to viewers."""
+    """Topic of the robot's run under the number by which it is announced to viewers."""
 
     number: int
     topic: str
     type: MessageType
     latched: bool
-    """A viewer that subscribes late receives the newest message."""
+    """True if a viewer that subscribes late receives the newest message at once."""
     newest: tuple[int, bytes] | None = None
-    """Time, ns since 1970, and CDR. None before the first message, when the channel is not announced yet."""
+    """Newest message: time (ns since 1970) and CDR; None before the first."""
 
 
 class Viewer:
@@ -39,11 +39,13 @@ class Viewer:
     def __init__(self, connection: ServerConnection) -> None:
         self.connection = connection
         self.subscriptions: dict[int, int] = {}
-        """Subscription numbers of the viewer by channel."""
+        """The viewer's own subscription number by number of the channel."""
         self.parameters: set[str] = set()
+        """Parameters whose changes the viewer receives."""
         self.graph = False
+        """True if the viewer receives the graph of publishers."""
         self.requests: set[asyncio.Task[None]] = set()
-        """Requests that the robot has not answered yet."""
+        """Tasks of the requests that the robot has not answered yet."""
         self._replies: deque[str | bytes] = deque()
         self._messages: deque[bytes] = deque()
         self._bytes = 0
@@ -51,7 +53,7 @@ class Viewer:
         self._more = asyncio.Event()
 
     def reply(self, frame: str | bytes) -> None:
-        """Queue a frame. These frames are all delivered, in the order in which they were queued."""
+        """Queue a frame that is not a message. All are delivered in order; one over the limit disconnects."""
         if len(self._replies) == MOST_REPLIES:
             # A regular close would wait for a viewer that does not receive.
             self.connection.transport.abort()
@@ -60,9 +62,9 @@ class Viewer:
         self._more.set()
 
     def show(self, channel: Channel, wall_ns: int, data: bytes) -> None:
-        """Queue a message if the viewer has subscribed to its channel.
+        """Queue a message (CDR; time in ns since 1970) if the viewer has subscribed to its channel.
 
-        A slow viewer loses the oldest messages.
+        A slow viewer loses the oldest messages and gets one warning.
         """
         subscription = self.subscriptions.get(channel.number)
         if subscription is None:
@@ -77,7 +79,10 @@ class Viewer:
         self._more.set()
 
     async def send(self) -> None:
-        """Send queued frames as fast as the viewer receives them. Raises ConnectionClosed."""
+        """Send queued frames, replies before messages, as fast as the viewer receives them.
+
+        Returns never; raises ConnectionClosed when the viewer has disconnected.
+        """
         while True:
             self._more.clear()
             while self._replies or self._messages:
