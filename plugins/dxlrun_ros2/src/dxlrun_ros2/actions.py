@@ -34,24 +34,25 @@ STATE_S = 1.0
 CLIENT_S = 1.0
 """Time without a client of the action after which a goal is cancelled, s"""
 _FAR_S = 10.0
-"""Duration of a goal that is cancelled at once, s"""
+"""Duration of the goal that stops joints and is cancelled at once, s"""
 _CYCLE_S = 0.01
-"""Polling period while a cycle is awaited, s"""
+"""Polling period while the record of a goal's last cycle is awaited, s"""
 _MEASURED_S = 5.0
-"""Timeout for the arrival of a cycle, s"""
+"""Longest wait for the record of the cycle in which a goal ended, s"""
 _AT_ONCE = 3
-"""Number of periods within which a goal counts as ended at its start"""
+"""A goal that ends within this number of periods of the loop was invalid from the start."""
 Seen: TypeAlias = tuple[int, float, Floats, Floats]
-"""Time (ns since 1970), time of the goal (s), desired and measured positions and velocities"""
+"""State of a trajectory's joints in one cycle: time (ns since 1970), time since the goal was accepted (s),
+desired and measured positions and velocities (shape (2, joints))"""
 
 
 class Action:
-    """Action server of a controller. Each goal of the action is a goal of the robot."""
+    """ROS 2 action server of a controller. Each action goal of a client becomes one goal of the robot."""
 
     kind: type
-    """Type of the action"""
+    """ROS 2 type of the action"""
     name: str
-    """Name of the action, after that of the controller"""
+    """Last part of the action's name CONTROLLER/NAME"""
 
     def __init__(self, node: Node, run: PublishedRun, controller: ControllerInfo) -> None:
         self.node, self.run, self.controller = node, run, controller
@@ -68,14 +69,17 @@ class Action:
         self._clients = f"{name}/_action/send_goal"
 
     def check(self, request: FollowJointTrajectory.Goal | GripperCommand.Goal) -> None:
-        """Check a goal before it is accepted. Raises DxlrunError with the reason to reject it."""
+        """Check an action goal before it is accepted. Raises DxlrunError with the reason to reject it."""
 
     def execute(self, handle: ServerGoalHandle, robot: RemoteRobot) -> object:
-        """Execute a goal, end its handle, and return its result. Raises DxlrunError."""
+        """Execute an accepted action goal on the robot.
+
+        Sets the final state of the handle and returns the action's result. Raises DxlrunError.
+        """
         raise NotImplementedError
 
     def failed(self, why: str, code: int = Result.INVALID_GOAL) -> object:
-        """Return the result of a goal that failed."""
+        """Return the action's result for a goal that failed, with reason and error code."""
         raise NotImplementedError
 
     def _answer(self, request: FollowJointTrajectory.Goal | GripperCommand.Goal) -> GoalResponse:
@@ -103,18 +107,23 @@ class Action:
     def wait(
         self, handle: ServerGoalHandle, robot: RemoteRobot, goal: RemoteGoal, look: Callable[[GoalState], str]
     ) -> tuple[GoalState, str]:
-        """Wait for the end of a goal.
+        """Wait until a goal has ended and the record of its last cycle has arrived.
 
-        If a client cancels or has exited, the goal is cancelled. It ends when the joints are at rest.
+        If the action's client cancels or has exited, the goal is cancelled. It ends when the joints are at
+        rest.
 
         Args:
             handle: Goal of the action.
             robot: Connection to the robot.
             goal: Goal of the robot.
-            look: Called with each new state. It returns a reason to cancel the goal, or an empty text.
+            look: Called every FEEDBACK_S with the state of the goal. It returns a reason to cancel the goal,
+                or an empty text.
 
         Returns:
             The final state, and the reason why the bridge cancelled the goal (empty if it did not).
+
+        Raises:
+            DxlrunError: The run or the bridge ends.
         """
         why, cancelled, seen = "", False, time.monotonic()
         while (state := robot.goal_state(goal.number, FEEDBACK_S)).status == "running":
@@ -147,7 +156,7 @@ class FollowTrajectory(Action):
     kind, name = FollowJointTrajectory, "follow_joint_trajectory"
 
     def check(self, request: FollowJointTrajectory.Goal) -> None:
-        """Check a goal before it is accepted. Raises InputError with the reason to reject it."""
+        """Check trajectory and tolerances before a goal is accepted. Raises InputError with the reason."""
         if request.multi_dof_trajectory.points:
             raise InputError("it has no joints with several degrees of freedom")
         goal_fields(request, self.controller.joints)
@@ -159,11 +168,11 @@ class FollowTrajectory(Action):
         return wanted(request.trajectory, self.controller.joints, now)
 
     def failed(self, why: str, code: int = Result.INVALID_GOAL) -> object:
-        """Return the result of a goal that failed."""
+        """Return the FollowJointTrajectory result of a goal that failed, with reason and error code."""
         return Result(error_code=code, error_string=why)
 
     def execute(self, handle: ServerGoalHandle, robot: RemoteRobot) -> object:
-        """Follow a trajectory. A trajectory without points stops the joints."""
+        """Follow the trajectory of an action goal. A trajectory without points stops the joints."""
         request = handle.request
         if not request.trajectory.points:
             state, _ = self.wait(handle, robot, stopped(robot, self.run, self.controller), lambda _: "")
@@ -202,7 +211,7 @@ class FollowTrajectory(Action):
             self.run.seen.discard(watch.see)
 
     def _code(self, state: GoalState) -> int:
-        """Return the error code of control_msgs for a goal that was not reached."""
+        """Return the error code of FollowJointTrajectory for a goal that was not reached."""
         if state.status == "missed":
             return int(Result.GOAL_TOLERANCE_VIOLATED)
         # A goal that is invalid from the start ends within a few periods.
@@ -212,7 +221,7 @@ class FollowTrajectory(Action):
 
 
 def stopped(robot: RemoteRobot, run: PublishedRun, controller: ControllerInfo) -> RemoteGoal:
-    """Stop the joints of a trajectory controller. Return the goal that ends when they are at rest."""
+    """Stop the joints of a trajectory controller; return the goal of the robot that ends when they rest."""
     try:
         if goal := robot.cancel(controller.name).goal:
             return goal
@@ -238,7 +247,7 @@ def _sent(
 
 
 class Watch:
-    """Desired and measured state of the joints of a trajectory, updated in each cycle"""
+    """Feedback of a FollowJointTrajectory goal: desired and measured joint states, updated in each cycle"""
 
     def __init__(self, run: PublishedRun, plan: Wanted) -> None:
         self.plan = plan
@@ -250,11 +259,11 @@ class Watch:
         self.newest: Seen | None = None
 
     def begin(self, state: GoalState) -> None:
-        """Count the time from the acceptance of the goal."""
+        """Set the time from which the trajectory is counted: the acceptance of the goal by the robot."""
         self._begin_ns = round(state.accepted * 1e9)
 
     def see(self, record: np.void) -> None:
-        """Update the states from the record of a cycle."""
+        """Update `newest` from the record of a cycle; ignored before `begin`."""
         if self._begin_ns is None:
             return
         t_ns = int(record["read_ns"])
@@ -264,7 +273,7 @@ class Watch:
         self.newest = t_ns + self._offset_ns, seconds, self._sample.rows[:2].copy(), actual
 
     def feedback(self, newest: Seen) -> FollowJointTrajectory.Feedback:
-        """Return the feedback of a cycle."""
+        """Return the feedback message with the joint states of a cycle."""
         wall_ns, seconds, desired, actual = newest
         message = FollowJointTrajectory.Feedback(joint_names=list(self.plan.joints))
         message.header.stamp.sec, message.header.stamp.nanosec = divmod(wall_ns, 1_000_000_000)
@@ -279,11 +288,11 @@ class Gripper(Action):
     kind, name = GripperCommand, "gripper_cmd"
 
     def failed(self, why: str, code: int = Result.INVALID_GOAL) -> object:
-        """Return the result of a goal that failed."""
+        """Return the GripperCommand result of a goal that failed, which has no field for the reason."""
         return self._report(GripperCommand.Result())
 
     def execute(self, handle: ServerGoalHandle, robot: RemoteRobot) -> object:
-        """Close or open the gripper. The goal also succeeds if the gripper holds something."""
+        """Move the gripper to a position. The action also succeeds if it stops early at an object."""
         command = handle.request.command
         wish: dict[str, object] = {"position": command.position}
         if command.max_effort > 0:
@@ -316,7 +325,10 @@ class Gripper(Action):
         return message
 
     def _stalled(self, robot: RemoteRobot, state: GoalState) -> bool:
-        """Return True if the gripper stalled, according to the first message of its topic after the end."""
+        """Return True if the gripper's first state message after the goal's end says that it stalled.
+
+        False if none arrives within STATE_S.
+        """
         until = time.monotonic() + STATE_S
         while time.monotonic() < until:
             found = robot.newest(f"/{self.controller.name}/state")

@@ -1,4 +1,4 @@
-"""Bridge: ROS 2 nodes of one run of a robot."""
+"""Bridge: the ROS 2 nodes `dxlrun`, `controller_manager` and one per controller, for one run of a robot."""
 
 from __future__ import annotations
 
@@ -19,23 +19,23 @@ from dxlrun_ros2.published_run import PublishedRun
 from dxlrun_ros2.set_points import SetPoints
 
 LOOK_S = 1.0
-"""Polling period for new topics and controllers, s"""
+"""Period of polling the run for new topics and controllers, s"""
 THREADS = 32
-"""Largest number of threads, which are started on demand. Each goal occupies one until it ends."""
+"""Largest number of threads that serve requests. Each action goal occupies one until it ends."""
 LAST_S = 1.0
-"""Time for the results of goals after the end of the run, s"""
+"""Time for which requests are still served after the end of the run, so that goals get results, s"""
 
 
 class Bridge:
     """ROS 2 nodes of one run. They have a context of their own, so that they all end with the run."""
 
     def __init__(self, robot: RemoteRobot, address: str, lease: float) -> None:
-        """Open nodes and topics.
+        """Open the nodes `dxlrun` and `controller_manager`, and the topics that every run has.
 
         Args:
             robot: Connection to the robot.
             address: Name or address under which the robot can be connected to.
-            lease: Time for which a setpoint of a publisher is valid, s.
+            lease: Time after which the joints of a silent publisher are held, s.
 
         Raises:
             DxlrunError: The run has ended, or refuses a request.
@@ -62,14 +62,17 @@ class Bridge:
             raise
 
     def node(self, name: str, **more: bool) -> Node:
-        """Create a node of the bridge."""
+        """Create a ROS 2 node, which `spin` serves; `more` are keyword arguments of rclpy's Node."""
         node = Node(name, context=self._context, **more)
         self._nodes[name] = node
         self._executor.add_node(node)
         return node
 
     def spin(self, stopped: threading.Event) -> None:
-        """Serve requests until the run has ended or the event is set. Raises DxlrunError."""
+        """Serve ROS 2 requests and new controllers until the run has ended or the event is set.
+
+        Requests are served for LAST_S more. Raises DxlrunError if polling the run fails.
+        """
         looked = 0.0
         while not (stopped.is_set() or self.run.ended.is_set()):
             if time.monotonic() > looked + LOOK_S:
@@ -91,7 +94,8 @@ class Bridge:
             self._nodes["dxlrun"].get_logger().error(f"{type(error).__name__}: {error}")
 
     def _look(self) -> None:
-        """Open a node for each new controller, and close those of unloaded ones. Raises DxlrunError."""
+        """Open a node for each new controller of the run, close the nodes of unloaded controllers, and update
+        changed parameters. Raises DxlrunError."""
         found = {one.name: one for one in info_of(self._robot).controllers}
         for name in [name for name in self._controllers if name not in found]:
             self._controllers.pop(name).close()
@@ -107,7 +111,7 @@ class Bridge:
                 self._controllers[name].refresh(self._robot)
 
     def close(self) -> None:
-        """Close all nodes."""
+        """Close all nodes and the connection of the publishers' setpoints."""
         self._points.close()
         self._executor.shutdown(timeout_sec=1.0)
         for node in self._nodes.values():

@@ -23,7 +23,7 @@ RETRY_S = 0.2
 
 
 def arguments(words: list[str]) -> argparse.Namespace:
-    """Parse the command line, from which the arguments of ROS have been removed."""
+    """Parse the command line without ROS arguments; exit with usage if it is invalid or ambiguous."""
     parser = argparse.ArgumentParser(
         "dxlrun-ros2", description="Bridge a running robot to ROS 2, with the names of ros2_control."
     )
@@ -45,7 +45,7 @@ def arguments(words: list[str]) -> argparse.Namespace:
 
 
 def main() -> int:
-    """Bridge each run of the robot, until Ctrl-C or SIGTERM."""
+    """Bridge the robot's run to ROS 2, and after its end each following run, until Ctrl-C or SIGTERM."""
     from rclpy.utilities import remove_ros_args
 
     from dxlrun_ros2.bridge import Bridge
@@ -72,7 +72,7 @@ def main() -> int:
 
 
 def _bridge(bridge: Bridge, name: str, stopped: threading.Event) -> None:
-    """Serve one run of a robot. Raises DxlrunError."""
+    """Serve a run until it ends or `stopped` is set; then close the bridge. Raises DxlrunError."""
     try:
         print(f"{name} is in ROS 2; Ctrl-C ends this, not the robot.", flush=True)
         bridge.spin(stopped)

@@ -25,18 +25,30 @@ from dxlrun_ros2.set_points import LONGEST_S, SetPoints
 from dxlrun_ros2.trajectories import point, wanted
 
 GROUP = ("positions", "posvel", "poseffort", "velocities", "efforts", "pwm")
-"""Commands with one number per joint and field"""
+"""Kinds of commands with one number per joint and field; the topic CONTROLLER/commands sends the first
+one that the controller accepts"""
 STATE_NS = 20_000_000
-"""Time between two messages of controller_state, ns"""
+"""Shortest time between two messages of a trajectory controller's topic controller_state, ns"""
 
 
 class ControllerNode:
-    """Interface of one controller. Its topics and actions depend on the commands that are accepted."""
+    """ROS 2 interface of one controller. Its topics and actions depend on the commands that it accepts."""
 
     def __init__(
         self, node: Node, robot: RemoteRobot, run: PublishedRun, controller: ControllerInfo, points: SetPoints
     ) -> None:
-        """Open the topics and actions. Raises DxlrunError."""
+        """Open topics, actions, services and parameters of a controller in its node.
+
+        Args:
+            node: Node of the controller.
+            robot: Connection to the robot.
+            run: Publisher of the run, whose cycles the node reports.
+            controller: Description of the controller.
+            points: Connection for the setpoints of publishers.
+
+        Raises:
+            DxlrunError: The run has ended.
+        """
         self.node, self._run, self._controller, self._points = node, run, controller, points
         name, takes = controller.name, controller.takes
         if "trajectory" in takes:
@@ -60,13 +72,16 @@ class ControllerNode:
             offer_torque(node, run.address, controller.name, name)
 
     def close(self) -> None:
-        """Stop processing the cycles of the run."""
+        """Stop publishing controller_state. The node itself is closed by the bridge."""
         self._run.seen.discard(getattr(self, "_show", None))
 
     # Topics
 
     def _trajectory(self, message: JointTrajectory, robot: RemoteRobot) -> None:
-        """Follow the newest trajectory of a publisher. A trajectory without points stops the joints."""
+        """Send a published trajectory to the controller, as a chunk with a lease if it accepts chunks.
+
+        A trajectory without points stops the joints.
+        """
         name = self._controller.name
         if not message.points:
             stopped(robot, self._run, self._controller)
@@ -93,7 +108,7 @@ class ControllerNode:
         self._points.send(robot, self._controller.name, "velocity", command)
 
     def _show(self, record: np.void) -> None:
-        """Publish the state of a trajectory controller, if there is a subscriber."""
+        """Publish controller_state from a cycle's record, at most every STATE_NS, if it has a subscriber."""
         t_ns = int(record["read_ns"])
         if t_ns < self._state_ns + STATE_NS or not self._state.get_subscription_count():
             return
@@ -112,7 +127,7 @@ class ControllerNode:
     # Parameters
 
     def _declare(self, robot: RemoteRobot) -> None:
-        """Declare the parameters of the robot file. Only live ones can be set."""
+        """Declare the controller's parameters in its node. Only those that can change in a run can be set."""
         for one in robot.parameter_table(self._controller.name):
             value = list(one.value) if isinstance(one.value, tuple) else one.value
             if not _is_parameter(value):
@@ -134,7 +149,7 @@ class ControllerNode:
         self.node.add_on_set_parameters_callback(self._set)
 
     def refresh(self, robot: RemoteRobot) -> None:
-        """Update the parameters that another client has changed."""
+        """Update the node's parameters that another client of the robot has changed."""
         now = {one.name: one.value for one in robot.parameter_table(self._controller.name) if one.live}
         changed = [name for name, value in now.items() if self._live.get(name) != value]
         self._live |= now
@@ -153,14 +168,17 @@ class ControllerNode:
 
 
 def fields_of(controller: ControllerInfo, kind: str) -> tuple[str, ...]:
-    """Return the fields of a command. Each is an array with one number per joint."""
+    """Return the field names of a kind of command, such as positions and velocities, one number per joint."""
     schema = controller.takes[kind]
     properties = schema.get("properties", {}) if isinstance(schema, dict) else {}
     return tuple(properties)
 
 
 def offer_torque(node: Node, robot: str, joints: str, place: str) -> None:
-    """Offer services for torque and reboot of joints. They deactivate the controllers if necessary."""
+    """Create the services PLACE/torque and PLACE/reboot of joints, a group, a controller or `all`.
+
+    Torque off and reboot deactivate the controllers that command the joints.
+    """
 
     def switch(connected: RemoteRobot, request: SetBool.Request) -> Executed:
         return connected.torque(joints, request.data, release=not request.data)
@@ -175,7 +193,10 @@ def offer_torque(node: Node, robot: str, joints: str, place: str) -> None:
 def offer(
     node: Node, robot: str, kind: type, name: str, ask: Callable[[RemoteRobot, SetBool.Request], Executed]
 ) -> None:
-    """Offer a service of std_srvs. It calls `ask` with a connection to the robot."""
+    """Create a service of std_srvs that calls `ask` with a new connection to the robot.
+
+    Its response has the cycle in which the request was executed, or the reason of the refusal.
+    """
 
     def asked(request: SetBool.Request, response: SetBool.Response) -> SetBool.Response:
         try:
@@ -192,7 +213,7 @@ def offer(
 
 
 def _is_parameter(value: object) -> bool:
-    """Return True if ROS 2 has a parameter type for a value."""
+    """Return True if ROS 2 has a parameter type for a value: a scalar, or a list of one type of scalars."""
     if isinstance(value, list):
         return len({type(one) for one in value}) == 1 and isinstance(value[0], bool | int | float | str)
     return isinstance(value, bool | int | float | str)

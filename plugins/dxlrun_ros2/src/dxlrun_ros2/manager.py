@@ -45,8 +45,8 @@ TYPES = {
     "joint_trajectory_controller": "joint_trajectory_controller/JointTrajectoryController",
     "pid_controller": "pid_controller/PidController",
 }
-"""Types of ros2_control by the type of dxlrun. All other types are named dxlrun/TYPE."""
-STATES = ("position", "velocity", "effort")
+"""Controller types of ros2_control by dxlrun's type. All other types are reported as dxlrun/TYPE."""
+STATES = ("position", "velocity", "effort")  # State interfaces of each joint
 
 
 AnyRequest = TypeVar("AnyRequest")
@@ -79,7 +79,10 @@ class Manager:
         request: AnyRequest,
         response: AnyResponse,
     ) -> AnyResponse:
-        """Answer a request. If it is refused, `ok` stays false and the reason is logged in ROS."""
+        """Fill the response of a service with `answer` and a new connection to the robot; return it.
+
+        If the request is refused, `ok` stays false and the reason is logged in ROS.
+        """
         try:
             with connect(self._address, CLIENT) as robot:
                 answer(robot, request, response)
@@ -132,7 +135,7 @@ class Manager:
             robot.switch(entering, leaving)
 
     def _load(self, robot: RemoteRobot, request: LoadController.Request, _: LoadController.Response) -> None:
-        """Load a controller while the loop is paused. A loaded controller is left unchanged."""
+        """Load a controller while the run is paused. If it is loaded already, nothing changes."""
         if request.name in {one.name for one in info_of(robot).controllers}:
             return
         entry = self._entry(request.name)
@@ -150,11 +153,15 @@ class Manager:
     def _configure(
         self, robot: RemoteRobot, request: ConfigureController.Request, _: ConfigureController.Response
     ) -> None:
-        """Only check the name, because loading also configures a controller."""
+        """Check that the controller is loaded. There is nothing to do, because loading also configures it."""
         _known(robot, request.name)
 
     def _entry(self, name: str) -> dict[str, object]:
-        """Return the entry of a controller from the parameters NAME.* of this node and NAME.params_file."""
+        """Return the robot file entry for a controller that is to be loaded.
+
+        In rising priority: the entry with which it was unloaded, files of the parameter NAME.params_file,
+        and parameters NAME.* of this node. Raises InputError without a type.
+        """
         given = {key: one.value for key, one in self._node.get_parameters_by_prefix(name).items()}
         files = given.pop("params_file", [])
         entry = dict(self._unloaded.get(name, {}))
@@ -173,7 +180,10 @@ class Manager:
 
 
 def _parameters(path: Path, name: str) -> dict[str, object]:
-    """Read the parameters of a controller from a parameter file. Raises InputError."""
+    """Read a controller's `ros__parameters` from a ROS 2 parameter file; empty if the file lacks it.
+
+    Raises InputError.
+    """
     try:
         found = yaml.safe_load(path.read_text(encoding="utf-8"))
         return dict(found[name]["ros__parameters"]) if name in found else {}
@@ -183,7 +193,7 @@ def _parameters(path: Path, name: str) -> dict[str, object]:
 
 @contextmanager
 def _paused(robot: RemoteRobot) -> Iterator[None]:
-    """Hold the joints while a controller is loaded or unloaded."""
+    """Pause the run, which holds all joints, while a controller is loaded or unloaded."""
     robot.pause()
     try:
         yield
@@ -192,17 +202,17 @@ def _paused(robot: RemoteRobot) -> Iterator[None]:
 
 
 def info_of(robot: RemoteRobot) -> RobotInfo:
-    """Return the information about a robot and its controllers."""
+    """Request `RemoteRobot.info` and convert it: names of joints, rate, controllers. Raises DxlrunError."""
     return msgspec.convert(robot.info(), RobotInfo)
 
 
 def ros_type(kind: str) -> str:
-    """Return the ros2_control type of a controller."""
+    """Return the ros2_control type for a controller type of dxlrun, or dxlrun/TYPE if there is none."""
     return TYPES.get(kind, f"dxlrun/{kind}")
 
 
 def _known(robot: RemoteRobot, name: str) -> ControllerInfo:
-    """Return a controller by its name. Raises InputError."""
+    """Return the description of a loaded controller. Raises InputError if it is not loaded."""
     known = {one.name: one for one in info_of(robot).controllers}
     if name not in known:
         raise InputError(f"there is no controller {name}; there are {', '.join(known)}")
@@ -210,7 +220,7 @@ def _known(robot: RemoteRobot, name: str) -> ControllerInfo:
 
 
 def _written(one: ControllerInfo, robot: RemoteRobot) -> dict[str, object]:
-    """Return a controller's entry for the robot file, with `active: false`."""
+    """Return the robot file entry that loads a controller again, inactive and with its current parameters."""
     entry: dict[str, object] = {"type": one.type, "active": False}
     entry |= {"into": list(one.into)} if one.into else {}
     entry |= {"fallback": one.fallback} if one.fallback else {}
@@ -252,7 +262,7 @@ def _state(one: ControllerInfo, known: Sequence[ControllerInfo]) -> ControllerSt
 
 
 def _hardware(robot: RemoteRobot) -> HardwareComponentState:
-    """Describe the robot as a single hardware component of ros2_control."""
+    """Describe the robot as one hardware component of ros2_control, with all command and state interfaces."""
     info = info_of(robot)
     direct = [one for one in info.controllers if not one.into]
     commanded = sorted({f"{joint}/{kind}" for one in direct for joint in one.joints for kind in one.command})

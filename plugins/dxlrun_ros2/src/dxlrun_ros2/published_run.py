@@ -20,7 +20,7 @@ from dxlrun_ros2 import CLIENT
 STATE = QoSProfile(depth=1)
 """Quality of service of ros2_control's broadcasters: reliable, depth 1, volatile"""
 LATCHED = QoSProfile(depth=1, durability=DurabilityPolicy.TRANSIENT_LOCAL)
-"""Quality of service of topics whose last message a later subscriber also receives"""
+"""Quality of service of topics whose last message a later subscriber also receives, such as /tf_static"""
 QUALITIES: Mapping[str, QoSProfile] = {
     LogTopic.FRAMES: QoSProfile(depth=100),
     LogTopic.ROSOUT: qos_profile_rosout_default,
@@ -31,16 +31,19 @@ GLOBAL = {
     LogTopic.ROSOUT,
     LogTopic.DIAGNOSTICS,
 }
-"""Topics that are global in ROS 2, whatever the namespace"""
+"""Topics that keep their leading slash. All others are in the namespace of the bridge's node."""
 LOGGED = {LogTopic.CYCLE, LogTopic.ACTIVATION, LogTopic.COMMANDS, LogTopic.EVENT, LogTopic.MACHINE}
-"""Topics that are only in the log, like those of buses"""
+"""Topics, besides those of buses, for which no message type is expected: no warning if it is missing"""
 
 
 class PublishedRun(LiveMessages):
-    """Publisher of one run. It publishes all topics of the log whose message type is installed."""
+    """Publisher of one run: all topics of its log whose ROS 2 message type is installed.
+
+    It also gives the other nodes the record of each cycle, in `newest` and to the functions in `seen`.
+    """
 
     def __init__(self, node: Node, robot: RemoteRobot, address: str) -> None:
-        """Open the topics that every run has.
+        """Create the publishers of the topics that every run has.
 
         Args:
             node: Node that publishes.
@@ -53,13 +56,15 @@ class PublishedRun(LiveMessages):
         super().__init__(robot.log_header())
         self.address, self._node = address, node
         self.ended = threading.Event()
+        """Set when the run has ended or a thread that receives messages has failed"""
         self.why = ""
+        """Reason of the end"""
         self.seen: set[Callable[[np.void], None]] = set()
         """Functions that are called with the record of each cycle"""
         self.newest: np.void | None = None
-        """Record of the newest cycle"""
+        """Record of the newest cycle; None before the first"""
         self.changed: set[str] = set()
-        """Controllers with changed parameters"""
+        """Controllers whose parameters changed and whose nodes are not updated yet"""
         self.on_changed = self.changed.add
         self._publishers_of: list[Publisher | None] = []
         self._heard: set[str] = set()
@@ -81,13 +86,13 @@ class PublishedRun(LiveMessages):
             publisher.publish(data)
 
     def hear(self, robot: RemoteRobot) -> None:
-        """Subscribe to topics that have been opened since the last call. Raises DxlrunError."""
+        """Receive and publish the run's topics that were opened since the last call. Raises DxlrunError."""
         if new := self.heard(robot.topics()) - self._heard:
             self._heard |= new
             threading.Thread(target=self._listen, args=(new,), daemon=True).start()
 
     def _listen(self, topics: set[str]) -> None:
-        """Publish the messages of topics until the run ends."""
+        """Publish the messages of topics until the run ends; then set `why` and `ended`."""
         try:
             with connect(self.address, CLIENT) as robot:
                 for message in robot.listen(*topics):
@@ -102,7 +107,7 @@ class PublishedRun(LiveMessages):
         self.ended.set()
 
     def take(self, message: TopicMessage) -> None:
-        """Publish a message, and store the newest record of a cycle."""
+        """Publish a message of the run. Store the record of a cycle, and call the functions in `seen`."""
         super().take(message)
         if message.topic == LogTopic.CYCLE:
             self.newest = self.read_cycle(message)
@@ -117,12 +122,15 @@ class PublishedRun(LiveMessages):
         return 0.0 if self.newest is None else int(self.newest["read_ns"]) * 1e-9
 
     def rows(self, joints: Sequence[str]) -> NDArray[np.int_]:
-        """Return the rows of joints in a record."""
+        """Return the indices of joints in the fields of a cycle's record."""
         return np.array([self.header.joints.index(joint) for joint in joints], int)
 
     @property
     def desired(self) -> Floats:
-        """Goal of each joint, or its measured position without a goal; NaN if unknown. Shape (joints,)."""
+        """Goal position of each joint in the newest cycle, or its measured position without a goal.
+
+        rad or m, shape (joints,); NaN if unknown.
+        """
         if self.newest is None:
             return np.full(len(self.header.joints), np.nan)
         goal, position = self.newest["goal_position"], self.newest["position"]
@@ -131,7 +139,7 @@ class PublishedRun(LiveMessages):
 
 
 def message_class(name: str) -> type | None:
-    """Return the class of a message such as `nav_msgs/msg/Odometry`, or None if it is not installed."""
+    """Return the Python class of a ROS 2 message such as `nav_msgs/msg/Odometry`; None if not installed."""
     package, folder, kind = name.split("/")
     package = "dxlrun_msgs" if package == "dxlrun" else package  # `dxlrun` is the Python package
     try:

@@ -1,4 +1,4 @@
-"""Setpoints: messages of ROS 2 publishers to controllers, one stream per publisher."""
+"""Setpoints: messages that ROS 2 publishers send to controllers, each valid for a limited time (lease)."""
 
 from __future__ import annotations
 
@@ -15,16 +15,21 @@ from dxlrun_ros2 import CLIENT
 
 Message = TypeVar("Message")
 LONGEST_S = 60.0
-"""Longest lease, s"""
+"""Longest lease that the run accepts, s"""
 QUIET_S = 2.0
-"""Shortest time between two warnings of a topic, s"""
+"""Shortest time between two warnings about refused messages of a topic, s"""
 
 
 class SetPoints:
-    """Connection for the streams of all publishers. The log names the node of each publisher."""
+    """Connection that sends the messages of all publishers. The robot's log names each publisher's node."""
 
     def __init__(self, address: str, lease: float) -> None:
-        """Set the lease: the time for which a setpoint is valid, s."""
+        """Prepare the connection to a robot, which the first message opens.
+
+        Args:
+            address: Name or address of the robot.
+            lease: Time for which a setpoint is valid; then the joints are held, s.
+        """
         self.lease = lease
         self._address = address
         self._robot: RemoteRobot | None = None
@@ -41,7 +46,7 @@ class SetPoints:
     def subscribe(
         self, node: Node, kind: type, topic: str, take: Callable[[Message, RemoteRobot], None]
     ) -> None:
-        """Subscribe to a topic.
+        """Subscribe to a ROS 2 topic. A message that the robot refuses is reported as a warning in ROS.
 
         Args:
             node: Node that subscribes.
@@ -70,7 +75,7 @@ class SetPoints:
         command: Mapping[str, object],
         more_s: float = 0.0,
     ) -> None:
-        """Send a setpoint for the present publisher. It is valid for the lease plus `more_s`, s."""
+        """Send a setpoint to a controller, from within `take`. It is valid for the lease plus `more_s`, s."""
         robot.stream(controller, kind, self.lease + more_s).send(command)
 
     def _connected(self) -> RemoteRobot:

@@ -8,7 +8,7 @@ from dxlrun_ros2.versions import other_version
 
 
 def main() -> int:
-    """Run the bridge, or return 2 if dxlrun has another version."""
+    """Run the bridge, and return its exit code; print an error and return 2 if dxlrun has another version."""
     if (wrong := other_version()) is not None:
         print(f"dxlrun-ros2: {wrong}", file=sys.stderr)
         return 2

@@ -1,4 +1,4 @@
-"""Conversion of ROS 2 trajectories to commands of dxlrun, and the splines that the controllers play."""
+"""Conversion of ROS 2 trajectories to commands of dxlrun, and to the splines that the controller plays."""
 
 from __future__ import annotations
 
@@ -17,30 +17,30 @@ from dxlrun_controllers.laws.spline import CUBIC, LINEAR, QUINTIC, SplineSample,
 
 @dataclass(frozen=True)
 class Wanted:
-    """Validated trajectory: rad, rad/s, rad/s^2, s."""
+    """Validated ROS 2 trajectory of a controller's joints: rad, rad/s, rad/s^2 (m for linear joints), s"""
 
     joints: tuple[str, ...]
     times: Floats
     """Times after the start, s, increasing; shape (points,)"""
     points: Floats
-    """Position, velocity, acceleration; shape (points, 3, joints)"""
+    """Position, velocity, acceleration (0 if not given); shape (points, 3, joints)"""
     orders: tuple[int, ...]
     """Order of each point: LINEAR with a position only, CUBIC with a velocity, QUINTIC with an acceleration
     """
     start_in: float
-    """Time until the start, s"""
+    """Time from the conversion of the message until the trajectory starts, s"""
 
     @property
     def seconds(self) -> float:
-        """Time until the last point, s"""
+        """Time from the conversion of the message until the last point, s"""
         return self.start_in + float(self.times[-1])
 
     def command(self) -> dict[str, object]:
-        """Return the goal `trajectory` of a joint_trajectory_controller."""
+        """Return the fields of the command `trajectory` of a joint_trajectory_controller."""
         return {"points": self._points(0.0), "joints": list(self.joints), "start_in": self.start_in}
 
     def chunk(self, now: float) -> dict[str, object]:
-        """Return the command `chunk`; `now` is the time of any monotonic clock, s."""
+        """Return the fields of the command `chunk`, whose points have times of the same clock as `now`, s."""
         return {"points": self._points(now + self.start_in), "joints": list(self.joints), "now": now}
 
     def _points(self, begin: float) -> list[dict[str, object]]:
@@ -55,27 +55,27 @@ class Wanted:
         return rows
 
     def spline(self, begin: Floats) -> Trajectory:
-        """Return the spline that the controller plays from rest at `begin`."""
+        """Return the spline that the controller plays from rest at the positions `begin`, shape (joints,)."""
         spline, now = Trajectory(len(self.joints)), SplineSample(len(self.joints))
         now.rest_at(begin)
         spline.load(flatten(self.orders, self.times, self.points, self.start_in), now)
         return spline
 
     def index(self, seconds: float) -> int:
-        """Return the index of the next point at a time after the start of the goal, s."""
+        """Return the index of the next point at `seconds` after the goal was accepted; finally the last."""
         return min(int(np.searchsorted(self.times + self.start_in, seconds)), len(self.times) - 1)
 
 
 def wanted(message: JointTrajectory, joints: Sequence[str], now: float) -> Wanted:
-    """Validate a trajectory of joints of a controller.
+    """Validate and convert a ROS 2 trajectory for some or all joints of a controller.
 
     Points in the past are omitted, and so is a first point at time 0 if more points follow, because the
     joints are there already.
 
     Args:
-        message: Trajectory.
+        message: Trajectory; it starts at once with a stamp of 0.
         joints: Joints of the controller.
-        now: Time of the clock of the stamp, s.
+        now: Present time of the clock of the message's stamp, s.
 
     Raises:
         InputError: The trajectory is invalid, or all of its points are in the past.
@@ -115,7 +115,7 @@ def wanted(message: JointTrajectory, joints: Sequence[str], now: float) -> Wante
 
 
 def tolerances(given: Sequence[JointTolerance], joints: Sequence[str]) -> dict[str, dict[str, float | str]]:
-    """Convert the tolerances of a goal to those of the command `trajectory`.
+    """Convert the tolerances of a ROS 2 action goal to those of the command `trajectory`, by joint.
 
     A tolerance of 0 is omitted, and a negative one becomes `inf`. Accelerations are not measured, so they are
     not checked.
@@ -137,7 +137,10 @@ def tolerances(given: Sequence[JointTolerance], joints: Sequence[str]) -> dict[s
 
 
 def goal_fields(goal: FollowJointTrajectory.Goal, joints: Sequence[str]) -> dict[str, object]:
-    """Convert the tolerances of a FollowJointTrajectory goal to fields of a command. Raises InputError."""
+    """Convert path, goal and time tolerances of an action goal to fields of the command `trajectory`.
+
+    Tolerances that are not given are omitted. Raises InputError.
+    """
     fields: dict[str, object] = {
         "path_tolerance": tolerances(goal.path_tolerance, joints),
         "goal_tolerance": tolerances(goal.goal_tolerance, joints),
@@ -148,12 +151,12 @@ def goal_fields(goal: FollowJointTrajectory.Goal, joints: Sequence[str]) -> dict
 
 
 def point(rows: Floats, seconds: float) -> JointTrajectoryPoint:
-    """Return a message with positions and velocities of joints, given as an array of shape (2, joints)."""
+    """Return a ROS 2 trajectory point: `rows` are positions and velocities, shape (2, joints); time in s."""
     message = JointTrajectoryPoint(positions=rows[0].tolist(), velocities=rows[1].tolist())
     message.time_from_start = Duration(sec=int(seconds), nanosec=int(seconds % 1 * 1e9))
     return message
 
 
 def seconds_of(message: Time | Duration) -> float:
-    """Convert a time or a duration to s."""
+    """Convert a ROS 2 time or duration to s."""
     return float(message.sec) + float(message.nanosec) * 1e-9

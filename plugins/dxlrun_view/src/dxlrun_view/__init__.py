@@ -1,4 +1,4 @@
-"""Browser page that shows a running robot or a log. dxlrun finds it by its entry point.
+"""Plug-in with the command `dxlrun view`: a browser page that shows a running robot or a log.
 
 The scripts of the page are in `page/`, next to `src/`. Reports about logs are in `dxlrun_analysis`.
 """
@@ -18,6 +18,6 @@ def dxlrun_contract() -> int:
 
 @hookimpl
 def dxlrun_commands() -> Sequence[Command]:
-    """Return the verb `view`."""
+    """Return the command `view`, with the function that is imported on use."""
     help_line = "Show a running robot, or a log, on a page in the browser: 3-D, curves, joints, controllers."
     return (Command("view", "dxlrun_view.command:view", help_line, "Robots that run"),)

@@ -1,4 +1,8 @@
-"""Messages of the page's buttons and sliders. Each type of message is an action on a running robot."""
+"""Actions of the page's buttons and sliders on a running robot: one class per type of JSON message.
+
+The fields of a class are those of the message. `perform` sends the request to the robot and returns the text
+for the page's message line; all raise DxlrunError if the robot refuses.
+"""
 
 from __future__ import annotations
 
@@ -17,22 +21,23 @@ Names = Annotated[tuple[str, ...], msgspec.Meta(min_length=1)]
 
 
 class Done(msgspec.Struct, frozen=True):
-    """Result of an action"""
+    """Result of an action, as JSON for the page"""
 
     said: str
     """Text for the message line of the page"""
     parameters: tuple[Parameter, ...] = ()
+    """Answer to ListParameters; empty for all other actions"""
 
 
 class _Message(msgspec.Struct, frozen=True, forbid_unknown_fields=True, tag_field="verb"):
-    """Base class of actions. The key `verb` of a message selects the type."""
+    """Base class of actions. The key `verb` of a message selects the class."""
 
     always: ClassVar[bool] = False
-    """True if the action is allowed without the right to steer"""
+    """True if the page may perform the action without `dxlrun view --control`"""
 
 
 class Stop(_Message, frozen=True, tag="stop"):
-    """Disable the torque of all joints."""
+    """STOP button: disable the torque of all joints, so that they become limp."""
 
     always = True
 
@@ -47,10 +52,10 @@ class Stop(_Message, frozen=True, tag="stop"):
 
 
 class Halt(_Message, frozen=True, tag="halt"):
-    """Bring all joints to rest."""
+    """Bring all joints to rest with torque on."""
 
     def perform(self, robot: RemoteRobot) -> Done:
-        """Halt the robot."""
+        """Halt the robot; return the time that the joints need to rest."""
         halted = robot.halt().halted
         return Done("Halted" if halted is None else f"Halted in {halted.seconds:.2f} s")
 
@@ -80,7 +85,7 @@ class SetTorque(_Message, frozen=True, tag="torque"):
     on: bool
 
     def perform(self, robot: RemoteRobot) -> Done:
-        """Enable the torque, or disable it and release the controllers."""
+        """Enable the torque, or disable it and deactivate the controllers that command the joints."""
         robot.torque(self.joints, self.on, release=not self.on)
         return Done(f"Torque {'on' if self.on else 'off'}: {', '.join(self.joints)}")
 
@@ -115,12 +120,12 @@ class Goal(_Message, frozen=True, tag="goal"):
 
 
 class Play(_Message, frozen=True, tag="play"):
-    """Play a motion file from the folder of the robot file."""
+    """Play a motion file from the directory `motions` next to the robot file."""
 
     motion: str
 
     def perform(self, robot: RemoteRobot) -> Done:
-        """Play the motion."""
+        """Start the motion, without waiting for its end."""
         goals = robot.play(self.motion).goals
         return Done(f"Playing {self.motion}" + (f" (goal {goals[0].number})" if goals else ""))
 
@@ -132,19 +137,19 @@ class ListParameters(_Message, frozen=True, tag="parameters"):
     controller: str
 
     def perform(self, robot: RemoteRobot) -> Done:
-        """Return the parameters."""
+        """Return the table of the controller's parameters."""
         return Done("", robot.parameter_table(self.controller))
 
 
 class SetParameter(_Message, frozen=True, tag="set_parameter"):
-    """Change a live parameter of a controller, with a value as in the robot file."""
+    """Change a parameter of a controller in the run, to a value as in the robot file."""
 
     controller: str
     parameter: str
     value: float | bool | str
 
     def perform(self, robot: RemoteRobot) -> Done:
-        """Change the parameter."""
+        """Change the parameter; return the value that it has now."""
         changed = robot.set_parameters(self.controller, {self.parameter: self.value})
         return Done(", ".join(f"{self.controller}: {name} is {new}" for name, (_, new) in changed.items()))
 
@@ -153,7 +158,11 @@ Action = Stop | Halt | Pause | Resume | SetTorque | Switch | Goal | Play | ListP
 
 
 def act(source: Source, action: Action) -> Done:
-    """Perform an action. Raises DxlrunError with the reason if it is not possible."""
+    """Perform an action on the robot that the page shows.
+
+    Raises:
+        DxlrunError: The page shows a log, the motion file is not offered, or the robot refuses.
+    """
     if not isinstance(source, LiveRobot):
         raise InputError("this is a log; start the robot to steer it")
     if isinstance(action, Play) and action.motion not in source.shown().motions:

@@ -1,4 +1,4 @@
-"""Entry point of the verb `view`. It checks that the versions of dxlrun and this package match."""
+"""Entry point of `dxlrun view`. Its import fails with InputError if dxlrun has another version."""
 
 from __future__ import annotations
 

@@ -19,28 +19,29 @@ JOINT_COLUMNS = (
 )
 """Columns of each joint, named `JOINT/position` and so on. The names are fields of the log's cycles."""
 LATE, CYCLE = "loop/late", "loop/cycle"
-"""Columns of the loop: lateness of the wake-up, s, and number of the cycle"""
+"""Columns of the control loop: lateness of its wake-up, s, and number of the cycle"""
 
 
 MOST_OF_FIELD = 40
-"""Largest length of an array in a message whose elements can be drawn"""
+"""Length of an array in a message up to which each element is a curve; longer arrays are skipped"""
 
 
 class Curve(msgspec.Struct, frozen=True):
-    """Column in a span of time, downsampled for a plot"""
+    """Points of one column in a span of time, downsampled for a plot"""
 
     name: str
+    """Name of the column, such as `pan/position`"""
     time: list[float]
-    """s"""
+    """Times, s on the clock of the run, or from the first cycle of a log"""
     value: list[float | None]
-    """None if unknown"""
+    """SI value at each time; None if unknown, which interrupts the line"""
 
 
 class Moment(msgspec.Struct, frozen=True):
-    """Values of all columns at one time"""
+    """Values of all columns in one cycle"""
 
     time: float
-    """s; 0 before the first cycle, because JSON has no NaN"""
+    """Time of the cycle, s; 0 before the first cycle, because JSON has no NaN"""
     values: list[float | None]
     """Values in the order of the columns; empty before the first cycle"""
 
@@ -48,13 +49,16 @@ class Moment(msgspec.Struct, frozen=True):
 def columns_of(
     joints: Sequence[str], states: Sequence[str], references: Sequence[str] = ()
 ) -> tuple[str, ...]:
-    """Return the names of all columns of a robot."""
+    """Return the names of all columns of a robot: loop, joints, states of sources, references."""
     of_joints = [f"{joint}/{column}" for column in JOINT_COLUMNS for joint in joints]
     return (CYCLE, LATE, *of_joints, *states, *references)
 
 
 class History:
-    """Ring buffer of the newest moments of a robot, or all moments of a log"""
+    """Table in memory: a row (moment) per cycle with its time, and columns such as `pan/position`.
+
+    For a robot it is a ring buffer of the newest `most` moments; for a log it has all moments.
+    """
 
     def __init__(self, columns: Sequence[str], most: int) -> None:
         self.columns = tuple(columns)
@@ -64,14 +68,14 @@ class History:
         self._count = 0
 
     def append(self, time: float, values: Values) -> None:
-        """Append a moment, with a time later than all others. A full buffer drops the oldest moment."""
+        """Append a moment at a time (s) not before all others. A full buffer drops the oldest moment."""
         place = self._count % len(self._times)
         self._times[place] = time
         self._values[place] = values
         self._count += 1
 
     def fill(self, times: Values, name: str, values: Values) -> None:
-        """Write one column of all moments. All columns must have the same times."""
+        """Write one column for all moments of a log at once. All columns must have the same times, s."""
         self._count = len(times)
         self._times[: len(times)] = times
         self._values[: len(times), self._place[name]] = values
@@ -91,7 +95,10 @@ class History:
         return float(first), float(last)
 
     def at(self, time: float | None = None) -> Moment:
-        """Return the last moment not after `time`, or the first one. Without a time, return the newest."""
+        """Return the last moment not after `time` (s), or the first one if there is none.
+
+        Without a time, return the newest moment.
+        """
         if not len(self):
             return Moment(0.0, [])
         index = len(self) if time is None else max(self._index(time), 1)
@@ -99,7 +106,9 @@ class History:
         return Moment(float(self._times[row]), plain(self._values[row]))
 
     def curve(self, name: str, begin: float, end: float, points: int) -> Curve:
-        """Return one column between two times, downsampled to about `points` points.
+        """Return one column between two times (s) and the next point on both sides.
+
+        It is downsampled to about `points` points.
 
         Downsampling keeps the minimum and the maximum of each piece, so that no peak is lost.
 
@@ -113,7 +122,7 @@ class History:
         return thinned(name, self._times[rows], self._values[rows, place], points)
 
     def _rows(self, index: NDArray[np.int64]) -> NDArray[np.int64]:
-        """Return the rows of moments, whose indices count from the oldest one."""
+        """Return the rows in the ring buffer of moments that are counted from the oldest one."""
         oldest = self._count % len(self._times) if self._count > len(self._times) else 0
         return (oldest + index) % len(self._times)
 
@@ -127,7 +136,7 @@ class History:
 
 
 def thinned(name: str, times: Values, values: Values, points: int) -> Curve:
-    """Return a curve, downsampled to about `points` points by the extremes of pieces."""
+    """Return a curve of about `points` points: the minimum and maximum of each piece of equal length."""
     # The minimum and the maximum of each piece are kept, so that a plot never hides a short peak.
     if len(times) > max(points, 2):
         pieces = np.array_split(np.arange(len(times)), max(points // 2, 1))
@@ -143,7 +152,11 @@ def thinned(name: str, times: Values, values: Values, points: int) -> Curve:
 def numbers_in(message: Mapping[str, object], name: str) -> dict[str, float]:
     """Return the numbers of a message by the names of their curves, such as `/arm/state:error[0]`.
 
-    Arrays with more than MOST_OF_FIELD elements are skipped.
+    Args:
+        message: Message as a mapping; fields of inner messages are named `outer.inner`.
+        name: Text before each field's name: `TOPIC:`.
+
+    Texts are skipped, and so are arrays with more than MOST_OF_FIELD elements.
     """
     found: dict[str, float] = {}
     for field, value in message.items():
@@ -160,5 +173,5 @@ def numbers_in(message: Mapping[str, object], name: str) -> dict[str, float]:
 
 
 def plain(values: Values) -> list[float | None]:
-    """Return the values for JSON, with None in place of NaN and infinity."""
+    """Return an array as a list for JSON, with None in place of NaN and infinity."""
     return [value if math.isfinite(value) else None for value in values.tolist()]

@@ -1,4 +1,4 @@
-"""Running robot as a source of the page. It is polled at 25 Hz, and only while a page is open."""
+"""Running robot as the source of the page. It is polled at 25 Hz, and only while a page is open."""
 
 from __future__ import annotations
 
@@ -22,26 +22,30 @@ from dxlrun_view.shown import LiveEvent, RobotInfo, Shown
 from dxlwire import Mode
 
 PERIOD_S = 0.04
-"""Polling period of a page, s. A faster rate would not be visible."""
+"""Period of polling the robot for its newest cycle, s. A faster rate would not be visible."""
 SLOW_S = 0.5
 """Polling period of values that rarely change (controllers, rate, events), s"""
 KEPT_S = 300.0
-"""Length of the curves, s"""
+"""Time for which curves are kept, s"""
 _KEPT = round(KEPT_S / PERIOD_S)
 DRAWN_S = 3.0
-"""Time without a plot of a topic after which the topic is no longer polled, s"""
+"""A topic whose curves no page has requested for this time is no longer polled, s."""
 GAP_S = 1.0
 """Time between two cycles above which a curve has a gap, s: no page was open, or the robot did not run"""
 _MOST_EVENTS = 400
-"""Number of events that are kept"""
+"""Number of events that are kept for pages"""
 _TORQUE = {torque.word: torque for torque in reversed(Torque)}
-"""Torque states of the log by their names"""
+"""Number of each torque state in the log, by the name in `RobotStates.torque`"""
 NOT_DRAWN = (LogTopic.EVENT, LogTopic.JOINT_STATES, "/goals")
-"""Topics without numbers, or with numbers that are columns already"""
+"""Topics that offer no curves: they have no numbers, or their numbers are columns of the cycles already."""
 
 
 class LiveRobot:
-    """Cached state of a running robot. One page at a time polls the robot; all other pages read the cache."""
+    """Cached state of a running robot, which pages read.
+
+    A page's request also polls the robot, unless another request does. After the run ends, the curves remain,
+    and the next run of the robot continues.
+    """
 
     def __init__(self, name: str) -> None:
         self._name = name
@@ -54,7 +58,7 @@ class LiveRobot:
         self._cycle = -1
         self._run = 0
         self._events: deque[LiveEvent] = deque(maxlen=_MOST_EVENTS)
-        """Events of all runs, with consecutive numbers"""
+        """Newest events of all runs since the start of the page, with consecutive numbers"""
         self._last_event, self._known_until_s = 0, -1.0
         """Number of the last event in the present run; time of the last event before the connection, s"""
         self._fields: dict[str, tuple[str, ...]] = {}
@@ -62,7 +66,7 @@ class LiveRobot:
         self._problem = ""
         self._looked_s = self._looked_slowly_s = -SLOW_S
         self._asking, self._lock = threading.Lock(), threading.Lock()
-        """Lock of the page that polls the robot, and lock of the curves"""
+        """Lock of the request that polls the robot, and lock of the curves"""
         self.at(None)
 
     def close(self) -> None:
@@ -73,7 +77,7 @@ class LiveRobot:
     # Requests of the page
 
     def shown(self) -> Shown:
-        """Return everything that the page shows in addition to the curves."""
+        """Return the cached properties of the robot that rarely change, without polling it."""
         return Shown(
             info=self._info,
             live=True,
@@ -99,7 +103,10 @@ class LiveRobot:
             return self._history.at(time_s)
 
     def curve(self, name: str, begin: float, end: float, points: int) -> Curve:
-        """Return a span of a curve. Raises KeyError for an unknown curve."""
+        """Return a column, or a number of a topic such as `/arm/state:error[0]`, between two times (s).
+
+        The first request for a number starts the polling of its topic. Raises KeyError for an unknown curve.
+        """
         topic, of_topic, _ = name.partition(":")
         if of_topic and name not in self._fields.get(topic, ()):
             raise KeyError(name)
@@ -115,22 +122,25 @@ class LiveRobot:
         return tuple(event for event in list(self._events) if event.number > after)
 
     def urdf(self) -> str:
-        """Return the robot's URDF, or an empty text."""
+        """Return the URDF of the newest run; empty if the robot has none."""
         return self._urdf
 
     @property
     def folder(self) -> Path | None:
-        """Directory of the robot file, in which meshes are searched"""
+        """Directory of the robot file, in which meshes are searched; None if unknown"""
         return Path(self._info.file).parent if self._info.file else None
 
     def asking(self) -> RemoteRobot:
-        """Open a separate connection for a request. Raises DxlrunError."""
+        """Open a new connection to the robot. Raises DxlrunError if it does not run."""
         return connect(self._name, "dxlrun view")
 
     # Polling the robot
 
     def _look(self, now_s: float) -> None:
-        """Poll the newest cycle, and every SLOW_S the values that rarely change."""
+        """Poll the robot's newest cycle, and every SLOW_S the values that rarely change.
+
+        Connects first if necessary, and disconnects with a reason for the page after an error.
+        """
         slowly = now_s - self._looked_slowly_s > SLOW_S
         if now_s - self._looked_s < PERIOD_S / 2 or not (self._robot or slowly):
             return
@@ -152,7 +162,7 @@ class LiveRobot:
             self._gone(str(error) if self._name in running() else waits)
 
     def _begun(self) -> RemoteRobot:
-        """Connect to a run, and read the values that are constant during a run. Raises DxlrunError."""
+        """Connect to the robot's run, and read its constants: URDF, IMU, motions. Raises DxlrunError."""
         robot = self.asking()
         self._info = info_of(robot)
         self._urdf = robot.urdf()
@@ -171,7 +181,7 @@ class LiveRobot:
         self._problem = ""
 
     def _note_cycle(self, states: RobotStates) -> None:
-        """Append a cycle to the curves."""
+        """Append a cycle's states to the curves, unless it is there. A new run can clear the curves."""
         if states.cycle == self._cycle:
             return
         columns = columns_of(states.joints, states.source_states, states.references)
@@ -204,7 +214,7 @@ class LiveRobot:
                 self._events.append(msgspec.structs.replace(event, number=number, run_time=run_time_s))
 
     def _note_fields(self, robot: RemoteRobot) -> None:
-        """Find the fields that can be drawn, from the first message of each topic."""
+        """Find the numbers of each new topic that can be drawn, from its newest message."""
         for topic in robot.topics():
             if topic.name in self._fields or topic.name in NOT_DRAWN or not topic.count:
                 continue
@@ -215,7 +225,7 @@ class LiveRobot:
                 self._fields = {**self._fields, topic.name: tuple(numbers)}
 
     def _note_topics(self, robot: RemoteRobot, now_s: float) -> None:
-        """Append the newest messages of the topics that a page draws."""
+        """Append the newest message of each topic whose curves were requested in the last DRAWN_S."""
         with self._lock:
             drawn_now = {name: one for name, one in self._drawn.items() if now_s - one.asked_s < DRAWN_S}
             self._drawn = drawn_now.copy()
@@ -235,16 +245,17 @@ class LiveRobot:
 
 
 class DrawnTopic:
-    """Numbers in the messages of one topic, kept while a page draws one of them"""
+    """Curves of all numbers in the messages of one topic, kept while a page draws one of them"""
 
     def __init__(self) -> None:
         self.asked_s = time.monotonic()
+        """Time of the last request for one of the curves, s (monotonic)"""
         self.history = History((), 1)
         self.time_ns = 0
         """Time of the newest message, ns"""
 
     def append(self, time_ns: int, numbers: Mapping[str, float]) -> None:
-        """Append the numbers of a message."""
+        """Append a message's numbers. If names differ or the time is earlier, all curves start again."""
         if tuple(numbers) != self.history.columns or time_ns < self.time_ns:
             self.history = History(tuple(numbers), _KEPT)
         self.time_ns = time_ns
@@ -252,7 +263,7 @@ class DrawnTopic:
 
 
 def info_of(robot: RemoteRobot) -> RobotInfo:
-    """Return the information about a robot that a page uses. Raises DxlrunError."""
+    """Request `RemoteRobot.info` and convert the part that a page uses. Raises DxlrunError."""
     return msgspec.convert(robot.info(), RobotInfo)
 
 
@@ -270,7 +281,7 @@ def _motions(info: RobotInfo) -> Iterator[str]:
 
 
 def _of_joints(states: RobotStates) -> Iterator[Values]:
-    """Yield the columns of the joints. Mode and torque are numbers, as in the log's cycles."""
+    """Yield all joints' values for each of JOINT_COLUMNS. Mode and torque are numbers, as in the log."""
     special = {
         "mode": [Mode[name.upper()] for name in states.mode],
         "torque": [_TORQUE[word] for word in states.torque],

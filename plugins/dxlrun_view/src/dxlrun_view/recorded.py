@@ -1,4 +1,4 @@
-"""Log as a source of the page. All columns are kept in memory; the cycles of a long log are downsampled."""
+"""Log as the source of the page. All columns are kept in memory; the cycles of a long log are downsampled."""
 
 from __future__ import annotations
 
@@ -28,7 +28,8 @@ from dxlrun_view.curves import (
 from dxlrun_view.shown import Controller, LiveEvent, Mark, RobotInfo, Shown
 
 MOST_CYCLES = 100_000
-"""Minimum number of cycles that are kept of a longer log. With 20 joints, they take some 120 MB."""
+"""Cycles that are at least kept of a log: at twice this number, every second one is dropped. With 20 joints,
+they take some 120 MB."""
 _IN_COLUMNS = (
     LogTopic.CYCLE,
     LogTopic.ACTIVATION,
@@ -37,14 +38,14 @@ _IN_COLUMNS = (
     LogTopic.JOINT_STATES,
     LogTopic.JOINT_COMMANDS,
 )
-"""Topics without numbers, or with numbers that are columns of the cycles"""
+"""Topics that offer no curves: they have no numbers, or their numbers are columns of the cycles already."""
 _NONE = np.zeros(0, [("cycle", "i8")])
 WORST = 8
-"""Number of latest cycles that are offered as jumps"""
+"""Number of marks on the time line, at the cycles with the latest wake-ups"""
 
 
 class RecordedRobot:
-    """Log that was read into memory"""
+    """Log of dxlrun as the source of the page, read into memory. Times are s from its first cycle."""
 
     def __init__(self, path: Path, progress: Callable[[float], object] = lambda share: None) -> None:
         """Read a log.
@@ -86,12 +87,12 @@ class RecordedRobot:
 
     @property
     def folder(self) -> Path | None:
-        """Directory of the robot file, or None if it no longer exists"""
+        """Directory of the robot file that was run, or None if it no longer exists"""
         folder = Path(self._info.file).parent
         return folder if folder.is_dir() else None
 
     def shown(self) -> Shown:
-        """Return everything that the page shows in addition to the curves."""
+        """Return the properties of the robot and the log that the page shows in addition to the curves."""
         frames = self._plan.frames if self._plan is not None else None
         return Shown(
             info=self._info,
@@ -107,11 +108,14 @@ class RecordedRobot:
         )
 
     def at(self, time_s: float | None) -> Moment:
-        """Return all columns at a time, by default at the end of the log."""
+        """Return all columns in the last cycle not after a time (s), by default in the last of the log."""
         return self._history.at(time_s)
 
     def curve(self, name: str, begin: float, end: float, points: int) -> Curve:
-        """Return a span of a column or of a field such as `/arm/state:error[0]`. Raises KeyError."""
+        """Return a column, or a number of a topic such as `/arm/state:error[0]`, between two times (s).
+
+        Raises KeyError for an unknown curve.
+        """
         if name in self._history:
             return self._history.curve(name, begin, end, points)
         times, values = self._field(name)
@@ -123,14 +127,14 @@ class RecordedRobot:
         return self._events[after:]
 
     def urdf(self) -> str:
-        """Return the robot's URDF, or an empty text."""
+        """Return the URDF in the log's plan; empty if there is none."""
         return self._plan.urdf or "" if self._plan is not None else ""
 
     def close(self) -> None:
         """Do nothing: the log is in memory."""
 
     def _field(self, name: str) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-        """Return the times and values of a field of a topic. Raises KeyError."""
+        """Return times (s) and values of a topic's number; NaN where an array is shorter. Raises KeyError."""
         if name not in self._topics:
             topic, _, field = name.partition(":")
             field, _, index = field.partition("[")
@@ -146,7 +150,7 @@ class RecordedRobot:
         return self._topics[name]
 
     def _drawable(self) -> Iterator[str]:
-        """Yield the names of the numbers in the first message of each topic."""
+        """Yield the names of the topics' numbers that can be drawn, from the first message of each topic."""
         for topic in self._reader.topics:
             if topic in _IN_COLUMNS or topic.startswith(BUS_PREFIX):
                 continue
@@ -190,14 +194,14 @@ class RecordedRobot:
         )
 
     def _planned(self) -> Plan | None:
-        """Return the plan of the run, or None if it is damaged or of an older version."""
+        """Return the run's plan from the log, or None if it is missing, damaged or of an older version."""
         try:
             return from_json(self._reader.attachments["plan.json"])
         except (KeyError, DxlrunError, msgspec.MsgspecError, ValueError):
             return None
 
     def _of_run(self, file: str) -> RobotInfo:
-        """Return the information about the robot that the log contains."""
+        """Return the robot's information from log header and plan; `file` is the path of the robot file."""
         header, plan = self._header, self._plan
         info = RobotInfo(
             header.robot,
@@ -227,19 +231,21 @@ class RecordedRobot:
 
 
 class _Read:
-    """Cycles of a log while it is read. Every second cycle is dropped when there are too many."""
+    """Cycles and events of a log while it is read. Every second cycle is dropped when there are too many."""
 
     def __init__(self) -> None:
         self.every = 1
+        """Number of cycles in the log per kept cycle"""
         self.skipped = 0
+        """Number of periods of the loop that were skipped"""
         self.events: list[Event] = []
         self.worst = _NONE
-        """Cycles with the latest wake-ups"""
+        """The WORST cycles with the latest wake-ups, the latest first"""
         self._parts: list[NDArray[np.void]] = []
         self._seen = self._kept = 0
 
     def take(self, cycles: NDArray[np.void]) -> None:
-        """Add the cycles of a slice."""
+        """Add the cycles of the next slice of the log."""
         if not len(cycles):
             return
         self.skipped += int(cycles["skipped"].sum())
@@ -256,7 +262,7 @@ class _Read:
 
     @property
     def cycles(self) -> NDArray[np.void]:
-        """Cycles that were kept"""
+        """All cycles that were kept, in one array"""
         return np.concatenate(self._parts) if self._parts else _NONE
 
 

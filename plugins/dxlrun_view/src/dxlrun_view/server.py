@@ -1,4 +1,4 @@
-"""Server of the page: a separate process on 127.0.0.1 that only serves the user's own browser.
+"""Web server of `dxlrun view`: a separate process on 127.0.0.1 that only serves the user's own browser.
 
 Each request must have a host name of this server (which prevents DNS rebinding), an origin of this page if it
 has an origin, and the token of the page's address. STOP works without `--control`. On an address that is not
@@ -39,11 +39,11 @@ PORT = 8765
 ANY = str(IPv4Address(0))
 """Wildcard for all addresses of this machine"""
 HEADER = "X-Dxlrun-Token"
-"""Header with the token of the page's address"""
+"""HTTP header in which the page's script sends the token of the page's address"""
 MOST_POINTS = 4000
-"""Largest number of points of a curve"""
+"""Largest number of points of a curve in a response"""
 MOST_CURVES = 64
-"""Largest number of curves of a plot"""
+"""Largest number of curves of a plot in a response; further ones are omitted"""
 MOST_BYTES = 1 << 16
 """Largest size of a request body, bytes"""
 _TYPES = {"": "text/html", "page.js": "text/javascript", "page.css": "text/css"}
@@ -61,33 +61,41 @@ _MESHES = (".stl", ".dae", ".obj")
 
 
 class Span(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
-    """Curves and span of time of one plot"""
+    """Part of a `Look`: curves and span of time of one plot"""
 
     names: tuple[str, ...]
+    """Names of the curves"""
     begin: float
+    """First time, s on the clock of the curves"""
     end: float
     points: int = 600
+    """Number of points to which each curve is downsampled"""
 
 
 class Look(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
-    """Request of the page for new data, sent at about 25 Hz"""
+    """Request of the page's script for new data, sent at about 25 Hz"""
 
     time: float | None = None
     """Position of the time line of a log, s; None for the newest moment"""
     after: int = 0
-    """Number of the last event that the page has"""
+    """Number of the last event that the page has; the response has those after it"""
     shown: bool = False
-    """True if the page also needs the values that rarely change"""
+    """True if the page also requests the properties that rarely change"""
     spans: tuple[Span, ...] = ()
+    """One for each plot"""
 
 
 class Seen(msgspec.Struct, frozen=True):
-    """Response to a `Look`"""
+    """Response to a page's request `Look`: new data of the robot or the log"""
 
     moment: Moment
+    """Values of all columns at the requested time"""
     events: tuple[LiveEvent, ...]
+    """Events that the page does not have yet"""
     curves: tuple[tuple[Curve, ...], ...]
+    """Curves of each plot"""
     shown: Shown | None = None
+    """Properties that rarely change; None if not requested"""
 
 
 _LOOK: Decoder[Look] = Decoder(Look)
@@ -97,7 +105,7 @@ Handler = Callable[[Request], Awaitable[Response]]
 
 
 class Page:
-    """Web application that shows a robot or a log"""
+    """Web application of `dxlrun view`, which shows one robot or one log to the browsers with its token"""
 
     def __init__(
         self, source: Source, listener: Listener, *, hosts: tuple[str, ...], control: bool = False
@@ -116,7 +124,7 @@ class Page:
         self._origins = (None, *(f"{scheme_of(listener)}://{host}" for host in hosts))
 
     def app(self) -> Starlette:
-        """Return the application."""
+        """Return the ASGI application with the paths of the page, its data and its actions."""
         return Starlette(
             routes=[
                 Route("/", self._guarded(self.page)),
@@ -150,7 +158,7 @@ class Page:
         return answer
 
     async def page(self, request: Request) -> Response:
-        """Return a file of the page. It needs no token: the script adds the token to its own requests."""
+        """Return page.html, page.js or page.css, which need no token: only the script's requests have it."""
         name = request.url.path.strip("/")
         where = files("dxlrun_view").joinpath("page", *(("build", name) if name else ("page.html",)))
         if not where.is_file():
@@ -160,7 +168,7 @@ class Page:
         return Response(where.read_bytes(), media_type=_TYPES[name])
 
     async def look(self, request: Request) -> Response:
-        """Return the data that the page draws."""
+        """Answer a `Look` of the page with a `Seen`: moment, events, curves."""
         asked = await _message(request, _LOOK)
         return _json(await run_in_threadpool(self._seen, asked, self._may_steer(request)))
 
@@ -186,11 +194,11 @@ class Page:
         return tuple(found)
 
     async def urdf(self, request: Request) -> Response:
-        """Return the robot's URDF, or an empty body."""
+        """Return the robot's URDF, or an empty body if it has none."""
         return Response(await run_in_threadpool(self.source.urdf), media_type="application/xml")
 
     async def mesh(self, request: Request) -> Response:
-        """Return a mesh that the URDF names, searched from the directory of the robot file."""
+        """Return the file of a mesh that the URDF names, searched from the directory of the robot file."""
         name = request.query_params.get("name", "")
         path = await run_in_threadpool(self._mesh, name)
         if path is None:
@@ -198,14 +206,17 @@ class Page:
         return Response(path.read_bytes(), media_type="application/octet-stream")
 
     def _mesh(self, name: str) -> Path | None:
-        """Return the path of a mesh, or None. Only files that the URDF names are allowed."""
+        """Return the path of a mesh file, or None if it does not exist or the URDF does not name it."""
         if self.source.folder is None or f'"{name}"' not in self.source.urdf():
             return None
         found = mesh_file(self.source.folder, name)
         return found if found is not None and found.suffix.lower() in _MESHES else None
 
     async def act(self, request: Request) -> Response:
-        """Perform an action. Without `--control`, only those with `always` are allowed, such as STOP."""
+        """Perform an action of the page. Without `--control`, only STOP and listing parameters are allowed.
+
+        A browser with the role observe may only list parameters.
+        """
         action = await _message(request, _ACTION)
         if not isinstance(action, ListParameters) and self._role(request) < Role.COMMAND:
             return _refused(403, "the certificate of this browser has the role observe; it may only look")
@@ -225,7 +236,7 @@ class Page:
 
 
 def mesh_file(folder: Path, name: str) -> Path | None:
-    """Find the file of a mesh, relative to the directory of the robot file, or return None.
+    """Find the file of a mesh that a URDF names, or return None; `folder` is that of the robot file.
 
     `package://NAME/...` is searched in that directory and in all of its parents. Without NAME, it is searched
     in that directory and two of its parents.
@@ -240,7 +251,7 @@ def mesh_file(folder: Path, name: str) -> Path | None:
 
 
 def scheme_of(listener: Listener) -> str:
-    """Return the URL scheme of a page."""
+    """Return the URL scheme of a page: https if the listener has TLS, else http."""
     return "http" if listener.tls is None else "https"
 
 
@@ -265,7 +276,7 @@ class Server(uvicorn.Server):
     """uvicorn server without signal handlers. A listener with TLS accepts its own connections."""
 
     async def startup(self, sockets: list[socket.socket] | None = None) -> None:
-        """Start to serve the sockets of `run`."""
+        """Start to serve the sockets that were given to `run`."""
         secured = [one for one in sockets or () if isinstance(one, Listener) and one.tls]
         for listener in secured:
             await serve_clients(listener, self.config, self.server_state)
@@ -273,12 +284,12 @@ class Server(uvicorn.Server):
 
     @contextmanager
     def capture_signals(self) -> Iterator[None]:
-        """Leave signals to the command."""
+        """Install no signal handlers: the command `view` has its own."""
         yield
 
 
 def server_of(page: Page) -> Server:
-    """Return the server of a page. Call `run(sockets=[...])` to serve it."""
+    """Return a web server for a page; its `run(sockets=[...])` serves until `should_exit` is set."""
     config = uvicorn.Config(
         page.app(),
         ws="none",
@@ -294,7 +305,7 @@ def server_of(page: Page) -> Server:
 
 
 async def _message(request: Request, decoder: Decoder[Message]) -> Message:
-    """Decode the message in the body of a request. Raises InputError if it is invalid or too long."""
+    """Decode the JSON body of a request. Raises InputError if it is invalid or exceeds MOST_BYTES."""
     data = b""
     async for piece in request.stream():
         data += piece

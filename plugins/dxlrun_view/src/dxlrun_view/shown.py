@@ -1,4 +1,7 @@
-"""Data that a page shows in addition to curves: joints, controllers, events, marks on the time line."""
+"""Data that the page shows in addition to curves, and the interface that robots and logs share.
+
+The structs are sent to the page as JSON. Times are s on the clock of the curves.
+"""
 
 from __future__ import annotations
 
@@ -12,18 +15,20 @@ from dxlrun_view.curves import Curve, Moment
 
 
 class Controller(msgspec.Struct, frozen=True):
-    """Controller of a robot, a row of RobotInfo"""
+    """Controller of the robot, as a row of RobotInfo"""
 
     name: str
     type: str
     active: bool
     joints: tuple[str, ...] = ()
     command: tuple[str, ...] = ()
+    """Quantities that it commands of its joints, such as position"""
     into: tuple[str, ...] = ()
-    """Controllers whose references it commands"""
+    """Controllers whose references it commands in a chain; empty if it commands servos"""
     fallback: str = ""
+    """Controller that replaces it after an error"""
     goals: tuple[str, ...] = ()
-    """Kinds of its commands that are goals"""
+    """Kinds of its commands that are goals, which end when they are reached"""
 
 
 class RobotInfo(msgspec.Struct, frozen=True):
@@ -31,12 +36,12 @@ class RobotInfo(msgspec.Struct, frozen=True):
 
     robot: str
     rate: float = 0.0
-    """Nominal rate, Hz"""
+    """Nominal rate of the control loop, Hz"""
     began: float | None = None
     """Time of the first cycle on the clock of the curves, s; None if unknown"""
     paused: bool = False
     skipped: int = 0
-    """Number of skipped periods"""
+    """Number of periods of the loop that were skipped because a cycle overran"""
     joints: tuple[str, ...] = ()
     groups: Mapping[str, tuple[str, ...]] = {}
     units: Mapping[str, str] = {}
@@ -44,15 +49,17 @@ class RobotInfo(msgspec.Struct, frozen=True):
     effort_units: Mapping[str, str] = {}
     """Units of efforts by joint; an empty text for the fraction of the servo's maximum"""
     limits: Mapping[str, tuple[float, float]] = {}
-    """Position limits by joint. Continuous joints are not included."""
+    """Lower and upper position limit by joint, rad or m. Continuous joints are not included."""
     controllers: tuple[Controller, ...] = ()
     file: str = ""
+    """Path of the robot file"""
 
 
 class LiveEvent(msgspec.Struct, frozen=True):
-    """Event of `RemoteRobot.events`"""
+    """Event of the run, a line of the page's list: error, warning or information"""
 
     number: int
+    """Consecutive number, from 1"""
     time: float
     """Time on the clock of the curves, s"""
     severity: int
@@ -64,62 +71,69 @@ class LiveEvent(msgspec.Struct, frozen=True):
 
 
 class Mark(msgspec.Struct, frozen=True):
-    """Point of interest in a log"""
+    """Mark on the time line of a log, to which the user can jump"""
 
     time: float
     what: str
+    """Label of the mark"""
 
 
 class Shown(msgspec.Struct, frozen=True, kw_only=True):
-    """Properties of a robot or a log that rarely change"""
+    """Properties of a robot or a log that rarely change, which the page requests in addition to the curves"""
 
     info: RobotInfo
     live: bool
+    """True for a running robot, False for a log"""
     columns: tuple[str, ...]
+    """Names of the columns of each moment, such as `pan/position`"""
     span: tuple[float, float]
     """Times of the oldest and the newest moment, s"""
     run: int = 1
     """Counter of runs. The page is rebuilt when it changes."""
     problem: str = ""
-    """Reason for missing data: the robot does not run, or has ended"""
+    """Reason for missing data: the robot does not run, or has ended; else empty"""
     every: int = 1
-    """Downsampling factor of the cycles of a long log"""
+    """Number of cycles in a long log per cycle that the page has"""
     units: Mapping[str, str] = {}
-    """SI units of the states of sources, by column"""
+    """SI unit of each column that is a state of a source (sensor or device)"""
     fields: tuple[str, ...] = ()
-    """Numbers in messages of topics that can be drawn, such as `/arm/state:error[0]`"""
+    """Names of curves that are numbers in messages of topics, such as `/arm/state:error[0]`"""
     marks: tuple[Mark, ...] = ()
     """Cycles of a log with the latest wake-ups"""
     control: bool = False
     """True if the page may steer the robot"""
     motions: tuple[str, ...] = ()
-    """Motion files that the page may play"""
+    """Paths of the motion files that the page may play"""
     imu: str = ""
-    """Source of the orientation of the body"""
+    """Sensor whose orientation turns the robot's body in the 3-D view; empty without one"""
     imu_link: str = ""
+    """Link of the URDF to which this sensor is fixed"""
 
 
 class Source(Protocol):
-    """Running robot or log"""
+    """Source of the page's data: a running robot (LiveRobot) or a log (RecordedRobot)"""
 
     @property
     def folder(self) -> Path | None:
-        """Directory of the robot file; None if unknown"""
+        """Directory of the robot file, from which meshes are searched; None if unknown"""
 
     def shown(self) -> Shown:
-        """Return the properties that rarely change."""
+        """Return the properties of the robot or the log that rarely change."""
 
     def at(self, time_s: float | None) -> Moment:
         """Return all columns at a time. Without a time, poll a running robot and return the newest values."""
 
     def curve(self, name: str, begin: float, end: float, points: int) -> Curve:
-        """Return a span of a curve. Raises KeyError for an unknown curve."""
+        """Return one curve between two times (s), downsampled to about `points` points.
+
+        Raises KeyError for an unknown curve.
+        """
 
     def events(self, after: int) -> tuple[LiveEvent, ...]:
         """Return the events with a number greater than `after`."""
 
     def urdf(self) -> str:
-        """Return the robot's URDF, or an empty text."""
+        """Return the robot's URDF, or an empty text if it has none."""
 
     def close(self) -> None:
-        """Release the connection, if there is one."""
+        """Close the connection to a robot."""

@@ -82,7 +82,10 @@ def view(
 
 
 def _source(what: str | None) -> Source:
-    """Open the robot or the log that the argument names. Raises DxlrunError."""
+    """Open the robot or log that the argument of `dxlrun view` names, by default the only running robot.
+
+    Raises DxlrunError if it does not run, does not exist or is ambiguous.
+    """
     from dxlrun_view.live import LiveRobot
 
     if what is None:
@@ -113,7 +116,7 @@ def _source(what: str | None) -> Source:
 
 
 def _open(url: str) -> None:
-    """Open a browser, or print a warning if that is not possible."""
+    """Open the page's address in a browser, or print a warning if that is not possible."""
     # Without a display, webbrowser would start a text browser in this terminal.
     if not (os.environ.get("DISPLAY") or os.environ.get("WAYLAND_DISPLAY")) or not webbrowser.open(url):
         print_warning("no browser could be opened; open the address yourself")
