@@ -26,7 +26,7 @@ class Controller(msgspec.Struct, frozen=True):
     into: tuple[str, ...] = ()
     """Controllers whose references it commands in a chain; empty if it commands servos"""
     fallback: str = ""
-    """Controller that replaces it after an error"""
+    """Controller that takes over when this one fails; empty without one"""
     goals: tuple[str, ...] = ()
     """Kinds of its commands that are goals, which end when they are reached"""
 
