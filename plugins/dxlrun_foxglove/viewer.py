@@ -53,7 +53,7 @@ class Viewer:
         self._more = asyncio.Event()
 
     def reply(self, frame: str | bytes) -> None:
-        """Queue a frame that is not a message. Frames are delivered in this order; one too many disconnects the viewer."""
+        """Queue a frame that is not a message. The viewer is disconnected if there are too many."""
         if len(self._replies) == MOST_REPLIES:
             # A regular close would wait for a viewer that does not receive.
             self.connection.transport.abort()
