@@ -273,14 +273,18 @@ class Maker:
             if "view" not in names or self.virtual:
                 return
             with self.running("robots/bioloid_torso_imu.yaml"):
-                served = Served(LiveRobot("bioloid_torso_imu"), control=True)
+                live = LiveRobot("bioloid_torso_imu")
+                served = Served(live, control=True)
                 for name, width, height in (("view", 1280, 760), ("view_phone", 390, 760)):
                     browser.open(served.address, width, height, dark=width < 600)
-                    browser.until("window.looked > 20")
+                    browser.until("window.looked > 5")
                     if name == "view":
-                        # The page is open before the motion begins, so that its curves have no gap.
                         printed(("play", "three_parts", "--no-wait"), self.place)
-                        browser.until("window.looked > 200")
+                        end_s = live.at(None).time + 9.0
+                        # Looks between those of the page, so that its curves have no gap on a busy machine.
+                        while live.at(None).time < end_s:
+                            time.sleep(0.04)
+                        browser.until(f"window.looked > {browser.value('window.looked') + 2}")
                     self._kept(name, browser.picture())
                 served.close()
 
