@@ -1,5 +1,4 @@
-"""Exact quantiles of integers, from the count of each distinct value. Memory grows with the number of
-distinct values.
+"""Exact quantiles of integers, from the count of each distinct value.
 
 `quantile` and `median` define every percentile that is shown (docs/reference/analyze.md).
 """
@@ -63,8 +62,7 @@ class Counts:
 
 
 def quantile(values: Numbers, counts: Numbers, share: float) -> float:
-    """Return a quantile of counted values by nearest rank: the smallest value whose cumulative share reaches
-    `share`.
+    """Return a quantile of counted values: the smallest value whose cumulative share reaches `share`.
 
     The result is an observed value, never an interpolated one. Its rank among n observations is ceil(share *
     n).
@@ -98,8 +96,7 @@ def median(values: Numbers, counts: Numbers) -> float:
 
 
 def has_them_alone(own: int, others: int) -> bool:
-    """Return whether one part accounts for nearly all occurrences of a problem, so that a finding may name
-    it.
+    """Return whether one part has nearly all occurrences of a problem, so that a finding may name it.
 
     It needs at least ten occurrences, and ten times as many as all other parts together. The bounds are plain
     counts, so a sentence can quote them.

@@ -37,8 +37,8 @@ _UNANSWERED = frozenset(("servo_lost", "silent"))
 _FAILED = _UNANSWERED | {"servo_rebooted", "torque_lost"}
 _SHARED = "Check what these buses share: the USB hub, its driver, the supply."
 _MARGIN = 0.1
-"""Margin between the share of late replies and the busy share of the run. A larger share of late replies has
-another cause than the busy machine."""
+"""A finding is kept on a busy machine if its share of late replies exceeds the busy share of the run by
+this: it then has another cause."""
 _LATE_SHARE = 0.01
 """Share of wake-ups more than 1 ms late from which the loop itself accounts for late replies."""
 _LEAST_CYCLES = 3  # One stall does not make a machine busy
@@ -46,8 +46,7 @@ _PART = 5  # Causes below a fifth of the excess of long cycles are not reported
 
 
 def busy_machine(totals: RunTotals) -> list[str]:
-    """Return the evidence that the machine was too busy for the loop, as phrases, or an empty list if it was
-    not.
+    """Return the evidence that the machine was too busy for the loop, as phrases; empty if it was not.
 
     The evidence consists of machine samples, waits for simulated servos, late wake-ups, and the causes of
     late wake-ups if they account for most of the time of long cycles. Wake-ups of a sequential loop have no
@@ -90,8 +89,7 @@ def complete(totals: RunTotals) -> Needs:
 
 
 def accused(totals: RunTotals, found: Iterable[Finding]) -> tuple[Finding, ...]:
-    """Drop findings whose evidence is incomplete or that others explain; return the rest with their final
-    rank and remedy."""
+    """Drop findings with incomplete evidence or that others explain; return the rest with final rank."""
     found = tuple(found)
     there, load = complete(totals), totals.causes.load
     spoilt = {one.subject for one in found if one.code in _SPOILT}
@@ -193,8 +191,7 @@ def _sentence(text: str) -> str:
 
 
 def _names(subject: str, totals: RunTotals) -> dict[str, str]:
-    """Return the values of the placeholders in a remedy: name, bus, port and ID of the servo that a
-    finding accuses."""
+    """Return the values of the placeholders in a remedy: name, bus, port and ID of the accused servo."""
     for bus in totals.plan.buses:
         ids = [str(servo_id) for servo_id, name in bus.names.items() if name == subject]
         if ids or subject in (bus.name, *(servo.joint for servo in bus.servos)):

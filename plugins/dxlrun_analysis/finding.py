@@ -1,5 +1,4 @@
-"""Finding: one observation about a run that the verdict reports, as data for programs and as a sentence
-for a person."""
+"""Finding: one observation about a run that the verdict reports, as data and as a sentence."""
 
 from __future__ import annotations
 
@@ -10,8 +9,7 @@ from enum import IntEnum, unique
 from dxlrun.tooling.records import EventCode
 
 ROBOT = "robot"
-"""Code of the verdict's first line, the summary of the robot's behaviour. It accuses nothing and precedes
-all other findings."""
+"""Code of the verdict's first line, the summary of the robot's behaviour, which accuses nothing."""
 
 
 HURTS = {
@@ -68,8 +66,7 @@ class Finding:
 
 
 def listed(names: Iterable[str], most: int = 3) -> str:
-    """Return names as text: the first `most` distinct ones, and the number of further ones (`a, b, c and 2
-    more`)."""
+    """Return the first `most` distinct names and the number of further ones: `a, b, c and 2 more`."""
     shown = list(dict.fromkeys(names))
     more = len(shown) - most
     return ", ".join(shown[:most]) + (f" and {more} more" if more > 0 else "")

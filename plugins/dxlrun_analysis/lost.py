@@ -1,5 +1,4 @@
-"""Rules of the verdict about losses in a run: lost buses, servos and devices, invalid states, missing
-replies."""
+"""Rules of the verdict about losses in a run: buses, servos, devices, states and replies."""
 
 from __future__ import annotations
 
@@ -49,8 +48,7 @@ _AT_ONCE_NS = 500_000_000  # Failures within half a second are simultaneous
 
 
 def lost_servos(totals: RunTotals) -> Iterable[Finding]:
-    """Report all servos that were lost, rebooted or lost their torque, in one finding that accuses the
-    worst."""
+    """Report the servos that were lost, rebooted or lost their torque, in one finding about the worst."""
     by_source: dict[str, list[EventGroup]] = {}
     for group in severe_of(totals.events, *HURTS):
         by_source.setdefault(group.source, []).append(group)
@@ -91,8 +89,7 @@ def lost_servos(totals: RunTotals) -> Iterable[Finding]:
 
 
 def _failed_together(totals: RunTotals, failed: Mapping[str, Sequence[EventGroup]]) -> bool:
-    """Return whether several but not all servos of one bus failed within half a second in the same way,
-    equally often."""
+    """Return whether several but not all servos of a bus failed in the same way within half a second."""
     bus_of = {servo.joint: servo.bus for servo in totals.servos if servo.joint and not servo.device}
     bus, *others = {bus_of.get(source, "") for source in failed}
     first = [min(groups, key=lambda group: group.t_ns) for groups in failed.values()]
@@ -118,8 +115,7 @@ def lost_devices(totals: RunTotals) -> Iterable[Finding]:
 
 
 def whole_buses(totals: RunTotals) -> Iterable[Finding]:
-    """Report each bus whose servos all rebooted or were lost at once, and several buses that lost all servos
-    at once.
+    """Report each bus whose servos all rebooted or were lost at once, and several such buses as one.
 
     Servos of a bus share supply and adapter.
     """
@@ -163,8 +159,7 @@ def _joined(parts: Sequence[str]) -> str:
 
 
 def invalid_states(totals: RunTotals) -> Iterable[Finding]:
-    """Report joints whose states were invalid in too many cycles, in one finding. Skipped cycles have no
-    states."""
+    """Report joints whose states were invalid in too many cycles, in one finding."""
     cycles, counts = totals.periods.records, invalid_joints(totals)
     if not counts:
         return
@@ -180,8 +175,7 @@ def invalid_states(totals: RunTotals) -> Iterable[Finding]:
 
 
 def invalid_joints(totals: RunTotals) -> dict[str, int]:
-    """Return the number of cycles with an invalid state, for each joint with more than the tolerated
-    number."""
+    """Return the number of cycles with an invalid state of each joint that exceeds the tolerance."""
     cycles = totals.periods.records
     return {
         joint: count

@@ -44,8 +44,7 @@ class LoggedServo(msgspec.Struct):
 
     @property
     def own_name(self) -> str:
-        """Name that is unique among the robot's servos: its joint, or its own if several servos move one
-        joint."""
+        """Name that is unique among servos: its joint, or its own if several servos move one joint."""
         return self.name or self.joint
 
     @property
@@ -148,8 +147,7 @@ class LoggedPlan(msgspec.Struct):
         return found
 
     def is_simulated(self, subject: str) -> bool:
-        """Return whether the part that a finding accuses is simulated, so that nothing on it can be checked
-        or exchanged.
+        """Return whether the part that a finding accuses is simulated, so that nothing on it can be checked.
 
         In a robot with a simulated bus, every subject counts as simulated unless the plan has it on a real
         bus, as a controller, or as a source that a process samples. If a controller and a bus have the same

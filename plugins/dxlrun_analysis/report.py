@@ -99,8 +99,7 @@ def parts(report: Report) -> tuple[Part, ...]:
 
 
 def tables(report: Report, section: str = "") -> dict[str, Table]:
-    """Return the tables of the report that have rows, by name of their part: those of one section of the
-    page, or all."""
+    """Return the tables of the report that have rows, by name: those of one section of the page, or all."""
     chosen = sorted(
         (part for part in PARTS if part.section == section or not section),
         key=lambda part: not part.first if section else part.late,
@@ -122,8 +121,7 @@ def began(log: Log, report: Report) -> str:
 
 
 def facts(log: Log, report: Report) -> tuple[Table, ...]:
-    """Return the tables about the circumstances of the run that have rows: robot, buses, real time,
-    software."""
+    """Return the tables about the run itself that have rows: robot, buses, real time, software."""
     planned = plan_of(log).by_name
     buses = ((f"bus {name}", _bus(planned.get(name))) for name in log.buses)
     found = (
@@ -175,8 +173,7 @@ def _bus(bus: LoggedBus | None) -> str:
 
 
 def _real_time(log: Log) -> Iterator[tuple[str, Value]]:
-    """Yield the real-time settings that the robot file requests, and the result of each request, as rows
-    of a table."""
+    """Yield table rows with the requested real-time settings, and the result of each request."""
     requested = log.metadata.get("scheduler", {})
     if requested:
         locked = ", memory locked" if requested.get("lock_memory") == "true" else ""

@@ -113,15 +113,14 @@ def _what(groups: Sequence[EventGroup]) -> str:
 
 
 def _when(groups: Sequence[EventGroup], begin_ns: int) -> str:
-    """Return the time of the first event as text: ` at 2.0 s`, or ` from 2.0 s on` if not all came within
-    half a second."""
+    """Return the time of events as text: ` at 2.0 s`, or ` from 2.0 s on` if they were not simultaneous."""
     first = _at(groups[0].t_ns, begin_ns)
     later = first and groups[-1].t_ns - groups[0].t_ns > _AT_ONCE_NS
     return f"{first.replace(' at ', ' from ')} on" if later else first
 
 
 def _at(t_ns: int, begin_ns: int) -> str:
-    """Return a time as text, s since the first deadline; empty without a first deadline."""
+    """Return the time of an event as text, in s since the first deadline (`begin_ns`); empty if that is 0."""
     return f" at {max((t_ns - begin_ns) / 1e9, 0.0):.1f} s" if begin_ns else ""
 
 
@@ -168,8 +167,7 @@ def _takeovers(totals: RunTotals) -> Iterator[str]:
 
 
 def _played(totals: RunTotals) -> str:
-    """Return a clause about the motions played, or another source of motion, with the largest tracking
-    error."""
+    """Return a clause about the motions played, or other movement, with the largest tracking error."""
     until_ns = totals.periods.seconds * 1e9
     begun = [one for one in totals.plan.loop.commands if one.at_ns <= until_ns and totals.periods.records]
     motions = sum(one.goal is not None for one in begun) or len({one.controller for one in begun})
@@ -185,8 +183,7 @@ def _played(totals: RunTotals) -> str:
 
 
 def _within(totals: RunTotals) -> str:
-    """Return the largest tracking error and its joint as text, excluding joints that failed; empty if it
-    is negligible."""
+    """Return the largest tracking error as text, without joints that failed; empty if negligible."""
     failed = {group.source for group in totals.events if group.code in _FAILED}
     worst = max(
         (one for one in totals.tracking if one.worst_rad is not None and one.name not in failed),

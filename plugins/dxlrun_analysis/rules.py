@@ -13,13 +13,11 @@ from typing import NamedTuple
 
 
 class Needs(Flag):
-    """Conditions that a run must meet before a rule may accuse a part; otherwise something else can be the
-    cause."""
+    """Conditions that a run must meet before a rule may accuse a part: else the cause can be another."""
 
     NOTHING = 0
     MACHINE = auto()
-    """The machine scheduled the loop on time; otherwise late and missing replies can be the machine's
-    fault."""
+    """The machine scheduled the loop on time; otherwise late and missing replies can be its fault."""
     LOOP = auto()  # The loop kept its rate, so goals were on time
     STATES = auto()  # The states of the joint are complete
     INTACT = auto()  # The replies of its bus are intact, so its positions are credible

@@ -1,5 +1,4 @@
-"""Totals of a run, the input of the rules of the verdict, collected slice by slice from a log of any
-length."""
+"""Totals of a run, the input of the rules of the verdict, collected slice by slice from a log."""
 
 from __future__ import annotations
 
@@ -108,7 +107,7 @@ class RunTotals:
 
 
 class Collector(Protocol):
-    """Accumulator that collects one subject of a log, slice by slice."""
+    """Interface of an accumulator that collects one subject of a log, slice by slice."""
 
     def take(self, log: Log) -> None:
         """Add the next slice of the log."""
@@ -118,8 +117,7 @@ C = TypeVar("C", bound=Collector)
 
 
 class Tally:
-    """Set of all accumulators for the report, fed with a log slice by slice. Its memory does not grow with
-    the log."""
+    """Set of all accumulators for the report, fed with a log slice by slice, in constant memory."""
 
     def __init__(
         self, watch: Callable[[Exchanges], None] = lambda _: None, others: Iterable[type[Collector]] = ()

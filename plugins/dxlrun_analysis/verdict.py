@@ -114,8 +114,7 @@ def judge(totals: RunTotals) -> Verdict:
 
 
 def _robot(totals: RunTotals) -> Iterable[Finding]:
-    """Report a robot that was down at the end of the run, and each goal of a played motion that was not
-    reached."""
+    """Report a robot that was down at the end of the run, and each missed goal of a played motion."""
     if totals.conduct.lies:
         turned = totals.conduct.turned_rad
         how = "its fall_reflex had others take over" if turned is None else "gravity is "
@@ -128,7 +127,7 @@ def _robot(totals: RunTotals) -> Iterable[Finding]:
 
 
 def _never_ran(totals: RunTotals) -> Iterable[Finding]:
-    """Report processes of the run that failed, and a loop that never ran a cycle."""
+    """Report processes of the run that failed, and a log without any cycle of the loop."""
     for failed in totals.failures:
         yield Finding("run_failed", "", f"The run failed: {failed}.", rank=Rank.NEVER_RAN)
     if not totals.periods.records:
@@ -223,8 +222,7 @@ _OTHER_RULES = frozenset((*HURTS, EventCode.DEVICE_LOST, EventCode.PORT_LOST, Ev
 
 
 def _events(totals: RunTotals) -> Iterable[Finding]:
-    """Report logged errors that no other rule reports, except those of controllers whose fallbacks took
-    over."""
+    """Report logged errors that no other rule reports, without controllers whose fallbacks took over."""
     taken_over = {one.controller for one in totals.conduct.takeovers} - set(totals.conduct.unanswered)
     severe = [
         group

@@ -1,5 +1,4 @@
-"""Breakdown of the excess of one late or long cycle into causes: its times and packets, compared with the
-plan.
+"""Breakdown of the excess of one late or long cycleby cause, from its times and packets and the plan.
 
 A late wake-up is attributed to an exchange of the idle time that ended after the deadline, otherwise to the
 machine. A read waits for all buses at once, so only the bus that was ready last counts. The planned time of
@@ -145,8 +144,7 @@ class Account:
         self.shares[CauseName("unexplained")] += beyond - late
 
     def _writes(self, packets: PacketColumns) -> int:
-        """Attribute the write() calls that send the cycle's goals to their buses; return their total time,
-        ns."""
+        """Attribute the write() calls that send goals to their buses; return their total time, ns."""
         goals = (packets.kind == PacketKind.INSTRUCTION) & (packets.first_ns >= self._cycle["updated"])
         goals &= packets.last_ns <= self._cycle["written"]
         took = packets.last_ns - packets.first_ns

@@ -46,8 +46,7 @@ Cycles = NDArray[np.void]
 
 @dataclass(frozen=True, slots=True)
 class Causes:
-    """Result of the cause analysis of a run: number of late and long cycles, causes, worst cycles, load of
-    the machine."""
+    """Result of the cause analysis of a run: late and long cycles, causes, load of the machine."""
 
     late: int = 0  # Cycles that woke late, including long ones
     long: int = 0  # Cycles longer than their period, or so late that periods were skipped
@@ -71,8 +70,7 @@ class _Kept(NamedTuple):
 
 
 class CycleCauses:
-    """Accumulator that finds late and long cycles and their causes, fed with the log slice by slice. Its
-    memory does not grow with the log."""
+    """Accumulator that finds late and long cycles and their causes, fed slice by slice in constant memory."""
 
     def __init__(self) -> None:
         self._late = self._long = 0
@@ -185,8 +183,7 @@ class CycleCauses:
         self._kept = sorted(self._kept, key=lambda one: -one.cycle["size"])[:KEPT]
 
     def _share_with_machine(self, accounts: Sequence[Account]) -> None:
-        """Move time of late wake-ups and own work to the machine, at most the time that the machine sample
-        of that second accounts for."""
+        """Move late wake-ups and own work to the machine, up to the time that its samples account for."""
         woken = np.array([int(one.cycle["woken"]) for one in self._kept], np.int64)
         for sample in self._samples:
             then = (woken > sample.begin_ns) & (woken <= sample.end_ns)
@@ -231,8 +228,7 @@ class CycleCauses:
         return f"servo {servo} ({joint or bus.name})", joint or f"{bus.name} {servo}"
 
     def _worst(self, one: _Kept, account: Account) -> WorstCycle:
-        """Return the record of a cycle for reports: its causes, and its packets since the preceding cycle
-        ended."""
+        """Return a cycle's record for reports: causes, and packets since the preceding cycle ended."""
         cycle, scheduled = one.cycle, int(one.cycle["scheduled"])
         shares = [
             CauseShare(name.kind, self._subject(name)[0], ns / 1e3)

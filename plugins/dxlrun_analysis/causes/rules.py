@@ -39,6 +39,5 @@ def own_work(causes: Causes) -> Iterable[Finding]:
 
 
 def _subject(one: Cause) -> str:
-    """Return the part that a cause accuses, as findings name it: `loop`, or the name of a controller or a
-    bus."""
+    """Return the part that a cause accuses,as findings name it: `loop`, a controller or a bus."""
     return "loop" if one.kind in ("own work", "plan") else one.subject.removeprefix("bus ")

@@ -14,8 +14,7 @@ _BROADCAST_ID = 0xFE
 
 
 def causes_table(causes: Causes) -> Table:
-    """Return the table of the causes of late and long cycles, the largest first. It has no rows without
-    causes."""
+    """Return the table of the causes of late and long cycles, the largest first; it may have no rows."""
     columns = [
         Column("cause", "name"),
         Column("of", "text"),
@@ -78,8 +77,7 @@ def _timeline(one: WorstCycle) -> Table:
 
 
 def worst_title(one: WorstCycle) -> str:
-    """Return the title of a cycle's table: number, time in the run, excess beyond the plan, and main
-    causes."""
+    """Return the title of a cycle's table: number, time, excess beyond the plan, main causes."""
     causes = ", ".join(f"{share.name} {microseconds(share.us)}" for share in one.causes[:_MOST_NAMED])
     skipped = f", {counted(one.skipped, 'period', 'periods')} skipped after it" if one.skipped else ""
     beyond = f"{microseconds(one.excess_us)} beyond the plan{skipped}"

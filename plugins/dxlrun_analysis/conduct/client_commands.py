@@ -33,8 +33,7 @@ def client_commands(log: Log) -> tuple[ClientCommand, ...]:
 
 
 def policy_begun(log: Log) -> TakenCommand | None:
-    """Return the loop's own record of the cycle in which the steps of a policy begin, or None without a
-    policy.
+    """Return the loop's own record of the cycle in which the steps of a policy begin, or None.
 
     The time of this record is before the wake-up of its cycle. A client's command of the same kind has the
     time of the cycle itself.
@@ -47,8 +46,7 @@ def policy_begun(log: Log) -> TakenCommand | None:
 
 
 def unlogged_commands(log: Log) -> tuple[int, ...]:
-    """Return the cycles in which the loop answered more commands than the log has, so that commands are
-    missing."""
+    """Return the cycles in which the loop answered more commands than the log has."""
     named_loop = any(controller.name == _LOOP for controller in log.controllers)
     held: dict[int, int] = {}
     for command in log.commands:

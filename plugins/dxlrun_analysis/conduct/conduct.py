@@ -61,8 +61,7 @@ NO_CONDUCT = Conduct()
 
 
 class ConductHistory:
-    """Accumulator of the robot's behaviour, fed with the log slice by slice. Its memory does not grow with
-    the log."""
+    """Accumulator of the robot's behaviour, fed slice by slice in constant memory."""
 
     def __init__(self) -> None:
         self._begin_ns: int | None = None

@@ -25,12 +25,12 @@ from dxlrun_analysis.plan import LoggedPlan, plan_of
 
 _HANGS_S = 1.0
 _TIMES_LONGER = 10
-"""Required ratio to the longest standstill before. A switch rarely changes, and neither does a simulated
-sensor without noise at rest."""
+"""Required ratio of a standstill to the longest before. A switch rarely changes, and neither does a
+simulated sensor without noise at rest."""
 _MOVED_RAD = 0.1  # At rest, a simulated sensor can measure a constant value
 _RESTED_RAD = 0.02  # Joints that move less are at rest
 _CHANGES = 40
-"""Number of the last changes that show whether a value trembles."""
+"""Number of the last changes of a value that show whether it trembles."""
 _REVERSALS = 16
 """Reversals of direction among these changes; a measured movement keeps its direction for longer."""
 _FEWEST_VALUES = 4  # A voltage that alternates between two steps has only two values
@@ -42,8 +42,7 @@ Times = NDArray[np.int64]
 
 @dataclass(frozen=True, slots=True)
 class _Stay:
-    """Longest time for which a value (or all values of a source) did not change, with the conditions at
-    that time."""
+    """Longest time in which a value (or all of a source) did not change, with its circumstances."""
 
     hung_s: float = 0.0
     from_s: float = 0.0

@@ -1,5 +1,4 @@
-"""Requests of clients in a run: one entry for each command or stream of set-points, and pauses of the
-loop."""
+"""Requests of clients in a run: commands, streams of set-points as one entry each, and pauses."""
 
 from __future__ import annotations
 
@@ -23,8 +22,7 @@ _CYCLE = np.dtype([(name, "i8") for name in ("cycle", "scheduled_ns", "woken_ns"
 
 
 class _Data(msgspec.Struct):
-    """Data of a command that the loop executes itself, with the keys of all kinds. A command has those of
-    its kind."""
+    """Data of a command that the loop executes itself; a command has the keys of its kind."""
 
     activate: tuple[str, ...] = ()
     deactivate: tuple[str, ...] = ()
@@ -52,8 +50,7 @@ class Act:
     set_points: int = 0  # Number of set-points; 0 if this is not a stream
     controller: str = ""  # Controller of a stream
     ended_s: float | None = None
-    """Time at which the lease of a stream ran out and no later stream continued; None if it did not run
-    out."""
+    """Time at which the lease of a stream ran out for good; None if it did not."""
     held: bool = False  # The controller then held its joints until the end of the run
 
 
@@ -67,8 +64,7 @@ class Pause:
 
 
 class SteeringHistory:
-    """Accumulator of client commands, fed with the log slice by slice. A stream is one entry, so memory use
-    stays small.
+    """Accumulator of client commands, fed with the log slice by slice. A stream is one entry.
 
     An answer and its cycle can be in a later slice than the command. The newest commands are kept until their
     answers are complete.
@@ -141,8 +137,7 @@ class SteeringHistory:
         return tuple(self._acts), tuple(self._pauses)
 
     def _digest(self, until_ns: int | None) -> None:
-        """Match the commands before a time (ns) with their answers, and add them to the entries; None: all
-        commands."""
+        """Match the commands before a time (ns; None: all) with their answers, and add them."""
         log = self._log
         if log is None:
             return
@@ -187,8 +182,7 @@ class SteeringHistory:
 
 
 def _continues(last: TakenCommand, command: TakenCommand) -> bool:
-    """Return whether a set-point continues the stream of the one before: same kind and client, within its
-    lease."""
+    """Return whether a set-point continues the stream of the last: same kind and client, in its lease."""
     return (
         bool(command.lease_ns)
         and (command.kind, command.origin) == (last.kind, last.origin)

@@ -1,5 +1,4 @@
-"""Punctuality of the control loop: lateness of its wake-ups, duration of each step of a cycle, skipped
-periods."""
+"""Punctuality of the control loop: lateness of wake-ups, duration of each step, skipped periods."""
 
 from __future__ import annotations
 
@@ -33,8 +32,7 @@ _LOW = 20  # Bits of the low part; parts are squared separately so that sums fit
 
 @dataclass(frozen=True, slots=True)
 class Latency:
-    """Lateness of the loop's wake-ups (actual minus scheduled time) over a run, us; shares of all
-    wake-ups, 0 to 1."""
+    """Lateness of the loop's wake-ups (actual minus scheduled time) in a run, us; shares from 0 to 1."""
 
     max_us: float
     mean_us: float
@@ -103,8 +101,7 @@ class Periods:
 
     @property
     def rates(self) -> str:
-        """Rates at which the loop ran, as text: `100 Hz and 50 Hz`, or their range if there are more than
-        four."""
+        """Rates at which the loop ran, as text: `100 Hz and 50 Hz`, or a range."""
         rates = self.rates_hz or (self.rate_hz,)
         if len(rates) > _MOST_RATES:
             return f"{len(rates)} rates from {min(rates):g} to {max(rates):g} Hz"
@@ -213,8 +210,7 @@ _WHOLE = np.dtype([(name, np.int64) for name in _TIMES])
 
 
 class Punctuality:
-    """Accumulator of the loop's wake-up latency and skipped periods, fed with the log slice by slice. Its
-    memory does not grow with the log."""
+    """Accumulator of the wake-up latency and skipped periods, fed slice by slice in constant memory."""
 
     def __init__(self) -> None:
         self._held: NDArray[np.void] | None = None  # Newest cycle: its period ends with the next one

@@ -20,8 +20,7 @@ CauseKind = Literal[
     "plan",
     "unexplained",
 ]
-"""Kind of cause to which a part of the unplanned time of a late or long cycle is attributed; analyze.md
-explains each."""
+"""Kind of cause of unplanned time in a late or long cycle; analyze.md explains each."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -34,8 +33,7 @@ class Cause:
     total_ns: int
     worst_ns: int  # Greatest share in one cycle
     long_ns: int
-    """Part of `total_ns` that is in long cycles; the rest is in cycles that woke late but were not too
-    long."""
+    """Part of `total_ns` in long cycles; the rest is in cycles that only woke late."""
     servo: str = ""  # Joint of the servo, or its bus and ID; empty if the cause is not a servo
 
 
@@ -49,8 +47,7 @@ class CauseShare:
 
     @property
     def name(self) -> str:
-        """Cause with its subject, as text: `late reply of bus main`. For a cause of kind `machine`, only
-        its activity."""
+        """Cause as text: `late reply of bus main`; for kind `machine`, only its activity."""
         if self.kind == "machine":
             return self.subject
         return f"{self.kind} of {self.subject}" if self.subject else self.kind
@@ -61,8 +58,7 @@ TimelineKind = Literal["instruction", "status", "noise", "late", "other host", "
 
 @dataclass(frozen=True, slots=True)
 class TimelinePacket:
-    """One packet on a bus during one cycle. Times are in us since the cycle's deadline, negative in the
-    idle time before."""
+    """One packet of a cycle; times in us since the cycle's deadline, negative before it."""
 
     bus: str
     kind: TimelineKind

@@ -315,8 +315,7 @@ def _write_meta(directory: Path, log: Log, features: Mapping[str, object], made:
 
 
 def _tasks(task: str) -> pa.Table:
-    """Return the content of meta/tasks.parquet. Its metadata make pandas use the task as index, which
-    LeRobot looks up."""
+    """Return the content of meta/tasks.parquet. Its metadata make the task the index, as LeRobot expects."""
     pandas = {
         "index_columns": ["task"],
         "column_indexes": [],

@@ -1,5 +1,4 @@
-"""Parquet export: a directory with a file each for cycles, packets, events, commands and every topic of
-controllers."""
+"""Parquet export: a directory with a file for cycles, packets, events, commands and each topic."""
 
 from __future__ import annotations
 
@@ -56,14 +55,12 @@ def write_parquet(reader: LogReader, directory: Path) -> int:
 
 
 def has_file(directory: Path, topic: str) -> bool:
-    """Return whether `write_parquet` wrote the table of a topic into a directory. The packets of all buses
-    share one table."""
+    """Return whether a directory has the file of a topic's table. The packets of all buses share one."""
     table = PACKETS if topic.startswith(BUS_PREFIX) else topic
     return (directory / file_name(table)).exists()
 
 
 def file_name(topic: str) -> str:
-    """Return the name of the Parquet file of a topic: `cycles.parquet`, `arm.error.parquet` for
-    `/arm/error`."""
+    """Return the name of the Parquet file of a topic: `arm.error.parquet` for `/arm/error`."""
     name = _NAMES.get(topic, topic.strip("/").replace("/", "."))
     return f"{_ODD.sub('_', name)[:_LONGEST] or '_'}.parquet"

@@ -1,5 +1,4 @@
-"""Time series of joint quantities over a run, in time bins that double in length when the run outgrows
-them."""
+"""Time series of joint quantities over a run, in bins that double in length when the run outgrows them."""
 
 from __future__ import annotations
 
@@ -13,13 +12,11 @@ _FIRST_BIN_NS = 100_000_000
 
 
 _JOINS = ((np.minimum, np.inf), (np.maximum, -np.inf), (np.add, 0.0), (np.add, 0.0))
-"""Reduction and neutral element of each array of `Bins`: minimum, maximum, sum, and number of finite
-values."""
+"""Reduction and neutral element of each array of `Bins`: minimum, maximum, sum, number of values."""
 
 
 class Bins:
-    """Minimum, mean and maximum of several quantities of each joint in 512 time bins of 0.1 s or more.
-    Memory does not grow with the run."""
+    """Minimum, mean and maximum of several quantities of each joint in 512 time bins of 0.1 s or more."""
 
     def __init__(self, quantities: int = 0, joints: int = 0, begin_ns: int = 0) -> None:
         shape = (quantities, _BINS, joints)

@@ -65,14 +65,12 @@ class Windows:
     most: Floats
 
     def reach(self, quantity: int, when: Flags) -> float:
-        """Return the greatest minus the smallest value of a quantity in the windows `when`, or 0 for no
-        windows."""
+        """Return the greatest minus the smallest value of a quantity in the windows `when`; 0 for none."""
         most = np.fmax.reduce(self.most[quantity, when], initial=-math.inf)
         return max(0.0, float(most - np.fmin.reduce(self.least[quantity, when], initial=math.inf)))
 
     def typical(self, quantity: int, when: Flags) -> float:
-        """Return the mean magnitude of a quantity in the windows `when`; NaN if it is unknown in all of
-        them."""
+        """Return the mean magnitude of a quantity in the windows `when`; NaN if never known."""
         values = self.mean[quantity, when]
         values = values[np.isfinite(values)]
         return float(np.abs(values).mean()) if len(values) else math.nan
@@ -94,8 +92,7 @@ class Windows:
 
 @dataclass(frozen=True, slots=True)
 class Failing:
-    """Failure of one joint to follow its commands: rule, description, and the windows of time in which it
-    failed."""
+    """Failure of one joint to follow its commands: rule, description, and windows in which it failed."""
 
     code: str
     text: str  # Description, continues a sentence that begins with the joint's name
@@ -154,8 +151,7 @@ def failure_of(brief: Windows, one: Windows) -> tuple[Windows, Failing | None]:
 
 
 def _still(one: Windows) -> Failing | None:
-    """Return the longest standstill of a joint whose trajectory moves, or None; see the module
-    docstring."""
+    """Return the longest standstill of a joint whose trajectory moves, or None."""
     near, moves = max(_STILL_RAD * one.joint.share, 2 * one.joint.tick), MOVED_RAD * one.joint.share
     least, most = one.least[POSITION], one.most[POSITION]
     away = one.mean[AWAY] > AWAY_RAD * one.joint.share
@@ -200,8 +196,7 @@ def _stood(one: Windows, when: Flags, there: Flags, seconds: float) -> Failing:
 
 
 def _far(one: Windows) -> Failing | None:
-    """Return the windows in which a joint is far from its goal and approaches it slower than it can, as a
-    failure; None if they last less than a second."""
+    """Return the windows in which a joint is far from its goal and approaches it slowly, as a failure."""
     away, speed = one.mean[AWAY], one.mean[SPEED]
     if not len(away):
         return None
@@ -223,8 +218,7 @@ def _far(one: Windows) -> Failing | None:
 
 
 def _oscillates(one: Windows) -> Failing | None:
-    """Return the windows in which the joint's error or its goal swings, as a failure; None if they last
-    less than a second."""
+    """Return the windows in which the joint's error or its goal swings, as a failure; None if too short."""
     by_effort = np.isnan(one.mean[AWAY])
     shakes = one.mean[SWINGS] >= np.where(by_effort, _SHAKES_BY_EFFORT_HZ, _SHAKES_HZ)
     told = one.mean[GOALS] >= _SHAKES_HZ
@@ -243,8 +237,7 @@ def _oscillates(one: Windows) -> Failing | None:
 
 
 def _worse(one: Windows) -> Failing | None:
-    """Return the windows in which a joint follows worse than ever before, as a failure; None if they last
-    less than a second."""
+    """Return the windows in which a joint follows worse than ever before, as a failure; None if too short."""
     away = one.mean[AWAY]
     bad, well, before = (np.zeros(len(away), np.bool_) for _ in range(3))
     follows = True

@@ -47,8 +47,7 @@ _CREEPS_RAD_S = 0.1  # Below this speed friction can act in either direction
 _FASTER = 1.5  # Speeds within this ratio are similar
 _MOST_BEFORE = 12  # Stays kept as reference per place, the first of the run
 _BENDS_RAD_S = 0.6
-"""Change of the trajectory's speed within 0.2 s, at least by half, that causes an error in a healthy
-joint."""
+"""Least change of speed within 0.2 s (and half of the speed) that causes an error in a healthy joint."""
 _BENDS_S = 0.1  # Interval before and after, over which the change is measured
 _SWING_RAD, _SWING_TICKS = 0.01, 4  # 0.6 deg, or this number of ticks
 _SWING_S = 0.2  # Longest time between reversals of a series
@@ -93,8 +92,7 @@ class Visit(NamedTuple):
 
 
 class _Stay(NamedTuple):
-    """Uninterrupted stay of a joint at one place (3 deg wide) in one direction, with its median speed,
-    error and load."""
+    """Stay of a joint at one place (3 deg wide) in one direction, with median speed, error and load."""
 
     end_s: float
     direction: int  # 0: nearly at rest
@@ -111,8 +109,7 @@ class _Stay(NamedTuple):
 
 
 class Followed(NamedTuple):
-    """Samples of one joint, compared with its trajectory after the lag that is typical of its kind; rad of
-    its servo."""
+    """Samples of one joint, and its trajectory after the lag typical of its kind; rad of its servo."""
 
     row: int
     joint: PlannedJoint
@@ -128,8 +125,7 @@ class Followed(NamedTuple):
     speed: Floats
 
     def visits(self, least: float, least_load: float) -> Iterator[Visit]:
-        """Yield each stay at a place where the joint was before, in the same direction at a similar speed, or
-        at rest.
+        """Yield each stay at a place where the joint was before, in the same direction at a similar speed.
 
         Stays whose error differs by less than `least` (rad) and whose load differs by less than `least_load`
         (share of torque) become the reference of later ones.
@@ -196,8 +192,7 @@ class Followed(NamedTuple):
         return self.at_s[turns]
 
     def _bends(self) -> Flags:
-        """Return the samples at which the speed of the trajectory changes much within 0.2 s, or is
-        unknown."""
+        """Return the samples at which the trajectory's speed changes much in 0.2 s, or is unknown."""
         bends = np.zeros(len(self.off), np.bool_)
         side = _samples(_BENDS_S, self.step_s)
         least = np.maximum(_BENDS_RAD_S, np.abs(self.speed[side:-side]) / 2)
@@ -285,8 +280,7 @@ def _lasting(when: Flags, samples: int) -> Flags:
 
 
 def _turning(values: Floats, least: float) -> list[int]:
-    """Return the indices at which finite values reverse by `least` or more, including both ends of the
-    movement."""
+    """Return the indices at which finite values reverse by `least` or more, and both ends of the movement."""
     step = np.sign(np.diff(values))
     moved = np.flatnonzero(step)
     turns = moved[1:][step[moved[1:]] != step[moved[:-1]]]
@@ -318,8 +312,7 @@ def _nearest(value: float, before: Sequence[float]) -> float:
 
 
 class _Shown(NamedTuple):
-    """Evidence about one joint for the rules below: its visits and swings, with the greatest change of
-    error and load."""
+    """Evidence about one joint for the rules below: its visits and swings, and the greatest changes."""
 
     one: Followed
     visits: list[Visit]

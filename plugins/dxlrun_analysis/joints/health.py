@@ -56,8 +56,7 @@ class _Sample(NamedTuple):
 
 
 class ServoHealth:
-    """Accumulator of temperatures, voltages and hardware errors of all joints. Its memory does not grow
-    with the log."""
+    """Accumulator of temperatures, voltages and hardware errors of all joints, in constant memory."""
 
     def __init__(self) -> None:
         self._joints: tuple[PlannedJoint, ...] = ()
@@ -112,8 +111,7 @@ class ServoHealth:
         )
 
     def findings(self, movement: Sequence[Finding]) -> Iterable[Finding]:
-        """Report hot and overloaded servos, impossible temperatures, and supply voltages that are too high,
-        too low or sag.
+        """Report hot and overloaded servos, impossible temperatures, and bad supply voltages.
 
         Args:
             movement: Findings about movement. Overload of the joints that they accuse is not reported

@@ -40,8 +40,7 @@ _SWING_RAD = 0.035  # 2 deg: smallest swing that counts
 _FULL_SPEED = 0.8
 """A joint moves as fast as it can from this share of its greatest speed so far on."""
 _SLOWEST_TOP = 0.4
-"""Share of the model's top speed that a joint reaches at least: a weak supply and a load make a servo
-slower."""
+"""Share of the model's top speed that a joint reaches at least, with a weak supply and a load."""
 
 
 @dataclass(slots=True)
@@ -55,8 +54,7 @@ class _Jumps:
     position: float = math.nan
 
     def take(self, joint: PlannedJoint, at_ns: NDArray[np.int64], position: Floats) -> None:
-        """Add positions of the joint with their times; NaN while it has no torque, which also interrupts
-        the comparison."""
+        """Add positions of the joint with their times; NaN while it has no torque: not compared."""
         at_ns, position = np.append(self.read_ns, at_ns), np.append(self.position, position)
         seconds, moved = np.diff(at_ns) * 1e-9, np.abs(np.diff(position))
         top = joint.logged.top_speed
@@ -174,8 +172,8 @@ class Movement:
         return found
 
     def _told(self, cycles: NDArray[np.void], way: Floats) -> Floats:
-        """Return the same for commanded swings: those of the trajectory, and steps of a goal that was
-        constant before, which count as two."""
+        """Return an array as of `_swings` for commanded swings: those of the trajectory, and steps of a
+        goal that was constant before, which count as two."""
         steps = np.abs(np.diff(cycles["goal_position"], axis=0, prepend=np.nan))
         begins = steps >= _SWING_RAD * np.array([joint.share for joint in self._joints])
         begins[1:] &= steps[:-1] == 0.0

@@ -58,8 +58,7 @@ class PlannedJoint:
 
 
 def planned_joints(log: Log) -> tuple[PlannedJoint, ...]:
-    """Return the planned joints in the order of the log's joints. A joint that is not in the plan has only
-    its name."""
+    """Return the joints in the order of the log. A joint that is not in the plan has only its name."""
     plan = plan_of(log)
     movers = plan.movers
     found = []

@@ -27,8 +27,7 @@ from dxlrun_analysis.joints.planned import PlannedJoint, planned_joints
 # A reachable trajectory that is constant for this time is at rest, so its joint is expected to settle.
 _REST_S = 0.3
 _SETTLED_PART, _SETTLED_TICKS = 0.02, 2
-"""Settled: within this share of the movement, or this number of ticks, of the rest position, whichever is
-more."""
+"""Settled: within this share of the movement, or number of ticks, of the rest position; the greater."""
 _MOVED_TICKS = 4  # Shorter movements give no lag, because positions are quantized in ticks
 _BLOCK = 1 << 16  # Cycles times joints that are processed at once, with eight joints at least
 _LONGEST_REST_S = 20.0  # A longer rest is counted as two
@@ -38,8 +37,7 @@ Flags = NDArray[np.bool_]
 
 @dataclass(frozen=True, slots=True)
 class JointTracking:
-    """Tracking error of one joint over a run: error, lag, settling time, and quality of its states; rad,
-    or m if linear."""
+    """Tracking error of one joint over a run: error, lag, settling time, invalid states; rad or m."""
 
     name: str
     invalid: int  # Cycles without an intact reply, except those of a requested reboot
@@ -73,8 +71,7 @@ def tracking(log: Log) -> tuple[JointTracking, ...]:
 
 
 def reachable(log: Log, row: int) -> Floats:
-    """Return the reachable trajectory of the joint in column `row`, for each cycle, rad; NaN without a
-    goal."""
+    """Return the reachable trajectory of joint number `row` in each cycle, rad; NaN without a goal."""
     limits = planned_joints(log)[row]
     return _reachable(_sent(log.cycles, row, limits), limits.acceleration, _Way())
 
@@ -261,8 +258,7 @@ class _OpenRest:
 
 
 class Tracking:
-    """Accumulator of the tracking errors of all joints, fed with the log slice by slice. Its memory does
-    not grow with the log."""
+    """Accumulator of the tracking errors of all joints, fed slice by slice in constant memory."""
 
     def __init__(self) -> None:
         self._parts: list[NDArray[np.void]] = []

@@ -17,8 +17,7 @@ _MOST = 8_192  # Samples kept, nearly three minutes. A longer run keeps the firs
 
 
 class Samples(NamedTuple):
-    """Positions and loads of all joints over time; NaN if unknown, and at the gap between the first and
-    the newest samples."""
+    """Positions and loads of all joints over time; NaN if unknown, and at the gap in a long run."""
 
     step_s: float  # Time between samples; the period of a loop below 50 Hz
     at_s: Floats  # Time since the start, shape (samples,)

@@ -57,8 +57,7 @@ class Settings:
     blocks: int
     cores: tuple[int, ...] = ()  # Cores of all conditions; empty for any core
     polling_ns: int | None = None
-    """Longest time that the clock is polled before a deadline, ns; None: a tenth of the period, as in a
-    run."""
+    """Longest time that the clock is polled before a deadline; None: a tenth of the period, as in a run."""
     idle_latency: bool = False  # Keep the cores from deep idle states during the measurement
 
     @property
@@ -67,14 +66,12 @@ class Settings:
         return self.iterations * self.period_ns * len(self.conditions) / 1e9
 
     def share(self, block: int) -> int:
-        """Return the number of wake-ups of each condition in a block. A remainder is spread over the first
-        blocks."""
+        """Return the number of wake-ups of each condition in a block; the first blocks share a remainder."""
         whole, rest = divmod(self.iterations, self.blocks)
         return whole + (block < rest)
 
     def scheduler(self, condition: Condition, lock_memory: bool) -> SchedulerPlan:
-        """Return the scheduler settings of the process that measures a condition, in the form of a robot
-        file's plan."""
+        """Return the scheduler settings of the process that measures a condition."""
         return SchedulerPlan(
             policy=condition.policy,
             priority=self.priority,
@@ -84,8 +81,7 @@ class Settings:
         )
 
     def check(self, allowed_cores: frozenset[int]) -> None:
-        """Check that a measurement with these settings is possible. `allowed_cores` are the cores that the
-        process may use.
+        """Check that a measurement with these settings is possible on the allowed cores.
 
         Raises:
             InputError: One sentence for each value that does not allow a measurement.

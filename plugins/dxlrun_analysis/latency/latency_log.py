@@ -25,14 +25,12 @@ ROBOT = "latency"  # Takes the place of the robot's name in logs of runs
 METADATA_NAME = "latency"  # Metadata record that marks the log of a measurement
 _TOPIC = "/latency/"
 _AT_ONCE = 10_000
-"""Number of wake-ups that are converted to Python integers at a time; ten millions of them take over a
-gigabyte."""
+"""Number of wake-ups that are converted to Python integers at a time; ten million take over 1 GB."""
 
 
 @dataclass(slots=True)
 class WakeUp:
-    """Message of one wake-up: deadline and actual time, ns of the monotonic clock, and number of its
-    block."""
+    """Message of one wake-up: deadline and actual time, ns of the monotonic clock, and its block."""
 
     scheduled_ns: int
     woken_ns: int
@@ -111,8 +109,7 @@ def measurement(log: LogReader) -> tuple[tuple[Block, ...], Result]:
 
 
 def _rows(log: LogReader, topic: str) -> tuple[Times, NDArray[np.int64]]:
-    """Return deadline and wake-up time of each wake-up of a condition, shape (wake-ups, 2), and the block
-    of each."""
+    """Return deadline and actual time of each wake-up of a condition, shape (wake-ups, 2), and its block."""
     if topic not in log.topics:  # A topic exists from its first message on, which a full disk can prevent
         return np.zeros((0, 2), np.int64), np.zeros(0, np.int64)
     found = log.columns(topic, "scheduled_ns", "woken_ns", "block")

@@ -214,8 +214,7 @@ def _skipped(times: Times, period_ns: int) -> int:
 
 
 def mode_us(late_ns: NDArray[np.int64]) -> int:
-    """Return the most frequent lateness: the lower edge of the fullest bin of 1 us, the smallest of equal
-    ones."""
+    """Return the most frequent lateness, us: lower edge of the fullest bin, smallest of equal ones."""
     bins, counts = np.unique(late_ns // 1000, return_counts=True)
     return int(bins[int(np.argmax(counts))])
 
@@ -232,8 +231,7 @@ def interval(values: Sequence[float]) -> Interval:
 
 
 def t_quantile(freedom: int, confidence: float = CONFIDENCE) -> float:
-    """Return the two-sided quantile of Student's t: t with P(|T| < t) = confidence, for whole degrees of
-    freedom."""
+    """Return the two-sided quantile of Student's t: t with P(|T| < t) = confidence."""
     low, high = 0.0, 1.0
     while _t_probability(high, freedom) < confidence:
         high *= 2

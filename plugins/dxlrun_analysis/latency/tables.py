@@ -61,8 +61,7 @@ def statistics_table(result: Result) -> Table:
 
 
 def blocks_table(result: Result) -> Table:
-    """Return the table with mean and 95 % interval over the blocks, and the ratios to the reference, block
-    by block."""
+    """Return the table with mean and 95 % interval over the blocks, and the ratios to the reference."""
     columns = (Column("", "name"), *(Column(one.label) for one in result.conditions))
     rows: list[tuple[Value, ...]] = [
         (words, *(_interval(one.over_blocks[name], duration) for one in result.conditions))

@@ -133,13 +133,11 @@ class Plot:
         self.model.add_layout(Span(location=at, dimension=dimension, line_color=colour, line_dash="dashed"))
 
     def hover(self, drawn: GlyphRenderer, *tips: tuple[str, str]) -> None:
-        """Show a tooltip when the mouse is over a drawn element; each tip is a pair of name and Bokeh
-        format."""
+        """Show a tooltip over a drawn element; each tip is a pair of name and Bokeh format."""
         self.model.add_tools(HoverTool(renderers=[drawn], tooltips=list(tips)))
 
     def named(self, name: str, *drawn: GlyphRenderer) -> None:
-        """Add a legend entry for drawn elements, in the colour of the first. A click on the entry hides
-        them."""
+        """Add a legend entry, in the colour of the first, that hides drawn elements by a click."""
         for one in drawn:
             one.name = name
         glyph = drawn[0].glyph
@@ -257,8 +255,7 @@ class Canvas:
     def curves(  # noqa: PLR0917  what is drawn, and how its axis is laid out
         self, plot: Plot, curves: Curves, lines: Sequence[Line], unit: str, least: float, scale: float = 1.0
     ) -> None:
-        """Draw curves that have values into a plot, later ones on top, with a band from smallest to largest
-        value.
+        """Draw curves into a plot, later ones on top, with a band from smallest to largest value.
 
         Args:
             plot: The plot.
@@ -299,8 +296,7 @@ class Canvas:
         plot.model.y_range = Range1d(low_end - missing, high_end + missing)
 
     def marks(self, plot: Plot, curves: Curves, lines: Sequence[Line]) -> None:
-        """Draw a row of ticks at the bottom of a plot for each line: one at each time at which its curve
-        has a value."""
+        """Draw a row of ticks at the bottom of a plot for each line, where its curve has a value."""
         shown = [line for line in lines if line.curve in curves]
         if not shown:
             return
@@ -345,8 +341,7 @@ class Canvas:
         return [figure(plot.name, plot.title, plot.place(), plot.text) for plot in plots]
 
     def scripts(self) -> list[Element]:
-        """Return the script elements at the end of the page: the plots as JSON, Bokeh's script, and the
-        script that starts it."""
+        """Return the script elements at the end of the page: plots as JSON, Bokeh's script, start script."""
         if not self._plots:
             return []
         document = Document()
@@ -364,8 +359,7 @@ class Canvas:
 
 
 def _renamed(value: object, names: dict[str, str]) -> object:
-    """Return Bokeh's JSON with the identifiers of models renumbered from 0, which makes the page
-    reproducible.
+    """Return Bokeh's JSON with models' identifiers counted from 0, so that the page is reproducible.
 
     Bokeh counts identifiers over the lifetime of a process.
     """

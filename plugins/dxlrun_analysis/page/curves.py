@@ -191,8 +191,8 @@ def windows(worst_ns: Iterable[int], most: int, period_ns: int) -> list[tuple[in
 
 
 def _values(log: Log, goals: NDArray[np.float64]) -> Samples:
-    """Return the values of all curves in each cycle, shape (cycles, curves), in the order of their names;
-    durations in us.
+    """Return the values of all curves in each cycle, shape (cycles, curves), in order of their names; times
+    in us.
 
     Args:
         log: Log with the cycles.

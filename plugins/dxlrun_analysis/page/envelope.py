@@ -44,8 +44,7 @@ class Rows:
         return Rows(t_ns[order], low, high)
 
     def with_gaps(self, longest_ns: int) -> Rows:
-        """Return a copy with a row of NaN in each gap longer than `longest_ns`, so that no line is drawn
-        across it."""
+        """Return a copy with a row of NaN in each gap longer than `longest_ns`: no line crosses it."""
         before = np.flatnonzero(np.diff(self.t_ns) > longest_ns) + 1
         if not len(before):
             return self

@@ -44,8 +44,7 @@ def grade(severity: int) -> int:
 
 
 def events_plot(canvas: Canvas, events: tuple[Event, ...], number: int) -> Plot:
-    """Return the plot of events over the run, one row per kind; `number` is the count of all events, also
-    those not drawn."""
+    """Return the plot of events over the run, one row per kind; `number` counts also those not drawn."""
     kinds = list(dict.fromkeys(event.name for event in events))
     plot = canvas.timed("events-timeline", "Events over the run", "", 90 + _ROW * len(kinds))
     times = canvas.seconds(np.array([event.t_ns for event in events], np.int64))

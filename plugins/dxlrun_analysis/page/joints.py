@@ -60,8 +60,7 @@ def _lines(joint: str, quantity: str) -> list[Line]:
 
 
 def _followed(joint: JointTracking) -> str:
-    """Return a joint's tracking error, lag, settling time and error at rest as a caption, as far as they
-    are known."""
+    """Return a joint's tracking error, lag, settling time and error at rest as a caption."""
     if joint.rms_rad is None or joint.worst_rad is None:
         return "No goal was sent, or no position was read."
     unit, scale = joint.unit.shown, joint.unit.factor
@@ -79,8 +78,7 @@ def _followed(joint: JointTracking) -> str:
 
 
 def state_plots(canvas: Canvas, cycles: Curves, joints: Sequence[str]) -> list[Plot]:
-    """Return plots of temperature, voltage and load of all joints, without quantities that were never
-    read."""
+    """Return plots of temperature, voltage and load of all joints, as far as they were read."""
     plots = []
     for field, title, label, unit, least in _ALL:
         lines = many_lines(cycles, ((joint_curve(field, joint), joint) for joint in joints))

@@ -63,8 +63,7 @@ def steps_plot(canvas: Canvas, cycles: Curves) -> Plot:
 
 
 def controllers_plot(canvas: Canvas, cycles: Curves, controllers: Sequence[Duration]) -> Plot | None:
-    """Return the plot of the duration of each controller's update over the run; None if no update took any
-    time."""
+    """Return the plot of the duration of each controller's update over the run; None if none took time."""
     lines = many_lines(cycles, ((f"controller {one.name}", one.name) for one in controllers))
     if not lines:
         return None

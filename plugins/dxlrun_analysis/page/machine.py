@@ -35,8 +35,7 @@ Numbers = NDArray[np.float64]
 
 
 class MachineCollector:
-    """Accumulator of the samples of topic /machine as curves: `busy 0` for core 0, `waiting` for the whole
-    machine."""
+    """Accumulator of the samples of topic /machine as curves, such as `busy 0` of core 0."""
 
     def __init__(self) -> None:
         self._cores = 0

@@ -20,8 +20,7 @@ _BIN_NS = 1_000_000  # Initial width of a bin
 
 
 class ReplyCollector:
-    """Accumulator of replies as curves: `reply BUS ID` is a reply time in us, `lost BUS ID` is 1 for a
-    lost reply."""
+    """Accumulator of replies as curves: `reply BUS ID`, reply time in us; `lost BUS ID`, 1 for a lost one."""
 
     def __init__(self) -> None:
         self._columns = np.zeros(0, np.int64)
@@ -67,6 +66,5 @@ class ReplyCollector:
 
 
 def rows_of_replies(servos: int) -> int:
-    """Return the number of time bins that the reply curves of this many servos may have, for a page of
-    bounded size."""
+    """Return the number of time bins that the reply curves of this many servos may have."""
     return min(max(BYTES_OF_REPLIES // (2 * _BYTES_A_VALUE * max(servos, 1)), _FEWEST_ROWS), _MOST_ROWS)

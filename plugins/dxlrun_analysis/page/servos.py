@@ -16,8 +16,7 @@ _ROW = 17  # Pixels per servo
 
 
 def reply_plots(canvas: Canvas, replies: Curves, servos: Sequence[ServoTraffic]) -> list[Plot]:
-    """Return the plots of reply times and lost replies over the run, and of median and slowest reply of
-    each servo."""
+    """Return the plots of reply times and lost replies over the run, and of each servo's slowest reply."""
     plots = []
     names = {f"{servo.bus} {servo.servo_id}": _name(servo) for servo in servos}
     lines = many_lines(replies, ((f"reply {key}", name) for key, name in names.items()))

@@ -32,8 +32,7 @@ class WakeUps(NamedTuple):
 def wake_up_plots(
     canvas: Canvas, curves: Curves, series: Sequence[WakeUps], summary: str
 ) -> tuple[Plot, ...]:
-    """Return the plots of wake-up latency: over time, as a histogram, and cumulative. `summary` is the
-    caption of the first."""
+    """Return the plots of wake-up latency: over time (caption `summary`), histogram, cumulative."""
     lines = [one.line for one in series]
     return _lateness(canvas, curves, lines, summary), _histogram(canvas, series), _cumulative(canvas, series)
 

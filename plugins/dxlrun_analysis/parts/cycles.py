@@ -1,5 +1,4 @@
-"""Parts of the report about cycles: periods, wake-ups, steps, updates of controllers, causes of long
-cycles."""
+"""Parts of the report about cycles: periods, wake-ups, steps, controllers, causes of long cycles."""
 
 from __future__ import annotations
 
@@ -12,8 +11,7 @@ from dxlrun_analysis.parts.part import Report, ReportPart, listing
 
 
 def _loop(report: Report, periods: Periods) -> Table:
-    """Return the table about the loop: numbers of recorded and skipped periods, and lateness of the
-    wake-ups."""
+    """Return the table about the loop: recorded and skipped periods, and lateness of the wake-ups."""
     late = report.totals.latency
     paused = sum(pause.periods for pause in report.totals.pauses)
     rows: list[tuple[str, Value]] = [

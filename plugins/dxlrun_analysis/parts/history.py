@@ -39,8 +39,7 @@ class TopicCounts:
 
     def __init__(self) -> None:
         self._found: dict[str, tuple[str, int, int, int]] = {}
-        """Type, number of messages, and times of the first and the last (ns), by topic; in order of the
-        first message."""
+        """Type, number of messages, times of the first and the last (ns), by topic."""
 
     def take(self, log: Log) -> None:
         """Count the messages in the next slice of the log."""

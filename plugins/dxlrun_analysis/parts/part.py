@@ -54,6 +54,5 @@ class ReportPart(Generic[T]):
 
 
 def listing(title: str, columns: Columns[T]) -> Callable[[Report, Sequence[T]], Table]:
-    """Return a function for `ReportPart.table` that makes a table with a row for each item of the part's
-    numbers."""
+    """Return a function for `ReportPart.table` that makes a table with a row for each item."""
     return lambda _, things: Table.listing(title, columns, things)

@@ -1,5 +1,4 @@
-"""Part of the report: minimum, mean and maximum of each state of a device, sensor or controller over a
-run."""
+"""Part of the report: minimum, mean and maximum of each state of devices, sensors and controllers."""
 
 from __future__ import annotations
 

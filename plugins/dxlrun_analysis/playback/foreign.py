@@ -65,8 +65,7 @@ class _Recording(msgspec.Struct, frozen=True):
 
 
 class _Moments(NamedTuple):
-    """Positions and their times from one message: one moment for a JointState, all points for a
-    JointTrajectory."""
+    """Positions and times from one message: a single one of a JointState, all of a JointTrajectory."""
 
     topic: str
     what: What
@@ -96,8 +95,7 @@ def is_foreign(path: Path) -> bool:
 def foreign_series(
     path: Path, what: What | None, topic: str | None
 ) -> tuple[dict[str, Series], tuple[str, ...]]:
-    """Return the positions over time of each joint in a foreign recording, and a sentence for each problem of
-    reading.
+    """Return each joint's positions in a foreign recording, and a sentence for each problem of reading.
 
     Args:
         path: The recording.
@@ -197,8 +195,7 @@ def _series(path: Path, moments: Sequence[_Moments]) -> dict[str, Series]:
 
 
 def _end_before(times: list[Floats], positions: list[Floats], start_s: float) -> None:
-    """Truncate a joint's trajectory so far at the start of the next one, and add the position reached by
-    then."""
+    """Truncate a joint's trajectory at the start of the next one, and add the position reached by then."""
     if not times:
         return
     time, position = np.concatenate(times), np.concatenate(positions)
@@ -263,8 +260,7 @@ _ZSTD = b"\x28\xb5\x2f\xfd"
 
 
 def _read_sqlite(file: Path, recording: _Recording) -> None:
-    """Add the messages of one file of rosbag2's sqlite3 storage (rosbag2_storage_sqlite3, its schema) to a
-    recording."""
+    """Add the messages of one file of rosbag2's sqlite3 storage (its schema) to a recording."""
     try:
         with closing(
             sqlite3.connect(f"{file.absolute().as_uri()}?mode=ro&immutable=1", uri=True)

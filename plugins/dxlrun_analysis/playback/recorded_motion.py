@@ -72,8 +72,7 @@ class RecordedMotion(msgspec.Struct, frozen=True, eq=False):
 
 
 class Stretch(msgspec.Struct, frozen=True):
-    """Part of a recording that the options `--from` and `--to` select, s since its start. None means its
-    start or end."""
+    """Part of a recording that `--from` and `--to` select, s since its start; None: its start or end."""
 
     begin_s: float | None = None
     end_s: float | None = None

@@ -24,8 +24,7 @@ RAMP_S = 0.3
 
 
 class Rows(msgspec.Struct, frozen=True, eq=False):
-    """Table of positions that plays a motion at a given speed, which ramps up from 0 at the start and down
-    to 0 at the end."""
+    """Table of positions that plays a motion at a given speed, which ramps up from 0 and down to 0."""
 
     motion: RecordedMotion
     speed: float
@@ -69,8 +68,7 @@ def rows_of(
     tolerance: float | None,
     period_s: float,
 ) -> Rows:
-    """Return the rows of a motion for a robot, one row per cycle of `period_s`, after a check of all joint
-    limits.
+    """Return the rows of a motion for a robot, one per cycle of `period_s`, after a check of all limits.
 
     Args:
         motion: The recorded motion.
@@ -169,8 +167,7 @@ def _beyond(
 def _slow_enough(
     plans: Sequence[JointPlan], played: Rows, path: SplinePath, period_s: float, allowed: Floats
 ) -> float | None:
-    """Return the highest speed factor below the given one at which no limit is exceeded, in steps of 0.01,
-    or None."""
+    """Return the highest lower speed factor at which no limit is exceeded, in steps of 0.01, or None."""
     low, high = 0, math.ceil(played.speed * 100)
     while high - low > 1:
         middle = (low + high) // 2

@@ -58,8 +58,7 @@ class SplinePath(msgspec.Struct, frozen=True, eq=False):
 
 
 def tolerances(motion: RecordedMotion, given: float | None) -> Floats:
-    """Return the tolerance of each joint for `fit`: `given` (rad), or the default for goals or measured
-    states.
+    """Return the tolerance of each joint for `fit`: `given` (rad), or the default for goals or states.
 
     The tolerance of a linear joint is in m: its movement for that angle (`TURN_SIZES`).
     """

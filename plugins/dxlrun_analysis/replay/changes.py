@@ -1,5 +1,4 @@
-"""Intended differences between a replay and its run: changed parameters, code, and arguments of the robot
-file."""
+"""Intended differences between a replay and its run: parameters, code, arguments of the robot file."""
 
 from __future__ import annotations
 
@@ -102,8 +101,7 @@ def _changed(plan: ControllerPlan, setting: Setting) -> ControllerPlan:
 
 
 def with_arguments(plan: RecordedPlan, loop: LoopPlan, arguments: Mapping[str, str]) -> LoopPlan:
-    """Return the loop's plan, with joints and controllers compiled from the log's robot file with changed
-    arguments.
+    """Return the loop's plan with joints and controllers compiled again with changed arguments.
 
     Cycles and commands stay as recorded.
 

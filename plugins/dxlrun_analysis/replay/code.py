@@ -1,5 +1,4 @@
-"""Choice of the Python files next to the robot file that a replay executes: those on disk, or those in the
-log.
+"""Choice of the robot file's Python files that a replay executes: those on disk or in the log.
 
 A log can come from an untrusted source, so the Python text in it is executed only on request.
 """
@@ -21,8 +20,7 @@ the texts in the log."""
 
 
 def with_code(plan: RecordedPlan, choice: CodeChoice | None) -> tuple[RecordedPlan, tuple[str, ...]]:
-    """Return the plan with the Python files that the replay executes, and a remark on each that has changed
-    since the run.
+    """Return the plan with the Python files that the replay executes, and remarks on changed ones.
 
     Without a choice, the files on disk must equal those in the log.
 

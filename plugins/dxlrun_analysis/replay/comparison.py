@@ -1,5 +1,4 @@
-"""Comparison of the commands and goals of a replayed loop with those in the log, cycle by cycle and bit by
-bit."""
+"""Comparison of commands and goals of a replayed loop with those in the log, bit by bit."""
 
 from __future__ import annotations
 
@@ -18,8 +17,7 @@ from dxlwire import COMMAND_INTERFACES
 _COMMANDS = tuple(f"command_{interface}" for interface in COMMAND_INTERFACES)
 _GOALS = tuple(f"goal_{interface}" for interface in COMMAND_INTERFACES)
 _COMPARED = (*CycleRecord.COMPUTED, *_COMMANDS, *_GOALS)
-"""Fields of a cycle that are compared, in order of computation. The first difference causes the later
-ones."""
+"""Fields of a cycle that are compared, in order of computation: a difference causes later ones."""
 _WHAT = {
     **{f"command_{interface}": f"command of the {interface}" for interface in COMMAND_INTERFACES},
     **{
@@ -41,8 +39,7 @@ class JointDifferences(msgspec.Struct, frozen=True):
 
 
 class Comparison:
-    """Counter of the differences between replayed and recorded cycles. NaN and zero are compared by their
-    bits."""
+    """Counter of the differences between replayed and recorded cycles, which are compared bit by bit."""
 
     def __init__(
         self, plan: LoopPlan, inputs: RecordedInputs, controllers: Callable[[], Sequence[ControllerPlan]]

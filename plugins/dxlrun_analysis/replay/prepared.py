@@ -1,5 +1,4 @@
-"""Prepared commands: arrays that a controller's `prepare` makes again from logged requests, compared with the
-log.
+"""Prepared commands: arrays that `prepare` makes again from logged requests, compared with the log.
 
 `prepare` ran outside of the loop: at compilation for a planned command, in the gateway for the command of a
 client.
@@ -130,8 +129,7 @@ class PreparedComparison:
         recorded: bytes,
         cycle: int,
     ) -> bytes:
-        """Prepare a command's request again and compare the array with the recorded one; return the array
-        for the replay."""
+        """Prepare a request again and compare it with the recorded array; return the array for the replay."""
         if not request:
             self.without_request += 1
             return recorded

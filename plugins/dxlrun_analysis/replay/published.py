@@ -51,8 +51,7 @@ class MessageComparison(MessageSink):
         self._whole = inputs.end == len(inputs.log.cycles) and any(
             event.code == EventCode.LOOP_STOPPED for event in inputs.log.events
         )
-        """True if the run stopped normally with the last compared cycle, so that its messages are
-        complete."""
+        """True if the run stopped normally with the last compared cycle: its messages are complete."""
         self.lost = _lost(inputs.log)
         """Number of messages that the recorder lost. If there are any, a message that only the replay has
         is not a difference."""
@@ -95,8 +94,7 @@ class MessageComparison(MessageSink):
             self._differs(t_ns, name, "", "no message", "a message")
 
     def finish(self, reached_ns: int) -> None:
-        """Count recorded messages up to the time `reached_ns` that the replay did not publish as
-        differences."""
+        """Count recorded messages until `reached_ns` that the replay did not publish as differences."""
         for name, pending in self._topics.items():
             self._pass(name, pending, min(reached_ns, self._until_ns) + 1)
 

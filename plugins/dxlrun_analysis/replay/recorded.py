@@ -48,16 +48,14 @@ class ReplayDifference(msgspec.Struct, frozen=True):
     what: str
     """`command of the position`, `goal of the velocity ...`, `reference arm_pid/j0/position`, `active`."""
     joint: str | None
-    """Joint of the value; None if a controller was active in only one of run and replay, or if a message
-    differs."""
+    """Joint of the value; None for a message, or if a controller was active in only one of the two."""
     controller: str | None  # Controller that claims the joint or commands the reference; None without one
     recorded: str  # Shortest decimal number with these bits; if it is not finite, also the bits
     replayed: str
 
 
 class RecordedInputs(RunInputs, frozen=True, eq=False):
-    """Inputs of a recorded run for its replay, with the plan, and the reason why some cycles cannot be
-    compared."""
+    """Inputs of a recorded run for its replay, with the plan, and why some cycles cannot be compared."""
 
     plan: RecordedPlan
     stopped: str  # Reason why some cycles cannot be compared; empty if all can
@@ -65,8 +63,7 @@ class RecordedInputs(RunInputs, frozen=True, eq=False):
     def difference(  # noqa: PLR0917  what a difference is made of
         self, index: int, what: str, joint: str | None, controller: str | None, recorded: str, replayed: str
     ) -> ReplayDifference:
-        """Make the record of one value that differs, in the cycle with this index; -1: before the first
-        cycle."""
+        """Return the record of a difference in the cycle with this index; -1: before the first cycle."""
         cycle = self.activation if index < 0 else self.log.cycles[index]
         time_s = (int(cycle["woken_ns"]) - self.start_ns) * 1e-9
         return ReplayDifference(int(cycle["cycle"]), time_s, what, joint, controller, recorded, replayed)
@@ -126,8 +123,7 @@ def _beginning(log: Log) -> np.void:
 
 
 def version_remarks(inputs: RecordedInputs, plugins: PlugIns) -> tuple[str, ...]:
-    """Return a sentence for dxlrun, numpy, and each controller type that has another version than in the
-    run."""
+    """Return a sentence for each of dxlrun, numpy and controller types with another version than then."""
     then = inputs.log.metadata.get("versions", {})
     sentences = []
     for name in _LIBRARIES:
@@ -145,8 +141,7 @@ def version_remarks(inputs: RecordedInputs, plugins: PlugIns) -> tuple[str, ...]
 
 
 def code_remarks(inputs: RecordedInputs) -> tuple[str, ...]:
-    """Return a sentence for dxlrun, and for each plug-in of these controllers, if its files have changed
-    since the run."""
+    """Return a sentence for each of dxlrun and the controllers' plug-ins whose files have changed."""
     publishers = [plan.distribution for plan in inputs.plan.loop.controllers]
     return changed_code(inputs.log.metadata.get(IDENTITY_NAME, {}), publishers)
 
@@ -183,8 +178,7 @@ def _plan(log: Log) -> RecordedPlan:
 
 
 def _check_controllers(log: Log, loop: LoopPlan) -> None:
-    """Raise LogError if a controller of the plan has an unknown joint, or a rate divider below 1, which no
-    compiler produces."""
+    """Raise LogError if a controller of the plan has an unknown joint, or a rate divider below 1."""
     for controller in loop.controllers:
         unknown = set(controller.joints) - set(log.joints)
         if unknown or controller.every < 1:
@@ -200,8 +194,7 @@ def _version(log: Log) -> str:
 
 
 def _check_times(log: Log, start_ns: int, period_ns: int) -> None:
-    """Raise LogError if the cycles' times contradict a periodic loop; a replay would follow them without an
-    end.
+    """Raise LogError if the cycles' times contradict a periodic loop; a replay might never end.
 
     The time between two deadlines is the difference of their numbers times the period. The period changes
     only in a cycle that executed a change of the rate. Across missing cycles it is unknown.

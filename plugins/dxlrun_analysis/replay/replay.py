@@ -148,8 +148,7 @@ def replay_log(
 
 
 def _offered(log: Path, loop: LoopPlan, plugins: PlugIns) -> None:
-    """Raise PlugInError if no installed plug-in offers the type of a controller in the log, with a line
-    for each."""
+    """Raise PlugInError with a line for each controller of the log whose type no plug-in offers here."""
     missing = [
         f"{log}: no plug-in offers the type {one.type} of controller {one.name}; the run had it from "
         f"{one.distribution or 'another package'}: install that"

@@ -83,8 +83,7 @@ def _scalars(cycles: NDArray[np.void]) -> NDArray[np.void]:
 
 
 class Tape:
-    """Reader that returns the cycles of a log one after the other, and reads the messages a few seconds
-    ahead."""
+    """Reader of the cycles of a log one after the other, and of the messages a few seconds ahead."""
 
     def __init__(
         self, reader: LogReader, woken_ns: NDArray[np.int64], messages: Callable[[Log], None]

@@ -1,5 +1,4 @@
-"""Pool of processes on this machine that analyze logs in parallel, connected by pipes without a listening
-socket."""
+"""Pool of processes that analyze logs in parallel, connected by pipes without a listening socket."""
 
 from __future__ import annotations
 

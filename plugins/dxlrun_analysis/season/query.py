@@ -28,8 +28,7 @@ _READ_ONLY: dict[str, str | bool | int | float | list[str]] = {
 
 
 def select_runs(runs: pa.Table, where: str | None, sort: str | None) -> list[dict[str, object]]:
-    """Return those rows of the table of logs that meet the SQL condition `where`, ordered by `sort`, by
-    default by name.
+    """Return the rows that meet the SQL condition `where`, ordered by `sort`, by default by name.
 
     Raises:
         InputError: An expression is wrong; the message names its option of the command line.

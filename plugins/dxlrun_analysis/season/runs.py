@@ -39,8 +39,7 @@ _TEXT, _WHOLE, _NUMBER, _YES = pa.string(), pa.int64(), pa.float64(), pa.bool_()
 
 
 def _began(report: Report, log: Log) -> datetime | None:
-    """Return the wall-clock time of the run's first deadline, in UTC without a time zone; None on virtual
-    time."""
+    """Return the wall-clock time of the first deadline, UTC without a time zone; None on virtual time."""
     offset_ns = log.header.epoch_offset_ns
     if not offset_ns:
         return None
@@ -189,8 +188,7 @@ def _belongs(name: str, files: Sequence[str]) -> bool:
 
 
 def row_of(log: FoundLog) -> Row:
-    """Analyze a log and return its row of the table. If it cannot be read, the row has the reason in
-    `unreadable`."""
+    """Analyze a log and return its row; if it cannot be read, the reason is in `unreadable`."""
     row: Row = {"log": log.name, "bytes": sum(file.stat().st_size for file in log.files if file.is_file())}
     try:
         reader = open_log(log.path)
@@ -217,8 +215,7 @@ def cache_directory() -> Path:
 
 
 def table_of(folder: Folder, progress: Progress) -> tuple[pa.Table, int]:
-    """Return the table of all logs below a directory, and how many of them were read now; the rest come from
-    the cached table.
+    """Return the table of all logs, and how many were read now; the rest come from the cached table.
 
     Raises:
         OSError: The table cannot be written to the cache.

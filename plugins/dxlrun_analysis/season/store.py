@@ -60,8 +60,7 @@ class Store(NamedTuple):
     others: tuple[str, ...]
 
     def table(self, progress: Progress) -> tuple[pa.Table, int]:
-        """Return the table of all logs in the store, and how many rows were fetched now; the rest come from
-        the cached table.
+        """Return the table of all logs, and how many rows were fetched now; the rest come from the cache.
 
         Raises:
             OSError: The table cannot be written to the cache.
@@ -107,8 +106,7 @@ def find_store(url: str) -> Store:
 
 
 def fetch(url: str) -> Path:
-    """Download one log from a store to a temporary directory, which is deleted when the process exits;
-    return its path."""
+    """Download one log from a store; return the path of the copy, which is deleted at exit."""
     files, root = _opened(url)
     copy = Path(mkdtemp(prefix="dxlrun-")) / root.rpartition("/")[2]
     atexit.register(shutil.rmtree, copy.parent, ignore_errors=True)
@@ -127,8 +125,7 @@ class Upload(NamedTuple):
 
 
 def upload(folder: Folder, url: str, progress: Progress) -> Upload:
-    """Copy the logs of finished runs to a store, each with its row. Logs that are complete in the store are
-    not copied again.
+    """Copy the logs of finished runs to a store, each with its row, unless they are complete there.
 
     Raises:
         DxlrunError: The store cannot be reached. The next call continues after the last complete log.
@@ -197,8 +194,7 @@ def _opened(url: str) -> tuple[fsspec.AbstractFileSystem, str]:
 
 @contextmanager
 def _reached(url: str) -> Iterator[None]:
-    """Convert any exception of a store library to a DxlrunError with the URL; the libraries have no common
-    base class."""
+    """Convert any exception to a DxlrunError with the URL; store libraries have no common base class."""
     try:
         yield
     except Exception as error:

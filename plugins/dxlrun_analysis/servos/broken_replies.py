@@ -22,8 +22,7 @@ _ALONE = 0.7  # Share of the exchanges of a bus with stray bytes from which a si
 
 
 class BrokenReplies:
-    """Counter of exchanges with bytes that belong to no intact packet, by servo and by bus; reports the
-    cause."""
+    """Counter of exchanges with bytes that belong to no intact packet, by servo and by bus."""
 
     def __init__(self, buses: int) -> None:
         self._broken, self._first, self._cut = np.zeros((3, buses * IDS), np.int64)
@@ -56,8 +55,7 @@ class BrokenReplies:
         self._asked += np.bincount(exchanges.bus[exchanges.request > 0], minlength=buses)
 
     def findings(self, index: int, bus: LoggedBus, losses: Mapping[int, ServoLosses]) -> Sequence[Finding]:
-        """Report the one servo of a bus whose replies are broken, or else noise on the bus; `losses` has
-        its servos by ID."""
+        """Report the one servo of a bus whose replies are broken, or else noise on the bus."""
         return self._broken_ones(index, bus, losses) or self._noise(index, bus)
 
     def _noise(self, index: int, bus: LoggedBus) -> Sequence[Finding]:

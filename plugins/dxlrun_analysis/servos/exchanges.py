@@ -68,8 +68,7 @@ class Replies(NamedTuple):
     wire_ns: Numbers  # Wire time of the status packet
     last_ns: Numbers  # After the read() of the status packet's last byte
     before_ns: Numbers
-    """`last_ns` of the preceding status packet in the exchange; for the first one, the end of the
-    instruction."""
+    """`last_ns` of the preceding status packet in the exchange; for the first, end of the instruction."""
     due_ns: Numbers  # Planned time by wire time and return delay, with all replies before it
     """Planned time of the reply's last byte, from the end of the instruction, and wire time and return
     delay of this and the preceding replies."""
@@ -111,8 +110,7 @@ class Late(NamedTuple):
 
 
 class Pairing:
-    """Pairs instructions with their replies, fed with the log slice by slice. Its memory does not grow with
-    the log.
+    """Pairs instructions with their replies, fed slice by slice in constant memory.
 
     The newest packets are held back, because records of a log are not strictly in order of time.
     """
@@ -164,8 +162,7 @@ class Pairing:
         return self._paired(packets, final=True)
 
     def alone(self, packets: PacketColumns) -> Exchanges:
-        """Return the exchanges of these packets alone, such as those of one cycle. All of them count as
-        ended."""
+        """Return the exchanges of these packets alone, such as those of one cycle; all count as ended."""
         self._free_ns[:] = 0
         return self._paired(packets)
 

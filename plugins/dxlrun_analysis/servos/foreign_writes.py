@@ -1,5 +1,4 @@
-"""Writes of other hosts to servos of the plan: written items, servos, and failures of these servos
-afterwards.
+"""Writes of other hosts to servos of the plan: written items, and failures of these servos afterwards.
 
 A single instruction is sufficient evidence, because noise hardly looks like one: it is intact, has the ID of
 a servo, and begins and ends at items of its control table. Sources: ROBOTIS e-Manual, Protocol 1.0 and 2.0,
@@ -89,8 +88,7 @@ class ForeignWrites:
 
 
 def _written(bus: int, plan: LoggedBus, packet: LoggedPacket) -> Iterator[_Write]:
-    """Yield the control table items of the plan's servos that an instruction writes, and their reboots and
-    resets."""
+    """Yield the items of the plan's servos that an instruction writes, and their reboots and resets."""
     data = packet.data
     second = data.startswith(_HEADER_2)
     at = 4 if second else 2
@@ -131,8 +129,7 @@ def _addressed(plan: LoggedBus, servo_id: int) -> list[LoggedServo]:
 
 
 def _items(plan: LoggedBus, servo: LoggedServo, address: int, data: bytes) -> list[tuple[str, int]]:
-    """Return name and value of the control table items that exactly cover the written bytes, or an empty
-    list."""
+    """Return name and value of the items that exactly cover the written bytes, or an empty list."""
     try:
         items = find_table(servo.model, plan.protocol).items
     except LookupError:  # The model of a plug-in that is not installed here

@@ -34,8 +34,7 @@ class Places:
 
 
 class JointStates:
-    """Buffer of joint states until the exchanges of their cycles are paired, and counter of the time spent in
-    each bin.
+    """Buffer of joint states until their cycles' exchanges are paired; counts the time in each bin.
 
     Its memory does not grow with the log.
     """
@@ -97,8 +96,7 @@ class JointStates:
         return Places(numbers[:end], bins)
 
     def range_text(self, joint: int, quantity: int, low: int, high: int) -> str:
-        """Return a range of bins of one quantity as text, such as `between 30 and 45 deg`; bin `high` is
-        included."""
+        """Return a range of bins of one quantity as text: `between 30 and 45 deg`; `high` is included."""
         begin, end = ((at + _FIRST[quantity]) * _STEPS[quantity] for at in (low, high + 1))
         if quantity == TEMPERATURE:
             return f"from {begin:.0f} deg C on" if high == BINS - 1 else f"at {begin:.0f} to {end:.0f} deg C"

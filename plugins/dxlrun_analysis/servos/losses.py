@@ -1,5 +1,4 @@
-"""Missing replies: which servo, bus or machine they are attributed to, from the other replies at the same
-time.
+"""Missing replies, attributed to servo, bus or machine by the other replies at the same time.
 
 An *outage* lasts from the first missing reply of a servo until its next answer. It begins with a loss that
 may be the servo's own: in a chain only the first missing reply is, because the following servos wait for it
@@ -49,8 +48,7 @@ _CHANCE = 1e-3  # Probability of this concentration if losses were independent o
 
 @dataclass(frozen=True, slots=True)
 class ServoLosses:
-    """Numbers of requests to one servo and of missing replies that are its own, not due to a servo before
-    it in a chain."""
+    """Requests to one servo, and missing replies that are its own, not due to a servo before it."""
 
     asked: int  # Requests that it could have answered: no reply before its own in the chain was missing
     lost: int
@@ -76,8 +74,7 @@ class _Outage:
 
 @dataclass(slots=True)
 class _Count:
-    """Counter of the occasions of one part. An occasion within 0.2 s of the preceding counted one is not
-    counted."""
+    """Counter of the occasions of one part that are 0.2 s or more apart."""
 
     apart: int = 0
     last_ns: int = -(1 << 62)
@@ -90,8 +87,7 @@ class _Count:
 
 
 class Losses:
-    """Accumulator of outages of servos, and of cycles with late replies. Its memory does not grow with the
-    log."""
+    """Accumulator of outages of servos, and of cycles with late replies, in constant memory."""
 
     def __init__(self, states: JointStates) -> None:
         self._states, servos = states, len(states.joint_of)
@@ -148,8 +144,7 @@ class Losses:
                 self._outages.append(out)
 
     def late(self, bus: Numbers, exchanges: Exchanges, rows: Numbers) -> None:
-        """Add exchanges with late replies: their rows and the bus of each. Several in one cycle count
-        once."""
+        """Add exchanges with late replies: rows and bus of each; several in one cycle count once."""
         if len(self._answers) < 2:
             return
         cycles = _moments(exchanges)[rows]
@@ -171,8 +166,7 @@ class Losses:
         }
 
     def occasions(self, always_late: Iterable[int] = ()) -> Occasions:
-        """Combine overlapping outages into occasions, and return them attributed to servos, buses or the
-        machine.
+        """Combine overlapping outages into occasions, attributed to servos, buses or the machine.
 
         Args:
             always_late: Indices of buses with constantly late replies, which do not count as occasions.
@@ -193,8 +187,7 @@ class Losses:
         return found
 
     def _heads(self) -> set[int]:
-        """Return first servos of chains without any reply for which lost instructions are not a plausible
-        cause."""
+        """Return first servos of silent chains for which lost instructions are not a plausible cause."""
         found = set()
         for servo in np.flatnonzero(self._broken_off).tolist():
             ids = slice(servo // IDS * IDS, (servo // IDS + 1) * IDS)
@@ -206,8 +199,7 @@ class Losses:
 
 
 class Occasions:
-    """Counter of the occasions attributed to each servo, each bus and the machine; see the module
-    docstring."""
+    """Counter of the occasions attributed to each servo, each bus and the machine."""
 
     def __init__(self, states: JointStates, heads: set[int]) -> None:
         """Create an empty counter; `heads` are first servos that are themselves the cause if no reply of
@@ -384,8 +376,7 @@ def narrowest(time: Numbers, begun: Numbers, *, open_above: bool) -> tuple[int, 
 
 
 def _moments(exchanges: Exchanges) -> Numbers:
-    """Return the cycle number of each exchange; before the first cycle, a distinct negative number for
-    each 10 ms."""
+    """Return the cycle of each exchange; before the first cycle, a distinct number for each 10 ms."""
     before = exchanges.asked_ns // _UNKNOWN_NS - (1 << 60)
     return np.where(exchanges.cycle > BEFORE_FIRST_CYCLE, exchanges.cycle, before)
 

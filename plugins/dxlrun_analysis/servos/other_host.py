@@ -47,8 +47,7 @@ class OtherHosts:
         self.writes = ForeignWrites()
 
     def take(self, exchanges: Exchanges) -> None:
-        """Add the foreign instructions, echoes and unrequested replies in some exchanges, and count the
-        missing replies."""
+        """Add the foreign instructions, echoes, unrequested and missing replies in some exchanges."""
         others, due = exchanges.others, exchanges.due
         self._sent.take(others.bus.astype(np.int64), instruction_of(others) * IDS + others.servo_id)
         for packet in others:

@@ -52,15 +52,13 @@ and the count of each."""
 
 
 class ReplyTimes:
-    """Accumulator of the own reply times of servos, and of late exchanges by bus. Its memory does not grow
-    with the log."""
+    """Accumulator of the own reply times of servos, and of late exchanges by bus, in constant memory."""
 
     def __init__(self, buses: int) -> None:
         self._own_us = Counts()
         self._late_us = Counts()  # Lateness of late exchanges, by the slowest servo of each
         self._given_up, self._single, self._single_late = np.zeros((3, buses * IDS), np.int64)
-        """Counts of each servo: late replies that were given up; exchanges with it alone; late ones of
-        these."""
+        """Counts by servo: late replies that were given up; exchanges with it alone; late ones of these."""
         self._exchanges = np.zeros(buses, np.int64)
 
     def take(self, exchanges: Exchanges, losses: Losses) -> None:
@@ -136,8 +134,7 @@ class ReplyTimes:
     # Results
 
     def always_late(self) -> list[int]:
-        """Return the indices of buses with at least half of their exchanges late. Constant lateness is not
-        an occasion."""
+        """Return the indices of buses with at least half of their exchanges late."""
         return [bus for bus in range(len(self._exchanges)) if self._share(bus, set()) >= 1 / 2]
 
     def longest_ms(self) -> float:
@@ -155,8 +152,7 @@ class ReplyTimes:
         return _slow_servos(bus, samples, now_and_then=now_and_then)
 
     def line(self, index: int, bus: LoggedBus, slow: Iterable[str]) -> Iterator[Finding]:
-        """Report a bus whose exchanges are late; those of its servos named in `slow` are already reported
-        and do not count."""
+        """Report a bus whose exchanges are late; those of the servos named in `slow` do not count."""
         of_servos = {servo for servo, name in bus.names.items() if name in set(slow)}
         of_servos |= {BROADCAST_ID} if of_servos else set()
         ids = slice(index * IDS, (index + 1) * IDS)

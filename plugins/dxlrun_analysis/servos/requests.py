@@ -20,16 +20,14 @@ PING, _READ = 0x01, 0x02  # Instruction codes of both protocols
 _SYNC_READ, _FAST_SYNC_READ, _BULK_READ, _FAST_BULK_READ = 0x82, 0x8A, 0x92, 0x9A
 _FAST = (_FAST_SYNC_READ, _FAST_BULK_READ)
 _MIXED = np.random.default_rng(15).integers(1, 2**63, 1 << 17, dtype=np.uint64) | np.uint64(1)
-"""Odd weights of a multilinear hash (Dietzfelbinger 1996), which makes collisions of instructions
-improbable."""
+"""Odd weights of a multilinear hash (Dietzfelbinger 1996): collisions are improbable."""
 
 Numbers = NDArray[np.int64]
 Flags = NDArray[np.bool_]
 
 
 class LoggedRequest(NamedTuple):
-    """Replies that one instruction requests: IDs in the order of the replies, empty for an instruction
-    without replies."""
+    """Replies that one instruction requests: IDs in the order of the replies, or none."""
 
     servo_ids: tuple[int, ...] = ()
     sizes: tuple[int, ...] = ()  # Data bytes per servo; only for reads of several servos
@@ -48,8 +46,7 @@ class Requests(NamedTuple):
     places: Numbers = np.zeros((0, IDS), np.int64)
     """Place of each ID in the chain of replies; -1: not asked; shape (requests, 256)."""
     ids: Numbers = np.zeros((0, IDS), np.int64)
-    """All 256 IDs; the last `servos` of them are asked, in the order of their replies; shape (requests,
-    256)."""
+    """All IDs; the last `servos` of them are asked, in the order of their replies; shape (requests, 256)."""
 
     def and_more(self, kinds: tuple[LoggedRequest, ...]) -> Requests:
         """Return a copy of the table with requests appended."""
@@ -69,8 +66,7 @@ _ALONE = Requests().and_more((LoggedRequest(), *(LoggedRequest((servo_id,)) for 
 
 
 class RequestTable:
-    """Table of the requests of a log, which grows as instructions are looked up. Each distinct instruction
-    is parsed once."""
+    """Table of the requests of a log, to which each distinct instruction is added once."""
 
     def __init__(self) -> None:
         self.all = _ALONE

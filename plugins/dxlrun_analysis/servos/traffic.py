@@ -29,8 +29,7 @@ _KINDS = max(PacketKind) + 1
 
 @dataclass(frozen=True, slots=True)
 class ServoTraffic:
-    """Requests, replies, reply times and error bits of one servo or device over the whole log, set-up and
-    shutdown included."""
+    """Requests, replies, reply times and error bits of one servo or device over the whole log."""
 
     bus: str
     servo_id: int
@@ -51,8 +50,7 @@ class ServoTraffic:
     reply_max_us: float
     reply_p99_us: float = 0.0
     losses: ServoLosses | None = None
-    """Missing replies that are the servo's own, not caused by a preceding servo of a chain; None if it was
-    never asked."""
+    """Missing replies that are its own, not due to a servo before it; None if it was never asked."""
     device: bool = False  # A device of the plan, not a servo
 
     @property
@@ -80,8 +78,7 @@ class BusTraffic:
 
 
 class Traffic:
-    """Accumulator of the traffic of all buses and servos, fed with the log slice by slice. Its memory does
-    not grow with the log."""
+    """Accumulator of the traffic of all buses and servos, fed slice by slice in constant memory."""
 
     def __init__(self, watch: Callable[[Exchanges], None] = lambda _: None) -> None:
         """Create the accumulator.
@@ -131,8 +128,7 @@ class Traffic:
         self._count(exchanges)
 
     def finish(self) -> tuple[tuple[ServoTraffic, ...], tuple[BusTraffic, ...]]:
-        """Return the traffic of each servo that was asked or replied, and of each bus; then `findings` is
-        complete."""
+        """Return the traffic of each servo and of each bus, and complete `findings`."""
         self._count(self._pairing.finish(), final=True)
         addressed = self._instructions.copy()
         addressed[BROADCAST_ID::IDS] = 0
