@@ -284,7 +284,6 @@ class Maker:
                         # Looks between those of the page, so that its curves have no gap on a busy machine.
                         while live.at(None).time < end_s:
                             time.sleep(0.04)
-                        browser.until(f"window.looked > {browser.value('window.looked') + 2}")
                     self._kept(name, browser.picture())
                 served.close()
 
