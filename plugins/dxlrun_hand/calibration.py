@@ -1,4 +1,4 @@
-"""Calibration: limp joints are moved by hand to zero and to both ends while their servos are read.
+"""`dxlrun calibrate`: the user moves limp joints to zero and to both ends while their servos are read.
 
 s = direction * (theta - reference) * ratio, where theta is the angle of the servo and s the position of its
 joint (`description/joints/mechanics.py`). The zero pose gives the reference, the end that the user calls
@@ -23,34 +23,36 @@ from dxlwire import BusPlan, ControlTable, ServoPlan
 
 _degrees = ROTARY.number
 LEAST_WAY = math.radians(5.0)
-"""Least angle of the servo between both ends; the hand may have slipped on a shorter way."""
+"""Smallest angle of the servo between both ends, rad; on a shorter way the hand may have slipped."""
 _STEPS: Mapping[JointUnit, float] = {ROTARY: math.radians(0.1), LINEAR: 1e-4}
-"""Resolution of limits. They are rounded inwards, because the joint is at its stop beyond them."""
+"""Steps to which measured limits are rounded inwards, rad and m; beyond them the joint is at its stop."""
 _READINGS = 5
-"""Readings of a joint at rest, whose median is used."""
+"""Number of readings of a joint at rest, whose median is its position."""
 _SHIFTING = {
     "drive_mode": (0x01, 0),
     "homing_offset": (-1, 0),
     "multi_turn_offset": (-1, 0),
     "resolution_divider": (-1, 1),
 }
-"""Items that change the meaning of a position: mask of the relevant bits, and their only accepted value."""
+"""Control table items that shift or scale the servo's position: mask of the relevant bits, and the only value
+with which a joint is calibrated."""
 
 
 class Measured(msgspec.Struct, frozen=True):
-    """Measured calibration of a joint."""
+    """Measured calibration of a joint, for its keys reference, direction and limits in the robot file."""
 
     joint: str
     reference: float
-    """rad of the servo, from its raw 0"""
+    """Angle of the servo in the zero pose of the joint, rad from its raw position 0."""
     direction: int
+    """1 if the servo's angle rises in the positive direction of the joint, else -1."""
     limits: tuple[float, float] | None
-    """rad, or m of a linear joint; None for a continuous joint."""
+    """Lower and upper position limit of the joint, rad or m; None for a continuous joint."""
     unit: JointUnit
     tick: float
-    """rad of the servo per tick"""
+    """Resolution of the servo's angle, rad."""
     ratio: float
-    """rad, or m, of the joint per rad of its servo."""
+    """Travel of the joint per rad of its servo, rad or m."""
 
 
 class BeyondTurn(ServoFault):
@@ -61,7 +63,12 @@ class HandJoint:
     """Limp joint with one servo, which is read while it is moved by hand."""
 
     def __init__(self, tool: ToolLine, plan: BusPlan, servo: ServoPlan) -> None:
-        """Find the servo of a joint.
+        """Search for the servo of a joint on its bus, and check its model and settings. Nothing is written.
+
+        Args:
+            tool: Open line of the bus.
+            plan: Plan of the bus.
+            servo: Plan of the joint's servo.
 
         Raises:
             ServoFault: The servo does not answer, is another model, or has settings that shift its
@@ -96,13 +103,13 @@ class HandJoint:
         """True if this object switched the torque off."""
 
     def let_go(self) -> None:
-        """Switch the torque off."""
+        """Switch the servo's torque off, so that the joint can be moved by hand."""
         # Set the flag first: the servo can be limp even if its reply is lost.
         self.limp = True
         self._one.torque(False)
 
     def begin(self) -> float:
-        """Start counting turns; return the angle of the servo, rad, within the turn of its goals."""
+        """Start counting the servo's turns; return its angle, rad, within the turn that its goals reach."""
         readings = sorted(self._read() for _ in range(_READINGS))
         self._raw = readings[_READINGS // 2]
         # A servo that counted turns, such as in wheel mode, is in its first turn after power-up.
@@ -110,7 +117,7 @@ class HandJoint:
         return self._angle
 
     def follow(self) -> float:
-        """Return the current angle, rad, counted across turns.
+        """Read the servo; return its angle, rad, counted across turns since `begin`.
 
         Raises:
             ServoFault: The servo does not answer.
@@ -124,7 +131,7 @@ class HandJoint:
         return self._angle
 
     def check_turn(self, lowest: float, highest: float) -> None:
-        """Check that the servo stayed within the angles that its goals reach.
+        """Check that the servo of a joint that is not continuous stayed within the angles its goals reach.
 
         Args:
             lowest: Lowest angle of the servo, rad.
@@ -156,7 +163,9 @@ class HandJoint:
 
 
 def measure(joints: Sequence[HandJoint], dialogue: Dialogue) -> list[Measured]:
-    """Guide the user through the measurement of joints. Their torque is off afterwards.
+    """Guide the user through zero pose and ends of joints; return their calibrations.
+
+    The torque of all joints is off afterwards.
 
     Raises:
         ServoFault: A servo does not answer any more.
@@ -192,8 +201,11 @@ def _measure(joint: HandJoint, zero: float, dialogue: Dialogue) -> Measured:
 
 
 def _ends(joint: HandJoint, dialogue: Dialogue) -> tuple[float, float, float, float]:
-    """Return the servo's angle at the positive and at the other end, and its lowest and highest angle,
-    rad."""
+    """Ask the user to move a joint to its ends; return four angles of its servo, rad.
+
+    They are the angles at the positive and at the other end, and the lowest and highest on the way. Raises
+    BeyondTurn.
+    """
     begin = joint.begin()
     seen = [begin, begin]
     now = begin
@@ -225,7 +237,7 @@ def _inside(lower: float, upper: float, unit: JointUnit) -> tuple[float, float]:
 
 
 def keys_of(joint: str, *, continuous: bool) -> list[KeyPath]:
-    """Return the keys that a calibration may change."""
+    """Return the keys of a joint in the robot file that a calibration may change."""
     place: KeyPath = ("joints", joint)
     return [
         (*place, "reference"),
@@ -237,7 +249,7 @@ def keys_of(joint: str, *, continuous: bool) -> list[KeyPath]:
 def replacements(
     text: RobotText, servo: ServoPlan, limits: tuple[float, float] | None, found: Measured
 ) -> list[Replacement]:
-    """Return the keys of a joint whose measured value differs from the file by more than a tick.
+    """Return new values for the keys of a joint that differ from the robot file by more than a tick.
 
     Args:
         text: The robot file.

@@ -14,17 +14,20 @@ from dxlrun import InputError
 from dxlrun.tooling.output import print_error
 
 LOOK_S = 0.02
-"""Polling interval while the dialogue waits for Enter."""
+"""Interval of measurements while the dialogue waits for Enter, s."""
 
 
 def yes(dialogue: Dialogue, question: str) -> bool:
-    """Ask a question; only y or yes counts as agreement."""
+    """Ask the user a yes/no question; return True only for y or yes."""
     return dialogue.ask(f"{question} [y/N] ").lower() in ("y", "yes")
 
 
 @contextmanager
 def ending_with(sentence: Callable[[], str]) -> Iterator[None]:
-    """Print the remaining state, unless it is empty, if the context ends early by Ctrl-C or an error."""
+    """Print a sentence to stderr, unless it is empty, if the context ends by Ctrl-C or an error.
+
+    The sentence says in which state the robot or its file was left.
+    """
     try:
         yield
     except BaseException:
@@ -34,10 +37,10 @@ def ending_with(sentence: Callable[[], str]) -> Iterator[None]:
 
 
 class Dialogue:
-    """Dialogue of a task at the terminal. Ctrl-C raises KeyboardInterrupt."""
+    """Questions and output of one command at the terminal. Ctrl-C raises KeyboardInterrupt."""
 
     def __init__(self, verb: str) -> None:
-        """Open the terminal.
+        """Check that this process has a terminal; `verb` is the command's name for the error message.
 
         Raises:
             InputError: Standard input or output is not a terminal.
@@ -51,18 +54,18 @@ class Dialogue:
         self._typed = b""
 
     def say(self, *lines: str) -> None:
-        """Print lines."""
+        """Print lines to the terminal."""
         sys.stdout.write("".join(f"{line}\n" for line in lines))
         sys.stdout.flush()
 
     def ask(self, question: str) -> str:
-        """Return the line that the user types. Input from before the question is discarded."""
+        """Ask, and return the line that the user types. Input from before the question is discarded."""
         return self._answer(question, None)
 
     def ask_while(self, question: str, look: Callable[[], str]) -> str:
-        """Ask, and call `look` until the answer comes.
+        """Ask, and call `look` every LOOK_S until the user has typed a line, which is returned.
 
-        Its text is shown in a line that is updated in place.
+        The text that `look` returns is shown in a line that is updated in place.
         """
         return self._answer(f"{question}\n", look)
 
@@ -88,7 +91,10 @@ class Dialogue:
         sys.stdout.flush()
 
     def _line(self, timeout_s: float | None) -> str | None:
-        """Return the next complete line, or None. The end of the input counts as Ctrl-C."""
+        """Return the next complete line of input, or None if there is none within the timeout, s.
+
+        The end of the input counts as Ctrl-C.
+        """
         if select.select([self._input], [], [], timeout_s)[0]:
             data = os.read(self._input, 4096)
             if not data:

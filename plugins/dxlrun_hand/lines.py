@@ -1,4 +1,4 @@
-"""Serial lines of a robot file's buses: found by their adapters, opened exclusively for this process."""
+"""Serial lines of a robot file's buses for `dxlrun setup` and `calibrate`; no run may use them then."""
 
 from __future__ import annotations
 
@@ -21,10 +21,10 @@ Devices = Callable[[], Iterable[str]]
 
 
 def find_port(bus: str, dialogue: Dialogue, devices: Devices) -> str:
-    """Return the persistent name of the adapter that the user plugs in.
+    """Ask the user to unplug and plug in the adapter of a bus; return the path of the port that appeared.
 
     Raises:
-        PortError: Three attempts failed.
+        PortError: Not exactly one port appeared in each of three attempts.
     """
     for _ in range(TRIES):
         dialogue.ask(f"Unplug the adapter of bus {bus}, and press Enter ")
@@ -53,14 +53,18 @@ def find_port(bus: str, dialogue: Dialogue, devices: Devices) -> str:
 
 
 class BusLines:
-    """Lines of buses, each open only while it is used.
+    """Serial lines of a robot file's buses by name, each open only while it is used.
 
     A board that powers its servos by USB drops out when a servo is plugged in, and its port comes back as
     another device. The persistent name stays valid, so the port is opened again by this name.
     """
 
     def __init__(self, ports: Mapping[str, str], opened: Opened = TunablePort) -> None:
-        """Check that each port can be opened.
+        """Check that each port can be opened, and close it again.
+
+        Args:
+            ports: Path of the port of each bus.
+            opened: Function that opens a port.
 
         Raises:
             PortError: A port cannot be opened.
@@ -80,7 +84,7 @@ class BusLines:
 
     @contextmanager
     def open(self, bus: str) -> Iterator[ToolLine]:
-        """Yield the line of a bus. Raises PortError."""
+        """Open the port of a bus, yield its line, and close it. Raises PortError."""
         with self._opened(self._names[bus]) as port:
             yield ToolLine(port)
 
@@ -88,10 +92,12 @@ class BusLines:
 def chosen_names(
     words: Sequence[str], known: Sequence[str], groups: Mapping[str, Sequence[str]]
 ) -> list[str]:
-    """Return the names that words select, where a word can be a group; all names without words.
+    """Return the known names that the words of a command line select, in the order of `known`.
+
+    A word is a name or a group, which stands for its members. Without words, all names are returned.
 
     Raises:
-        InputError: Unknown words.
+        InputError: A word is unknown.
     """
     wrong = [word for word in words if word not in known and word not in groups]
     if wrong:

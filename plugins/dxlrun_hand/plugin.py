@@ -1,4 +1,4 @@
-"""Commands with a dialogue, registered by the same hooks as those of any other package."""
+"""Plug-in that adds the commands `setup`, `calibrate` and `teach`, by the same hooks as any other package."""
 
 from __future__ import annotations
 
@@ -11,13 +11,13 @@ _PLACE = "dxlrun_hand.commands"
 
 @hookimpl
 def dxlrun_contract() -> int:
-    """Return the contract that this package was written for: the one it is published with."""
+    """Return the version of the plug-in contract; this package is published together with the runtime."""
     return CONTRACT_VERSION
 
 
 @hookimpl
 def dxlrun_commands() -> Sequence[Command]:
-    """Return the commands that guide the user through a task step by step."""
+    """Return the commands `setup`, `calibrate` and `teach`, which are dialogues at the terminal."""
     return (
         Command("setup", f"{_PLACE}.setup:setup", group="Servos"),
         Command("calibrate", f"{_PLACE}.calibrate:calibrate", group="Servos"),

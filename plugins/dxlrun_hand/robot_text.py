@@ -25,7 +25,7 @@ from dxlrun.tooling.robots import Source, read_sources
 
 
 class _Edit(NamedTuple):
-    """Replacement of characters; an empty range inserts text."""
+    """Replacement of a file's characters from `start` to before `end`; an empty range inserts the text."""
 
     start: int
     end: int
@@ -33,10 +33,13 @@ class _Edit(NamedTuple):
 
 
 class RobotText:
-    """Robot file with its included files; `put` plans changes and `write` executes them."""
+    """Text of a robot file and its included files; `put` plans changes of values, and `write` writes them.
+
+    A key path such as `("joints", "pan", "reference")` names a value.
+    """
 
     def __init__(self, robot: Path) -> None:
-        """Read the files.
+        """Read the robot file and the files that it includes.
 
         Raises:
             InputError: A file cannot be read.
@@ -47,10 +50,11 @@ class RobotText:
         self._uses = [Counter(map(id, _nodes(source.tree.root))) for source in self._sources]
 
     def check(self, path: KeyPath) -> None:
-        """Check that a value can be put at a path.
+        """Check that the value at a key path can be replaced or added.
 
         Raises:
-            InputError: The value cannot be put there, or its file is read-only.
+            InputError: The value comes from an alias or an argument, a key above it is not a mapping, or its
+                file is read-only.
         """
         source, at, node = self._own(path)
         if not os.access(source.path.resolve(), os.W_OK):
@@ -66,7 +70,10 @@ class RobotText:
             raise _refuse_node(source, node, f"{_words(at)} is not a mapping", "write its keys below it")
 
     def put(self, path: KeyPath, value: str | Sequence[str]) -> None:
-        """Plan a value, or the items of a list, for a path. Raises InputError as `check`."""
+        """Plan a new value, or new items of a list, for a key path; a missing key is added.
+
+        Raises InputError as `check`.
+        """
         self.check(path)
         source, at, node = self._own(path)
         edits = self._edits[source.path]
@@ -78,14 +85,14 @@ class RobotText:
             edits.append(_replaced(node, _flow(value)))
 
     def unit(self, path: KeyPath) -> str:
-        """Return the unit of a value, or of the first item of a list; empty without a unit."""
+        """Return the unit in which the file gives a value, or a list's first item; empty without one."""
         _, at, node = self._own(path)
         scalars = [one for one in _nodes(node) if isinstance(one, yaml.ScalarNode)] if at == path else []
         found = re.search(r"[a-z]+$", scalars[0].value) if scalars else None
         return found[0] if found else ""
 
     def diff(self) -> list[str]:
-        """Return the changed lines in the format of `diff -u`."""
+        """Return the planned changes of all files as lines in the format of `diff -u`."""
         lines: list[str] = []
         for path in [path for path, edits in self._edits.items() if edits]:
             old, new = (data.decode().splitlines() for data in (self._before[path], self._after(path)))
@@ -129,20 +136,23 @@ class RobotText:
         return mark + text.encode()
 
     def _own(self, path: KeyPath) -> tuple[Source, KeyPath, yaml.Node]:
-        """Return the file that has a value, or else the longest prefix of its path, with the node there."""
+        """Return the file to change for a key path: the one with the longest existing prefix of the path.
+
+        The prefix and the YAML node there are returned, too; if the value exists, it is the whole path.
+        """
         found = ((source, *_nearest(source.tree.root, path)) for source in reversed(self._sources))
         # max returns the first of equal lengths: the file with the highest priority.
         return max(found, key=lambda one: len(one[1]))
 
 
 def _refuse_node(source: Source, node: yaml.Node, what: str, fix: str) -> InputError:
-    """Return the error for a value that cannot be replaced, with its position."""
+    """Return the error for a value that cannot be replaced: its file, line and column, the problem, a fix."""
     place = node.start_mark
     return InputError([Problem(Mark(str(source.path), place.line + 1, place.column + 1), what, fix)])
 
 
 def _nodes(node: yaml.Node) -> Iterator[yaml.Node]:
-    """Yield a node and all nodes below it. A node behind several aliases is yielded once per use."""
+    """Yield a YAML node and all nodes below it. A node behind several aliases is yielded once per use."""
     yield node
     children = node.value if isinstance(node, yaml.SequenceNode) else ()
     if isinstance(node, yaml.MappingNode):
@@ -152,7 +162,7 @@ def _nodes(node: yaml.Node) -> Iterator[yaml.Node]:
 
 
 def _nearest(root: yaml.Node, path: KeyPath) -> tuple[KeyPath, yaml.Node]:
-    """Return the longest existing prefix of a path, and its node."""
+    """Return the longest prefix of a key path that exists below a YAML node, and the node there."""
     node = root
     for index, key in enumerate(path):
         pairs = node.value if isinstance(node, yaml.MappingNode) else ()
@@ -168,7 +178,7 @@ def _replaced(node: yaml.Node, text: str) -> _Edit:
 
 
 def _inserted(text: str, node: yaml.CollectionNode, keys: KeyPath, value: str) -> _Edit:
-    """Return the edit that adds a key to a mapping, after its other keys."""
+    """Return the edit that adds a value under nested keys to a mapping, after its other keys."""
     entry = f"{keys[0]}: " + "".join(f"{{{key}: " for key in keys[1:]) + value + "}" * (len(keys) - 1)
     # The value of an alias is before its key.
     here = [child for name, child in node.value if child.start_mark.index > name.start_mark.index]

@@ -1,4 +1,4 @@
-"""Setup of new servos: each is connected alone and configured from a robot file; then all are compared."""
+"""`dxlrun setup`: each new servo is connected alone and configured; then all are compared with the file."""
 
 from __future__ import annotations
 
@@ -24,7 +24,7 @@ SKIP = ("s", "skip")
 
 
 class SetUp:
-    """Dialogue that configures the servos of a robot file; `done` lists the finished ones."""
+    """Dialogue that configures the servos of a robot file; `done` lists the names of the finished ones."""
 
     def __init__(self, description: Description, dialogue: Dialogue) -> None:
         self.description = description
@@ -34,17 +34,20 @@ class SetUp:
         self.plans: Sequence[BusPlan] = compile_robot(description, []).plan.buses
         self.done: list[str] = []
         self.changing = ""
-        """Servo that is being written to, or empty."""
+        """Name of the servo that is being written to; empty between two servos."""
 
     def connect_each(self, lines: BusLines, chosen: Collection[str]) -> None:
-        """Set up the chosen servos, each connected alone."""
+        """Ask the user to connect each chosen servo alone, and write its settings; servos can be skipped."""
         for index, plan in enumerate(self.plans):
             for servo in plan.servos:
                 if servo.own_name in chosen and self._set_up(lines, index, servo.own_name):
                     self.done.append(servo.own_name)
 
     def compare_all(self, lines: BusLines, chosen: Collection[str]) -> bool:
-        """Read the chosen servos of each bus back, all connected; return whether all match the file."""
+        """Ask the user to connect all servos, read the chosen ones back, and print deviations.
+
+        Returns True if all match the robot file, or False once the user declines to repeat the comparison.
+        """
         for plan in self.plans:
             servos = tuple(servo for servo in plan.servos if servo.own_name in chosen)
             while servos:
@@ -62,7 +65,7 @@ class SetUp:
         return True
 
     def _set_up(self, lines: BusLines, index: int, name: str) -> bool:
-        """Set one servo up; return False if the user skipped it."""
+        """Set up the servo `name` of a bus, again after errors; return False if the user skipped it."""
         while True:
             plan = self.plans[index]
             servo = _named(plan, name)
@@ -90,10 +93,10 @@ class SetUp:
             return True
 
     def _alone(self, tool: ToolLine, plan: BusPlan, servo: ServoPlan) -> FoundServo:
-        """Return the only servo that answers.
+        """Search a bus for the only servo that answers, at its usual baud rates first, then at all.
 
         Raises:
-            ServoFault: No servo answers, several do, or a wrong one does.
+            ServoFault: No servo answers, several do, or one of another protocol or model than `servo` does.
         """
         table = find_table(servo.model, plan.protocol)
         rates = dict.fromkeys((plan.baud_rate, factory_rate(table)))
@@ -136,12 +139,13 @@ def factory_rate(table: ControlTable) -> int:
 
 
 def bring(one: OneServo, plan: BusPlan, servo: ServoPlan) -> list[str]:
-    """Set baud rate, ID and EEPROM registers of a servo; return a sentence for each change.
+    """Bring the settings of a connected servo to those of the robot file; return a sentence for each change.
 
-    Settings that would prevent a run, such as a Secondary ID, are reset to factory defaults.
+    Torque is switched off; baud rate, ID and EEPROM registers are written. Settings that would prevent a run,
+    such as a Secondary ID, are reset to factory defaults.
 
     Raises:
-        ServoFault: The servo cannot be configured.
+        ServoFault: The model lacks the baud rate, or the servo does not accept a change.
     """
     done: list[str] = []
     if one.holds_torque():

@@ -1,4 +1,4 @@
-"""Taught motion: poses and motions shown by hand, joined to one, trimmed, smoothed and within limits."""
+"""Taught motion: poses and motions that the user showed by hand, joined to one motion within limits."""
 
 from __future__ import annotations
 
@@ -16,29 +16,29 @@ from dxlrun_analysis.playback.recorded_motion import Floats, RecordedMotion, Wha
 from dxlrun_analysis.playback.spline_path import TURN_SIZES, fit, tolerances
 
 MOVED_RAD = np.radians(1.0)
-"""Movement below which a joint stands still; for a linear joint multiplied by its `TURN_SIZES`."""
+"""Movement below which a joint stands still, rad; for a linear joint multiplied by its `TURN_SIZES`."""
 REST_S = 0.2
-"""Standstill that is kept at both ends, so that a motion begins and ends at rest."""
+"""Standstill that is kept at both ends, so that a motion begins and ends at rest, s."""
 WINDOW_S = 0.2
-"""Averaging window of positions: a hand trembles at 8 to 12 Hz (R. J. Elble, "Physiologic and essential
+"""Averaging window of positions, s: a hand trembles at 8 to 12 Hz (R. J. Elble, "Physiologic and essential
 tremor", Neurology 36, 1986)."""
 LEAST_WAY_S = 0.5  # Shortest transition between two parts
 _STEP_S = 0.01  # Sampling interval of a smoothed motion
 _SPARE = 0.9
-"""Share of a joint's top speed that a motion uses."""
+"""Fraction of a joint's speed limit that a taught motion uses at most."""
 
 
 class Shown(msgspec.Struct, frozen=True, eq=False):
-    """Single pose or motion shown by hand."""
+    """Recorded positions of one pose or motion that the user showed by hand."""
 
     time_s: Floats
-    """s, shape (moments,), from 0; a single moment is a pose."""
+    """Times of the samples, s, shape (moments,), from 0; a single moment is a pose."""
     position: Floats
     """rad or m, shape (moments, joints)."""
 
 
 class Taught(msgspec.Struct, frozen=True):
-    """Joints that are taught, with their limits."""
+    """Joints of a taught motion with their limits, and the processing of what the user showed."""
 
     joints: tuple[str, ...]
     units: tuple[JointUnit, ...]
@@ -47,11 +47,11 @@ class Taught(msgspec.Struct, frozen=True):
     upper: Floats
     speed: Floats
     way_speed: float
-    """rad/s from one pose to the next"""
+    """Speed of the transition from one pose to the next, rad/s of a rotary joint"""
 
     @property
     def size(self) -> Floats:
-        """Movement of each joint that is equivalent to 1 rad of a rotary joint."""
+        """Movement of each joint that counts as much as 1 rad of a rotary joint, rad or m."""
         return np.array([TURN_SIZES[unit] for unit in self.units])
 
     def trimmed(self, shown: Shown) -> Shown:
@@ -83,7 +83,10 @@ class Taught(msgspec.Struct, frozen=True):
         return Shown(time, np.array(columns, np.float64).T)
 
     def joined(self, parts: Sequence[Shown], path: Path) -> RecordedMotion:
-        """Return all parts as one motion within the limits, with a transition between consecutive parts."""
+        """Join poses and motions to one motion, clipped to the limits, with transitions between them.
+
+        `path` is the motion file that it will have.
+        """
         times, positions = [0.0], [self._within(parts[0].position[0])]
         for part in parts:
             inside = self._within(part.position)
@@ -98,13 +101,13 @@ class Taught(msgspec.Struct, frozen=True):
         )
 
     def slowed(self, motion: RecordedMotion) -> tuple[RecordedMotion, float]:
-        """Return a motion slow enough for all joints, and the factor of its duration."""
+        """Return a motion slowed to the speed limits of all joints, and the factor of its duration."""
         fastest = np.abs(fit(motion, tolerances(motion, None)).velocity).max(axis=0)
         longer = max(1.0, float((fastest / (_SPARE * self.speed)).max()))
         return replace(motion, time_s=motion.time_s * longer), longer
 
     def beyond(self, parts: Sequence[Shown]) -> list[str]:
-        """Return the joints that were shown beyond their limits."""
+        """Return the joints that the user moved beyond their position limits."""
         positions, slack = np.concatenate([part.position for part in parts]), MOVED_RAD * self.size
         out = ((positions < self.lower - slack) | (positions > self.upper + slack)).any(axis=0)
         return [joint for joint, is_out in zip(self.joints, out, strict=True) if is_out]
@@ -117,7 +120,10 @@ class Taught(msgspec.Struct, frozen=True):
         return max(LEAST_WAY_S, float((np.abs(end - begin) / speed).max()))
 
     def text_of(self, motion: RecordedMotion, plans: Sequence[ControllerPlan], origin: str) -> str:
-        """Return the text of the motion file for the active controllers of `plans`."""
+        """Return the YAML text of a motion file that the active controllers of `plans` play.
+
+        `origin` is the comment at its top.
+        """
         allowed = tolerances(motion, None)
         speeds = dict(zip(self.joints, self.speed.tolist(), strict=True))
         return motion_file(motion, allowed, motion.path, None, origin, plans=plans, speeds=speeds).text

@@ -1,4 +1,4 @@
-"""Teaching: limp joints of a running robot are moved by hand to poses and motions, which the robot plays."""
+"""`dxlrun teach`: the user moves limp joints of a running robot by hand, and the robot plays that motion."""
 
 from __future__ import annotations
 
@@ -20,17 +20,17 @@ from dxlrun_hand.dialogue import Dialogue, ending_with, yes
 from dxlrun_hand.taught_motion import Shown, Taught
 
 LONGEST_AGE_NS = 1_000_000_000
-"""Age of a joint's newest position from which the joint does not answer."""
+"""Age of a joint's newest position above which its servo counts as lost, ns."""
 HELP = "Enter: take this pose; r: record a motion; u: undo; limp NAME, hold NAME; s: save; q: quit"
 
 
 class Teaching:
-    """Teaching of one motion to a robot."""
+    """Dialogue that teaches one motion to a running robot, and restores torque and controllers afterwards."""
 
     def __init__(
         self, robot: RemoteRobot, dialogue: Dialogue, words: Sequence[str], way_speed: float
     ) -> None:
-        """Select the joints to teach.
+        """Select the joints to teach. Nothing changes on the robot.
 
         Args:
             robot: Connection to the running robot.
@@ -73,9 +73,9 @@ class Teaching:
             way_speed,
         )
         self.limp: list[str] = []
-        """Joints that were made limp here and are still without torque."""
+        """Joints that the dialogue made limp and that are still without torque."""
         self.released: list[str] = []
-        """Controllers that were deactivated here."""
+        """Controllers that the dialogue deactivated and that are still inactive."""
 
     def teach(self) -> list[Shown]:
         """Run the teaching dialogue; return the poses and motions, or an empty list if the user quits."""
@@ -101,7 +101,7 @@ class Teaching:
                 self._dialogue.say(f"  {typed!r} does nothing here" if shown else "  nothing was shown yet")
 
     def save(self, shown: Sequence[Shown], target: Path) -> None:
-        """Write the poses and motions to a new motion file.
+        """Join the poses and motions to one within the joints' limits, and write it to a new motion file.
 
         Raises:
             InputError: The file cannot be written.
@@ -120,7 +120,10 @@ class Teaching:
         self._dialogue.say(f"{target}: {motion.duration_s:.1f} s of {len(taught.joints)} joints")
 
     def hold(self) -> None:
-        """Enable torque at the current positions of the joints, and activate their controllers again."""
+        """Enable the torque of all limp joints where they are, and activate their controllers again.
+
+        The user is asked to hold the joints, again after each refusal by the robot.
+        """
         while self.limp:
             self._dialogue.ask("The torque comes back where the joints are: hold them, and press Enter ")
             self._try(self._hold, list(self.limp))
@@ -128,8 +131,10 @@ class Teaching:
         self.released = []
 
     def play(self, motion: Path) -> bool:
-        """Play the motion, with a slow start from the current positions; return whether it reached all
-        goals."""
+        """Play a motion file with a slow start from the current positions, and wait for its end.
+
+        Returns True if all goals were reached. Ctrl-C cancels the motion.
+        """
         done = self._robot.play(motion)
         numbers = [goal.number for goal in done.goals]
         try:
@@ -141,7 +146,7 @@ class Teaching:
         return all(state.reached for state in states)
 
     def left(self) -> str:
-        """Return the remaining state if teaching ends early; empty if the robot is as before."""
+        """Return a sentence with limp joints and deactivated controllers that remain; empty without any."""
         parts = [f"{', '.join(self.limp)} limp still: `dxlrun torque on {' '.join(self.limp)}`"] * bool(
             self.limp
         )
@@ -182,8 +187,8 @@ class Teaching:
         self._try(self._let_go if verb == "limp" else self._hold, names)
 
     def _try(self, switch: Callable[[Sequence[str]], None], names: Sequence[str]) -> None:
-        """Switch the torque of joints; print the reason if the robot refuses, such as a joint beyond its
-        limits."""
+        """Call `switch` (torque on or off) with names; print the reason if the robot refuses, such as a joint
+        beyond its limits."""
         try:
             switch(names)
         except Refused as error:
@@ -192,7 +197,7 @@ class Teaching:
     # Positions
 
     def _now(self) -> tuple[float, Floats]:
-        """Return the time of the newest cycle, s, and the joint positions.
+        """Return the time of the robot's newest cycle, s, and the positions of the taught joints in it.
 
         Raises:
             ServoFault: A joint does not answer any more.
@@ -213,7 +218,7 @@ class Teaching:
         return "  " + "  ".join(written)
 
     def _recorded(self) -> Shown:
-        """Record until Enter; return the motion, trimmed and smoothed."""
+        """Record the joints' positions until Enter; return the motion without standstill, smoothed."""
         times: list[float] = []
         positions: list[Floats] = []
 
@@ -236,7 +241,18 @@ class Teaching:
 def taught(
     robot: RemoteRobot, dialogue: Dialogue, words: Sequence[str], target: Path, way_speed: float
 ) -> int:
-    """Teach a motion, save it, and play it after confirmation; return the exit code."""
+    """Teach a motion in a dialogue, save it as the motion file `target`, and play it after confirmation.
+
+    Args:
+        robot: Connection to the running robot.
+        dialogue: Dialogue with the user.
+        words: Joints, groups and controllers that become limp; empty for all.
+        target: New motion file.
+        way_speed: Speed between two poses, rad/s.
+
+    Returns:
+        Exit code: 0, or 1 if nothing was saved or the played motion missed a goal.
+    """
     task = Teaching(robot, dialogue, words, way_speed)
     with ending_with(task.left):
         shown = task.teach()
@@ -252,14 +268,17 @@ def taught(
 
 
 def _groups(info: Mapping[str, Any]) -> dict[str, tuple[str, ...]]:
-    """Return the joints by name of a joint, group or controller, and `all`."""
+    """Return the joints that each name of a joint, group or controller, or `all`, stands for.
+
+    `info` is that of `RemoteRobot.info`. Controllers without commands are omitted.
+    """
     controllers = {one["name"]: tuple(one["joints"]) for one in info["controllers"] if one["command"]}
     groups = {name: tuple(joints) for name, joints in info["groups"].items()}
     return {"all": tuple(info["joints"]), **controllers, **groups, **{one: (one,) for one in info["joints"]}}
 
 
 def _plan(one: Mapping[str, Any]) -> ControllerPlan:
-    """Return the plan of a running controller with the fields that a motion needs."""
+    """Return a ControllerPlan from a controller's entry in `RemoteRobot.info`, with what a motion needs."""
     joints, command = tuple(one["joints"]), tuple(one["command"])
     return ControllerPlan(
         one["name"], one["type"], "", "{}", joints, command, (), active=one["active"], every=1

@@ -37,20 +37,23 @@ _INTERRUPTED = 130
 _LEDGER = "ledger.jsonl"
 
 Run = Callable[[Plan], Path]
-"""Function that runs a plan and returns its log. The ledger of simulated buses is in the same directory."""
+"""Function that runs a plan and returns its log. The ledger of simulated buses (times of their packets) is in
+the same directory."""
 
 
 class Tried(msgspec.Struct, frozen=True):
-    """Result of a run at one rate"""
+    """Result of a run at one loop rate"""
 
     rate_hz: float
     cycles: int
     overruns: int
+    """Cycles that took longer than their period, so that periods were skipped"""
     by_simulation: int
     """Overruns that the simulated servos caused"""
     median_us: float
     """Median time from a cycle's deadline to its last write, us"""
     p999_us: float
+    """99.9 % quantile of this time, us"""
     kept: bool
     """True if at most one cycle in a thousand overran without being delayed by simulated servos"""
 
@@ -72,10 +75,10 @@ def highest_rate(
     run: Run,
     progress: Callable[[float], None] = lambda _: None,
 ) -> HighestRate:
-    """Run a robot at decreasing rates until one is kept.
+    """Run a robot at decreasing loop rates until one is kept, at most MOST_TRIES times.
 
     Args:
-        description: Robot.
+        description: Robot file.
         seconds: Duration of each run, s.
         run: Function that runs a plan.
         progress: Called with each rate before its run.

@@ -27,11 +27,11 @@ from dxlwire import BITS_PER_BYTE, PacketKind
 
 Longs = NDArray[np.int64]
 Sent = Sequence[tuple[int, int]]
-"""Start times of the host's writes, ns, and their lengths in bytes"""
+"""Start time (ns) and length (bytes) of each instruction that the host wrote to a bus, from the log"""
 
 
 class LedgerTransaction(NamedTuple):
-    """Instruction with its replies"""
+    """Instruction and its replies on a simulated bus, from the ledger"""
 
     handed_ns: int  # time at which the end of the last reply was delivered to the host
     late_ns: int  # delay of that delivery
@@ -40,7 +40,10 @@ class LedgerTransaction(NamedTuple):
 
 
 def waits_for_servos(log: Log, entries: Iterable[LedgerEntry]) -> tuple[Longs, Longs]:
-    """Return the time that each cycle waited for simulated servos, ns: in its read, after its deadline."""
+    """Return how long each cycle waited for late simulated servos, ns, as two arrays of shape (cycles,).
+
+    The first is the wait in the cycle's read, the second the wait between its deadline and its wake-up.
+    """
     by_bus: dict[str, list[LedgerEntry]] = {name: [] for name in log.buses}
     for entry in entries:
         by_bus.setdefault(entry.bus, []).append(entry)
@@ -56,7 +59,7 @@ def waits_for_servos(log: Log, entries: Iterable[LedgerEntry]) -> tuple[Longs, L
 
 
 def _waits(cycles: NDArray[np.void], found: Iterable[LedgerTransaction]) -> tuple[Longs, Longs]:
-    """Return the time that each cycle waited for servos of a bus, ns: in its read, after its deadline."""
+    """Return the two arrays of `waits_for_servos` for one bus."""
     scheduled, woken = cycles["scheduled_ns"], cycles["woken_ns"]
     in_read, in_idle = np.zeros(len(woken), np.int64), np.zeros(len(woken), np.int64)
     for one in found:
@@ -80,7 +83,10 @@ def overruns_by_servos(log: Log, entries: Iterable[LedgerEntry]) -> int:
 
 
 def transactions(entries: Sequence[LedgerEntry], sent: Sent, byte_ns: float) -> Iterator[LedgerTransaction]:
-    """Yield the transactions of one bus. Without `sent`, only the delays of replies count."""
+    """Yield the transactions of one simulated bus from the entries of its ledger, with their delays.
+
+    `byte_ns` is the duration of a byte on the wire. Without `sent`, only the delays of replies count.
+    """
     written = _written(entries, sent)
     free_ns = could_be_free_ns = waited_ns = 0.0
     taken = given = 0
@@ -108,7 +114,10 @@ def _answered(last: LedgerEntry, waited_ns: float, taken: int, given: int) -> Le
 
 
 def _written(entries: Sequence[LedgerEntry], sent: Sent) -> dict[int, int]:
-    """Return the time at which the host wrote the first byte of each `in`, by number; {} on a mismatch."""
+    """Return the time, ns, at which the host wrote the first byte of each `in` entry, by the entry's index.
+
+    Empty if the entries have more bytes than the host wrote.
+    """
     ends = np.cumsum([count for _, count in sent])
     taken = sum(len(entry.data) for entry in entries if entry.direction == "in")
     if not len(ends) or taken > ends[-1]:

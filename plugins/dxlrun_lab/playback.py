@@ -16,11 +16,11 @@ from dxlrun_lab.guided.segment import Guard, Recorded, Segment
 _SETTLE_S = 0.5
 """Time for which the last pose is still commanded, s"""
 _OLDEST_S, _OLDEST_CYCLES = 0.1, 3
-"""Largest age of a state, s and cycles. The motion ends if both are exceeded."""
+"""Age of a joint's state, s and cycles. The motion ends if both are exceeded."""
 
 
 class PlayedJoint(msgspec.Struct, frozen=True):
-    """Tracking error of a joint"""
+    """Difference of measured position and goal of a joint during a playback"""
 
     name: str
     rms: float
@@ -30,18 +30,20 @@ class PlayedJoint(msgspec.Struct, frozen=True):
 
 
 class PlayedBack(msgspec.Struct, frozen=True):
-    """Result of a playback"""
+    """Result of the playback of a recorded motion"""
 
     seconds: float
-    """Duration in the robot's time, s"""
+    """Time for which the motion was played, s"""
     whole: bool
+    """True if the motion was played to its last pose"""
     joints: tuple[PlayedJoint, ...]
 
 
 class Playback(msgspec.Struct, frozen=True):
-    """Experiment that plays rows. The joints remain at the last pose."""
+    """Experiment that plays a recorded motion as one segment. The joints remain at the last pose."""
 
     rows: Rows
+    """The motion as poses of the robot's joints, one per period"""
 
     @property
     def expected(self) -> tuple[str, ...]:
@@ -77,7 +79,7 @@ class Playback(msgspec.Struct, frozen=True):
         )
 
     def procedure(self, situation: Situation) -> Procedure:
-        """Yield the motion."""
+        """Yield the motion as a segment, which moves to the first pose before."""
         rows = self.rows
         yield Segment(
             "recorded motion",
@@ -91,7 +93,7 @@ class Playback(msgspec.Struct, frozen=True):
         )
 
     def finish(self, situation: Situation, recorded: Sequence[Recorded], why: str) -> PlayedBack:
-        """Return the duration and the tracking errors."""
+        """Return the played duration and the tracking error of each joint."""
         played = recorded[-1]
         off = np.abs(np.where(played.valid, played.position - played.goal, np.nan))
         joints = []

@@ -1,4 +1,4 @@
-"""Plug-in with the verbs that measure robots or replay logs. It uses the same hooks as any other package."""
+"""Plug-in with the commands that measure robots or replay logs. It uses the same hooks as other packages."""
 
 from __future__ import annotations
 
@@ -11,13 +11,13 @@ _PLACE = "dxlrun_lab.commands"
 
 @hookimpl
 def dxlrun_contract() -> int:
-    """Return the plug-in contract version. This package is released together with it."""
+    """Return the version of the plug-in contract; this package is published together with the runtime."""
     return CONTRACT_VERSION
 
 
 @hookimpl
 def dxlrun_commands() -> Sequence[Command]:
-    """Return the verbs that measure robots or replay logs."""
+    """Return the commands that measure robots or replay logs, each with the function imported on use."""
     return (
         Command("replay", f"{_PLACE}.replay:replay", group="Logs"),
         Command("convert", f"{_PLACE}.convert:convert", group="Logs"),

@@ -50,7 +50,7 @@ with tempfile.TemporaryFile(dir=sys.argv[3], buffering=0) as file:
 
 
 class Stress:
-    """Context manager that loads the machine; with `wanted=False` it does nothing."""
+    """Context manager that loads the machine by other processes; with `wanted=False` it does nothing."""
 
     def __init__(self, *, wanted: bool = True) -> None:
         self.text = ""
@@ -72,7 +72,7 @@ class Stress:
             self._programs = [(_COMPUTE,), (_ALLOCATE_AND_WRITE, str(memory), _DISK)]
 
     def __enter__(self) -> Self:
-        """Start the load. Raises ProcessFault if it exits at once."""
+        """Start the load, and wait until it is effective. Raises ProcessFault if it exits at once."""
         for code, *words in self._programs:
             command = [sys.executable, "-c", _WITH_PARENT + code, str(os.getpid()), *words]
             self._running.append(
@@ -92,7 +92,7 @@ class Stress:
         return self
 
     def __exit__(self, *_: object) -> None:
-        """End the load."""
+        """Terminate the processes of the load."""
         for process in self._running:
             process.terminate()
         for process in self._running:
@@ -100,6 +100,6 @@ class Stress:
         self._running.clear()
 
     def ended(self) -> tuple[str, ...]:
-        """Return a remark if a process of the load has exited early."""
+        """Return a remark if a process of the load has exited; empty while all run."""
         gone = any(process.poll() is not None for process in self._running)
         return ("the load ended before the measurement did",) if gone else ()

@@ -1,4 +1,4 @@
-"""MuJoCo plant: bodies of a URDF whose joints are moved by the servos' torques, in MuJoCo.
+"""Plant of simulated servos (`physics: mujoco`): MuJoCo moves the bodies of a URDF by the servos' torques.
 
 Used from the URDF: the tree, masses and inertias (for a link without `inertial`: those of its collision
 shapes at the density of water), `dynamics` and `mimic` of joints. Gravity is along -z of the first link,
@@ -51,18 +51,19 @@ _HELD_SOLREF = (0.004, 1.0)
 that MuJoCo allows."""
 _FRICTION_SOLREF = (0.004, 1.0)
 _FRICTION_SOLIMP = (0.9999, 0.9999, 0.001, 0.5, 2.0)
-"""Stiff friction: with MuJoCo's defaults a joint creeps although its friction could hold it."""
+"""MuJoCo's solref and solimp for stiff friction: with the defaults, a joint creeps although friction could
+hold it."""
 
 
 def mujoco_plant(bodies: UrdfBodies) -> PlantMaker:
-    """Return the maker of a plant with these bodies.
+    """Return a function that creates the plant of simulated servos with the bodies of a URDF.
 
-    A mechanism moves without bodies if the URDF lacks one of its joints, or has it with an unsuitable type
-    (hinges for rad, slides for m).
+    A mechanism (servos and their joints) moves without bodies if the URDF lacks one of these joints, or has
+    an unsuitable type for one (hinges for rad, slides for m).
 
     Raises:
         ImportError: MuJoCo cannot be loaded.
-        InputError: MuJoCo cannot load the URDF, or would move nothing.
+        InputError: MuJoCo cannot load the URDF, or no servo moves one of its joints.
     """
     from xml.etree import ElementTree  # Only robots with a URDF need it
 
@@ -98,26 +99,28 @@ def mujoco_plant(bodies: UrdfBodies) -> PlantMaker:
 
 
 class _Moved(msgspec.Struct, frozen=True):
+    """Mechanisms whose joints MuJoCo moves."""
+
     single: tuple[Mechanism, ...]  # One servo each, which is the rotor of its joint
-    shared: tuple[Mechanism, ...]
+    shared: tuple[Mechanism, ...]  # Several servos that share joints, each with its own rotor
 
     @property
     def names(self) -> set[str]:
-        """Names of the URDF's joints."""
+        """Names of the URDF's joints that servos move."""
         return {name for one in (*self.single, *self.shared) for name in one.joints}
 
     @property
     def servos(self) -> list[MechanismServo]:
-        """All servos, with the rotors of single joints first."""
+        """Servos of all mechanisms, first those of single ones."""
         return [servo for one in (*self.single, *self.shared) for servo in one.servos]
 
     @property
     def rows(self) -> list[int]:
-        """Indices of the servos."""
+        """Index of each of `servos` among all servos of the simulation."""
         return [servo.index for servo in self.servos]
 
     def of(self, count: int) -> _Moved:
-        """Return the mechanisms whose servos are all among the first `count` ones."""
+        """Return the mechanisms whose servos are all among the first `count` servos of the simulation."""
         parts = (
             tuple(one for one in part if all(servo.index < count for servo in one.servos))
             for part in (self.single, self.shared)
@@ -129,7 +132,10 @@ _NOTHING_MOVED = _Moved((), ())
 
 
 class MujocoBodies:
-    """Servos that are coupled through the bodies that they move."""
+    """MuJoCo simulation of the bodies, as the plant of the servos that move them.
+
+    `angle` (rad) and `velocity` (rad/s) have an item for each servo's shaft, in the order of `_Moved.servos`.
+    """
 
     def __init__(self, urdf: str, moved: _Moved, servos: Sequence[PlantJoint]) -> None:
         import mujoco
@@ -191,7 +197,7 @@ class MujocoBodies:
         self.velocity[:] = self._speed[numbers] / scale
 
     def place(self, index: int, angle: float) -> None:
-        """Move a resting shaft to an angle, rad, together with the joints that it moves."""
+        """Put a servo's shaft at an angle, rad, at rest, together with the joints that it moves."""
         by = self._per_rad[index] * (angle - self.angle[index])
         self.angle[index] = angle
         self.velocity[index] = 0.0
@@ -203,16 +209,16 @@ class MujocoBodies:
         self._put_bodies()
 
     def recount(self, index: int, by: float) -> None:
-        """Shift the angle count of a resting shaft by an angle, rad."""
+        """Add `by`, rad, to the counted angle of a servo's shaft. The shaft and the bodies do not move."""
         self.angle[index] += by
         self._reference[index] += by
 
     def jam(self, index: int, on: bool) -> None:
-        """Block a shaft at its angle, or release it."""
+        """Block a servo's shaft at its angle by friction (`on`), or release it."""
         self._own_friction[index] = JAMMED_NM if on else self._free_friction[index]
 
     def _put_bodies(self) -> None:
-        """Move all bodies according to the shafts; bodies of shared and mimic joints come to rest."""
+        """Put all bodies where the shafts' angles require; shared and mimic joints come to rest."""
         turned = self._per_rad * (self.angle - self._reference)
         self._turn[self._numbers] = turned
         for one in self._shared:
@@ -231,9 +237,11 @@ class MujocoBodies:
 
 
 class _SharedBodies:
+    """Indices and coupling matrix of a mechanism whose servos share joints."""
+
     def __init__(self, mechanism: Mechanism, indices: Sequence[int], numbers: Rows) -> None:
         self.rows: Rows = np.array([indices.index(servo.index) for servo in mechanism.servos], dtype=np.intp)
-        """Indices of its servos."""
+        """Index of each servo of the mechanism in `MujocoBodies.angle`."""
         self.numbers = numbers  # Indices of its joints in MuJoCo
         self.matrix: Floats = np.array(mechanism.matrix, dtype=np.float64)
         self.together = coupled_projection(self.matrix)
@@ -263,7 +271,9 @@ def _make_movable(root: Element, moved: Set[str]) -> None:
 
 
 def _compiled(urdf: str, moved: _Moved, servos: Sequence[PlantJoint]) -> MjModel:
-    """Return the model with the rotors and frictions of servos.
+    """Compile the URDF to a MuJoCo model, with the rotors and frictions of servos.
+
+    Joint limits and contacts are disabled.
 
     Raises:
         ValueError: MuJoCo cannot load the URDF.
@@ -299,7 +309,10 @@ def _compiled(urdf: str, moved: _Moved, servos: Sequence[PlantJoint]) -> MjModel
 
 
 def _drive(joint: MjsJoint, motor: Motor, per_rad: float, friction: float) -> None:
-    """Add the rotor of a servo to a joint; `friction` is that of the load at the servo, Nm."""
+    """Add inertia, damping and friction of a servo's motor to a joint of the MuJoCo model.
+
+    `friction` is additional friction of the load at the servo's shaft, Nm.
+    """
     joint.armature = motor.inertia / per_rad**2
     joint.damping[0] += motor.viscous_friction / per_rad**2
     _rub(joint, (motor.friction + friction) / abs(per_rad))

@@ -14,26 +14,27 @@ from dxlrun import InputError, RemoteRobot
 from dxlrun.tooling.files import suggestion
 
 Row = Mapping[str, Any]
-"""Part of `RemoteRobot.info`"""
+"""Mapping in `RemoteRobot.info`, such as the entry of a controller"""
 USUAL_SPEED = {"rad": 0.5, "m": 0.05}
-"""Speed of a joint at full deflection and factor 1, rad/s and m/s"""
+"""Speed of a joint at full deflection of an axis and speed factor 1, by unit: rad/s and m/s"""
 USUAL_TWIST = {"linear": 0.2, "angular": 1.0}
-"""Speed of a base at full deflection and factor 1, m/s and rad/s. It is lower if the base needs longer than
-BRAKING_S to stop."""
+"""Speed of a mobile base at full deflection of an axis and speed factor 1, m/s and rad/s. It is lower if the
+base needs longer than BRAKING_S to stop."""
 BRAKING_S = 0.2
 """Longest time in which a base stops from full deflection, s"""
 HORIZON_S = 0.1
 """Duration of the trajectories that drive a joint of a trajectory controller, s. Each one ends at rest, so
 the joint stops without a further command."""
 _ROOM = 1.5
-"""Reserve of the speed limit, because a trajectory that catches up is faster than its axis"""
+"""Ratio of a joint's speed limit to the highest speed of its axis, because a trajectory that catches up is
+faster than the axis"""
 _LEADING = 1.25
-"""Ratio of the commanded speed of a servo to the speed of its goal, so that the servo keeps up"""
+"""Ratio of the speed that is sent with a position to the speed of the axis, so that the servo keeps up"""
 
 
 @unique
 class Form(Enum):
-    """Form of a command: its fields, and whether axes are integrated to its numbers."""
+    """Form of a controller's command: its field names, and True if axes are integrated to positions."""
 
     POSITIONS = frozenset({"positions"}), True
     POSVEL = frozenset({"positions", "velocities"}), True
@@ -45,40 +46,42 @@ class Form(Enum):
         self.fields, self.integrates = fields, integrates
 
     def fits(self, fields: Collection[str]) -> bool:
-        """Return True if the fields are those of this form. A trajectory may have additional fields."""
+        """Return True if a command with these fields has this form. A trajectory may have more fields."""
         return self.fields <= set(fields) if self is Form.TRAJECTORY else self.fields == set(fields)
 
 
 class Slot(msgspec.Struct, frozen=True):
-    """Number of a command"""
+    """One number of a controller's command that an axis can drive: a joint, or a speed of a base"""
 
     name: str
-    """Joint, or field of a twist"""
+    """Joint, or field of a twist: linear, angular"""
     unit: str
     """`rad` or `m`; speeds are in this unit per second"""
     speed: float
-    """Speed at full deflection and factor 1"""
+    """Speed at full deflection of the axis and speed factor 1"""
     most: float
-    """Speed limit, whatever the factor"""
+    """Speed limit, whatever the speed factor"""
     lower: float = -math.inf
+    """Lower position limit of the joint, rad or m"""
     upper: float = math.inf
 
 
 class Bank(msgspec.Struct, frozen=True):
-    """Controller, and the numbers of its command that the axes drive"""
+    """Assignment of the device's axes to the command of one controller, of which one is active at a time"""
 
     controller: str
     kind: str
+    """Kind of the command, such as `posvel`"""
     form: Form
     slots: tuple[Slot, ...]
-    """Numbers of the command, in the order of the command"""
+    """All numbers of the command, in its order"""
     driven: tuple[int, ...]
-    """Index of the slot that each axis drives"""
+    """Index in `slots` that each axis drives"""
     into: tuple[str, ...] = ()
-    """Controllers whose references it commands; empty if it commands servos"""
+    """Controllers whose references the controller commands; empty if it commands servos"""
 
     def command(self, values: Sequence[float], factor: float) -> dict[str, object]:
-        """Return the command with these values (SI units)."""
+        """Return the fields of the controller's command with these values, one per slot (SI units)."""
         match self.form:
             case Form.TWIST:
                 return {slot.name: value for slot, value in zip(self.slots, values, strict=True)}
@@ -96,7 +99,10 @@ class Bank(msgspec.Struct, frozen=True):
 
 
 def banks_of(robot: RemoteRobot, targets: Sequence[str], axes: int) -> list[Bank]:
-    """Return the banks that can be driven, in the order of the targets.
+    """Return the banks between which the user can switch, in the order of the targets.
+
+    A controller with more numbers than axes has several banks. Controllers that other ones command, or that
+    follow other joints, are omitted.
 
     Args:
         robot: Running robot.
@@ -134,12 +140,12 @@ def banks_of(robot: RemoteRobot, targets: Sequence[str], axes: int) -> list[Bank
 
 
 def _follows(one: Row, info: Row) -> bool:
-    """Return True if a controller moves its joints according to other joints, such as a leader_follower."""
+    """Return True if a controller reads the states of joints to move its own, such as a leader_follower."""
     return any(read.split("/")[0] in info["units"] for read in one["reads"])
 
 
 def _bank(robot: RemoteRobot, one: Row, info: Row) -> Bank | None:
-    """Return the bank of a controller with all numbers of its command, or None without a known form."""
+    """Return a bank that drives all numbers of a controller's command; None if no Form fits it."""
     for kind, schema in one["takes"].items():
         for form in (form for form in Form if form.fits(schema.get("properties", ()))):
             twist = form is Form.TWIST
@@ -156,7 +162,8 @@ def _joint(name: str, info: Row, form: Form) -> Slot:
 
 
 def _twist(robot: RemoteRobot, one: Row) -> list[Slot]:
-    """Return the slots of a base, with speeds from which its limits allow it to stop in BRAKING_S."""
+    """Return the slots linear and angular of a base controller, with speeds from which it can stop in
+    BRAKING_S by the limits in its parameters."""
     given, slots = robot.parameters(one["name"]), []
     for field, unit in (("linear", "m"), ("angular", "rad")):
         most, rise, sink, jerk = (

@@ -1,4 +1,4 @@
-"""Gamepads and keyboards as Linux input devices, which also report releases (extra `teleop`: evdev).
+"""Gamepads and keyboards as Linux input devices, which also report releases of keys (extra `teleop`: evdev).
 
 Codes are those of linux/input-event-codes.h. The layout of a gamepad is that of the kernel's
 Documentation/input/gamepad.rst. The state of a device is polled, so that a lost event has no effect.
@@ -23,7 +23,7 @@ EV_KEY, EV_ABS = 1, 3
 SHOULDERS = frozenset((0x136, 0x137))
 """BTN_TL and BTN_TR, the dead-man's switch of a gamepad"""
 BUTTONS: Mapping[int, Press] = {0x130: Press.NEXT, 0x13B: Press.QUIT}
-"""BTN_SOUTH, BTN_START"""
+"""Actions of a gamepad's buttons: BTN_SOUTH, BTN_START"""
 _STICKS = "left stick", "right stick", "right stick", "pad"
 STICKS: Mapping[int, str] = {  # ABS_Y, _X, _RY, _RX (on some gamepads _RZ, _Z), _HAT0Y, _HAT0X
     code: f"{_STICKS[at // 2]} {('up/down', 'left/right')[at % 2]}"
@@ -32,12 +32,12 @@ STICKS: Mapping[int, str] = {  # ABS_Y, _X, _RY, _RX (on some gamepads _RZ, _Z),
 DEAD_ZONE = 0.1
 """Deflection below which a stick counts as released. The rest of its range is scaled to the whole axis."""
 KEYS: Mapping[int, Press] = {15: Press.NEXT, 13: Press.FASTER, 12: Press.SLOWER, 1: Press.QUIT}
-"""KEY_TAB, KEY_EQUAL, KEY_MINUS, KEY_ESC"""
+"""Actions of a keyboard's keys: KEY_TAB, KEY_EQUAL, KEY_MINUS, KEY_ESC"""
 SIDES: Mapping[int, tuple[int, float]] = {
     first + axis: (axis, side) for first, side in ((16, 1.0), (30, -1.0)) for axis in range(8)
 } | {103: (0, 1.0), 108: (0, -1.0), 105: (1, 1.0), 106: (1, -1.0)}
-"""Axis and direction of the keys from KEY_Q and KEY_A on (by position, whatever the layout), and of the
-arrows"""
+"""Axis (index) and direction (1 or -1) of each key that moves: eight keys from KEY_Q and from KEY_A on (by
+position, whatever the layout), and the arrows"""
 
 
 class Gamepad:
@@ -57,7 +57,10 @@ class Gamepad:
         self.axes = tuple(STICKS[code] for code in self._codes)
 
     def read(self, now: float) -> Given:
-        """Return the present state of axes and buttons. Raises DxlrunError if the device is unplugged."""
+        """Read the present deflections, the dead-man's switch, and buttons pressed since the last call.
+
+        Raises DxlrunError if the device is unplugged.
+        """
         try:
             held = frozenset(self._device.active_keys())
             axes, enabled = self._driven(held)
@@ -71,14 +74,14 @@ class Gamepad:
         return tuple(map(self._axis, self._codes)), not SHOULDERS.isdisjoint(held)
 
     def _axis(self, code: int) -> float:
-        """Return the deflection of a stick, -1..1, without its dead zone. Up and left are positive."""
+        """Return the deflection of a stick's axis, -1..1, 0 in its dead zone. Up and left are positive."""
         value, lowest, highest = self._device.absinfo(code)[:3]
         way: float = (lowest + highest - 2 * value) / ((highest - lowest) or 1)
         beyond = min(max(0.0, abs(way) - DEAD_ZONE) / (1.0 - DEAD_ZONE), 1.0)
         return beyond if way > 0 else -beyond
 
     def close(self) -> None:
-        """Close the device."""
+        """Close the input device, which ends the exclusive use of a keyboard."""
         self._device.close()
 
 
@@ -106,7 +109,7 @@ class KeyboardDevice(Gamepad):
 
 
 def source_of(device: InputDevice[str]) -> Gamepad | None:
-    """Return a device as a gamepad or a keyboard, or None if it is neither."""
+    """Return the source for a Linux input device: Gamepad or KeyboardDevice, or None if it is neither."""
     codes = {kind: set(found) for kind, found in device.capabilities(absinfo=False).items()}
     keys = codes.get(EV_KEY, set())
     if codes.get(EV_ABS, set()) >= {0, 1} and not SHOULDERS.isdisjoint(keys):
@@ -115,7 +118,7 @@ def source_of(device: InputDevice[str]) -> Gamepad | None:
 
 
 def chosen(path: str | None) -> Gamepad:
-    """Return the device at `path`, or the only gamepad if `path` is None. Close all other devices.
+    """Open the gamepad or keyboard at `path`, or the only gamepad if `path` is None.
 
     Raises:
         InputError: The device was not found, or there are several gamepads. The message lists them.

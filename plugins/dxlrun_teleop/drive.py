@@ -1,4 +1,4 @@
-"""Drive: convert the input of a device to setpoints of a stream, or to short trajectories.
+"""Drive: converts the input of a gamepad or keyboard to commands, as a stream or as short trajectories.
 
 The robot holds when the switch is released, and also when this program has exited: a setpoint expires after
 LEASE_S, and a trajectory ends after HORIZON_S.
@@ -15,16 +15,17 @@ from dxlrun_teleop.bank import HORIZON_S, Bank, Form
 from dxlrun_teleop.source import Given, Press
 
 PERIOD_S = 0.02
-"""Period of the setpoints, s"""
+"""Period of `Drive.step`, in which the device is read and a command is sent, s"""
 LEASE_S = 0.15
-"""Lease of a setpoint, s: seven periods. Including some periods of the loop, joints hold within 250 ms."""
+"""Time for which a command of the stream is valid, s: seven periods. Including some periods of the loop,
+joints hold within 250 ms after the last one."""
 FACTORS = 0.1, 10.0
 """Smallest and largest speed factor"""
 _FASTER = {Press.FASTER: 1.25, Press.SLOWER: 0.8}
 
 
 class Drive:
-    """Teleoperation of a running robot. Call `step` every PERIOD_S.
+    """Teleoperation of a running robot by one device and one active bank. Call `step` every PERIOD_S.
 
     After the start and after a change of the bank, nothing moves until the dead-man's switch was released.
     """
@@ -37,19 +38,19 @@ class Drive:
 
     @property
     def bank(self) -> Bank:
-        """Active bank"""
+        """Bank that the axes drive at present; Press.NEXT selects the next one"""
         return self._banks[self._place]
 
     @property
     def values(self) -> Sequence[float]:
-        """Commanded value of each slot; empty while the robot holds"""
+        """Last commanded value of each slot of the bank (SI units); empty while the robot holds"""
         return () if self._moving is None else self._moving.values
 
     def step(self, given: Given, now: float) -> None:
-        """Apply the input of a device.
+        """Apply the input of the device: change speed factor or bank, and send the next command.
 
         Args:
-            given: Input.
+            given: Input of the device since the last call.
             now: Time of a monotonic clock, s.
 
         Raises:
@@ -69,14 +70,14 @@ class Drive:
             self._moving.move(given.axes, self.factor, now)
 
     def close(self) -> None:
-        """End a stream with a command to stand still. A trajectory ends without one."""
+        """Stop: end a stream with a command to stand still. A short trajectory ends without one."""
         moving, self._moving = self._moving, None
         if moving is not None:
             moving.settle(self.factor)
 
 
 class _Moving:
-    """Motion of a bank while the switch is held, starting from the present goals at rest"""
+    """Motion of a bank while the dead-man's switch is held, which starts at the joints' present goals"""
 
     def __init__(self, robot: RemoteRobot, bank: Bank, now: float) -> None:
         self._robot, self._bank = robot, bank
@@ -87,7 +88,10 @@ class _Moving:
         self._stream: Stream | None = robot.stream(bank.controller, bank.kind, LEASE_S) if as_stream else None
 
     def move(self, axes: Sequence[float], factor: float, now: float) -> None:
-        """Integrate the axes since the last call, and send the command."""
+        """Integrate the axes' deflections since the last call to positions, and send the command.
+
+        Speeds are sent as they are. A trajectory is sent every HORIZON_S / 2 at most.
+        """
         bank, elapsed, self.moved = self._bank, now - self.moved, now
         for axis, index in zip(axes, bank.driven, strict=False):  # a source may have more axes
             slot = bank.slots[index]
@@ -103,7 +107,7 @@ class _Moving:
             self._robot.send(bank.controller, bank.kind, bank.command(self.values, factor))
 
     def settle(self, factor: float) -> None:
-        """End the stream by a single command to stand still, which has no lease."""
+        """End the stream with one command to stand still, which does not expire."""
         bank = self._bank
         if self._stream is not None:
             values = self.values if bank.form.integrates else [0.0] * len(self.values)
@@ -113,7 +117,10 @@ class _Moving:
 
 
 def _present(robot: RemoteRobot, bank: Bank) -> list[float]:
-    """Return the present goals of joints, or else their positions. Raises Refused while they are unknown."""
+    """Return the goal at which each slot's joint is at present: its reference, goal or measured position.
+
+    Raises Refused while none is known.
+    """
     states, found = robot.states(), []
     references = dict(zip(states.references, states.reference.tolist(), strict=True))
     for slot in bank.slots:

@@ -1,4 +1,4 @@
-"""Keyboard of a terminal. It reports presses and repeats of keys, but not their release."""
+"""Keyboard of a terminal as the device of teleop. A terminal reports presses and repeats, but no releases."""
 
 from __future__ import annotations
 
@@ -24,7 +24,7 @@ _ARROWS = {"A": (0, 1.0), "B": (0, -1.0), "D": (1, 1.0), "C": (1, -1.0)}
 _PRESSES = {"\t": Press.NEXT, "+": Press.FASTER, "=": Press.FASTER, "-": Press.SLOWER, "\x04": Press.QUIT}
 _TYPED = re.compile(r"\x1b[\[O](?:[\d;]*)([A-Za-z~])|(.)", re.DOTALL)
 _PART = re.compile(r"\x1b(?:[\[O][\d;]*)?\Z")
-"""Incomplete escape sequence at the end of the input"""
+"""Incomplete escape sequence at the end of the input, which the next read completes"""
 
 
 class TerminalKeyboard:
@@ -46,7 +46,7 @@ class TerminalKeyboard:
         self._input = sys.stdin.fileno()
         self._before = termios.tcgetattr(self._input)
         self._typed: dict[int, tuple[float, float]] = {}
-        """Direction of each axis, and time of the last press or repeat, s"""
+        """Direction (1 or -1), and time of the last press or repeat of its key, s, by axis"""
         self._rest = ""
         tty.setcbreak(self._input, termios.TCSAFLUSH)
 
@@ -55,7 +55,7 @@ class TerminalKeyboard:
         termios.tcsetattr(self._input, termios.TCSAFLUSH, self._before)
 
     def read(self, now: float) -> Given:
-        """Return the axes whose keys are held."""
+        """Return the input at `now`, s: axes whose keys count as held, and presses since the last call."""
         presses: set[Press] = set()
         while select.select([self._input], [], [], 0.0)[0]:
             if not (data := os.read(self._input, 4096)):

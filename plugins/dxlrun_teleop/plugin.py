@@ -1,4 +1,4 @@
-"""Plug-in with the verb `teleop`. It uses the same hooks as any other package."""
+"""Plug-in that adds the command `dxlrun teleop`, by the same hooks as any other package."""
 
 from __future__ import annotations
 
@@ -9,11 +9,11 @@ from dxlrun import CONTRACT_VERSION, Command, hookimpl
 
 @hookimpl
 def dxlrun_contract() -> int:
-    """Return the plug-in contract version. This package is released together with it."""
+    """Return the version of the plug-in contract; this package is published together with the runtime."""
     return CONTRACT_VERSION
 
 
 @hookimpl
 def dxlrun_commands() -> Sequence[Command]:
-    """Return the verb that drives a running robot."""
+    """Return the command `teleop`, with the function that is imported on use."""
     return (Command("teleop", "dxlrun_teleop.command:teleop", group="Robots that run"),)

@@ -1,4 +1,4 @@
-"""Live view in the terminal: keys, commands and positions."""
+"""Live view of `dxlrun teleop` in the terminal: keys of the axes, commands and positions."""
 
 from __future__ import annotations
 
@@ -17,7 +17,8 @@ _SHOWN = {"rad": (180 / math.pi, "deg"), "m": (1e3, "mm")}
 
 
 def view(robot: RemoteRobot, drive: Drive, source: Source) -> tuple[str, Table]:
-    """Return a headline with the controller, and a table with target, command and position per axis."""
+    """Return a headline (robot, controller, speed factor), and a table with joint, command and position of
+    each axis."""
     bank, values, states = drive.bank, drive.values, robot.states()
     positions = dict(zip(states.joints, states.position.tolist(), strict=True))
     rows = []
@@ -35,7 +36,10 @@ def view(robot: RemoteRobot, drive: Drive, source: Source) -> tuple[str, Table]:
 
 @contextmanager
 def screen(robot: RemoteRobot, drive: Drive, source: Source) -> Iterator[Callable[[float], None]]:
-    """Yield a function that draws the view at a time, s, at most every REFRESH_S. It needs a terminal."""
+    """Yield a function that draws the view, at most every REFRESH_S of the time (s) it is called with.
+
+    Without a terminal, it does nothing.
+    """
     console = out()
     if not console.is_terminal:
         yield lambda now: None

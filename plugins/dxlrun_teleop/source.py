@@ -1,4 +1,4 @@
-"""Input of a device: axes, dead-man's switch, and single presses."""
+"""Interface of teleop's input devices: axes, dead-man's switch, and presses that trigger an action."""
 
 from __future__ import annotations
 
@@ -10,20 +10,21 @@ from typing import NamedTuple, Protocol
 class Press(Enum):
     """Action that a press of a key or button triggers once"""
 
-    NEXT = auto()  # drive the next controller
-    FASTER = auto()
+    NEXT = auto()  # drive the next bank
+    FASTER = auto()  # raise the speed factor
     SLOWER = auto()
     QUIT = auto()
 
 
 class Given(NamedTuple):
-    """Present input of a device"""
+    """Input of a device at one time"""
 
     axes: tuple[float, ...]
     """Deflections, -1..1, in the order of `Source.axes`"""
     enabled: bool
     """True while the dead-man's switch is held. Otherwise the robot holds."""
     presses: frozenset[Press] = frozenset()
+    """Actions triggered since the previous input"""
 
 
 class Source(Protocol):
@@ -35,11 +36,11 @@ class Source(Protocol):
     """Description of the dead-man's switch and of the other keys, for the screen"""
 
     def read(self, now: float) -> Given:
-        """Return the input at `now`, s of a monotonic clock, without waiting.
+        """Return the device's input at `now`, s of a monotonic clock, without waiting for a press.
 
         Raises:
             DxlrunError: The device is unplugged.
         """
 
     def close(self) -> None:
-        """Restore the device."""
+        """Release the device: close it, or restore the terminal."""

@@ -46,7 +46,17 @@ def calibrate(
 def calibrated(
     result: Compiled, dialogue: Dialogue, opened: Opened, words: Sequence[str], assignments: Sequence[str]
 ) -> int:
-    """Calibrate a robot; return the exit code. An error leaves the file unchanged."""
+    """Calibrate joints in a dialogue, and write the robot file after confirmation; return the exit code.
+
+    0: written or unchanged, 1: refused by the user. An error leaves the file unchanged.
+
+    Args:
+        result: The compiled robot file.
+        dialogue: Dialogue with the user.
+        opened: Function that opens a serial port.
+        words: Joints and groups of the command line; empty for all joints.
+        assignments: Arguments of the robot file.
+    """
     from dxlrun.tooling.robots import compile_robot, read_robot
     from dxlrun_hand.calibration import HandJoint, keys_of, measure, replacements
     from dxlrun_hand.dialogue import ending_with, yes
@@ -96,10 +106,12 @@ def _limp(hands: Sequence[HandJoint]) -> str:
 
 
 def _joints(result: Compiled, words: Sequence[str], dialogue: Dialogue) -> dict[str, CompiledJoint]:
-    """Return the chosen joints that have one servo each.
+    """Return the joints to calibrate: of those chosen, the ones with a servo of their own.
+
+    The user is informed about the others.
 
     Raises:
-        InputError: No such joint was chosen.
+        InputError: No joint remains.
     """
     from dxlrun_hand.lines import chosen_names
 

@@ -52,7 +52,22 @@ def setup(
 def set_up(
     task: SetUp, opened: Opened, devices: Devices, words: Sequence[str] = (), *, search: bool = False
 ) -> int:
-    """Set the servos of a robot up; return the exit code. Raises InputError, PortError."""
+    """Set up the chosen servos of a robot file in a dialogue, and compare all of them with the file.
+
+    Args:
+        task: Dialogue and robot file.
+        opened: Function that opens a serial port.
+        devices: Function that returns the available serial ports.
+        words: Joints and groups of the command line; empty for all.
+        search: Find each bus's port by unplugging its adapter, even if the port in the file exists.
+
+    Returns:
+        Exit code: 0 if all chosen servos match the file, else 1.
+
+    Raises:
+        InputError: A word is unknown, or a file cannot be written.
+        PortError: A port cannot be opened or found.
+    """
     from dxlrun_hand.dialogue import ending_with
     from dxlrun_hand.lines import BusLines, chosen_names
 
@@ -73,7 +88,7 @@ def set_up(
 
 
 def _left(task: SetUp) -> str:
-    """Return the state of the servos if the dialogue ends early."""
+    """Return a sentence for an early end of the dialogue: servos that were set up, and one half-changed."""
     done = f"set up: {', '.join(task.done)}" if task.done else "no servo was set up"
     if not task.changing:
         return f"{done}; all others are unchanged"
@@ -81,7 +96,10 @@ def _left(task: SetUp) -> str:
 
 
 def _port(task: SetUp, plan: BusPlan, devices: Devices, *, search: bool) -> str:
-    """Return the port of a bus: the one in the file if it exists, else the one that the user plugs in."""
+    """Return the port of a bus: the one in the robot file if it exists, else the one that the user plugs in.
+
+    The new port is written to the robot file after confirmation. `search` skips the port in the file.
+    """
     from dxlrun.tooling.robots import SIMULATED
     from dxlrun_hand.dialogue import yes
     from dxlrun_hand.lines import find_port

@@ -20,25 +20,26 @@ from dxlrun_lab.characterize.trace import Trace, polynomial
 
 NAME, REVERSAL = "dead band", "smallest change that moves it"
 MARGINS = ("cw_compliance_margin", "ccw_compliance_margin")
-"""Registers of the dead band: Compliance Margin (26, 27) of AX and RX, ticks"""
+"""Registers of a servo's own dead band, ticks: Compliance Margin (26, 27) of AX and RX"""
 SLOW = math.radians(3.0)
 """Speed of the goal during an approach, rad/s"""
 REST_S = 0.7
-"""Duration of a rest, s"""
+"""Time for which the goal rests at each place, s"""
 _LOOK_S = 0.3
 """Time at the end of a rest in which the joint must not move, s"""
 _FOLLOWED_TICKS = 4
 """Shortest motion of a joint that counts as following its goal, ticks"""
 _LEAST_ROWS = 5
-"""Smallest number of samples for the fit of a line"""
+"""Smallest number of samples for the fit of a line to a motion"""
 _MOVING = 0.5
 """Fraction of the goal's speed above which a joint counts as following it"""
 
 
 class Approach(msgspec.Struct, frozen=True):
-    """Rest after a slow approach"""
+    """Rest of a joint after a slow approach to its goal"""
 
     upward: bool
+    """True if the joint came from below"""
     short: float
     """Distance to the goal at rest, rad; positive if the joint stopped before the goal"""
     reversal: float
@@ -46,12 +47,15 @@ class Approach(msgspec.Struct, frozen=True):
 
 
 def stops(places: Sequence[float], reach: float) -> list[float]:
-    """Return the goals of a table that approaches each place from both sides."""
+    """Return goals, rad, at which to rest in turn, so that each place is approached from both sides.
+
+    `reach` is the distance from which a place is approached, rad.
+    """
     return [places[0], *(turn for place in places for turn in (place - reach, place, place + reach, place))]
 
 
 def table(goals: Sequence[float], period: float) -> tuple[Floats, float]:
-    """Return a table of goals that rests at each place and moves slowly between them, and its duration, s."""
+    """Return goals for each period, rad, which rest at `goals` and move slowly between, and their time, s."""
     pieces = [np.full(math.ceil(REST_S / period), goals[0])]
     for before, after in itertools.pairwise(goals):
         count = max(1, math.ceil(abs(after - before) / SLOW / period))
@@ -61,7 +65,10 @@ def table(goals: Sequence[float], period: float) -> tuple[Floats, float]:
 
 
 def approaches(trace: Trace) -> list[Approach]:
-    """Return the rests in a trace of the table, except those to which the joint did not follow its goal."""
+    """Return the joint's rests in the recording of a `table`.
+
+    Omitted are rests in which the joint still moved, or to which it did not follow its goal.
+    """
     moving = np.diff(trace.goal) != 0
     edges = np.flatnonzero(moving)
     if not len(edges):
@@ -94,8 +101,8 @@ def _reversal(trace: Trace, moves: int, sign: float, rest: float) -> float:
     """Return the change of the goal after a reversal at which the joint left its rest, rad; NaN if not seen.
 
     Args:
-        trace: The way back and the rest that follows.
-        moves: Number of rows of the way back.
+        trace: Samples of the goal's way back, and of the rest that follows.
+        moves: Number of samples of the way back.
         sign: Direction of the approach, 1 or -1.
         rest: Position of the rest before the reversal, rad.
     """
@@ -121,10 +128,10 @@ def _reversal(trace: Trace, moves: int, sign: float, rest: float) -> float:
 def dead_band(
     found: Sequence[Approach], tick: float, registers: Mapping[str, int], unit: float
 ) -> tuple[Measured, Measured]:
-    """Return the dead band to each side, and the smallest change of the goal that moves the joint.
+    """Return two figures: dead band to each side, and smallest change of the goal that moves the joint.
 
     Args:
-        found: Rests.
+        found: Rests of the joint.
         tick: Resolution of the position, rad.
         registers: Known registers of the servo.
         unit: Unit of a margin register, rad.
@@ -148,7 +155,7 @@ def dead_band(
 
 
 def _parts(whole: float, registers: Mapping[str, int], unit: float) -> str:
-    """Describe the parts of a dead band that the servo's margin and the position gain cause."""
+    """Describe which parts of a dead band (rad) the servo's margin and friction cause."""
     margins = [registers[name] * unit for name in MARGINS if name in registers]
     if not margins:
         return "all by friction over the position gain: the model has no margin"

@@ -22,22 +22,22 @@ from dxlrun_lab.characterize.trace import Trace
 MOTION_S = math.pi
 """Period of the thesis' motion, 0.5 (sin 2t - sin 4t), s"""
 FADE_S = 0.5
-"""Time in which the motion fades in, s. It is judged after that."""
+"""Time in which the motion fades in, s. Deviations are judged after that."""
 LARGEST = 1.7602
 """Maximum of |sin 2t - sin 4t|"""
 FASTEST = 6.0
 """Peak speed of the motion per rad of its size, rad/s"""
 _STILL_TICKS = 1.5
-"""Travel below which a joint counts as at rest while its motion continues by `_MOVES_TICKS`, ticks"""
+"""A joint that travels less than this while the motion travels `_MOVES_TICKS` counts as at rest, ticks."""
 _MOVES_TICKS = 8.0
 _STILL_PART = 0.15
-"""The same threshold as a fraction of the travel of the motion"""
+"""The same limit for the joint as a fraction of the travel of the motion"""
 _BETWEEN = 0.03
 """Relative distance between the best and the worst gap at which the search ends"""
 
 
 def motion(time: Floats, size: float) -> tuple[Floats, Floats]:
-    """Return position (rad) and speed (rad/s) of the thesis' motion, `size` (sin 2t - sin 4t).
+    """Return position (rad) and speed (rad/s) of the thesis' motion at times (s): `size` (sin 2t - sin 4t).
 
     The motion fades in from rest, but does not fade out.
     """
@@ -49,23 +49,24 @@ def motion(time: Floats, size: float) -> tuple[Floats, Floats]:
 
 
 class Gap(msgspec.Struct, frozen=True):
-    """Result of a motion with one gap"""
+    """Result of one motion that was sent with a gap between two commands"""
 
     gap_s: float
+    """Time between two commands, s"""
     deviation: float
     """Largest deviation from the path with a command in each cycle, rad"""
     stood: bool
     """True if the joint came to rest while its motion continued"""
 
     def kept(self, tolerance: float) -> bool:
-        """Return True if the joint stayed on its path."""
+        """Return True if the deviation is within the tolerance, rad, and the joint did not rest."""
         return self.deviation <= tolerance and not self.stood
 
 
 def judge(gap_s: float, trace: Trace, reference: Trace, size: float) -> Gap:
     """Compare a motion that was sent with gaps to the same motion that was sent in each cycle.
 
-    The times of both traces start with the first goal of the motion.
+    The times of both traces start with the first goal of the motion; `size` is that of `motion`, rad.
     """
     time, since = trace.time, trace.time > FADE_S
     path = np.interp(time, reference.time, reference.position)
@@ -78,7 +79,7 @@ def judge(gap_s: float, trace: Trace, reference: Trace, size: float) -> Gap:
 
 
 def _lag(trace: Trace, ideal: Floats) -> float:
-    """Return the time by which the joint lags behind its motion, s."""
+    """Return the time by which the joint lags behind the ideal positions of its motion, 0 to 0.3 s."""
     shifts = np.linspace(0.0, 0.3, 61)
     middle = trace.position - trace.position.mean()
     off = [float(np.sum((middle - np.interp(trace.time - s, trace.time, ideal)) ** 2)) for s in shifts]
@@ -102,9 +103,10 @@ def _stood(trace: Trace, going: Floats, since: NDArray[np.bool_]) -> bool:
 def following(
     tried: Sequence[Gap], shortest: float, longest: float, step: float, tolerance: float
 ) -> float | None:
-    """Return the gap to try next, a multiple of `step`, or None at the end of the search.
+    """Return the gap to try next, s, a multiple of `step`, or None at the end of the search.
 
-    Gaps grow by half until the joint leaves its path. A bisection follows.
+    Gaps from `shortest` to `longest` grow by half until the joint leaves its path by more than `tolerance`,
+    rad. A bisection follows.
     """
     kept = [round(gap.gap_s / step) for gap in tried if gap.kept(tolerance)]
     bad = min((round(gap.gap_s / step) for gap in tried if not gap.kept(tolerance)), default=0)
@@ -126,10 +128,10 @@ def longest_gap(
     *,
     tick: float = 0.0,
 ) -> Measured:
-    """Return the longest gap with which the joint stays on its path.
+    """Return the figure of the longest gap with which the joint stays on its path, between two tried gaps.
 
     Args:
-        tried: Gaps in increasing order.
+        tried: Results in increasing order of their gaps.
         interface: Interface of the commands.
         tolerance: Largest deviation, rad.
         shortest: Gap of the reference, s.

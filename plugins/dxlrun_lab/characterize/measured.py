@@ -1,4 +1,4 @@
-"""Measured: figure of a joint with its uncertainty, or the reason why it was not measured."""
+"""Measured: one figure of a servo, such as its top speed, with uncertainty, or why it was not measured."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ _NORMAL_95, _BEYOND = 1.96, 2.5
 
 
 class Measured(msgspec.Struct, frozen=True):
-    """Figure of a joint in SI units; angles in rad"""
+    """Figure of a joint's servo in SI units: a row in the result of `dxlrun characterize`"""
 
     name: str
     """Name in the table, such as `response to first motion`"""
@@ -24,7 +24,7 @@ class Measured(msgspec.Struct, frozen=True):
     value: float | None = None
     """None if it was not measured; the reason is in `why`"""
     uncertainty: float | None = None
-    """Half-width of the 95 % confidence interval, from scatter and resolution"""
+    """Half-width of the 95 % confidence interval, from scatter and resolution; None if unknown"""
     spread: float | None = None
     """Standard deviation of single measurements; None for a single one"""
     count: int = 0
@@ -32,7 +32,7 @@ class Measured(msgspec.Struct, frozen=True):
     how: str = ""
     """Method and motion of the measurement"""
     limit: str = ""
-    """Limiting factor, if it is known"""
+    """Limiting factor or parts of the value, if known: `the bus: ...`"""
     why: str = ""
     """Reason for a missing value, one sentence"""
 
@@ -43,7 +43,7 @@ class Measured(msgspec.Struct, frozen=True):
 
 
 def not_measured(name: str, unit: str, why: str, how: str = "") -> Measured:
-    """Return a figure without a value."""
+    """Return a figure without a value, with the reason as one sentence."""
     return Measured(name, unit, how=how, why=why)
 
 

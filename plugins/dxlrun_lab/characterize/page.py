@@ -25,7 +25,7 @@ _TITLE = "What the servos can do"
 
 
 def page(found: Characterized) -> str:
-    """Return the page of a result."""
+    """Return the HTML page of a result: key figures, and for each joint a table and plots."""
     measured = [one for joint in found.joints for one in joint.figures]
     known = sum(one.value is not None for one in measured)
     keys = [(joint.joint.name, one) for joint in found.joints for one in _key(joint)]

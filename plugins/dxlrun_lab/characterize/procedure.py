@@ -24,13 +24,14 @@ MEASUREMENTS: Final[tuple[Measurement, ...]] = get_args(Measurement)
 TOLERANCE: Final = math.radians(1.0)
 
 _EASED_S: Final = 1.2
-"""Rest at the start of a segment, s. The gate limits speeds for one second after a controller was loaded."""
+"""Rest at the start of a controller's first segment, s. The gate limits speeds for one second after a
+controller was loaded."""
 _REST_S: Final = 0.3
 _FASTEST_SAMPLING: Final = 480.0
 _SAMPLING: Final = 240.0
 _SLOW_SAMPLING: Final = 60.0
-"""Loop rates for the measurement of speeds, gaps and dead band, Hz; lower if the joint's highest rate is
-lower"""
+"""Loop rates for the measurement of speeds, gaps and dead band, Hz, in this order. They are lower if the
+joint's highest rate is lower."""
 _OF_HIGHEST: Final = 0.8
 _STEP: Final = math.radians(8.0)
 _STEP_HOLD_S: Final = 0.5
@@ -53,7 +54,7 @@ Part = Generator[Segment, Recorded, None]
 
 @dataclass(slots=True)
 class Found:
-    """Figures of a joint, and the data of their plots"""
+    """Result of one joint: figures, and the data of their plots as far as they were measured"""
 
     joint: Joint
     figures: list[Measured] = field(default_factory=list)
@@ -61,26 +62,31 @@ class Found:
     steps: list[response.Step] = field(default_factory=list)
     moves: list[response.Step] = field(default_factory=list)
     gaps: dict[str, list[gaps.Gap]] = field(default_factory=dict)
-    """Tried gaps by interface"""
+    """Tried gaps between commands, by command interface"""
     band: Trace | None = None
+    """Recording of the dead band measurement"""
 
     def value(self, name: str) -> float | None:
-        """Return the value of a figure, or None if it was not measured."""
+        """Return the value of the figure with this name, or None if it was not measured."""
         return next((one.value for one in self.figures if one.name == name), None)
 
 
 class Characterized(msgspec.Struct, frozen=True):
-    """Result of the experiment"""
+    """Result of `dxlrun characterize`"""
 
     robot: str
     joints: tuple[Found, ...]
     why: str
     """Reason for an early end, one sentence; empty on success"""
     tolerance: float
+    """Largest deviation from the path during a gap, rad"""
 
 
 class Characterize:
-    """Experiment (see guided.experiment.Experiment) that moves one joint at a time. All other joints hold."""
+    """Experiment (see guided.experiment.Experiment) that measures one joint at a time; all others hold.
+
+    `tolerance` is the largest deviation from a path during a gap between commands, rad.
+    """
 
     def __init__(
         self, measurements: Sequence[Measurement] = MEASUREMENTS, tolerance: float = TOLERANCE
@@ -91,7 +97,10 @@ class Characterize:
         self._eased: set[str] = set()
 
     def moves(self, situation: Situation) -> Sequence[str]:
-        """Describe the motions of each joint. Raises InputError for a joint that shares its servos."""
+        """Describe measurements, speed and range of each joint, one sentence each.
+
+        Raises InputError for a joint that is linear or has several servos.
+        """
         require_own_servos(situation.plan, situation.names, "characterize", gears=True)
         return [
             f"{joint.name}: {', '.join(self._measurements)}; as fast as "
@@ -101,7 +110,10 @@ class Characterize:
         ]
 
     def procedure(self, situation: Situation) -> Procedure:
-        """Yield the segments of all measurements, and evaluate their recordings."""
+        """Yield the segments of all measurements of each joint, and evaluate their recordings.
+
+        A measurement that the run refuses has that reason in its figures.
+        """
         parts = {
             "rate": self._rate,
             "response": self._response,
@@ -122,7 +134,7 @@ class Characterize:
                     ]
 
     def finish(self, situation: Situation, recorded: Sequence[Recorded], why: str) -> Characterized:
-        """Return the results. Each figure that was not measured has a reason."""
+        """Return the results of all joints. Each figure that was not measured has the reason `why`."""
         reason = f"the experiment ended before: {why}" if why else "nothing was recorded"
         for joint in situation.joints:
             found = self._found.setdefault(joint.name, Found(joint))
@@ -147,13 +159,14 @@ class Characterize:
     # Rates of the loop
 
     def _sampling(self, situation: Situation, found: Found, wanted: float) -> float:
-        """Return the loop rate for a measurement, Hz, below the highest rate at which the joint responds."""
+        """Return a measurement's loop rate, Hz: `wanted`, or less if the joint's highest rate is low."""
         kept = found.value(rates.NAME) or rates.highest_by_bus(situation.plan)
         lowest = 1e9 / situation.plan.loop.slowest_period_ns if situation.plan.loop.slowest_period_ns else 0.0
         return rates.fitting(max(min(wanted, _OF_HIGHEST * kept), lowest), rates.rate_step(situation.plan))
 
     def _lead(self, interface: str = "position") -> float:
-        """Return the rest at the start of a segment, s, after which the gate no longer eases goals."""
+        """Return the rest at the start of a segment, s: longer for the first segment of a command interface,
+        because the gate then limits speeds."""
         if interface in self._eased:
             return _REST_S
         self._eased.add(interface)
@@ -162,7 +175,7 @@ class Characterize:
     # Measurements
 
     def _rate(self, situation: Situation, joint: Joint, found: Found) -> Part:
-        """Toggle the goal by one tick in each cycle, at increasing rates."""
+        """Measure the highest rate: toggle the goal by one tick in each cycle, at increasing loop rates."""
         column, label = situation.names.index(joint.name), joint.plan.label
         step, tick = rates.rate_step(situation.plan), joint.servo.position_per_tick
         highest = min(rates.highest_by_bus(situation.plan), rates.MOST_HZ)
@@ -185,7 +198,7 @@ class Characterize:
         found.figures.append(rates.highest_rate(found.rates, situation.plan, label))
 
     def _response(self, situation: Situation, joint: Joint, found: Found) -> Part:
-        """Step twice up and twice down at several loop rates, with one packet per step."""
+        """Measure response times by small steps up and down at several loop rates, one packet per step."""
         low, high = joint.inner
         speed = joint.plan.highest_speed
         size = min(_STEP, (high - low) / 2)
@@ -209,7 +222,7 @@ class Characterize:
         found.figures += response.response(found.steps)
 
     def _step_rates(self, situation: Situation, found: Found, wanted: float) -> list[float]:
-        """Return the loop rates of the steps, Hz: as many as the rates of the controllers allow."""
+        """Return the loop rates of the steps, Hz, as many as controllers with rates of their own allow."""
         lowest, highest = _STEP_RATES
         fastest = self._sampling(situation, found, min(max(wanted, lowest), highest))
         step = rates.rate_step(situation.plan)
@@ -222,7 +235,7 @@ class Characterize:
         return found_rates
 
     def _speed(self, situation: Situation, joint: Joint, found: Found) -> Part:
-        """Move from end to end of the range at full speed."""
+        """Measure speed and acceleration by moves from end to end of the range at full speed."""
         low, high = joint.inner
         rate = self._sampling(situation, found, _FASTEST_SAMPLING)
         speed = joint.plan.highest_speed
@@ -266,7 +279,7 @@ class Characterize:
         found.figures += speeds.speeds(moves, joint.upper - joint.lower, speed)
 
     def _dead_band(self, situation: Situation, joint: Joint, found: Found) -> Part:
-        """Approach places slowly from both sides."""
+        """Measure the dead band: approach three places slowly from both sides, from a distance that grows."""
         low, high = joint.inner
         rate = self._sampling(situation, found, _SLOW_SAMPLING)
         reach, most = _BAND_REACH, (high - low) / 2
@@ -289,7 +302,7 @@ class Characterize:
         )
 
     def _gap(self, situation: Situation, joint: Joint, found: Found) -> Part:
-        """Send a smooth motion with increasing gaps, by position and by posvel."""
+        """Measure the longest gap: send a smooth motion with growing gaps, by position and by posvel."""
         low, high = joint.inner
         rate = self._sampling(situation, found, _SAMPLING)
         size = min((high - low) / 2 / gaps.LARGEST, _GAP_SPEED * joint.plan.highest_speed / gaps.FASTEST)
@@ -318,7 +331,10 @@ class Characterize:
     def _motion(
         self, joint: Joint, interface: Literal["position", "posvel"], gap: float, rate: float, size: float
     ) -> Segment:
-        """Return the segment of a motion with a gap. The motion starts after `_lead_of` gaps."""
+        """Return the segment that sends the smooth motion with `gap` seconds between commands.
+
+        The motion starts after `_lead_of` gaps; `size` is that of `gaps.motion`, `rate` the loop rate, Hz.
+        """
         lead = _lead_of(gap)
         time = np.arange(lead + math.ceil((gaps.MOTION_S + gaps.FADE_S) / gap)) * gap - lead * gap
         position, _ = gaps.motion(np.maximum(time, 0.0), size)
@@ -363,12 +379,15 @@ _FIGURES: Final[Mapping[Measurement, Sequence[tuple[str, str]]]] = {
 
 
 def _lead_of(gap: float) -> int:
-    """Return the number of gaps before the start of a motion."""
+    """Return the number of gaps (s each) for which the joint rests before a motion starts."""
     return math.ceil(_EASED_S / gap)
 
 
 def _margins(situation: Situation, joint: Joint) -> Mapping[str, int]:
-    """Return the registers of a servo's dead band, ticks: declared values, or else factory defaults."""
+    """Return the servo's compliance margins by register name, ticks: declared, or else factory default.
+
+    A model without these registers has none.
+    """
     protocol = next(bus.protocol for bus in situation.plan.buses if joint.servo in bus.servos)
     table = find_table(joint.servo.model, protocol)
     shipped = {name: table.items[name].initial or 0 for name in dead_band.MARGINS if name in table.items}

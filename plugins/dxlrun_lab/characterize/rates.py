@@ -35,11 +35,12 @@ Fault = Literal["", "servo", "bus", "run"]
 
 
 class Rate(msgspec.Struct, frozen=True):
-    """Result of one rate"""
+    """Result of one loop rate that was tried"""
 
     rate: float
-    """Hz"""
+    """Loop rate, Hz"""
     cycles: int
+    """Number of cycles at this rate; 0 if the run refused it"""
     lost: int
     """Number of cycles without an intact reply of the joint"""
     too_long: int
@@ -49,11 +50,11 @@ class Rate(msgspec.Struct, frozen=True):
     exchange_s: float
     """Median time from a cycle's wake-up to its last write, s; NaN without cycles"""
     text: str = ""
-    """Reason for an early end"""
+    """Reason for an early end or for the refusal; empty otherwise"""
 
     @property
     def fault(self) -> Fault:
-        """Reason why the rate fails; empty on success"""
+        """Reason why the rate fails: servo, bus or run; empty on success"""
         if not self.cycles:
             return "run"
         if self.lost > ALLOWED * self.cycles:
@@ -62,7 +63,7 @@ class Rate(msgspec.Struct, frozen=True):
 
 
 def judge(rate: float, recorded: Sequence[Recorded], column: int) -> Rate:
-    """Evaluate the cycles at a rate."""
+    """Evaluate the recordings at a loop rate, Hz; `column` is that of the joint in them."""
     period_ns = 1e9 / rate
     valid = np.concatenate([part.valid[:, column] for part in recorded])
     took = np.concatenate([part.of_cycles("written_ns") - part.of_cycles("woken_ns") for part in recorded])
@@ -79,12 +80,15 @@ def judge(rate: float, recorded: Sequence[Recorded], column: int) -> Rate:
 
 
 def refused(rate: float, text: str) -> Rate:
-    """Return a rate that the run refused."""
+    """Return the result of a loop rate, Hz, that the run refused with a text."""
     return Rate(rate, 0, 0, 0, 0, math.nan, text)
 
 
 def rate_step(plan: Plan) -> Fraction:
-    """Return the frequency of which controllers require the loop rate to be a multiple, Hz, or 0."""
+    """Return the frequency, Hz, of which the loop rate must be a multiple because of controllers' own rates.
+
+    0 if no controller has a rate of its own.
+    """
     step = Fraction(0)
     for controller in plan.loop.controllers:
         if controller.rate is not None:
@@ -100,19 +104,22 @@ def _common(a: Fraction, b: Fraction) -> Fraction:
 
 
 def fitting(rate: float, step: Fraction) -> float:
-    """Return the highest rate up to `rate` that the controllers allow, Hz, but at least one step."""
+    """Return the largest multiple of `step` up to `rate`, Hz, but at least one step; `rate` if step is 0."""
     if not step:
         return rate
     return float(max(1, math.floor(Fraction(rate) / step + Fraction(1, 10**6))) * step)
 
 
 def highest_by_bus(plan: Plan) -> float:
-    """Return the highest rate that the buses allow by computation, Hz; infinite if it was not computed."""
+    """Return the highest loop rate that the buses allow by the plan, Hz; infinite if it has none."""
     return 1e9 / plan.loop.least_period_ns if plan.loop.least_period_ns else math.inf
 
 
 def following(tried: Sequence[Rate], begin: float, highest: float, step: Fraction) -> float | None:
-    """Return the rate to try next, Hz, up to `highest`, or None at the end of the search."""
+    """Return the loop rate to try next, Hz, or None at the end of the search.
+
+    Rates grow from `begin` up to `highest` until one fails. A bisection follows. All are multiples of `step`.
+    """
     if not tried:
         return fitting(min(begin, highest), step)
     good = max((one.rate for one in tried if not one.fault), default=0.0)
@@ -127,7 +134,10 @@ def following(tried: Sequence[Rate], begin: float, highest: float, step: Fractio
 
 
 def highest_rate(tried: Sequence[Rate], plan: Plan, servo: str) -> Measured:
-    """Return the highest rate without a fault, and its limiting factor; `servo` is the name in messages."""
+    """Return the figure of the highest rate without a fault, and what limits it.
+
+    `servo` is the servo's name in sentences.
+    """
     how = f"{len(tried)} rates, {sum(rate.cycles for rate in tried)} cycles"
     kept = [rate for rate in tried if not rate.fault]
     failed = [rate for rate in tried if rate.fault]

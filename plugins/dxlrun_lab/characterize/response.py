@@ -23,9 +23,9 @@ from dxlrun_lab.characterize.measured import Measured, not_measured, student
 from dxlrun_lab.characterize.trace import Trace, polynomial
 
 PART = 1 - math.exp(-1)
-"""63 %, the step response of a first-order lag after its time constant"""
+"""63 %: fraction of the way that a first-order lag has covered after its time constant"""
 LEAST_STEPS = 6
-"""Smallest number of steps for an estimate of their scatter"""
+"""Smallest number of steps from which response times are determined, because their scatter is estimated"""
 _CLEAR_S = 0.02
 """A shorter response is still reported if its uncertainty is below half of this time, s"""
 LEAST_TICKS = 8
@@ -38,32 +38,33 @@ known delay. Their way does not start as a polynomial."""
 _REST_S = 0.1
 """Time before a step, and before the next one, in which the shaft must be at rest, s"""
 _STILL_TICKS, _STILL_PART = 2.5, 0.05
-"""Motion below which a joint counts as at rest: ticks, or fraction of the step"""
+"""Motion below which a joint counts as at rest: ticks, or fraction of the step's height"""
 _BEFORE_S = 0.03
-"""Time before a step from which samples are included, s"""
+"""A step's samples start this long before its goal was sent, s."""
 ONSET, RISE = "response to first motion", "response to 63 %"
 
 
 class Step(msgspec.Struct, frozen=True):
-    """Step response of a joint that was at rest, until the next step"""
+    """Recorded response of a resting joint to one step of its goal, until the next step"""
 
     time: Floats
     """Time since the last byte of the first packet with the new goal, s"""
     way: Floats
-    """Distance from the rest, rad, positive towards the goal"""
+    """Distance of the joint from its rest before the step, rad, positive towards the goal"""
     goal: Floats
     """Distance of the sent goal from the previous one, rad"""
     height: float
-    """Height of the step, rad"""
+    """Height of the step of the goal, rad, positive"""
     reached: float
-    """Distance at the final rest, rad; NaN if the joint did not come to rest"""
+    """Distance from the first to the final rest, rad; NaN if the joint did not come to rest"""
     packets_s: float
     """Time in which packets with changing goals were sent, s; above 0 if the gate limited the step"""
     tick: float
+    """Resolution of the position, rad"""
 
 
 def steps_of(trace: Trace) -> list[Step]:
-    """Return the steps in a trace. A step starts when the goal changes after a rest."""
+    """Return the steps in a recording. A step starts when the goal changes after a rest of the joint."""
     changed = np.flatnonzero(np.diff(trace.goal) != 0) + 1
     if not len(changed):
         return []
@@ -78,7 +79,7 @@ def steps_of(trace: Trace) -> list[Step]:
 
 
 def _step(trace: Trace, start: int, end: int) -> Step | None:
-    """Return a step, or None if the joint was not at rest before it."""
+    """Return the step from row `start` to before row `end`, or None if the joint did not rest before it."""
     origin = float(trace.sent[start])
     before = trace.part((trace.time > trace.time[start] - _REST_S) & (np.arange(len(trace)) <= start))
     height = float(trace.goal[end - 1] - trace.goal[start - 1])
@@ -107,7 +108,7 @@ def _step(trace: Trace, start: int, end: int) -> Step | None:
 
 
 def response(steps: Sequence[Step]) -> tuple[Measured, Measured]:
-    """Return the response times to the first motion and to 63 % of the way.
+    """Return two figures: the response times to the first motion and to 63 % of the way.
 
     The samples of all steps are pooled. Steps at different loop rates interleave, so the samples are dense.
     """
@@ -129,7 +130,7 @@ def _rested(step: Step) -> bool:
 
 
 def _not_usable(steps: Sequence[Step]) -> str:
-    """Return the reason why steps are not usable, one sentence; empty if they are."""
+    """Return the reason why no response time can be found from the steps, one sentence; empty if it can."""
     if len(steps) < LEAST_STEPS:
         return f"{len(steps)} steps were recorded in which the joint rested before; {LEAST_STEPS} are needed"
     most, height = max(float(np.max(step.way)) for step in steps), steps[0].height
@@ -151,9 +152,10 @@ def _not_usable(steps: Sequence[Step]) -> str:
 
 
 class _Pool(NamedTuple):
+    """Samples of one step: time since the goal's packet, s, and fraction of the whole way"""
+
     time: Floats
     part: Floats
-    """Fraction of the whole way"""
 
 
 def _pooled(
@@ -163,7 +165,7 @@ def _pooled(
     how: str,
     resolution: float = 0.0,
 ) -> Measured:
-    """Return a time that the first of `ways` finds in the pooled samples of all steps.
+    """Return the figure of a response time that the first of the estimators `ways` finds in all steps.
 
     The scatter is estimated by the jackknife (B. Efron and C. Stein, Annals of Statistics 9, 1981).
     Differences to the other estimators in `ways` add to the uncertainty.
@@ -192,7 +194,10 @@ def _curve(pools: Sequence[_Pool]) -> tuple[Floats, Floats]:
 
 
 def _rise(pools: Sequence[_Pool], level: float = PART) -> float:
-    """Return the time to a fraction of the way, s, by a parabola through the samples around it."""
+    """Return the response time to the fraction `level` of the way, s, by a parabola through samples near it.
+
+    NaN with too few samples.
+    """
     time, part = _curve(pools)
     rising = (time > 0) & (time < _until(time, part, 0.5 * (1 + level)))
     near = rising & (np.abs(part - level) < 0.5 * (1 - level) + 1e-9)
@@ -202,7 +207,7 @@ def _rise(pools: Sequence[_Pool], level: float = PART) -> float:
 
 
 def _until(time: Floats, part: Floats, level: float) -> float:
-    """Return the last time at which a sample is below a level."""
+    """Return the last time, s, at which a sample is below a fraction of the way; at least 0."""
     below = time[part < level]
     return float(below.max(initial=0.0))
 
@@ -243,11 +248,15 @@ _OTHER_FITS: Final[Sequence[Callable[[Sequence[_Pool]], float]]] = (
     lambda pools: _first_motion(pools, 0.7 * ONSET_PART),
     lambda pools: _first_motion(pools, 1.3 * ONSET_PART),
 )
-"""Fits with less and with more of the way. Their differences estimate the error by polynomial and ticks."""
+"""Estimators of the first motion that use less or more of the way. Their differences to the main estimate
+are its error by polynomial and ticks."""
 
 
 def _spread(pools: Sequence[_Pool]) -> float | None:
-    """Return the standard deviation of the response times of single steps, s, by their shifts in the pool."""
+    """Return the standard deviation of single steps' response times, s, by their shifts against all samples.
+
+    None with too few samples.
+    """
     time, part = _curve(pools)
     rows = (part > 0.1) & (part < 0.9) & (time < _until(time, part, 0.9))
     if np.count_nonzero(rows) < 3 * LEAST_STEPS:

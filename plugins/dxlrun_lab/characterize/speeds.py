@@ -23,39 +23,42 @@ RISE = 0.2, 0.8
 _CRUISE = 0.95
 """Fraction of the highest speed above which a joint counts as cruising"""
 _FOLLOWS = 0.015
-"""Relative difference to the speed of the goal below which the goal limits the cruise, not the servo"""
+"""If the cruise differs from the goal's speed by less than this fraction, the goal limits it."""
 _SLOPE_NOISE = 0.01
-"""Allowed scatter of a slope by ticks, as a fraction of the top speed"""
+"""Allowed scatter of a speed by the ticks of positions, as a fraction of the top speed"""
 _LEAST_SAMPLES, _MOST_SAMPLES = 5, 41
-"""Smallest and largest number of samples of a slope"""
+"""Smallest and largest number of positions from which a speed is found"""
 _ROOM = 1.3
-"""Safety factor on the recommended range"""
+"""Safety factor on the range of motion that is recommended to reach the top speed"""
 
 
 class Move(msgspec.Struct, frozen=True):
-    """Evaluation of one long move"""
+    """Speeds of one long move of a joint; the joint cruises while it is nearly as fast as at its peak"""
 
     time: Floats
+    """Time since the goal's packet, s"""
     speed: Floats
-    """rad/s, positive towards the goal"""
+    """Speed at each time, rad/s, positive towards the goal"""
     highest: float
-    """Mean speed of the cruise, or else the peak, rad/s"""
+    """Mean speed of the cruise, or the peak without one, rad/s"""
     cruised_s: float
+    """Duration of the cruise, s"""
     cruised: bool
     """True if the joint cruised for at least as long as it accelerated, so that `highest` is its top speed"""
     rise_s: float
-    """Time between the fractions `RISE` of the highest speed, s; NaN if not seen"""
+    """Time of acceleration between the fractions `RISE` of the highest speed, s; NaN if not seen"""
     fall_s: float
+    """Time of braking between these fractions, s; NaN if not seen"""
     drift: float
     """Half of the speed difference between the two halves of the cruise, rad/s"""
     half_width_s: float
-    """Half-width of the window of slopes, s"""
+    """Half-width of the window of positions from which each speed is found, s"""
     follows: bool
     """True if the joint was exactly as fast as its goal, so the servo may be faster"""
 
 
 def move_of(step: Step) -> Move | None:
-    """Evaluate a move. Return None if the joint hardly moved."""
+    """Evaluate the recording of a long move. Return None if the joint hardly moved."""
     way, tick = step.way, step.tick
     total = float(np.max(way))
     if total < LEAST_TICKS * tick:
@@ -99,7 +102,10 @@ def move_of(step: Step) -> Move | None:
 
 
 def _half_width(period: float, tick: float, speed: float) -> float:
-    """Return the half-width of the window of slopes, s, that keeps the scatter below _SLOPE_NOISE."""
+    """Return the half-width, s, of the window of positions from which a speed (rad/s) is found.
+
+    It is the shortest one that keeps the scatter by the tick (rad) below _SLOPE_NOISE.
+    """
     for count in range(_LEAST_SAMPLES, _MOST_SAMPLES, 2):
         scatter = tick / math.sqrt(12) / (period * math.sqrt(count * (count**2 - 1) / 12))
         if scatter <= _SLOPE_NOISE * speed:
@@ -108,7 +114,7 @@ def _half_width(period: float, tick: float, speed: float) -> float:
 
 
 def speeds(steps: Sequence[Step], range_rad: float, own_speed: float) -> tuple[Measured, Measured, Measured]:
-    """Return top speed, acceleration and braking.
+    """Return three figures: top speed, acceleration and braking.
 
     Args:
         steps: Long moves.
@@ -150,7 +156,7 @@ def _top(moves: Sequence[Move], range_rad: float, own_speed: float, how: str) ->
 
 
 def _needed_range(moves: Sequence[Move], own_speed: float) -> float | None:
-    """Return the range in which the joint would cruise, deg, or None without acceleration or braking."""
+    """Return the range of motion in which the joint would reach its top speed, deg; None if unknown."""
     whole = [move for move in moves if math.isfinite(move.rise_s + move.fall_s)]
     if not whole:
         return None
@@ -166,7 +172,8 @@ def _needed_range(moves: Sequence[Move], own_speed: float) -> float | None:
 
 
 def _change(name: str, moves: Sequence[Move], times: Sequence[float], period: float, how: str) -> Measured:
-    """Return the mean acceleration between the fractions `RISE` of the highest speed, rad/s^2."""
+    """Return the figure of acceleration or braking (`name`), rad/s^2, from each move's time (s) between the
+    fractions `RISE` of its highest speed."""
     part = RISE[1] - RISE[0]
     known = [(move.highest, time) for move, time in zip(moves, times, strict=True) if math.isfinite(time)]
     if len(known) < max(2, len(moves) // 2):

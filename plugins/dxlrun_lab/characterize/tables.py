@@ -10,11 +10,11 @@ from dxlrun_lab.characterize.measured import Measured
 from dxlrun_lab.characterize.procedure import Characterized, Found
 
 _SHOWN = {"rad": ("deg", math.degrees(1.0)), "s": ("ms", 1e3)}
-"""Units of the tables. The JSON output has SI units."""
+"""Units of the tables by SI unit, with the factor. The JSON output has SI units."""
 
 
 def results(found: Characterized) -> dict[str, object]:
-    """Return the JSON content of a result, in SI units; angles in rad."""
+    """Return the content of the JSON output of `dxlrun characterize`, in SI units; angles in rad."""
     return {
         "robot": found.robot,
         "complete": not found.why,
@@ -36,7 +36,7 @@ def results(found: Characterized) -> dict[str, object]:
 
 
 def parts(found: Characterized) -> Iterator[Part]:
-    """Yield a table for each joint, and the reason for each figure that was not measured."""
+    """Yield the terminal output: a table for each joint, and why figures were not measured."""
     for joint in found.joints:
         yield table(joint)
         for one in joint.figures:
@@ -47,7 +47,7 @@ def parts(found: Characterized) -> Iterator[Part]:
 
 
 def table(found: Found) -> Table:
-    """Return the table of a joint."""
+    """Return the table of a joint, one row per figure."""
     joint = found.joint
     lower, upper = math.degrees(joint.lower), math.degrees(joint.upper)
     columns = (

@@ -21,12 +21,15 @@ from dxlwire import BITS_PER_BYTE, BusPlan, ServoPlan
 
 
 class Trace(msgspec.Struct, frozen=True):
-    """Goals and positions of a joint, one row per cycle with an intact reply; times in s"""
+    """Goals and positions of a joint, one row per cycle with an intact reply
+
+    Times are s since the wake-up of the recording's first cycle.
+    """
 
     time: Floats
-    """Time of the position in the servo"""
+    """Time at which the servo had the position"""
     position: Floats
-    """rad"""
+    """Position of the joint, rad"""
     sent: Floats
     """Time at which the last byte of the cycle's goal was transmitted; later than `time`"""
     goal: Floats
@@ -36,7 +39,10 @@ class Trace(msgspec.Struct, frozen=True):
 
     @classmethod
     def of(cls, recorded: Recorded, joint: Joint, buses: Sequence[BusPlan]) -> Self:
-        """Return the trace of a joint in a recording. Rows without an intact reply are omitted."""
+        """Extract the trace of a joint from a recording. Cycles without an intact reply are omitted.
+
+        The delays of the bus are those of the plan in `buses`.
+        """
         column = recorded.joints.index(joint.name)
         reply_ns, goal_ns = _on_the_wire(joint.servo, buses)
         taken_ns = recorded.of_cycles("read_ns") - recorded.of_joints("age_ns")[:, column] - reply_ns
@@ -61,12 +67,15 @@ class Trace(msgspec.Struct, frozen=True):
         return float(np.median(np.diff(self.time))) if len(self) > 1 else math.nan
 
     def part(self, rows: slice | NDArray[np.bool_]) -> Trace:
-        """Return a part of the rows."""
+        """Return a trace with some of the rows."""
         return Trace(self.time[rows], self.position[rows], self.sent[rows], self.goal[rows], self.tick)
 
 
 def _on_the_wire(servo: ServoPlan, buses: Sequence[BusPlan]) -> tuple[int, int]:
-    """Return the delays of a servo's state to the host and of a goal to the servo, ns, by the plan."""
+    """Return the computed delays, ns, of a servo's state to the host and of a goal to the servo.
+
+    Raises LookupError if no bus of the plan has the servo.
+    """
     for bus in buses:
         if servo not in bus.servos:
             continue
@@ -85,7 +94,7 @@ def _on_the_wire(servo: ServoPlan, buses: Sequence[BusPlan]) -> tuple[int, int]:
 
 
 def slopes(time: Floats, values: Floats, half_width: float) -> Floats:
-    """Return the slope of a straight line through the samples within `half_width`, s, of each sample.
+    """Return the derivative at each sample: the slope of a line through the samples within `half_width`, s.
 
     This is the first derivative of A. Savitzky and M. J. E. Golay (Anal. Chem. 36, 1964), for times that need
     not be evenly spaced. It is NaN with fewer than two samples.

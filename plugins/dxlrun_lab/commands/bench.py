@@ -1,4 +1,4 @@
-"""`dxlrun bench`: how fast does this machine run a robot?"""
+"""`dxlrun bench rate`: the highest loop rate that a robot keeps on this machine."""
 
 from __future__ import annotations
 

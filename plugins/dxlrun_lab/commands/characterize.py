@@ -1,4 +1,4 @@
-"""`dxlrun characterize`: what can the servos of a robot do?"""
+"""`dxlrun characterize`: response, speed, dead band, highest rate and longest command gap of servos."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""`dxlrun convert`: a motion file from a log."""
+"""`dxlrun convert`: writes the motion that a log recorded to a motion file."""
 
 from __future__ import annotations
 
@@ -74,7 +74,10 @@ def convert(
 
 
 def _where(motion: RecordedMotion) -> str:
-    """Describe a recording on one line, with unprintable characters of the file name replaced."""
+    """Describe the source of a motion on one line: file, time, and joints by goals or states.
+
+    Unprintable characters of the file name are replaced.
+    """
     name = "".join(letter if letter.isprintable() else "?" for letter in str(motion.path))
     end_s = motion.begin_s + motion.duration_s
     goals = [joint for joint, what in zip(motion.joints, motion.what, strict=True) if what == "goals"]

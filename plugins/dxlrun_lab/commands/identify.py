@@ -128,7 +128,7 @@ def _check(duration: float, inertia: float | None, gravity: float | None, voltag
 
 
 def _check_output(target: Path, joints: tuple[str, ...]) -> None:
-    """Raise InputError before anything moves if the motor file cannot be written."""
+    """Raise InputError if the motor file of --output cannot be written, or several joints are named."""
     if len(joints) != 1:
         raise InputError("--output takes the motor file of one joint; name that joint only")
     check_target(target)

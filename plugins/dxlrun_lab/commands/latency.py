@@ -1,4 +1,4 @@
-"""`dxlrun latency`: how late does this machine wake a loop up?"""
+"""`dxlrun latency`: measures how late this machine wakes up a loop, without a robot."""
 
 from __future__ import annotations
 
@@ -106,7 +106,10 @@ def latency(
 def _measured(
     settings: Settings, stress: bool, place: Path | None, report: Path | None, *, as_json: bool
 ) -> int:
-    """Measure, then write and show the results. Return the exit code."""
+    """Measure, then write log and report and show the results. Return the exit code.
+
+    `place` is the file or directory of the log; None for no log.
+    """
     from dxlrun_lab.latency.measurement import (
         Measured,
         compiled_yardstick,
@@ -218,7 +221,7 @@ def _cores(text: str | None) -> tuple[int, ...]:
 
 
 def _log_place(log: Path | None, record: bool) -> Path | None:
-    """Return the file or directory of the log, or None without a log."""
+    """Return the .mcap file, or the directory for a new log, from --log and --record; None without a log."""
     if not record:
         return None
     if log is None:

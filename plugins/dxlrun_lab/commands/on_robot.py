@@ -1,4 +1,4 @@
-"""Experiments on a robot: common options, choice of the robot, countdown, and abort.
+"""Experiments of commands on a robot: common options, choice of the robot, confirmation, countdown, abort.
 
 dxlrun characterize robots/single_joint.yaml port:=/dev/ttyUSB0 joint --range joint=-20deg..20deg
 dxlrun identify elbow --robot arm
@@ -35,7 +35,7 @@ if TYPE_CHECKING:
 
 R = TypeVar("R")
 COUNTDOWN_S = 3, 1.0
-"""Number of counts, and duration of each, s"""
+"""Countdown before a real joint moves: number of counts, and duration of each, s"""
 _LOOK_S = 0.1
 INTERRUPTED = 130
 NOTHING_MOVED = "nothing was moved"
@@ -76,15 +76,17 @@ DEFAULTS = OnRobot()
 
 
 class Chosen(NamedTuple):
-    """Arguments of a command line: an optional robot file with its arguments, and joints"""
+    """Parsed arguments of a command: `[ROBOT.yaml [arg:=value ...]] JOINT ...`"""
 
     file: Path | None
+    """Robot file; None for a running robot"""
     assignments: tuple[str, ...]
+    """Arguments of the robot file: `arg:=value`"""
     joints: tuple[str, ...]
 
     @classmethod
     def of(cls, words: Sequence[str]) -> Chosen:
-        """Parse the words. Raises InputError for arguments without a robot file."""
+        """Split the words of a command line. Raises InputError for `arg:=value` without a robot file."""
         rest = list(words)
         file = None
         if rest and (rest[0].endswith((".yaml", ".yml")) or os.sep in rest[0]):
@@ -100,17 +102,19 @@ class Chosen(NamedTuple):
 
 
 class Ran(msgspec.Struct, Generic[R], frozen=True):
-    """Outcome of an experiment on a robot"""
+    """Outcome of an experiment on a robot: its result, and how it ended"""
 
     result: R | None
-    """Result; None if nothing was recorded"""
+    """Result of the experiment; None if nothing was recorded"""
     robot: str
     log: Path | None
+    """Log of the run"""
     why: str
     """Reason for an early end, one sentence; empty on success"""
     problems: tuple[str, ...]
     """State that was not restored, and errors of a run that the command started"""
     interrupted: bool
+    """True if the user aborted or did not confirm"""
 
     @property
     def failures(self) -> tuple[str, ...]:
@@ -124,19 +128,20 @@ class Ran(msgspec.Struct, Generic[R], frozen=True):
 
 
 class Course(msgspec.Struct, frozen=True):
-    """Settings in which an experiment and a recorded motion differ"""
+    """Settings of `perform_on` in which an experiment and the playback of a recorded motion differ"""
 
     name: str = "the experiment"
+    """Name in messages"""
     ranges: Mapping[str, tuple[float, float]] | None = {}
     """Ranges of joints by `--range`, rad; None for their limits"""
     back: bool = True
     """True if the joints move back to their start at the end"""
     expected: tuple[str, ...] | None = None
-    """Description of the motions for the question before the start of a run; None for joints and ranges"""
+    """Sentences that describe the motions before a run is started; None for joints and their ranges"""
 
 
 def run_on_robot(experiment: Experiment[R], words: Sequence[str], options: OnRobot = DEFAULTS) -> Ran[R]:
-    """Perform an experiment on the robot of a command line. See perform_on."""
+    """Perform an experiment on the robot, the joints and the ranges of a command line. See perform_on."""
     from dxlrun_lab.guided.choice import parse_ranges
 
     chosen = Chosen.of(words)
@@ -147,7 +152,9 @@ def run_on_robot(experiment: Experiment[R], words: Sequence[str], options: OnRob
 def perform_on(
     experiment: Experiment[R], chosen: Chosen, plan: Plan | None, options: OnRobot, course: Course
 ) -> Ran[R]:
-    """Perform an experiment. Start the run of a plan, or use a running robot without one.
+    """Perform an experiment with confirmation, countdown and abort, and return its outcome.
+
+    The run of `plan` is started for it; without a plan, the running robot is used.
 
     Progress is printed to stderr, and the caller shows the result. The confirmation for real joints precedes
     the start of a run, because a run enables torque.
@@ -202,7 +209,7 @@ def perform_on(
 
 
 def _ended(ran: Ran[R], performed: Performed, course: Course) -> Ran[R]:
-    """Print the problems of an outcome, and return it."""
+    """Print to stderr why an experiment ended early, and what was not restored; return the outcome."""
     if ran.why:
         kept = len(performed.recorded) if course.ranges is not None else 0
         left = f"; {counted(kept, 'piece', 'pieces')} measured before that" if kept else ""
@@ -213,7 +220,10 @@ def _ended(ran: Ran[R], performed: Performed, course: Course) -> Ran[R]:
 
 
 def _plan_of(chosen: Chosen, ranges: Mapping[str, tuple[float, float]], options: OnRobot) -> Plan | None:
-    """Return the plan of a robot file, or None without a file. Joints and ranges are checked."""
+    """Compile the chosen robot file to a plan, or return None without a file.
+
+    Raises InputError for mistakes in joints, ranges and options.
+    """
     from dxlrun_lab.guided.choice import check_joints
 
     if chosen.file is not None:
@@ -228,9 +238,9 @@ def _plan_of(chosen: Chosen, ranges: Mapping[str, tuple[float, float]], options:
 
 
 def _rig(chosen: Chosen, plan: Plan | None, options: OnRobot, aborting: Aborting) -> Rig | None:
-    """Return the run of the experiment: on virtual time, started here, or already running.
+    """Return access to the run: on virtual time, started as a child process, or already running (no plan).
 
-    Returns None if the user aborted.
+    Returns None if the user aborted while it started.
     """
     from dxlrun_lab.guided.own_run import OwnRun
     from dxlrun_lab.guided.rig import live_rig, require_whole
@@ -291,7 +301,10 @@ def _real(plan: Plan, options: OnRobot) -> bool:
 def _start_confirmed(
     plan: Plan, names: Sequence[str], options: OnRobot, course: Course, aborting: Aborting
 ) -> bool:
-    """Ask for confirmation before a run is started. Return True if no real joint will move."""
+    """Describe the motions and ask for confirmation before a run is started. Return True if confirmed.
+
+    No question is asked if no real joint will move.
+    """
     from dxlrun_lab.guided.choice import range_text
 
     if not _real(plan, options):
@@ -308,7 +321,9 @@ def _start_confirmed(
 
 
 def _confirmed(plan: Plan, options: OnRobot, aborting: Aborting) -> bool:
-    """Ask for confirmation before a real joint moves.
+    """Ask for confirmation before a real joint moves; return False if it is declined or aborted.
+
+    Simulated servos and --yes need no confirmation.
 
     Raises:
         InputError: stdin is not a terminal and --yes was not given.
@@ -386,7 +401,7 @@ class Aborting:
 
     @contextmanager
     def by_any_key(self) -> Iterator[None]:
-        """Read single keys from the terminal. The terminal is restored afterwards."""
+        """Let any key abort in this context. The terminal, if there is one, is restored afterwards."""
         if not self.has_keys:
             yield
             return
@@ -404,7 +419,7 @@ class Aborting:
             termios.tcsetattr(descriptor, termios.TCSADRAIN, before)
 
     def __call__(self) -> str | None:
-        """Return the reason to abort the experiment, or None."""
+        """Return the reason why the user aborted the experiment, or None; polls the keys."""
         if self.reason is None and self._keys and select.select([sys.stdin], [], [], 0)[0]:
             # An empty read means that the terminal was closed, so no key could abort.
             self.reason = "aborted by a key" if os.read(sys.stdin.fileno(), 64) else "the terminal is gone"

@@ -60,7 +60,7 @@ class RecordedPart:
 
     @property
     def tolerance_rad(self) -> float | None:
-        """Tolerance, rad, or None without one. Raises InputError for an invalid tolerance."""
+        """Value of --tolerance, rad, or None if it was not given. Raises InputError if it is invalid."""
         if self.tolerance is None:
             return None
         from dxlrun.tooling.verbs import angle
@@ -76,7 +76,10 @@ class RecordedPart:
         return allowed
 
     def read(self, log: Path) -> RecordedMotion:
-        """Read the motion, and print warnings about unreadable parts. Raises InputError."""
+        """Read this part of a recording as a motion, and print warnings about it. Raises InputError.
+
+        `log` is a log of dxlrun, a foreign MCAP file or a ROS 2 bag.
+        """
         from dxlrun_analysis.playback.recorded_motion import Stretch, parse_names
         from dxlrun_analysis.playback.sources import read_motion
 
@@ -126,7 +129,15 @@ NOWHERE = PlayedOn()
 def play_recorded(
     log: Path, chosen: Chosen, played_on: PlayedOn, part: RecordedPart, *, as_json: bool
 ) -> int:
-    """Play a recorded motion on the robot of `chosen`. Return the exit code."""
+    """Play a part of a recording on a robot, and show how well it was followed. Return the exit code.
+
+    Args:
+        log: Recording.
+        chosen: Robot file with its arguments. Its joints are those of the motion.
+        played_on: Speed, and other options of the command.
+        part: Part of the recording.
+        as_json: Print the result as JSON.
+    """
     from dxlrun_analysis.playback.rows import rows_of
     from dxlrun_lab.playback import Playback
 

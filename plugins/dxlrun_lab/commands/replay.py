@@ -1,4 +1,4 @@
-"""`dxlrun replay`: run the controllers of a log again."""
+"""`dxlrun replay`: runs the controllers of a log again with its inputs, or plays its motion on a robot."""
 
 from __future__ import annotations
 

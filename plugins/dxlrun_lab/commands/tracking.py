@@ -1,4 +1,4 @@
-"""`dxlrun experiment tracking`: how well a motion is followed, by four ways to send it."""
+"""`dxlrun experiment tracking`: measures how well a joint follows a motion that is sent in four set-ups."""
 
 from __future__ import annotations
 

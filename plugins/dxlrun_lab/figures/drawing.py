@@ -1,4 +1,4 @@
-"""Drawing of figures as SVG with the colours of the page, with downsampling of long series.
+"""Drawing of the figures of HTML reports: SVG by matplotlib with the colours of the page, downsampling.
 
 matplotlib is only imported in this package, because the import takes seconds. `Figure` is used without
 pyplot, so nothing is kept globally and no display is needed.
@@ -33,8 +33,8 @@ ROLES = dict(
         strict=True,
     )
 )
-"""Roles of the placeholder colours. The style sheet of the page defines each role, in light and in dark mode.
-"""
+"""Roles of the placeholder colours above. In the SVG, each becomes the CSS variable of its role, which the
+page's style sheet defines for light and dark mode."""
 
 _STYLE: dict[str, object] = {
     "axes.axisbelow": True,
@@ -78,7 +78,7 @@ _REFERENCE = re.compile(r"(?<=url\(#)[\w.-]+|(?<=href=\"#)[\w.-]+")
 def draw(  # noqa: PLR0917  what the figure shows, from its name to its size
     name: str, title: str, alt: str, text: str, height: float, fill: Callable[[Figure], None]
 ) -> ET.Element:
-    """Draw a figure as an element of a page.
+    """Draw a figure with matplotlib, and return it as an element of an HTML report.
 
     Args:
         name: Identifier, unique in the page, of letters, digits and dashes.
@@ -97,7 +97,10 @@ def draw(  # noqa: PLR0917  what the figure shows, from its name to its size
 
 
 def _svg(text: str, name: str, about: Sequence[tuple[str, str]]) -> ET.Element:
-    """Convert matplotlib's SVG for a page: unique identifiers, title, description, and the page's colours."""
+    """Convert matplotlib's SVG text for a page: unique identifiers, the page's colours, title, description.
+
+    `name` is the figure's identifier; `about` has the tags and texts of title and description.
+    """
     for colour, role in ROLES.items():
         text = text.replace(colour, f"var(--{role})")
     root = ET.fromstring(text)  # noqa: S314  written by matplotlib, a moment ago
@@ -124,7 +127,7 @@ def _svg(text: str, name: str, about: Sequence[tuple[str, str]]) -> ET.Element:
 
 
 def _named(key: str, value: str, name: str) -> str:
-    """Return the value of an attribute, with the identifier in it made unique in the page."""
+    """Return the value of an SVG attribute, with `name` before an identifier in it."""
     if key == "id":
         return f"{name}-{value}"
     if key.endswith("href"):
@@ -133,7 +136,7 @@ def _named(key: str, value: str, name: str) -> str:
 
 
 def reduced(x: Floats, y: Floats) -> tuple[Floats, Floats]:
-    """Downsample to the minimum and the maximum in each of 900 columns.
+    """Downsample a series to the minimum and the maximum in each of 900 columns; return x and y.
 
     Args:
         x: Shape (samples,).

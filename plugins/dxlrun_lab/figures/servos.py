@@ -30,20 +30,24 @@ _PARTS_SHOWN = 4  # time axis of steps, in multiples of the longest response tim
 
 
 class Mark(NamedTuple):
-    """Line at a measured value, with its confidence interval"""
+    """Vertical line of a figure at a measured value, with its confidence interval"""
 
     name: str
     value: float
+    """Position on the horizontal axis"""
     uncertainty: float
+    """Half-width of the interval"""
 
 
 class Points(NamedTuple):
-    """Values that were tried, with marks of those that failed"""
+    """Series of a figure: values that were tried (x), and the result of each (y)"""
 
     name: str
+    """Name in the legend; empty for none"""
     x: Floats
     y: Floats
     failed: Sequence[bool]
+    """True for each value that failed, which is crossed"""
 
 
 def curves_drawing(  # noqa: PLR0917  what the figure shows, from its name to its marks
@@ -55,7 +59,10 @@ def curves_drawing(  # noqa: PLR0917  what the figure shows, from its name to it
     levels: Sequence[float],
     marks: Sequence[Mark] = (),
 ) -> Element:
-    """Draw superimposed curves with dashed levels, and marks on the horizontal axis."""
+    """Draw superimposed curves, dashed horizontal levels, and marks on the horizontal axis.
+
+    `name` is the identifier in the page, `text` the caption, and `labels` are those of the axes.
+    """
     x_label, y_label = labels
 
     def fill(figure: Figure) -> None:
@@ -83,7 +90,10 @@ def points_drawing(  # noqa: PLR0917  what the figure shows, from its name to it
     x_label: str,
     y_label: str,
 ) -> Element:
-    """Draw points that were tried, successful ones filled and failed ones crossed, with a level."""
+    """Draw series of tried values, successful ones filled and failed ones crossed.
+
+    `name` is the identifier in the page, `text` the caption, and `level` a named dashed horizontal line.
+    """
 
     def fill(figure: Figure) -> None:
         axes = figure.add_subplot(xlabel=x_label, ylabel=y_label)

@@ -1,4 +1,4 @@
-"""Choice: joints of an experiment, and the range in which each may move."""
+"""Choice of an experiment's joints, and of the range in which each may move, from the command line."""
 
 from __future__ import annotations
 
@@ -26,7 +26,10 @@ _SLACK = 1e-9
 
 
 def parse_ranges(words: Sequence[str]) -> dict[str, tuple[float, float]]:
-    """Parse ranges such as `JOINT=-30deg..30deg`, rad. Raises InputError with all mistakes."""
+    """Parse options `--range` such as `JOINT=-30deg..30deg` to lower and upper end by joint, rad.
+
+    Raises InputError with all mistakes.
+    """
     ranges: dict[str, tuple[float, float]] = {}
     mistakes: list[str] = []
     for word in words:
@@ -58,7 +61,7 @@ def check_joints(
 ) -> None:
     """Raise InputError with all mistakes in the joints and ranges of a command line.
 
-    The check needs no run. Checks that depend on the positions of joints follow later.
+    The check needs no run. `situation_of` makes the checks that depend on positions.
     """
     plans = {joint.name: joint for joint in joints}
     known = tuple(plans)
@@ -86,7 +89,7 @@ def check_joints(
 
 
 def whole_situation(rig: Rig, names: Sequence[str]) -> Situation:
-    """Return the situation of a motion that has already been checked against the limits of its joints.
+    """Return the situation of a motion for which the range of each joint is that of its position limits.
 
     A servo may overshoot a limit by up to OVERSHOOT. Raises InputError as situation_of.
     """
@@ -100,13 +103,16 @@ def whole_situation(rig: Rig, names: Sequence[str]) -> Situation:
 
 
 def _within_all(plan: JointPlan) -> tuple[float, float]:
-    """Return the limits of a joint; of one without any a range that it does not leave, rad."""
+    """Return the position limits of a joint, rad; without limits, a range that it cannot leave."""
     lower, upper = _limits(plan)
     return max(lower, -_FAR), min(upper, _FAR)
 
 
 def situation_of(rig: Rig, names: Sequence[str], ranges: Mapping[str, tuple[float, float]]) -> Situation:
-    """Return what an experiment begins with. Raises InputError with everything that speaks against it."""
+    """Return the joints of an experiment with their ranges and present positions.
+
+    Raises InputError with all reasons against it: unknown joints, active controllers, torque off, ranges.
+    """
     plans = {joint.name: joint for joint in rig.plan.loop.joints}
     check_joints(names, ranges, rig.plan.loop.joints)
     servos = rig.plan.servos_by_joint
@@ -127,7 +133,10 @@ def situation_of(rig: Rig, names: Sequence[str], ranges: Mapping[str, tuple[floa
 
 
 def require_own_servos(plan: Plan, names: Sequence[str], command: str, *, gears: bool) -> None:
-    """Raise InputError unless each joint is rotary and has a single servo; `gears` allows a gear ratio."""
+    """Raise InputError unless each named joint is rotary and has a single servo; `gears` allows a gear ratio.
+
+    `command` is the name for the message.
+    """
     alone = f"`dxlrun {command}` measures one servo: describe it as a joint of its own in another robot file"
     mistakes = []
     for joint in plan.loop.joints:
@@ -146,7 +155,10 @@ def require_own_servos(plan: Plan, names: Sequence[str], command: str, *, gears:
 
 
 def _taken(rig: Rig, names: Sequence[str], controllers: Sequence[RunningController]) -> list[str]:
-    """Return the conflicts of an experiment with other commands of the run, one sentence each."""
+    """Return what prevents an experiment in the run: pause, another experiment, controllers of its joints.
+
+    Each is a sentence with a fix.
+    """
     robot = rig.plan.robot
     if rig.paused:
         return [f"{robot} is paused; resume it first: dxlrun resume --robot {robot}"]
@@ -177,7 +189,7 @@ def _degrees(lower: float, upper: float) -> str:
 
 
 def range_text(plan: JointPlan, given: tuple[float, float] | None) -> str:
-    """Format the range of a joint whose position is still unknown."""
+    """Describe the range of a joint before its position is known: `--range`, or the default."""
     if given is not None:
         return f"{_degrees(*given)} (--range)"
     reach = math.degrees(DEFAULT_REACH)
@@ -185,7 +197,7 @@ def range_text(plan: JointPlan, given: tuple[float, float] | None) -> str:
 
 
 def _range_problem(plan: JointPlan, given: tuple[float, float] | None) -> str:
-    """Return the problem with a joint's range, whatever its position, or an empty text."""
+    """Return the problem with a joint's range (rad; None for the default), whatever its position, or ''."""
     lower, upper = _limits(plan)
     if given is None:
         if math.isfinite(lower) and math.isfinite(upper) and not plan.continuous:
@@ -203,7 +215,10 @@ def _range_problem(plan: JointPlan, given: tuple[float, float] | None) -> str:
 
 
 def _range_of(plan: JointPlan, now: JointNow, given: tuple[float, float] | None) -> tuple[float, float, str]:
-    """Return the range of a joint, rad, and its origin. Raises ValueError if no range is possible."""
+    """Return lower and upper end of a joint's range, rad, and a description of its origin.
+
+    Raises ValueError if the joint has no torque, or is outside of the range or its limits.
+    """
     name, position = plan.name, now.position
     if now.torque not in TORQUED:
         raise ValueError(

@@ -1,4 +1,4 @@
-"""Experiment: a procedure of segments and the evaluation of their recordings, performed on a rig.
+"""Experiment: plays tables of goals (segments) on joints of a run, and evaluates their recordings.
 
 At the end, the controllers, their activity and the loop rate of the run are always restored.
 """
@@ -21,17 +21,17 @@ from dxlrun_lab.guided.segment import Guard, Interface, Recorded, Segment
 from dxlwire import Mode, ServoPlan, mode_of
 
 APPROACH_RAD_S: Final = 0.5
-"""Highest speed on the way to the start of a segment, rad/s"""
+"""Highest speed of joints that are moved to the start of a segment, rad/s"""
 _NEAR_RAD: Final = 0.005
 """Distance within which a joint counts as at its start, rad"""
 _APPROACH_PERIOD_S: Final = 0.02
 _PIECE_NUMBERS: Final = 2000
 """Numbers of a table in one command: 16 KiB, which gateway and loop process without being late"""
 _EXTRA_S: Final = 5.0
-"""Additional time for the goal of a segment, s"""
+"""Time beyond its duration after which a segment is cancelled, s"""
 PLAYER: Final = "experiment"
-"""Prefix of the names of loaded controllers; the interface follows. Two experiments cannot run at once,
-because the names would be the same."""
+"""Prefix of the names of the sample_players that an experiment loads; the interface follows. Two experiments
+cannot run at once, because the names would be the same."""
 
 Procedure = Generator[Segment, Recorded, None]
 Abort = Callable[[], str | None]
@@ -73,7 +73,7 @@ class Joint(msgspec.Struct, frozen=True):
 
 
 class Situation(msgspec.Struct, frozen=True):
-    """Initial situation of an experiment"""
+    """Joints, loop rate and plan of a run before an experiment"""
 
     joints: tuple[Joint, ...]
     """Joints of the experiment, in the order of the command line"""
@@ -81,10 +81,11 @@ class Situation(msgspec.Struct, frozen=True):
     """Loop rate, Hz"""
     plan: Plan
     virtual: bool = False
+    """True on virtual time, with simulated servos"""
 
     @property
     def names(self) -> tuple[str, ...]:
-        """Names of the joints"""
+        """Names of the experiment's joints"""
         return tuple(joint.name for joint in self.joints)
 
 
@@ -104,7 +105,7 @@ class Experiment(Protocol[R_co]):
         ...
 
     def finish(self, situation: Situation, recorded: Sequence[Recorded], why: str) -> R_co:
-        """Evaluate the recordings.
+        """Evaluate the recordings of all segments, and return the result of the experiment.
 
         Args:
             situation: Initial situation.
@@ -115,13 +116,14 @@ class Experiment(Protocol[R_co]):
 
 
 class Performed(msgspec.Struct, frozen=True):
-    """Outcome of an experiment"""
+    """Recordings of an experiment, before their evaluation"""
 
     recorded: tuple[Recorded, ...]
+    """Recording of each segment that was played; the last one may be incomplete"""
     why: str = ""
     """Reason for an early end, one sentence; empty on success"""
     not_restored: tuple[str, ...] = ()
-    """State that was not restored, one sentence each"""
+    """State of the run that could not be restored, one sentence each"""
 
 
 class _Ended(Exception):
@@ -129,7 +131,7 @@ class _Ended(Exception):
 
 
 class _Unfit(Exception):
-    """Segment that does not fit the run, for the reason in `refusal`"""
+    """Error of a segment that the run cannot play, for the reason in `refusal`"""
 
     def __init__(self, refusal: Refused) -> None:
         super().__init__(str(refusal))
@@ -145,10 +147,10 @@ def perform(
     *,
     back: bool = True,
 ) -> Performed:
-    """Play the segments of an experiment, and always restore the run.
+    """Play and record the segments of an experiment, and always restore the run. Nothing is evaluated.
 
     Args:
-        rig: Run.
+        rig: Run of the experiment.
         experiment: Experiment.
         situation: Initial situation.
         abort: Function that returns a reason to abort.
@@ -197,7 +199,7 @@ def _play_all(
 
 
 class _Stage:
-    """Run during an experiment"""
+    """Run during an experiment: moves its joints by sample_player controllers, and restores it at the end"""
 
     def __init__(self, rig: Rig, situation: Situation, abort: Abort) -> None:
         self.rig, self.situation, self.abort = rig, situation, abort
@@ -214,10 +216,11 @@ class _Stage:
     # Forward
 
     def begin(self, segment: Segment) -> None:
-        """Prepare a segment: move the joints to its start, and set the loop rate and the player.
+        """Prepare a segment: move the joints to its start, set the loop rate, and activate its sample_player.
 
         Raises:
-            _Unfit: The segment does not fit the run.
+            _Unfit: The run refuses the loop rate, or a servo lacks the mode.
+            _Ended: The user aborted, a joint has no torque, or the way to the start failed.
         """
         self._check()
         self._check_modes(segment.interface)
@@ -235,7 +238,7 @@ class _Stage:
         self._activate(segment.interface, segment.guard)
 
     def play(self, segment: Segment) -> Recorded:
-        """Play a segment and return its recording."""
+        """Play a prepared segment to its end or an abort, and return its recording."""
         names = self.situation.names
         plan_joints = [joint.name for joint in self.situation.plan.loop.joints]
         goal = self._send(segment)
@@ -278,7 +281,10 @@ class _Stage:
             raise _Ended(text or f"the way to the start was {outcome}")
 
     def _send(self, segment: Segment) -> int:
-        """Send the table of a segment in pieces that fit into a cycle. Return the number of its goal."""
+        """Send a segment's table to the active sample_player, in pieces that fit into a cycle.
+
+        Returns the number of the goal that plays it.
+        """
         joints = self.situation.names
         now = self.rig.joints()
         still = 0.0
@@ -305,7 +311,10 @@ class _Stage:
         return self.rig.send(self._player, "samples", last)
 
     def _activate(self, interface: Interface, guard: Guard) -> None:
-        """Activate the player of an interface in place of the joints' controllers. Load it if necessary."""
+        """Activate the sample_player of an interface and a guard in place of the active controllers.
+
+        It is loaded if necessary.
+        """
         name = self._players.get((interface, guard))
         if name is not None and name == self._player:
             return
@@ -364,7 +373,7 @@ class _Stage:
     # Back
 
     def restore(self) -> tuple[str, ...]:
-        """Restore the run. Return a sentence for each failure, without raising."""
+        """Restore controllers and loop rate of the run. Return a sentence for each failure; raise nothing."""
         problems: list[str] = []
         try:
             for step in self._steps_back():
@@ -379,7 +388,7 @@ class _Stage:
         return tuple(dict.fromkeys(problems))
 
     def _steps_back(self) -> Iterator[Callable[[], None]]:
-        """Yield the steps that restore the run. A failed step does not prevent the next ones."""
+        """Yield functions that restore the run in turn. A step that fails does not prevent the next ones."""
         now = {one.name: one for one in self.rig.controllers()}
         ours = [name for name in self._players.values() if name in now and now[name].active]
         missing = [name for name in self._active if name in now and not now[name].active]

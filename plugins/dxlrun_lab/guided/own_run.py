@@ -1,4 +1,4 @@
-"""Run that is started for an experiment as a child process, and ends with the experiment."""
+"""Run of `dxlrun` that is started for an experiment as a child process, and ends with the experiment."""
 
 from __future__ import annotations
 
@@ -30,7 +30,7 @@ _POLL_S = 0.05
 
 
 class OwnRun:
-    """Run in a child process. Its output is only shown if it fails.
+    """Run of a robot in a child process. Its output is only shown if it fails.
 
     The process has its own session, so that Ctrl-C only reaches the experiment. It ends cleanly when the
     process of the experiment has exited.
@@ -50,7 +50,7 @@ class OwnRun:
         )
 
     def listening(self, abort: Callable[[], str | None]) -> RemoteRobot | None:
-        """Wait for the start of the run, and connect to it.
+        """Wait until the run listens and has had a cycle, and connect to it.
 
         Returns:
             The connection, or None if `abort` returned a reason.
@@ -93,7 +93,7 @@ class OwnRun:
         return found
 
     def _sentences(self) -> tuple[str, ...]:
-        """Return the failure reasons; empty on success."""
+        """Return the errors that the ended process printed, one sentence each; empty if it succeeded."""
         code = self._process.returncode
         if code == 0 or (code == 130 and self._stopping):
             return ()

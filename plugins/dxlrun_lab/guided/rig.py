@@ -1,4 +1,4 @@
-"""Rig: access of an experiment to a run, through the client of a running robot.
+"""Rig: what an experiment does with the run of a robot: read states, load controllers, send goals, record.
 
 The cycles are read from the log that the run is writing. On virtual time (virtual_rig.py) they come directly
 from the loop.
@@ -25,27 +25,27 @@ from dxlrun.tooling.records import Event, EventCode, GoalReport
 from dxlrun_lab.guided.own_run import OwnRun
 
 TORQUED = ("on", "doubt")
-"""Torque states of joints that can be moved (see channels/cycle.py)"""
+"""Names of the torque states in which a joint can be moved (see channels/cycle.py)"""
 _LOOK_S = 0.1
 _STOPPING_S = 3.0
 _LOG_S = 5.0
-"""Timeout for cycles to appear in the log, s. The recorder writes twice a second."""
+"""Timeout for the last cycle of a goal to appear in the log, s. The recorder writes twice a second."""
 Cycles = NDArray[np.void]
 Look = Callable[[], tuple[Cycles, Sequence[Event]]]
-"""Function that returns the cycles and events since its last call"""
+"""Function that returns the run's cycles and events since its last call"""
 
 
 class RunningController(NamedTuple):
-    """Controller of the run"""
+    """Controller that is loaded in the run"""
 
     name: str
     active: bool
     joints: tuple[str, ...]
-    """Joints that it commands"""
+    """Joints that it commands; empty for a broadcaster"""
 
 
 class JointNow(NamedTuple):
-    """State of a joint in the newest cycle; NaN if unknown"""
+    """State of a joint in the newest cycle; positions in rad, NaN if unknown"""
 
     position: float
     goal_position: float
@@ -54,7 +54,10 @@ class JointNow(NamedTuple):
 
 
 class Rig:
-    """Run of an experiment. All methods raise Refused with the reason of a refusal, and RunGone."""
+    """Run of an experiment, and the recording of its cycles.
+
+    Methods raise Refused if the run refuses a request, and RunGone if it has ended.
+    """
 
     def __init__(
         self,
@@ -66,7 +69,7 @@ class Rig:
         end: Callable[[], Sequence[str]] | None = None,
         now_s: Callable[[], float] | None = None,
     ) -> None:
-        """Start to record cycles.
+        """Connect the experiment to a run, whose cycles are recorded from now on.
 
         Args:
             robot: Connection to the run.
@@ -87,7 +90,7 @@ class Rig:
 
     @contextmanager
     def _asking(self) -> Iterator[RemoteRobot]:
-        """Convert connection errors to RunGone."""
+        """Yield the connection to the run; its connection errors become RunGone."""
         try:
             yield self.robot
         except (Refused, RunGone):
@@ -101,7 +104,7 @@ class Rig:
 
     @property
     def now_s(self) -> float:
-        """Time of the run, s"""
+        """Time for timeouts, s: monotonic, or virtual time"""
         return self._now_s()
 
     @property
@@ -115,7 +118,7 @@ class Rig:
         return bool(self._info()["paused"])
 
     def controllers(self) -> tuple[RunningController, ...]:
-        """Return the loaded controllers."""
+        """Return all loaded controllers of the run."""
         rows = self._info()["controllers"]
         return tuple(
             RunningController(
@@ -127,14 +130,14 @@ class Rig:
         )
 
     def joints(self) -> Mapping[str, JointNow]:
-        """Return the joints in the newest cycle."""
+        """Return the state of each joint of the robot in the newest cycle, by name."""
         with self._asking() as robot:
             states = robot.states()
         rows = zip(states.position.tolist(), states.goal_position.tolist(), states.torque, strict=True)
         return dict(zip(states.joints, starmap(JointNow, rows), strict=True))
 
     def load(self, name: str, entry: Mapping[str, object]) -> None:
-        """Load a controller while the run is paused."""
+        """Load a controller by its robot file entry, while the run is paused."""
         with self._pause() as robot:
             robot.load(name, entry)
 
@@ -145,7 +148,7 @@ class Rig:
 
     @contextmanager
     def _pause(self) -> Iterator[RemoteRobot]:
-        """Pause the run. A run that another client has paused is not resumed."""
+        """Pause the run, yield its connection, and resume it unless another client had paused it."""
         with self._asking() as robot:
             try:
                 robot.pause()
@@ -166,12 +169,15 @@ class Rig:
             robot.switch(activate, deactivate)
 
     def change_rate(self, rate: float) -> None:
-        """Run the loop at another rate, Hz."""
+        """Set the loop rate of the run, Hz."""
         with self._asking() as robot:
             robot.rate(rate)
 
     def send(self, controller: str, kind: str, command: Mapping[str, object]) -> int:
-        """Send a command, and keep all cycles from then on. Return the number of its goal, or 0."""
+        """Send a command to a controller; return the number of its goal, or 0 if it has none.
+
+        The recording starts again: earlier cycles are dropped.
+        """
         self._record()
         self._cycles, self._times = self._cycles[:1], {}
         with self._asking() as robot:
@@ -185,7 +191,7 @@ class Rig:
         per second of the run.
 
         Returns:
-            Outcome and text of the goal.
+            Status of the goal (`reached`, `cancelled` ...), and its text or the reason of the cancellation.
         """
         until = self.now_s + longest_s
         with self._asking() as robot:
@@ -201,7 +207,7 @@ class Rig:
         return end.status, end.text
 
     def recorded(self, goal: int) -> Cycles:
-        """Wait for the cycles of the last goal in the log, and return them.
+        """Wait until the cycles of the last sent goal are in the log, and return their records.
 
         They start with the cycle that accepted the goal, and end with the one in which it ended, or the last.
         """
@@ -220,7 +226,7 @@ class Rig:
         return cycles[int(np.searchsorted(written, begun_ns)) : end]
 
     def _whole(self, goal: int) -> bool:
-        """Return True if the cycle in which a goal ended has been recorded."""
+        """Return True if the cycle in which a goal ended has been read from the log."""
         ended_ns = self._times.get((goal, EventCode.GOAL_ENDED))
         return ended_ns is not None and bool((self._cycles[-1]["written_ns"][-1:] >= ended_ns).any())
 
@@ -235,7 +241,7 @@ class Rig:
                     self._times[report.goal, event.code] = event.t_ns
 
     def close(self) -> Sequence[str]:
-        """Close the connection, and end a run of the experiment's own. Return the errors of that run."""
+        """Close the connection, and end the run if it was started for the experiment; return its errors."""
         self.robot.close()
         return self._end()
 
@@ -244,7 +250,9 @@ _BEGUN_AND_ENDED = EventCode.GOAL_ACCEPTED, EventCode.GOAL_ENDED
 
 
 def live_rig(robot: RemoteRobot, run: OwnRun | None = None) -> Rig:
-    """Return the rig of a running robot; `run` is the process if it was started for the experiment.
+    """Return the rig of a robot that runs in real time, whose cycles are read from its log.
+
+    `run` is its process if it was started for the experiment.
 
     Raises:
         InputError: The robot records no log, or deletes old parts of the log.
@@ -266,7 +274,10 @@ def live_rig(robot: RemoteRobot, run: OwnRun | None = None) -> Rig:
 
 
 def require_whole(recording: RecordingPlan, robot: str) -> None:
-    """Raise InputError if old parts of the log are deleted."""
+    """Raise InputError if the run deletes old parts of its log, from which experiments read cycles.
+
+    `robot` is the name or file for the message.
+    """
     if recording.keep_ns is not None:
         raise InputError(
             f"{robot} deletes the oldest parts of its log, and an experiment takes what it measures from the "

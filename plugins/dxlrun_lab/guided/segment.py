@@ -1,4 +1,4 @@
-"""Segments: tables of goals of an experiment, and their recordings."""
+"""Segments: tables of goals that an experiment sends to joints, and the recordings of the cycles."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 from dxlrun import Floats
 
 Interface = Literal["position", "posvel", "velocity", "effort", "pwm"]
-"""Command interface of a table (see sample_player)"""
+"""Command interface of a segment's table: the quantity that a sample_player commands"""
 
 
 class Guard(msgspec.Struct, frozen=True):
@@ -27,11 +27,12 @@ class Guard(msgspec.Struct, frozen=True):
 
 
 class Segment(msgspec.Struct, frozen=True):
-    """Table of goals of joints, one row per period"""
+    """Table of goals of joints, one row per period, which a sample_player plays"""
 
     title: str
     """Description in the progress output, such as `top speed, 20 deg up`"""
     period_s: float
+    """Time between two rows, s"""
     rows: Mapping[str, Floats]
     """Values by joint, shape (rows,): rad, rad/s, the joint's effort unit, or the fraction of full voltage.
     Joints of the experiment that are missing hold their position, or get 0."""
@@ -64,7 +65,7 @@ class Segment(msgspec.Struct, frozen=True):
 
     @property
     def duration_s(self) -> float:
-        """Duration, s"""
+        """Duration of the rows and of `settle_s`, s"""
         return self.count * self.period_s + self.settle_s
 
 
@@ -79,7 +80,7 @@ class Recorded(msgspec.Struct, frozen=True):
     """Joints of the columns of all arrays of shape (cycles, joints)"""
     cycles: NDArray[np.void]
     columns: tuple[int, ...]
-    """Index of each joint in the rows of `cycles`"""
+    """Index of each joint in the fields of `cycles`"""
     segment: Segment
     outcome: str = "reached"
     """Outcome of the goal: `reached`, or for an incomplete segment `aborted`, `cancelled` or `lost`"""
@@ -88,21 +89,21 @@ class Recorded(msgspec.Struct, frozen=True):
 
     @property
     def whole(self) -> bool:
-        """True if the segment was played to its end"""
+        """True if the whole segment was played"""
         return self.outcome == "reached"
 
     def __len__(self) -> int:
         return len(self.cycles)
 
     def of_cycles(self, name: str) -> NDArray[np.int64]:
-        """Return a column of the record with one number per cycle, such as `woken_ns`; shape (cycles,)."""
+        """Return the field of the record with this name, one number per cycle, such as `woken_ns`."""
         values: NDArray[np.int64] = self.cycles[name]
         return values
 
     def of_joints(self, name: str) -> Floats:
-        """Return a column with one number per joint, such as `position`, shape (cycles, joints).
+        """Return the field with this name, such as `position`, for `joints`; shape (cycles, joints).
 
-        A state is the last known one if `valid` is False.
+        Where `valid` is False, a state is the last known one.
         """
         values: Floats = self.cycles[name][:, list(self.columns)]
         return values
@@ -115,16 +116,16 @@ class Recorded(msgspec.Struct, frozen=True):
 
     @property
     def goal(self) -> Floats:
-        """Goals in the segment's interface (the position with posvel); NaN if none was sent"""
+        """Goals of the segment's interface (positions with posvel), shape (cycles, joints); NaN if none"""
         interface = self.segment.interface
         return self.of_joints(f"goal_{'position' if interface == 'posvel' else interface}")
 
     @property
     def position(self) -> Floats:
-        """rad"""
+        """Measured positions, rad; shape (cycles, joints)"""
         return self.of_joints("position")
 
     @property
     def valid(self) -> NDArray[np.bool_]:
-        """True for each intact reply; shape (cycles, joints)"""
+        """True where the cycle has an intact reply of the joint's servo; shape (cycles, joints)"""
         return self.of_joints("valid").astype(np.bool_)

@@ -1,4 +1,5 @@
-"""Excitation: goals that separate inertia, back-EMF, friction, gravity and delay.
+"""Excitation: goals of a joint from whose motion inertia, back-EMF, friction, gravity and delay can be told
+apart.
 
 It has four parts, in the spirit of J. Swevers et al., "Optimal robot excitation and identification" (IEEE
 Trans. Robotics and Automation 13, 1997): steps, which saturate the voltage and show the motor's own dynamics;
@@ -27,15 +28,15 @@ _MARGIN = 0.95
 
 
 class Room(msgspec.Struct, frozen=True):
-    """Range and limits of a joint"""
+    """Range and limits within which the goals of a joint remain"""
 
     lower: float
-    """rad"""
+    """Lower end of the range, rad"""
     upper: float
     velocity: float = math.inf
-    """rad/s"""
+    """Velocity limit, rad/s"""
     acceleration: float = math.inf
-    """rad/s^2; infinite if goals may jump"""
+    """Acceleration limit, rad/s^2; infinite if goals may jump"""
 
     @property
     def middle(self) -> float:
@@ -49,20 +50,21 @@ class Room(msgspec.Struct, frozen=True):
 
 
 class Part(NamedTuple):
-    """Part of the excitation: goals, rad, one per period"""
+    """Part of the excitation, such as the steps"""
 
     title: str
     goals: Floats
+    """Goals, rad, one per period"""
 
 
 def excitation(
     room: Room, seconds: float, period_s: float, *, start: float, seed: int = 0
 ) -> tuple[Part, ...]:
-    """Return goals for a joint, which stay within the range and the limits.
+    """Return the parts of a joint's excitation, which stay within range and limits, from its start on.
 
     Args:
-        room: Range and limits.
-        seconds: Duration, s.
+        room: Range and limits of the joint.
+        seconds: Duration without the way to the middle, s.
         period_s: Time between two goals, s.
         start: Present position, rad.
         seed: Seed of the random numbers.
@@ -92,7 +94,7 @@ def excitation(
 
 
 def _glide(start: float, end: float, room: Room, period_s: float) -> Floats:
-    """Return a smooth motion at up to 1 rad/s and half of the limits."""
+    """Return goals of a smooth motion between two positions, rad, at up to 1 rad/s and half of the limits."""
     way = abs(end - start)
     speed = min(1.0, room.velocity / 2)
     # The peaks of the first and second derivative of 10 s^3 - 15 s^4 + 6 s^5 are 1.875 and 5.774.
@@ -102,7 +104,10 @@ def _glide(start: float, end: float, room: Room, period_s: float) -> Floats:
 
 
 def _steps(room: Room, count: int, period_s: float, random: np.random.Generator) -> Floats:
-    """Return steps between both halves of the range, held for 0.15 to 0.6 s. With limits they are ramps."""
+    """Return `count` goals that step at random between both halves of the range.
+
+    Each step is held for 0.15 to 0.6 s. With limits of velocity or acceleration, steps are ramps.
+    """
     goals = np.empty(0)
     side, at = 1.0, room.middle
     while len(goals) < count:
@@ -115,7 +120,7 @@ def _steps(room: Room, count: int, period_s: float, random: np.random.Generator)
 
 
 def _limited(start: float, end: float, room: Room, period_s: float) -> Floats:
-    """Return a step, or a ramp within the limits of velocity and acceleration."""
+    """Return goals from one position to another, rad: a step, or a ramp within velocity and acceleration."""
     way = abs(end - start)
     if room.acceleration == math.inf and room.velocity == math.inf:
         return np.full(1, end)
@@ -132,7 +137,7 @@ def _limited(start: float, end: float, room: Room, period_s: float) -> Floats:
 
 
 def _fitted(shape: Floats, room: Room, period_s: float) -> Floats:
-    """Scale a shape as far as range, velocity and acceleration allow, and move it to the middle."""
+    """Scale a motion around 0 as far as range, velocity and acceleration allow; move it to the middle."""
     velocity = np.gradient(shape, period_s)
     factor = min(
         room.reach / max(1e-9, float(np.abs(shape).max())),
@@ -143,7 +148,7 @@ def _fitted(shape: Floats, room: Room, period_s: float) -> Floats:
 
 
 def _window(count: int, period_s: float) -> Floats:
-    """Return a window of ones with smooth ends of 0.5 s."""
+    """Return `count` factors that rise smoothly from 0 to 1 in 0.5 s, and fall again at the end."""
     ends = max(1, min(round(0.5 / period_s), count // 4))
     ramp = np.sin(np.linspace(0.0, math.pi / 2, ends)) ** 2
     return np.concatenate((ramp, np.ones(max(0, count - 2 * ends)), ramp[::-1]))
@@ -165,7 +170,7 @@ def _chirp(room: Room, count: int, period_s: float) -> Floats:
 
 
 def _triangles(room: Room, count: int, period_s: float) -> Floats:
-    """Return triangles with a different slow speed on each flank."""
+    """Return `count` goals that go to and fro through the range with a different slow speed each way."""
     goals, at, side = [np.full(1, room.middle)], room.middle, 1.0
     speeds, total = (0.15, 0.4, 0.8, 0.25, 0.6), 1
     while total < count:

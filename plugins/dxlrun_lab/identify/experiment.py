@@ -1,4 +1,4 @@
-"""Experiment: excitation of joints on a robot, one after the other, and the fit of the recordings."""
+"""Experiment of `dxlrun identify`: moves one joint after the other, and fits a servo model to each motion."""
 
 from __future__ import annotations
 
@@ -27,9 +27,10 @@ _LEAST_RATE = 50.0
 
 
 class Options(msgspec.Struct, frozen=True):
-    """Options of an identification"""
+    """Options of `dxlrun identify`"""
 
     seconds: float = SECONDS
+    """Duration of the excitation of each joint, s"""
     seed: int = 0
     """Seed of the excitation's random numbers"""
     load: KnownLoad = msgspec.field(default_factory=KnownLoad)
@@ -38,23 +39,27 @@ class Options(msgspec.Struct, frozen=True):
 
 
 class JointResult(msgspec.Struct, frozen=True):
-    """Result of one joint, or the reason why there is none"""
+    """Result of the identification of one joint, or the reason why there is none"""
 
     joint: str
     identified: Identified | None
+    """Parameters of its servo; None if they could not be identified"""
     refusal: str = ""
     """Reason for a missing result, one sentence"""
     position: Curve | None = None
-    """Measured and simulated positions"""
+    """Measured and simulated positions, for the figures"""
 
 
 class Identification(msgspec.Struct, frozen=True):
-    """Experiment (see guided/) that excites one joint after the other"""
+    """Experiment (see guided/experiment.py) that moves one joint after the other to identify its servo"""
 
     options: Options = Options()
 
     def moves(self, situation: Situation) -> Sequence[str]:
-        """Describe the motions. Raises InputError for a joint that cannot be identified."""
+        """Describe the excitation of each joint, one sentence each.
+
+        Raises InputError for a joint that cannot be identified, or if the loop rate is too low.
+        """
         if situation.rate < _LEAST_RATE:
             raise InputError(
                 f"the loop's rate is {situation.rate:g} Hz, and a motor takes {_LEAST_RATE:g} Hz to be "
@@ -77,7 +82,7 @@ class Identification(msgspec.Struct, frozen=True):
                 yield segment
 
     def finish(self, situation: Situation, recorded: Sequence[Recorded], why: str) -> tuple[JointResult, ...]:
-        """Return the result of each joint, from its recordings."""
+        """Fit the servo model to the recordings of each joint; return one result per joint."""
         results = []
         for joint in situation.joints:
             mine = [part for part in recorded if joint.name in part.segment.rows]
@@ -105,7 +110,7 @@ class Identification(msgspec.Struct, frozen=True):
 
 
 def from_log(log: Log, joints: Sequence[str], options: Options) -> tuple[JointResult, ...]:
-    """Return the results of joints of an earlier run, by default of all joints.
+    """Identify joints from the log of an earlier run, by default all of its joints.
 
     Raises:
         InputError: The log lacks a joint, or a joint cannot be identified.

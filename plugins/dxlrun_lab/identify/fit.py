@@ -1,4 +1,4 @@
-"""Fit: parameters of the model with which the simulation is closest to the measurements.
+"""Fit: parameters of the servo model (model.py) with which its simulation is closest to the measured motion.
 
 The method is output error. Each piece of the run is simulated from its commands alone, and positions (and
 currents, or duties) are compared with the measured ones. A linear least squares fit on smoothed accelerations
@@ -41,22 +41,22 @@ _LIMITS: Mapping[str, tuple[float, float, float]] = {
     "resistance": (0.05, 1e-2, 1e4),
     "effort_delay": (2e-4, -0.02, 0.02),
 }
-"""Step for derivatives, lower bound and upper bound of each parameter"""
+"""Step for numerical derivatives, lower bound and upper bound of each parameter of Numbers"""
 _RELATIVE = frozenset(("drive", "back_emf", "gain", "resistance"))
 """Parameters whose step is relative to their start value"""
 _COULOMB = ("drive", "back_emf", "friction", "delay", "gravity_sin", "gravity_cos")
 _ALIKE = 0.8
-"""Correlation of measured and simulated effort below which the measurement is not the modelled effort"""
+"""Correlation of measured and simulated effort below which measured efforts are ignored"""
 _SATURATED = 0.01
-"""Fraction of the time at full duty above which the scale of the duty can be identified"""
+"""Fraction of the time at full duty above which the servo's gain can be identified"""
 _SMOOTH_S = 0.06
 _MORE_FRICTION = ("load_friction", "stribeck_friction")
 _BETTER = 0.03
 """Relative reduction of the error in held-out pieces that friction near standstill must achieve"""
 _FAR = 0.15
-"""Largest error of the simplest model for a servo, as a fraction of the travel"""
+"""Error of the simplest model, as a fraction of the travel, above which the joint did not follow its goals"""
 _LOOSE = 0.5
-"""Relative half-width of the drive above which the motor is not determined"""
+"""Relative half-width of the interval of `drive` above which the run does not determine the motor"""
 _EFFORT_S = 3e-3
 """Uncertainty of the time of an effort, s. It is filtered, and from the last period of the servo's control.
 """
@@ -66,7 +66,7 @@ control and delay of the adapter [i]. More samples do not reduce it."""
 
 
 class Fit(msgspec.Struct, frozen=True):
-    """Parameters of the best fit"""
+    """Fit of the servo model with one friction model to a run: parameters, covariance and errors"""
 
     friction_model: str
     """m1: Coulomb and viscous; m3: and load-dependent; m4: and Stribeck"""
@@ -92,7 +92,7 @@ class Fit(msgspec.Struct, frozen=True):
 
     @property
     def student(self) -> float:
-        """Half-width of a 95 % interval in standard deviations"""
+        """Half-width of a parameter's 95 % interval in standard deviations (Student's t)"""
         return float(stats.t.ppf(0.975, max(2, self.pieces - len(self.free))))
 
     def variance(self, name: str) -> float:
@@ -103,19 +103,21 @@ class Fit(msgspec.Struct, frozen=True):
 
 
 class Curve(msgspec.Struct, frozen=True):
-    """Measured and simulated values for a figure, shape (samples,)"""
+    """Measured and simulated positions (rad) or efforts (A, or fraction of full voltage); shape (samples,)"""
 
     time_s: Floats
+    """Time in the run, s, increasing"""
     measured: Floats
     simulated: Floats
     held_out: NDArray[np.bool_]
+    """True for samples that validate the fit instead of determining it"""
 
 
 def fit_run(run: Measured) -> tuple[Fit, ...]:
-    """Fit the model with increasingly detailed friction. The first result is the model that the run supports.
+    """Fit the servo model with three friction models to a run, and return the selected fit first.
 
     Raises:
-        InputError: The run does not determine the motor.
+        InputError: The run does not determine the motor, or the joint did not follow its goals.
     """
     start = _start(run)
     noise = (max(run.servo.tick / np.sqrt(12), 3e-4), _first_effort_noise(run))
@@ -133,7 +135,7 @@ def fit_run(run: Measured) -> tuple[Fit, ...]:
 
 
 def curves(run: Measured, numbers: Numbers) -> tuple[Curve, Curve]:
-    """Return measured and simulated positions and efforts, by time."""
+    """Return two curves of a run: positions and efforts, measured and simulated with these parameters."""
     parts = [(group, _simulated(group, numbers.array()[:, None])) for group in run.groups]
     order = np.argsort(np.concatenate([group.time_s for group in run.groups]), kind="stable")
     time_s = np.concatenate([group.time_s for group in run.groups])[order]
@@ -155,7 +157,7 @@ def curves(run: Measured, numbers: Numbers) -> tuple[Curve, Curve]:
 
 
 def _start(run: Measured) -> Numbers:
-    """Return the start values: those of the built-in motor, or a linear fit if it is better."""
+    """Return the start values of the fit: those of the simulation's motor, or of a linear fit if better."""
     built_in = run.servo.built_in
     gain, _ = run.servo.expected_gain()
     voltage = built_in.voltage or 12.0
@@ -174,7 +176,10 @@ def _start(run: Measured) -> Numbers:
 
 
 def _linear(run: Measured, known: Numbers, share: float) -> dict[str, float]:
-    """Fit drive, back-EMF, friction and gravity by linear least squares to the smoothed motion."""
+    """Fit drive, back-EMF, friction and gravity by linear least squares to the smoothed motion of a run.
+
+    Returns parameters by name, with the friction times `share`; none if the joint hardly moved.
+    """
     period = float(np.median(np.diff(run.time_s)))
     window = max(5, round(_SMOOTH_S / period) | 1)
     even = np.arange(run.time_s[0], run.time_s[-1], period)
@@ -215,7 +220,10 @@ def _cost(run: Measured, numbers: Numbers) -> float:
 
 
 def _free(run: Measured, start: Numbers) -> tuple[str, ...]:
-    """Return the parameters that the run determines. The gain needs a known scale of the duty."""
+    """Return the names of the parameters that the run determines and the fit varies.
+
+    The gain needs a saturated duty, a measured duty or duty commands; resistance needs a measured current.
+    """
     values = start.array()[:, None]
     duties = [np.abs(_simulated(group, values).duty) for group in run.groups]
     limit = run.groups[0].control.limit
@@ -233,7 +241,7 @@ def _free(run: Measured, start: Numbers) -> tuple[str, ...]:
 
 
 def _alike(run: Measured, numbers: Numbers) -> bool:
-    """Return True if the measured effort correlates with the simulated one."""
+    """Return True if the measured effort correlates with the simulated one, so that it can be fitted."""
     _, effort = curves(run, numbers)
     known = np.isfinite(effort.measured)
     if np.count_nonzero(known) < 100 or np.ptp(effort.measured[known]) == 0.0:
@@ -345,9 +353,9 @@ def _simulated(group: Compared, values: Floats) -> Simulated:
 def _sampled(
     run: Measured, group: Compared, found: Simulated, quantity: str, delays: Floats | None = None
 ) -> Floats:
-    """Return simulated positions or efforts at the samples, shape (samples, sets).
+    """Return simulated positions or efforts (`quantity`) at the times of the samples, shape (samples, sets).
 
-    `delays` is the age of each set's effort relative to the position, s.
+    A set is one set of parameters; `delays` is the age of its effort relative to the position, s.
     """
     if quantity == "position":
         return _between(found.position, group, group.step, group.part)
@@ -380,7 +388,7 @@ def _first_effort_noise(run: Measured) -> float:
 
 
 def _noise(run: Measured, numbers: Numbers, before: tuple[float, float]) -> tuple[float, float]:
-    """Return robust standard deviations of the residuals of positions and efforts.
+    """Return robust standard deviations of the residuals of positions (rad) and efforts, for the next fit.
 
     They are at least the quantisation noise of positions, and the initial noise of efforts.
     """
@@ -401,7 +409,13 @@ def _clusters(run: Measured, *, twice: bool) -> NDArray[np.intp]:
 
 
 def _sandwich(slopes: Floats, left: Floats, clusters: NDArray[np.intp]) -> Floats:
-    """Return the covariance of a least squares fit with residuals that are correlated within clusters."""
+    """Return the covariance of the parameters of a least squares fit, robust to correlation within clusters.
+
+    Args:
+        slopes: Derivatives of the residuals, shape (residuals, parameters).
+        left: Residuals.
+        clusters: Number of the cluster of each residual.
+    """
     # Weights of the soft L1 loss, which reduce the influence of residuals above 3.
     weight = 1.0 / np.sqrt(1.0 + np.square(left / 3.0))
     scale = 1.0 / np.maximum(np.sqrt(np.sum(np.square(slopes), axis=0)), 1e-12)
@@ -423,7 +437,7 @@ def _sandwich(slopes: Floats, left: Floats, clusters: NDArray[np.intp]) -> Float
 
 
 def _by_timing(slopes: Floats, free: Sequence[str]) -> Floats:
-    """Return the covariance by an error of the delay, which other parameters partly compensate.
+    """Return the covariance of the parameters by an error of _TIMING_S in all times.
 
     In a smooth motion, a larger gain looks like a shorter delay. Steps in the motion separate them.
     """
@@ -449,7 +463,7 @@ def _rms(values: Floats) -> float:
 
 
 def _require_followed(run: Measured, fit: Fit) -> None:
-    """Raise InputError if the joint did not follow its goals as a servo does."""
+    """Raise InputError if the simplest model fits so badly that the joint did not follow its goals."""
     if fit.position_rms > _FAR * run.moved:
         raise InputError(
             f"{run.servo.joint}: no model of a servo follows this run ({fit.position_rms:.2g} of "
@@ -459,7 +473,7 @@ def _require_followed(run: Measured, fit: Fit) -> None:
 
 
 def _require_determined(run: Measured, fit: Fit) -> None:
-    """Raise InputError if the drive of the motor is not determined."""
+    """Raise InputError if the 95 % interval of `drive` (acceleration per volt) is too wide."""
     name = run.servo.joint
     part = fit.student * np.sqrt(fit.variance("drive")) / fit.numbers.drive
     if part > _LOOSE:

@@ -1,4 +1,4 @@
-"""Measured data of one joint for the fit: commands, samples, voltage, and usable spans.
+"""Data of one joint from a log, for the fit: commands, measured samples, voltage, and usable spans.
 
 A span is an uninterrupted time with torque, in one mode, and with known goals. It is cut into pieces, which
 are simulated in parallel. The simulation of a piece starts before the part that is compared, so that the
@@ -28,13 +28,13 @@ LEAD_S = 0.5
 _LEAST_S = 8.0
 """Shortest duration of usable data, s"""
 _LEAST_MOVED = 40
-"""Shortest travel that counts as motion, ticks"""
+"""Shortest travel of a joint from which it can be identified, ticks"""
 _SLOW = 0.1
-"""Speed below which a joint hardly moves, rad/s, because friction is different there"""
+"""Speed below which a joint counts as hardly moving, rad/s, because friction is different there"""
 _EVEN = 0.2
-"""Relative spread of speeds below which they count as one speed"""
+"""Relative spread of speeds below which the joint moved at one speed only"""
 _SLOPE_S = 0.03
-"""Half-width of the window for a velocity, s"""
+"""Half-width of the window of positions for a velocity, s"""
 _VOLTAGE_S = 10.0
 """Window of the median voltage, s. Readings are seconds apart, with a resolution of 0.1 V."""
 
@@ -42,14 +42,18 @@ Flags = NDArray[np.bool_]
 
 
 class Compared(msgspec.Struct, frozen=True):
-    """Pieces of one mode, and the samples to compare them with; shape (samples,)"""
+    """Pieces of the run in one mode, and the measured samples to compare their simulation with
+
+    Arrays have shape (samples,).
+    """
 
     pieces: Pieces
+    """Initial states, voltages and commands, from which the pieces are simulated"""
     control: Control
     piece: NDArray[np.intp]
     """Index of the piece of each sample"""
     step: NDArray[np.intp]
-    """Index of the grid point before the sample"""
+    """Index of the simulation's grid point before the sample"""
     part: Floats
     """Position of the sample between two grid points, 0..1"""
     position: Floats
@@ -61,23 +65,23 @@ class Compared(msgspec.Struct, frozen=True):
 
 
 class Measured(msgspec.Struct, frozen=True):
-    """Run of one joint"""
+    """Usable data of one joint from a run; arrays have shape (samples,)"""
 
     servo: Servo
     time_s: Floats
-    """Time of each sample since the first one, s; shape (samples,)"""
+    """Time of each sample since the first cycle's, s"""
     position: Floats
-    """rad"""
+    """Measured position, rad"""
     effort: Floats
-    """A, or fraction of full voltage"""
+    """Measured effort: current, A, or fraction of full voltage"""
     command: Floats
-    """Command at the time of the sample: rad, or duty"""
+    """Command in the cycle of the sample: position, rad, or duty"""
     voltage: Floats
-    """V, averaged"""
+    """Supply voltage, V, as a median over 20 s"""
     by_position: Flags
     """True if the command is a position"""
     groups: tuple[Compared, ...]
-    """All pieces, by mode"""
+    """Pieces to simulate: those in position mode, and those in PWM mode"""
     seconds: float
     """Usable duration, s"""
     lost_s: float
@@ -85,12 +89,12 @@ class Measured(msgspec.Struct, frozen=True):
 
     @property
     def moved(self) -> float:
-        """Travel of the joint, rad"""
+        """Difference of highest and lowest position, rad"""
         return float(np.ptp(self.position))
 
 
 def measured(cycles: NDArray[np.void], row: int, servo: Servo, *, voltage: float | None = None) -> Measured:
-    """Extract the run of one joint from the cycles of a log.
+    """Extract the data of one joint from the cycles of a log, and cut them into pieces.
 
     Args:
         cycles: Records of the log.
@@ -99,7 +103,7 @@ def measured(cycles: NDArray[np.void], row: int, servo: Servo, *, voltage: float
         voltage: Supply voltage in place of the measured one, V.
 
     Raises:
-        InputError: The log is not sufficient for an identification.
+        InputError: The log has too little motion, time with torque, or voltage for an identification.
     """
     name = servo.joint
     usable = _usable(cycles, row)
@@ -152,7 +156,7 @@ def measured(cycles: NDArray[np.void], row: int, servo: Servo, *, voltage: float
 
 
 class _Sent(NamedTuple):
-    """Commands of all cycles, including those without a reply"""
+    """Commands and voltages of all cycles of the log, including those without a reply"""
 
     time_s: Floats
     command: Floats
@@ -160,7 +164,7 @@ class _Sent(NamedTuple):
 
 
 def _usable(cycles: NDArray[np.void], row: int) -> Flags:
-    """Return True for each cycle with torque, a supported mode, and a known goal."""
+    """Return True for each cycle in which the joint has torque, position or PWM mode, and a known goal."""
     mode, torque = cycles["mode"][:, row], cycles["torque"][:, row]
     goal = np.where(mode == Mode.PWM, cycles["goal_pwm"][:, row], cycles["goal_position"][:, row])
     known = np.isin(mode, (Mode.POSITION, Mode.PWM)) & np.isin(torque, (Torque.ON, Torque.UNKNOWN))
@@ -169,7 +173,10 @@ def _usable(cycles: NDArray[np.void], row: int) -> Flags:
 
 
 def _voltage(cycles: NDArray[np.void], row: int, given: float | None, name: str) -> Floats:
-    """Return the voltage of each cycle, as the median of the readings around it."""
+    """Return the supply voltage of each cycle, V: `given`, or medians of the servo's readings around it.
+
+    Raises InputError if the log has no reading.
+    """
     count = len(cycles)
     if given is not None:
         return np.full(count, given)
@@ -196,7 +203,10 @@ def _voltage(cycles: NDArray[np.void], row: int, given: float | None, name: str)
 
 
 def _commands(cycles: NDArray[np.void], row: int, servo: Servo, sent_s: Floats, by_position: Flags) -> Floats:
-    """Return the command of the servo in each cycle. A goal with a speed is converted to a ramp."""
+    """Return the servo's command in each cycle: position, rad, or duty.
+
+    Positions are rounded to ticks, and a goal with a speed is converted to a ramp.
+    """
     goals = np.array([servo.rounded(goal) for goal in cycles["goal_position"][:, row].tolist()])
     speeds = np.abs(cycles["goal_velocity"][:, row])
     if (np.isfinite(speeds) & by_position).any():
@@ -206,7 +216,7 @@ def _commands(cycles: NDArray[np.void], row: int, servo: Servo, sent_s: Floats, 
 
 
 def _ramped(goals: Floats, speeds: Floats, sent_s: Floats, position: Floats) -> Floats:
-    """Return the servo's internal setpoint: a ramp to each goal at the commanded speed."""
+    """Return the servo's internal setpoint in each cycle, rad: a ramp to the goal at the commanded speed."""
     way = np.array(goals)
     at = float("nan")
     for index in range(len(goals)):
@@ -223,7 +233,7 @@ def _ramped(goals: Floats, speeds: Floats, sent_s: Floats, position: Floats) -> 
 
 
 def _spans(usable: Flags, by_position: Flags, sent_s: Floats) -> list[slice]:
-    """Return the uninterrupted spans of usable cycles in one mode. A pause of the loop ends a span."""
+    """Return the spans of consecutive usable cycles in one mode, as slices. A pause of the loop ends one."""
     period = float(np.median(np.diff(sent_s))) if len(sent_s) > 1 else 0.0
     broken = np.ones(len(usable) + 1, dtype=bool)
     pause = np.diff(sent_s) > max(0.1, 5 * period)
@@ -233,7 +243,7 @@ def _spans(usable: Flags, by_position: Flags, sent_s: Floats) -> list[slice]:
 
 
 def _require_motion(name: str, time_s: Floats, position: Floats, servo: Servo) -> None:
-    """Raise InputError if a joint did not move, or moved at a single speed."""
+    """Raise InputError if the joint hardly moved, or moved at a single speed."""
     if not len(position) or np.ptp(position) < _LEAST_MOVED * servo.tick:
         raise InputError(
             f"{name}: never moved in this log (by {_LEAST_MOVED} ticks), so nothing of its motor shows; "
@@ -262,7 +272,10 @@ def _slopes(time_s: Floats, position: Floats, at_s: Floats) -> Floats:
 
 
 def _compared(run: Measured, sent: _Sent, spans: list[slice], control: Control) -> Compared | None:
-    """Cut spans into pieces of equal length, and find their samples. Return None if there are none."""
+    """Cut the spans of one mode into pieces of equal length, and find the samples of each.
+
+    Returns None if no piece has enough samples.
+    """
     starts: list[float] = []
     for span in spans:
         first, last = float(sent.time_s[span.start]), float(sent.time_s[span.stop - 1])

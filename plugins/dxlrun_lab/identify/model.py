@@ -29,7 +29,7 @@ of second order, so the error is about 1 in 600."""
 
 
 class Numbers(msgspec.Struct, frozen=True):
-    """Parameters of the model; I is the inertia of motor, gear and load"""
+    """Parameters of the servo model; I is the inertia of motor, gear and load"""
 
     drive: float
     """Acceleration per volt, torque constant / (resistance I), rad/s^2/V"""
@@ -70,43 +70,47 @@ class Numbers(msgspec.Struct, frozen=True):
 
 
 ROWS: Mapping[str, int] = {name: row for row, name in enumerate(Numbers.__struct_fields__)}
-"""Row of each parameter in an array"""
+"""Row of each parameter in the arrays of `Numbers.array` and `simulate`"""
 
 
 class Control(msgspec.Struct, frozen=True):
     """Properties of the servo's control except its gain, from registers and manual"""
 
     limit: float = 1.0
-    """Highest duty"""
+    """Highest duty (fraction of full voltage), 0..1"""
     damping_s: float = 0.0
-    """Ratio of D gain to P gain, s"""
+    """Ratio of D gain to P gain of the position control, s"""
     margin: float = 0.0
     """Dead band of the error, rad"""
     punch: float = 0.0
     """Duty at the edge of the margin"""
     by_position: bool = True
-    """False if the command is the duty"""
+    """True if the command is a position, rad; False if it is the duty"""
 
 
 class Pieces(msgspec.Struct, frozen=True):
-    """Pieces of a run that are simulated in parallel; shape (steps, pieces) on a grid of STEP_S"""
+    """Pieces of a run that are simulated in parallel, each from its initial state on a time grid of STEP_S"""
 
     start_s: Floats
-    """Time of the first grid point, shape (pieces,)"""
+    """Time of each piece's first grid point in the run, s; shape (pieces,)"""
     steps: int
+    """Number of steps of each piece"""
     voltage: Floats
-    """V at each step"""
+    """Supply voltage at each step, V; shape (steps, pieces)"""
     position: Floats
     """Initial position, rad, shape (pieces,)"""
     velocity: Floats
     """Initial velocity, rad/s, shape (pieces,)"""
     command_s: Floats
-    """Time of each command in the run, shape (commands,)"""
+    """Time of each command in the run, s; shape (commands,)"""
     command: Floats
-    """rad, or duty; each command holds until the next one"""
+    """Position, rad, or duty; each command holds until the next one"""
 
     def commands(self, delays: Floats) -> Floats:
-        """Return the mean command of each step for each delay, s; shape (steps, delays, pieces)."""
+        """Return the mean command in each step if commands act after a delay, s.
+
+        The result has an entry for each delay; shape (steps, delays, pieces).
+        """
         grid = self.start_s + np.arange(self.steps + 1)[:, None] * STEP_S
         sent, held = self.command_s, self.command
         area = np.concatenate(([0.0], np.cumsum(np.diff(sent) * held[:-1])))
@@ -119,14 +123,16 @@ class Pieces(msgspec.Struct, frozen=True):
 
 
 class Simulated(msgspec.Struct, frozen=True):
-    """Simulated pieces, shape (steps + 1, sets of parameters, pieces)"""
+    """Simulated motion of pieces, at each grid point; shape (steps + 1, sets of parameters, pieces)"""
 
     position: Floats
+    """rad"""
     velocity: Floats
+    """rad/s"""
     duty: Floats
-    """Duty; the last row repeats the previous one"""
+    """Fraction of full voltage; the last row repeats the previous one"""
     current: Floats
-    """A, in the scale of `resistance`"""
+    """Motor current, A, in the scale of `resistance`"""
 
 
 def simulate(values: Floats, pieces: Pieces, control: Control) -> Simulated:
@@ -176,7 +182,7 @@ def simulate(values: Floats, pieces: Pieces, control: Control) -> Simulated:
 
 
 def _duty(error: Floats, w: Floats, gain: Floats, control: Control) -> Floats:
-    """Return the duty for an error, rad, before clamping. The damping term acts on the velocity."""
+    """Return the duty of the position control for an error, rad, before clamping; `w` is the velocity."""
     if control.margin or control.punch:
         outside = np.abs(error) - control.margin
         error = np.where(outside > 0.0, np.copysign(outside + control.punch / gain, error), 0.0)

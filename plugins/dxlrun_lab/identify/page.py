@@ -1,4 +1,4 @@
-"""HTML page of an identification: tables, and the fit and residuals of each joint."""
+"""HTML report of `dxlrun identify`: table, and plots of fit and residuals, for each joint."""
 
 from __future__ import annotations
 
@@ -27,7 +27,7 @@ _DETAIL_S = 4.0
 
 
 def page(robot: str, results: Sequence[JointResult]) -> str:
-    """Return an HTML page of all identified joints. Needs matplotlib."""
+    """Return the HTML report of all identified joints of a robot or log. Needs matplotlib."""
     found = [(each, each.identified) for each in results if each.identified is not None]
     top = header(
         f"Servos of {robot}",
@@ -80,7 +80,7 @@ def _fit(number: int, result: Identified, curve: Curve) -> Element:
 
 
 def _detail(number: int, result: Identified, curve: Curve) -> Element:
-    """Return a figure of the seconds in which the joint was fastest."""
+    """Draw measured and simulated positions in the four seconds in which the joint was fastest."""
     speed = np.abs(np.gradient(curve.measured, np.maximum(curve.time_s, np.arange(len(curve.time_s)) * 1e-9)))
     middle = float(curve.time_s[int(np.argmax(np.convolve(speed, np.ones(50), mode="same")))])
     near = np.abs(curve.time_s - middle) <= _DETAIL_S / 2

@@ -1,4 +1,4 @@
-"""Result: torques with their intervals, from the parameters of a fit and one known torque.
+"""Result of an identification: motor figures with their intervals, from a fit and one known torque.
 
 A motion only determines torques relative to the moving inertia. The scale comes from the first known of: the
 weight of a load, the current that the servo measures, the stall torque in the manual.
@@ -22,10 +22,10 @@ from dxlrun_lab.identify.servo import Servo
 Scale = Literal["load", "current", "manual"]
 
 _UNKNOWN = 0.5
-"""Relative half-width above which a value is not identified"""
+"""Relative half-width of the 95 % interval above which a value counts as not identified"""
 _CORRELATED = 0.98
 _LEAST_GRAVITY = 3.0
-"""Number of half-widths above which a weight is significant"""
+"""Number of half-widths of its interval above which the weight of the load is significant"""
 UNITS: Mapping[str, str] = {
     "torque_constant": "Nm/A",
     "resistance": "ohm",
@@ -50,7 +50,7 @@ back-EMF's."""
 
 
 class KnownLoad(msgspec.Struct, frozen=True):
-    """Known properties of the load"""
+    """Properties of the load that the user knows (--load-inertia, --load-gravity)"""
 
     inertia: float | None = None
     """Inertia in addition to that of motor and gear, kg m^2; None if unknown"""
@@ -59,7 +59,7 @@ class KnownLoad(msgspec.Struct, frozen=True):
 
 
 class Value(msgspec.Struct, frozen=True):
-    """Identified figure"""
+    """Figure of the servo, such as its torque constant: a row of the result"""
 
     name: str
     value: float
@@ -73,24 +73,28 @@ class Value(msgspec.Struct, frozen=True):
 
     @property
     def identified(self) -> bool:
-        """False if the interval is too wide"""
+        """True if the figure was fitted and its interval is narrow enough"""
         return self.half is not None and self.half <= _UNKNOWN * abs(self.value)
 
 
 class Identified(msgspec.Struct, frozen=True):
-    """Identified servo of one joint"""
+    """Result of the identification of one joint's servo"""
 
     joint: str
     model: str
+    """Model name of the servo"""
     friction_model: str
+    """Selected friction model: m1, m3 or m4 (see Fit)"""
     values: tuple[Value, ...]
     scale: Scale
+    """Source of the scale of torques: known load, measured current, or stall torque of the manual"""
     scale_sentence: str
     notes: tuple[str, ...]
     """Remarks, one sentence each"""
     motor: MotorModel
+    """Content of the motor file"""
     uncertainty: dict[str, float]
-    """Half-widths, by the names of a motor file"""
+    """Half-widths of the 95 % intervals, by the names in a motor file"""
     seconds: float
     """Usable duration of the run, s"""
     position_rms: float
@@ -102,7 +106,7 @@ class Identified(msgspec.Struct, frozen=True):
 
 
 def identified(run: Measured, fits: tuple[Fit, ...], load: KnownLoad, source: str) -> Identified:
-    """Return the figures of a servo from the first of the fits of a run.
+    """Convert the first of a run's fits to the figures of the servo. `source` is noted in the motor file.
 
     Raises:
         InputError: The known load contradicts the run, or the scale of torques is unknown.
@@ -176,12 +180,14 @@ def _scale_of(fit: Fit, servo: Servo, load: KnownLoad) -> tuple[Scale, str]:
 
 
 class _Physical(msgspec.Struct, frozen=True):
+    """Conversion of the model's parameters, which are relative to the inertia, to figures in SI units"""
+
     servo: Servo
     scale: Scale
     load: KnownLoad
 
     def of(self, numbers: Floats) -> dict[str, float]:
-        """Return the figures by name."""
+        """Return the figures by name (see UNITS), from parameters in the order of ROWS."""
         at = {name: float(numbers[row]) for name, row in ROWS.items()}
         drive, constant = at["drive"], at["back_emf"]
         gravity = math.hypot(at["gravity_sin"], at["gravity_cos"])
@@ -321,13 +327,13 @@ def _notes(  # noqa: PLR0917  all that a sentence may be about
 
 
 def _viscous_share(servo: Servo) -> float:
-    """Return the share of viscous friction in the damping of the built-in motor (from publications)."""
+    """Return the share of viscous friction in the damping of the simulation's motor (from publications)."""
     built_in = servo.built_in
     return built_in.viscous_friction / (built_in.damping + built_in.viscous_friction)
 
 
 def _expected(servo: Servo, viscous_share: float) -> dict[str, float]:
-    """Return the expected figures, from the built-in motor and the manual's stall torque.
+    """Return the expected figures by name, from the simulation's motor and the manual's stall torque.
 
     `viscous_share` is the share of viscous friction in the damping, which the torque constant includes if the
     two are not separated.
@@ -362,7 +368,7 @@ def _motor(  # noqa: PLR0917  all that a motor file has
     run: Measured,
     source: str,
 ) -> tuple[MotorModel, dict[str, float]]:
-    """Return the motor with all significant figures, and their half-widths."""
+    """Return the content of a motor file with all significant figures, and half-widths by name."""
     fitted = _fitted_names(fit)
     told = {
         name: value

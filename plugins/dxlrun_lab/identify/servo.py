@@ -1,4 +1,4 @@
-"""Known properties of a servo before its identification: from the plan in a log, tables and manuals."""
+"""Properties of a servo that are known before its identification: from plan, control table and manual."""
 
 from __future__ import annotations
 
@@ -23,10 +23,11 @@ class Servo(msgspec.Struct, frozen=True):
     joint: str
     table: ControlTable
     reference: float
-    """Position of the servo at the joint position 0, rad"""
+    """Angle of the servo at the joint position 0, rad"""
     direction: int
+    """1 if the servo's angle rises with the joint position, else -1"""
     declared: Mapping[str, int] = msgspec.field(default_factory=dict)
-    """Registers that the robot file declares"""
+    """Values of the registers that the robot file declares, by name"""
 
     @property
     def tick(self) -> float:
@@ -35,7 +36,7 @@ class Servo(msgspec.Struct, frozen=True):
 
     @property
     def measures_current(self) -> bool:
-        """True if the effort is a current; otherwise it is the fraction of full voltage"""
+        """True if the servo's effort is a current, A; False if it is the fraction of full voltage"""
         return self.table.effort_unit == "A"
 
     @property
@@ -47,12 +48,12 @@ class Servo(msgspec.Struct, frozen=True):
 
     @property
     def built_in(self) -> Motor:
-        """Motor of the model in the simulation"""
+        """Parameters with which the simulation (dxlsim) moves this servo model"""
         return motor_of(self.table)
 
     @property
     def p_gain_item(self) -> str | None:
-        """Register of the P gain; None for a servo with compliance slopes"""
+        """Name of the register of the P gain; None for a servo with compliance slopes"""
         return next((name for name in ("position_p_gain", "p_gain") if name in self.table.items), None)
 
     @property
@@ -61,14 +62,17 @@ class Servo(msgspec.Struct, frozen=True):
         return None if self.p_gain_item is None else self.register(self.p_gain_item)
 
     def register(self, name: str, otherwise: int = 0) -> int:
-        """Return the declared value of a register, or else its factory default."""
+        """Return the value of a register that the robot file declares, or else its factory default.
+
+        `otherwise` is returned if the model lacks the register or the default is unknown.
+        """
         if name in self.declared:
             return self.declared[name]
         item = self.table.items.get(name)
         return otherwise if item is None or item.initial is None else item.initial
 
     def manual_gain(self) -> float:
-        """Return the duty per rad of error by the manual; 0 if it is not documented.
+        """Return the gain of the position control by the manual, duty per rad; 0 if not documented.
 
         On the X series, it is Position P Gain / 128 in PWM units per tick (e-Manual, X series, 84). The P
         gain 32 of the MX is as stiff as a compliance slope of 32, which reaches full duty in 32 units of 300
@@ -87,14 +91,17 @@ class Servo(msgspec.Struct, frozen=True):
         return (1.0 - self.control().punch) / (slope * SLOPE_TICK)
 
     def expected_gain(self) -> tuple[float, str]:
-        """Return the expected duty per rad of error, and its source."""
+        """Return the expected gain of the position control, duty per rad of error, and its source as text."""
         built_in = self.built_in
         if built_in.p_gain_duty and self.p_gain:
             return built_in.p_gain_duty * self.p_gain, built_in.gain_source
         return self.manual_gain(), "the manual"
 
     def control(self, *, by_position: bool = True) -> Control:
-        """Return the other properties of the control. Raises InputError for an unsupported setting."""
+        """Return the properties of the servo's control except its gain, from its registers.
+
+        Raises InputError for an integral gain or an acceleration profile, which are not modelled.
+        """
         for name in ("position_i_gain", "i_gain"):
             if self.register(name):
                 raise InputError(
@@ -122,7 +129,7 @@ class Servo(msgspec.Struct, frozen=True):
         )
 
     def rounded(self, goal: float) -> float:
-        """Round a goal, rad, to ticks of the servo."""
+        """Round a goal of the joint, rad, to the nearest tick of the servo."""
         if not math.isfinite(goal):
             return goal
         ticks = round((self.direction * goal + self.reference) / self.tick)
@@ -130,14 +137,17 @@ class Servo(msgspec.Struct, frozen=True):
 
 
 def servo_of(plan: Plan, joint: str) -> Servo:
-    """Return the servo of a joint in a plan. Raises LookupError for an unknown model."""
+    """Return the first servo of a joint in a plan. Raises LookupError for an unknown servo model."""
     bus, servo = plan.servos_by_joint[joint][0]
     table = find_table(servo.model, bus.protocol)
     return Servo(joint, table, servo.reference, servo.direction, servo.declared)
 
 
 def servos_in(log: Log, joints: Sequence[str]) -> list[Servo]:
-    """Return the servos of joints in a log. Raises InputError if one cannot be identified."""
+    """Return the servos of joints, from the plan in a log.
+
+    Raises InputError if a joint is unknown, is linear, or has several servos or a gear.
+    """
     for joint in joints:
         if joint not in log.joints:
             raise InputError(f"{log.path}: no joint {joint}; {suggestion(joint, log.joints)}")

@@ -1,4 +1,4 @@
-"""Result of an identification as tables and sentences, for a terminal and a page."""
+"""Result of `dxlrun identify` as tables and sentences, for terminal and HTML report."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ _MODELS = {
 
 
 def parts(result: Identified) -> tuple[Part, ...]:
-    """Return the table and the sentences of one joint."""
+    """Return the result of one joint: the table of figures, and sentences on scale, fit and remarks."""
     degrees = math.degrees(result.position_rms), math.degrees(result.held_out_rms)
     lines = [
         f"{'* ' if result.scale == 'manual' else ''}{result.scale_sentence}",
@@ -35,7 +35,7 @@ def parts(result: Identified) -> tuple[Part, ...]:
 
 
 def values_table(result: Identified) -> Table:
-    """Return the table of figures with their intervals and expected values."""
+    """Return the table of a joint's figures with their intervals and expected values."""
     columns = (
         Column("", "name"),
         Column("value"),

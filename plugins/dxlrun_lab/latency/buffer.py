@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 
 
 class Place(IntEnum):
-    """Offsets in 64-bit integers"""
+    """Offsets in the shared memory, in 64-bit integers"""
 
     DONE = 0
     """Number of complete wake-ups"""
@@ -29,14 +29,14 @@ class Place(IntEnum):
     MARGIN_NS = 4
     """Time for which the clock is polled before a deadline, ns"""
     WAKE_UPS = 8
-    """Start of the wake-ups"""
+    """Start of the wake-ups: deadline and wake-up time of each, ns"""
 
 
 SIZE = 8
 
 
 def create_file(name: str, content: bytes = b"") -> int:
-    """Create an anonymous file (memfd) with `content`, and return its descriptor."""
+    """Create an anonymous file in memory (memfd) with `content`, and return its descriptor."""
     descriptor = os.memfd_create(name)
     os.pwrite(descriptor, content, 0)
     return descriptor
@@ -48,7 +48,7 @@ def read_file(descriptor: int) -> bytes:
 
 
 class Buffer:
-    """Shared memory of one block, an anonymous file"""
+    """Shared memory of one block of wake-ups, an anonymous file that the measuring process inherits"""
 
     def __init__(self, descriptor: int) -> None:
         self.descriptor = descriptor

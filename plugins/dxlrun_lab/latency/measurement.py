@@ -1,4 +1,4 @@
-"""Measurement in blocks, one process per block, which is monitored while it measures.
+"""Measurement of `dxlrun latency`: blocks of wake-ups, each in a process of its own.
 
 Settings that the operating system refuses are detected before the first block: the process of each condition
 is started once without wake-ups, and reports the granted settings.
@@ -38,26 +38,27 @@ _STANDSTILL_S = 30.0
 _STOP_S = 2.0
 
 Progress = Callable[[str, float], None]
-"""Function that gets the name of the present block, and the fraction of all wake-ups so far"""
+"""Function that shows the progress: name of the present block, and fraction of all wake-ups so far"""
 
 
 @dataclass(slots=True)
 class Measured:
-    """Measurements so far, which remain valid after an interrupt or a failure"""
+    """Blocks that were measured so far, which remain valid after an interrupt or a failure"""
 
     blocks: list[Block] = field(default_factory=list)
     interrupted: bool = False
     failure: str = ""
-    """Failure of a process, one sentence; empty on success"""
+    """Failure of a measuring process, one sentence; empty on success"""
     remarks: list[str] = field(default_factory=list)
+    """Remarks for the report, one sentence each: memory was not locked, the load ended early"""
 
 
 @contextmanager
 def compiled_yardstick(settings: Settings) -> Iterator[str]:
-    """Compile the C program if a condition needs it, and yield its path, or an empty text.
+    """Compile the C program yardstick.c if a condition needs it, and yield its path, or an empty text.
 
-    The program is in an anonymous file. The file is always removed with this process, and can be executed
-    even if /tmp is mounted noexec.
+    The program is in an anonymous file, which disappears with this process and can be executed even if /tmp
+    is mounted noexec.
 
     Raises:
         InputError: The compiler is missing, or it fails.
@@ -95,7 +96,7 @@ def compiled_yardstick(settings: Settings) -> Iterator[str]:
 
 
 def require_grants(settings: Settings, yardstick: str) -> tuple[str, ...]:
-    """Start the process of each condition once without wake-ups, to check the granted settings.
+    """Check that the settings of each condition are granted, by a process of each without wake-ups.
 
     Returns:
         A remark if memory was not locked, which does not prevent the measurement.
@@ -113,7 +114,10 @@ def require_grants(settings: Settings, yardstick: str) -> tuple[str, ...]:
 
 
 def keep_cores_awake(settings: Settings) -> None:
-    """Keep cores from deep idle states while this process exists. Raises InputError if that is refused."""
+    """With --idle-latency, keep cores out of deep idle states until this process exits.
+
+    Raises InputError if the operating system refuses that.
+    """
     if settings.idle_latency:
         grant = realtime.keep_awake()
         if not grant.granted:
@@ -123,7 +127,10 @@ def keep_cores_awake(settings: Settings) -> None:
 def measure(
     settings: Settings, yardstick: str, stress: Stress, progress: Progress, measured: Measured
 ) -> None:
-    """Measure all blocks into `measured`. Complete blocks remain valid after an interrupt or a failure."""
+    """Measure all blocks, alternating the conditions, and append them to `measured`.
+
+    An interrupt or a failure ends the measurement and is noted there. `yardstick` is the C program's path.
+    """
     total = settings.iterations * len(settings.conditions)
     done = 0
     try:
@@ -151,6 +158,8 @@ def measure(
 
 
 class _Process:
+    """Process that measures one block of a condition, and the shared memory with its wake-ups"""
+
     def __init__(self, settings: Settings, condition: Condition, iterations: int, yardstick: str) -> None:
         self._condition = condition
         self._period_ns = settings.period_ns
@@ -184,7 +193,7 @@ class _Process:
         os.close(self._errors)
 
     def watch(self, show: Callable[[int, float], None]) -> None:
-        """Report the progress until the process ends.
+        """Call `show` with number of wake-ups and largest lateness (us) so far, until the process ends.
 
         On an interrupt, the process is requested to end, so that its last wake-up is complete.
         KeyboardInterrupt is then raised again.
@@ -217,7 +226,7 @@ class _Process:
         return bool(ready)
 
     def end(self) -> None:
-        """Wait for the end of the process. Raises ProcessFault on a timeout or an error."""
+        """Wait for the process to exit. Raises ProcessFault on a timeout or a bad exit code."""
         try:
             code = self._process.wait(_STANDSTILL_S)
         except subprocess.TimeoutExpired:
@@ -228,11 +237,11 @@ class _Process:
             raise ProcessFault(f"the process that measures {self._condition.label} ended ({how})")
 
     def grants(self) -> tuple[Grant, ...]:
-        """Return the settings that the operating system granted."""
+        """Return for each requested setting whether the operating system granted it."""
         return msgspec.json.decode(read_file(self._grants), type=tuple[Grant, ...])
 
     def block(self, number: int) -> Block:
-        """Return the measurements so far."""
+        """Return the wake-ups so far, as block `number` of the condition."""
         words = self._buffer.words
         return Block(
             self._condition.name,

@@ -1,4 +1,4 @@
-"""Measuring process: wait for deadlines with the clock and the pacing of the loop.
+"""Measuring process of `dxlrun latency`: waits for deadlines with the clock and the pacing of the loop.
 
 The process is set up like the loop's (one thread, real-time settings, measured margin) and waits on the same
 clock. Between two waits it only stores the times. For the yardstick, it is set up in the same way and then
@@ -42,7 +42,10 @@ class Job(msgspec.Struct, frozen=True):
 
 
 def measure(deadlines: Deadlines, iterations: int, buffer: Buffer) -> None:
-    """Wait for deadlines until the front process requests the end, and store the times of each wake-up."""
+    """Wait for `iterations` deadlines, and store deadline and wake-up time of each in the shared memory.
+
+    Ends early if the front process requests it.
+    """
     words = buffer.words
     done, stop = int(Place.DONE), int(Place.STOP)  # plain integers: members of an enum are slower
     place = int(Place.WAKE_UPS)
@@ -55,7 +58,10 @@ def measure(deadlines: Deadlines, iterations: int, buffer: Buffer) -> None:
 
 
 def run(job: Job) -> None:
-    """Set up this process, measure, and store the used processor time."""
+    """Apply real-time settings, report the granted ones, and measure, or execute the C program instead.
+
+    Wake-ups and used processor time are stored in the shared memory.
+    """
     buffer = Buffer(job.buffer)
     grants = realtime.apply(job.scheduler)
     deadlines = Deadlines(job.period_ns)

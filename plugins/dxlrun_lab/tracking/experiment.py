@@ -1,4 +1,4 @@
-"""Tracking experiment: one run per set-up, evaluated from its log."""
+"""Tracking experiment: one run of the same motion per set-up, each evaluated from its log."""
 
 from __future__ import annotations
 
@@ -27,16 +27,17 @@ _INTERRUPTED = 130
 
 @dataclass(slots=True)
 class Experiment:
-    """Measurements so far, and the reasons for an early end"""
+    """Result of the tracking experiment so far: one measurement per set-up, and failures"""
 
     robot: str
     period_ns: int
+    """Period of the loop, ns"""
     motion: DesiredMotion
     load: str
-    """Description of the load; empty without one"""
+    """Description of the load on the machine; empty without one"""
     measured: list[Measured] = field(default_factory=list)
     failures: list[str] = field(default_factory=list)
-    """Failures, one sentence each"""
+    """Failures of runs, one sentence each"""
     interrupted: bool = False
 
     @property
@@ -48,7 +49,7 @@ class Experiment:
 def run_experiment(
     plan: Plan, motion: DesiredMotion, setups: Sequence[Setup], stress: Stress, console: Console
 ) -> Experiment:
-    """Run a robot in each set-up under a load, and evaluate the logs. Progress is printed to the console.
+    """Run a robot's plan in each set-up under a load, and evaluate the logs. Progress is printed.
 
     A failed run is evaluated up to its failure, and the next set-up follows. Each run ends by the policy of
     the robot.
@@ -85,7 +86,7 @@ def _one(experiment: Experiment, setup: Setup, plan: Plan, stress: Stress, conso
 
 
 def _refused(log: Log) -> list[str]:
-    """Return remarks about scheduler settings that were not granted, which change the set-up."""
+    """Return the log's warnings about scheduler settings that were not granted, which change the set-up."""
     return [
         event.text
         for event in log.events

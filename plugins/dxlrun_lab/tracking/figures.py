@@ -1,4 +1,4 @@
-"""One figure per set-up, all with the same axes, as in Figures 31 to 34 of the thesis.
+"""Figures of the tracking experiment, one per set-up with equal axes, as Figures 31 to 34 of the thesis.
 
 The upper part shows the whole motion: desired, sent and measured position, and the lateness of each cycle.
 The lower part shows position and velocity in the first five seconds (Figure 31) and around the latest cycle
@@ -48,7 +48,7 @@ class _Axes(msgspec.Struct, frozen=True):
 
     @classmethod
     def of(cls, measured: Sequence[Measured], motion: DesiredMotion) -> _Axes:
-        """Return axes that fit all set-ups."""
+        """Return ranges of the axes into which the curves of all set-ups fit."""
         curves = [one.curves for one in measured]
         return cls(
             max(float(one.woken_s[-1]) for one in curves),
@@ -72,18 +72,20 @@ def _span(arrays: Sequence[Floats]) -> tuple[float, float]:
 
 
 def drawings(measured: Sequence[Measured], motion: DesiredMotion) -> tuple[Element, ...]:
-    """Return a figure for each set-up, of at least one. Needs matplotlib."""
+    """Draw a figure for each of one or more set-ups, with equal axes. Needs matplotlib."""
     axes = _Axes.of(measured, motion)
     return tuple(_SetupPlot(one, motion, axes).drawing() for one in measured)
 
 
 class _SetupPlot(msgspec.Struct, frozen=True):
+    """Figure of one set-up"""
+
     measured: Measured
     motion: DesiredMotion
     axes: _Axes
 
     def drawing(self) -> Element:
-        """Return the figure with title and caption."""
+        """Draw the figure with title and caption."""
         tracked, curves = self.measured.tracked, self.measured.curves
         latest = (
             f"the latest, by {microseconds(float(curves.late_us[curves.worst]))}, at "
@@ -148,7 +150,7 @@ class _SetupPlot(msgspec.Struct, frozen=True):
     def _series(  # noqa: PLR0917  one line of a plot
         axes: Axes, x: Floats, y: Floats, window: tuple[float, float], name: str, style: dict[str, object]
     ) -> None:
-        """Draw the samples in a window. Goals are drawn as steps."""
+        """Draw the samples with x in a window (s). The series named "sent" is drawn as steps."""
         first, stop = np.searchsorted(x, window)
         first, stop = max(0, int(first) - 1), int(stop) + 1
         times, values = reduced(x[first:stop], y[first:stop])
@@ -156,7 +158,7 @@ class _SetupPlot(msgspec.Struct, frozen=True):
         axes.plot(times, values, label=name, drawstyle=held, **style)  # type: ignore[arg-type]  # one dictionary for all keys
 
     def _marks(self, axes: Axes, begin_s: float, end_s: float, *, extent: bool) -> None:
-        """Mark the late cycles in a window: by their extent, or by a tick if `extent` is false."""
+        """Mark late cycles in a window of time, s: from deadline to start, or by a tick without `extent`."""
         curves = self.measured.curves
         chosen = _late(curves) & (curves.woken_s >= begin_s) & (curves.due_s <= end_s)
         if extent:

@@ -1,4 +1,4 @@
-"""Evaluation of a motion in a log: drift, tracking error and late cycles.
+"""Evaluation of one run of the tracking experiment from its log: drift, tracking error and late cycles.
 
 A cycle is *late* by the time from its deadline to its start. The deadline is the first one after the start of
 the previous cycle, so if that cycle took too long, it is the one of the first skipped period. Simulated
@@ -27,21 +27,24 @@ LATE_NS = ROUGH_NS
 
 
 class Curves(msgspec.Struct, frozen=True):
-    """Cycles of a motion, shape (cycles,); times in s since the start of the motion"""
+    """Cycles of the motion for the figures, shape (cycles,); times in s since the start of the motion"""
 
     due_s: Floats
     """First deadline after the start of the previous cycle"""
     woken_s: Floats
+    """Start of the cycle"""
     sent_s: Floats
+    """Time at which the goal was written"""
     sent: Floats
-    """rad"""
+    """Goal position, rad"""
     read_s: Floats
+    """Time at which the position was read"""
     read: Floats
-    """rad; NaN without a reply"""
+    """Measured position, rad; NaN without a reply"""
     velocity: Floats
     """Measured velocity, rad/s"""
     late_us: Floats
-    """Lateness without that of the simulated bus"""
+    """Time from deadline to start of the cycle, us, without the part that simulated servos caused"""
 
     @property
     def worst(self) -> int:
@@ -50,7 +53,7 @@ class Curves(msgspec.Struct, frozen=True):
 
 
 class Tracked(msgspec.Struct, frozen=True):
-    """Figures of one set-up. Fields `*_by_bus` are the part of a simulated bus, None on a real one."""
+    """Figures of the run in one set-up. Fields `*_by_bus*` are the part of simulated servos, or None."""
 
     setup: str
     title: str
@@ -81,7 +84,7 @@ class Tracked(msgspec.Struct, frozen=True):
     mean_late_us: float
     max_late_us: float
     late_by_bus_us: float | None
-    """Sum over all cycles"""
+    """Lateness that simulated servos caused, us, as a sum over all cycles"""
     silent_cycles: int
     """Number of cycles without an intact reply, which do not count in the error"""
     remarks: tuple[str, ...] = ()
@@ -99,7 +102,7 @@ class Tracked(msgspec.Struct, frozen=True):
 
 
 class Measured(msgspec.Struct, frozen=True):
-    """Figures and curves of one set-up"""
+    """Evaluation of the run in one set-up: figures, and curves to draw"""
 
     tracked: Tracked
     curves: Curves
@@ -112,7 +115,7 @@ def measure(
     ledger: Sequence[LedgerEntry] | None,
     remarks: tuple[str, ...] = (),
 ) -> Measured | None:
-    """Evaluate a motion in the log of its run. Return None if the run ended before the motion started.
+    """Evaluate how a run followed a motion. Return None if the run ended before the motion started.
 
     Args:
         log: Log of the run.
@@ -173,14 +176,16 @@ def measure(
 
 
 class _Span(NamedTuple):
-    """Cycles of a motion in a log"""
+    """Cycles of the motion in the log of its run"""
 
     begin_ns: int
+    """Start of the motion on the clock of the log, ns"""
     first: int
     """Index of the cycle with the first pose"""
     stop: int
     """Index after the cycle with the last pose"""
     ended: bool
+    """True if the log has the end of the motion"""
 
 
 def _span(log: Log, setup: Setup, desired: DesiredMotion) -> _Span | None:

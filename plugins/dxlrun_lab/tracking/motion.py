@@ -1,5 +1,5 @@
-"""Desired motion: position and velocity of a joint at any time, interpolated between samples of a motion
-file."""
+"""Desired motion of the tracking experiment: position and velocity of a joint at any time, interpolated
+between the samples of a motion file."""
 
 from __future__ import annotations
 
@@ -25,15 +25,18 @@ class DesiredMotion(msgspec.Struct, frozen=True):
     positions: tuple[float, ...]  # rad
     velocities: tuple[float, ...]  # rad/s
     lead_ns: int
-    """Time from the acceptance of the motion's first command to the first sample"""
+    """Time from the acceptance of the motion's first command to the first sample, ns"""
 
     @property
     def duration_ns(self) -> int:
-        """Time from the first sample to the last"""
+        """Time from the first sample to the last, ns"""
         return round(self.times_s[-1] * 1e9)
 
     def at(self, times_s: Floats) -> tuple[Floats, Floats]:
-        """Return position (rad) and velocity (rad/s). Before and after the motion the joint is at rest."""
+        """Return position (rad) and velocity (rad/s) at times since the first sample, s.
+
+        Before and after the motion, the joint is at rest.
+        """
         times, samples = np.clip(times_s, 0.0, self.times_s[-1]), np.array(self.times_s)
         states = np.array([self.positions, self.velocities])
         index = np.clip(np.searchsorted(samples, times, side="right") - 1, 0, len(samples) - 2)
@@ -47,7 +50,10 @@ class DesiredMotion(msgspec.Struct, frozen=True):
 
 
 def desired_motion(path: Path, plan: Plan) -> DesiredMotion:
-    """Return the motion of a file that the plan plays. Raises InputError unless it moves one joint."""
+    """Return the motion of the motion file `path`, which the plan plays.
+
+    Raises InputError unless it moves one joint by two or more positions.
+    """
     parts = len(read_motion(path, plan.groups).motion.motions)
     commands = plan.loop.commands
     joints = next(one.joints for one in plan.loop.controllers if one.name == commands[0].controller)
@@ -72,7 +78,7 @@ def desired_motion(path: Path, plan: Plan) -> DesiredMotion:
 
 
 class _Point(msgspec.Struct):
-    """Point of a command: targets of the joints at a time"""
+    """Point of a motion's command, as decoded from JSON: targets of the joints at a time"""
 
     time: float = 0.0
     """s"""
@@ -92,7 +98,10 @@ class _Trajectory(msgspec.Struct):
 
 
 def _points(commands: Sequence[ScheduledCommand]) -> tuple[Sequence[_Point], int]:
-    """Return the points of a motion, and the time from its first command to its first point, ns."""
+    """Decode a motion's points from its commands: one trajectory, or one command per point.
+
+    The time from the first command to the first point, ns, is returned, too.
+    """
     trajectory = msgspec.json.decode(commands[0].request, type=_Trajectory)
     if trajectory.points:
         return trajectory.points, round(trajectory.start_in * 1e9) + trajectory.points[0].time_ns

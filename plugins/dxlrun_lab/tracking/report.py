@@ -14,7 +14,7 @@ _THESIS = "M. A. Araujo, UFU 2017, section 5.3.3"
 
 
 def parts(experiment: Experiment) -> tuple[Part, ...]:
-    """Return the output for the terminal: table, findings, paths of logs, and remarks."""
+    """Return the experiment's output for the terminal: table, findings, paths of logs, and remarks."""
     tracked = _tracked(experiment)
     return (
         table(tracked),
@@ -25,7 +25,7 @@ def parts(experiment: Experiment) -> tuple[Part, ...]:
 
 
 def result(experiment: Experiment) -> dict[str, object]:
-    """Return the JSON content of the result."""
+    """Return the content of the JSON output of the experiment."""
     motion = experiment.motion
     return {
         "robot": experiment.robot,
@@ -43,7 +43,7 @@ def result(experiment: Experiment) -> dict[str, object]:
 
 
 def machine() -> str:
-    """Describe this machine. The version of the kernel shows if it is a real-time kernel."""
+    """Describe this machine: kernel with version, which shows if it is a real-time one, and cores."""
     here = os.uname()
     cores = counted(len(os.sched_getaffinity(0)), "core", "cores")
     return f"{here.sysname} {here.release} ({here.version}), {cores}"
@@ -84,7 +84,7 @@ def _us(value: float | None) -> str | None:
 
 
 def sentences(experiment: Experiment) -> list[str]:
-    """Return the findings, one sentence each."""
+    """Return one sentence per set-up: how late the motion ended and why, or how long it was measured."""
     tracked = _tracked(experiment)
     found = [_of_sequence(one) for one in tracked if one.start_delays_ns is not None and one.ended]
     found += [_of_loop(one) for one in tracked if one.start_delays_ns is None and one.ended]
@@ -112,7 +112,7 @@ def _of_loop(one: Tracked) -> str:
 
 
 def page(experiment: Experiment) -> str:
-    """Return the page of an experiment with at least one set-up. Needs matplotlib."""
+    """Return the HTML report of an experiment with at least one measured set-up. Needs matplotlib."""
     from dxlrun_lab.tracking.figures import drawings
 
     tracked, motion = _tracked(experiment), experiment.motion

@@ -1,4 +1,4 @@
-"""Set-ups: schedule that sends the motion, and scheduling policy of the operating system.
+"""Set-ups of the tracking experiment: how the motion is sent, and the operating system's scheduling policy.
 
 The thesis (M. A. Araujo, UFU 2017, section 5.3.3) measures three of them. It does not measure the fourth, a
 sequential sender on the real-time scheduler.
@@ -18,18 +18,19 @@ from dxlrun.tooling.realtime import missing_priority
 
 
 class Setup(msgspec.Struct, frozen=True):
-    """Way to send a motion. All other settings are those of an ordinary run."""
+    """Schedule and scheduling policy of a run. All other settings are those of an ordinary run."""
 
     name: str
     title: str
     schedule: ScheduleName
+    """`absolute`: the loop by the clock; `sequential`: a sender that counts poses instead of time"""
     real_time: bool
     """True for the real-time scheduler of the robot file, false for the ordinary one"""
     thesis: str
     """Figures of the thesis that show it"""
 
     def plan(self, plan: Plan) -> Plan:
-        """Return a robot's plan in this set-up."""
+        """Return a robot's plan with the schedule and the scheduling policy of this set-up."""
         scheduler = plan.loop.scheduler
         if not self.real_time:
             scheduler = replace(scheduler, policy="other")
@@ -50,7 +51,7 @@ _BY_NAME = {setup.name: setup for setup in SETUPS}
 
 
 def chosen(names: Sequence[str]) -> tuple[Setup, ...]:
-    """Return set-ups by name, in the order of SETUPS. Raises InputError for an unknown name."""
+    """Return the set-ups with these names, in the order of SETUPS. Raises InputError for an unknown name."""
     for name in names:
         if name not in _BY_NAME:
             raise InputError(f"there is no set-up {name!r}; {suggestion(name, tuple(_BY_NAME))}")
@@ -58,7 +59,7 @@ def chosen(names: Sequence[str]) -> tuple[Setup, ...]:
 
 
 def require_right(setups: Sequence[Setup], plan: Plan) -> None:
-    """Raise InputError if a set-up needs a priority that this user is not allowed to use."""
+    """Raise InputError if a set-up needs a real-time priority that the operating system denies this user."""
     real_time = [one for one in setups if one.real_time]
     missing = [line for one in real_time if (line := missing_priority(one.plan(plan).loop.scheduler))]
     if not missing:
