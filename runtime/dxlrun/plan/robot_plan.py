@@ -137,7 +137,9 @@ def _move_sections(data: bytes) -> bytes:
     if b'"of_features":' in data:
         return data
     tree = msgspec.json.decode(data, type=dict[str, Any])
-    loop = msgspec.convert(tree.get("loop", {}), dict[str, Any])
+    if "loop" not in tree:
+        return data
+    loop = msgspec.convert(tree["loop"], dict[str, Any])
     policies = msgspec.convert(loop.get("policies", {}), dict[str, Any])
     own = {one.name: policies.pop(one.name) for one in FEATURES if one.name in policies}
     sections = {one.name: loop.pop(one.name, None) for one in FEATURES}

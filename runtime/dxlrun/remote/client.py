@@ -47,14 +47,14 @@ LEASE_S = 0.2
 _STOP_S = 30.0
 _POLL_S = 2.0
 _FEEDBACK_S = 0.1
-"""Longest wait of one request for the end of a goal, without and with progress to report."""
+"""Longest wait, s, of one request for the end of a goal: without, and with, a callback for progress."""
 _WRONG_INPUT = (404, 413, 422)
-"""HTTP statuses of requests that are wrong at any time: unknown name, body too long, invalid body."""
+"""HTTP statuses of refusals that are independent of the robot's state: unknown name, long or invalid body."""
 
 
 @dataclass(frozen=True, slots=True)
 class RemoteGoal:
-    """Handle of a goal of a running robot."""
+    """Handle of a goal that was sent to a running robot, given by its number."""
 
     robot: RemoteRobot
     number: int
@@ -83,7 +83,7 @@ class RemoteGoal:
 
 
 Executed: TypeAlias = replies.Executed[RemoteGoal]
-"""Reply to a command that the robot executed."""
+"""Reply to a command that the robot executed, with its goals as handles."""
 
 
 def connect(robot: str | None = None, client: str | None = None) -> RemoteRobot:
@@ -128,7 +128,7 @@ class RemoteRobot:
     """
 
     def __init__(self, name: str, link: RobotLink) -> None:
-        """`link`: the connection to the robot, see RobotLink."""
+        """`name`: the robot's name, for messages; `link`: the connection to its gateway."""
         self.name, self.link = name, link
         self._frames: FrameTree | None = None
 
@@ -145,11 +145,15 @@ class RemoteRobot:
     # State
 
     def info(self) -> dict[str, object]:
-        """Return rate, cycles, log, and the controllers with the commands that they accept."""
+        """Return the robot's rate (Hz), cycles, joints, files, and its controllers with the commands that
+        they accept.
+        """
         return self._decoded(self._asked(requests.ROBOT), Row)
 
     def states(self) -> RobotStates:
-        """Return the newest cycle: arrays with a row for each joint, device state or controller; SI units."""
+        """Return the states of the newest cycle: arrays with one value per joint, source state or controller,
+        SI units.
+        """
         # Imported here because it imports NumPy, which most commands do not need.
         from dxlrun.remote.live.states import RobotStates, array
 
@@ -215,7 +219,7 @@ class RemoteRobot:
         return list(self._ask(requests.TOPICS).topics)
 
     def newest(self, topic: str) -> TopicMessage | None:
-        """Return the newest message of a topic; None before the first message."""
+        """Return the newest message of a topic; None when the topic has had no message yet."""
         with self._listen((topic,), "&once=true") as found:
             return next(iter(found), None)
 
@@ -260,7 +264,9 @@ class RemoteRobot:
         return sorted((*found.running, *found.ended), key=lambda goal: goal.number)
 
     def goal_state(self, number: int, wait: float = 0.0) -> GoalState:
-        """Return one goal; with `wait` (s, at most 5), after its end or after that time."""
+        """Return the state of a goal; with `wait` (s, at most 5), when the goal has ended or that time has
+        passed.
+        """
         return self._ask(requests.GOAL, number, query={"wait": f"{wait:g}"} if wait else {})
 
     def wait(
@@ -419,7 +425,7 @@ class RemoteRobot:
         return self._execute(requests.REGISTER, joint, item, body=Value(value))
 
     def rate(self, rate: float) -> Executed:
-        """Change the loop's rate, Hz."""
+        """Change the loop's rate, Hz; returns when the loop has changed it."""
         return self._execute(requests.RATE, body=Rate(rate))
 
     def halt(self) -> Executed:
@@ -435,7 +441,7 @@ class RemoteRobot:
         return self._execute(requests.TAKE_OVER)
 
     def pause(self) -> Executed:
-        """Hold the joints, and stop the controllers' time."""
+        """Hold the joints at their goals, and stop the clock of the controllers until `resume`."""
         return self._execute(requests.PAUSE)
 
     def resume(self) -> Executed:
@@ -470,7 +476,9 @@ class RemoteRobot:
     # Implementation
 
     def _stopping(self) -> bool:
-        """Send one stop request; return False when a gateway that is alive closed the connection."""
+        """Send one stop request; return True if it was accepted or the robot is gone, False if it must be
+        repeated.
+        """
         try:
             self._execute(requests.STOP)
         except Refused:
@@ -500,7 +508,10 @@ class RemoteRobot:
         body: Body | None = None,
         query: Mapping[str, object] = {},
     ) -> Answer:
-        """Send a request and return the decoded reply; `names` fill the path. Raises Refused."""
+        """Send a request and return its decoded reply; `names` fill the placeholders of its path.
+
+        Raises Refused.
+        """
         return self._decoded(self._asked(request, *names, body=body, query=query), request.answer)
 
     def _asked(
@@ -510,7 +521,8 @@ class RemoteRobot:
         body: Body | None = None,
         query: Mapping[str, object] = {},
     ) -> bytes:
-        """Send a request and return the bytes of the reply; raises Refused."""
+        """Send a request and return the body of the reply; raises Refused, or DxlrunError for a broken link.
+        """
         path = request.target(*names)
         content = body if body is None or isinstance(body, bytes) else _json(body)
         try:
@@ -531,7 +543,9 @@ class RemoteRobot:
             raise DxlrunError(f"{self.name} answers in a way that this version does not know") from error
 
     def _refused(self, status: int, answer: bytes) -> DxlrunError:
-        """Return the exception for a reply that is a refusal."""
+        """Return the exception for a refusal by the robot: Refused, or DxlrunError when the reply is not
+        readable.
+        """
         try:
             refused = msgspec.json.decode(answer, type=NotDone)
         except msgspec.MsgspecError:
@@ -540,7 +554,7 @@ class RemoteRobot:
         return Refused(sentence, code=refused.code, fields=refused.fields, wrong_input=wrong)
 
     def _gone(self, error: Exception) -> DxlrunError:
-        """Return the exception for a link that does not respond."""
+        """Return the exception for a link that failed with `error`."""
         return DxlrunError(f"{self.name} no longer answers: {str(error) or type(error).__name__}")
 
 
@@ -549,7 +563,10 @@ def _listed(names: str | Sequence[str]) -> tuple[str, ...]:
 
 
 def _json(content: object) -> bytes:
-    """Return a request's body, with NumPy arrays as lists. Raises Refused for content that is not JSON."""
+    """Return a request's body as JSON, with NumPy arrays as lists.
+
+    Raises Refused for content JSON cannot express.
+    """
     try:
         content = asdict(content) if isinstance(content, msgspec.Struct) else content
         body = json.dumps(content, default=_plain, allow_nan=False).encode()
@@ -568,7 +585,8 @@ def _json(content: object) -> bytes:
 
 
 def _not_finite(content: object, where: str = "") -> tuple[str, float] | None:
-    """Return the path (`positions[1]`) and the value of the first infinite number or NaN of a body."""
+    """Return path (`positions[1]`) and value of the first infinite number or NaN of a body; None without one.
+    """
     if isinstance(content, float):
         return None if math.isfinite(content) else (where or "a value", content)
     if isinstance(content, Mapping):
@@ -615,4 +633,4 @@ class Stream:
         return self
 
     def __exit__(self, *_: object) -> None:
-        """Send nothing: the lease expires, and the joints hold."""
+        """Send no last set-point: the lease of the newest one expires, and then the joints hold."""

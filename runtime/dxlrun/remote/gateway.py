@@ -97,20 +97,24 @@ from dxlrun.remote.requests.replies import (
 from dxlrun.remote.requests.table import REQUESTS, Answer, Body, NewMotion, NewValues, Request, Row, Value
 
 LEASE_S = (0.01, 0.2, 60.0)
-"""Shortest, default and longest lease of a stream's set-point."""
+"""Shortest, default and longest lease of a streamed set-point, s; without a newer one, it expires after that
+time.
+"""
 _SHORTEST_LOOK_S, _LONGEST_LOOK_S = 0.0005, 0.02
-"""Limits of a stream's polling interval, which is half a period of the loop."""
+"""Shortest and longest polling interval of a topic stream, s; between them it is half a period of the loop.
+"""
 BEAT_S = 2.0
-"""Interval at which a stream without messages sends an empty frame, which shows that the gateway is alive."""
+"""Interval, s, at which a topic stream without messages sends an empty frame to show that the gateway runs.
+"""
 _ENDING_S = 0.5
-"""Timeout for the results of goals when the run ends."""
+"""Timeout, s, of a request for a running goal's result once the run is ending."""
 LONGEST_WAY_S = 3600.0
-"""Longest duration of a trajectory to a point given by joint names."""
+"""Longest duration, s, that a client can request for a move of named joints (query parameter `in`)."""
 MOTION_S = 8.0
-"""Timeout for the check of a motion, during which other clients are served; shorter than a client's 10 s."""
+"""Timeout, s, of checking a motion file in a forked process; shorter than the 10 s that a client waits."""
 LONGEST_FILE = 200
 MOST_MISTAKES = 20
-"""Upper limit of the reported mistakes of a motion."""
+"""Upper limit of the mistakes of a motion file that are listed in a refusal."""
 LONGEST_SENTENCE = 2000
 _STATUS = {
     Code.UNKNOWN_CONTROLLER: 404,
@@ -142,7 +146,9 @@ _STATUS = {
     Code.RUN_ENDING: 503,
 }
 _CONFLICT = 409
-"""HTTP status of all other refusals: the loop or a controller cannot do this in its present state."""
+"""HTTP status of refusal codes that are not in `_STATUS`: the robot's present state does not permit the
+request.
+"""
 
 _Handler: TypeAlias = Callable[["GatewayApp", Asked[Body]], Awaitable[Answer | Response]]
 _HANDLERS: dict[Request[Any, Any], _Handler[Any, Any]] = {}
@@ -151,7 +157,7 @@ _HANDLERS: dict[Request[Any, Any], _Handler[Any, Any]] = {}
 def _answers(
     request: Request[Body, Answer],
 ) -> Callable[[_Handler[Body, Answer]], _Handler[Body, Answer]]:
-    """Register the decorated method as the handler of a request."""
+    """Return a decorator that registers a method of GatewayApp as the handler of a request."""
 
     def note(handler: _Handler[Body, Answer]) -> _Handler[Body, Answer]:
         _HANDLERS[request] = handler
@@ -161,7 +167,10 @@ def _answers(
 
 
 class GatewayApp:
-    """HTTP routes. Every request is checked and prepared here, so the loop only has to execute it."""
+    """HTTP application of the gateway.
+
+    It checks and prepares each request, so the loop only has to execute it.
+    """
 
     def __init__(
         self,
@@ -180,10 +189,12 @@ class GatewayApp:
         self._changing = asyncio.Lock()
         self._playing = asyncio.Lock()
         self._released: dict[str, None] = {}
-        """Controllers that were deactivated by torque or reboot requests and are not active again."""
+        """Names of controllers, in order, that torque or reboot requests deactivated and that are not active
+        again.
+        """
 
     def app(self) -> Starlette:
-        """Return the ASGI application."""
+        """Return the ASGI application with one route for each request of `requests/table.py`."""
         routes = [Route(one.path, self._answered(one), methods=[one.method]) for one in REQUESTS]
         app = Starlette(routes=routes, exception_handlers={HTTPException: _unknown_page})
         app.router.redirect_slashes = False
@@ -192,7 +203,9 @@ class GatewayApp:
     def _answered(
         self, request: Request[Body, Answer]
     ) -> Callable[[starlette.requests.Request], Awaitable[Response]]:
-        """Return the endpoint of a request, which checks rate limit, role, body and commander."""
+        """Return the endpoint of a request: it checks rate limit, role, body and commander, then calls the
+        handler.
+        """
         allowance, handler = self._allowances.get(request.rate), _HANDLERS[request]
 
         async def answer(http: starlette.requests.Request) -> Response:
@@ -222,7 +235,9 @@ class GatewayApp:
 
     @_answers(requests.ROBOT)
     async def robot(self, asked: Asked[None]) -> RobotInfo:
-        """Return the run, its controllers and the commands that they accept."""
+        """Return the robot's name, rate, joints, sources and files, and its controllers with the commands
+        they accept.
+        """
         link, plan = self._link, self._link.plan
         joints, began_ns = plan.loop.joints, link.began_ns
         return RobotInfo(
@@ -262,7 +277,7 @@ class GatewayApp:
 
     @_answers(requests.STATES)
     async def states(self, asked: Asked[None]) -> Response:
-        """Return the newest cycle; unknown numbers are null."""
+        """Return the joint and source states of the newest cycle; numbers that are not known are null."""
         return Response(encoded(self._states()), media_type="application/json")
 
     def _states(self) -> RobotStates:
@@ -270,7 +285,7 @@ class GatewayApp:
         return states_of(self._link.plan, self._newest(), places)
 
     def _newest(self) -> CycleRecord:
-        """Return the newest cycle; raises RefusedRequest before the first."""
+        """Return the record of the loop's newest cycle; raises RefusedRequest before the first cycle."""
         record = self._link.newest()
         if record is None:
             raise refused(Code.NO_CYCLE, {})
@@ -278,19 +293,25 @@ class GatewayApp:
 
     @_answers(requests.FRAMES)
     async def frames(self, asked: Asked[None]) -> Frames:
-        """Return the URDF and its moved joints, from which a client computes the poses of frames."""
+        """Return the text of the URDF and the joints that move its links; a client computes poses of frames
+        from them.
+        """
         plan = self._link.plan
         return Frames(plan.urdf, plan.frames)
 
     @_answers(requests.LOG_HEADER)
     async def log_header(self, asked: Asked[None]) -> Response:
-        """Return the header from which log messages are made: joints, controllers, cycle layout."""
+        """Return the header (joints, controllers, layout of a cycle record) with which a client decodes log
+        messages.
+        """
         header = LogHeader.of(self._link.plan, self._link.topics.epoch_offset_ns)
         return Response(msgspec.json.encode(header), media_type="application/json")
 
     @_answers(requests.EVENTS)
     async def events(self, asked: Asked[None]) -> Events:
-        """Return the stored events after number `after`; `last` is the newest number."""
+        """Return the stored events with a number above the query's `after`; `last` is the newest event's
+        number.
+        """
         after, kept = asked.number("after", 0.0), self._link.events
         rows = (
             EventRow(number, one.t_ns * 1e-9, one.name, one.severity, one.source, one.text)
@@ -301,12 +322,14 @@ class GatewayApp:
 
     @_answers(requests.TOPICS)
     async def topics(self, asked: Asked[None]) -> Topics:
-        """Return all topics, with their types and rates."""
+        """Return all topics that can be streamed, with message type, rate and count."""
         return Topics((*self._link.topic_states(),))
 
     @_answers(requests.STREAM)
     async def stream(self, asked: Asked[None]) -> Response:
-        """Stream the messages of topics as frames, see `Frame`, until the run ends."""
+        """Stream the messages of the queried topics as frames, see `Frame`, until the run ends; with `once`,
+        only one batch.
+        """
         query, rate = asked.http.query_params, asked.number("rate", requests.MOST_LOOKS)
         topics = query.getlist("topic")
         if not topics or rate <= 0:
@@ -335,13 +358,14 @@ class GatewayApp:
 
     @_answers(requests.GOALS)
     async def goals(self, asked: Asked[None]) -> Goals:
-        """Return the running goals and the last ended goals."""
+        """Return the state of the running goals and of the last ended goals."""
         book = self._link.goals
         return Goals((*book.running.values(),), (*book.ended.values(),))
 
     @_answers(requests.GOAL)
     async def goal(self, asked: Asked[None]) -> GoalState:
-        """Return one goal; with `wait`, s, after its end or after that time."""
+        """Return one goal's state; with `wait` (s), reply when the goal ends, at the latest after that time.
+        """
         wait_s, chosen, goals = asked.wait_s, asked.goal, self._link.goals
         running = self._link.heartbeat.phase is Phase.RUNNING
         if goals.status(chosen).ended is None and not running:
@@ -356,7 +380,9 @@ class GatewayApp:
     @_answers(requests.CANCEL)
     @_answers(requests.CANCEL_OF)
     async def cancel(self, asked: Asked[None]) -> Executed[int]:
-        """Cancel a goal by its number, or the goal of a controller; reply with its number."""
+        """Cancel a goal by its number, or the running goals of a controller; reply with the numbers of these
+        goals.
+        """
         if "number" in asked.http.path_params:
             wanted = Cancel(goal=asked.goal)
             goals = [wanted.goal]
@@ -409,7 +435,9 @@ class GatewayApp:
         return Executed(done.cycle, done.goals, seconds=played.seconds)
 
     def _played(self, given: NewMotion, file: str) -> bytes:
-        """Return a Played for the loop, or the Refusal, as MessagePack; runs in a forked process."""
+        """Check a motion file against the newest cycle, in a forked process; return a Played, or a Refusal,
+        as MessagePack.
+        """
         answer: Played | Refusal
         try:
             motion = parse_motion(given.text, Path(file), self._link.plan.groups)
@@ -432,13 +460,13 @@ class GatewayApp:
 
     @_answers(requests.PARAMETERS)
     async def parameters(self, asked: Asked[None]) -> Parameters:
-        """Return a controller's parameters."""
+        """Return name, present value, range and description of each parameter of a controller."""
         now = self._preparation.parameters(self._known(asked).plan)
         return Parameters((*parameters_of(now),))
 
     @_answers(requests.CHANGE)
     async def change(self, asked: Asked[NewValues]) -> Changed:
-        """Change live parameters of a controller, all in one cycle."""
+        """Change live parameters of a controller, all in one cycle; reply with their old and new values."""
         # One change at a time: values that were checked against the present ones must meet these in the loop.
         async with self._changing:
             loaded = self._known(asked)
@@ -453,7 +481,9 @@ class GatewayApp:
 
     @_answers(requests.COMMAND)
     async def command(self, asked: Asked[bytes]) -> Executed[int]:
-        """Check and prepare a typed command, within the limits, and send it to the loop."""
+        """Check a typed command, refuse values beyond joint limits, and send it to the loop; reply once it is
+        executed.
+        """
         kind, content = asked.part("kind"), asked.body
         query, source = asked.http.query_params, self._commanded.get(asked.part())
         if source is not None and kind == SOURCE_COMMANDS:
@@ -491,9 +521,10 @@ class GatewayApp:
 
     @_answers(requests.SET_POINT)
     async def set_point(self, asked: Asked[bytes]) -> Clamped:
-        """Pass the newest set-point of a stream to the loop; a refusal by the loop is an event, not a reply.
+        """Replace the set-point of a stream that waits for the loop; a refusal by the loop is an event, not a
+        reply.
 
-        The last gate clamps values beyond their joints' limits; the reply counts them.
+        The loop clamps values beyond their joints' limits; the reply counts them.
         """
         shortest, usual, longest = LEASE_S
         lease = asked.number("lease", usual)
@@ -512,7 +543,9 @@ class GatewayApp:
 
     @_answers(requests.SWITCH)
     async def switch(self, asked: Asked[Switch]) -> Executed[int]:
-        """Activate and deactivate controllers in one cycle; reply when those that wait for modes are in."""
+        """Activate and deactivate controllers in one cycle; reply after the servos have changed their
+        operating modes.
+        """
         switch, known = asked.body, tuple(self._link.controllers)
         if unknown := [name for name in (*switch.activate, *switch.deactivate) if name not in known]:
             raise unknown_controllers(unknown, known)
@@ -527,7 +560,9 @@ class GatewayApp:
         return Executed(done.cycle, below=(*below,))
 
     def _below(self, names: Sequence[str]) -> list[str]:
-        """Return the inactive controllers below the named ones, which are activated together with them."""
+        """Return the inactive controllers that the named ones send commands to, which the loop activates with
+        them.
+        """
         found: list[str] = []
         left, seen = list(names), set(names)
         while left:
@@ -543,7 +578,9 @@ class GatewayApp:
 
     @_answers(requests.REGISTER)
     async def register(self, asked: Asked[Value]) -> Executed[int]:
-        """Write a RAM item of a joint's servo, and reply when the value was read back."""
+        """Write a RAM item of a joint's servo; reply with the old and new value when the new one was read
+        back.
+        """
         joint, item = asked.part(), asked.part("item")
         register = prepared_register(self._link.plan, joint, item, asked.body.value)
         done = await self._link.for_loop("register", register, asked.origin)
@@ -551,7 +588,9 @@ class GatewayApp:
 
     @_answers(requests.READ_REGISTER)
     async def read_register(self, asked: Asked[None]) -> Row:
-        """Read a control table item of a joint's servo."""
+        """Read a control table item of a joint's servo, in the loop's idle time, and return its value with
+        unit.
+        """
         plan, joint, item = self._link.plan, asked.part(), asked.part("item")
         reading = prepared_reading(plan, joint, item)
         done = await self._link.for_loop("get", reading, asked.origin)
@@ -591,7 +630,7 @@ class GatewayApp:
         return Executed(done.cycle, joints=wanted.joints, deactivated=done.deactivated, offered=offered)
 
     def _offered(self) -> tuple[str, ...]:
-        """Return the released controllers that can be activated again because their joints have torque."""
+        """Return the controllers that requests deactivated and whose joints all have torque again."""
         record, known = self._link.newest(), self._link.controllers
         for name in [one for one in self._released if one not in known or self._link.active(known[one])]:
             del self._released[name]
@@ -603,46 +642,53 @@ class GatewayApp:
 
     @_answers(requests.RATE)
     async def rate(self, asked: Asked[Rate]) -> Executed[int]:
-        """Change the loop's rate."""
+        """Change the loop's rate, Hz."""
         return await self._for_loop(
             "rate", asked.body, asked.origin, partial(self._link.note_rate, asked.body.rate)
         )
 
     @_answers(requests.HALT)
     async def halt(self, asked: Asked[None]) -> Executed[int]:
-        """Stop every joint and hold; reply when all joints are at rest."""
+        """Stop every joint and deactivate its controllers; reply when all joints are at rest."""
         return await self._for_loop("halt", None, asked.origin)
 
     @_answers(requests.PAUSE)
     async def pause(self, asked: Asked[None]) -> Executed[int]:
-        """Hold the joints at their goals, and stop the controllers' time."""
+        """Hold the joints at their goals and stop the clock of the controllers until `resume`."""
         return await self._for_loop("pause", None, asked.origin, partial(self._link.note_paused, True))
 
     @_answers(requests.RESUME)
     async def resume(self, asked: Asked[None]) -> Executed[int]:
-        """Resume the controllers' time."""
+        """Resume the clock of the controllers after a pause."""
         return await self._for_loop("resume", None, asked.origin, partial(self._link.note_paused, False))
 
     @_answers(requests.STOP)
     async def stop(self, asked: Asked[None]) -> Executed[int]:
-        """Stop the run normally."""
+        """End the run normally, with the steps of `on_exit`."""
         return await self._for_loop("stop", None, asked.origin)
 
     async def _for_loop(
         self, kind: str, data: object, origin: str, noted: Callable[[Done], object] | None = None
     ) -> Executed[int]:
-        """Send the loop a command of its own; `noted` is called when the loop has executed it."""
+        """Send the loop a command that is not for a controller; `noted` is called once the loop has executed
+        it.
+        """
         done = await self._link.for_loop(kind, data, origin, noted)
         return Executed(done.cycle, halted=done.halted)
 
     @_answers(requests.TAKE_OVER)
     async def take_over(self, asked: Asked[None]) -> Executed[int]:
-        """Make this client the commander, in place of another one."""
+        """Make this client the commander, the only client of another computer that may command, in place of
+        the present one.
+        """
         before = self._commander.become(client_of(asked.http))
         return await self._note_commander(before or self._commander.name, asked.origin)
 
     async def _admit(self, asked: Asked[Body], request: Request[Body, Answer]) -> None:
-        """Require that a client may command, and log a change of the commander; raises RefusedRequest."""
+        """Require that a client may make a request as commander; log when it became commander.
+
+        Raises RefusedRequest.
+        """
         client = client_of(asked.http)
         before = self._commander.admit(client, request)
         if before is not None:
@@ -651,19 +697,21 @@ class GatewayApp:
             self._commander.admit(client, request)
 
     async def _note_commander(self, before: str, origin: str) -> Executed[int]:
-        """Log the change of the commander."""
+        """Have the loop log that the commander is no longer the client `before`."""
         return await self._for_loop("commander", NewCommander(self._commander.name, before), origin)
 
     @_answers(requests.LOAD)
     async def load(self, asked: Asked[Row]) -> Executed[int]:
-        """Load a controller into a paused loop."""
+        """Check a controller's entry, written as in the robot file, and load the controller into a paused
+        loop.
+        """
         others = {name: loaded.plan for name, loaded in self._link.controllers.items()}
         plan = self._preparation.controller(asked.body, others, self._link.rate)
         return await self._for_loop("load", plan, asked.origin, partial(self._link.loaded, plan))
 
     @_answers(requests.UNLOAD)
     async def unload(self, asked: Asked[None]) -> Executed[int]:
-        """Unload a controller from a paused loop."""
+        """Unload an inactive controller from a paused loop."""
         name = self._known(asked).plan.name
         return await self._for_loop("unload", Unload(name), asked.origin, partial(self._link.unloaded, name))
 
@@ -687,7 +735,8 @@ class GatewayApp:
 
 
 def _response(reply: object, status: int = 200) -> Response:
-    """Return the HTTP response for a handler's reply."""
+    """Return a handler's reply as JSON with HTTP status 200, or 202 for a set-point; a Response is unchanged.
+    """
     if isinstance(reply, Response):
         return reply
     if isinstance(reply, Executed | Changed | Clamped):
@@ -697,7 +746,9 @@ def _response(reply: object, status: int = 200) -> Response:
 
 
 def _mistaken(error: InputError) -> dict[str, Field]:
-    """Return the mistakes of a motion: one text with all, and a tuple each of places, problems and fixes."""
+    """Return the fields of a refused motion file: a text with all mistakes, and their places, problems and
+    fixes.
+    """
     found = error.problems[:MOST_MISTAKES]
     if not found:
         return {"problem": str(error)}

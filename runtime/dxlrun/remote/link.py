@@ -1,4 +1,5 @@
-"""Link: the gateway's connection to the loop: mailbox, answers, newest cycle and events."""
+"""Link: the gateway's shared memory with the loop: command mailbox, answers, newest cycle, events and topics.
+"""
 
 from __future__ import annotations
 
@@ -33,17 +34,18 @@ from dxlrun.remote.preparation import RefusedRequest
 from dxlrun.remote.requests.replies import TopicState
 
 ANSWER_S = 2.0
-"""Timeout for an answer of the loop, in addition to two of the loop's periods."""
+"""Timeout, s, of the loop's answer to a command; two periods of the loop are added."""
 MOST_WAITING = 64
 MOST_WAITING_BYTES = 2 * LONGEST_COMMAND
-"""Upper limits of the commands that wait for an answer; the rest of the mailbox is reserved for `stop`."""
+"""Limits of number and bytes of the commands without an answer. The rest of the mailbox is for `stop`."""
 KEPT_EVENTS = 1000
 KEPT_TEXT = 1 << 20
 """Upper limits of the stored events: number, and characters of their texts."""
 LONGEST_DATA = LONGEST_COMMAND - 1024
-"""Bytes; the mailbox's longest operation minus room for names."""
+"""Upper limit of a command's payload, bytes: the longest operation of the mailbox minus room for names."""
 ENTER_S = 6.0
-"""Timeout for a mode change; the loop's own timeout is five seconds."""
+"""Timeout, s, after the loop replied that servos change their operating mode; the loop's own timeout is 5 s.
+"""
 # s; polling interval while a command is pending; ten times as long otherwise. The rings are shared memory
 # without a wake-up.
 _LOOK_S = 0.002
@@ -54,7 +56,7 @@ _HELD = {
     EventCode.CONTROLLER_ACTIVATED: False,
     EventCode.CONTROLLER_DEACTIVATED: False,
 }
-"""Events of a controller -> True when its joints are held afterwards because its stream ended."""
+"""Event about a controller -> new value of `Loaded.held`."""
 
 
 _codec = lru_cache(Codec)
@@ -62,7 +64,9 @@ _codec = lru_cache(Codec)
 
 @dataclass(slots=True)
 class Loaded:
-    """A loaded controller and the index of its bit in the cycle record's `active` mask."""
+    """A controller in the loop, as the gateway records it: plan, and index of its bit in a cycle record's
+    `active` mask.
+    """
 
     plan: ControllerPlan
     place: int
@@ -71,19 +75,21 @@ class Loaded:
 
 @dataclass(slots=True)
 class _Pending:
-    """A command that waits for the loop's answer."""
+    """A command that was sent to the loop and is not answered yet."""
 
     size: int
     answer: asyncio.Future[Answer]
     done: Callable[[Done], object] | None
-    """Called when the loop has executed the command, even after the client stopped waiting."""
+    """Called with the loop's answer once the command is executed, even after the client stopped waiting."""
 
 
 class Link:
-    """State of the loop as seen by the gateway, and the sender of commands; one asyncio loop, no threads."""
+    """The gateway's copy of the loop's state, and the sender of commands to the loop; one asyncio loop, no
+    threads.
+    """
 
     def __init__(self, plan: Plan, memory: Descriptors, epoch_offset_ns: int = 0) -> None:
-        """`epoch_offset_ns`: wall time minus the run's clock."""
+        """`memory`: shared memory of the run; `epoch_offset_ns`: wall time minus the run's clock."""
         self.plan = plan
         self.rate = 1e9 / plan.loop.period_ns
         self.paused = False
@@ -106,17 +112,24 @@ class Link:
         self._pending: dict[int, _Pending] = {}
         self._pending_bytes = 0
         self.take_servo_limits: Callable[[str, tuple[ServoLimit, ...]], object] = lambda joint, limits: None
-        """Called with a joint and the registers that limit its servo, which the loop reports at its start."""
+        """Called with a joint's name and the registers of its servo that limit it, which the loop reads at
+        start-up.
+        """
 
     def let_begin(self) -> None:
-        """Resume the loop that the supervisor paused until a client could stop it."""
+        """Resume the loop, which the supervisor started paused so that it does not move before a client can
+        stop it.
+        """
         if self._mailbox.used:
             self._mailbox.post(Command(0, LOOP, "resume", b"", "loop"))
 
     # State
 
     def newest(self) -> CycleRecord | None:
-        """Return the newest cycle; None before the first. The next call overwrites the returned record."""
+        """Return the record of the newest cycle; None before the first.
+
+        The next call overwrites the returned record.
+        """
         found = self._cycles.newest()
         if found is not None and len(found.payload) == len(self._record.raw):
             self._record.raw[:] = found.payload
@@ -127,7 +140,7 @@ class Link:
 
     @property
     def began_ns(self) -> int | None:
-        """Time of the first cycle, ns of the run's clock; None before it."""
+        """Start time of the run's first cycle, ns of the run's clock; None before that cycle."""
         self.newest()
         return self._began_ns
 
@@ -138,16 +151,18 @@ class Link:
 
     @property
     def ended(self) -> bool:
-        """True when the loop has ended normally."""
+        """True when the loop's process has reported that the run ended normally."""
         return self.heartbeat.phase is Phase.DONE
 
     def topic_states(self) -> list[TopicState]:
-        """Return the topics: those of the loop, its events, and those made from each cycle."""
+        """Return name, type, rate and count of each topic: those the loop sends, events, and those made from
+        cycles.
+        """
         self.newest()
         return self.topics.states(max(0, self._cycles.passed - 1))
 
     def listen(self, topics: Sequence[str], *, newest: bool) -> TopicStream:
-        """Return a stream of the messages of topics; raises RefusedRequest."""
+        """Return a stream of the messages of the named topics; raises RefusedRequest for an unknown topic."""
         known = [one.name for one in self.topic_states()]
         for topic in topics:
             if topic not in known:
@@ -205,7 +220,9 @@ class Link:
     async def for_loop(
         self, kind: str, data: object, origin: str, done: Callable[[Done], object] | None = None
     ) -> Done:
-        """Send a command to the loop itself and wait until it is executed; raises RefusedRequest."""
+        """Send a command that is not for a controller, as JSON, and wait until the loop executed it; raises
+        RefusedRequest.
+        """
         return await self.command(
             LOOP, kind, b"" if data is None else msgspec.json.encode(data), origin, done
         )
@@ -213,7 +230,11 @@ class Link:
     def set_point(  # noqa: PLR0917  a command's parts, as they come
         self, loaded: Loaded, kind: str, data: bytes, origin: str, lease_ns: int, request: bytes = b""
     ) -> None:
-        """Replace the set-point that waits for the loop; raises RefusedRequest."""
+        """Put a controller's set-point into the mailbox in place of one that the loop has not read; no answer
+        is awaited.
+
+        Raises RefusedRequest when the run is ending, or the set-point is too long.
+        """
         self._require_running()
         number = next(self._numbers)
         command = Command(number, loaded.plan.name, kind, data, origin, lease_ns, request)
@@ -224,7 +245,8 @@ class Link:
             )
 
     async def recorded(self, cycle: int) -> None:
-        """Wait for the record of a cycle, which shows the controllers that are active in that cycle."""
+        """Wait until the record of cycle number `cycle`, or a later one, can be read, or the run is ending.
+        """
         while self.heartbeat.phase is Phase.RUNNING:
             record = self.newest()
             if record is not None and record.cycle >= cycle:
@@ -244,24 +266,24 @@ class Link:
     # Reports of the loop
 
     def loaded(self, plan: ControllerPlan, done: Done) -> None:
-        """Record a loaded controller with the place that the loop assigned."""
+        """Add a controller to `controllers` after the loop loaded it at the place that its answer names."""
         if done.place is not None:
             self.controllers[plan.name] = Loaded(plan, done.place)
 
     def unloaded(self, name: str, _: Done) -> None:
-        """Record that a controller was unloaded."""
+        """Remove a controller from `controllers` after the loop unloaded it."""
         self.controllers.pop(name, None)
 
     def note_rate(self, rate: float, _: Done) -> None:
-        """Record the loop's new rate, Hz."""
+        """Store the loop's new rate, Hz, after the loop changed it."""
         self.rate = rate
 
     def note_paused(self, paused: bool, _: Done) -> None:
-        """Record whether the loop is paused."""
+        """Store that the loop was paused or resumed."""
         self.paused = paused
 
     async def watch(self) -> None:
-        """Collect answers and events until the task is cancelled."""
+        """Poll the shared memory for answers, events and topics until the task is cancelled."""
         while True:
             if self._began_ns is None:
                 self.newest()
@@ -269,7 +291,8 @@ class Link:
             await asyncio.sleep(_LOOK_S if self._pending else 10 * _LOOK_S)
 
     def collect(self) -> None:
-        """Collect the answers and events that have arrived."""
+        """Read the answers, events and goal reports that have arrived; abort goals whose reports were lost.
+        """
         for answered in self._answers.new():
             # Other answers belong to set-points of a stream, for which no client waits.
             if answered.number in self._pending:
@@ -299,7 +322,9 @@ class Link:
                 self.goals.end(goal.number, Outcome.ABORTED, LOST, idle_s)
 
     def _idle(self) -> tuple[float, frozenset[str]]:
-        """Return the time of the newest cycle, s, and its inactive controllers, which cannot have a goal."""
+        """Return the newest cycle's time, s, and the names of its inactive controllers, which cannot have a
+        goal.
+        """
         record = self.newest()
         idle = (one.plan.name for one in self.controllers.values() if not self.active(one))
         return (0.0, frozenset()) if record is None else (record.woken_ns * 1e-9, frozenset(idle))
@@ -317,7 +342,9 @@ class Link:
             pending.done(answer)
 
     def _keep(self, event: Event) -> None:
-        """Store an event for clients, and update the state that the event changes."""
+        """Store an event, drop the oldest beyond the limits, and update goals, servo limits, `paused` and
+        `held` from it.
+        """
         self._text += len(event.text)
         while self.events and (self._text > KEPT_TEXT or len(self.events) >= KEPT_EVENTS):
             self._text -= len(self.events.popleft()[1].text)

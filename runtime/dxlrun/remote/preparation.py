@@ -1,4 +1,4 @@
-"""Preparation: checks a client's input against plan and plug-ins, and converts it for the loop.
+"""Preparation: checks commands of clients against the robot's plan and converts them to the loop's arrays.
 
 All plug-in code that a client can reach runs here, in the gateway's process, never in the loop's.
 """
@@ -48,20 +48,23 @@ from dxlrun.remote import texts
 from dxlwire.joint_unit import LINEAR, ROTARY, JointUnit
 
 LONGEST_NAME = 64
-"""Upper limit of a loaded controller's name in characters; the log truncates longer names."""
+"""Upper limit of the name of a controller that a client loads, characters; the log truncates longer names."""
 BUDGET_S = 5.0
-"""Timeout of a plug-in's code for one request. All other clients wait for it, even those that send `stop`."""
+"""Timeout, s, of the plug-in code that one request runs.
+
+All other clients wait for it, even to send `stop`.
+"""
 _MOST_MISTAKES = 5
 _LONGEST_SENTENCE = 300
 _MOST_QUANTITIES = 20
-"""Upper limit of the wrong quantities in a reply."""
+"""Upper limit of the wrong quantities that a refusal lists."""
 _NAME: TypeAdapter[str] = TypeAdapter(Name)
 _GROUP_FIELDS = frozenset({"positions", "velocities", "efforts", "pwm"})
-"""Fields of the commands of group controllers."""
+"""Fields of the commands of group controllers (positions, velocities, efforts or PWM)."""
 
 
 class RefusedRequest(Exception):
-    """A request that the gateway or the loop refused."""
+    """A request that the gateway or the loop refused; `refusal` has code and fields."""
 
     def __init__(self, refusal: Refusal) -> None:
         super().__init__(refusal.text)
@@ -69,15 +72,17 @@ class RefusedRequest(Exception):
 
 
 def refused(code: Code, fields: Mapping[str, Field]) -> RefusedRequest:
-    """Return the exception for a refusal."""
+    """Return the exception for a refusal with this code and fields."""
     return RefusedRequest(Refusal(code, fields))
 
 
 def travel_s(joint: JointPlan, distance: float, speed: float) -> float:
-    """Return the time that a joint needs for a distance at a speed, s.
+    """Return the time, s, that a joint needs for a distance at a speed.
+
+    Returns 0 at speed 0 when the distance is within the joint's goal tolerance.
 
     Raises:
-        RefusedRequest: A register of its servo keeps the joint from moving.
+        RefusedRequest: The speed is 0 because a register of the servo keeps the joint from moving.
     """
     if speed:
         return distance / speed
@@ -87,19 +92,20 @@ def travel_s(joint: JointPlan, distance: float, speed: float) -> float:
 
 
 def invalid(problem: str) -> RefusedRequest:
-    """Return the exception for an input that is invalid in any state of the robot."""
+    """Return the exception for an input that would be refused in any state of the robot."""
     return refused(Code.INVALID, {"problem": problem})
 
 
 class _TooLong(BaseException):
-    """A plug-in exceeded its timeout; not an Exception, which the plug-in could catch."""
+    """A plug-in's code exceeded BUDGET_S; not an Exception, which the plug-in could catch."""
 
 
 @contextmanager
 def bounded(controller: str) -> Iterator[None]:
-    """Limit the block's Python code to BUDGET_S, in the main thread; raises RefusedRequest after that time.
+    """Limit the Python code of a `with` block to BUDGET_S; raises RefusedRequest that names `controller`
+    after it.
 
-    A call into C that never returns is not interrupted; then only Ctrl-C in the robot's terminal helps.
+    Only in the main thread. A call into C that never returns is not interrupted; then only Ctrl-C helps.
     """
 
     def interrupt(*_: object) -> None:
@@ -118,7 +124,8 @@ def bounded(controller: str) -> Iterator[None]:
 
 @contextmanager
 def plugin_code(controller: str, where: str, model: type[BaseModel] | None = None) -> Iterator[None]:
-    """Run a plug-in's code, `bounded`; its exceptions become a RefusedRequest that begins with `where`.
+    """Run a plug-in's code with a time limit; its exceptions become a RefusedRequest that begins with
+    `where`.
 
     `model`: type of a validated input, whose mistakes are listed one by one.
     """
@@ -139,20 +146,20 @@ def plugin_code(controller: str, where: str, model: type[BaseModel] | None = Non
 
 @dataclass(frozen=True, slots=True)
 class Prepared:
-    """A command prepared for the loop."""
+    """A controller's command in the form that the loop reads, with the result of the check of limits."""
 
     controller: str
     kind: str
     data: bytes
-    """Little-endian float64"""
+    """Array that the controller's class prepared, little-endian float64."""
     beyond: tuple[BeyondLimit, ...]
-    """Values beyond their joints' limits."""
+    """Values of the command that are beyond the limits of their joints."""
     request: bytes = b""
-    """The command as JSON, in SI units."""
+    """The command as JSON in SI units, for the log."""
 
     @property
     def joints_beyond(self) -> tuple[str, ...]:
-        """Joints of the values beyond limits, without repeats."""
+        """Names of the joints with a value beyond their limits, without repeats."""
         return tuple(dict.fromkeys(one.joint for one in self.beyond))
 
     def require_within_limits(self) -> None:
@@ -167,7 +174,7 @@ class Prepared:
 
 @dataclass(frozen=True, slots=True)
 class Known:
-    """Class, parameters and joints of a controller, looked up once for all its commands."""
+    """A controller's plan with its class, parameters and joints, kept for its next commands."""
 
     plan: ControllerPlan
     controller: ControllerClass
@@ -177,30 +184,32 @@ class Known:
 
 @dataclass(frozen=True, slots=True)
 class Preparation:
-    """Preparation of commands by the controllers' classes, outside the loop's process."""
+    """Checks and conversions of commands, with the robot's joints and the plug-ins' controller classes."""
 
     joints: dict[str, JointPlan]
-    """Joints of the robot by name, in the robot's order."""
+    """Joint plans of the robot by name, in the robot's order."""
     plugins: PlugIns
     sources: tuple[SourcePlan, ...] = ()
-    """Devices and sensors of the robot."""
+    """Devices and sensors of the robot, whose states controllers can read."""
     urdf: str | None = None
     """Text of the robot's URDF."""
     groups: Groups = field(default_factory=dict)
-    """Groups of joints by name."""
+    """Names of groups of joints in the robot file, with their joints."""
     _known: dict[str, Known] = field(default_factory=dict, init=False)
-    """Cache by controller name; a controller that is loaded later under the same name has another plan."""
+    """Cache of `known`, by controller name; not used when a controller of that name has another plan now."""
     _schemas: dict[str, dict[str, object]] = field(default_factory=dict, init=False)
-    """Controller type -> schema of each command."""
+    """Cache of `takes`: controller type -> command -> JSON Schema."""
 
     def take_servo_limits(self, joint: str, limits: tuple[ServoLimit, ...]) -> None:
-        """Add the registers that limit a joint's servo to the checks of commands."""
+        """Store the registers that limit a joint's servo, so that commands are checked against them."""
         if joint in self.joints:
             self.joints[joint] = replace(self.joints[joint], servo_limits=limits)
             self._known.clear()
 
     def takes(self, plan: ControllerPlan) -> dict[str, object]:
-        """Return the JSON Schema of each command that a controller accepts; empty when its code fails."""
+        """Return the JSON Schema of each command that a controller accepts; a schema is empty when the
+        plug-in fails.
+        """
         if plan.type not in self._schemas:
             offer = self.plugins.controllers.get(plan.type)
             commands = offer.controller.Commands if offer else {}
@@ -213,19 +222,24 @@ class Preparation:
         return self._schemas[plan.type]
 
     def compiled(self, plan: ControllerPlan) -> CompiledController:
-        """Return a controller with its class and parameters; raises RefusedRequest."""
+        """Return a controller's plan with its offer and parsed parameters; raises RefusedRequest for wrong
+        parameters.
+        """
         known = self._known.get(plan.name)
         same = known is not None and known.plan.parameters == plan.parameters and known.plan.type == plan.type
         parameters = known.parameters if known is not None and same else self.known(plan).parameters
         return CompiledController(plan, self.plugins.controllers[plan.type], parameters)
 
     def goals(self, plan: ControllerPlan) -> list[str]:
-        """Return the names of a controller's commands that are goals."""
+        """Return the names of a controller's commands that are goals: they run for a time and report a
+        result.
+        """
         offer = self.plugins.controllers.get(plan.type)
         return sorted(offer.controller.Goals) if offer else []
 
     def motions(self, plan: ControllerPlan) -> dict[str, float]:
-        """Return the motions that a controller plays, with durations, s; empty when its code fails."""
+        """Return the names of a controller's motions with durations, s; empty when the plug-in's code fails.
+        """
         try:
             known = self.known(plan)
             with bounded(plan.name):
@@ -235,17 +249,21 @@ class Preparation:
             return {}
 
     def parameters(self, plan: ControllerPlan) -> ParametersModel:
-        """Return the present parameters of a controller; raises RefusedRequest."""
+        """Return the parsed parameters in a controller's plan; raises RefusedRequest."""
         return self.known(plan).parameters
 
     def command(self, plan: ControllerPlan, kind: str, body: bytes, *, units: bool = False) -> Prepared:
-        """Decode and prepare a typed command from JSON (`true` and "1" are not numbers there).
+        """Check a controller's command in JSON and convert it for the loop (`true` and "1" are not numbers
+        there).
 
         Args:
             plan: Plan of the controller.
             kind: Name of the command.
             body: JSON of the command.
             units: The quantities are texts with units, if motions can use this command.
+
+        Returns:
+            The prepared command, which can have values beyond limits.
 
         Raises:
             RefusedRequest: The command is unknown, or its values are invalid.
@@ -269,7 +287,10 @@ class Preparation:
         return Prepared(plan.name, kind, data, beyond, body)
 
     def known(self, plan: ControllerPlan) -> Known:
-        """Return a controller's class and parameters, parsed once; raises RefusedRequest."""
+        """Return a controller's class, parsed parameters and joints, from the cache if the plan is the same.
+
+        Raises RefusedRequest for a type without a plug-in, or wrong parameters.
+        """
         known = self._known.get(plan.name)
         if known is not None and known.plan is plan:
             return known
@@ -285,9 +306,11 @@ class Preparation:
     def controller(
         self, entry: Mapping[str, object], others: Mapping[str, ControllerPlan], rate: float
     ) -> ControllerPlan:
-        """Return the plan of a controller that is loaded in addition to `others`; raises RefusedRequest.
+        """Check the entry of a controller to be loaded in addition to `others`, and return its plan,
+        inactive.
 
-        `entry` is an entry of the robot file with its `name`; `rate` is the loop's rate, Hz.
+        `entry` is an entry of the robot file with its `name`; `rate` is the loop's rate, Hz. Raises
+        RefusedRequest.
         """
         try:
             name = _NAME.validate_python(entry.get("name", ""))
@@ -310,7 +333,9 @@ class Preparation:
         return plan
 
     def _compiled(self, plan: ControllerPlan) -> ControllerPlan:
-        """Return a controller's plan with the interfaces that its class requests; raises RefusedRequest."""
+        """Return a controller's plan with the interfaces that its class claims and reads; raises
+        RefusedRequest.
+        """
         model: type[ParametersModel] = ParametersModel
         try:
             # Unbounded, because this imports a package: an interrupted import would leave a partial module in
@@ -328,7 +353,9 @@ class Preparation:
         return found.plan
 
     def _mistakes(self, plans: Sequence[ControllerPlan], rate: float) -> list[Mistake]:
-        """Return the mistakes in the graph of a run's controllers at this rate of the loop, Hz."""
+        """Return the mistakes of these controllers run together (claims, chains, rates) at this loop rate,
+        Hz.
+        """
         period_ns = round(1e9 / rate)
         now = [
             # The divider 0 marks a rate that does not divide the loop's rate; the loop refuses it.
@@ -384,7 +411,7 @@ _QUANTITIES: Mapping[JointUnit, Mapping[str, Callable[[object], object]]] = {
 
 
 def _of_motions(kind: str, model: type[BaseModel]) -> bool:
-    """Return whether a command has the fields of a standard controller, whose quantities have units."""
+    """Return whether quantities of a command may be texts with units: a trajectory, or a group's command."""
     fields = set(model.model_fields)
     return kind == TRAJECTORY or (bool(fields) and fields <= _GROUP_FIELDS)
 
