@@ -20,7 +20,9 @@ def _line(text: str) -> str:
     try:
         words = shlex.split(text)
     except ValueError as error:
-        raise refuse(f"{text!r} is not a line of words: {error}", "write it as behind `dxlrun`") from error
+        raise refuse(
+            f"{text!r} is not a command line: {error}", "write it like the words after `dxlrun`"
+        ) from error
     if not words or not words[0].endswith((".yaml", ".yml")):
         raise refuse(f"{text!r} begins with no robot file", "write ROBOT.yaml and what follows it")
     return text

@@ -174,7 +174,7 @@ def measure(joints: Sequence[HandJoint], dialogue: Dialogue) -> list[Measured]:
     for joint in joints:
         joint.let_go()
     names = ", ".join(joint.name for joint in joints)
-    dialogue.ask(f"Bring to the zero pose: {names}. Then press Enter ")
+    dialogue.ask(f"Move to the zero pose: {names}. Then press Enter ")
     zeros = [joint.begin() for joint in joints]
     return [_measure(joint, zero, dialogue) for joint, zero in zip(joints, zeros, strict=True)]
 

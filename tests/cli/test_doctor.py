@@ -439,7 +439,7 @@ def test_on_another_system_the_exit_code_is_one(
     monkeypatch.setattr(Machine, "this", lambda: Machine(platform="darwin"))
     said = dxlrun("doctor")
     assert said.code == 1
-    assert said.out.splitlines()[-1] == "no robot runs here like this: 1 missing, 0 could be better"
+    assert said.out.splitlines()[-1] == "robots cannot run here yet: 1 missing, 0 could be better"
 
 
 def test_an_exchange_that_is_not_compiled_is_missing(look: Look) -> None:

@@ -358,11 +358,14 @@ def test_a_motion_is_played_by_its_name(dxlrun: Dxlrun, robot: Robot, wave: Path
         "`dxlrun send pages play motion=bow`\n"
     )
     said = dxlrun("play", "wolk")
-    assert (said.code, "knows no motion wolk, nor is it a file; did you mean walk?" in said.err) == (2, True)
+    assert (
+        said.code,
+        "has no motion wolk, and there is no file of that name; did you mean walk?" in said.err,
+    ) == (2, True)
     (wave.parent / "torso_two.yaml").write_text("name: torso_two\njoints: {}\n")  # a robot is no motion
     for folder in (wave.parent, wave.parent / "motions"):
         (folder / "wave.yaml").write_text("name: wave\nmotions: []\n")
-    assert dxlrun("play", "dance").err.endswith("nor is it a file; known: bow, walk, wave\n")
+    assert dxlrun("play", "dance").err.endswith("and there is no file of that name; known: bow, walk, wave\n")
 
 
 def test_motions_are_played_one_after_the_other_until_one_does_not_reach_its_end(
@@ -383,7 +386,7 @@ def test_motions_are_played_one_after_the_other_until_one_does_not_reach_its_end
         (("walk", "bow", "--no-wait"), "--no-wait returns when one motion has begun; omit it"),
         (("walk", "--loop", "2", "--no-wait"), "--no-wait returns when one motion has begun; omit it"),
         (("walk", "nowhere/wave.yaml"), "there is no motion file nowhere/wave.yaml; check the path"),
-        (("walk", "wolk"), "knows no motion wolk, nor is it a file; did you mean walk?"),
+        (("walk", "wolk"), "has no motion wolk, and there is no file of that name; did you mean walk?"),
     ],
 )
 def test_nothing_is_played_of_what_cannot_be_played_whole(

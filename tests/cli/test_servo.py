@@ -114,7 +114,7 @@ def test_what_the_model_does_not_have_is_reported(one):
 def test_a_servo_moves_to_another_id_and_rate_and_is_started_anew_and_reset(one):
     servo, finish = one()
     assert "has ID 9; it had 1" in servo(1, "id", "9", "--yes", *NEW).out
-    assert "talks at 2000000 bit/s; it did at 1000000" in servo(9, "baud", "2000000", "--yes", *NEW).out
+    assert "runs at 2000000 bit/s; before that, at 1000000" in servo(9, "baud", "2000000", "--yes", *NEW).out
     fast = ("--protocol", "2.0", "--baud", "2000000")
     assert "rebooted, and is limp" in servo(9, "reboot", *fast).out
     reset = servo(9, "factory-reset", "--except", "id", "--yes", *fast)

@@ -104,4 +104,4 @@ def test_a_mistake_has_its_path_in_the_file() -> None:
     plan = ControllerPlan("up", "part", "", "{}", ("j",), ("position",), (), True, 1, into=("low",))
     (mistake,) = ControllerGraph(("j",), (plan,)).mistakes()
     assert mistake.at == ("controllers", "up", "into", 0)
-    assert mistake.what == "up is into low, which is not a controller of the robot"
+    assert mistake.what == "`into` of up names low, which is not a controller of the robot"

@@ -347,15 +347,15 @@ def _above(graph: Graph, name: str) -> set[str]:
 
 
 SENTENCES = {
-    "self": r" is into itself$",
-    "unknown": r" is into \w+, which is not a controller of the robot$",
-    "twice": r" is into \w+ twice$",
-    "commands nothing": r" is into .*, but commands nothing$",
-    "mute": r" is into \w+, which exports no reference$",
+    "self": r"`into` of \w+ names \w+ itself$",
+    "unknown": r"`into` of \w+ names \w+, which is not a controller of the robot$",
+    "twice": r"`into` of \w+ names \w+ twice$",
+    "commands nothing": r"`into` of \w+ names .*, but \w+ commands nothing$",
+    "mute": r"`into` of \w+ names \w+, which exports no reference$",
     "not exported": r" commands j\d(, j\d)*, which [\w, ]+ (does|do) not export$",
     "interface": r" commands [\w ]+ of [\w, ]+, which \w+ does not export$",
     "double": r" is exported by \w+ and ",
-    "idle": r" is into \w+, which exports none of its joints$",
+    "idle": r"`into` of \w+ names \w+, which exports none of its joints$",
     "inactive": r" is active from the start, but \w+, which it commands, is not$",
     "rate": r"its rate does not divide that of \w+$",
     "reads": r" reads .*, but ",

@@ -88,7 +88,7 @@ def test_mistakes_are_said_where_they_stand_and_all_at_once(including: str) -> N
         "fragments/head.yaml:5:24: joints.yaw.id is the text 'x', but must be a whole number; "
         "write for example `id: 1`",
         "fragments/head.yaml:5:95: there is no argument 'sped'; did you mean speed?",
-        "robot.yaml:13:75: joints.elbow.direction is 2, but must be 1 or -1; write it so",
+        "robot.yaml:13:75: joints.elbow.direction is 2, but must be 1 or -1; write one of them",
     ]
 
 
@@ -159,7 +159,7 @@ def test_depth_number_and_size_are_bounded() -> None:
     for includes, expected in (
         (["deep0.yaml"], f"includes go deeper than {MOST_LEVELS} files; include it further up"),
         (names, f"more than {MOST_FILES} files are included; put some of them together"),
-        (["large1.yaml", "large2.yaml"], "with large2.yaml the robot has more than 1024 KiB; thin it out"),
+        (["large1.yaml", "large2.yaml"], "with large2.yaml the robot has more than 1024 KiB; shorten it"),
     ):
         problems = desk.refusals(f"include: [{', '.join(includes)}]\n{TORSO}")
         assert any(problem.endswith(expected) for problem in problems), problems

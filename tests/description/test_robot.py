@@ -149,8 +149,8 @@ def test_ten_mistakes_give_ten_errors_with_their_places() -> None:
         "robot.yaml:5:36: buses.main has an unknown key 'baudrate'; did you mean baud_rate?",
         "robot.yaml:7:9: there is no argument 'rat'; did you mean rate?",
         "robot.yaml:8:23: loop.scheduler.policy is the text 'realtime', but must be other, fifo or round_robin;"
-        " write it so",
-        "robot.yaml:12:9: joints.swing.id is the text '1', but must be a whole number; take the quotes away",
+        " write one of them",
+        "robot.yaml:12:9: joints.swing.id is the text '1', but must be a whole number; remove the quotes",
         "robot.yaml:14:16: joints.swing.reference: 60 has no unit; write an angle with its unit, such as"
         " 60 deg or 1.05 rad",
         "robot.yaml:16:24: joints.swing.limits.position: the lower limit is not below the upper one;"

@@ -53,7 +53,7 @@ def test_each_joint_stands_behind_the_one_above_it() -> None:
 
 
 TWO_ROOTS = "2 links have no parent: base, lonely; join them to one tree; a fixed joint moves nothing"
-CIRCLE = "links stand in a circle: upper -> thumb -> upper; remove one of the joints between them"
+CIRCLE = "links form a circle: upper -> thumb -> upper; remove one of the joints between them"
 
 
 @pytest.mark.parametrize(
@@ -144,7 +144,7 @@ def test_a_body_that_is_a_circle_alone_is_named() -> None:
         f'<joint name="{a}{b}" type="fixed"><parent link="{a}"/><child link="{b}"/></joint>'
         for a, b in ("ab", "ba")
     )
-    with pytest.raises(InputError, match="links stand in a circle: "):
+    with pytest.raises(InputError, match="links form a circle: "):
         read_urdf(f'<robot><link name="a"/><link name="b"/>{joints}</robot>')
 
 

@@ -109,7 +109,7 @@ def test_every_rate_of_the_table_can_be_set(model, protocol):
     rig = Rig(model, protocol)
     before = RATE
     for rate in rig.one.table.baud_rates.values():
-        assert rig.one.change_rate(rate) == f"talks at {rate} bit/s; it did at {before}"
+        assert rig.one.change_rate(rate) == f"runs at {rate} bit/s; before that, at {before}"
         assert rig.servo.baud_rate == pytest.approx(rate, rel=0.03)
         before = rig.one.baud_rate
         assert before == rate

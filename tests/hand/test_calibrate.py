@@ -129,7 +129,7 @@ def test_no_is_an_answer(arm: Arm) -> None:
     moves = [("positive", arm.move(1, 20)), ("other", arm.move(1, -50))]
     script = arm.do(("hold", ""), ("zero", ""), *moves, ("Write", ""), joints=("elbow",))
     assert (arm.code, arm.path.read_bytes()) == (1, arm.before)
-    assert f"{arm.path} is as it was" in script.text
+    assert f"{arm.path} is unchanged" in script.text
 
 
 def test_a_joint_that_begins_at_its_positive_end_is_measured(arm: Arm) -> None:
@@ -212,7 +212,7 @@ def test_after_ctrl_c_at_each_step_the_file_is_as_it_was(
         arm.do(*steps, joints=("elbow",))
     assert arm.path.read_bytes() == arm.before
     limp = "" if at in ("hold", "Write") else "limp now: elbow\n"
-    assert capsys.readouterr().err == f"{limp}{arm.path} is as it was\n"
+    assert capsys.readouterr().err == f"{limp}{arm.path} is unchanged\n"
     assert [path.name for path in arm.path.parent.iterdir()] == ["arm.yaml"]
 
 
@@ -228,7 +228,7 @@ def test_a_servo_that_does_not_answer_ends_it(arm: Arm, at: str, capsys: pytest.
     with pytest.raises(ServoFault, match=r"^elbow \(ID 1 on bus main\) does not answer"):
         arm.do(*((step, cut if step == at else moves.get(step, "")) for step in STEPS), joints=("elbow",))
     assert arm.path.read_bytes() == arm.before
-    assert f"{arm.path} is as it was" in capsys.readouterr().err
+    assert f"{arm.path} is unchanged" in capsys.readouterr().err
 
 
 def change(item: str, value: int) -> Callable[[Arm], None]:

@@ -238,7 +238,7 @@ def test_random_robots_are_taught(number: int, tmp_path: Path, monkeypatch: pyte
 
         shown = dict(begins)
         steps = [
-            ("Limp", ""),
+            ("become limp", ""),
             ("shown", pose("")),
             ("shown", pose("r")),
             ("Recording", pose("")),

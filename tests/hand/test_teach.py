@@ -130,7 +130,7 @@ def test_a_joint_beyond_its_limits_is_kept_at_them(
 
 
 def test_giving_up_saves_nothing_and_gives_the_torque_back(robot: RemoteRobot, tmp_path: Path) -> None:
-    steps = (("Limp", ""), ("0 shown", DONE), ("0 shown", "limp x"), ("0 shown", "q"), ("comes back", ""))
+    steps = (("become limp", ""), ("0 shown", DONE), ("0 shown", "limp x"), ("0 shown", "q"), ("comes back", ""))
     script = Script(*steps)
     assert taught(robot, script, ("hand",), tmp_path / "none.yaml", SPEED) == 1
     assert script.said[-1] == "Nothing was saved."
@@ -141,12 +141,12 @@ def test_giving_up_saves_nothing_and_gives_the_torque_back(robot: RemoteRobot, t
 
 
 @pytest.mark.parametrize(
-    ("at", "limp"), [("Limp", False), ("0 shown", True), ("comes back", True), ("Play", False)]
+    ("at", "limp"), [("become limp", False), ("0 shown", True), ("comes back", True), ("Play", False)]
 )
 def test_after_ctrl_c_it_is_said_what_is_limp(
     robot: RemoteRobot, tmp_path: Path, at: str, limp: bool, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    steps = [("Limp", ""), ("0 shown", ""), ("1 shown", "s"), ("comes back", ""), ("Play", "y")]
+    steps = [("become limp", ""), ("0 shown", ""), ("1 shown", "s"), ("comes back", ""), ("Play", "y")]
     with pytest.raises(KeyboardInterrupt):
         taught(
             robot,
@@ -173,7 +173,7 @@ def test_a_refusal_that_deactivated_a_controller_names_it(
 
     monkeypatch.setattr(RemoteRobot, "torque", refuse)
     with pytest.raises(Refused):
-        taught(robot, Script(("Limp", "")), ("elbow",), tmp_path / "a.yaml", SPEED)
+        taught(robot, Script(("become limp", "")), ("elbow",), tmp_path / "a.yaml", SPEED)
     assert "deactivated: arm: `dxlrun switch --activate arm`" in capsys.readouterr().err
 
 
@@ -186,7 +186,7 @@ def test_a_servo_that_falls_silent_ends_it(
         monkeypatch.setattr(RemoteRobot, "states", lambda _: old)
         look()
 
-    script = Script(("Limp", ""), ("0 shown", silent))
+    script = Script(("become limp", ""), ("0 shown", silent))
     with pytest.raises(ServoFault, match="elbow does not answer any more; nothing was"):
         taught(robot, script, ("elbow",), tmp_path / "a.yaml", SPEED)
     assert list(tmp_path.iterdir()) == []

@@ -101,7 +101,7 @@ def test_ctrl_c_and_the_end_of_input_leave_the_file_as_it_was(robot: Path, tmp_p
         screen.types(key)
         assert screen.ended() == 130
         said = re.sub(r"\x1b\[[\d;]*m|\r", "", screen.text).splitlines()
-        assert said[-3:] == ["limp now: elbow", "arm.yaml is as it was", "interrupted"]
+        assert said[-3:] == ["limp now: elbow", "arm.yaml is unchanged", "interrupted"]
     assert robot.read_text() == ROBOT
 
 

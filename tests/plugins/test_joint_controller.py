@@ -288,7 +288,7 @@ def test_wrong_keys_have_their_place(written: Written) -> None:
 
 
 FAULTS = {
-    "None": ("None", "returned None from positions; return an array of 2 numbers, one a joint (pan, tilt)"),
+    "None": ("None", "returned None from positions; return an array of 2 numbers, one per joint (pan, tilt)"),
     "a number": ("0.5", "returned 0.5 from positions; return an array of 2 numbers"),
     "three": ("np.zeros(3)", "returned an array of shape (3,) from positions; "),
     "words": ("['a', 'b']", "returned ['a', 'b'] from positions; "),
@@ -304,7 +304,7 @@ FAULTS = {
     ),
     "a field that is set": (
         "setattr(self, 'amplitude', 1.0)",
-        "raised in update: AttributeError: amplitude is a parameter, which only the robot file and clients"
+        "raised in update: AttributeError: amplitude is a parameter; only the robot file and clients"
         " change (wave.py:",
     ),
     "a shape that numpy refuses": (

@@ -125,9 +125,9 @@ WRONG = [
     ("POST", "/controllers", LOAD | {"active": True}, 422, "invalid", "load it, then switch to it"),
     ("POST", "/controllers", LOAD | {"fallback": "nun"}, 422, "invalid", "the fallback nun of more is not a controller"),
     ("POST", "/controllers", LOAD | {"fallback": "more"}, 422, "invalid", "more is its own fallback; name another"),
-    ("POST", "/controllers", LOAD | {"into": "lefty"}, 422, "invalid", "more is into lefty, which is not a controller of the robot; did you mean left?"),
+    ("POST", "/controllers", LOAD | {"into": "lefty"}, 422, "invalid", "`into` of more names lefty, which is not a controller of the robot; did you mean left?"),
     ("POST", "/controllers", LOAD | {"into": ["left", "more"]}, 422, "invalid", "left, which exports no reference; no controller of the robot exports any"),
-    ("POST", "/controllers", LOAD | {"into": ["left", "more"]}, 422, "invalid", "more is into itself"),
+    ("POST", "/controllers", LOAD | {"into": ["left", "more"]}, 422, "invalid", "`into` of more names more itself"),
     ("POST", "/controllers", LOAD | {"into": 3}, 422, "invalid", "names no controller"),
     ("POST", "/controllers", b"[]", 422, "invalid", "Expected `object`"),
 ]  # fmt: skip

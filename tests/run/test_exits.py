@@ -122,10 +122,10 @@ CONFIRMED = "torque off was confirmed by all 2 servos"
             ("the loop did not stop and was killed", CONFIRMED),
         ),
         ([(GUARDIAN, STOP), (LOOP, KILL), (GUARDIAN, KILL)], (CONFIRMED,)),
-        ([(GUARDIAN, STOP)], ("the guardian did not look after the loop any more and was killed",)),
+        ([(GUARDIAN, STOP)], ("the guardian stopped watching the loop, and was killed",)),
         (
             [(GUARDIAN, STOP), (LOOP, KILL)],
-            ("the guardian did not look after the loop any more and was killed",),
+            ("the guardian stopped watching the loop, and was killed",),
         ),
     ],
     ids=["guardian", "hung loop", "both", "stopped guardian", "stopped guardian, loop"],

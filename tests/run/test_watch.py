@@ -637,7 +637,7 @@ def test_a_supervisor_waits_for_a_guardian_only_shortly_once_torque_is_to_be_cut
     monkeypatch.setattr(supervisor, "time", SimpleNamespace(monotonic_ns=lambda: guardian.now_ns))
     run.watch(guardian, lambda heartbeat: None)  # type: ignore[arg-type]  # what stands for the guardian
     assert least_s < guardian.killed_ns * 1e-9 <= most_s
-    assert run.sentences == ["the guardian did not look after the loop any more and was killed"]
+    assert run.sentences == ["the guardian stopped watching the loop, and was killed"]
     guardian.channel.close()
     guardian.theirs.close()
 

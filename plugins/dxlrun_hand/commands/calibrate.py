@@ -71,7 +71,7 @@ def calibrated(
             text.check(path)
     servos = {name: plan.servos_by_joint[name][0] for name in joints}
     ports = {bus.name: bus.port for bus, _ in servos.values()}
-    with ending_with(lambda: f"{robot} is as it was"), ExitStack() as stack:
+    with ending_with(lambda: f"{robot} is unchanged"), ExitStack() as stack:
         lines = BusLines(ports, opened)
         tools = {bus: stack.enter_context(lines.open(bus)) for bus in ports}
         hands = [HandJoint(tools[bus.name], bus, servo) for bus, servo in servos.values()]
@@ -93,7 +93,7 @@ def calibrated(
         except InputError as error:
             dialogue.say("With these values the robot file has other mistakes:", *error.sentences)
         if not yes(dialogue, f"Write this into {robot}?"):
-            dialogue.say(f"{robot} is as it was.")
+            dialogue.say(f"{robot} is unchanged.")
             return 1
         text.write()
     dialogue.say(f"{robot} is written; the joints are limp. `dxlrun check {robot}` checks the whole file.")

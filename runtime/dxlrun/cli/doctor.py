@@ -46,5 +46,5 @@ def _findings(findings: Sequence[Finding], missing: int) -> Iterator[Part]:
             yield Sentence(f"{one.what}: {one.why}", _TONES[one.state])
             yield f"    {one.fix}"
     worse = sum(one.state == "worse" for one in findings)
-    verdict = "robots run here" if not missing else "no robot runs here like this"
+    verdict = "robots run here" if not missing else "robots cannot run here yet"
     yield f"{verdict}: {missing} missing, {worse} could be better"

@@ -213,7 +213,7 @@ def known_file(robot: Path) -> None:
         raise InputError(
             f"`dxlrun {word}` is a command of the package {package}, which cannot be imported here; "
             f"`dxlrun plugins` may say why, and `pip install {verbs.source_of(package)}` "
-            "where dxlrun came from installs it"
+            "in the source folder of dxlrun installs it"
         )
     if (named := robot.with_suffix(".yaml")).is_file():
         raise InputError(f"there is no file {word}; write `{named}`")

@@ -228,15 +228,13 @@ class ControllerGraph:
         for index, target in enumerate(plan.into):
             at = (*_path(name), "into", index)
             if target == name:
-                yield Mistake(
-                    at, f"{name} is into itself", "name the controller whose references it commands"
-                )
+                yield Mistake(at, f"`into` of {name} names {name} itself", "name the controller below it")
             elif target not in self._named:
                 known = tuple(one.name for one in self.controllers if one.reference and one.name != name)
-                what = f"{name} is into {target}, which is not a controller of the robot"
+                what = f"`into` of {name} names {target}, which is not a controller of the robot"
                 yield Mistake(at, what, suggestion(target, known or tuple(self._named)))
             elif target in plan.into[:index]:
-                yield Mistake(at, f"{name} is into {target} twice", "name it once")
+                yield Mistake(at, f"`into` of {name} names {target} twice", "name it once")
 
     def _exports(self, plan: ControllerPlan) -> Iterator[Mistake]:
         """Check that exactly one controller in `into` exports each joint with all commanded interfaces."""
@@ -244,14 +242,14 @@ class ControllerGraph:
         if not plan.into or name in self._incomplete:
             return
         if not plan.command:
-            what = f"{name} is into {_listed(plan.into)}, but commands nothing"
+            what = f"`into` of {name} names {_listed(plan.into)}, but {name} commands nothing"
             yield Mistake((*_path(name), "into"), what, "remove `into`, or use a controller that commands")
             return
         mute = [
             one for one in lowers if not (one.reference and one.joints) and one.name not in self._incomplete
         ]
         for lower in mute:
-            what = f"{name} is into {lower.name}, which exports no reference"
+            what = f"`into` of {name} names {lower.name}, which exports no reference"
             yield Mistake(self._at_into(plan, lower), what, self._exporting(plan))
         known = all(target in self._named and target not in self._incomplete for target in plan.into)
         useful = [one for one in lowers if one not in mute]
@@ -295,7 +293,7 @@ class ControllerGraph:
             )
         idle_ones = [one for one in lowers if one.name not in used and not missing]
         for idle in idle_ones:
-            what = f"{name} is into {idle.name}, which exports none of its joints"
+            what = f"`into` of {name} names {idle.name}, which exports none of its joints"
             yield Mistake(self._at_into(plan, idle), what, f"remove {idle.name} from `into`")
 
     def _activity(self, plan: ControllerPlan) -> Iterator[Mistake]:

@@ -179,7 +179,7 @@ def _one_a_joint(returned: object, name: str, joints: tuple[str, ...]) -> Floats
     if values.shape == (len(joints),):
         return values
     what = f"an array of shape {returned.shape}" if isinstance(returned, np.ndarray) else repr(returned)
-    wanted = f"an array of {counted(len(joints), 'number', 'numbers')}, one a joint ({', '.join(joints)})"
+    wanted = f"an array of {counted(len(joints), 'number', 'numbers')}, one per joint ({', '.join(joints)})"
     raise ControllerFault(f"returned {what[:_MOST_SHOWN]} from {name}; return {wanted}")
 
 

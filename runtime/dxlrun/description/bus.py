@@ -28,13 +28,13 @@ def _protocol(value: float) -> float:
 
 def _timer(value: int) -> int:
     if value > _LONGEST_TIMER_NS:
-        raise refuse("no adapter gathers bytes for so long", "write 255 ms at most")
+        raise refuse("an adapter does not buffer bytes for that long", "write 255 ms at most")
     return value
 
 
 def _boot_time(value: int) -> int:
     if value > _LONGEST_BOOT_NS:
-        raise refuse("no board boots for so long", "write 10 s at most")
+        raise refuse("a board does not boot for that long", "write 10 s at most")
     return value
 
 

@@ -153,7 +153,7 @@ def read_text(path: Path, language: str = "YAML") -> str:
         if number in (errno.EISDIR, errno.EINVAL):
             raise refusal(Mark(file), reason, f"name a {language} file") from None
         if number == errno.EFBIG:
-            raise refusal(Mark(file), reason, "split it, or thin it out") from None
+            raise refusal(Mark(file), reason, "split it, or shorten it") from None
         what, fix = f"the file cannot be read ({reason})", "check its name and its rights"
         raise refusal(Mark(file), what, fix) from None
     if language == "YAML" and (kind := kind_of_bytes(data, path)):
@@ -202,7 +202,7 @@ def _refused_tags(text: str, file: str) -> Iterator[Problem]:
         if isinstance(event, yaml.DocumentStartEvent):
             documents += 1
             if documents > 1:
-                raise refusal(mark, "a second document starts here", "keep one document a file")
+                raise refusal(mark, "a second document starts here", "keep one document per file")
         elif isinstance(event, yaml.CollectionStartEvent):
             depth += 1
             if depth > DEEPEST:

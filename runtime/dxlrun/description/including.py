@@ -131,7 +131,7 @@ class _Collector:
             return
         if self._characters + len(text) > LARGEST_FILE:
             what = f"with {entry} the robot has more than {LARGEST_FILE // 1024} KiB"
-            self._refuse(mark, what, "thin it out")
+            self._refuse(mark, what, "shorten it")
             return
         try:
             self.take(fragment, text, parse(text, str(fragment)), above)

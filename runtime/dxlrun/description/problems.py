@@ -411,10 +411,10 @@ def _remedy(error: _Error) -> str:
     if expected == "a mapping" and (fix := _indentation(error)):
         return fix
     if error.kind in ("literal_error", "enum"):
-        return "write it so"
+        return "write one of them"
     written = plain_value(error.input) if isinstance(error.input, str) else None
     if isinstance(written, int | float) and expected in (_WHOLE, _NUMBER, _BOOL):
-        return "take the quotes away" if expected != _WHOLE or isinstance(written, int) else _REMEDIES[_WHOLE]
+        return "remove the quotes" if expected != _WHOLE or isinstance(written, int) else _REMEDIES[_WHOLE]
     if expected == _TEXT and isinstance(error.input, bool | int | float):
         return f'put it in quotes: "{text_of(error.input)}"'
     return _example(error) or _REMEDIES.get(expected, "correct it")

@@ -35,7 +35,7 @@ from dxlrun.features.feature import PolicyKey, Section
 
 def _cores(value: tuple[int, ...]) -> tuple[int, ...]:
     if not value or len(set(value)) < len(value):
-        raise refuse("cores are given once each, and at least one", "write for example [3]")
+        raise refuse("cores must be a list of different cores", "write for example [3]")
     return value
 
 

@@ -153,7 +153,7 @@ class LogWriter(RunMessages):
     def take(self, kind: int, payload: Payload) -> None:
         """Write one record of a ring. Raises ValueError for a record that does not fit into a log."""
         if kind not in self._takers:
-            raise ValueError(f"a record of kind {kind} does not belong into a log")
+            raise ValueError(f"a record of kind {kind} does not belong in a log")
         self._guarded(self._takers[kind], payload)
         if self._chunk_bytes > CHUNK_BYTES:
             self.flush()

@@ -188,7 +188,7 @@ class RunMessages(ABC):
                 self._add(self._topic_channels[number], t_ns, data)
             case other:
                 raise ValueError(
-                    f"{type(other).__name__} does not belong into a log, or its topic was not opened"
+                    f"{type(other).__name__} does not belong in a log, or its topic was not opened"
                 )
 
     def _taken_command(self, command: TakenCommand) -> None:

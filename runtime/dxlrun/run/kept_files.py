@@ -160,7 +160,7 @@ class KeptFiles:
         except OSError as error:
             self.problems[controller] = f"{error.strerror or error}"
         except ValueError as error:
-            self.problems[controller] = f"what left the loop {error}"
+            self.problems[controller] = f"the state that came from the loop {error}"
         else:
             self.problems.pop(controller, None)
 

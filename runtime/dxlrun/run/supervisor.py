@@ -277,7 +277,7 @@ class _Run:
             if message:
                 self._take(message, guardian.channel.descriptors)
             elif duty is not Duty.NONE and not guardian.channel.closed:
-                self.sentences.append("the guardian did not look after the loop any more and was killed")
+                self.sentences.append("the guardian stopped watching the loop, and was killed")
                 guardian.kill()
                 break
 

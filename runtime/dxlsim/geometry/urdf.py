@@ -216,7 +216,7 @@ class _Reading:
             return cast("JointType", kind)
         if kind in _FREE:
             what = f"joint {name} is {kind}: it has several coordinates, and a servo has one"
-            self._add(element.mark, what, "make it fixed, or one revolute or prismatic joint a coordinate")
+            self._add(element.mark, what, "make it fixed, or one revolute or prismatic joint per coordinate")
         else:
             what = f"joint {name} has the type {kind}" if kind else f"joint {name} has no type"
             self._add(element.mark, what, f"write one of {', '.join(_TYPES)}")
@@ -341,7 +341,7 @@ class _Reading:
             while way.count(way[-1]) == 1:
                 way.append(above[way[-1]].parent)
             circle = way[way.index(way[-1]) :][::-1]
-            what = f"links stand in a circle: {' -> '.join(circle)}"
+            what = f"links form a circle: {' -> '.join(circle)}"
             self._add(above[circle[-1]].mark, what, "remove one of the joints between them")
         return roots[0] if roots else ""
 

@@ -143,7 +143,9 @@ def _found(robot: RemoteRobot, name: str) -> Found:
     if fitting or having:
         return Found(name, fitting[0]) if fitting else Found(name, Path(name), having[0])
     known = [each.motion for each in _playable(info)]
-    raise InputError(f"{robot.name} knows no motion {name}, nor is it a file; {suggestion(name, known)}")
+    raise InputError(
+        f"{robot.name} has no motion {name}, and there is no file of that name; {suggestion(name, known)}"
+    )
 
 
 def _players(info: Mapping[str, object]) -> dict[str, Mapping[str, float]]:

@@ -225,14 +225,14 @@ class Context(msgspec.Struct, frozen=True):
         below = place[common:-1]
         if common == len(here) and below and NAME not in below:
             if below[0] in self.present:
-                return f"it belongs into `{'.'.join(below)}`: move it there"
-            return f"it belongs into `{'.'.join(below)}`: write `{_in_mappings(below, written)}`"
+                return f"it belongs in `{'.'.join(below)}`: move it there"
+            return f"it belongs in `{'.'.join(below)}`: write `{_in_mappings(below, written)}`"
         names = [*self.sections.get(place[0], ())]
         entry = str(self.path[1]) if common >= 2 else names[0] if len(names) == 1 else NAME
         where = ".".join(entry if step == NAME else step for step in place[:-1])
         if not where:
             return f"it belongs to the top of the file: write `{written}` without indentation"
-        return f"it belongs into `{where}`: write `{written}` there"
+        return f"it belongs in `{where}`: write `{written}` there"
 
 
 def misplaced_sections(

@@ -266,7 +266,7 @@ class OneServo(OneNode):
             known = ", ".join(map(str, sorted(self.table.baud_rates.values())))
             raise InputError(f"an {self.table.model} has no rate of {new} bit/s; it has {known}")
         if new == self.baud_rate:
-            return f"talks at {new} bit/s already"
+            return f"runs at {new} bit/s already"
         if not confirm(f"{self.called}: its baud rate becomes {new} bit/s (EEPROM)"):
             return ""
         self.writable([self.register(self.rate_item(), value)])
@@ -293,7 +293,7 @@ class OneServo(OneNode):
                 )
             raise self.fail(f"was given {item.title} = {value}, but still answers at {old} bit/s")
         self._same()
-        return f"talks at {new} bit/s; it did at {old}"
+        return f"runs at {new} bit/s; before that, at {old}"
 
     def rate_item(self) -> str:
         """Return the name of the item with the baud rate; the Y series has two rates."""

@@ -180,7 +180,7 @@ def _written_items(file: RobotFile, name: str, device: Device, table: DeviceTabl
             why = (
                 "is in the EEPROM, and the EEPROM wears out"
                 if item.area == "EEPROM"
-                else "is a bit among others"
+                else "shares its byte with other bits"
             )
             why = "cannot be written" if item.access == "R" else why
             mark = _item_mark(file.description, ("devices", name, "commands"), index, command)

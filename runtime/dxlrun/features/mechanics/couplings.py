@@ -263,7 +263,7 @@ def _agree(file: RobotFile, coupling: Coupling) -> bool:
             good = False
         elif first.table.effort_unit != other.table.effort_unit:
             what = f"{pair} one measures its load, the other its current or torque"
-            file.error(model, what, "take two of one model")
+            file.error(model, what, "use two of the same model")
             good = False
         else:
             speeds = sorted((first.top_speed, other.top_speed))
@@ -272,13 +272,14 @@ def _agree(file: RobotFile, coupling: Coupling) -> bool:
                     model,
                     f"{pair} {first.table.model} and {other.table.model} differ in their top speeds, "
                     f"{speeds[0]:.3g} and {speeds[1]:.3g} rad/s",
-                    "the slower one sets the pace, and the other pulls it; take two of one model",
+                    "the slower one limits the speed, and the other pulls against it; use two of the same "
+                    "model",
                 )
     if good and not coupling.modes:
         file.error(
             others[0].described.mark(marks, "model") if others else marks.key(*coupling.place),
             f"the servos of {coupling.name} have no mode in common",
-            "take servos of one model",
+            "use servos of the same model",
         )
         return False
     return good

@@ -50,7 +50,7 @@ _OWN: Mapping[str, tuple[str, str]] = MappingProxyType(
             "policies reduce it, and a start restores it",
             "declare max_torque, its value after power-on",
         ),
-        "bus_watchdog": ("dxlrun arms it", "remove it; the bus' key `bus_watchdog` is its time"),
+        "bus_watchdog": ("dxlrun arms it", "remove it; the key `bus_watchdog` of the bus sets its time"),
         "lock": ("it closes the EEPROM until power-off", "remove it"),
         "hybrid_save": ("it stores RAM values in the EEPROM", "remove it"),
         "electronic_gearratio_numerator": _TICK,
