@@ -305,7 +305,7 @@ FAULTS = {
     "a field that is set": (
         "setattr(self, 'amplitude', 1.0)",
         "raised in update: AttributeError: amplitude is a parameter; only the robot file and clients"
-        " change (wave.py:",
+        " change it (wave.py:",
     ),
     "a shape that numpy refuses": (
         "self.start + np.linalg.inv(np.ones(3))",
