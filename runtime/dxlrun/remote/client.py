@@ -521,8 +521,7 @@ class RemoteRobot:
         body: Body | None = None,
         query: Mapping[str, object] = {},
     ) -> bytes:
-        """Send a request and return the body of the reply; raises Refused, or DxlrunError for a broken link.
-        """
+        """Send a request and return the reply's body; raises Refused, or DxlrunError for a broken link."""
         path = request.target(*names)
         content = body if body is None or isinstance(body, bytes) else _json(body)
         try:
@@ -585,8 +584,7 @@ def _json(content: object) -> bytes:
 
 
 def _not_finite(content: object, where: str = "") -> tuple[str, float] | None:
-    """Return path (`positions[1]`) and value of the first infinite number or NaN of a body; None without one.
-    """
+    """Return path (`positions[1]`) and value of the first number of a body that is not finite, or None."""
     if isinstance(content, float):
         return None if math.isfinite(content) else (where or "a value", content)
     if isinstance(content, Mapping):

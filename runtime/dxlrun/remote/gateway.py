@@ -364,8 +364,7 @@ class GatewayApp:
 
     @_answers(requests.GOAL)
     async def goal(self, asked: Asked[None]) -> GoalState:
-        """Return one goal's state; with `wait` (s), reply when the goal ends, at the latest after that time.
-        """
+        """Return one goal's state; with `wait`, reply when the goal ends, after `wait` s at the latest."""
         wait_s, chosen, goals = asked.wait_s, asked.goal, self._link.goals
         running = self._link.heartbeat.phase is Phase.RUNNING
         if goals.status(chosen).ended is None and not running:
@@ -735,8 +734,7 @@ class GatewayApp:
 
 
 def _response(reply: object, status: int = 200) -> Response:
-    """Return a handler's reply as JSON with HTTP status 200, or 202 for a set-point; a Response is unchanged.
-    """
+    """Return a handler's reply as JSON, with status 200, or 202 for a set-point; a Response is unchanged."""
     if isinstance(reply, Response):
         return reply
     if isinstance(reply, Executed | Changed | Clamped):

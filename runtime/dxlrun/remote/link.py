@@ -1,5 +1,4 @@
-"""Link: the gateway's shared memory with the loop: command mailbox, answers, newest cycle, events and topics.
-"""
+"""Link: the gateway's shared memory with the loop: mailbox, answers, newest cycle, events and topics."""
 
 from __future__ import annotations
 
@@ -245,8 +244,7 @@ class Link:
             )
 
     async def recorded(self, cycle: int) -> None:
-        """Wait until the record of cycle number `cycle`, or a later one, can be read, or the run is ending.
-        """
+        """Wait until the record of cycle `cycle`, or a later one, can be read, or the run is ending."""
         while self.heartbeat.phase is Phase.RUNNING:
             record = self.newest()
             if record is not None and record.cycle >= cycle:
@@ -291,8 +289,7 @@ class Link:
             await asyncio.sleep(_LOOK_S if self._pending else 10 * _LOOK_S)
 
     def collect(self) -> None:
-        """Read the answers, events and goal reports that have arrived; abort goals whose reports were lost.
-        """
+        """Read the new answers, events and goal reports; abort goals whose reports were lost."""
         for answered in self._answers.new():
             # Other answers belong to set-points of a stream, for which no client waits.
             if answered.number in self._pending:

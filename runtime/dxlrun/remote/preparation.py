@@ -238,8 +238,7 @@ class Preparation:
         return sorted(offer.controller.Goals) if offer else []
 
     def motions(self, plan: ControllerPlan) -> dict[str, float]:
-        """Return the names of a controller's motions with durations, s; empty when the plug-in's code fails.
-        """
+        """Return a controller's motions with durations, s, by name; empty when the plug-in's code fails."""
         try:
             known = self.known(plan)
             with bounded(plan.name):
