@@ -1,4 +1,4 @@
-"""`dxlrun fleet`: table of several robots, and commands that start and stop them."""
+"""`dxlrun fleet`: shows several robots of the network in one table, and starts and stops them."""
 
 from __future__ import annotations
 

@@ -37,7 +37,7 @@ OPENING_S = 5.0  # Time for TLS and WebSocket handshakes
 PING_S = 10.0
 """Interval between pings; a viewer that does not answer for twice as long is disconnected."""
 MOST_BYTES = 1 << 16
-"""Largest frame from a viewer."""
+"""Largest frame that a viewer may send, bytes."""
 GOING_AWAY, TRY_AGAIN = 1001, 1013  # Close codes of RFC 6455 and its IANA registry: run ended, no run
 ONLY_SHOWN = "this only shows the robot: start `dxlrun foxglove --control` to change it"
 _SILENT = logging.Logger("dxlrun foxglove", logging.CRITICAL)
@@ -89,10 +89,8 @@ class FoxgloveServer:
     # Access
 
     def _let_in(self, connection: ServerConnection, request: Request) -> Response | None:
-        """Return the HTTP refusal of a connection without the token or beyond MOST_VIEWERS, else None.
-
-        The library checks the origin.
-        """
+        """Return the HTTP refusal of a connection without the token or beyond MOST_VIEWERS, else None. The
+        library checks the origin."""
         given = parse_qs(urlsplit(request.path).query).get("token", [""])[0]
         # A constant-time comparison does not reveal a partly correct token.
         if not secrets.compare_digest(given.encode(), self.token.encode()):
@@ -206,10 +204,8 @@ class FoxgloveServer:
                 self._ask(viewer, run, received)
 
     def _ask(self, viewer: Viewer, run: ViewedRun, request: Words | Call) -> None:
-        """Start a task that sends a request to the robot and answers it, so that messages continue.
-
-        A request is refused while the viewer has MOST_REQUESTS unanswered, a halt while it has twice as many.
-        """
+        """Start a task that sends a request to the robot and answers it, so that messages continue. A request
+        is refused while the viewer has MOST_REQUESTS unanswered, a halt while it has twice as many."""
         halts = isinstance(request, Call) and request.service == HALT
         if len(viewer.requests) >= MOST_REQUESTS * (1 + halts):
             viewer.reply(protocol.failure(request, "too many requests at once; wait for the answers"))

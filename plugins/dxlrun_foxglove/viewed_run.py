@@ -116,7 +116,7 @@ class ViewedRun(LiveMessages):
 
     @property
     def channels(self) -> list[Channel]:
-        """Channels that have had a message."""
+        """Channels that have had a message; only these are announced to viewers."""
         return [one for one in self._channels if one.newest is not None]
 
     @property

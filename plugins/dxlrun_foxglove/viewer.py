@@ -34,7 +34,7 @@ class Channel(msgspec.Struct, eq=False):
 
 
 class Viewer:
-    """Subscriptions and send queues of one viewer."""
+    """Connection of one viewer: its subscriptions, and queues of the frames to send."""
 
     def __init__(self, connection: ServerConnection) -> None:
         self.connection = connection

@@ -91,10 +91,8 @@ class Dialogue:
         sys.stdout.flush()
 
     def _line(self, timeout_s: float | None) -> str | None:
-        """Return the next complete line of input, or None if there is none within the timeout, s.
-
-        The end of the input counts as Ctrl-C.
-        """
+        """Return the next complete line of input, or None if there is none within the timeout, s. The end of
+        the input counts as Ctrl-C."""
         if select.select([self._input], [], [], timeout_s)[0]:
             data = os.read(self._input, 4096)
             if not data:

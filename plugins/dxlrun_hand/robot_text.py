@@ -136,10 +136,8 @@ class RobotText:
         return mark + text.encode()
 
     def _own(self, path: KeyPath) -> tuple[Source, KeyPath, yaml.Node]:
-        """Return the file to change for a key path: the one with the longest existing prefix of the path.
-
-        The prefix and the YAML node there are returned, too; if the value exists, it is the whole path.
-        """
+        """Return the file to change for a key path: the one with the longest existing prefix of the path. The
+        prefix and the YAML node there are returned, too; if the value exists, it is the whole path."""
         found = ((source, *_nearest(source.tree.root, path)) for source in reversed(self._sources))
         # max returns the first of equal lengths: the file with the highest priority.
         return max(found, key=lambda one: len(one[1]))

@@ -34,7 +34,7 @@ class Shown(msgspec.Struct, frozen=True, eq=False):
     time_s: Floats
     """Times of the samples, s, shape (moments,), from 0; a single moment is a pose."""
     position: Floats
-    """rad or m, shape (moments, joints)."""
+    """Positions of the taught joints, rad or m, shape (moments, joints)."""
 
 
 class Taught(msgspec.Struct, frozen=True):

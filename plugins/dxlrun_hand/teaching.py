@@ -268,10 +268,8 @@ def taught(
 
 
 def _groups(info: Mapping[str, Any]) -> dict[str, tuple[str, ...]]:
-    """Return the joints that each name of a joint, group or controller, or `all`, stands for.
-
-    `info` is that of `RemoteRobot.info`. Controllers without commands are omitted.
-    """
+    """Return the joints that each name of a joint, group or controller, or `all`, stands for. `info` is that
+    of `RemoteRobot.info`. Controllers without commands are omitted."""
     controllers = {one["name"]: tuple(one["joints"]) for one in info["controllers"] if one["command"]}
     groups = {name: tuple(joints) for name, joints in info["groups"].items()}
     return {"all": tuple(info["joints"]), **controllers, **groups, **{one: (one,) for one in info["joints"]}}

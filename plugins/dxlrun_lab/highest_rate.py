@@ -30,7 +30,7 @@ from dxlsim import read_ledger
 HIGHEST_HZ = 2000.0
 MOST_TRIES = 8
 ALLOWED = 0.001
-"""Allowed fraction of cycles that overrun"""
+"""A rate counts as kept if at most this fraction of its cycles overrun."""
 _STEP = 0.95
 _COMFORT = 0.98
 _INTERRUPTED = 130

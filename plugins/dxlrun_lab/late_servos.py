@@ -115,9 +115,7 @@ def _answered(last: LedgerEntry, waited_ns: float, taken: int, given: int) -> Le
 
 def _written(entries: Sequence[LedgerEntry], sent: Sent) -> dict[int, int]:
     """Return the time, ns, at which the host wrote the first byte of each `in` entry, by the entry's index.
-
-    Empty if the entries have more bytes than the host wrote.
-    """
+    Empty if the entries have more bytes than the host wrote."""
     ends = np.cumsum([count for _, count in sent])
     taken = sum(len(entry.data) for entry in entries if entry.direction == "in")
     if not len(ends) or taken > ends[-1]:

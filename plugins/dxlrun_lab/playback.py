@@ -24,9 +24,9 @@ class PlayedJoint(msgspec.Struct, frozen=True):
 
     name: str
     rms: float
-    """Root mean square error, rad"""
+    """Root mean square of the difference, rad"""
     worst: float
-    """Largest error, rad"""
+    """Largest difference, rad"""
 
 
 class PlayedBack(msgspec.Struct, frozen=True):

@@ -24,7 +24,7 @@ from dxlrun.tooling.output import counted
 MOST_MEMORY = 2 << 30
 """Bytes that one process allocates, as in the thesis. Two processes take at most half of the free memory."""
 _START_S = 0.5
-"""Time until the load is effective, s"""
+"""Time after the start of the load before a measurement begins, s"""
 _DISK = "/var/tmp"  # noqa: S108  files without a name; unlike /tmp it is on a disk (FHS 3.0, 5.15)
 
 _WITH_PARENT = """

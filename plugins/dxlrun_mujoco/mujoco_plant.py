@@ -309,10 +309,8 @@ def _compiled(urdf: str, moved: _Moved, servos: Sequence[PlantJoint]) -> MjModel
 
 
 def _drive(joint: MjsJoint, motor: Motor, per_rad: float, friction: float) -> None:
-    """Add inertia, damping and friction of a servo's motor to a joint of the MuJoCo model.
-
-    `friction` is additional friction of the load at the servo's shaft, Nm.
-    """
+    """Add inertia, damping and friction of a servo's motor to a joint of the MuJoCo model. `friction` is
+    additional friction of the load at the servo's shaft, Nm."""
     joint.armature = motor.inertia / per_rad**2
     joint.damping[0] += motor.viscous_friction / per_rad**2
     _rub(joint, (motor.friction + friction) / abs(per_rad))

@@ -120,10 +120,8 @@ def make(source: Path, place: Path, library: Path, libraries: Path) -> None:
 
 
 def _compile(name: str, place: Path, prefix: Path, library: Path, libraries: Path) -> None:
-    """Compile the generated sources of a message package; link its C libraries and its Python module.
-
-    Raises RuntimeError without compilers, or if one fails.
-    """
+    """Compile the generated sources of a message package; link its C libraries and its Python module. Raises
+    RuntimeError without compilers, or if one fails."""
     include = sysconfig.get_paths()["include"]
     if not (shutil.which("gcc") and shutil.which("g++") and (Path(include) / "Python.h").exists()):
         raise RuntimeError(f"{name} has no wheel and is built here; that needs {NEEDED}")

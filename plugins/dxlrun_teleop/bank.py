@@ -76,7 +76,7 @@ class Bank(msgspec.Struct, frozen=True):
     slots: tuple[Slot, ...]
     """All numbers of the command, in its order"""
     driven: tuple[int, ...]
-    """Index in `slots` that each axis drives"""
+    """For each axis of the device, index in `slots` of the number that it drives"""
     into: tuple[str, ...] = ()
     """Controllers whose references the controller commands; empty if it commands servos"""
 

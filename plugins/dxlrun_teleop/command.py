@@ -1,4 +1,4 @@
-"""`dxlrun teleop`: drive a running robot by hand."""
+"""`dxlrun teleop`: drives a running robot by keyboard or gamepad."""
 
 from __future__ import annotations
 

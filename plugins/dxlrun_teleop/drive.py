@@ -88,10 +88,8 @@ class _Moving:
         self._stream: Stream | None = robot.stream(bank.controller, bank.kind, LEASE_S) if as_stream else None
 
     def move(self, axes: Sequence[float], factor: float, now: float) -> None:
-        """Integrate the axes' deflections since the last call to positions, and send the command.
-
-        Speeds are sent as they are. A trajectory is sent every HORIZON_S / 2 at most.
-        """
+        """Integrate the axes' deflections since the last call to positions, and send the command. Speeds are
+        sent as they are. A trajectory is sent every HORIZON_S / 2 at most."""
         bank, elapsed, self.moved = self._bank, now - self.moved, now
         for axis, index in zip(axes, bank.driven, strict=False):  # a source may have more axes
             slot = bank.slots[index]
@@ -118,9 +116,7 @@ class _Moving:
 
 def _present(robot: RemoteRobot, bank: Bank) -> list[float]:
     """Return the goal at which each slot's joint is at present: its reference, goal or measured position.
-
-    Raises Refused while none is known.
-    """
+    Raises Refused while none is known."""
     states, found = robot.states(), []
     references = dict(zip(states.references, states.reference.tolist(), strict=True))
     for slot in bank.slots:

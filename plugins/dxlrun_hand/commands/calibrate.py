@@ -1,4 +1,4 @@
-"""`dxlrun calibrate`: reference, direction and limits of joints, measured by hand, into the robot file."""
+"""`dxlrun calibrate`: measures reference, direction and limits of joints by hand, for the robot file."""
 
 from __future__ import annotations
 

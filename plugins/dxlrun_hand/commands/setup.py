@@ -1,4 +1,4 @@
-"""`dxlrun setup`: configuration of new servos with the IDs, rates and registers of a robot file."""
+"""`dxlrun setup`: configures new servos with the IDs, baud rates and registers of a robot file."""
 
 from __future__ import annotations
 
@@ -97,9 +97,7 @@ def _left(task: SetUp) -> str:
 
 def _port(task: SetUp, plan: BusPlan, devices: Devices, *, search: bool) -> str:
     """Return the port of a bus: the one in the robot file if it exists, else the one that the user plugs in.
-
-    The new port is written to the robot file after confirmation. `search` skips the port in the file.
-    """
+    The new port is written to the robot file after confirmation. `search` skips the port in the file."""
     from dxlrun.tooling.robots import SIMULATED
     from dxlrun_hand.dialogue import yes
     from dxlrun_hand.lines import find_port

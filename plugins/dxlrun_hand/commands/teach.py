@@ -1,4 +1,4 @@
-"""`dxlrun teach`: motion that is shown to a running robot by hand, saved as a motion file."""
+"""`dxlrun teach`: saves a motion that the user shows to a running robot by hand as a motion file."""
 
 from __future__ import annotations
 

@@ -64,7 +64,7 @@ class Found:
     gaps: dict[str, list[gaps.Gap]] = field(default_factory=dict)
     """Tried gaps between commands, by command interface"""
     band: Trace | None = None
-    """Recording of the dead band measurement"""
+    """Last recording of the dead band measurement, with the slow approaches"""
 
     def value(self, name: str) -> float | None:
         """Return the value of the figure with this name, or None if it was not measured."""
@@ -72,7 +72,7 @@ class Found:
 
 
 class Characterized(msgspec.Struct, frozen=True):
-    """Result of `dxlrun characterize`"""
+    """Result of `dxlrun characterize`: figures of all joints, also after an early end"""
 
     robot: str
     joints: tuple[Found, ...]
@@ -331,10 +331,8 @@ class Characterize:
     def _motion(
         self, joint: Joint, interface: Literal["position", "posvel"], gap: float, rate: float, size: float
     ) -> Segment:
-        """Return the segment that sends the smooth motion with `gap` seconds between commands.
-
-        The motion starts after `_lead_of` gaps; `size` is that of `gaps.motion`, `rate` the loop rate, Hz.
-        """
+        """Return the segment that sends the smooth motion with `gap` seconds between commands. The motion
+        starts after `_lead_of` gaps; `size` is that of `gaps.motion`, `rate` the loop rate, Hz."""
         lead = _lead_of(gap)
         time = np.arange(lead + math.ceil((gaps.MOTION_S + gaps.FADE_S) / gap)) * gap - lead * gap
         position, _ = gaps.motion(np.maximum(time, 0.0), size)
@@ -384,10 +382,8 @@ def _lead_of(gap: float) -> int:
 
 
 def _margins(situation: Situation, joint: Joint) -> Mapping[str, int]:
-    """Return the servo's compliance margins by register name, ticks: declared, or else factory default.
-
-    A model without these registers has none.
-    """
+    """Return the servo's compliance margins by register name, ticks: declared, or else factory default. A
+    model without these registers has none."""
     protocol = next(bus.protocol for bus in situation.plan.buses if joint.servo in bus.servos)
     table = find_table(joint.servo.model, protocol)
     shipped = {name: table.items[name].initial or 0 for name in dead_band.MARGINS if name in table.items}

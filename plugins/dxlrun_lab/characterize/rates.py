@@ -24,7 +24,7 @@ MOST_HZ = 2000.0
 ALLOWED = 0.001
 """Allowed fraction of cycles with a lost reply, or with an exchange longer than the period"""
 GROWS = 1.3
-"""Ratio of two successive rates, until one fails"""
+"""Ratio of each tried rate to the previous one, until one fails"""
 NEAR = 0.02
 """Relative distance between the best and the worst rate at which the bisection ends"""
 BURST_S = 0.04

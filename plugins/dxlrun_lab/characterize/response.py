@@ -195,9 +195,7 @@ def _curve(pools: Sequence[_Pool]) -> tuple[Floats, Floats]:
 
 def _rise(pools: Sequence[_Pool], level: float = PART) -> float:
     """Return the response time to the fraction `level` of the way, s, by a parabola through samples near it.
-
-    NaN with too few samples.
-    """
+    NaN with too few samples."""
     time, part = _curve(pools)
     rising = (time > 0) & (time < _until(time, part, 0.5 * (1 + level)))
     near = rising & (np.abs(part - level) < 0.5 * (1 - level) + 1e-9)
@@ -254,9 +252,7 @@ are its error by polynomial and ticks."""
 
 def _spread(pools: Sequence[_Pool]) -> float | None:
     """Return the standard deviation of single steps' response times, s, by their shifts against all samples.
-
-    None with too few samples.
-    """
+    None with too few samples."""
     time, part = _curve(pools)
     rows = (part > 0.1) & (part < 0.9) & (time < _until(time, part, 0.9))
     if np.count_nonzero(rows) < 3 * LEAST_STEPS:

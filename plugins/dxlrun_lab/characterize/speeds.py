@@ -102,10 +102,8 @@ def move_of(step: Step) -> Move | None:
 
 
 def _half_width(period: float, tick: float, speed: float) -> float:
-    """Return the half-width, s, of the window of positions from which a speed (rad/s) is found.
-
-    It is the shortest one that keeps the scatter by the tick (rad) below _SLOPE_NOISE.
-    """
+    """Return the half-width, s, of the window of positions from which a speed (rad/s) is found. It is the
+    shortest one that keeps the scatter by the tick (rad) below _SLOPE_NOISE."""
     for count in range(_LEAST_SAMPLES, _MOST_SAMPLES, 2):
         scatter = tick / math.sqrt(12) / (period * math.sqrt(count * (count**2 - 1) / 12))
         if scatter <= _SLOPE_NOISE * speed:

@@ -33,7 +33,7 @@ class Trace(msgspec.Struct, frozen=True):
     sent: Floats
     """Time at which the last byte of the cycle's goal was transmitted; later than `time`"""
     goal: Floats
-    """Goal after the gate, rad"""
+    """Goal that was sent, after the gate limited it, rad"""
     tick: float
     """Resolution of the position, rad"""
 
@@ -72,10 +72,8 @@ class Trace(msgspec.Struct, frozen=True):
 
 
 def _on_the_wire(servo: ServoPlan, buses: Sequence[BusPlan]) -> tuple[int, int]:
-    """Return the computed delays, ns, of a servo's state to the host and of a goal to the servo.
-
-    Raises LookupError if no bus of the plan has the servo.
-    """
+    """Return the computed delays, ns, of a servo's state to the host and of a goal to the servo. Raises
+    LookupError if no bus of the plan has the servo."""
     for bus in buses:
         if servo not in bus.servos:
             continue

@@ -74,10 +74,8 @@ def convert(
 
 
 def _where(motion: RecordedMotion) -> str:
-    """Describe the source of a motion on one line: file, time, and joints by goals or states.
-
-    Unprintable characters of the file name are replaced.
-    """
+    """Describe the source of a motion on one line: file, time, and joints by goals or states. Unprintable
+    characters of the file name are replaced."""
     name = "".join(letter if letter.isprintable() else "?" for letter in str(motion.path))
     end_s = motion.begin_s + motion.duration_s
     goals = [joint for joint, what in zip(motion.joints, motion.what, strict=True) if what == "goals"]

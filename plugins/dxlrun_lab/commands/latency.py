@@ -106,10 +106,8 @@ def latency(
 def _measured(
     settings: Settings, stress: bool, place: Path | None, report: Path | None, *, as_json: bool
 ) -> int:
-    """Measure, then write log and report and show the results. Return the exit code.
-
-    `place` is the file or directory of the log; None for no log.
-    """
+    """Measure, then write log and report and show the results. Return the exit code. `place` is the file or
+    directory of the log; None for no log."""
     from dxlrun_lab.latency.measurement import (
         Measured,
         compiled_yardstick,

@@ -220,10 +220,8 @@ def _ended(ran: Ran[R], performed: Performed, course: Course) -> Ran[R]:
 
 
 def _plan_of(chosen: Chosen, ranges: Mapping[str, tuple[float, float]], options: OnRobot) -> Plan | None:
-    """Compile the chosen robot file to a plan, or return None without a file.
-
-    Raises InputError for mistakes in joints, ranges and options.
-    """
+    """Compile the chosen robot file to a plan, or return None without a file. Raises InputError for mistakes
+    in joints, ranges and options."""
     from dxlrun_lab.guided.choice import check_joints
 
     if chosen.file is not None:
@@ -239,9 +237,7 @@ def _plan_of(chosen: Chosen, ranges: Mapping[str, tuple[float, float]], options:
 
 def _rig(chosen: Chosen, plan: Plan | None, options: OnRobot, aborting: Aborting) -> Rig | None:
     """Return access to the run: on virtual time, started as a child process, or already running (no plan).
-
-    Returns None if the user aborted while it started.
-    """
+    Returns None if the user aborted while it started."""
     from dxlrun_lab.guided.own_run import OwnRun
     from dxlrun_lab.guided.rig import live_rig, require_whole
 
@@ -301,10 +297,8 @@ def _real(plan: Plan, options: OnRobot) -> bool:
 def _start_confirmed(
     plan: Plan, names: Sequence[str], options: OnRobot, course: Course, aborting: Aborting
 ) -> bool:
-    """Describe the motions and ask for confirmation before a run is started. Return True if confirmed.
-
-    No question is asked if no real joint will move.
-    """
+    """Describe the motions and ask for confirmation before a run is started. Return True if confirmed. No
+    question is asked if no real joint will move."""
     from dxlrun_lab.guided.choice import range_text
 
     if not _real(plan, options):
@@ -382,7 +376,7 @@ class Aborting:
         self._before: dict[int, object] = {}
 
     def __enter__(self) -> Aborting:
-        """Install the signal handlers."""
+        """Install handlers of the signals that abort, which only note the reason."""
         self.has_keys = sys.stdin.isatty()
         for number in (signal.SIGINT, signal.SIGTERM, signal.SIGHUP):
             if number != signal.SIGHUP or signal.getsignal(number) != signal.SIG_IGN:
@@ -390,7 +384,7 @@ class Aborting:
         return self
 
     def __exit__(self, *_: object) -> None:
-        """Restore the signal handlers."""
+        """Restore the previous signal handlers."""
         for number, handler in self._before.items():
             signal.signal(number, handler)  # type: ignore[arg-type]  # what signal() returned
 

@@ -98,9 +98,7 @@ def draw(  # noqa: PLR0917  what the figure shows, from its name to its size
 
 def _svg(text: str, name: str, about: Sequence[tuple[str, str]]) -> ET.Element:
     """Convert matplotlib's SVG text for a page: unique identifiers, the page's colours, title, description.
-
-    `name` is the figure's identifier; `about` has the tags and texts of title and description.
-    """
+    `name` is the figure's identifier; `about` has the tags and texts of title and description."""
     for colour, role in ROLES.items():
         text = text.replace(colour, f"var(--{role})")
     root = ET.fromstring(text)  # noqa: S314  written by matplotlib, a moment ago

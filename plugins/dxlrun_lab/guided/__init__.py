@@ -1,4 +1,4 @@
-"""Guided experiments: client of a run that plays tables of goals and collects the recordings.
+"""Guided experiments: a client of a run plays tables of goals on joints, and records the run's cycles.
 
 The measurements and their sequence are in the packages of the experiments.
 """

@@ -156,9 +156,7 @@ def require_own_servos(plan: Plan, names: Sequence[str], command: str, *, gears:
 
 def _taken(rig: Rig, names: Sequence[str], controllers: Sequence[RunningController]) -> list[str]:
     """Return what prevents an experiment in the run: pause, another experiment, controllers of its joints.
-
-    Each is a sentence with a fix.
-    """
+    Each is a sentence with a fix."""
     robot = rig.plan.robot
     if rig.paused:
         return [f"{robot} is paused; resume it first: dxlrun resume --robot {robot}"]
@@ -215,10 +213,8 @@ def _range_problem(plan: JointPlan, given: tuple[float, float] | None) -> str:
 
 
 def _range_of(plan: JointPlan, now: JointNow, given: tuple[float, float] | None) -> tuple[float, float, str]:
-    """Return lower and upper end of a joint's range, rad, and a description of its origin.
-
-    Raises ValueError if the joint has no torque, or is outside of the range or its limits.
-    """
+    """Return lower and upper end of a joint's range, rad, and a description of its origin. Raises ValueError
+    if the joint has no torque, or is outside of the range or its limits."""
     name, position = plan.name, now.position
     if now.torque not in TORQUED:
         raise ValueError(

@@ -51,7 +51,7 @@ class Joint(msgspec.Struct, frozen=True):
     start: float
     """Position before the experiment, rad"""
     plan: JointPlan
-    """Joint in the robot file, with its limits"""
+    """Plan of the joint, with its limits"""
     servos: tuple[ServoPlan, ...]
     """Servos that move the joint"""
 
@@ -211,7 +211,7 @@ class _Stage:
         self._players: dict[tuple[Interface, Guard], str] = {}
         """Names of loaded sample_players by interface and guard"""
         self._player = ""
-        """Active sample_player"""
+        """Name of the active sample_player; empty before the first"""
 
     # Forward
 
@@ -281,10 +281,8 @@ class _Stage:
             raise _Ended(text or f"the way to the start was {outcome}")
 
     def _send(self, segment: Segment) -> int:
-        """Send a segment's table to the active sample_player, in pieces that fit into a cycle.
-
-        Returns the number of the goal that plays it.
-        """
+        """Send a segment's table to the active sample_player, in pieces that fit into a cycle. Returns the
+        number of the goal that plays it."""
         joints = self.situation.names
         now = self.rig.joints()
         still = 0.0
@@ -311,10 +309,8 @@ class _Stage:
         return self.rig.send(self._player, "samples", last)
 
     def _activate(self, interface: Interface, guard: Guard) -> None:
-        """Activate the sample_player of an interface and a guard in place of the active controllers.
-
-        It is loaded if necessary.
-        """
+        """Activate the sample_player of an interface and a guard in place of the active controllers. It is
+        loaded if necessary."""
         name = self._players.get((interface, guard))
         if name is not None and name == self._player:
             return

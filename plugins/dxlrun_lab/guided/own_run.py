@@ -25,7 +25,7 @@ _CREDENTIALS = struct.Struct("=3i")
 START_S = 60.0
 """Timeout for the start of a run, s: compilation, loading of plug-ins, set-up of the servos"""
 END_S = 30.0
-"""Timeout for the end of a run, s"""
+"""Timeout for the exit of the run after SIGTERM, s; then it gets a second one, and at last SIGKILL"""
 _POLL_S = 0.05
 
 

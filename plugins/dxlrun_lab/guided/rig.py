@@ -50,7 +50,7 @@ class JointNow(NamedTuple):
     position: float
     goal_position: float
     torque: str
-    """Name of a Torque, in lower case"""
+    """Torque state, such as `on` or `limp`: the name of a Torque in lower case"""
 
 
 class Rig:

@@ -23,7 +23,7 @@ class Guard(msgspec.Struct, frozen=True):
     effort: float | None = None
     """Highest measured effort, Nm, A or the fraction of maximum"""
     age_s: float | None = 0.1
-    """Largest age of a joint's state, s"""
+    """Largest age of a joint's newest state, s: an older one means that its servo does not respond"""
 
 
 class Segment(msgspec.Struct, frozen=True):
@@ -60,7 +60,7 @@ class Segment(msgspec.Struct, frozen=True):
 
     @property
     def count(self) -> int:
-        """Number of rows"""
+        """Number of rows of the table"""
         return len(next(iter(self.rows.values())))
 
     @property

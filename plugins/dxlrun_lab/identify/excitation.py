@@ -104,10 +104,8 @@ def _glide(start: float, end: float, room: Room, period_s: float) -> Floats:
 
 
 def _steps(room: Room, count: int, period_s: float, random: np.random.Generator) -> Floats:
-    """Return `count` goals that step at random between both halves of the range.
-
-    Each step is held for 0.15 to 0.6 s. With limits of velocity or acceleration, steps are ramps.
-    """
+    """Return `count` goals that step at random between both halves of the range. Each step is held for 0.15
+    to 0.6 s. With limits of velocity or acceleration, steps are ramps."""
     goals = np.empty(0)
     side, at = 1.0, room.middle
     while len(goals) < count:

@@ -74,7 +74,7 @@ class Fit(msgspec.Struct, frozen=True):
     free: tuple[str, ...]
     """Names of the fitted parameters. All others have given values."""
     covariance: Floats
-    """Covariance of `free`, shape (free, free)"""
+    """Covariance of the parameters in `free`, shape (free, free)"""
     pieces: int
     """Number of clusters of the confidence intervals"""
     independent: float
@@ -177,9 +177,7 @@ def _start(run: Measured) -> Numbers:
 
 def _linear(run: Measured, known: Numbers, share: float) -> dict[str, float]:
     """Fit drive, back-EMF, friction and gravity by linear least squares to the smoothed motion of a run.
-
-    Returns parameters by name, with the friction times `share`; none if the joint hardly moved.
-    """
+    Returns parameters by name, with the friction times `share`; none if the joint hardly moved."""
     period = float(np.median(np.diff(run.time_s)))
     window = max(5, round(_SMOOTH_S / period) | 1)
     even = np.arange(run.time_s[0], run.time_s[-1], period)
@@ -220,10 +218,8 @@ def _cost(run: Measured, numbers: Numbers) -> float:
 
 
 def _free(run: Measured, start: Numbers) -> tuple[str, ...]:
-    """Return the names of the parameters that the run determines and the fit varies.
-
-    The gain needs a saturated duty, a measured duty or duty commands; resistance needs a measured current.
-    """
+    """Return the names of the parameters that the run determines and the fit varies. The gain needs a
+    saturated duty, a measured duty or duty commands; resistance needs a measured current."""
     values = start.array()[:, None]
     duties = [np.abs(_simulated(group, values).duty) for group in run.groups]
     limit = run.groups[0].control.limit
@@ -354,9 +350,7 @@ def _sampled(
     run: Measured, group: Compared, found: Simulated, quantity: str, delays: Floats | None = None
 ) -> Floats:
     """Return simulated positions or efforts (`quantity`) at the times of the samples, shape (samples, sets).
-
-    A set is one set of parameters; `delays` is the age of its effort relative to the position, s.
-    """
+    A set is one set of parameters; `delays` is the age of its effort relative to the position, s."""
     if quantity == "position":
         return _between(found.position, group, group.step, group.part)
     # A duty holds for a whole step, so the interpolation is shifted by half a step.
@@ -389,9 +383,7 @@ def _first_effort_noise(run: Measured) -> float:
 
 def _noise(run: Measured, numbers: Numbers, before: tuple[float, float]) -> tuple[float, float]:
     """Return robust standard deviations of the residuals of positions (rad) and efforts, for the next fit.
-
-    They are at least the quantisation noise of positions, and the initial noise of efforts.
-    """
+    They are at least the quantisation noise of positions, and the initial noise of efforts."""
     found = []
     for curve, least in zip(curves(run, numbers), (run.servo.tick / np.sqrt(12), before[1]), strict=True):
         left = np.abs(curve.measured - curve.simulated)[~curve.held_out]
@@ -437,10 +429,8 @@ def _sandwich(slopes: Floats, left: Floats, clusters: NDArray[np.intp]) -> Float
 
 
 def _by_timing(slopes: Floats, free: Sequence[str]) -> Floats:
-    """Return the covariance of the parameters by an error of _TIMING_S in all times.
-
-    In a smooth motion, a larger gain looks like a shorter delay. Steps in the motion separate them.
-    """
+    """Return the covariance of the parameters by an error of _TIMING_S in all times. In a smooth motion, a
+    larger gain looks like a shorter delay. Steps in the motion separate them."""
     delay = free.index("delay")
     others = [each for each in range(len(free)) if each != delay]
     moved = np.zeros(len(free))

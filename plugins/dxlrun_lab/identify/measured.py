@@ -22,7 +22,7 @@ from dxlrun_lab.identify.servo import Servo
 from dxlwire import Mode
 
 PIECE_S = 1.0
-"""Compared part of a piece, s"""
+"""Duration of the part of a piece in which simulation and measurement are compared, s"""
 LEAD_S = 0.5
 """Simulated time before the compared part, s: 7 to 30 time constants of a position controller"""
 _LEAST_S = 8.0
@@ -51,7 +51,7 @@ class Compared(msgspec.Struct, frozen=True):
     """Initial states, voltages and commands, from which the pieces are simulated"""
     control: Control
     piece: NDArray[np.intp]
-    """Index of the piece of each sample"""
+    """Index in `pieces` of the piece to which each sample belongs"""
     step: NDArray[np.intp]
     """Index of the simulation's grid point before the sample"""
     part: Floats
@@ -83,9 +83,9 @@ class Measured(msgspec.Struct, frozen=True):
     groups: tuple[Compared, ...]
     """Pieces to simulate: those in position mode, and those in PWM mode"""
     seconds: float
-    """Usable duration, s"""
+    """Sum of the durations of usable spans, s"""
     lost_s: float
-    """Unusable duration, s: without torque, with a lost servo, or in another mode"""
+    """Rest of the log's duration, s: no torque, lost servo, no goal, other mode, or too short a span"""
 
     @property
     def moved(self) -> float:
@@ -174,9 +174,7 @@ def _usable(cycles: NDArray[np.void], row: int) -> Flags:
 
 def _voltage(cycles: NDArray[np.void], row: int, given: float | None, name: str) -> Floats:
     """Return the supply voltage of each cycle, V: `given`, or medians of the servo's readings around it.
-
-    Raises InputError if the log has no reading.
-    """
+    Raises InputError if the log has no reading."""
     count = len(cycles)
     if given is not None:
         return np.full(count, given)
@@ -203,10 +201,8 @@ def _voltage(cycles: NDArray[np.void], row: int, given: float | None, name: str)
 
 
 def _commands(cycles: NDArray[np.void], row: int, servo: Servo, sent_s: Floats, by_position: Flags) -> Floats:
-    """Return the servo's command in each cycle: position, rad, or duty.
-
-    Positions are rounded to ticks, and a goal with a speed is converted to a ramp.
-    """
+    """Return the servo's command in each cycle: position, rad, or duty. Positions are rounded to ticks, and a
+    goal with a speed is converted to a ramp."""
     goals = np.array([servo.rounded(goal) for goal in cycles["goal_position"][:, row].tolist()])
     speeds = np.abs(cycles["goal_velocity"][:, row])
     if (np.isfinite(speeds) & by_position).any():
@@ -272,10 +268,8 @@ def _slopes(time_s: Floats, position: Floats, at_s: Floats) -> Floats:
 
 
 def _compared(run: Measured, sent: _Sent, spans: list[slice], control: Control) -> Compared | None:
-    """Cut the spans of one mode into pieces of equal length, and find the samples of each.
-
-    Returns None if no piece has enough samples.
-    """
+    """Cut the spans of one mode into pieces of equal length, and find the samples of each. Returns None if no
+    piece has enough samples."""
     starts: list[float] = []
     for span in spans:
         first, last = float(sent.time_s[span.start]), float(sent.time_s[span.stop - 1])

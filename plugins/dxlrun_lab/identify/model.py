@@ -45,7 +45,7 @@ class Numbers(msgspec.Struct, frozen=True):
     """Additional friction / I at rest, rad/s^2; in motion it is scaled by exp(-(velocity / stribeck_speed)^2)
     """
     stribeck_speed: float = 0.5
-    """rad/s"""
+    """Speed at which the additional friction at rest has fallen to 1/e, rad/s"""
     gain: float = 0.0
     """Duty per rad of error, with the servo's present P gain"""
     delay: float = 0.0
@@ -83,7 +83,7 @@ class Control(msgspec.Struct, frozen=True):
     margin: float = 0.0
     """Dead band of the error, rad"""
     punch: float = 0.0
-    """Duty at the edge of the margin"""
+    """Duty with which the servo starts at the edge of the margin, fraction of full voltage"""
     by_position: bool = True
     """True if the command is a position, rad; False if it is the duty"""
 

@@ -32,7 +32,7 @@ from dxlrun_lab.stress import Stress
 _SOURCE = Path(__file__).with_name("yardstick.c")
 _FLAGS = ("-std=c11", "-O2", "-Wall", "-Wextra")
 _LOOK_S = 0.2
-"""Polling period of the front process, s"""
+"""Period in which this (front) process reads the progress of the measuring process, s"""
 _STANDSTILL_S = 30.0
 """Time without progress after which a process is given up, s; two periods are added"""
 _STOP_S = 2.0

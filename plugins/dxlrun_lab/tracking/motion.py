@@ -81,27 +81,25 @@ class _Point(msgspec.Struct):
     """Point of a motion's command, as decoded from JSON: targets of the joints at a time"""
 
     time: float = 0.0
-    """s"""
+    """Time in the trajectory, or since the first command, s"""
     positions: tuple[float, ...] = ()
     velocities: tuple[float, ...] = ()
 
     @property
     def time_ns(self) -> int:
-        """Time, ns"""
+        """`time` in ns"""
         return round(self.time * 1e9)
 
 
 class _Trajectory(msgspec.Struct):
     points: tuple[_Point, ...] = ()
     start_in: float = 0.0
-    """s"""
+    """Time from the acceptance of the command to the start of the trajectory, s"""
 
 
 def _points(commands: Sequence[ScheduledCommand]) -> tuple[Sequence[_Point], int]:
-    """Decode a motion's points from its commands: one trajectory, or one command per point.
-
-    The time from the first command to the first point, ns, is returned, too.
-    """
+    """Decode a motion's points from its commands: one trajectory, or one command per point. The time from the
+    first command to the first point, ns, is returned, too."""
     trajectory = msgspec.json.decode(commands[0].request, type=_Trajectory)
     if trajectory.points:
         return trajectory.points, round(trajectory.start_in * 1e9) + trajectory.points[0].time_ns

@@ -325,10 +325,8 @@ class Gripper(Action):
         return message
 
     def _stalled(self, robot: RemoteRobot, state: GoalState) -> bool:
-        """Return True if the gripper's first state message after the goal's end says that it stalled.
-
-        False if none arrives within STATE_S.
-        """
+        """Return True if the gripper's first state message after the goal's end says that it stalled. False
+        if none arrives within STATE_S."""
         until = time.monotonic() + STATE_S
         while time.monotonic() < until:
             found = robot.newest(f"/{self.controller.name}/state")

@@ -78,10 +78,8 @@ class ControllerNode:
     # Topics
 
     def _trajectory(self, message: JointTrajectory, robot: RemoteRobot) -> None:
-        """Send a published trajectory to the controller, as a chunk with a lease if it accepts chunks.
-
-        A trajectory without points stops the joints.
-        """
+        """Send a published trajectory to the controller, as a chunk with a lease if it accepts chunks. A
+        trajectory without points stops the joints."""
         name = self._controller.name
         if not message.points:
             stopped(robot, self._run, self._controller)

@@ -79,10 +79,8 @@ class Manager:
         request: AnyRequest,
         response: AnyResponse,
     ) -> AnyResponse:
-        """Fill the response of a service with `answer` and a new connection to the robot; return it.
-
-        If the request is refused, `ok` stays false and the reason is logged in ROS.
-        """
+        """Fill the response of a service with `answer` and a new connection to the robot; return it. If the
+        request is refused, `ok` stays false and the reason is logged in ROS."""
         try:
             with connect(self._address, CLIENT) as robot:
                 answer(robot, request, response)
@@ -180,10 +178,8 @@ class Manager:
 
 
 def _parameters(path: Path, name: str) -> dict[str, object]:
-    """Read a controller's `ros__parameters` from a ROS 2 parameter file; empty if the file lacks it.
-
-    Raises InputError.
-    """
+    """Read a controller's `ros__parameters` from a ROS 2 parameter file; empty if the file lacks it. Raises
+    InputError."""
     try:
         found = yaml.safe_load(path.read_text(encoding="utf-8"))
         return dict(found[name]["ros__parameters"]) if name in found else {}

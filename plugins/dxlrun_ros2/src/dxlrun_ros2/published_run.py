@@ -58,7 +58,7 @@ class PublishedRun(LiveMessages):
         self.ended = threading.Event()
         """Set when the run has ended or a thread that receives messages has failed"""
         self.why = ""
-        """Reason of the end"""
+        """Reason why the run has ended; empty before"""
         self.seen: set[Callable[[np.void], None]] = set()
         """Functions that are called with the record of each cycle"""
         self.newest: np.void | None = None

@@ -52,7 +52,7 @@ class Stop(_Message, frozen=True, tag="stop"):
 
 
 class Halt(_Message, frozen=True, tag="halt"):
-    """Bring all joints to rest with torque on."""
+    """Halt button: deactivate all controllers and bring the joints to rest, where they hold."""
 
     def perform(self, robot: RemoteRobot) -> Done:
         """Halt the robot; return the time that the joints need to rest."""
@@ -61,7 +61,7 @@ class Halt(_Message, frozen=True, tag="halt"):
 
 
 class Pause(_Message, frozen=True, tag="pause"):
-    """Pause the controllers."""
+    """Pause button: pause the run's controllers; the joints hold."""
 
     def perform(self, robot: RemoteRobot) -> Done:
         """Pause the robot."""
@@ -70,7 +70,7 @@ class Pause(_Message, frozen=True, tag="pause"):
 
 
 class Resume(_Message, frozen=True, tag="resume"):
-    """Resume the controllers."""
+    """Resume button: let the run's controllers continue after a pause."""
 
     def perform(self, robot: RemoteRobot) -> Done:
         """Resume the robot."""
@@ -91,7 +91,7 @@ class SetTorque(_Message, frozen=True, tag="torque"):
 
 
 class Switch(_Message, frozen=True, tag="switch"):
-    """Activate or deactivate a controller."""
+    """Activate (`on`) or deactivate a controller of the run."""
 
     controller: str
     on: bool
@@ -104,7 +104,7 @@ class Switch(_Message, frozen=True, tag="switch"):
 
 
 class Goal(_Message, frozen=True, tag="goal"):
-    """Move a joint to a position, rad or m."""
+    """Slider of a joint: move it to a position, rad or m."""
 
     joint: str
     position: float

@@ -127,7 +127,7 @@ class History:
         return (oldest + index) % len(self._times)
 
     def _index(self, time: float) -> int:
-        """Return the number of moments not after a time."""
+        """Return the number of kept moments whose time is not after `time`, s."""
         oldest = self._count % len(self._times) if self._count > len(self._times) else 0
         first, second = self._times[oldest : self._count], self._times[:oldest]
         if len(second) and time >= second[0]:

@@ -137,10 +137,8 @@ class LiveRobot:
     # Polling the robot
 
     def _look(self, now_s: float) -> None:
-        """Poll the robot's newest cycle, and every SLOW_S the values that rarely change.
-
-        Connects first if necessary, and disconnects with a reason for the page after an error.
-        """
+        """Poll the robot's newest cycle, and every SLOW_S the values that rarely change. Connects first if
+        necessary, and disconnects with a reason for the page after an error."""
         slowly = now_s - self._looked_slowly_s > SLOW_S
         if now_s - self._looked_s < PERIOD_S / 2 or not (self._robot or slowly):
             return
@@ -268,10 +266,8 @@ def info_of(robot: RemoteRobot) -> RobotInfo:
 
 
 def _motions(info: RobotInfo) -> Iterator[str]:
-    """Yield the files `motions/*.yaml` next to the robot file that only use controllers of this robot.
-
-    Files that cannot be read are skipped.
-    """
+    """Yield the files `motions/*.yaml` next to the robot file that only use controllers of this robot. Files
+    that cannot be read are skipped."""
     names = {row.name for row in info.controllers}
     for path in sorted(Path(info.file).parent.glob("motions/*.yaml")):
         with suppress(DxlrunError, OSError):

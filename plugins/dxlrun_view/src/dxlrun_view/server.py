@@ -37,7 +37,7 @@ if TYPE_CHECKING:
 
 PORT = 8765
 ANY = str(IPv4Address(0))
-"""Wildcard for all addresses of this machine"""
+"""Address 0.0.0.0, at which the server listens on all interfaces of this computer"""
 HEADER = "X-Dxlrun-Token"
 """HTTP header in which the page's script sends the token of the page's address"""
 MOST_POINTS = 4000

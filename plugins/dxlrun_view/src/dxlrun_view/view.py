@@ -83,9 +83,7 @@ def view(
 
 def _source(what: str | None) -> Source:
     """Open the robot or log that the argument of `dxlrun view` names, by default the only running robot.
-
-    Raises DxlrunError if it does not run, does not exist or is ambiguous.
-    """
+    Raises DxlrunError if it does not run, does not exist or is ambiguous."""
     from dxlrun_view.live import LiveRobot
 
     if what is None:
