@@ -1,6 +1,7 @@
-"""Anchoring: restart joints at their measured positions after they may have moved without the loop.
+"""Anchoring: after a pause or regained torque, set joint goals to the measured positions.
 
-Decisions depend on the cycle's record only, so a replay makes the same ones.
+The controllers of these joints are restarted there. Decisions depend on the cycle's record only, so a replay
+makes the same ones.
 """
 
 from __future__ import annotations
@@ -19,14 +20,16 @@ from dxlwire.joint_unit import LINEAR, ROTARY, JointUnit
 from dxlwire.modes import Mode
 
 MOVED_DISTANCES: Mapping[JointUnit, float] = {ROTARY: 0.0873, LINEAR: 0.005}
-"""5 deg or 5 mm: a joint that moved farther in a pause restarts at its measured position. A joint in effort
-mode coasts or sags by less. [i]"""
+"""Distance from which a joint counts as moved in a pause: 5 deg or 5 mm.
+
+It restarts at its measured position. A joint in effort mode coasts or sags by less. [i]
+"""
 _HOLDING = (Mode.POSITION, Mode.EFFORT_POSITION)
-"""Modes in which a servo with torque keeps its goal while the controllers are paused."""
+"""Modes in which a servo with torque keeps its position goal while the loop is paused."""
 
 
 class Anchoring:
-    """Sets goals to measured positions and restarts the controllers of these joints."""
+    """Sets goals to the measured positions and restarts controllers, after joints moved without the loop."""
 
     def __init__(self, context: ControlContext, switching: Switching, gate: Gate) -> None:
         joints, record = context.plan.joints, context.record
@@ -38,14 +41,15 @@ class Anchoring:
         self._record = record
         self._still = np.array([STILL_SPEEDS[joint.unit] for joint in joints])
         self._paused_at: Floats = record.states.position.copy()
-        """Position of each joint when it first came to rest in the pause, rad or m."""
+        """Position at which each joint came to rest in the pause, rad or m."""
         self._coasts = np.zeros(len(self._names), dtype=np.bool_)
-        """Joints that have not come to rest yet in the pause."""
+        """Joints that were still moving in all cycles of this pause so far."""
 
     def anchor_given(self) -> None:
-        """Anchor the joints whose torque was just enabled, and send goals to their servos again.
+        """Anchor the joints whose torque was just enabled; the hardware sends their goals again.
 
-        Called after a read. A joint without a valid reply is anchored later: its position is not known.
+        Called after each read. A joint without a valid reply waits for a later cycle, because its position is
+        not known.
         """
         states = self._record.states
         given = (states.torque == Torque.GIVEN) & states.valid
@@ -54,7 +58,7 @@ class Anchoring:
             self._hardware.follow_goals(np.flatnonzero(given).tolist())
 
     def begin_pause(self) -> None:
-        """Store the joint positions at the start of a pause."""
+        """Store all joint positions at the start of a pause of the loop."""
         self._coasts.fill(True)
         self.watch_pause()
         np.copyto(self._paused_at, self._record.states.position)
@@ -70,7 +74,7 @@ class Anchoring:
         np.copyto(self._paused_at, states.position, where=self._coasts)
 
     def end_pause(self) -> None:
-        """Anchor the joints that were moved in the pause and are not in a mode that holds a position."""
+        """Anchor joints that moved more than MOVED_DISTANCES in the pause and do not hold a position."""
         states = self._record.states
         moved = ~np.isin(states.mode, _HOLDING) & (np.abs(states.position - self._paused_at) > self._moved)
         if moved.any():

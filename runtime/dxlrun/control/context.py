@@ -17,32 +17,35 @@ from dxlwire.clock import Clock
 
 
 class StopFlag(msgspec.Struct):
-    """Stop request, set by a signal handler and checked once a cycle."""
+    """Flag that asks the loop to end the run.
+
+    A signal handler sets it, and the loop checks it once a cycle.
+    """
 
     requested: bool = False
 
     def request(self) -> None:
-        """Request an orderly end of the loop."""
+        """Ask the loop to end the run after the current cycle, with the policy `on_exit`."""
         self.requested = True
 
 
 class Supervision(Protocol):
-    """Interface of the loop to its process: the stop request and the heartbeat for the guardian."""
+    """Interface from the loop to its process: the stop request and the heartbeat for the guardian process."""
 
     stop: StopFlag
 
     def beat(self) -> None:
-        """Send a heartbeat to the guardian. Called once a cycle and between long steps."""
+        """Send a heartbeat to the guardian process. Called once a cycle and between long steps."""
 
     def limit_cycle(self, limit_ns: int) -> None:
-        """Set the guardian's timeout for a cycle, ns."""
+        """Set the time, ns, that a cycle may take before the guardian process intervenes."""
 
     def set_period(self, period_ns: int) -> None:
-        """Adapt the clock's polling time to a period, ns, so that it stays a small share of the period."""
+        """Limit the polling time before deadlines to a small share of a new loop period, ns."""
 
 
 class Unsupervised:
-    """Supervision of a loop without a guardian."""
+    """Supervision for a loop without a guardian process, as in tests and replays: all methods do nothing."""
 
     def __init__(self, stop: StopFlag | None = None) -> None:
         self.stop = stop or StopFlag()
@@ -66,18 +69,21 @@ class ControlContext:
 
     plan: LoopPlan
     record: CycleRecord
-    """Record of the current cycle, with the shared arrays."""
+    """Arrays of states, commands and goals of the current cycle, in memory that all users share."""
     clock: Clock
     hardware: Hardware
-    """Started before the loop and stopped after it by the code that built it."""
+    """Interface to the servos.
+
+    The code that builds the context starts it before the loop and stops it after.
+    """
     events: EventSink
     command_log: CommandSink = field(default_factory=NoCommands)
-    """Log of the commands that cycles executed."""
+    """Log of the commands that cycles executed; discards them by default."""
     inbox: Inbox = field(default_factory=NoInbox)
-    """Queue of client commands and their answers."""
+    """Queue of client commands, which also sends the answers; empty by default."""
     supervision: Supervision = field(default_factory=Unsupervised)
     schedule: Schedule = field(init=False)
-    """Deadlines, period and the controllers' time."""
+    """Deadlines, period and the controllers' time of the loop; built from the plan."""
 
     def __post_init__(self) -> None:
         object.__setattr__(self, "schedule", schedule_of(self.plan))

@@ -1,4 +1,4 @@
-"""Deadlines: the loop's waits without a robot, for programs that measure this machine."""
+"""Deadlines: the waits of the control loop without a robot, for programs that measure this machine."""
 
 from __future__ import annotations
 
@@ -8,7 +8,7 @@ from dxlwire.clock import Clock, MonotonicClock
 
 
 class Deadlines:
-    """Periodic deadlines with the clock and the schedule of the loop.
+    """Periodic deadlines with the clock and schedule of the control loop.
 
     Deadlines that passed before `wait` was called are skipped, as in a run with `overrun: skip`. The first
     deadline is one period after the first call of `wait`.
@@ -25,7 +25,7 @@ class Deadlines:
         self._started = False
 
     def measure_margin(self, most_ns: int | None) -> Grant:
-        """Measure and set the time for which the clock is polled before a deadline.
+        """Measure how late sleeps wake on this machine, and set the polling time before each deadline.
 
         Args:
             most_ns: Longest time, as `SchedulerPlan.polling_ns`; None: a share of the period.
@@ -34,11 +34,11 @@ class Deadlines:
 
     @property
     def margin_ns(self) -> int:
-        """Polling time before a deadline, ns."""
+        """Time before a deadline for which the clock is polled instead of sleeping, ns."""
         return self._machine.spin_ns
 
     def wait(self) -> tuple[int, int]:
-        """Wait for the next deadline; return the deadline and the wake-up time, ns."""
+        """Wait until the next deadline; return that deadline and the wake-up time, ns of the clock."""
         schedule, clock = self._schedule, self._clock
         if self._started:
             schedule.advance(schedule.following(clock.now_ns(), "skip"))

@@ -1,4 +1,7 @@
-"""Gate: limit and check all commands before they become goals. `gate.c` has the computation."""
+"""Gate: limit the controllers' commands and turn them into the servos' goals.
+
+`gate.c` has the computation.
+"""
 
 from __future__ import annotations
 
@@ -27,9 +30,13 @@ BRAKING = 10.0
 """Deceleration toward a position limit in effort and PWM modes, rad/s^2. A higher acceleration limit replaces
 it. An XM430 at 1.2 A reaches this with 0.2 kg m^2. A heavier joint brakes too late. [i]"""
 LEAST_BAND = 1.0
-"""rad/s; excess speed that is braked with the full effort; `brake` in gate.c may widen this band. [i]"""
+"""Smallest excess over the permitted speed near a limit, rad/s, that is braked with full effort; `brake` in
+gate.c may widen this band. [i]
+"""
 BACK_SPEED = 0.5
-"""rad/s; highest speed of a joint that returns from beyond a limit, as ENGAGE_SPEED of `servo/modes.py`."""
+"""Highest speed of a joint that returns from beyond a position limit, rad/s; same as ENGAGE_SPEED of
+`servo/modes.py`.
+"""
 _WHAT = {
     Clamp.LOWER: "raised to the lower position limit",
     Clamp.UPPER: "lowered to the upper position limit",
@@ -45,21 +52,24 @@ _LIMITED: Mapping[Clamp, LimitedInterface] = {
     Clamp.EFFORT: "effort",
     Clamp.PWM: "pwm",
 }
-"""Clamps whose limit a register of the servo may tighten."""
+"""Clamps whose limit a register of the servo may tighten, with the command interface of that register."""
 CLAMP_ENDS_NS = 1_000_000_000
-"""Shorter gaps do not end a clamp: a joint that is pressed against a limit oscillates there. [i]"""
+"""Time without a clamp after which its end is reported.
+
+A joint pressed against a limit oscillates there. [i]
+"""
 _NEUTRAL = {Mode.VELOCITY: "velocity", Mode.EFFORT: "effort", Mode.PWM: "pwm"}
-"""Interface whose goal is 0 to keep a joint in this mode at rest."""
+"""Command interface whose goal is set to 0 to keep a joint in this mode at rest."""
 
 
 @dataclass(slots=True)
 class _Clamped:
-    """One reported clamp of one joint."""
+    """A clamp of one joint whose begin was reported in an event and whose end was not."""
 
     what: str
     begun_ns: int
     last_ns: int
-    """Newest cycle in which the clamp was active."""
+    """Time of the newest cycle in which the clamp was active."""
 
 
 class Gate:
@@ -107,7 +117,7 @@ class Gate:
         count = len(plan.joints)
         self._plan = plan
         self._limited = plan.joints
-        """Joints with the limiting registers of their servos."""
+        """Plans of the joints, with the limits from the registers of their servos."""
         self._record = record
         self._events = events
         self._sources = SourceGate(plan, record, events)
@@ -116,7 +126,7 @@ class Gate:
         self._begun, self._before = np.zeros((2, count), dtype=np.uint8)
         self._now_ns = 0  # Sum of the times between cycles
         self._clamps: dict[tuple[Clamp, int], _Clamped] = {}
-        """Clamps whose begin was reported and whose end was not, by bit and row."""
+        """Clamps whose begin was reported and whose end was not, by clamp bit and row of the joint."""
         states, commands, goals = record.states, record.commands, record.goals
         self._gate = STRUCTS["Gate"](
             joints=self._joints.ctypes.data,
@@ -135,7 +145,7 @@ class Gate:
         self._law.argtypes = (c_void_p, c_int64)
         self._address = ctypes.addressof(self._gate)
         self.modes = b""
-        """Modes of the joints, as bytes of `states.mode`, for which goals were set last."""
+        """Modes of the joints, as bytes of `states.mode`, that the gate last set its goals for."""
         self._take_modes()
 
     def take_servo_limits(self, limits: Mapping[int, Sequence[ServoLimit]]) -> None:
@@ -165,7 +175,7 @@ class Gate:
             self._joints[name] = values
 
     def begin(self) -> None:
-        """Start from the current modes and goals of the joints.
+        """Take over the modes and goals in the record as the starting point, before the first cycle.
 
         The goals must match the modes and be at rest.
         """
@@ -178,22 +188,22 @@ class Gate:
         self.modes = self._record.states.mode.tobytes()
 
     def _rest(self, rows: NDArray[np.bool_]) -> None:
-        """Mark the goals of these joints as at rest."""
+        """Mark the current goals of these joints as at rest: no speed, no remaining target."""
         self._joints["moving"][rows] = 0.0
         for known in ("target", "left"):
             self._joints[known][rows] = self._record.goals.position[rows]
 
     def enter_modes(self) -> None:
-        """Set goals at rest for the joints whose mode has changed. Called after a read.
+        """Hold joints whose mode has changed: goal at the measured position, or 0 velocity, effort or PWM.
 
-        These joints follow their next commands with a slow start.
+        Called after a read. These joints follow their next commands with a slow start.
         """
         changed = self._record.states.mode != self._joints["mode"]
         self._take_modes()
         self._hold_still(changed)
 
     def anchor(self, rows: NDArray[np.bool_]) -> None:
-        """Set goals at rest. The slow start of these joints begins when their goals move again.
+        """Hold joints at their measured positions. Their slow start begins when their goals move again.
 
         Args:
             rows: Mask of the joints, shape (joints,).
@@ -213,7 +223,7 @@ class Gate:
         self.ease_in(np.flatnonzero(rows).tolist())
 
     def ease_in(self, rows: Sequence[int] | None = None) -> None:
-        """Limit the speed of joints to SLOW_SPEED for one second.
+        """Limit the goal speed of joints to SLOW_SPEED for the next second.
 
         Called when torque was just enabled, or after a time without commands.
 
@@ -223,7 +233,9 @@ class Gate:
         self._joints["slow_ns"][slice(None) if rows is None else list(rows)] = SLOW_START_NS
 
     def apply(self, dt_ns: int) -> None:
-        """Move the goals toward the commands, in place.
+        """Move the goals in the record toward the commands, within all limits, and report clamps.
+
+        Called each cycle.
 
         Args:
             dt_ns: Time since the previous cycle.
@@ -259,7 +271,7 @@ class Gate:
                 self._events.emit(name, texts.clamp_ended(name, clamped.what, lasted_ns))
 
     def _owner(self, joint: str) -> str:
-        """Return the controller that commands a servo, and the controllers above it, as text."""
+        """Return text that names the active controller that commands a joint, and those above it."""
         active = self._record.active
         plans = [plan for index, plan in enumerate(self._plan.controllers) if active >> index & 1]
         for plan in plans:
@@ -271,7 +283,7 @@ class Gate:
 
 
 def _speeds_and_efforts(joints: Sequence[JointPlan]) -> Mapping[str, Sequence[float]]:
-    """Return the fields of `Joint` in gate.c that registers of the servos may lower."""
+    """Return the limits of all joints that servo registers may lower, by `Joint` field of gate.c."""
     return {
         "speed": [joint.step_speed for joint in joints],
         "highest_speed": [joint.highest_speed for joint in joints],
@@ -281,7 +293,7 @@ def _speeds_and_efforts(joints: Sequence[JointPlan]) -> Mapping[str, Sequence[fl
 
 
 def _laid_out(joints: Sequence[JointPlan]) -> NDArray[np.void]:
-    """Return the `Joint` structs of gate.c, at the begin of their slow start."""
+    """Return the array of `Joint` structs for gate.c, filled from the plans; all joints start slowly."""
     laid: NDArray[np.void] = np.zeros(len(joints), dtype=np.dtype(STRUCTS["Joint"]))
     # The constants are in rad/s. They are scaled for linear joints by the ratio of the slow speeds.
     share = np.array([joint.slow_speed / SLOW_SPEED for joint in joints])
@@ -309,7 +321,7 @@ def _limits(limits: Sequence[float | None]) -> Floats:
 
 
 class SourceGate:
-    """Clamps the commands of sources to their ranges. NaN means "not commanded" and stays NaN."""
+    """Clamps the commands for sources, such as devices, to their ranges. NaN, "not commanded", stays NaN."""
 
     def __init__(self, plan: LoopPlan, record: CycleRecord, events: EventSink) -> None:
         ranges = [each for source in plan.sources for each in source.ranges]
@@ -317,13 +329,16 @@ class SourceGate:
         self._lowest, self._highest = np.array(ranges, dtype=np.float64).reshape(-1, 2).T
         self._events = events
         self.commands: Floats = record.source_commands
-        """Commands of the robot's sources."""
+        """Commands for all sources of the robot, in the record."""
         self._outside = np.zeros(len(ranges), dtype=np.bool_)
         self._held = np.zeros(len(ranges), dtype=np.bool_)
-        """Commands that are at an end of their range because they were clamped."""
+        """Mask of the commands that are at an end of their range because they were clamped."""
 
     def apply(self) -> None:
-        """Clamp the commands in place. An event reports the begin of a clamp."""
+        """Clamp the source commands in the record to their ranges.
+
+        An event reports the begin of each clamp.
+        """
         commands, outside, held = self.commands, self._outside, self._held
         at_end = (commands == self._lowest) | (commands == self._highest)
         np.logical_or(commands < self._lowest, commands > self._highest, out=outside)

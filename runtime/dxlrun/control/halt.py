@@ -1,4 +1,4 @@
-"""Halt: stop and hold all joints within their limits while the run continues."""
+"""Halt: the client command that stops and holds all joints within their limits while the run continues."""
 
 from __future__ import annotations
 
@@ -14,15 +14,20 @@ from dxlwire.joint_unit import LINEAR, ROTARY, JointUnit
 from dxlwire.modes import Mode
 
 STILL_SPEEDS: Mapping[JointUnit, float] = {ROTARY: 0.1, LINEAR: 0.003}
-"""rad/s or m/s; a slower joint counts as at rest. Servos report velocity in steps of 0.024 rad/s (XM430) or
-less, with noise of some steps. [i]"""
+"""Speed below which a joint counts as at rest, rad/s or m/s.
+
+Servos report velocity in steps of 0.024 rad/s (XM430) or less, with noise of some steps. [i]
+"""
 STILL_NS = 100_000_000
-"""Time for which all joints must be at rest, with constant goals."""
+"""Time for which all joints must be at rest, with unchanged goals, before a halt is answered as done."""
 HALT_NS = 5_000_000_000
-"""Timeout of a halt; joints may take so long to change their modes."""
+"""Time after which a halt is refused if joints still move.
+
+Joints may need that long to change their modes.
+"""
 _HOLDING = (Mode.POSITION, Mode.VELOCITY)
 _FREE = (*LIMP, *OFFLINE)
-"""Torque states of joints that a halt ignores: the run does not move them, or their state is unknown."""
+"""Torque states (limp or offline) of joints that a halt ignores: the run does not move them."""
 
 
 class Halt:
@@ -51,12 +56,15 @@ class Halt:
         self._record = context.record
         self._answer = answer
         self.waiting: list[int] = []
-        """Numbers of the commands that wait until the joints are at rest."""
+        """Numbers of the `halt` commands that are answered when the joints are at rest."""
         self._began_ns = self._still_ns = 0
         self._before = b""
 
     def halt_joints(self, number: int) -> Refusal | Waiting:
-        """Deactivate the controllers, upper ends of chains first, and start to watch the joints."""
+        """Deactivate all controllers that command joints, and watch until the joints are at rest.
+
+        Returns `Waiting`, or the refusal.
+        """
         refusal = self._switching.switch_controllers((), self._switching.commanding(self._joints))
         if isinstance(refusal, Refusal):
             return refusal
@@ -67,9 +75,9 @@ class Halt:
         return Waiting(())
 
     def watch(self) -> None:
-        """Check the joints, and answer when they have been at rest for STILL_NS or after the timeout.
+        """Check if all joints are at rest, and answer the waiting commands when they are or at the timeout.
 
-        Called after a read while commands wait.
+        Called after a read while commands wait. Rest must last STILL_NS.
         """
         record, now_ns = self._record, self._record.woken_ns
         states, goals = record.states, record.goals
@@ -103,7 +111,7 @@ class Halt:
             )
 
     def end(self) -> None:
-        """Refuse the waiting commands because the run ends."""
+        """Refuse the waiting `halt` commands because the run ends."""
         self._end(Refusal(Code.RUN_ENDING))
 
     def _end(self, answer: Answer) -> None:

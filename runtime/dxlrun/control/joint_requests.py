@@ -1,4 +1,4 @@
-"""Joint requests: torque, reboots and registers of single joints, requested by clients of a running loop.
+"""Joint requests: client requests for torque, reboots and registers of single joints of a running loop.
 
 The record of the cycle that receives a request decides about it, so a replay makes the same decision. The
 hardware executes the request in idle time, and the answer follows after that.
@@ -20,20 +20,20 @@ from dxlrun.control.controllers.switching import Switching
 
 
 class _Pending(msgspec.Struct):
-    """An unanswered request for several joints."""
+    """A torque or reboot request that waits for the results of its joints."""
 
     code: Code
-    """Code of the refusal if a servo fails."""
+    """Code of the refusal that the client gets if any servo fails."""
     left: int
-    """Number of joints without a result."""
+    """Number of joints whose result is missing."""
     joints: list[str] = msgspec.field(default_factory=list)
     problems: list[str] = msgspec.field(default_factory=list)
     deactivated: tuple[str, ...] = ()
-    """Controllers that commanded the joints."""
+    """Controllers that commanded the joints and were deactivated for the request."""
 
 
 class JointRequests:
-    """Checks requests for joints, passes them to the hardware, and answers them.
+    """Passes client requests for torque, reboots and registers to the hardware, and answers them.
 
     Args:
         context: The run.
@@ -55,7 +55,9 @@ class JointRequests:
     def execute_request(
         self, number: int, request: TorqueRequest | RebootRequest | Register | RegisterReading
     ) -> Refusal | None:
-        """Start a request. A request for several joints is executed for all of them or for none.
+        """Check a request and pass it to the hardware.
+
+        With several joints, it applies to all of them or to none.
 
         Args:
             number: Number of the client's command.
@@ -119,13 +121,13 @@ class JointRequests:
     def _await(
         self, number: int, code: Code, rows: dict[str, int], released: tuple[str, ...]
     ) -> list[tuple[int, Callable[[str], None]]]:
-        """Answer that the request waits; return each row with the callback for its result."""
+        """Answer `Waiting` to a request; return each joint's row with the callback for its result."""
         pending = self._pending[number] = _Pending(code, len(rows), deactivated=released)
         self._answer(number, Waiting(()))
         return [(row, partial(self._done, number, pending, joint)) for joint, row in rows.items()]
 
     def end(self) -> None:
-        """Refuse the unanswered requests because the run ends."""
+        """Refuse the pending torque and reboot requests because the run ends."""
         for number in self._pending:
             self._answer(number, Refusal(Code.RUN_ENDING))
         self._pending.clear()
@@ -133,7 +135,7 @@ class JointRequests:
     # Inside
 
     def _known(self, joints: Sequence[str]) -> dict[str, int] | Refusal:
-        """Return the rows of joints, including all joints that the same servos move."""
+        """Return the rows of the joints and of all joints that the same servos move; refuse unknown names."""
         unknown = tuple(joint for joint in joints if joint not in self._rows)
         if unknown or not joints:
             return Refusal(Code.UNKNOWN_JOINT, {"joint": unknown})
@@ -171,7 +173,9 @@ class JointRequests:
     def _release(
         self, rows: dict[str, int], names: tuple[str, ...], release: bool
     ) -> tuple[str, ...] | Refusal:
-        """Deactivate the controllers that command joints and return their names, or refuse.
+        """Deactivate the named controllers and return their names.
+
+        Refuse if the client does not allow that.
 
         Args:
             rows: Rows of the joints by name.
@@ -189,7 +193,10 @@ class JointRequests:
         return Refusal(Code.JOINT_COMMANDED, {"joint": joints, "controller": names})
 
     def _done(self, number: int, pending: _Pending, joint: str, problem: str) -> None:
-        """Store the result for one joint. The last result answers the request."""
+        """Store the result for one joint; an empty problem is a success.
+
+        The last result answers the request.
+        """
         pending.left -= 1
         if problem:
             pending.joints.append(joint)
@@ -208,6 +215,6 @@ class JointRequests:
         self._answer(number, answer)
 
     def _answer_register(self, number: int, code: Code, problem: str, found: int | None) -> None:
-        """Answer a request for a register after it was written or read, or after that failed."""
+        """Answer a register request with the value read, None after a write, or with the problem."""
         refusal = Refusal(code, {"problem": problem}) if problem else None
         self._answer(number, refusal or Done(self._record.cycle, value=found))

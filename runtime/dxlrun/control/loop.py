@@ -1,4 +1,4 @@
-"""Loop: read, update, gate and write, once a cycle of the schedule."""
+"""Loop: the control loop, which once a period reads servos, updates controllers, limits goals and writes."""
 
 from __future__ import annotations
 
@@ -30,30 +30,36 @@ from dxlrun.plan.policy_plan import Last
 
 
 class CycleSink(Protocol):
-    """Destination of finished cycles. Its methods never block and never raise."""
+    """Destination of finished cycles, such as the log. Its methods never block and never raise."""
 
     def wake(self, cycle: int) -> None:
-        """Start a cycle. Packets that the buses exchange from now on belong to its period."""
+        """Note that a cycle starts: bus packets from now on belong to the period of this cycle."""
 
     def append(self, record: CycleRecord) -> None:
-        """Store a copy of the record. The next cycle overwrites its memory."""
+        """Store a copy of a finished cycle's record, whose memory the next cycle overwrites."""
 
     def begin(self, record: CycleRecord) -> None:
-        """Store a copy of the record before the first cycle, with the states and goals of the activation."""
+        """Store a copy of the record before the first cycle: states and goals of the activation."""
 
 
 class LoopResult(msgspec.Struct, frozen=True):
-    """Result of a loop. `cycles` + `skipped` is the number of elapsed periods."""
+    """Result of a finished loop. `cycles` + `skipped` is the number of elapsed periods."""
 
     cycles: int
     skipped: int
     reason: Literal["ended", "stopped", "fault"]
     detail: str = ""
-    """One sentence if the reason is a fault."""
+    """Explanation in one sentence if the reason is a fault; may be empty otherwise."""
     last: Last = "limp"
-    """Final state of the robot by the policy. The code that started the hardware brings it about."""
+    """Final state of the robot after the exit policy:
+
+    `limp` or `hold`. The code that stops the hardware applies it.
+    """
     invalid: tuple[int, ...] = ()
-    """Number of cycles with an invalid state, by joint. Cycles of a requested reboot do not count."""
+    """Number of cycles with an invalid servo state, a value for each joint.
+
+    Requested reboots do not count.
+    """
 
 
 class Loop:
@@ -100,7 +106,7 @@ class Loop:
         self._cycles = 0
         joints = len(context.plan.joints)
         self._invalid: NDArray[np.int64] = np.zeros(joints, np.int64)
-        """Number of cycles with an invalid state, by joint, without cycles of a requested reboot."""
+        """Number of cycles with an invalid servo state, by joint, without cycles of a requested reboot."""
         self._all_valid = bytes([True]) * joints
         self._skipped = 0
         self._late = False
@@ -110,11 +116,13 @@ class Loop:
         self._anchoring = self.steering.anchoring
         self._motion: SafeMotion | None = None
         self._servo_limits: Mapping[int, Sequence[ServoLimit]] = {}
-        """Servo limits that the gate has. Compared by identity: the hardware replaces the mapping when a
-        servo returns."""
+        """Register limits of the servos that the gate has.
+
+        Compared by identity: the hardware replaces the mapping when a servo returns.
+        """
 
     def run(self) -> LoopResult:
-        """Run until the plan's end, a stop request or a fault, and wind up by the policy for that.
+        """Run cycles until the plan's end, a stop request or a fault, then execute the policy for that end.
 
         Controllers are activated before the first cycle and deactivated after the last one. The steps of the
         policy follow, and leave the robot limp or holding. Exceptions of controllers and PortError of the
@@ -143,7 +151,7 @@ class Loop:
     # Inside
 
     def _begin(self) -> None:
-        """Activate the controllers, one period before the first deadline."""
+        """Start the schedule, log the start and activate controllers a period before the first deadline."""
         self._woken_ns = self.clock.now_ns()
         self.schedule.start(self._woken_ns)
         self.context.events.emit("loop", texts.loop_started(self.plan.period_ns))
@@ -160,7 +168,7 @@ class Loop:
         self.gate.take_servo_limits(self._servo_limits)
 
     def _cycle_until_end(self) -> tuple[Literal["ended", "stopped", "fault"], str]:
-        """Run cycles; return the reason of the end, and one sentence for a fault."""
+        """Run cycles; return the reason of the end (`ended`, `stopped`, `fault`) and a fault's sentence."""
         end_ns, schedule = self.plan.end_ns, self.schedule
         while self.manager.switching.fault is None:
             # A motion that ends late must not shorten the settling time of its goal.
@@ -176,7 +184,7 @@ class Loop:
         return "fault", self.manager.switching.fault
 
     def _one(self) -> None:
-        """Wait for the deadline, then read, execute commands, update, gate and write."""
+        """Run one cycle: wait, read servos, execute commands, update controllers, gate, write goals."""
         record, now_ns, schedule = self.record, self.clock.now_ns, self.schedule
         cycle, deadline_ns = schedule.cycle, schedule.due_ns
         self.hardware.idle(deadline_ns, schedule.grid_ns)
@@ -247,7 +255,7 @@ class Loop:
             steering.answer_late()
 
     def _wind_up(self, name: str) -> Last:
-        """Execute the steps of a policy in additional cycles; return the final state of the robot."""
+        """Execute the steps of an exit policy in additional cycles; return the final state, limp or hold."""
         policy = self.plan.policies.named(name)
         motion = SafeMotion(policy, self.context)
         if not motion.over:
@@ -275,7 +283,10 @@ class Loop:
         self.context.command_log.take(begun)
 
     def _next(self) -> bool:
-        """Advance to the next cycle after any skipped periods; return whether an overrun ends the run."""
+        """Advance the schedule past skipped periods to the next cycle.
+
+        Returns True if an overrun ends the run.
+        """
         schedule, cycle, due_ns = self.schedule, self.schedule.cycle, self.schedule.due_ns
         now_ns, policy, next_ns = self.clock.now_ns(), self.plan.overrun, due_ns + schedule.period_ns
         if self.steering.stood:
@@ -323,7 +334,7 @@ class Loop:
 
 
 class Overruns:
-    """Selects the overrun policy for a late cycle: the first answer of the hooks, otherwise the robot file's.
+    """Selects the policy for a late cycle: a hook's first answer, otherwise `overrun` of the robot file.
 
     A hook that raises or returns an invalid answer is reported in an event and not called again.
     """
@@ -334,7 +345,7 @@ class Overruns:
         self._events = events
 
     def decide(self, cycle: int, scheduled_ns: int, actual_ns: int) -> OverrunPolicy:
-        """Return the policy for a cycle that was due at `scheduled_ns` and can begin at `actual_ns`."""
+        """Return the policy for a cycle that was due at `scheduled_ns` but can begin only at `actual_ns`."""
         for hook in tuple(self._hooks):
             try:
                 answer = hook.decide(cycle, scheduled_ns, actual_ns)

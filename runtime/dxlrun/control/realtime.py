@@ -30,39 +30,44 @@ _PR_SET_TIMERSLACK = 29  # linux/prctl.h
 _RESET_ON_FORK = 1  # SCHED_FLAG_RESET_ON_FORK, linux/sched.h: for this process, not for its children
 _TASKS = Path("/proc/self/task")
 IDLE_LATENCY = Path("/dev/cpu_dma_latency")
-"""Device with the longest wake-up time of idle cores, int32 in us. The request ends when the file is closed
-(kernel: Documentation/power/pm_qos_interface.rst)."""
+"""Device file that limits the wake-up time of idle cores, int32 in us.
+
+The request ends when the file is closed (kernel: Documentation/power/pm_qos_interface.rst).
+"""
 _AGAIN = "and log in again"
 P = ParamSpec("P")
 
 
 class Grant(msgspec.Struct, frozen=True):
-    """A request to the operating system and its result."""
+    """A real-time setting requested from the operating system, and whether it was granted."""
 
     request: str
-    """collector, timer slack, memory in place, locked memory, cores, idle latency, scheduler, time slice,
-    polling"""
+    """Name: collector, timer slack, memory in place, locked memory, cores, idle latency, scheduler, time
+    slice or polling.
+    """
     granted: bool
     sentence: str
-    """Result in one sentence; for a refusal, with its consequence."""
+    """Result for the user in one sentence; for a refusal, with its consequence."""
     fix: str = ""
-    """Fix for a refusal; empty if there is none."""
+    """Command or change that a user can make to get the request granted; empty if there is none."""
     process: str = "loop"
 
     @property
     def text(self) -> str:
-        """Sentence and fix, prefixed with the process if it is not the loop."""
+        """Result and fix as one text, prefixed with the process if that is not the loop."""
         text = f"{self.sentence}: {self.fix}" if self.fix else self.sentence
         return text if self.process == "loop" else f"{self.process}: {text}"
 
     @property
     def name(self) -> str:
-        """The request, prefixed with the process if it is not the loop."""
+        """Name of the request, prefixed with the process if that is not the loop."""
         return self.request if self.process == "loop" else f"{self.process}: {self.request}"
 
 
 def apply(plan: SchedulerPlan) -> tuple[Grant, ...]:
-    """Prepare the calling thread for the loop. Never raises.
+    """Apply the real-time settings of the robot file to the calling thread; return one result for each.
+
+    Never raises.
 
     Steps that allocate come first and the scheduling policy comes last, so that no slow step runs with
     real-time priority.
@@ -79,7 +84,7 @@ def apply(plan: SchedulerPlan) -> tuple[Grant, ...]:
 
 
 def apply_to_guardian(priority: int, lock: bool) -> tuple[Grant, ...]:
-    """Prepare the guardian's process. Never raises.
+    """Apply real-time settings to the guardian's process; return one result for each. Never raises.
 
     Args:
         priority: Real-time priority; 0: none.
@@ -92,14 +97,14 @@ def apply_to_guardian(priority: int, lock: bool) -> tuple[Grant, ...]:
 
 
 def log_grants(grants: Sequence[Grant], source: str, events: EventSink) -> None:
-    """Emit an event for each request of a process, a warning if it was refused."""
+    """Emit an event for the result of each request: information if granted, a warning if refused."""
     for grant in grants:
         text = texts.request_granted if grant.granted else texts.request_denied
         events.emit(source, text(grant.text), msgspec.json.encode(Granted(grant.request, grant.granted)))
 
 
 def freeze_collector() -> Grant:
-    """Collect garbage once, freeze the remaining objects, and disable the collector.
+    """Collect garbage once, exempt the remaining objects from collection, and disable Python's collector.
 
     A collection takes milliseconds, and the loop creates no reference cycles that would need one.
     """
@@ -110,7 +115,7 @@ def freeze_collector() -> Grant:
 
 
 def guardian_priority(plan: SchedulerPlan) -> int:
-    """Return the guardian's priority, one above the loop's; 0: no real-time priority."""
+    """Return the guardian's real-time priority, one above the loop's; 0 without real-time policy."""
     return 0 if plan.policy == "other" else min(plan.priority + 1, 99)
 
 
@@ -130,7 +135,7 @@ def _tasks() -> int | None:
 
 
 class _Refused(Exception):
-    """Refusal of a request. Its arguments are the sentence and the fix of the grant."""
+    """Raised inside a request that was refused. Its arguments are `sentence` and `fix` of the Grant."""
 
 
 def _requested(request: str) -> Callable[[Callable[P, str]], Callable[P, Grant]]:
@@ -160,7 +165,7 @@ def set_policy(policy: Policy, priority: int, limit: int | None = None) -> str:
 
     Args:
         policy: Policy.
-        priority: Real-time priority, 1..99.
+        priority: Real-time priority, 1..99; ignored with the policy `other`.
         limit: rtprio limit for the fix of a refusal, if another process needs more than `priority`.
     """
     if policy == "other":
@@ -185,11 +190,13 @@ def _timer_slack() -> str:
 
 
 SLICE_NS = 100_000
-"""Shortest time slice that Linux accepts for an ordinary process (kernel/sched/syscalls.c)."""
+"""Requested time slice; the shortest that Linux accepts for an ordinary process (kernel/sched/syscalls.c)."""
 _SCHED_ATTR = struct.Struct("<IIQiIQQQ")
 """struct sched_attr of sched_setattr(2): size, policy, flags, nice, priority, runtime, deadline, period."""
 _SCHED_CALLS = {"x86_64": (314, 315), "aarch64": (274, 275)}
-"""Numbers of sched_setattr and sched_getattr; the C library has no functions for them before 2.41."""
+"""System call numbers of sched_setattr and sched_getattr by machine; the C library lacks these functions
+before 2.41.
+"""
 
 
 def _short_slice() -> tuple[Grant, ...]:
@@ -214,7 +221,10 @@ def _short_slice() -> tuple[Grant, ...]:
 
 @_requested("cores")
 def _stay_on(cores: Sequence[int]) -> str:
-    """Bind the calling thread to cores. Linux ignores cores that do not exist (sched_setaffinity(2))."""
+    """Bind the calling thread to these cores.
+
+    Linux ignores cores that do not exist (sched_setaffinity(2)).
+    """
     before, fix = os.sched_getaffinity(0), "write others under loop.scheduler.cores"
     try:
         os.sched_setaffinity(0, cores)
@@ -246,7 +256,7 @@ def _keep_memory() -> str:
 
 @_requested("locked memory")
 def lock_memory() -> str:
-    """Lock all current and future memory. Never raises.
+    """Lock all current and future memory of this process in RAM. Never raises.
 
     Refused under a memory limit, where later allocations would fail.
     """
@@ -272,7 +282,7 @@ def keep_awake() -> str:
 
 
 def allow_idle_latency(account: str = "") -> str:
-    """Return the command that permanently allows a user to keep cores out of deep idle states.
+    """Return the shell command that permanently allows a user to keep cores out of deep idle states.
 
     Args:
         account: Name of the user; empty: the current user.
@@ -305,7 +315,10 @@ def raise_share(process: int, nice: int) -> None:
 # Memory
 
 HEAP = 8 << 20
-"""Bytes of heap that are touched. A loop of 20 servos allocates and frees a few kB in a cycle [i]."""
+"""Bytes of heap that `touch` writes before the loop.
+
+A loop of 20 servos allocates and frees a few kB in a cycle [i].
+"""
 _STACK_DEPTH = 800
 """Depth of nested lists for `repr`, which makes one C call a level: 800 levels touch some 100 kB of stack
 [measured]. Python's recursion limit is 1000."""
@@ -321,13 +334,13 @@ def libc() -> ctypes.CDLL:
 
 
 def succeed(code: int) -> None:
-    """Raise OSError from errno if a call of the C library did not return 0."""
+    """Raise OSError from errno if a C library call returned another code than 0."""
     if code != 0:
         raise OSError(ctypes.get_errno(), os.strerror(ctypes.get_errno()))
 
 
 def may_lock() -> bool:
-    """Return whether all memory may be locked. Under a limit, a later allocation would fail."""
+    """Return whether this process may lock its memory without a limit (RLIMIT_MEMLOCK)."""
     return lockable_bytes() == UNLIMITED
 
 
@@ -345,7 +358,7 @@ def keep_freed() -> bool:
 
 
 def touch() -> None:
-    """Touch heap and stack once, so that no cycle has the page faults of a first use."""
+    """Write to HEAP bytes and to the stack once, so that no cycle has the page faults of a first use."""
     bytearray(HEAP)  # zeroed, so each page is written; freed at once, and kept by `keep_freed`
     nested: list[object] = []
     for _ in range(_STACK_DEPTH):
@@ -357,24 +370,30 @@ def touch() -> None:
 # Polling before a deadline
 
 AUTO_SHARE = 10
-"""Divider of the period for the longest polling time, if the robot file sets none."""
+"""Divider: without `polling` in the robot file, the polling time is at most period / AUTO_SHARE."""
 _TRIES = 32
 _NAP_NS = 2_000_000
-"""All tries together take 64 ms. Longer sleeps overshoot more, which _RESERVE covers."""
+"""Longest sleep of a try, ns.
+
+All tries together take 64 ms. Longer sleeps overshoot more, which _RESERVE covers.
+"""
 _QUANTILE = 0.95
 _RESERVE = 1.5
-"""Sleeps of 20 ms overshoot 1.4 times as much as those of 2 ms [measured, round_robin, x86-64]."""
+"""Factor on the measured delay.
+
+Sleeps of 20 ms overshoot 1.4 times as much as those of 2 ms [measured, round_robin, x86-64].
+"""
 
 
 def overshoot_ns(nap_ns: int) -> int:
-    """Sleep for a time, and return the delay of the wake-up, ns."""
+    """Sleep for `nap_ns`, and return how much later than that the thread woke up, ns."""
     deadline_ns = time.monotonic_ns() + nap_ns
     time.sleep(nap_ns * 1e-9)
     return time.monotonic_ns() - deadline_ns
 
 
 class Pacing:
-    """Sets a clock's polling margin to a measured value, bounded by the robot file and the period.
+    """Measures and sets how long a clock is polled before a deadline, bounded by robot file and period.
 
     Args:
         clock: The clock.
@@ -385,12 +404,12 @@ class Pacing:
         self._clock = clock
         self._most_ns = most_ns
         self.measured_ns = clock.spin_ns
-        """Measured margin before bounds are applied."""
+        """Measured polling time, ns, before the limits are applied."""
 
     def measure(
         self, period_ns: int, beat: Callable[[], None], nap: Callable[[int], int] = overshoot_ns
     ) -> Grant:
-        """Measure the delay of sleeps, and set the margin to 1.5 times its 95th percentile.
+        """Measure how late sleeps wake up, and set the polling time to 1.5 times the 95th percentile.
 
         Args:
             period_ns: Period of the loop.
@@ -414,7 +433,7 @@ class Pacing:
         )
 
     def set_period(self, period_ns: int) -> None:
-        """Apply the bounds of a new period, ns, to the measured margin."""
+        """Limit the measured polling time again for a new loop period, ns."""
         most_ns = period_ns // AUTO_SHARE if self._most_ns is None else self._most_ns
         self._clock.spin_ns = min(self.measured_ns, most_ns, period_ns // MOST_SHARE)
 
@@ -422,14 +441,14 @@ class Pacing:
 # Limits of this process
 
 IPC_LOCK, SYS_NICE = 14, 23
-"""Bit numbers of capabilities (linux/capability.h)."""
+"""Bit numbers of the Linux capabilities CAP_IPC_LOCK and CAP_SYS_NICE (linux/capability.h)."""
 LIMITS = Path("/etc/security/limits.d/dxlrun.conf")
 UNLIMITED = -1
 _STATUS = Path("/proc/self/status")
 
 
 def has_capability(bit: int, status: Path = _STATUS) -> bool:
-    """Return whether this process has an effective capability; False on systems without capabilities."""
+    """Return whether this process has an effective Linux capability, by bit; False on other systems."""
     try:
         text = status.read_text()
     except OSError:
@@ -453,7 +472,7 @@ def highest_priority() -> int:
 
 
 def missing_priority(plan: SchedulerPlan) -> str:
-    """Return the command that permits this user the priorities of a plan; empty if they are permitted."""
+    """Return the shell command that permits this user the plan's real-time priorities; empty if permitted."""
     needed = guardian_priority(plan)
     return "" if highest_priority() >= needed else allow("rtprio", needed)
 
@@ -473,7 +492,7 @@ def lowest_nice() -> int:
 
 
 def lockable_bytes() -> int:
-    """Return the number of bytes that this process may lock (RLIMIT_MEMLOCK); UNLIMITED with CAP_IPC_LOCK."""
+    """Return how many bytes of memory this process may lock (RLIMIT_MEMLOCK); UNLIMITED with CAP_IPC_LOCK."""
     import resource
 
     if has_capability(IPC_LOCK):
@@ -482,7 +501,7 @@ def lockable_bytes() -> int:
 
 
 def allow(limit: str, value: int | str, account: str = "") -> str:
-    """Return the command that raises a limit of a user from the next login on, limits.conf(5).
+    """Return the shell command that raises a limit of a user from the next login on, limits.conf(5).
 
     Args:
         limit: `rtprio` or `memlock`.
@@ -493,7 +512,7 @@ def allow(limit: str, value: int | str, account: str = "") -> str:
 
 
 def user() -> str:
-    """Return the name of the current user for limits.conf(5), or `UID:UID` without a name."""
+    """Return the current user's name as in limits.conf(5), or `UID:UID` for a user without a name."""
     if not hasattr(os, "getuid"):
         return sys.platform
     import pwd

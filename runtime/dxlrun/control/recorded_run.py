@@ -1,4 +1,4 @@
-"""Recorded run: run a loop with the clock, servos and clients of a log. Its goals are not sent to servos.
+"""Recorded run: run a loop again with the clock, servo states and client commands of a log, without servos.
 
 A replay replaces only these interfaces of the loop.
 """
@@ -39,12 +39,14 @@ _STATES = tuple(field.name for field in fields(States) if field.name != "motion"
 
 
 class RunInputs(msgspec.Struct, frozen=True, eq=False):
-    """Inputs of one run."""
+    """Inputs of one recorded run, taken from its log."""
 
     log: Log  # Without packets and topics; only the scalars of cycles
     loop: LoopPlan
-    """The plan's loop with the planned commands that cycles executed. The recording decides when it ends,
-    skips periods and begins a policy."""
+    """The loop's plan, including the planned commands that cycles executed.
+
+    The recording decides when it ends, skips periods and begins a policy.
+    """
     activation: np.void  # States and goals when the controllers were activated
     start_ns: int  # Deadline of cycle 0
     steered: tuple[ClientCommand, ...]  # Commands of clients
@@ -54,10 +56,9 @@ class RunInputs(msgspec.Struct, frozen=True, eq=False):
 
 
 def kept_states_of(log: Log) -> KeptStates:
-    """Return the kept states that the controllers started with. Older logs have none.
+    """Return the kept states, from earlier runs, that the controllers started with; empty for older logs.
 
-    Raises:
-        LogError: The attachment cannot be read.
+    Raises: LogError: The attachment cannot be read.
     """
     data = log.attachments.get(KEPT_ATTACHMENT)
     try:
@@ -67,7 +68,7 @@ def kept_states_of(log: Log) -> KeptStates:
 
 
 class RecordedClock:
-    """Clock with the recorded times, at each point of a cycle that matters to controllers."""
+    """Clock that returns the recorded times instead of the machine's."""
 
     __slots__ = ("_now_ns", "wake_ns")
 
@@ -76,21 +77,21 @@ class RecordedClock:
         self.wake_ns = now_ns  # When the next wait ends
 
     def now_ns(self) -> int:
-        """Return recorded time, ns."""
+        """Return the recorded time of the current point in the cycle, ns."""
         return self._now_ns
 
     def wait_until(self, deadline_ns: int) -> int:
-        """Return the recorded wake-up time, ns."""
+        """Ignore the deadline, set the clock to the recorded wake-up time and return that, ns."""
         self._now_ns = self.wake_ns
         return self._now_ns
 
     def move(self, now_ns: int) -> None:
-        """Set the time, ns."""
+        """Set the recorded time that `now_ns` returns, ns."""
         self._now_ns = now_ns
 
 
 class RecordedHardware:
-    """Hardware with the recorded states, bit for bit. Goals are ignored; see `contract.hardware.Hardware`.
+    """Hardware with the recorded servo states, bit for bit. Goals are ignored; see `contract.hardware`.
 
     Each write moves the clock to the deadline of the next recorded cycle, so the loop skips the same periods
     as the run. The loop is stopped before cycle `inputs.ends`, where the policy begins. After the last cycle,
@@ -98,10 +99,10 @@ class RecordedHardware:
 
     Args:
         inputs: The inputs of the run.
-        row: Returns a cycle by its index.
-        record: The cycle's record.
+        row: Returns a recorded cycle of the log by its index.
+        record: Receives the recorded states of each cycle.
         clock: The clock that the loop uses.
-        stop: Receives the stop request.
+        stop: Flag set to stop the loop before cycle `inputs.ends`.
     """
 
     def __init__(
@@ -121,11 +122,11 @@ class RecordedHardware:
         self._outside_states = sum(len(one.states) for one in inputs.loop.sources)
         self.index = 0  # Index of the replayed cycle
         self.servo_limits: Mapping[int, Sequence[ServoLimit]] = {}
-        """Limiting registers of the servos, from the events up to this cycle, by row."""
+        """Limits in the servos' registers by row of the joint, from the log's events up to this cycle."""
         self._limit_events = deque(_read_limits(inputs))
 
     def start(self, engaging: Callable[[], None] = lambda: None) -> None:
-        """Copy the states and goals of the activation into the record."""
+        """Copy the recorded states and goals of the controllers' activation into the record."""
         record, activation = self._record, self._inputs.activation
         for name in _STATES:
             np.copyto(getattr(record.states, name), activation[name])
@@ -140,20 +141,23 @@ class RecordedHardware:
             self.servo_limits = {**self.servo_limits, row: limits}
 
     def _take_sources(self, row: np.void) -> None:
-        """Copy the states of devices and sensors. Controllers compute their provided states again."""
+        """Copy the recorded states of devices and sensors.
+
+        Controllers compute the states they provide again.
+        """
         sources, states, count = self._record.sources, self._outside_states, self._outside
         np.copyto(sources.values[:states], row["source_state"][:states])
         np.copyto(sources.valid[:count], row["source_valid"][:count])
         np.copyto(sources.age_ns[:count], row["source_age_ns"][:count])
 
     def idle(self, until_ns: int, time_ns: int) -> None:
-        """Set the end of the next wait to the recorded one. Raises PortError after the last cycle."""
+        """Set the clock's next wake-up to that of the log. Raises PortError after the last recorded cycle."""
         if self.index == self._inputs.end:
             raise PortError("the log ends")
         self._clock.wake_ns = int(self._inputs.log.cycles["woken_ns"][self.index])
 
     def read(self) -> None:
-        """Copy the states of this cycle into the record."""
+        """Copy the recorded states of this cycle into the record."""
         row = self.recorded()
         for name in _STATES:
             np.copyto(getattr(self._record.states, name), row[name])
@@ -162,7 +166,7 @@ class RecordedHardware:
         self._take_limits(int(row["updated_ns"]))
 
     def recorded(self) -> np.void:
-        """Return the recorded data of the current cycle."""
+        """Return the log's row of the current cycle."""
         return self._row(self.index)
 
     def write(self) -> None:
@@ -176,7 +180,7 @@ class RecordedHardware:
             self._stop.request()
 
     def next(self) -> None:
-        """Advance to the next cycle, after the current one was compared."""
+        """Advance to the next recorded cycle, after the current one was compared."""
         self.index += 1
 
     def set_modes(self, modes: NDArray[np.uint8]) -> None:
@@ -209,7 +213,7 @@ class RecordedHardware:
 
 
 def _read_limits(inputs: RunInputs) -> Iterator[tuple[int, int, Sequence[ServoLimit]]]:
-    """Yield time, row and limits of each event that reports the limits of a servo."""
+    """Yield time (ns), joint row and register limits of each event in the log that reports servo limits."""
     rows = {joint.name: row for row, joint in enumerate(inputs.loop.joints)}
     for event in inputs.log.events:
         if event.code == EventCode.SERVO_LIMITS and event.source in rows:
@@ -219,14 +223,14 @@ def _read_limits(inputs: RunInputs) -> Iterator[tuple[int, int, Sequence[ServoLi
 
 
 class RecordedInbox:
-    """Inbox that returns the recorded commands of each cycle.
+    """Inbox that returns the commands that clients sent in the recorded run, in the same cycles.
 
     `remarks` has a sentence for each command whose acceptance differs between run and replay.
 
     Args:
         steered: Commands of clients, in the order of the run.
         record: The cycle's record.
-        prepared: Returns the data of a command, prepared again.
+        prepared: Returns the data of a recorded command, prepared again for the replay.
     """
 
     def __init__(
@@ -245,14 +249,14 @@ class RecordedInbox:
             self._by_cycle.setdefault(one.command.cycle, []).append((number, one.command))
 
     def take(self) -> Sequence[Command]:
-        """Return the recorded commands of this cycle."""
+        """Return the commands that this cycle executed in the recorded run."""
         return [
             Command(number, then.controller, then.kind, self._prepared(then), then.origin, then.lease_ns)
             for number, then in self._by_cycle.get(self._record.cycle, ())
         ]
 
     def answer(self, number: int, answer: Answer) -> None:
-        """Compare the first answer to a command with the recorded one."""
+        """Note a remark if the first answer accepts a command that was refused in the run, or vice versa."""
         if number in self._answered:
             return  # the late answer of a switch follows from states, which are compared anyway
         self._answered.add(number)
@@ -272,7 +276,7 @@ def _outcome(refusal: str) -> str:
 
 
 class PlannedCommands:
-    """Checks that each planned command is executed in the same cycle as in the run."""
+    """Command log that checks that the replay executes each planned command in the same cycle as the run."""
 
     def __init__(self, commands: Iterable[TakenCommand], log: str) -> None:
         self._log = log
@@ -281,7 +285,7 @@ class PlannedCommands:
         }
 
     def take(self, command: TakenCommand) -> None:
-        """Check one command. Raises LogError if another cycle executed it in the run."""
+        """Check one executed command. Raises LogError if the run did not execute it in this cycle."""
         if command.planned >= 0 and (command.cycle, command.controller, command.kind) not in self._then:
             raise LogError(
                 f"{self._log}: {command.kind} of the plan for {command.controller} was not taken by cycle "
@@ -297,12 +301,12 @@ class _NoEvents:
 
 
 Compare = Callable[[CycleRecord, np.void, int], None]
-"""Called after each cycle with its record, the recorded cycle and that cycle's index."""
+"""Function called after each replayed cycle with its record, the recorded cycle and that cycle's index."""
 
 
 @dataclass(frozen=True, slots=True)
 class _ComparingSink:
-    """Cycle sink that passes each replayed and recorded cycle to a function."""
+    """Cycle sink that passes each replayed cycle, with the recorded one, to the function `compare`."""
 
     hardware: RecordedHardware
     compare: Compare
@@ -314,7 +318,7 @@ class _ComparingSink:
         """Do nothing: commands follow in the first cycle."""
 
     def append(self, record: CycleRecord) -> None:
-        """Compare a finished cycle and advance to the next one."""
+        """Compare a finished cycle with the recorded one, and advance the hardware to the next."""
         self.compare(record, self.hardware.recorded(), self.hardware.index)
         self.hardware.next()
 
@@ -324,8 +328,8 @@ class RecordedRun:
 
     Args:
         inputs: The inputs of the run.
-        plan: Plan to run; that of the inputs, possibly changed.
-        plugins: Controller types.
+        plan: Plan to run: that of the recorded run, possibly changed.
+        plugins: Installed controller types.
         row: Returns a cycle of the log by its index.
         messages: Destination of the controllers' messages.
         prepare: Returns the data of a client's command. Its arguments are the command and a function that
@@ -372,16 +376,16 @@ class RecordedRun:
 
     @property
     def controllers(self) -> tuple[ControllerPlan, ...]:
-        """Plans of all controllers, by bit in the record's masks."""
+        """Plans of all controllers; the index is the controller's bit in the record's masks."""
         return self._manager.plans
 
     @property
     def remarks(self) -> Sequence[str]:
-        """A sentence for each feature that is not installed, and each command whose acceptance differs."""
+        """Sentences about features that are not installed and commands accepted in only one of the runs."""
         return [*self._missing, *self._inbox.remarks]
 
     def run(self, compare: Compare) -> LoopResult:
-        """Run all cycles that can be replayed.
+        """Replay all recorded cycles, and pass each to `compare` with the recorded one.
 
         Raises:
             LogError: The log is damaged.

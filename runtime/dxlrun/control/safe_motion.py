@@ -1,4 +1,4 @@
-"""Safe motion: execute the steps of a policy cycle by cycle, through gate and hardware.
+"""Safe motion: execute the steps of an exit policy (poses, less torque) cycle by cycle, through the gate.
 
 All times are those of the cycles, so a replay gives the same result.
 """
@@ -19,9 +19,15 @@ from dxlwire.joint_unit import LINEAR, ROTARY, JointUnit
 from dxlwire.modes import Mode
 
 ARRIVED: Mapping[JointUnit, float] = {ROTARY: 0.05, LINEAR: 0.002}
-"""Tolerance of a pose, rad or m: ten ticks of an AX-12. Friction stops it some ticks short of its goal."""
+"""Distance within which a joint counts as arrived at a pose, rad or m: ten ticks of an AX-12.
+
+Friction stops it some ticks short of its goal.
+"""
 MODES_NS = 500_000_000
-"""Timeout for mode changes, part of the policy's own time. They take some twenty transactions a servo. [i]"""
+"""Longest wait for mode changes before the steps, within the policy's time limit.
+
+They take some twenty transactions a servo. [i]
+"""
 STAND_NS = 100_000_000
 """Shortest time for which a pose, or a goal of 0 rad/s for joints that keep their torque, is sent. A write
 may be lost, and a servo that missed a reply gets its goal a cycle later."""
@@ -29,7 +35,7 @@ may be lost, and a servo that missed a reply gets its goal a cycle later."""
 
 @dataclass(slots=True)
 class SafeMotion:
-    """Execution of a policy. It is `over` after its last step or its time limit.
+    """Execution of an exit policy. It is `over` after the last step or the policy's time limit.
 
     Joints that would not hold still, and joints that a pose moves, change their modes first. Joints in
     velocity mode stop in the first cycle, or as fast as their acceleration limit permits.
@@ -47,24 +53,26 @@ class SafeMotion:
     joints: tuple[JointPlan, ...] = field(init=False)
     over: bool = field(default=False, init=False)
     unfinished: str = field(default="", init=False)
-    """Step that ended early, or pose that was not reached, with the reason; empty: none."""
+    """Step that ended early, or pose that was not reached, with the reason; empty if all steps were
+    completed.
+    """
     _index: int = field(default=0, init=False)
     _began_ns: int = field(default=-1, init=False)
     _step_ns: int = field(default=0, init=False)
     _there_ns: int = field(default=-1, init=False)
     _level: int = field(default=0, init=False)
     _modes: NDArray[np.uint8] = field(init=False)
-    """Mode that each joint must enter before the steps; UNKNOWN: no change."""
+    """Mode that each joint must enter before the first step; UNKNOWN: it keeps its mode."""
     _wait_ns: int = field(default=0, init=False)
-    """Timeout for modes and for joints to stop, before the steps."""
+    """Longest wait for mode changes and for joints to stop, before the first step."""
     _stand_ns: int = field(init=False)
-    """Time that joints get to stop before the robot holds."""
+    """Time that joints get to stop before the first step."""
     _reach: Floats = field(init=False)
-    """Longest lead of a command over its goal, in units of the step's way in a cycle."""
+    """Longest lead of a position command over its goal, as a multiple of the step's travel in a cycle."""
     _speeds: list[Floats] = field(init=False)
-    """Speed of each joint toward its target, by step, rad/s or m/s."""
+    """Speed of each joint toward its pose, for each step of the policy, rad/s or m/s."""
     _arrived: Floats = field(init=False)
-    """Tolerance of each joint's target, rad or m."""
+    """Distance within which each joint counts as arrived at its pose, rad or m."""
 
     def __post_init__(self) -> None:
         self.record, self.joints = self.context.record, self.context.plan.joints
@@ -87,12 +95,15 @@ class SafeMotion:
         self.over = not self.policy.steps and not self._wait_ns
 
     def begin(self) -> None:
-        """Request the required modes in the first cycle. Called before the states are read."""
+        """Request the modes that the steps need, in the first cycle only.
+
+        Called before the states are read.
+        """
         if self._began_ns < 0 and self._modes.any():
             self.context.hardware.set_modes(self._modes)
 
     def command(self) -> None:
-        """Write the commands of this cycle. They are all NaN after the last step."""
+        """Write this cycle's commands for the current step into the record; all NaN after the last step."""
         record = self.record
         now_ns = record.woken_ns
         record.commands.clear()
@@ -108,14 +119,14 @@ class SafeMotion:
             self.over = self._index == len(self.policy.steps)
 
     def give_up(self, why: str) -> None:
-        """End the policy before its steps are complete, and record the reason."""
+        """End the policy before its steps are complete, and name step and reason in `unfinished`."""
         if not self.over:
             self.over = True
             step = self.policy.steps[self._index].text if self.policy.steps else "the change of modes"
             self.unfinished = f"{step} ends early: {why}"
 
     def _needed(self, row: int, mode: Mode) -> Mode:
-        """Return the mode that a joint must enter before the steps; UNKNOWN: no change."""
+        """Return the mode that a joint in `mode` must enter before the steps; UNKNOWN: it keeps its mode."""
         if self.policy.last == "limp" and not self.policy.steps:
             return Mode.UNKNOWN
         if any(step.targets and step.targets[row] is not None for step in self.policy.steps):
@@ -123,7 +134,10 @@ class SafeMotion:
         return Mode.UNKNOWN if mode in {Mode.POSITION, Mode.VELOCITY} else self.joints[row].rest
 
     def _changing(self, now_ns: int) -> bool:
-        """Return whether the steps must wait for modes. They begin after the timeout in any case."""
+        """Return whether the steps must still wait for mode changes.
+
+        They begin after the timeout in any case.
+        """
         if not self._wait_ns:
             return False
         away = (self._modes != Mode.UNKNOWN) & (self._modes != self.record.states.mode)
@@ -160,7 +174,7 @@ class SafeMotion:
         return False
 
     def _judge(self, step: Step, posed: list[int], target: Floats, away: NDArray[np.bool_]) -> None:
-        """Record the worst joint as the reason if a pose was not reached."""
+        """Store in `unfinished` which joint did not reach its pose, and why. The worst joint is named."""
         states = self.record.states
         found = states.unable(posed) or states.doubtful(np.flatnonzero(away).tolist())
         if found is None and away.any():

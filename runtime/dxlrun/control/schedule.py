@@ -17,7 +17,7 @@ MOST_CAUGHT_UP = 5
 
 @dataclass(slots=True)
 class Schedule:
-    """Deadline of the next cycle and the controllers' time. Cycles are numbered by period.
+    """Deadlines of the loop's cycles, and the controllers' time. Cycles are numbered by period.
 
     Absolute, t_d[i] = t_0 + i * T: a grid that keeps its phase, even if cycles begin late. Controllers get
     the time of the wake-up.
@@ -33,19 +33,22 @@ class Schedule:
     sequential: bool = False
     cycle: int = 0
     due_ns: int = 0
-    """Deadline of `cycle`, if all earlier cycles begin on time."""
+    """Deadline of `cycle`, ns of the clock, if all earlier cycles begin on time."""
     grid_ns: int = 0
     """Controllers' time at the deadline of `cycle`: time since the first deadline, without pauses."""
     time_ns: int = 0
-    """Controllers' time in the running cycle. It never goes back."""
+    """Controllers' time in the running cycle: ns since the first deadline, without pauses.
+
+    It never goes back.
+    """
 
     def start(self, now_ns: int) -> None:
-        """Set the first deadline to one period from now."""
+        """Reset cycle and controllers' time to 0, and set the first deadline to one period after `now_ns`."""
         self.cycle = self.grid_ns = self.time_ns = 0
         self.due_ns = now_ns + self.period_ns
 
     def begin_cycle(self, woken_ns: int) -> int:
-        """Begin the cycle that is due, and set the controllers' time.
+        """Begin the cycle that is due, and set the controllers' time from its wake-up time.
 
         Returns:
             Time by which the controllers' time would go back, ns. Positive after a pause that began in a late
@@ -60,19 +63,19 @@ class Schedule:
         return behind_ns
 
     def end_cycles(self, now_ns: int) -> None:
-        """Advance the controllers' time to now, after the last cycle."""
+        """Advance the controllers' time to `now_ns`, after the last cycle."""
         passed_ns = 0 if self.sequential else now_ns - self.due_ns
         self.time_ns = max(self.time_ns, self.grid_ns + passed_ns)
 
     def advance(self, cycle: int) -> None:
-        """Advance to a later cycle."""
+        """Make a later cycle the next one, and move the deadline by its periods."""
         passed_ns = (cycle - self.cycle) * self.period_ns
         self.cycle = cycle
         self.due_ns += passed_ns
         self.grid_ns += passed_ns
 
     def following(self, now_ns: int, policy: OverrunPolicy) -> int:
-        """Return the number of the cycle to run next.
+        """Return the number of the cycle to run next, which may skip periods.
 
         Args:
             now_ns: End of the current cycle.
@@ -88,5 +91,5 @@ class Schedule:
 
 
 def schedule_of(plan: LoopPlan) -> Schedule:
-    """Return the schedule of a plan."""
+    """Return a new schedule with the period and kind (absolute or sequential) of a plan."""
     return Schedule(plan.period_ns, plan.schedule == "sequential")

@@ -1,6 +1,7 @@
 """Source processes: processes that sample the sources of features, and their readers in the loop.
 
-Each process writes its newest sample into a slot of shared memory. A reader copies it into the record.
+A source is a sensor or device. Its process writes the newest sample into a slot of shared memory. A reader
+copies it into the record.
 """
 
 from __future__ import annotations
@@ -22,17 +23,17 @@ from dxlrun.plan.loop_plan import LoopPlan
 from dxlsim.motion.link_motion import Body
 
 Slots = Mapping[str, Sequence[memoryview]]
-"""Slots of the processes of each feature, by name of the feature."""
+"""Shared-memory slots of source processes, one for each process, by name of the feature."""
 REOPEN_NS = 1_000_000_000
-"""Pause before a failed source is opened again."""
+"""Pause after a failure before the source's device is opened again."""
 _NUMBER = re.compile(r"\[Errno -?\d+\] ")
 
 
 class SourceProcess(msgspec.Struct, frozen=True):
-    """A process that samples one source."""
+    """Description of a process that samples one source, such as a sensor."""
 
     source: str
-    """Name of the source."""
+    """Name of the source in the robot file."""
     kind: str
     """Noun for messages: `sensor`."""
     values: int
@@ -40,9 +41,9 @@ class SourceProcess(msgspec.Struct, frozen=True):
     period_ns: int
     """Time between two samples."""
     plan: bytes
-    """Data with which the feature opens the source."""
+    """Encoded settings of the source, which the feature passes to its `build`."""
     has_body: bool = False
-    """True if it senses the simulated body."""
+    """True if the source measures the simulated robot body in a virtual run."""
 
     @property
     def title(self) -> str:
@@ -51,12 +52,12 @@ class SourceProcess(msgspec.Struct, frozen=True):
 
 
 class SourceContext(msgspec.Struct, frozen=True):
-    """Objects that a source gets from its process."""
+    """Objects that a source gets from its process when it is built."""
 
     plugins: PlugIns
     writer: SlotWriter
     now_ns: Callable[[], int]
-    """The run's clock."""
+    """Returns the time on the run's clock, ns."""
     body: Body | None
     """The simulated body; None without `SourceProcess.has_body`."""
 
@@ -66,23 +67,26 @@ class Driver(Protocol):
 
     @property
     def waits(self) -> bool:
-        """True if `read` waits for the next sample of the device."""
+        """True if `read` waits until the device has its next sample."""
 
     def read(self, values: Floats) -> int | None:
-        """Read a sample into values that are NaN; return its time on the run's clock, None without one."""
+        """Write a sample into `values`, which are NaN; return its time, ns of the run's clock.
+
+        None without.
+        """
 
     def close(self) -> None:
-        """Close the device, also after an incomplete opening."""
+        """Close the device. Also called after an attempt to open it has failed."""
 
 
 class SampledSource:
-    """A source that writes its samples into a slot. Only `open_first` raises exceptions of the driver.
+    """A source that writes samples of its driver into a slot of shared memory. Only `open_first` raises.
 
     Args:
-        driver: Driver of its device.
-        open_driver: Opens the driver; the argument logs a sentence.
+        driver: Driver of the device.
+        open_driver: Opens the driver's device. Its argument is a function that reports a sentence.
         period_ns: Time between two samples.
-        context: Objects of its process.
+        context: Slot and clock of the process.
     """
 
     def __init__(
@@ -96,7 +100,7 @@ class SampledSource:
         self.open = False
         """True while the device is open."""
         self.reopen_ns = 0
-        """Time of the next attempt to open the device; meaningful only while it is not `open`."""
+        """Time of the next attempt to open the device, ns; meaningful only while `open` is False."""
         self._open_driver = open_driver
         self._period_ns = period_ns
         self._writer = context.writer
@@ -105,7 +109,7 @@ class SampledSource:
         self._ahead = False
 
     def open_first(self) -> None:
-        """Open the device at the start of a run; raise whatever the driver raises."""
+        """Open the device at the start of a run, and report it as open; raise whatever the driver raises."""
         try:
             self._open_driver(self._say)
         except BaseException:
@@ -115,7 +119,7 @@ class SampledSource:
         self._writer.say(SlotState.OPEN, "")
 
     def sample(self) -> bool:
-        """Sample once, or reopen the device if that is due; return True if there was a sample."""
+        """Write one sample to the slot, or reopen a failed device; return True if a sample was written."""
         if not self.open and not self._reopen():
             return False
         # A value that the driver does not set must be invalid, not old.
@@ -137,7 +141,7 @@ class SampledSource:
         return True
 
     def close(self) -> None:
-        """Close the device and report any exception."""
+        """Close the device; report an exception of the driver in the slot instead of raising it."""
         self.open = False
         try:
             self.driver.close()
@@ -145,7 +149,7 @@ class SampledSource:
             self._writer.say(SlotState.FAILED, f"cannot be closed: {describe_error(error)}")
 
     def fail(self, error: Exception) -> None:
-        """Close the device after an exception, and schedule its reopening."""
+        """Close the device after an exception, report the error, and reopen after REOPEN_NS."""
         self.close()
         self.reopen_ns = self._now_ns() + REOPEN_NS
         self._writer.say(SlotState.FAILED, describe_error(error))
@@ -167,20 +171,23 @@ class SampledSource:
 
 
 class ProcessStage(msgspec.Struct, frozen=True):
-    """`STAGE` of `process.py`: processes of a feature. On virtual time, they run in the loop's process."""
+    """Processes of a feature: the object `STAGE` of its `process.py`.
+
+    On virtual time, they run in the loop's process.
+    """
 
     FILE: ClassVar[str] = "process"
 
     processes: Callable[[bytes], Sequence[SourceProcess]]
-    """Returns the processes for `Contribution.plan`."""
+    """Returns the processes to start, from the feature's encoded plan (`Contribution.plan`)."""
     build: Callable[[bytes, SourceContext], SampledSource]
-    """Builds the source for `SourceProcess.plan`, in its process. Raises PlugInError."""
+    """Builds the source in its process, from `SourceProcess.plan`. Raises PlugInError."""
     refuse_virtual_time: Callable[[bytes], str] = lambda plan: ""
-    """Returns the reason why a run with `Contribution.plan` cannot use virtual time; empty if it can."""
+    """Returns why a run with the feature's plan cannot use virtual time; empty if it can."""
 
 
 class PlannedProcess(msgspec.Struct, frozen=True):
-    """A process of a run, with its index among the processes of its feature."""
+    """A source process of a run, with its feature and its index among that feature's processes."""
 
     feature: Feature
     stage: ProcessStage
@@ -189,34 +196,37 @@ class PlannedProcess(msgspec.Struct, frozen=True):
 
 
 def planned_processes(loop: LoopPlan) -> Iterator[PlannedProcess]:
-    """Yield the processes of all features of a robot, in order of features and processes."""
+    """Yield the source processes of all features of a robot, in order of features and processes."""
     for feature, stage in stages(ProcessStage, loop.features):
         for index, process in enumerate(stage.processes(loop.feature_plans.get(feature.name, b""))):
             yield PlannedProcess(feature, stage, index, process)
 
 
 class SourceReader(Protocol):
-    """Copies the newest samples into the record."""
+    """Copies the newest samples of a feature's source processes into the cycle's record."""
 
     def read(self) -> None:
-        """Update the rows of its sources. Called in each cycle after the servos were read. Never waits."""
+        """Copy the newest samples into the record.
+
+        Called in each cycle after the servos were read. Never waits.
+        """
 
 
 class ReaderContext(msgspec.Struct, frozen=True):
-    """Objects that a reader gets in the loop's process."""
+    """Objects that a reader gets in the loop's process when it is built."""
 
     plan: bytes
-    """`Contribution.plan` of the feature."""
+    """The feature's encoded plan (`Contribution.plan`)."""
     slots: Sequence[memoryview]
-    """Slots of its processes, in the order of the processes."""
+    """Shared-memory slots of the feature's processes, in the order of the processes."""
     record: CycleRecord
     now_ns: Callable[[], int]
-    """Clock of the times in the slots."""
+    """Returns the time, ns, on the clock that stamps the samples in the slots."""
     events: EventSink
 
 
 class ReaderStage(msgspec.Struct, frozen=True):
-    """`STAGE` of `reader.py`: reads the samples of a feature in the loop. A replay has no readers."""
+    """Reader of a feature: the object `STAGE` of its `reader.py`. A replay has no readers."""
 
     FILE: ClassVar[str] = "reader"
 
@@ -236,6 +246,6 @@ def build_readers(
 
 
 def describe_error(error: BaseException) -> str:
-    """Return an error as one line of text."""
+    """Return an error as one line of text, with its type unless it is an OSError with a message."""
     text = _NUMBER.sub("", " ".join(str(error).split()))
     return text if isinstance(error, OSError) and text else f"{type(error).__name__}: {text}"

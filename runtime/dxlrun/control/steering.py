@@ -1,7 +1,7 @@
 """Steering: execute and answer a bounded number of client commands after each cycle's read.
 
-Commands for the loop itself have a kind and data of a form (FORMS). This module executes them, including
-changes of the loop's rate and pauses.
+Commands for the loop itself have a kind and data in the form that FORMS gives. This module executes them,
+including changes of the loop's rate and pauses.
 """
 
 from __future__ import annotations
@@ -37,20 +37,28 @@ from dxlrun.plan.loop_plan import ControllerPlan
 from dxlrun.plan.policy_plan import HOLD
 
 MOST_RATE = 100_000.0
-"""Hz; same limit as in the robot file."""
+"""Highest loop rate that clients can request, Hz; same limit as in the robot file."""
 LEAST_RATE = 1.0
-"""Hz; lowest rate that clients can request. Commands, also `stop`, are executed once a cycle, and the
-guardian's timeout follows the rate."""
+"""Lowest loop rate that clients can request, Hz.
+
+Commands, also `stop`, are executed once a cycle, and the guardian's timeout follows the rate.
+"""
 PAUSE_LEASE_NS = 60_000_000_000
-"""A pause ends by `on_stale_command` after so long without a command for the loop."""
+"""Time without a command for the loop after which a pause ends by the policy `on_stale_command`."""
 PAUSED_CYCLE_NS = 200_000_000
-"""Timeout of a cycle while the loop is paused. It is longer because a cycle may load a controller."""
+"""Guardian's timeout of a cycle while the loop is paused.
+
+It is longer because a cycle may load a controller.
+"""
 LONGEST_SHOWN = 120
-"""Longest data of a command in its event, characters."""
+"""Number of characters after which a command's data are cut in its event."""
 
 
 class Play(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
-    """Data of `play`: parts of a motion. An array with all their commands follows the JSON text."""
+    """Data of the command `play`: parts of a motion.
+
+    An array with all their commands follows the JSON text.
+    """
 
     parts: tuple[PlayedPart, ...]
 
@@ -73,7 +81,7 @@ FORMS: Mapping[str, type[msgspec.Struct] | None] = {
     "commander": NewCommander,
     "stop": None,
 }
-"""Kinds of commands for the loop with the form of their data; None: no data."""
+"""Commands for the loop by kind, with the type that their JSON data are decoded to; None: no data."""
 
 
 class Steering:
@@ -96,9 +104,10 @@ class Steering:
         self.halt = Halt(context, manager.switching, self._answer)
         self.anchoring = Anchoring(context, manager.switching, gate)
         self.paused_until_ns = 0
-        """Time at which a pause ends without further commands, ns; 0: no pause."""
+        """Time at which the pause ends without further commands, ns of the clock; 0: the loop is not paused.
+        """
         self.stood = False
-        """True in cycles of a pause and in the cycle that ends it, which may be long."""
+        """True in cycles of a pause and in the cycle that ends the pause. These cycles may be long."""
         self._context = context
         self._record = context.record
         self._supervision = context.supervision
@@ -111,7 +120,7 @@ class Steering:
         self.inbox.answer(number, answer)
 
     def execute_commands(self, commands: Sequence[Command]) -> int:
-        """Execute commands, and end streams and pauses whose lease expired.
+        """Execute and answer client commands, and end streams and pauses whose lease expired.
 
         The loop calls it only if there are commands, streams, a pause or a halt.
 
@@ -169,18 +178,21 @@ class Steering:
         return count
 
     def refuse(self) -> None:
-        """Refuse new commands because the run is ending. They are not logged, as they have no effect."""
+        """Refuse new client commands because the run is ending.
+
+        They are not logged, as they have no effect.
+        """
         for command in self.inbox.take():
             self.inbox.answer(command.number, Refusal(Code.RUN_ENDING))
 
     def end(self) -> None:
-        """Answer all commands that still wait, after the controllers were deactivated."""
+        """Answer all client commands that still wait, after the last deactivation of controllers."""
         self.answer_late()
         self.joints.end()
         self.halt.end()
 
     def answer_late(self) -> None:
-        """Answer the switches whose wait for modes has ended."""
+        """Answer the `switch` commands whose wait for joint modes has ended."""
         ended = self._manager.switching.ended
         for number, refusal in ended:
             self.inbox.answer(number, refusal or Done(self._record.cycle))
@@ -190,11 +202,11 @@ class Steering:
 
     @property
     def paused(self) -> bool:
-        """True between `pause` and `resume`."""
+        """True while a client's `pause` command is in effect."""
         return self.paused_until_ns > 0
 
     def change_rate(self, rate: float) -> Refusal | None:
-        """Change the rate of the loop from the next cycle on.
+        """Change the rate of the loop from the next cycle on; refuse a rate that the robot cannot keep.
 
         Args:
             rate: Hz.
@@ -221,7 +233,10 @@ class Steering:
         return None
 
     def pause(self) -> Refusal | None:
-        """Stop the controllers' time in this cycle. Servos are read and held; controllers are not updated."""
+        """Pause the loop: servos are read and held, but controllers are not updated and their time stops.
+
+        Returns: The refusal if the loop is paused already, else None.
+        """
         if self.paused:
             return Refusal(Code.PAUSED_ALREADY)
         self.stood = True
@@ -231,7 +246,10 @@ class Steering:
         return None
 
     def resume(self) -> Refusal | None:
-        """Resume the controllers' time, with a slow start toward commands that differ from the goals."""
+        """End the pause, with a slow start toward commands that differ from the goals.
+
+        Returns: The refusal if the loop is not paused, else None.
+        """
         if not self.paused:
             return Refusal(Code.NOT_PAUSED)
         self.paused_until_ns = 0
@@ -241,13 +259,16 @@ class Steering:
         return None
 
     def _set_cycle_limit(self) -> None:
-        """Set the guardian's timeout of a cycle. The time of this cycle counts from now."""
+        """Set the guardian's timeout of a cycle for the current period or pause, and send a heartbeat."""
         self._supervision.beat()
         period_ns = self._schedule.period_ns
         self._supervision.limit_cycle(max(period_ns, PAUSED_CYCLE_NS) if self.paused else period_ns)
 
     def _stale(self, why: str) -> str:
-        """End the run if the policy for stale commands requires it; return that as text, or an empty one."""
+        """End the run if the policy `on_stale_command` requires it; return the text for the event.
+
+        The text is empty if the run continues.
+        """
         policy = self._context.plan.policies.of_features.get("on_stale_command", HOLD)
         if policy.goes_on:
             return ""
@@ -257,7 +278,7 @@ class Steering:
     # Commands
 
     def _for_loop(self, command: Command) -> Answer | None:
-        """Execute a command for the loop itself; return None if it is answered later."""
+        """Decode and execute a command for the loop itself; return its answer, None if that comes later."""
         kind, data, numbers = command.kind, command.data, b""
         if kind not in FORMS:
             problem = texts.unknown_loop_command(kind, FORMS)
@@ -276,7 +297,7 @@ class Steering:
         return self._execute(command, request, numbers) or Done(self._record.cycle)
 
     def _execute(self, command: Command, request: msgspec.Struct | None, numbers: bytes) -> Answer | None:
-        """Execute a decoded command for the loop; return None on success without a result."""
+        """Execute a decoded command for the loop; return its answer, or None on success without a result."""
         manager = self._manager
         found: Answer | None = None
         match request:
@@ -313,7 +334,10 @@ class Steering:
     # Reports
 
     def _report(self, command: Command, answer: Answer | None, place: int) -> None:
-        """Report a refused command or a command for the loop. `Manager` reports those for controllers."""
+        """Emit an event for a refused command or a command for the loop.
+
+        `Manager` reports accepted ones for controllers.
+        """
         refusal = answer if isinstance(answer, Refusal) else None
         if refusal is not None:
             source = command.controller or "loop"

@@ -1,4 +1,4 @@
-"""Activity: publish which controller's code runs, and refuse threads and processes that it starts.
+"""Activity: publish which controller's code the loop runs, and refuse threads and processes it starts.
 
 A second thread could take the interpreter lock in the middle of a cycle. A fork copies the loop's memory map
 and stalls the loop for that time. Controllers must not start either while the robot runs. A start by Python
@@ -27,7 +27,7 @@ from dxlrun.errors import ControllerFault, counted
 _TRACEBACK = 6000
 P = ParamSpec("P")
 _LOADING = int(ControllerMethod.ON_CONFIGURE)
-"""The last method before the robot runs."""
+"""Number of the last controller method that may start threads: those up to on_configure precede the run."""
 # Bound here because each call of a controller uses both twice.
 _ident, _process = threading.get_ident, os.getpid
 
@@ -50,7 +50,7 @@ def is_interrupt(error: BaseException) -> bool:
 
 
 class Activity:
-    """Calls methods of controllers and publishes the current call to other processes.
+    """Calls methods of controllers, and publishes the current call in shared memory for the guardian.
 
     Args:
         page: Shared memory for the name of the controller and of the method; None publishes nothing.
@@ -59,7 +59,9 @@ class Activity:
     """
 
     guarded: ClassVar[Activity | None] = None
-    """Instance whose controller must not start threads or processes now. A process runs only one loop."""
+    """Instance whose controller is being called while the robot runs, so it must not start threads or
+    processes; None: no call. A process runs only one loop.
+    """
 
     def __init__(self, page: Heartbeat | None = None, count_threads: Callable[[], int] | None = None) -> None:
         self._page = page
@@ -68,19 +70,20 @@ class Activity:
         self._process = _process()
         self._names: dict[int, str] = {}
         self.thread = 0
-        """Identifier of the thread that calls the controller."""
+        """Identifier of the thread that called the controller last."""
         self.refused = ""
-        """Thread or process that the controller tried to start in this call; empty: none."""
+        """Description of the thread or process that the controller tried to start in this call; empty: none.
+        """
         _guard()
 
     def name_controller(self, place: int, name: str) -> None:
-        """Set the name of the controller at a place. Must precede the first call of the controller."""
+        """Set the name of the controller with this index. Must precede the first call of the controller."""
         self._names[place] = name
         if self._page is not None:
             self._page.name_controller(place, name)
 
     def show(self, place: int, method: ControllerMethod) -> None:
-        """Publish the method that is called next for the controller at a place."""
+        """Publish the controller (by its index) and the method that run from now on, without calling them."""
         if self._page is not None:
             self._page.call(place, method)
 
@@ -93,12 +96,12 @@ class Activity:
         *arguments: P.args,
         **named: P.kwargs,
     ) -> None:
-        """Call a method of the controller at a place.
+        """Call a method of a controller, publish the call, and convert any exception to ControllerFault.
 
         A forked child that returns from the call exits here: there must be only one loop.
 
         Args:
-            place: Place of the controller.
+            place: Index of the controller.
             method: Method that is called, for other processes and messages.
             kind: Kind of the command that is passed; empty: no command.
             call: The bound method, with its arguments.
@@ -154,14 +157,20 @@ class Activity:
 
 
 def _line_of(raised: BaseException | None) -> str:
-    """Return the innermost line of the author's code in the traceback, in brackets; empty: none."""
+    """Return file and line, in the controller author's code, that raised, as ` (wave.py:12)`.
+
+    Empty if unknown.
+    """
     frames = traceback.extract_tb(None if raised is None else raised.__traceback__)
     own = [frame for frame in frames if not frame.filename.startswith(_NOT_THE_AUTHORS)]
     return f" ({os.path.basename(own[-1].filename)}:{own[-1].lineno})" if own else ""
 
 
 _NOT_THE_AUTHORS = (str(Path(__file__).parents[2]), str(Path(np.__file__).parent))
-"""Folders of dxlrun and numpy: lines that the author of a controller cannot correct."""
+"""Folders of dxlrun and numpy.
+
+Their lines in tracebacks are skipped: the author of a controller cannot correct them.
+"""
 _STARTS = {
     "os.fork": "a child process",
     "os.forkpty": "a child process",
@@ -173,11 +182,13 @@ _STARTS = {
     "_thread.start_new_thread": "a thread",
     "_thread.start_joinable_thread": "a thread",
 }
-"""Audit events of process and thread starts (docs.python.org, Audit events table)."""
+"""Python audit events that report the start of a process or thread, with its description (docs.python.org,
+Audit events table).
+"""
 
 
 def _refuse(what: str) -> None:
-    """Raise RuntimeError if the caller is a controller while the robot runs."""
+    """Raise RuntimeError if a controller calls this while the robot runs, and note `what` as refused."""
     activity = Activity.guarded
     if activity is not None and activity.thread == _ident():
         activity.refused = what
@@ -191,7 +202,7 @@ def _audit(event: str, _: tuple[object, ...]) -> None:
 
 @cache
 def _guard() -> None:
-    """Install the checks for the start of threads and processes, once a process.
+    """Install the checks that refuse threads and processes of controllers, once a process.
 
     Audit events alone are not sufficient: before Python 3.12 none reports threads, and none reports
     multiprocessing's processes that are not forked.

@@ -1,4 +1,4 @@
-"""Claims: check which controllers may be active together. Each servo and each reference has one commander.
+"""Claims: check which controllers may be active together: each servo and reference has one commander.
 
 A controller that is `into` others commands their references: it is above them. It is never active without
 them, so it enters after them and leaves before them, in the same step.
@@ -24,7 +24,9 @@ class Conflict(msgspec.Struct, frozen=True):
     holder: str
     other: str
     reference: str = ""
-    """`arm_pid/shoulder/position`, or `light/led` for a device; empty: both claim the servo."""
+    """Name of the contested reference, `arm_pid/shoulder/position`, or of a device's command, `light/led`;
+    empty: both controllers command the servo of the joint.
+    """
 
     def __str__(self) -> str:
         what = self.reference or f"joint {self.joint}"
@@ -32,7 +34,7 @@ class Conflict(msgspec.Struct, frozen=True):
 
 
 def conflicts(claimants: Iterable[ControllerPlan]) -> tuple[Conflict, ...]:
-    """Return each joint and reference that a later controller claims although an earlier one holds it.
+    """Return a conflict for each joint or reference that two of these controllers claim.
 
     A claim of one interface of a servo claims the whole joint: a servo combines position and speed, so a
     stale speed of another controller would move the robot unexpectedly. Interfaces of a reference are claimed
@@ -51,7 +53,7 @@ def conflicts(claimants: Iterable[ControllerPlan]) -> tuple[Conflict, ...]:
 
 
 def _claims(claimant: ControllerPlan, named: Plans) -> Iterator[tuple[str, str]]:
-    """Yield pairs of joint and claimed reference. The reference is empty if the servo is claimed.
+    """Yield pairs of joint and reference that a controller claims. The reference is empty for a servo.
 
     A controller above several others claims each joint at the controller in `named` that exports it.
     """
@@ -72,7 +74,10 @@ def _claims(claimant: ControllerPlan, named: Plans) -> Iterator[tuple[str, str]]
 
 
 def conflicts_text(found: Iterable[Conflict]) -> str:
-    """Return the conflicts as text: each pair of controllers once, with its first joint. Empty for none."""
+    """Return the conflicts as text: each pair of controllers once, with its first joint.
+
+    Empty without conflicts.
+    """
     pairs: dict[tuple[str, str], list[Conflict]] = {}
     for conflict in found:
         pairs.setdefault((conflict.holder, conflict.other), []).append(conflict)
@@ -82,10 +87,11 @@ def conflicts_text(found: Iterable[Conflict]) -> str:
 
 
 def claimed_modes(claimants: Iterable[ControllerPlan]) -> dict[str, Mode]:
-    """Return the required mode of each claimed joint, by joint name.
+    """Return the servo mode that each joint needs for the commands of these controllers, by joint name.
 
-    Raises:
-        ValueError: No mode has this combination of command interfaces.
+    Controllers that command references only are ignored.
+
+    Raises: ValueError: No mode has this combination of command interfaces.
     """
     return {
         joint: mode_of(claimant.command)
@@ -96,7 +102,7 @@ def claimed_modes(claimants: Iterable[ControllerPlan]) -> dict[str, Mode]:
 
 
 def start_modes(joints: Iterable[JointPlan], controllers: Iterable[ControllerPlan]) -> dict[str, Mode]:
-    """Return the initial mode of each joint, by joint name.
+    """Return the servo mode of each joint at the start of a run, by joint name.
 
     That is the mode that an initially active controller requires, otherwise the joint's rest mode.
     """
@@ -105,29 +111,32 @@ def start_modes(joints: Iterable[JointPlan], controllers: Iterable[ControllerPla
 
 
 class Step(msgspec.Struct, frozen=True):
-    """Controllers that leave and enter together, in execution order."""
+    """One step of a switch: names of the controllers to deactivate and to activate, in execution order."""
 
     leave: tuple[str, ...]
     enter: tuple[str, ...]
 
 
 class Standing(msgspec.Struct, frozen=True):
-    """Snapshot of the controllers and their states, by name. Plans switches from this state."""
+    """Snapshot of all loaded controllers (`known`), and of the active and the waiting ones, by name.
+
+    Its methods plan switches without executing them.
+    """
 
     known: Plans
     active: Plans
     entering: Plans = {}
-    """Controllers that become active as soon as their joints are in the required modes."""
+    """Controllers that wait for joint modes and then become active."""
 
     @property
     def engaged(self) -> Plans:
-        """Controllers that hold claims: active and entering ones."""
+        """Plans of the controllers that hold claims on joints: the active and the entering ones."""
         return {**self.active, **self.entering}
 
     def switch(self, activate: Sequence[str], deactivate: Sequence[str]) -> Step | Refusal:
-        """Return the step of a switch, or its refusal.
+        """Return the step that activates and deactivates these controllers, or the refusal.
 
-        Inactive controllers below the activated ones enter too.
+        Inactive controllers below the activated ones are activated too.
         """
         known, engaged = self.known, self.engaged
         for code, names in (
@@ -157,7 +166,7 @@ class Standing(msgspec.Struct, frozen=True):
         return Step(uppers_first(deactivate, known), enter)
 
     def request(self, names: Sequence[str]) -> Step | Refusal:
-        """Return the step of a takeover that a controller requested, or its refusal.
+        """Return the step by which the named controllers take over at a controller's request, or its refusal.
 
         Controllers leave if they hold a claim that the requested ones or those below them need, together with
         the controllers above them. Requested controllers that are already active or entering stay as they
@@ -187,7 +196,7 @@ class Standing(msgspec.Struct, frozen=True):
         in use by a controller that stays.
 
         Args:
-            fallback: The fallback.
+            fallback: Name of the fallback controller.
             taken: Controllers that were deactivated because of a fault.
             failed: Controllers that have broken their contract. The fault of another one never reactivates
                 them.
@@ -205,7 +214,7 @@ class Standing(msgspec.Struct, frozen=True):
         return self._step(leave, enter)
 
     def only_under(self, taken: Sequence[str]) -> set[str]:
-        """Return the controllers below these that no remaining controller uses."""
+        """Return the active or entering controllers below these that no other controller commands."""
         plans, engaged = tuple(self.known.values()), self.engaged
         free = {lower for name in taken for lower in below(plans, name)} & engaged.keys()
         while kept := {name for name in free if commander(name, _without(engaged, free))}:
@@ -213,7 +222,10 @@ class Standing(msgspec.Struct, frozen=True):
         return free
 
     def _displaced(self, enter: Sequence[str]) -> set[str]:
-        """Return the controllers whose claims conflict with these, and the controllers above them."""
+        """Return the controllers that must leave so that these can enter.
+
+        They have conflicting claims, or are above controllers with conflicting claims.
+        """
         engaged = self.engaged
         claimants = [*engaged.values(), *(self.known[name] for name in enter)]
         leave = {conflict.holder for conflict in conflicts(claimants)}

@@ -1,4 +1,4 @@
-"""Goals: commands that a controller pursues until they end, one at a time, numbered from 1.
+"""Goals: client goals that a controller pursues until an outcome, one at a time, numbered from 1.
 
 Events report that a goal was accepted and its outcome. The topic /goals has its progress too.
 """
@@ -25,20 +25,21 @@ from dxlrun.plan.loop_plan import UNLIMITED, JointPlan
 from dxlwire.joint_unit import ROTARY
 
 FEEDBACK_NS = 100_000_000
-"""Shortest time between two progress reports of a goal, ns of the run's clock: 10 Hz."""
+"""Shortest time between two progress messages of a goal on /goals, ns of the run's clock: 10 Hz."""
 GOALS_TOPIC = "/goals"
 KEPT = 256
-"""Number of ended goals whose outcome is kept."""
+"""Number of most recently ended goals whose outcome is remembered for answers to clients."""
 _LONGEST_TEXT = 500  # characters; a GoalReport must fit LONGEST_DATA of an event
 _UNREACHED = (Outcome.MISSED, Outcome.ABORTED)
 CERTAIN_NS = 500_000_000
-"""Longest wait for missing replies and uncertain torque before a goal ends; at least LOST_CYCLES periods.
-[i]"""
+"""Longest wait, at the end of a motion, for missing replies and uncertain torque before the goal is aborted;
+at least LOST_CYCLES periods. [i]
+"""
 
 
 @dataclass(slots=True)
 class GoalStatus:
-    """Message of the topic /goals: a goal was accepted, runs, or has ended."""
+    """Message of the topic /goals: a goal was accepted, is running, or has ended."""
 
     header: Header = field(default_factory=Header)
     goal: int = 0
@@ -46,51 +47,57 @@ class GoalStatus:
     kind: str = ""
     origin: str = ""
     status: str = ""
-    """`accepted`, `running`, or its outcome: `reached`, `missed`, `aborted`, `cancelled`, `preempted`."""
+    """`accepted`, `running`, or the outcome: `reached`, `missed`, `aborted`, `cancelled`, `preempted`."""
     progress: float = 0.0
-    """0..1"""
+    """Completed share of the goal, 0..1."""
     error: float = math.nan
-    """Largest distance from the desired state; of an ended goal, the worst joint's distance from the goal.
-    SI units."""
+    """While running, the largest distance from the desired state; after the end, the worst joint's distance
+    from the goal. SI units; NaN if unknown.
+    """
     joint: str = ""
     text: str = ""
 
 
 class PlayedPart(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
-    """Commands of a motion for one controller, with their times, or a single command that is a goal."""
+    """Part of a motion for one controller: timed commands of one kind, or a single goal command."""
 
     controller: str
     kind: str
     at_ns: tuple[int, ...]
     """Time of each command since the start of the motion; not decreasing."""
     sizes: tuple[int, ...]
-    """Number of float64 values of each command."""
+    """Number of float64 values in each command."""
     end_ns: int = 0
-    """End of the part since the start of the motion."""
+    """Time at which the motion of this part ends, ns since the start of the motion."""
     positions: tuple[float | None, ...] = ()
-    """Final position of each joint of the controller, rad or m; None: no position for this joint. Empty: the
-    part has no positions."""
+    """Final position of each joint of the controller, rad or m, None for joints without one.
+
+    Empty: the part has no positions.
+    """
 
 
 class PlayedMotion(msgspec.Struct):
-    """Timed commands for a controller. The runtime, not the controller, pursues the goal."""
+    """Timed commands that the runtime sends to a controller, and the goal that it pursues by them."""
 
     goal: RunningGoal
     part: PlayedPart
     commands: tuple[NDArray[np.float64], ...]
     begun_ns: int
-    """Start, ns of the controllers' time."""
+    """Start of the motion, ns of the controllers' time."""
     next: int = 0
 
     def due(self, time_ns: int) -> NDArray[np.float64] | None:
-        """Return the next command if it is due, else None."""
+        """Return the next command and advance, if it is due at this controllers' time, ns; else None."""
         if self.next < len(self.commands) and self.begun_ns + self.part.at_ns[self.next] <= time_ns:
             self.next += 1
             return self.commands[self.next - 1]
         return None
 
     def report(self, time_ns: int) -> None:
-        """Report the progress. After the last command, let the joints' states decide the outcome."""
+        """Report the motion's progress to its goal.
+
+        After the last command, start to judge the joints' states.
+        """
         passed_ns, end_ns = time_ns - self.begun_ns, self.part.end_ns
         if self.goal.is_judged:
             return
@@ -103,17 +110,19 @@ class PlayedMotion(msgspec.Struct):
 
 
 class Commanded(NamedTuple):
-    """Current commands of a controller, directly or through other controllers."""
+    """Joints that a controller commands, with its current commands before any limit."""
 
     joints: tuple[str, ...] = ()
     positions: Floats | None = None
-    """rad or m, before any limit; None: no position commands."""
+    """Commanded positions, rad or m, before any limit; None: no position commands."""
     velocities: Floats | None = None
-    """rad/s or m/s; None: no velocity commands, or they are the speeds of position commands."""
+    """Commanded velocities, rad/s or m/s; None: no velocity commands, or they are the speeds of position
+    commands.
+    """
 
     @classmethod
     def by_interfaces(cls, joints: tuple[str, ...], interfaces: Sequence[str], commands: Commands) -> Self:
-        """Return the values of `commands` that belong to these command interfaces."""
+        """Return the commanded positions if `interfaces` has them, else the velocities if it has those."""
         if not interfaces:
             return cls()
         if "position" in interfaces:
@@ -122,37 +131,43 @@ class Commanded(NamedTuple):
 
 
 class _Target(NamedTuple):
-    """Goal position of one joint, with its tolerances."""
+    """Position that one joint must reach for a goal, with its tolerances."""
 
     joint: JointPlan
     column: int
-    """Index among the controller's joints."""
+    """Index of the joint among the controller's joints."""
     row: int
     position: float
-    """Requested position before any limit, rad or m; NaN: no position."""
+    """Required position before any limit, rad or m; NaN: any position."""
     tolerance: float
-    """rad or m"""
+    """Permitted distance from the position, rad or m."""
     rest_speed: float
-    """Speed below which the joint is at rest, rad/s or m/s."""
+    """Speed below which the joint counts as at rest, rad/s or m/s."""
 
 
 class _Judgement(NamedTuple):
-    """Criteria and deadlines for the outcome of a goal whose motion has ended."""
+    """Targets and deadlines by which the runtime decides the outcome of a goal whose motion has ended."""
 
     targets: tuple[_Target, ...]
     text: str
     settle_ns: int
-    """Settling time: a joint may take so long to come within its tolerance."""
+    """Time that joints have after the motion to come within their tolerances."""
     back_ns: int
-    """Deadline for the return of a lost joint, ns of the controllers' time. Its settling time starts then."""
+    """Deadline for a lost joint to respond again, ns of the controllers' time.
+
+    Its settling time starts then.
+    """
     settled_ns: int
     """Deadline for joints to come within their tolerances, ns of the controllers' time."""
     certain_ns: int
-    """Deadline for missing replies and uncertain torque, ns of the controllers' time."""
+    """Deadline for missing replies and uncertain torque, ns of the controllers' time.
+
+    The goal is aborted then.
+    """
 
 
 class RunningGoal:
-    """One goal; implements `controller.Goal`. It does not change any more after it has ended."""
+    """One goal of a controller; implements `controller.Goal`. Nothing changes it after its end."""
 
     def __init__(self, goals: Goals, number: int, controller: str, kind: str, origin: str) -> None:
         self.number = number
@@ -160,25 +175,28 @@ class RunningGoal:
         self.kind = kind
         self.origin = origin
         self.cancelling = False
-        """True after a cancel request."""
+        """True after a client asked to cancel the goal."""
         self.outcome: Outcome | None = None
-        """None while it runs."""
+        """Outcome of the goal; None while it is running."""
         self.progress, self.error, self.joint, self.text = 0.0, math.nan, "", ""
         """Values of the last report."""
         self.judgement: _Judgement | None = None
-        """None until the motion has ended."""
+        """Criteria for the outcome; None until the motion has ended."""
         self.accepted_ns = goals.time_ns
-        """ns of the controllers' time."""
+        """Time at which the goal was accepted, ns of the controllers' time."""
         self._goals = goals
         self._reported_ns = -FEEDBACK_NS
 
     @property
     def is_judged(self) -> bool:
-        """True after the end of the motion, when the runtime decides the outcome."""
+        """True from the end of the motion to the end of the goal, while the runtime decides the outcome."""
         return self.judgement is not None
 
     def feedback(self, progress: float, error: float = math.nan) -> None:
-        """Report progress, 0..1, and the largest distance from the desired state, SI units."""
+        """Set progress, 0..1, and the largest distance from the desired state, SI units.
+
+        Publish them at 10 Hz at most.
+        """
         if self.outcome is not None or self.is_judged:
             return
         self.progress, self.error = float(progress), float(error)
@@ -195,7 +213,7 @@ class RunningGoal:
         tolerances: GoalTolerances | None = None,
         text: str = "",
     ) -> None:
-        """Let the joints' states decide the outcome, see `controller.Goal.judge`."""
+        """End the motion: from now on, the joints' states decide the outcome; see `controller.Goal.judge`."""
         if self.outcome is None and not self.is_judged:
             self._goals.begin_judging(self, positions, joints, tolerances, text)
 
@@ -243,9 +261,9 @@ class Goals:
         self._joints = {joint.name: (row, joint) for row, joint in enumerate(joints)}
         self._commanded = commanded
         self.last = 0
-        """Number of the newest goal."""
+        """Number of the newest goal; 0: there was none."""
         self.running: dict[int, RunningGoal] = {}
-        """Running goals by number; at most one for each controller."""
+        """Goals that have not ended, by number; at most one for each controller."""
         self._record = record
         self._events = events
         self._ended: list[tuple[int, str, Outcome] | None] = [None] * KEPT
@@ -253,7 +271,7 @@ class Goals:
         self._status = GoalStatus()
 
     def open(self, topics: TopicLog) -> None:
-        """Announce the topic /goals for the first controller that accepts goals. Allocates."""
+        """Announce the topic /goals, once a run, for the first controller that accepts goals. Allocates."""
         if self._publisher is None:
             self._publisher = topics.open(GOALS_TOPIC, GoalStatus)
 
@@ -263,14 +281,14 @@ class Goals:
         return self._record.woken_ns
 
     def accept(self, controller: str, kind: str, origin: str) -> RunningGoal:
-        """Create and report a goal. The previous goal of the controller must have ended."""
+        """Create the next goal of a controller and report it. Its previous goal must have ended."""
         self.last += 1
         goal = self.running[self.last] = RunningGoal(self, self.last, controller, kind, origin)
         self._report(goal, texts.goal_accepted(goal.number, kind, origin), "accepted")
         return goal
 
     def found(self, number: int) -> RunningGoal | Refusal:
-        """Return the running goal with this number, or a refusal."""
+        """Return the running goal with this number, or a refusal if it has ended or never existed."""
         goal = self.running.get(number)
         if goal is not None:
             return goal
@@ -282,7 +300,7 @@ class Goals:
         return Refusal(Code.GOAL_ENDED, {"goal": number, "controller": ended[1], "outcome": ended[2].value})
 
     def commanded_positions(self, controller: str) -> Floats | None:
-        """Return a copy of a controller's current position commands, or None without any."""
+        """Return a copy of a controller's current position commands, rad or m; None if it commands none."""
         positions = self._commanded(controller).positions
         return None if positions is None else positions.copy()
 
@@ -294,7 +312,10 @@ class Goals:
         tolerances: GoalTolerances | None,
         text: str,
     ) -> None:
-        """Start to judge a goal whose motion has ended; see `controller.Goal.judge`."""
+        """Start to judge a goal whose motion has ended, with tolerances from the robot's joints by default.
+
+        See `controller.Goal.judge` for the arguments.
+        """
         names = self._commanded(goal.controller).joints
         settle_ns = None if tolerances is None else tolerances.settle_ns
         targets, longest_ns = [], 0
@@ -328,7 +349,10 @@ class Goals:
         )
 
     def _judge(self, goal: RunningGoal, judgement: _Judgement) -> None:
-        """End a goal if its joints' states decide its outcome. A goal that can still be reached continues."""
+        """End a goal if its joints' states decide the outcome: reached, missed or aborted.
+
+        Otherwise wait for more cycles.
+        """
         states, targets, text, now_ns = self._record.states, judgement.targets, judgement.text, self.time_ns
         rows = [target.row for target in targets]
         lost = [row for row in rows if states.torque.item(row) == Torque.LOST]
@@ -359,7 +383,9 @@ class Goals:
         self._close(goal, outcome, text, joint, error)
 
     def _find_worst(self, targets: Sequence[_Target], velocities: Floats | None) -> tuple[str, float, str]:
-        """Return the worst joint, its distance from the target, and the reason; no reason means reached.
+        """Return the worst joint's name, distance from its target and problem.
+
+        No problem: the goal is reached.
 
         Joints outside of their tolerances rank first, moving joints second. A joint whose commanded velocity
         is not 0 counts as moving, even if it is slow.
@@ -416,9 +442,9 @@ class Goals:
         self._close(goal, outcome, text, joint, error)
 
     def _describe_unable(self, judgement: _Judgement | None, joint: str, why: str) -> tuple[float, str]:
-        """Return the distance of a lost or limp joint from its target, and the reason as text.
+        """Return how far a lost or limp joint is from its target, and the problem as text.
 
-        The distance is NaN before the motion has ended.
+        The distance is in rad or m, and NaN before the motion has ended.
         """
         row, plan = self._joints[joint]
         targets = () if judgement is None else judgement.targets
@@ -441,14 +467,17 @@ class Goals:
         self._report(goal, ended(goal.number, outcome, goal.text), outcome.value)
 
     def judge_running(self) -> None:
-        """Judge the goals whose motions have ended."""
+        """Check all goals whose motions have ended, and end those whose outcome is clear.
+
+        Called once a cycle.
+        """
         for goal in tuple(self.running.values()):
             if goal.judgement is not None:
                 self._judge(goal, goal.judgement)
 
     @property
     def are_settling(self) -> bool:
-        """True while the motion of a goal has ended and its joints may still settle."""
+        """True while any goal's motion has ended but its outcome is still open."""
         return any(goal.is_judged for goal in self.running.values())
 
     def _report(self, goal: RunningGoal, event: EventBody, status: str) -> None:
@@ -459,7 +488,7 @@ class Goals:
         self.publish(goal, status)
 
     def publish(self, goal: RunningGoal, status: str) -> None:
-        """Publish the status of a goal on the topic /goals."""
+        """Publish a goal's number, progress and status on the topic /goals."""
         if self._publisher is None:
             return
         message = self._status

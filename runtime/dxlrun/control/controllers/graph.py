@@ -18,20 +18,22 @@ from typing import NamedTuple
 from dxlrun.plan.loop_plan import ControllerPlan
 
 Plans = Mapping[str, ControllerPlan]
-"""Controllers by their names."""
+"""Plans of controllers by the controllers' names."""
 Circle = tuple[str, ...]
-"""Controllers in a circular dependency: each has an edge to the next, and the last one to the first."""
+"""Names of controllers that depend on each other in a circle: each has an edge to the next, and the last one
+to the first.
+"""
 
 
 class Edge(NamedTuple):
-    """`before` is updated before `after`, in the same cycle."""
+    """Constraint on the update order: controller `before` is updated before `after` in each cycle."""
 
     before: str
     after: str
 
 
 def edges(plans: Sequence[ControllerPlan]) -> tuple[Edge, ...]:
-    """Return the edges between the given controllers, without duplicates, in the order of the plans."""
+    """Return the constraints on the update order of these controllers, without duplicates."""
     known = {plan.name for plan in plans}
     found = [Edge(plan.name, lower) for plan in plans for lower in plan.into if lower in known]
     chains = tuple(found)
@@ -52,10 +54,9 @@ def edges(plans: Sequence[ControllerPlan]) -> tuple[Edge, ...]:
 
 
 def update_order(plans: Sequence[ControllerPlan]) -> tuple[str, ...]:
-    """Return the controllers in update order. The given order decides between independent controllers.
+    """Return the controllers' names in update order. The given order decides between independent ones.
 
-    Raises:
-        ValueError: The graph has circles; the message shows them.
+    Raises: ValueError: Controllers depend on each other in a circle; the message shows it.
     """
     if found := circles(plans):
         raise ValueError(f"controllers command each other in a circle: {'; '.join(map(drawn, found))}")
@@ -76,9 +77,10 @@ def update_order(plans: Sequence[ControllerPlan]) -> tuple[str, ...]:
 
 
 def circles(plans: Sequence[ControllerPlan]) -> tuple[Circle, ...]:
-    """Return circles of the graph. Removing their edges makes the graph acyclic.
+    """Return the circular dependencies between controllers; empty if there are none.
 
-    Each circle begins with its first controller in the given order.
+    Removing the edges of these circles makes the graph acyclic. Each circle begins with its first controller
+    in the given order.
     """
     place = {plan.name: number for number, plan in enumerate(plans)}
     left = list(edges(plans))
@@ -103,7 +105,7 @@ def drawn(circle: Circle) -> str:
 
 
 def above(plans: Sequence[ControllerPlan], name: str) -> tuple[str, ...]:
-    """Return the controllers that command a controller's references, directly or indirectly, nearest first.
+    """Return the controllers that command `name`, directly or through others, nearest first.
 
     The controller itself need not be among the plans.
     """
@@ -111,7 +113,7 @@ def above(plans: Sequence[ControllerPlan], name: str) -> tuple[str, ...]:
 
 
 def below(plans: Sequence[ControllerPlan], name: str) -> tuple[str, ...]:
-    """Return the controllers whose references one commands, directly or indirectly, nearest first."""
+    """Return the controllers that `name` commands, directly or through others, nearest first."""
     into = {plan.name: plan.into for plan in plans}
     return _reached(plans, name, lambda upper, plan: plan.name in into.get(upper, ()))
 
@@ -130,7 +132,7 @@ def _reached(
 
 
 def lowers_first(names: Iterable[str], known: Plans, without: Collection[str] = ()) -> tuple[str, ...]:
-    """Return controllers and all controllers below them. Each follows the ones below it.
+    """Return these controllers and all controllers below them, each after the ones below it.
 
     The given order decides otherwise. Controllers in `without` are omitted, with the controllers below them.
     """
@@ -149,13 +151,19 @@ def _add_lowers_first(name: str, known: Plans, without: Collection[str], found: 
 
 
 def uppers_first(names: Collection[str], known: Plans) -> tuple[str, ...]:
-    """Return these controllers, each after the ones above it. The given order decides otherwise."""
+    """Return these controllers sorted so that each follows the ones above it.
+
+    The given order decides otherwise.
+    """
     order = [name for name in lowers_first(reversed(tuple(names)), known) if name in names]
     return tuple(reversed(order))
 
 
 def commander(name: str, engaged: Iterable[ControllerPlan]) -> str:
-    """Return the first controller that commands references of this one, or an empty string."""
+    """Return the first of the `engaged` controllers that commands references of `name`.
+
+    Empty if none does.
+    """
     return next((plan.name for plan in engaged if name in plan.into), "")
 
 
@@ -167,7 +175,10 @@ def _sorter(plans: Sequence[ControllerPlan], found: Iterable[Edge]) -> Topologic
 
 
 def rate_fits(rate: float | None, period_ns: int) -> bool:
-    """Return whether the loop's rate is a multiple of a controller's own rate (Hz; None: the loop's rate)."""
+    """Return whether the loop's rate is a multiple of a controller's own rate (Hz.
+
+    None: updated in each cycle).
+    """
     if rate is None:
         return True
     divider = 1e9 / period_ns / rate if rate > 0 else 0.0
@@ -177,5 +188,8 @@ def rate_fits(rate: float | None, period_ns: int) -> bool:
 
 
 def rate_divider(rate: float | None, period_ns: int) -> int:
-    """Return the number of cycles between two updates of a controller. Requires `rate_fits`."""
+    """Return after how many loop cycles a controller with this rate (Hz) is updated again.
+
+    Requires `rate_fits`.
+    """
     return 1 if rate is None else max(1, round(1e9 / period_ns / rate))

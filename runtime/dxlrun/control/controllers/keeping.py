@@ -1,4 +1,4 @@
-"""Keeping: restore the persistent states of controllers at start, and publish new ones in pieces."""
+"""Keeping: restore states that controllers kept in earlier runs, and publish new ones in pieces on /kept."""
 
 from __future__ import annotations
 
@@ -27,7 +27,7 @@ from dxlrun.plan.loop_plan import ControllerPlan
 
 
 class Keeping:
-    """Restores the state that a controller kept in an earlier run, and publishes new states a piece a cycle.
+    """Restores the state that a controller kept in an earlier run, and publishes new ones piece by piece.
 
     A state whose publication has begun is completed. Of the states that a controller keeps during that time,
     only the newest is published.
@@ -39,17 +39,20 @@ class Keeping:
         self._events = events
         self._publisher: Publisher | None = None
         self.controllers: dict[str, Facts] = {}
-        """Controllers that keep a state, with the facts that it depends on. Empty: cycles skip `step`."""
+        """Facts (servos, controllers below) that each controller's kept state depends on, by controller.
+
+        Empty: no controller keeps a state, and cycles skip `step`.
+        """
         self._waiting: dict[str, bytes] = {}
-        """Unpublished states by controller."""
+        """Kept states whose publication has not begun, by controller."""
         self._newest: dict[str, bytes] = {}
-        """Last state of this run by controller."""
+        """Last state that each controller kept in this run."""
         self._leaving: Iterator[bytes] = iter(())
         self._number = -1
         self._message = KeptPiece(Header(), "", 0, 0, 0, np.empty(0, np.uint8))
 
     def open(self, plan: ControllerPlan, plans: Plans) -> tuple[bytes, Callable[[bytes], None]]:
-        """Return the kept state of a controller and the function that keeps a new one.
+        """Return the state that a controller kept before, and the function by which it keeps a new one.
 
         The state is empty if none was kept, or if it does not fit this robot. The first call announces the
         topic /kept. Allocates.
@@ -97,7 +100,7 @@ class Keeping:
         self._waiting[controller] = self._newest[controller] = state
 
     def step(self) -> None:
-        """Publish the next piece, if any. Called once a cycle."""
+        """Publish the next piece of a kept state on /kept, if any. Called once a cycle."""
         if self._publisher is None:
             return
         data = next(self._leaving, None)
@@ -120,6 +123,6 @@ class Keeping:
         return next(self._leaving)
 
     def finish(self) -> None:
-        """Publish all remaining pieces, after the controllers have ended."""
+        """Publish all remaining pieces at the end of a run, after the controllers were deactivated."""
         while self._waiting or self._message.piece < self._message.pieces:
             self.step()

@@ -1,4 +1,4 @@
-"""Live parameters: names and values of the parameters that may change in a run, and their replacement."""
+"""Live parameters: names, values and replacement of the controller parameters that may change in a run."""
 
 from __future__ import annotations
 
@@ -10,12 +10,12 @@ from pydantic import BaseModel
 from dxlrun.contract.controller import Live
 
 LiveValues: TypeAlias = Mapping[str, bool | int | float]
-"""Values in SI units by dotted name, such as `gains.p`, or `gains.p.elbow` of a mapping."""
+"""New values of live parameters, SI units, by dotted name: `gains.p`, or `gains.p.elbow` of a mapping."""
 _Model = TypeVar("_Model", bound=BaseModel)
 
 
 def live_names(model: BaseModel) -> Iterator[str]:
-    """Yield the dotted names of the live parameters, including nested models and mappings."""
+    """Yield the dotted names of all parameters marked `Live`, also in nested models and mappings."""
     for name, field in type(model).model_fields.items():
         value = getattr(model, name)
         if any(isinstance(mark, Live) for mark in field.metadata):
@@ -25,7 +25,7 @@ def live_names(model: BaseModel) -> Iterator[str]:
 
 
 def value_of(model: BaseModel, name: str) -> object:
-    """Return a parameter's value by its dotted name."""
+    """Return the value of a parameter by its dotted name, such as `gains.p.elbow`."""
     value: object = model
     for key in name.split("."):
         value = _inner(value, key)
@@ -37,7 +37,7 @@ def _inner(value: object, key: str) -> object:
 
 
 def with_values(model: _Model, values: LiveValues) -> _Model:
-    """Return a copy of the parameters with new values. The values are not validated.
+    """Return a copy of the parameters with some live parameters replaced. The values are not validated.
 
     Raises:
         ValueError: A name is not that of a live parameter.
@@ -52,7 +52,7 @@ def with_values(model: _Model, values: LiveValues) -> _Model:
 
 
 def _changed(inner: object, path: list[str], value: object) -> object:
-    """Return a copy of a model or mapping with one nested value replaced."""
+    """Return a copy of a model or mapping with the value at a path of nested names replaced."""
     if not path:
         return value
     first, *rest = path

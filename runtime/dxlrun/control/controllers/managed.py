@@ -51,7 +51,7 @@ class State(Enum):
 
     INACTIVE = "inactive"
     ENTERING = "entering"
-    """Holds its claims, and becomes active as soon as its joints are in the required modes."""
+    """The controller holds its claims, and becomes active as soon as its joints are in the required modes."""
     ACTIVE = "active"
 
 
@@ -74,16 +74,22 @@ TRANSITIONS: Mapping[State, Mapping[Event, State]] = MappingProxyType(
         State.ACTIVE: {Event.AWAIT: State.ACTIVE, Event.COMMAND: State.ACTIVE, **_OUT},
     }
 )
-"""All legal transitions. Another one is a bug of dxlrun, which ends the controller with a ControllerFault.
-Only `activate` and commands can cause one, and their callers handle the fault."""
+"""Next state of a controller by its state and the event.
+
+A missing entry is a bug of dxlrun, which ends the controller with a ControllerFault. Only `activate` and
+commands can cause one, and their callers handle the fault.
+"""
 
 
 class Request(NamedTuple):
-    """Request of a controller to the run. It is executed after all updates of the cycle."""
+    """Request of a controller: another one takes over, or the run ends.
+
+    Executed after all updates of the cycle.
+    """
 
     requester: str
     takes_over: tuple[str, ...]
-    """Controllers that shall take over; empty: the run shall end."""
+    """Names of the controllers to activate; empty: the run shall end."""
     why: str
 
 
@@ -93,22 +99,22 @@ class ControllersContext(msgspec.Struct, frozen=True, kw_only=True):
     run: ControlContext
     plugins: PlugIns
     activity: Activity
-    """Publishes which controller's code runs."""
+    """Publishes which controller's code runs, and refuses threads that it starts."""
     topics: TopicLog
-    """Destination of their messages."""
+    """Destination of the controllers' messages."""
     keeping: Keeping
     requests: list[Request]
-    """Requests of this cycle."""
+    """Takeovers and ends of the run that controllers requested in this cycle; not executed yet."""
 
 
 class Managed:
-    """A controller with its rows of the robot's arrays.
+    """A controller in a run, with its state, its rows of the robot's arrays and its calls.
 
     Inputs are gathered before an update; commands are checked and merged after it.
 
     Args:
         plan: The controller's plan.
-        place: Index of the controller, its bit in the record's masks.
+        place: Index of the controller, which is its bit in the record's masks.
         context: Objects that the controllers share.
 
     Raises:
@@ -123,16 +129,23 @@ class Managed:
         self.failed = False
         """True after the controller broke its contract."""
         self.held = False
-        """True while a joint that it commands, directly or through others, is lost. Updates continue."""
+        """True while its joints are held because one that it commands, directly or through others, is lost.
+
+        Updates continue.
+        """
         self.withheld = False
         """True while its commands are not merged, because its command stream ended and it has no `on_hold`.
         Updates continue."""
         self.uppers: tuple[Managed, ...] = ()
-        """Controllers that command its references while they are active."""
+        """Controllers that can command its references: they do so while active."""
         self.due_cycle = 0
-        """Cycle of the next update. If that cycle is skipped, the update happens in the following one."""
+        """Number of the cycle of the next update.
+
+        If that cycle is skipped, the update happens in the following one.
+        """
         self.until_ns = 0
-        """End of the lease of its command stream, ns of the run's clock; 0: no stream."""
+        """Time at which its command stream ends without another command, ns of the run's clock; 0: no stream.
+        """
         self.controller: Controller[Any]
         """The controller instance of the plug-in."""
         self._bit = 1 << place
@@ -147,7 +160,7 @@ class Managed:
         self._inputs = Inputs(plan, record, self.rows)
         self._outputs = Outputs(plan, record, self.rows)
         self.provided = Provided(plan, record) if plan.provides else None
-        """States that it provides; None: none."""
+        """States that the controller provides to others; None: it provides none."""
         self._topics = context.topics.of_controller(plan.name, self._bit)
         self._divider = plan.every
         self._nominal_ns = plan.every * context.run.schedule.period_ns
@@ -218,7 +231,10 @@ class Managed:
         plugins.after_each(f"of controller {name}")
 
     def on(self, event: Event) -> None:
-        """Change the state. Raises ControllerFault if the state has no transition for the event."""
+        """Change the controller's state as TRANSITIONS has it for an event.
+
+        An end of activity withdraws its commands. Raises ControllerFault if the state has no transition.
+        """
         before, after = self.active, TRANSITIONS[self.state].get(event)
         if after is None:
             text = f"is {self.state.value}, where {event.value} cannot happen"
@@ -235,11 +251,14 @@ class Managed:
 
     @property
     def active(self) -> bool:
-        """True in the state ACTIVE."""
+        """True if the controller is updated in cycles: state ACTIVE, not ENTERING."""
         return self.state is State.ACTIVE
 
     def activate(self, *, restarts: bool = False) -> None:
-        """Activate or restart the controller. Raises ControllerFault."""
+        """Activate the controller, by on_restart if `restarts`, else by on_activate.
+
+        Raises ControllerFault.
+        """
         if restarts:
             self._call_without_commands(ControllerMethod.ON_RESTART, self.controller.on_restart)
         else:
@@ -249,14 +268,17 @@ class Managed:
         self.on(Event.ENTER)
 
     def _call_without_commands(self, method: ControllerMethod, call: Callable[[int], None]) -> None:
-        """Clear the commands, gather the current states and call a method. Raises ControllerFault."""
+        """Clear the controller's commands, gather current states, and call one of its methods.
+
+        Raises ControllerFault.
+        """
         self.withheld = False
         self._outputs.forget()
         self._inputs.gather()
         self._call(method, "", call, self._schedule.time_ns)
 
     def deactivate(self, why: str = "") -> None:
-        """Release the joints and deactivate the controller.
+        """Withdraw the controller's commands, abort its goal, and call its on_deactivate.
 
         Args:
             why: Reason for which its goal is aborted; empty: the deactivation itself.
@@ -269,9 +291,9 @@ class Managed:
         self._call(ControllerMethod.ON_DEACTIVATE, "", on_deactivate, time_ns)
 
     def release(self, event: Event, why: str) -> None:
-        """Abort the goal and withdraw the commands by an event that makes the controller inactive.
+        """Abort the controller's goal, and make it inactive by an event, LEAVE or FAULT.
 
-        The gate then holds the last goals of the joints.
+        Its commands are withdrawn. The gate then holds the last goals of the joints.
         """
         if (goal := self.goal) is not None:
             goal.end(Outcome.ABORTED, why)
@@ -280,7 +302,7 @@ class Managed:
     # In a cycle
 
     def give_command(self, kind: str, data: NDArray[np.float64]) -> None:
-        """Pass a prepared command without a lease to the controller. Raises ControllerFault."""
+        """Pass a command without a lease to the controller's on_command. Raises ControllerFault."""
         self._begin_command()
         if self._inputs.gathered:
             self._inputs.gather()
@@ -288,7 +310,7 @@ class Managed:
         self._call(ControllerMethod.ON_COMMAND, kind, on_command, kind, data, time_ns)
 
     def _begin_command(self) -> None:
-        """End the previous command stream, and reactivate a controller whose commands were withheld.
+        """End the previous command stream; a controller with withheld commands is activated again.
 
         Withheld commands are outdated: the joints may have moved since. Raises ControllerFault.
         """
@@ -299,22 +321,25 @@ class Managed:
 
     @property
     def goal(self) -> RunningGoal | None:
-        """The running goal, or None."""
+        """Goal of the controller that has not ended; None without one."""
         if self._goal is not None and self._goal.outcome is not None:
             self._goal = None
         return self._goal
 
     @property
     def commanded(self) -> Commanded:
-        """Its joints and current commands, before any limit."""
+        """Joints and current commands of the controller, before any limit."""
         return Commanded.by_interfaces(self.plan.joints, self.plan.command, self._outputs.commands)
 
     def adopt(self, goal: RunningGoal) -> None:
-        """Assign a goal that the runtime pursues with plain commands for this controller."""
+        """Assign a goal that the runtime, not the controller, pursues with plain commands."""
         self._goal = goal
 
     def begin_goal(self, goal: RunningGoal, data: NDArray[np.float64]) -> None:
-        """Pass a goal to the controller. The previous goal must have ended. Raises ControllerFault."""
+        """Pass a new goal to the controller's on_goal.
+
+        The previous goal must have ended. Raises ControllerFault.
+        """
         self._goal = goal
         self._begin_command()
         self._inputs.gather()
@@ -322,7 +347,7 @@ class Managed:
         self._call(ControllerMethod.ON_GOAL, goal.kind, on_goal, goal, data, time_ns)
 
     def cancel_goal(self, goal: RunningGoal) -> None:
-        """Request the controller to end its goal. Raises ControllerFault.
+        """Ask the controller, by on_cancel, to end its goal. Raises ControllerFault.
 
         A goal that the runtime pursues ends at once, and the controller keeps its last command.
         """
@@ -337,7 +362,7 @@ class Managed:
             goal.end(Outcome.CANCELLED, "stopped at the end of the motion")
 
     def change_parameters(self, values: LiveValues) -> None:
-        """Replace live parameters in one step.
+        """Replace live parameters of the controller in one step, and call its on_parameters.
 
         Raises:
             ControllerFault: The controller raised.
@@ -362,7 +387,7 @@ class Managed:
             self._call_without_commands(ControllerMethod.ON_HOLD, self.controller.on_hold)
 
     def follow_upper(self) -> None:
-        """End streams and goals of clients, because a controller above commands the references now.
+        """End command streams and goals of clients, because a controller above sends the commands now.
 
         Raises ControllerFault.
         """
@@ -371,7 +396,7 @@ class Managed:
             self.cancel_goal(goal)
 
     def hold_lost(self, lost: Collection[int], *, below: bool) -> bool:
-        """Hold the joints while the controller commands a lost one, or while a controller below it is held.
+        """Hold or resume the joints, as a joint of the controller is lost or a controller below it is held.
 
         Args:
             lost: Rows of the lost joints.
@@ -389,7 +414,7 @@ class Managed:
         return changed and self.active
 
     def _merge(self) -> None:
-        """Write the commands into the robot's arrays, or commands that hold the joints while one is lost.
+        """Write the controller's commands into the robot's arrays, or hold its joints while one is lost.
 
         A controller with an active commander follows held references, so its own commands continue: a PID law
         keeps the joints in place.
@@ -402,13 +427,16 @@ class Managed:
             self._outputs.merge()
 
     def change_period(self, period_ns: int) -> None:
-        """Keep the controller's own rate with a new period of the loop, ns."""
+        """Keep the controller's own rate by updating it every so many cycles of a new period, ns."""
         self._divider = rate_divider(self.plan.rate, period_ns)
         self._nominal_ns = self._divider * period_ns
         self.due_cycle = 0  # the new divider applies from the next cycle
 
     def update(self, cycle: int) -> None:
-        """Update the controller, and check and merge its commands. Raises ControllerFault."""
+        """Call the controller's update for a cycle, then check and merge its commands.
+
+        Raises ControllerFault.
+        """
         time_ns = self._schedule.time_ns
         period_ns = self._nominal_ns if self._last_ns < 0 else time_ns - self._last_ns
         self._last_ns = time_ns
@@ -427,7 +455,10 @@ class Managed:
 
 
 def _take_over(requests: list[Request], plan: ControllerPlan, controllers: Sequence[str], why: str) -> None:
-    """Record a takeover request. Raises ControllerFault for a controller that is not in `takeovers`."""
+    """Record a controller's request that others take over.
+
+    Raises ControllerFault for one not in its `takeovers`.
+    """
     if other := [name for name in controllers if name not in plan.takeovers]:
         raise ControllerFault(f"requested that {other[0]} takes over, but that is not one of its takeovers")
     if controllers:

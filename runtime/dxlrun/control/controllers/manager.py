@@ -34,7 +34,7 @@ P = ParamSpec("P")
 
 
 class Manager:
-    """Controllers of a robot. The cycle's record holds the arrays that they share."""
+    """All controllers of a robot in a run: configures, updates and commands them once a cycle."""
 
     def __init__(
         self,
@@ -55,7 +55,7 @@ class Manager:
             kept: States that controllers kept in earlier runs.
         """
         self.switching = Switching(context)
-        """States of the controllers, and switches between them."""
+        """States of the controllers, and activations and deactivations."""
         self._plan = context.plan
         self._record = context.record
         self._events = context.events
@@ -64,7 +64,7 @@ class Manager:
         self._topics = topics or TopicLog(context.record)
         self._keeping = Keeping(kept or KeptStates(), self._topics, context.events)
         self._requests: list[Request] = []
-        """Requests of controllers in this cycle."""
+        """Takeovers and ends of the run that controllers requested in this cycle; not executed yet."""
         self._shared = ControllersContext(
             run=context,
             plugins=plugins,
@@ -75,21 +75,30 @@ class Manager:
         )
         self._schedule = context.schedule
         self._managed: tuple[Managed, ...] = ()
-        """Controllers by place. An unloaded controller keeps its place until the place is used again."""
+        """All controllers by index (their bit in the record's masks).
+
+        An unloaded one keeps its index until a new controller gets that.
+        """
         self._named = self.switching.named
         self._order: tuple[Managed, ...] = ()
-        """Controllers in update order: upper controllers of a chain before lower ones."""
+        """Loaded controllers in update order: upper controllers of a chain before lower ones."""
         self.streams: dict[int, Managed] = {}
-        """Controllers with a command stream, by place. `stale` removes those whose stream has ended."""
+        """Controllers that receive a stream of commands with a lease, by index.
+
+        `stale` removes those whose stream has ended.
+        """
         self.providers: tuple[Provided, ...] = ()
-        """Provided states of controllers, which age in each cycle."""
+        """States that controllers provide; their age increases in each cycle."""
         self._next = 0  # index into the plan's commands
         self._lost: list[int] = []  # rows of lost joints
         self._goals = Goals(context.record, context.events, context.plan.joints, self._commanded)
         self._motions: dict[str, PlayedMotion] = {}
-        """Motions that the runtime plays with plain commands, by controller."""
+        """Motions that the runtime plays with plain commands, by name of the controller."""
         self._pursued: dict[str, RunningGoal] = {}
-        """Goals that the runtime pursues with commands of the plan, by controller. They may have ended."""
+        """Goals that the runtime pursues with commands of the plan, by controller name.
+
+        They may have ended.
+        """
 
     def configure(self) -> None:
         """Build and configure every controller. Allocates, so it runs before real time.
@@ -117,7 +126,7 @@ class Manager:
         joints. The update of other controllers continues.
 
         Args:
-            cycle: Number of periods since the first deadline, without pauses.
+            cycle: Number of the cycle: periods since the first deadline, without pauses.
         """
         self._goals.time_ns = self._schedule.time_ns
         self._dispatch_due()
@@ -142,7 +151,7 @@ class Manager:
             self._keeping.step()
 
     def _dispatch_due(self) -> None:
-        """Activate controllers whose modes are ready, dispatch due commands, and judge goals."""
+        """Activate waiting controllers, dispatch due commands of plan and motions, and judge goals."""
         if self.switching.groups:
             self.switching.admit_groups()
         if self._next < len(self._plan.commands):
@@ -153,7 +162,7 @@ class Manager:
             self._play_on()
 
     def _execute_requests(self) -> None:
-        """Execute the requests of controllers: takeovers first, then ends of the run."""
+        """Execute the controllers' requests of this cycle: takeovers first, then ends of the run."""
         requests = sorted(self._requests, key=lambda request: not request.takes_over)
         self._requests.clear()
         for request in requests:
@@ -162,7 +171,7 @@ class Manager:
                 self.switching.execute_request(request)
 
     def deactivate(self) -> None:
-        """Deactivate all controllers, in reverse order. Never raises; `switching.fault` has the first fault.
+        """Deactivate all controllers at the end of a run. Never raises, but sets `switching.fault`.
 
         Goals that are neither reached nor missed are aborted because the run ends.
         """
@@ -175,11 +184,11 @@ class Manager:
 
     @property
     def settles(self) -> bool:
-        """True while the motion of a goal has ended and its joints may still be settling."""
+        """True while the motion of any goal has ended but its outcome is still open."""
         return self._goals.are_settling
 
     def dispatch_command(self, command: Command, pursued: RunningGoal | None = None) -> int | Refusal:
-        """Dispatch a prepared command to its controller.
+        """Pass a client's or the plan's command to its controller, which must be active.
 
         A command with a lease starts or continues a stream, which ends unless another command follows in time
         (see `stale`). Only the first command of a stream is reported as an event.
@@ -231,7 +240,7 @@ class Manager:
         *arguments: P.args,
         **named: P.kwargs,
     ) -> Refusal | None:
-        """Call a method of a managed controller; on a fault, deactivate it and return the refusal."""
+        """Call a method of a controller. On a fault, deactivate the controller and return the refusal."""
         try:
             call(*arguments, **named)
         except ControllerFault as fault:
@@ -256,7 +265,7 @@ class Manager:
         return managed
 
     def _hand_over(self) -> None:
-        """Dispatch the due commands of the plan, and count the accepted ones."""
+        """Dispatch the commands of the plan that are due, and count the accepted ones in the record."""
         commands, record = self._plan.commands, self._record
         while self._next < len(commands) and commands[self._next].at_ns <= self._schedule.time_ns:
             place, command = self._next, commands[self._next]
@@ -273,7 +282,10 @@ class Manager:
                 record.command_count += 1
 
     def _pursue(self, command: ScheduledCommand) -> RunningGoal | None:
-        """Return the goal that the runtime pursues with a command of the plan; accept it if it is new."""
+        """Return the goal that the runtime pursues with a command of the plan; None without one.
+
+        A command that starts such a goal creates it.
+        """
         name, planned = command.controller, command.goal
         managed = self._commandable(name) if planned is not None else None
         if planned and isinstance(managed, Managed) and command.kind not in managed.controller.Goals:
@@ -284,7 +296,10 @@ class Manager:
         return self._pursued.get(name)
 
     def change_parameters(self, controller: str, values: LiveValues) -> Refusal | None:
-        """Replace live parameters of a controller in one step. The controller need not be active."""
+        """Replace live parameters of a controller, active or not, in one step.
+
+        Returns the refusal, None on success.
+        """
         managed = self._known(controller)
         if isinstance(managed, Refusal):
             return managed
@@ -298,7 +313,7 @@ class Manager:
         return refusal
 
     def stale(self, now_ns: int) -> list[str]:
-        """Remove expired command streams, and return their controllers.
+        """Remove the command streams whose lease expired, and return the names of their controllers.
 
         Args:
             now_ns: Time of the run's clock.
@@ -311,12 +326,17 @@ class Manager:
         return [managed.plan.name for managed in sorted(stale, key=lambda one: one.place)]
 
     def hold_controller(self, controller: str) -> None:
-        """Hold the joints of a controller until its next command. The controller stays active."""
+        """Hold the joints of a controller, whose command stream ended, until its next command.
+
+        It stays active.
+        """
         if (managed := self._named.get(controller)) is not None:
             self._attempt(managed, managed.hold_joints)
 
     def hold_lost(self, lost: Collection[int], until: str) -> tuple[int, ...]:
         """Hold the controllers that command a lost joint, and the controllers above them.
+
+        Resume the others.
 
         Held controllers are updated, but their joints stay where they are. This includes controllers that are
         activated while a joint is lost. Lost joints get no commands.
@@ -358,7 +378,10 @@ class Manager:
         return self._attempt(managed, managed.begin_goal, goal, data) or goal.number
 
     def cancel_goal(self, number: int, controller: str) -> Refusal | None:
-        """Cancel the goal of a controller, or the goal with a number if `controller` is empty."""
+        """Cancel the running goal of a controller, or the goal `number` if `controller` is empty.
+
+        Returns the refusal, None on success.
+        """
         if controller:
             managed = self._known(controller)
             if isinstance(managed, Refusal):
@@ -376,7 +399,7 @@ class Manager:
     def play_motion(
         self, parts: Sequence[PlayedPart], numbers: bytes, origin: str
     ) -> tuple[int, ...] | Refusal:
-        """Start all parts of a motion in this cycle, or none of them.
+        """Start all parts of a client's motion in this cycle, or none of them.
 
         Args:
             parts: Parts of the motion.
@@ -423,7 +446,7 @@ class Manager:
         return goal.number
 
     def _play_on(self) -> None:
-        """Dispatch the due commands of each motion, and remove motions that have ended."""
+        """Dispatch the due commands of each motion being played, and remove motions that have ended."""
         time_ns = self._schedule.time_ns
         for name, motion in tuple(self._motions.items()):
             managed, kind = self._named[name], motion.part.kind  # it is active, otherwise its goal has ended
@@ -435,13 +458,16 @@ class Manager:
                 del self._motions[name]
 
     def _commanded(self, controller: str) -> Commanded:
-        """Return the joints and current commands of a controller."""
+        """Return the joints and current commands of a controller, before any limit."""
         return self._named[controller].commanded
 
     # Loading
 
     def load(self, plan: ControllerPlan) -> int | Refusal:
-        """Add a controller, which is inactive at first; return its place. Requires a paused loop."""
+        """Configure a new controller, inactive at first; return its index, or the refusal.
+
+        Requires a paused loop.
+        """
         place = self._free_place()
         if refusal := next(self._refusals(plan, place), None):
             return refusal
@@ -459,7 +485,7 @@ class Manager:
         return place
 
     def _refusals(self, plan: ControllerPlan, place: int) -> Iterator[Refusal]:
-        """Yield the reasons why a controller cannot be loaded into a place, the most important one first."""
+        """Yield the reasons why a controller cannot be loaded at this index, the most important one first."""
         known, layout = self.switching.standing.known, self._record.layout
         if plan.name in known:
             yield Refusal(Code.NAME_TAKEN, {"controller": plan.name})
@@ -485,9 +511,9 @@ class Manager:
         yield from _refused_rates({**known, plan.name: plan}, self._schedule.period_ns)
 
     def _free_place(self) -> int:
-        """Return a free place. Places of the plan's controllers are never used again, even after an unload.
+        """Return the lowest index for a new controller. It is never one of the plan's controllers.
 
-        The log identifies each controller by its place.
+        The log identifies each controller by this index, even after an unload.
         """
         for place in range(len(self._plan.controllers), len(self._managed)):
             there = self._managed[place]
@@ -496,7 +522,10 @@ class Manager:
         return len(self._managed)
 
     def unload(self, name: str) -> Refusal | None:
-        """Remove an inactive controller. Requires a paused loop."""
+        """Remove an inactive controller from the run; return the refusal, None on success.
+
+        Requires a paused loop.
+        """
         managed = self._known(name)
         if isinstance(managed, Refusal):
             return managed
@@ -511,7 +540,10 @@ class Manager:
         return None
 
     def change_period(self, period_ns: int) -> Refusal | None:
-        """Adapt every controller to a new period of the loop, ns, so that each keeps its own rate."""
+        """Adapt every controller to a new loop period, ns, so that each keeps its rate.
+
+        Refuse if one cannot.
+        """
         if refusal := next(_refused_rates(self.switching.standing.known, period_ns), None):
             return refusal
         for managed in self._named.values():
@@ -519,7 +551,7 @@ class Manager:
         return None
 
     def controller(self, name: str) -> Controller[Any] | None:
-        """Return a loaded controller for use outside of the loop, or None."""
+        """Return the loaded controller of this name, for use outside of the loop; None if there is none."""
         managed = self._named.get(name)
         return None if managed is None else managed.controller
 
@@ -530,7 +562,7 @@ class Manager:
 
     @property
     def plans(self) -> tuple[ControllerPlan, ...]:
-        """Plans of all controllers by place, which is the bit in the record's masks."""
+        """Plans of all controllers. The index is the controller's bit in the record's masks."""
         return tuple(managed.plan for managed in self._managed)
 
     def _sort(self) -> None:
@@ -554,7 +586,7 @@ def _commanded_by(controller: str, upper: str, hint: str) -> Refusal:
 
 
 def _refused_rates(plans: Plans, period_ns: int) -> Iterator[Refusal]:
-    """Yield the reasons against a period, ns.
+    """Yield the reasons why controllers cannot run with a loop period, ns.
 
     A controller could not keep its own rate, or would not be updated in each cycle that updates a controller
     above it.

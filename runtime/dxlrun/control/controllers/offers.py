@@ -1,4 +1,4 @@
-"""Offers: classes that plug-ins offer for sections of features, and checks of their methods."""
+"""Offers: classes (such as sensor drivers) that plug-ins offer for features, and checks of their methods."""
 
 from __future__ import annotations
 
@@ -9,41 +9,41 @@ from typing import Any, ClassVar, TypeAlias
 import msgspec
 
 Breach = tuple[str, str]
-"""Problem and fix, two clauses of one message."""
+"""Violation of the plug-in contract: the problem and its fix, two clauses of one message."""
 
 
 DriverClass: TypeAlias = type[Any]
 
 
 class DriverOffer(msgspec.Struct, frozen=True):
-    """A class that a plug-in offers for the section of a feature."""
+    """A class that a plug-in offers for entries of a feature's section in the robot file, such as sensors."""
 
     type: str
-    """Type name in the robot file."""
+    """Name of the class in the robot file, `type:`."""
     driver: DriverClass
     distribution: str
-    """Its publisher: `name version`."""
+    """Python package that offers the class: `name version`."""
 
 
 class OfferStage(msgspec.Struct, frozen=True):
-    """`STAGE` of `offer.py`: classes that plug-ins offer for the entries of the feature's section."""
+    """Plug-in classes of a feature: the object `STAGE` of its `offer.py`."""
 
     FILE: ClassVar[str] = "offer"
 
     hook: str
-    """Hook that returns the classes by type: `dxlrun_sensors`."""
+    """Name of the plug-in hook that returns the classes by type: `dxlrun_sensors`."""
     kind: str
-    """Noun for messages: `sensor`."""
+    """Noun for an entry in messages: `sensor`."""
     form: str
-    """Name of the entry's form, whose schema includes the parameters of the classes."""
+    """Name of the schema of an entry, which includes the parameters of the classes."""
     find_breach: Callable[[object], Breach | None]
-    """Checks a class against the contract when it is loaded."""
+    """Checks a class against the contract when it is loaded; returns the first violation or None."""
     facts: Callable[[DriverClass], Mapping[str, object]] = lambda driver: {}
     """Returns additional fields of a class for `dxlrun plugins --json`."""
 
 
 def methods_breach(found: object, base: type, names: Sequence[str]) -> Breach | None:
-    """Return the first method that a derived class lacks or declares with other arguments than its base."""
+    """Return the first method in `names` that a class lacks, or declares with other arguments than `base`."""
     if missing := sorted(getattr(found, "__abstractmethods__", ())):
         return f"which has no method {' and no method '.join(missing)}", "write it"
     for name in names:
@@ -57,12 +57,12 @@ def methods_breach(found: object, base: type, names: Sequence[str]) -> Breach | 
 
 
 def is_model(found: object, base: type) -> bool:
-    """Return whether something is a class derived from another."""
+    """Return whether `found` is a class derived from `base`, not an instance or another object."""
     return isinstance(found, type) and issubclass(found, base)
 
 
 def takes(found: Callable[..., object], contract: Callable[..., object]) -> bool:
-    """Return whether a method accepts as many positional arguments as the contract's method."""
+    """Return whether a method can be called with as many positional arguments as the contract's method."""
     if found is contract:  # inherited
         return True
     count = len(inspect.signature(contract).parameters)

@@ -1,4 +1,4 @@
-"""Plug-ins: find the packages that offer controllers, and check them against the contract.
+"""Plug-ins: find the installed packages that offer controllers, and check them against the contract.
 
 Plug-ins are checked when they are loaded. Their authors get one sentence with a fix, and runs do not fail
 with a traceback. A broken plug-in does not affect the other ones. The checks cover methods, their arguments,
@@ -57,25 +57,28 @@ _METHODS = (
     "update",
     "on_deactivate",
 )
-"""Methods that dxlrun calls with positional arguments."""
+"""Controller methods that dxlrun calls with positional arguments, which are checked against the base class.
+"""
 _DECLARED = {
     "Commands": (dict[str, type], "write {name: class of dxlrun.CommandModel}"),
     "Goals": (frozenset[str], "write frozenset({name})"),
     "Topics": (dict[str, type], 'write Topics = {"state": WaveState}'),
     "publishes": (tuple[str, ...], 'write publishes = ("/joint_states",)'),
 }
-"""Class attributes of a controller, with their types and a fix as an example."""
+"""Class attributes of a controller, each with its required type and an example as the fix."""
 _HOOKS = tuple(name for name in vars(HookSpecs) if name.startswith("dxlrun_"))
 _NO_FILES: Mapping[str, str] = MappingProxyType({})
 Decide: TypeAlias = Callable[[int, int, int], object]
-"""Hook `dxlrun_overrun` of one plug-in: cycle, scheduled_ns, actual_ns -> policy or None."""
+"""Function of a plug-in that implements its hook `dxlrun_overrun`: cycle, scheduled_ns, actual_ns -> policy
+or None.
+"""
 
 
 class OverrunHook(msgspec.Struct, frozen=True):
-    """Overrun hook of one plug-in."""
+    """Hook of one plug-in that chooses the policy for late cycles."""
 
     plugin: str
-    """Entry point and distribution."""
+    """Name of the plug-in's entry point, with its distribution in brackets."""
     decide: Decide
 
 
@@ -83,18 +86,18 @@ class Offer(msgspec.Struct, frozen=True):
     """A controller class that a plug-in offers."""
 
     type: str
-    """Type name in the robot file."""
+    """Name of the controller class in the robot file, `type:`."""
     controller: ControllerClass
     distribution: str
-    """Its publisher: `name version`."""
+    """Python package that offers the class: `name version`."""
 
 
 Refuse: TypeAlias = Callable[[str, str], PlugInError]
-"""Returns the error of one plug-in for a problem and its fix."""
+"""Makes the PlugInError of one plug-in from a problem and its fix."""
 Offered = TypeVar("Offered", Offer, DriverOffer)
 Result = TypeVar("Result")
 Make: TypeAlias = Callable[[], Offered]
-"""Imports and checks a class; raises PlugInError."""
+"""Imports and checks a class that a plug-in offers; raises PlugInError."""
 
 
 def _nothing_else(name: str) -> Never:
@@ -102,14 +105,14 @@ def _nothing_else(name: str) -> Never:
 
 
 class Offers(Mapping[str, Offered]):
-    """Offers of plug-ins by type. A class that is named by its import path is imported on first access.
+    """Classes that plug-ins offer, by type name. One named by an import path is imported on first access.
 
     If the import fails, the type is removed and `broken` has the reason.
 
     Args:
         makes: Functions that import and check the classes, by type.
         broken: Receives the error messages, by type.
-        unlisted: Makes an offer that is not in `makes`, such as a type in a single file, or raises KeyError.
+        unlisted: Makes the offer for a type not in `makes`, such as one in a single file, or raises KeyError.
     """
 
     def __init__(
@@ -142,25 +145,25 @@ class Offers(Mapping[str, Offered]):
 
 
 class LoadedPlugIn(msgspec.Struct, frozen=True):
-    """A plug-in that was loaded without errors."""
+    """A plug-in whose entry point was imported and checked without errors."""
 
     name: str
     """Name of its entry point."""
     distribution: str
-    """Its publisher: `name version`."""
+    """Python package of the plug-in: `name version`."""
     package: str
-    """Top package of its entry point."""
+    """Top-level Python module of its entry point."""
     contract: int
-    """Version of the contract that it was written for."""
+    """Version of dxlrun's plug-in contract that it was written for."""
     controllers: Mapping[str, Make[Offer]]
-    """Controllers by type."""
+    """Functions that import and check its controller classes, by type name."""
     servo_models: tuple[str, ...]
     overrun: Decide | None
-    """Hook for late cycles; None: not implemented."""
+    """Its hook for late cycles; None: not implemented."""
     drivers: Mapping[str, Mapping[str, Make[DriverOffer]]]
-    """Classes for the sections of features, by feature and type."""
+    """Functions that import and check its classes for features, by feature and type name."""
     verbs: tuple[str, ...]
-    """Its command line verbs."""
+    """Names of the commands that it adds to the command line."""
 
 
 def _any_threads(name: str) -> None:
@@ -168,23 +171,27 @@ def _any_threads(name: str) -> None:
 
 
 class PlugIns(msgspec.Struct, frozen=True):
-    """All installed controllers, and the reasons why others are not available."""
+    """All installed plug-ins: controllers and drivers that they offer, and the reasons why some are broken."""
 
     controllers: Mapping[str, Offer]
-    """Controllers by type."""
+    """Offered controller classes by type name."""
     broken: Mapping[str, str]
-    """One sentence for each broken plug-in, by entry point, and for each type that two plug-ins offer, by
-    type."""
+    """Sentences about errors: by entry point for each broken plug-in, by type name for a type that two
+    plug-ins offer or that cannot be imported.
+    """
     loaded: tuple[LoadedPlugIn, ...] = ()
     """Plug-ins without errors, in load order."""
     after_each: Callable[[str], None] = _any_threads
-    """Called with a name after foreign code was imported or configured. May raise PlugInError."""
+    """Called with a name after plug-in code was imported or configured, to count threads.
+
+    May raise PlugInError.
+    """
     drivers: Mapping[str, Mapping[str, DriverOffer]] = msgspec.field(default_factory=dict)
-    """Classes for the sections of features, by feature and type."""
+    """Offered classes for the sections of features, such as sensors, by feature and type name."""
 
     @property
     def overrun_hooks(self) -> tuple[OverrunHook, ...]:
-        """Overrun hooks in the order in which they are called."""
+        """Hooks of all plug-ins for late cycles, in the order in which they are called."""
         return tuple(
             OverrunHook(f"{one.name} ({one.distribution})", one.overrun)
             for one in self.loaded
@@ -192,15 +199,15 @@ class PlugIns(msgspec.Struct, frozen=True):
         )
 
     def drivers_of(self, feature: str) -> Mapping[str, DriverOffer]:
-        """Return the classes for the section of a feature, by type."""
+        """Return the classes that plug-ins offer for entries of a feature's section, by type name."""
         return self.drivers.get(feature, {})
 
     def parameters_of_drivers(self, feature: str, publisher: str = "") -> dict[str, type[ParametersModel]]:
-        """Return the parameter models of the classes for the section of a feature, by type.
+        """Return the parameter models of the classes offered for a feature's section, by type name.
 
         Args:
             feature: Name of the feature.
-            publisher: Prefix of the distribution; empty: all distributions.
+            publisher: Prefix of `name version` of the packages to include; empty: all packages.
         """
         offers = self.drivers_of(feature)
         return {
@@ -210,7 +217,7 @@ class PlugIns(msgspec.Struct, frozen=True):
         }
 
     def packages_of(self, controllers: Sequence[ControllerPlan], models: Container[str]) -> dict[str, str]:
-        """Return the distributions of all packages that run in a robot, by package.
+        """Return the Python packages whose code runs in a robot: distribution name by top-level module.
 
         These are the packages that offer its controllers or servo models, the packages of the classes if they
         differ, and the packages with an overrun hook.
@@ -232,11 +239,11 @@ class PlugIns(msgspec.Struct, frozen=True):
         return self._name_packages(offering, classes, types)
 
     def packages_of_drivers(self, feature: str, types: Mapping[str, str]) -> dict[str, str]:
-        """Return the distributions of the classes for the section of a feature, by package.
+        """Return the Python packages of a feature's classes: distribution name by top-level module.
 
         Args:
             feature: Name of the feature.
-            types: Publishers of the classes by type.
+            types: Distributions (`name version`) of the classes in use, by type name.
         """
         offering = [one for one in self.loaded if types.keys() & one.drivers.get(feature, {}).keys()]
         classes = {kind: self.drivers_of(feature)[kind].driver for kind in types}
@@ -256,17 +263,19 @@ class PlugIns(msgspec.Struct, frozen=True):
         return {package: distribution_name(publisher) for package, publisher in sorted(found.items())}
 
     def import_all(self) -> None:
-        """Import all controllers. An import in a running loop would take longer than a cycle."""
+        """Import all offered controller classes now.
+
+        An import in a running loop would take longer than a cycle.
+        """
         for name in self.controllers:
             if self.controllers.get(name) is not None:
                 self.after_each(name)
 
     def built(self, plan: ControllerPlan) -> Controller[Any]:
-        """Return a new controller of the plan's type.
+        """Return a new controller of the plan's type, with the plan's parameters.
 
-        Raises:
-            PlugInError: The type is not available, or its parameters are not valid.
-            ControllerFault: The class raised.
+        Raises: PlugInError: The type is not available, or its parameters are not valid. ControllerFault: The
+        class raised.
         """
         offer = self.controllers.get(plan.type)
         if offer is None:
@@ -285,7 +294,7 @@ class PlugIns(msgspec.Struct, frozen=True):
             ) from error
 
     def unknown_type(self, what: str, kind: str) -> PlugInError:
-        """Return the error for an entry whose type no plug-in offers."""
+        """Return the error for an entry `what` of the robot file whose type `kind` no plug-in offers."""
         why = f" ({'; '.join(self.broken.values())})" if self.broken else ""
         return PlugInError(f"no plug-in offers the type {kind} of {what}{why}")
 
@@ -293,7 +302,7 @@ class PlugIns(msgspec.Struct, frozen=True):
 def load_plugins(
     after_each: Callable[[str], None] = _any_threads, files: Mapping[str, str] = _NO_FILES
 ) -> PlugIns:
-    """Import all entry points of the group `dxlrun` and collect their controllers and servo models.
+    """Import all installed plug-ins (entry points `dxlrun`); return their classes and the errors.
 
     Raises only exceptions of `after_each`.
 
@@ -325,7 +334,10 @@ def load_plugins(
 
 
 def _offer_of_file(files: Mapping[str, str], name: str) -> Offer:
-    """Return the offer of a single file. Raises KeyError for other types, PlugInError for a broken class."""
+    """Return the offer of a controller class in a single file. Raises KeyError for types without a file.
+
+    Raises PlugInError for a broken class.
+    """
     controller, file = class_in_file(name, files), file_of(name) or ""
 
     def refuse(what: str, fix: str) -> PlugInError:
@@ -337,7 +349,7 @@ def _offer_of_file(files: Mapping[str, str], name: str) -> Offer:
 def _together(
     what: str, offered: Sequence[tuple[str, Mapping[str, Make[Offered]]]], broken: dict[str, str]
 ) -> dict[str, Make[Offered]]:
-    """Return the offers of several plug-ins. A type that two plug-ins offer is added to `broken`."""
+    """Merge the classes that several plug-ins offer. A type that two of them offer is moved to `broken`."""
     made: dict[str, Make[Offered]] = {}
     publishers: dict[str, str] = {}
     twice: dict[str, str] = {}
@@ -411,7 +423,7 @@ def _load(plugin: InstalledPlugin) -> LoadedPlugIn:
 
 
 def _asked(refuse: Refuse, what: str, call: Callable[[], Result], also: str = "") -> Result:
-    """Call foreign code, and convert its exceptions to PlugInError."""
+    """Call plug-in code and return its result; convert exceptions to the PlugInError that `refuse` makes."""
     try:
         return call()
     except (Exception, SystemExit) as error:
@@ -419,7 +431,7 @@ def _asked(refuse: Refuse, what: str, call: Callable[[], Result], also: str = ""
 
 
 def _functions(module: object) -> Iterator[tuple[str, object]]:
-    """Yield the functions of a module that have the name of a hook."""
+    """Yield name and function of each hook, `dxlrun_...`, that a plug-in's module defines."""
     for name in _HOOKS:
         hook = getattr(module, name, None)
         if callable(hook):
@@ -429,7 +441,7 @@ def _functions(module: object) -> Iterator[tuple[str, object]]:
 def _makes(
     mappings: Sequence[object], hook: str, refuse: Refuse, offer: Callable[[str, object], Offered]
 ) -> Iterator[tuple[str, Make[Offered]]]:
-    """Yield types with the functions that make their offers.
+    """Yield each type name that a hook returned, with the function that makes its offer.
 
     A class is checked at once. An import path is imported and checked later.
     """
@@ -454,7 +466,10 @@ def _imported(name: str, place: str, refuse: Refuse, offer: Callable[[str, objec
 
 
 def _overrun(manager: pluggy.PluginManager) -> Decide | None:
-    """Return a function that calls the hook `dxlrun_overrun` with the arguments that the plug-in declares."""
+    """Return a function that calls a plug-in's `dxlrun_overrun` with the arguments that it declares.
+
+    None without.
+    """
     found = manager.hook.dxlrun_overrun.get_hookimpls()
     return partial(_call, found[0].function, found[0].argnames) if found else None
 
@@ -515,7 +530,7 @@ def _check(breach: Breach | None, kind: object, name: str, refuse: Refuse) -> No
 
 
 def controller_breach(controller: object) -> Breach | None:
-    """Check a class that is offered as a controller; return the first problem."""
+    """Check a class that is offered as a controller; return the first violation of the contract, or None."""
     if not (isinstance(controller, type) and issubclass(controller, Controller)):
         return "which is not a controller", "derive a class from dxlrun.Controller"
     if breach := methods_breach(controller, Controller, _METHODS) or _laws_breach(controller):
@@ -557,7 +572,7 @@ def _topics_breach(topics: Mapping[str, type]) -> Breach | None:
 
 
 def interfaces_breach(interfaces: object, *, chained: bool = False) -> Breach | None:
-    """Check the result of a controller's `interfaces`; return the first problem.
+    """Check the result of a controller's `interfaces`; return the first problem, or None.
 
     Args:
         interfaces: The result.
@@ -595,7 +610,7 @@ def _names_breach(interfaces: Interfaces) -> Breach | None:
 
 
 def motor_breach(needed: Sequence[str], joint: JointPlan) -> Breach | None:
-    """Return the problem if a joint's motor lacks figures that a controller needs, else None."""
+    """Return the problem if a joint's motor model lacks figures that a controller needs, else None."""
     identify = f"let `dxlrun identify {joint.name}` measure it, and name the file that it writes"
     if needed and joint.motor is None:
         return (
@@ -618,7 +633,9 @@ def mismatches(
     joints: Sequence[JointPlan],
     urdf: str | None,
 ) -> list[Mismatch]:
-    """Return the mismatches between a robot and a controller. Exceptions of the controller pass through.
+    """Return the reasons why a controller does not suit a robot.
+
+    Exceptions of the controller pass through.
 
     Args:
         controller: Class of the controller; its `mismatches` is called if no figure of a motor is missing.

@@ -23,29 +23,32 @@ from dxlrun.plan.loop_plan import ControllerPlan
 
 _TYPE = re.compile(r"\./([A-Za-z_]\w*\.py):([A-Za-z_]\w*)", re.ASCII)
 _HASH = 12
-"""Digits of the SHA-256 in names of file versions; the log has all 64."""
+"""Number of SHA-256 digits in the names of file versions; the log has all 64 digits."""
 
 
 def is_of_file(type_name: str) -> bool:
-    """Return whether a type refers to a file, including misspelled references."""
+    """Return whether a controller's `type` refers to a Python file, even if misspelled."""
     return "/" in type_name or ".py" in type_name
 
 
 def file_of(type_name: str) -> str | None:
-    """Return the file name in a type: `wave.py` for `./wave.py:Wave`. None if the type has another form."""
+    """Return the file name in a controller's `type`:
+
+    `wave.py` for `./wave.py:Wave`; None for another form.
+    """
     match = _TYPE.fullmatch(type_name)
     return match and match[1]
 
 
 def publisher_of(file: str, text: str) -> str:
-    """Return the file name with the hash of its text, in analogy to a package name with its version."""
+    """Return the file name with the hash of its text, used in place of a package name with its version."""
     return f"{file} {sha256(text.encode()).hexdigest()[:_HASH]}"
 
 
 def published_by(
     controllers: Sequence[ControllerPlan], texts: Mapping[str, str]
 ) -> tuple[ControllerPlan, ...]:
-    """Return the plans with the publisher of each controller whose file is in `texts`.
+    """Return the plans; those of controllers in single files get `distribution` set to file name and hash.
 
     Args:
         controllers: The plans of all controllers.
@@ -60,7 +63,7 @@ def published_by(
 
 
 def class_in_file(type_name: str, files: Mapping[str, str]) -> object:
-    """Return the class that a type refers to.
+    """Execute the text of a single file, and return the class that a controller's `type` names.
 
     Args:
         type_name: `./wave.py:Wave`.
@@ -86,23 +89,23 @@ def class_in_file(type_name: str, files: Mapping[str, str]) -> object:
 
 
 class _Text(ExecutionLoader):
-    """Module loader for a text. Tracebacks show the file's name."""
+    """Module loader that executes the text of a single file, so that tracebacks show the file's name."""
 
     def __init__(self, file: str, text: str) -> None:
         self._file, self._text = file, text
 
     def get_filename(self, fullname: str) -> str:
-        """Return the name of the file."""
+        """Return the name of the single file, without a folder."""
         return self._file
 
     def get_source(self, fullname: str) -> str:
-        """Return the text, for tracebacks too."""
+        """Return the text of the single file, which is executed and shown in tracebacks."""
         return self._text
 
 
 @cache
 def _executed(file: str, text: str) -> ModuleType:
-    """Return the module of a text, which is executed once a process."""
+    """Execute the text of a single file, once a process, and return the module."""
     loader = _Text(file, text)
     module = ModuleType(publisher_of(file, text).replace(".py ", "_"))
     module.__loader__ = loader
@@ -116,7 +119,7 @@ def _executed(file: str, text: str) -> ModuleType:
 
 
 def _line_of(error: BaseException, file: str) -> int:
-    """Return the line of the file at which its execution failed."""
+    """Return the line of the single file at which its execution failed; 1 if unknown."""
     if isinstance(error, SyntaxError) and error.filename == file:
         return error.lineno or 1
     lines = [frame.lineno for frame in traceback.extract_tb(error.__traceback__) if frame.filename == file]

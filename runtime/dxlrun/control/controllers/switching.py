@@ -26,45 +26,55 @@ from dxlrun.errors import ControllerFault
 from dxlwire.modes import Mode
 
 MODE_TIMEOUT_NS = 5_000_000_000
-"""Timeout for mode changes. Twenty servos, one after the other in short idle times, need less than one
-second; a servo after a reset needs somewhat more. [i]"""
+"""Time after which controllers that wait for mode changes are dropped.
+
+Twenty servos, one after the other in short idle times, need less than one second; a servo after a reset needs
+somewhat more. [i]
+"""
 _STILL = (Mode.POSITION, Mode.VELOCITY)
 """Modes in which a joint without commands holds still, so it stays in them when no controller claims it."""
 
 _Failed = tuple[tuple[Managed, ...], str]
-"""A controller that broke its contract, the controllers that left with it, and the reason as text. The
-exception is not stored: it refers to a frame, and the loop has no collector for reference cycles."""
+"""A controller that broke its contract, with the controllers that left with it, and the reason as text.
+
+The exception is not stored: it refers to a frame, and the loop has no collector for reference cycles.
+"""
 
 
 class Group(msgspec.Struct, frozen=True):
-    """Controllers that wait for modes and become active together."""
+    """Controllers that wait for their joints' modes and then become active together."""
 
     entering: tuple[Managed, ...]
     until_ns: int
-    """Deadline in the controllers' time. The group is dropped then."""
+    """Time, ns of the controllers' time, at which the group is dropped if joints are not in their modes."""
     number: int | None
-    """Number of the client's command; None: no command requested the switch."""
+    """Number of the client's `switch` command to be answered; None: no command requested the switch."""
     why: str
-    """Fault of the controller that they replace; empty: the switch was requested."""
+    """Fault of the controller that the group replaces; empty: the switch was requested."""
 
 
 class Switching:
-    """State changes of a run's controllers. All times are the controllers' time."""
+    """Activates and deactivates the controllers of a run. All times are the controllers' time."""
 
     def __init__(self, context: ControlContext) -> None:
         self.fault: str | None = None
-        """Reason to end the run; None: it continues. Set by the first controller that requested the end or
-        broke its contract without a fallback that took over."""
+        """Reason to end the run; None: it continues.
+
+        Set by the first controller that requested the end or broke its contract without a fallback that took
+        over.
+        """
         self.named: dict[str, Managed] = {}
         """Loaded controllers by name."""
         self.ended: list[tuple[int, Refusal | None]] = []
-        """Results of switches that waited for modes: number of the command, and its refusal or None."""
+        """Answers to `switch` commands that waited for modes: number of the command, and its refusal or None
+        for success.
+        """
         self.groups: list[Group] = []
-        """Controllers that wait for modes."""
+        """Controllers that wait for their joints' modes, grouped by switch."""
         self.released: set[int] = set()
-        """Rows of joints whose torque clients disabled. The states show that a cycle later."""
+        """Rows of joints whose torque clients disabled; the states show it only a cycle later."""
         self.modes_requested = True
-        """False if claims have changed since the last request of modes."""
+        """False if the active controllers have changed since modes were last requested from the hardware."""
         self._joints = context.plan.joints
         self._rows = {joint.name: row for row, joint in enumerate(self._joints)}
         self._states = context.record.states
@@ -83,7 +93,7 @@ class Switching:
         )
 
     def start_controllers(self) -> None:
-        """Activate the initially active controllers."""
+        """Activate the controllers that the plan marks as active, at the start of the run."""
         known = self.standing.known
         names = [name for name, managed in self.named.items() if managed.plan.active and not managed.active]
         self._enter([name for name in lowers_first(names, known) if name in names], None, "")
@@ -131,7 +141,7 @@ class Switching:
         self._take(step, None, f"{requester}: {why}")
 
     def restart_controllers(self, joints: Collection[str], why: str) -> None:
-        """Restart every active controller that commands one of these joints, and the controllers above it.
+        """Restart the active controllers that command one of these joints, and the controllers above them.
 
         Each controller starts from the current positions and goals of its joints. Its goal is aborted. After
         the end of a command stream, commands stay withheld.
@@ -160,7 +170,7 @@ class Switching:
                 managed.hold_joints()
 
     def end_controller(self, managed: Managed, fault: ControllerFault) -> None:
-        """Deactivate a controller that broke its contract, and activate a fallback.
+        """Deactivate a controller that broke its contract, and activate a fallback in its place.
 
         The controllers above it leave too. Its own fallback is tried first, then theirs, the nearest first.
         If the controller waits for modes, the wait ends and the command is refused. An inactive controller
@@ -172,7 +182,10 @@ class Switching:
             self._fall_back(*self._take_out_with_uppers(managed, fault))
 
     def deactivate_all(self) -> None:
-        """Deactivate all controllers, upper ones first, otherwise in reverse order. Never raises."""
+        """Deactivate all controllers at the end of the run, upper ones first, otherwise in reverse order.
+
+        Never raises.
+        """
         standing = self.standing
         for name in uppers_first(tuple(standing.active)[::-1], standing.known):
             self._deactivate(self.named[name], RUN_ENDED)
@@ -184,7 +197,7 @@ class Switching:
     # Torque
 
     def commanding(self, joints: Collection[str]) -> tuple[str, ...]:
-        """Return the controllers that command one of these joints, directly or through a chain.
+        """Return the controllers that command one of these joints, directly or through other controllers.
 
         The result includes active controllers and those that wait for modes, upper ends of chains first.
         """
@@ -198,7 +211,10 @@ class Switching:
         return tuple(reversed(found))
 
     def stopped_by(self, joints: Mapping[str, int]) -> tuple[str, ...]:
-        """Return the controllers that command one of these joints and must stop without its torque."""
+        """Return the controllers that must be deactivated if these joints (name: row) lose their torque.
+
+        A `partial` controller can continue while other joints have torque.
+        """
         return tuple(
             name
             for name in self.commanding(joints)
@@ -207,12 +223,12 @@ class Switching:
         )
 
     def _torqued(self, managed: Managed) -> list[int]:
-        """Return the rows of a controller's joints that have torque or will get it."""
+        """Return the rows of those joints of a controller that have torque or are about to get it."""
         torque = self._states.torque
         return [row for row in managed.rows.tolist() if row not in self.released and torque[row] not in LIMP]
 
     def _refuse_limp(self, entering: Sequence[str]) -> Refusal | None:
-        """Return a refusal if entering controllers command limp joints, which cannot move."""
+        """Return a refusal if controllers to be activated command joints without torque, else None."""
         limp: dict[str, str] = {}
         limp_rows: list[int] = []
         names: list[str] = []
@@ -233,7 +249,7 @@ class Switching:
         return Refusal(Code.JOINT_LIMP, {"joint": tuple(limp), "servo": tuple(limp.values()), "hint": hint})
 
     def _is_outside(self, row: int) -> bool:
-        """Return whether a joint is outside of its limits, where its torque is not enabled."""
+        """Return whether a joint is beyond its position limits, where torque is not enabled."""
         joint, position = self._joints[row], float(self._states.position[row])
         return joint.bounded and (position < joint.lower or position > joint.upper)
 
@@ -265,7 +281,7 @@ class Switching:
         self._fall_back_all(failed)
 
     def request_modes(self) -> None:
-        """Request the modes that active and waiting controllers claim from the hardware.
+        """Ask the hardware for the joint modes that active and waiting controllers need.
 
         A joint without a claim keeps a mode in which it holds still. From other modes it enters its rest
         mode.
@@ -284,13 +300,15 @@ class Switching:
             self._hardware.set_modes(modes)
 
     def _missing(self, entering: Iterable[Managed]) -> dict[str, tuple[Mode, Mode]]:
-        """Return the required and the current mode of each joint in a wrong mode, by joint name."""
+        """Return required and current mode of each joint that is in a wrong mode for these controllers, by
+        name.
+        """
         claimed = claimed_modes(managed.plan for managed in entering)
         now = {joint: Mode(int(self._states.mode[self._rows[joint]])) for joint in claimed}
         return {joint: (mode, now[joint]) for joint, mode in claimed.items() if mode != now[joint]}
 
     def _mode_problem(self, group: Group) -> str:
-        """Return a text that names the joints that did not enter their modes."""
+        """Return a text that names a joint which did not enter its mode, and the number of further ones."""
         missing = self._missing(group.entering)
         stays = [
             f"{joint} stays in {_shown(now)} mode instead of {_shown(mode)} mode"
@@ -305,7 +323,10 @@ class Switching:
         return (stays or late)[0] + (f" (and {len(missing) - 1} more)" if len(missing) > 1 else "")
 
     def _await_no_more(self, managed: Managed) -> Group | None:
-        """Remove a controller from its group, and return the remaining group; None if it does not wait."""
+        """Remove a controller from the group that waits for modes; return the rest of the group.
+
+        None if the controller does not wait.
+        """
         for index, group in enumerate(self.groups):
             if managed in group.entering:
                 left = tuple(one for one in group.entering if one is not managed)
@@ -315,7 +336,7 @@ class Switching:
         return None
 
     def _drop_group(self, managed: Managed, why: str) -> None:
-        """Drop the group of a controller that cannot be activated any more."""
+        """Drop the waiting group that includes this controller, which cannot be activated any more."""
         for group in self.groups:
             if managed in group.entering:
                 self.groups = [one for one in self.groups if one is not group]
@@ -334,7 +355,9 @@ class Switching:
     # Entering and leaving
 
     def _take(self, step: Step, number: int | None, why: str = "") -> Refusal | Waiting | None:
-        """Execute a step. Returns the same as `switch_controllers`.
+        """Execute a step: deactivate and activate its controllers.
+
+        Returns the same as `switch_controllers`.
 
         Args:
             step: The controllers that leave and enter.
@@ -355,7 +378,10 @@ class Switching:
         return self._enter(step.enter, number, why)
 
     def _enter(self, names: Sequence[str], number: int | None, why: str) -> Refusal | Waiting | None:
-        """Activate controllers with checked claims, at once or as soon as their joints are in their modes."""
+        """Activate controllers with checked claims, now or as soon as their joints are in their modes.
+
+        Returns the same as `switch_controllers`.
+        """
         entering = [self.named[name] for name in names]
         self.modes_requested = False
         if not self._missing(entering):
@@ -373,7 +399,7 @@ class Switching:
     def _activate_all(
         self, entering: Sequence[Managed], failed: list[_Failed], *, restarts: bool = False
     ) -> Refusal | None:
-        """Activate controllers with checked claims, and append the ones that fail to `failed`.
+        """Activate controllers with checked claims, and append those that raise to `failed`.
 
         The caller activates fallbacks after all controllers have entered. An earlier fallback could take a
         joint that belongs to a controller that has not entered yet.
@@ -424,14 +450,17 @@ class Switching:
     # Faults
 
     def _take_out(self, managed: Managed, fault: ControllerFault) -> None:
-        """Deactivate a controller that broke its contract, without a fallback, and report the fault."""
+        """Deactivate a controller that broke its contract and report the fault. No fallback is activated."""
         managed.release(Event.FAULT, str(fault))
         self.modes_requested = False
         event = texts.controller_failed(str(fault), getattr(fault, "__notes__", ()))
         self._events.emit(managed.plan.name, event)
 
     def _take_out_with_uppers(self, managed: Managed, fault: ControllerFault) -> _Failed:
-        """Deactivate a controller that broke its contract and those above it; return all, nearest first."""
+        """Deactivate a controller that broke its contract and those above it.
+
+        Returns all of them, nearest first, and the reason.
+        """
         engaged = tuple(self.standing.engaged.values())
         uppers = [self.named[name] for name in above(engaged, managed.plan.name)]
         self._take_out(managed, fault)
@@ -449,7 +478,9 @@ class Switching:
             self._fall_back(taken, why)
 
     def _fall_back(self, taken: Sequence[Managed], why: str) -> None:
-        """Activate the first available fallback of these controllers; without one, end the run with a fault.
+        """Activate the first available fallback of these controllers.
+
+        Without one, end the run with a fault.
 
         A controller that broke its contract before is not available: two that are each other's fallback would
         alternate forever. Neither is a fallback for joints without torque.
@@ -474,7 +505,7 @@ class Switching:
             self.ended.append((number, refusal))
 
     def report_refusal(self, controller: str, event: EventBody, outcome: CommandOutcome) -> None:
-        """Report a refused command, with its outcome as data."""
+        """Emit the event of a refused command, with the command's outcome as JSON data."""
         self._events.emit(controller, event, msgspec.json.encode(outcome))
 
     def _report_left_out(
@@ -484,7 +515,7 @@ class Switching:
 
 
 def fault_of(managed: Managed, problem: str) -> Refusal:
-    """Return the refusal of a command during which a controller broke its contract."""
+    """Return the refusal for a command during which the controller broke its contract."""
     return Refusal(Code.CONTROLLER_FAULT, {"controller": managed.plan.name, "problem": problem})
 
 

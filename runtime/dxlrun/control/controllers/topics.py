@@ -1,4 +1,4 @@
-"""Topics of the loop: messages that controllers and the runtime publish to the log and to clients.
+"""Topics: messages that controllers and the runtime publish from the loop to the log and to clients.
 
 The loop's process checks and encodes a message when it is published, and keeps no reference to it.
 """
@@ -15,11 +15,11 @@ from dxlrun.messages.declared import DeclaredMessage, WrongMessage, declared_mes
 MOST_PER_CYCLE = 16
 """Messages that one controller may publish in a cycle. The limit catches runaway controllers."""
 OWN_PACKAGE = "dxlrun_msgs"
-"""Package of the runtime's own messages."""
+"""ROS package name of the runtime's own message types."""
 
 
 class Publisher:
-    """Publisher of one topic. Messages are stamped with the time of the cycle."""
+    """Publishes messages on one topic, stamped with the wake-up time of the cycle."""
 
     def __init__(
         self,
@@ -46,13 +46,7 @@ class Publisher:
 
 
 class TopicLog:
-    """Opens the loop's topics.
-
-    Args:
-        record: The cycle's record, for the time of messages.
-        sink: Destination of the messages; None drops them.
-        epoch_offset_ns: Offset of wall time to the run's clock, ns, for stamps.
-    """
+    """Opens the topics that a loop publishes, and gives their messages to a sink."""
 
     def __init__(
         self, record: CycleRecord, sink: MessageSink | None = None, epoch_offset_ns: int = 0
@@ -74,12 +68,12 @@ class TopicLog:
         return Publisher(topic, declared, self._sink, self._record, self._epoch_offset_ns)
 
     def of_controller(self, name: str, bit: int) -> ControllerTopics:
-        """Return the publisher of a controller. Its topics are opened later."""
+        """Return the object by which a controller publishes. Its topics are opened later, by `open`."""
         return ControllerTopics(self, self._record, name, bit)
 
 
 class ControllerTopics:
-    """Topics of one controller. Implements `Context.publish`."""
+    """Topics of one controller, `/CONTROLLER/TOPIC`. Implements `Context.publish`."""
 
     def __init__(self, log: TopicLog, record: CycleRecord, name: str, bit: int) -> None:
         self._log = log
@@ -91,7 +85,7 @@ class ControllerTopics:
         self._left = 0
 
     def open(self, topics: Mapping[str, type], distribution: str, joints: tuple[str, ...]) -> None:
-        """Open the controller's topics.
+        """Announce the controller's topics, so that it can publish.
 
         Args:
             topics: Message classes by topic.
@@ -110,7 +104,7 @@ class ControllerTopics:
                 raise ControllerFault(f"controller {self._name}: topic {topic}: {error}") from None
 
     def publish(self, topic: str = "", message: object = None) -> None:
-        """Publish a message on a topic. Without a topic, mark this cycle for the topics of `publishes`.
+        """Publish a message on a topic; without arguments, mark this cycle for the topics of `publishes`.
 
         Raises:
             ControllerFault: The topic is not declared, the message does not fit, or the controller published

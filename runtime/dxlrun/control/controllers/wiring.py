@@ -20,15 +20,21 @@ from dxlrun.plan.loop_plan import ControllerPlan
 from dxlwire.modes import COMMAND_INTERFACES
 
 READABLE = ("position", "velocity", "effort", "temperature", "voltage", "age")
-"""States of a joint that any controller may read, as `JOINT/position`. The age is in s."""
+"""States of a joint that any controller may read, as `JOINT/position`.
+
+The age (time since the last reply) is in s.
+"""
 
 _Element = TypeVar("_Element", bound=np.generic)
 Columns = slice | NDArray[np.intp]
-"""Rows of joints. Rows at equal distances are a slice, which numpy indexes in a tenth of the time."""
+"""Indices of joints in an array.
+
+Indices at equal distances are a slice, which numpy indexes in a tenth of the time.
+"""
 
 
 def _columns(rows: NDArray[np.intp]) -> Columns:
-    """Return the rows as a slice if they are at equal distances, ascending or descending."""
+    """Return indices as a slice if they are at equal distances, ascending or descending, else unchanged."""
     if not rows.size:
         return rows
     first, last = int(rows[0]), int(rows[-1])
@@ -43,25 +49,28 @@ def _places(names: Sequence[str], known: Sequence[str]) -> NDArray[np.intp]:
 
 
 class Provided:
-    """States that a controller provides. They are published after its updates and age in other cycles."""
+    """States that a controller provides to others, copied into the record after its updates."""
 
     def __init__(self, plan: ControllerPlan, record: CycleRecord) -> None:
         self.own = np.full(len(plan.provides), np.nan)
-        """Array that the controller writes."""
+        """Array in which the controller writes the states."""
         sources = record.sources
         self._place = record.layout.sources.index(plan.name)
         self._shown = sources.values[record.layout.source_slice(plan.name)]
         self._valid, self._age_ns = sources.valid, sources.age_ns
 
     def grow_old(self, period_ns: int) -> None:
-        """Mark the states as not updated and increase their age by a period, ns."""
+        """Mark the provided states as not updated in this cycle, and increase their age by a period, ns."""
         place, age_ns = self._place, self._age_ns
         self._valid[place] = False
         if age_ns[place] >= 0:
             age_ns[place] += period_ns
 
     def take(self) -> None:
-        """Publish the controller's array. It is valid if all values are finite; all NaN: no new values."""
+        """Copy the controller's array into the record. It is valid if all values are finite.
+
+        An array of NaN only means that there are no new values, and is not copied.
+        """
         known = np.count_nonzero(np.isfinite(self.own))
         if not known and np.isnan(self.own).all():
             return
@@ -72,21 +81,12 @@ class Provided:
 
 
 class Inputs:
-    """Read-only inputs of a controller: states and goals of its joints, its references, its reads.
-
-    Args:
-        plan: The controller.
-        record: The cycle's record.
-        rows: Rows of the controller's joints.
-
-    Raises:
-        ControllerFault: The record lacks a reference or an interface in `reads`.
-    """
+    """Arrays that a controller reads: states and goals of its joints, its references, and its `reads`."""
 
     def __init__(self, plan: ControllerPlan, record: CycleRecord, rows: NDArray[np.intp]) -> None:
         place = _columns(rows)
         self._pairs: list[tuple[NDArray[np.generic], NDArray[np.generic], NDArray[np.intp]]] = []
-        """Copies before each call: source array, controller's array, source rows."""
+        """Copies to make before each call: source array, controller's array, source indices."""
         sources = [getattr(record.states, field.name) for field in fields(States) if field.init]
         self.states = States(*(self._shown(source, place) for source in sources))
         self.goals = Commands(self._shown(record.goals.values, place))
@@ -110,10 +110,10 @@ class Inputs:
         self._ages_ns, self._age_places = record.floats.view("<i8"), at[self._aged]
         self.reads = _read_only(self._reads)
         self.gathered = bool(self._pairs)
-        """True if `gather` has values to copy."""
+        """True if `gather` has anything to copy; False if all inputs are views."""
 
     def gather(self) -> None:
-        """Copy the inputs that are not views, and convert ages to s."""
+        """Copy the inputs that are not views of the robot's arrays, and convert ages to s."""
         for source, own, place in self._pairs:
             # numpy buffers `out` with the default mode "raise" (numpy.take). The indices are always valid.
             source.take(place, axis=-1, out=own, mode="clip")
@@ -135,7 +135,7 @@ def _read_only(values: NDArray[_Element]) -> NDArray[_Element]:
 
 
 def _readable(layout: CycleLayout) -> Iterator[tuple[str, int]]:
-    """Yield each interface that can be read without a claim, with its index in `CycleRecord.floats`."""
+    """Yield each value that a controller may read, by name, with its index in `CycleRecord.floats`."""
     for sequence, names in (
         ("reference", layout.references),
         ("source_state", layout.source_states),
@@ -148,22 +148,22 @@ def _readable(layout: CycleLayout) -> Iterator[tuple[str, int]]:
 
 
 _CARRYING = ("effort", "pwm")
-"""Interfaces that carry a joint's load. The joint falls without their commands."""
+"""Command interfaces that carry a joint's load: without these commands, the joint falls."""
 
 
 class _Part(NamedTuple):
-    """One interface of a controller's commands."""
+    """Commands of a controller for one interface, and where they are written."""
 
     own: Floats
-    """View of the controller's array."""
+    """View of the controller's own array."""
     merged: Floats
-    """Array of the robot that receives the commands."""
+    """Array of the robot that the commands are copied to."""
     place: Columns
-    """Rows in `merged`."""
+    """Indices of the commands in `merged`."""
     goes_on: bool = True
-    """True if the command is also written while the joints are held."""
+    """True if commands are copied even while the joints are held."""
     held: float | None = None
-    """Value that is written while the joints are held; None: the last command stays."""
+    """Value written instead while the joints are held; None: the last command stays."""
 
 
 class Outputs:
@@ -189,11 +189,14 @@ class Outputs:
         self.commands = Commands(own[:sources].reshape(len(COMMAND_INTERFACES), count))
         self.source_commands: Floats = own[sources:]
         self.taken = b""
-        """Bytes of `own` at the last check."""
+        """Bytes of `own` when it was last checked."""
         self._parts: list[_Part] = []
         self._owner = plan.name
         self._names = [""] * own.size
-        """Name of each element: `shoulder/position`, `arm_pid/shoulder/position`, `light/led`."""
+        """Name of each command in `own`:
+
+        `shoulder/position`, `arm_pid/shoulder/position`, `light/led`; empty: not commanded.
+        """
         self._rows: NDArray[np.intp] | None = None if plan.into else rows
         """Rows of the commanded servos; None: the controller commands references."""
         self._clamped = record.clamped
@@ -229,17 +232,17 @@ class Outputs:
 
     @property
     def is_empty(self) -> bool:
-        """True if the controller has no command interface."""
+        """True if the controller has nothing to command."""
         return not self._parts
 
     def forget(self) -> None:
-        """Reset all commands to NaN, as before the first command."""
+        """Reset the controller's own commands to NaN, as before the first command."""
         self.own.fill(np.nan)
         self._seen.fill(False)
         self.taken = b""
 
     def check(self) -> None:
-        """Check the controller's commands. NaN is accepted until the first finite value.
+        """Check that the controller's commands are finite. NaN is accepted before the first finite value.
 
         Raises:
             ControllerFault: A command is infinite, or is NaN after a finite value.
@@ -260,12 +263,12 @@ class Outputs:
         self.taken = own.tobytes()
 
     def merge(self) -> None:
-        """Write the commands into the robot's arrays."""
+        """Copy the controller's commands into the robot's arrays."""
         for own, merged, place, _, _ in self._parts:
             merged[place] = own
 
     def hold(self) -> None:
-        """Write commands that hold the joints: positions stay unchanged, velocities become 0.
+        """Write commands into the robot's arrays that hold the joints: positions stay, velocities become 0.
 
         Efforts and PWM are still written because they carry the joints' load, and so are device commands.
         """
@@ -276,7 +279,7 @@ class Outputs:
                 merged[place] = held
 
     def withdraw(self) -> None:
-        """Replace the commands in the robot's arrays with NaN."""
+        """Set the controller's commands in the robot's arrays to NaN, "not commanded"."""
         for _, merged, place, _, _ in self._parts:
             merged[place] = np.nan
 

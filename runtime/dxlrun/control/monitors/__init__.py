@@ -14,6 +14,6 @@ from dxlrun.plan.loop_plan import LoopPlan
 
 
 def build_monitors(plan: LoopPlan, record: CycleRecord, actions: PolicyActions) -> tuple[Monitor, ...]:
-    """Return the monitors that apply to this robot, in the order in which a cycle calls them."""
+    """Return the monitors that apply to this robot, in the order in which each cycle calls them."""
     built = (stage.monitor.build(plan, record, actions) for _, stage in stages(MonitorStage, plan.features))
     return tuple(one for one in built if one is not None)

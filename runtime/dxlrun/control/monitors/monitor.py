@@ -1,4 +1,4 @@
-"""Monitor: interface of the loop's monitors."""
+"""Monitor: interface of the checks that features run in every cycle of the loop."""
 
 from __future__ import annotations
 
@@ -20,10 +20,10 @@ class Monitor(Protocol):
 
     @classmethod
     def build(cls, plan: LoopPlan, record: CycleRecord, actions: PolicyActions) -> Self | None:
-        """Return a monitor for this robot, or None if it does not apply."""
+        """Return a monitor for this robot, or None if the feature has nothing to check."""
 
     def check(self, time_ns: int) -> None:
-        """Check the states of this cycle. Called before commands and controllers, except while a run ends.
+        """Check the states of this cycle, and act on them. Called before commands and controllers.
 
         Args:
             time_ns: The controllers' time.
@@ -31,7 +31,7 @@ class Monitor(Protocol):
 
 
 class MonitorStage(msgspec.Struct, frozen=True):
-    """`STAGE` of `monitor.py`, used when a loop is built."""
+    """Monitor of a feature: the object `STAGE` of its `monitor.py`, used when a loop is built."""
 
     FILE: ClassVar[str] = "monitor"
 

@@ -1,4 +1,4 @@
-"""Policy actions: the actions of a policy on a running robot."""
+"""Policy actions: what monitors can do to a running robot when a policy requires it."""
 
 from __future__ import annotations
 
@@ -15,20 +15,25 @@ if TYPE_CHECKING:  # `check` shows the policies and needs nothing of the run
 
 
 class PolicyActions:
-    """Actions of a policy: end the run, disable torque, hold controllers, report."""
+    """Actions for monitors and steering: end the run, disable torque, hold controllers, report an event."""
 
     def __init__(self, context: ControlContext, manager: Manager, gate: Gate) -> None:
         self.policies: PolicyPlan = context.plan.policies
         self.ending: tuple[str, str] | None = None
-        """Policy that ends the run after this cycle, and the reason as text; None: the run continues."""
+        """Name of the policy that ends the run after this cycle, and the reason as text; None: the run
+        continues.
+        """
         self._context = context
         self._manager = manager
         self._gate = gate
         self._held: dict[int, Collection[int]] = {}
-        """Rows of the joints whose controllers are held, by the `id` of the monitor that holds them."""
+        """Rows of the joints whose controllers each monitor holds, by the monitor's `id`."""
 
     def end_run(self, policy: str, why: str) -> None:
-        """End the run after this cycle by a policy other than on_exit. Only the first call has an effect."""
+        """End the run after this cycle by the named policy, not on_exit.
+
+        Only the first call has an effect.
+        """
         if self.ending is None:
             self.ending = policy, f"{why}; {policy}: {self.policies.named(policy).text}"
 
@@ -38,7 +43,9 @@ class PolicyActions:
             self._context.hardware.switch_torque(row, False, _ignore_answer)
 
     def hold_controllers(self, holder: object, rows: Collection[int], until: str) -> None:
-        """Replace the joints that a monitor holds. Controllers that no monitor holds any more resume slowly.
+        """Hold the controllers of these joints only.
+
+        Controllers that no monitor holds any more resume slowly.
 
         Args:
             holder: The monitor. It can release only joints that it holds itself.
@@ -49,7 +56,7 @@ class PolicyActions:
         self._gate.ease_in(self._manager.hold_lost(frozenset().union(*self._held.values()), until))
 
     def report(self, event: EventBody, *, source: str = "loop") -> None:
-        """Report an action of a policy as an event."""
+        """Emit an event about an action of a policy."""
         self._context.events.emit(source, event)
 
 
