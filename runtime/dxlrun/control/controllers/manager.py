@@ -284,7 +284,7 @@ class Manager:
     def _pursue(self, command: ScheduledCommand) -> RunningGoal | None:
         """Return the goal that the runtime pursues with a command of the plan; None without one.
 
-        A command that starts such a goal creates it.
+        The goal is created if the command is the first for it.
         """
         name, planned = command.controller, command.goal
         managed = self._commandable(name) if planned is not None else None

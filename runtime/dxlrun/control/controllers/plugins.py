@@ -171,7 +171,7 @@ def _any_threads(name: str) -> None:
 
 
 class PlugIns(msgspec.Struct, frozen=True):
-    """All installed plug-ins: controllers and drivers that they offer, and the reasons why some are broken."""
+    """All installed plug-ins: controllers and drivers that they offer, and reasons why some are broken."""
 
     controllers: Mapping[str, Offer]
     """Offered controller classes by type name."""

@@ -300,9 +300,7 @@ class Switching:
             self._hardware.set_modes(modes)
 
     def _missing(self, entering: Iterable[Managed]) -> dict[str, tuple[Mode, Mode]]:
-        """Return required and current mode of each joint that is in a wrong mode for these controllers, by
-        name.
-        """
+        """Return required and current mode of each joint in a wrong mode for these controllers, by name."""
         claimed = claimed_modes(managed.plan for managed in entering)
         now = {joint: Mode(int(self._states.mode[self._rows[joint]])) for joint in claimed}
         return {joint: (mode, now[joint]) for joint, mode in claimed.items() if mode != now[joint]}
