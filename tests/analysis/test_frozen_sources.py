@@ -111,7 +111,7 @@ def test_one_value_that_stands_still_beside_others_is_named_alone() -> None:
     (finding,) = findings(still(3.0, 1), RESTS, kind="device")
     assert (finding.code, finding.rank) == ("frozen", Rank.CAUSE)
     assert "is frozen: y stayed the same to the bit for 3.0 s" in finding.sentence
-    assert "its other values went on" in finding.sentence
+    assert "its other values changed" in finding.sentence
 
 
 TWO_STEPS = np.where(TIME[:, None] < 3.0, np.random.default_rng(3).integers(12, 14, size=(600, 3)), 12.0)

@@ -271,8 +271,8 @@ def test_a_pipe_or_a_device_is_one_sentence_and_none_of_the_parts(four: Path, tm
     (tmp_path / "zero.mcap").symlink_to("/dev/zero")
     (tmp_path / "self.mcap").symlink_to("self.mcap")
     for name, sentence in (
-        ("pipe.mcap", "a pipe or a device, no file"),
-        ("zero.mcap", "a pipe or a device, no file"),
+        ("pipe.mcap", "a pipe or a device, not a file"),
+        ("zero.mcap", "a pipe or a device, not a file"),
         ("self.mcap", "cannot be read: "),
     ):
         with pytest.raises(LogError, match=rf"{name}: {sentence}"):

@@ -68,7 +68,7 @@ def test_a_stop_before_the_set_up_gives_no_torque(odd, all_limp):
     assert bytes((24, 1)) not in sent(run)
     assert b"\x83" not in sent(run)
     assert all_limp(run)
-    assert "given up on request" in " ".join(event.text for event in run.log().events)
+    assert "aborted on request" in " ".join(event.text for event in run.log().events)
 
 
 def test_an_interrupt_while_plug_ins_load_touches_no_servo_and_leaves_no_log(odd, tmp_path):
