@@ -1,4 +1,4 @@
-"""App: the application with its commands, and the reports of their errors."""
+"""App: the command-line application with its commands, and the messages for their errors."""
 
 from __future__ import annotations
 
@@ -34,12 +34,12 @@ if TYPE_CHECKING:
     from rich.console import Console, ConsoleOptions
 
 INTERRUPTED = 130
-"""128 + SIGINT, as in shells."""
+"""Exit code after Ctrl-C: 128 + SIGINT, as in shells."""
 
 _PIPED_HELP = 80
-"""Columns of the help in a pipe."""
+"""Width of the help, columns, when it is not printed to a terminal."""
 _BEHIND = 100
-"""Sort key of the groups after those of verbs."""
+"""Sort key of the groups that come after the groups of commands in the help."""
 _PARAMETERS = Group("Parameters", sort_key=_BEHIND + 1)
 HELP = """Run a robot of Dynamixel servos from one YAML file.
 
@@ -55,9 +55,9 @@ interrupted."""
 
 
 def build(verb: str = "", *, listed: bool = False) -> App:
-    """Return the application for a command line that begins with a `verb`.
+    """Return the application, with only those commands that a line beginning with `verb` needs.
 
-    `listed` imports all commands, for a list of them.
+    `listed`: import all commands, for a list of them.
     """
     app = App(
         name="dxlrun",
@@ -117,19 +117,19 @@ def install_completion(*, shell: Literal["bash", "zsh", "fish"] | None = None) -
 
 
 class _Help:
-    """Formatter that prints the help with the tables of all results."""
+    """Formatter that prints help with the same tables as results."""
 
     def __call__(self, console: Console, options: ConsoleOptions, panel: HelpPanel) -> None:
-        """Print the commands or the parameters of one group."""
+        """Print the commands or the options of one group as a table."""
         facts = ((" ".join(entry.display_labels_with_metavar), _about(entry)) for entry in panel.entries)
         show(Table.facts(str(panel.title), facts), console=out(_PIPED_HELP))
 
     def render_usage(self, console: Console, options: ConsoleOptions, usage: object) -> None:
-        """Print the usage of a command."""
+        """Print the usage line of a command."""
         show(str(usage) if str(usage).startswith("Usage") else f"Usage: {usage}")
 
     def render_description(self, console: Console, options: ConsoleOptions, description: object) -> None:
-        """Print the description of a command."""
+        """Print the description of a command, folded to the width."""
         show(_filled(description), console=out(_PIPED_HELP), folded=True)
 
 
@@ -140,7 +140,7 @@ def _about(entry: HelpEntry) -> str:
 
 
 def _filled(text: object) -> str:
-    """Return the text of a docstring without line breaks within paragraphs."""
+    """Return a docstring's text with each paragraph joined to one line."""
     plain = str(getattr(text, "primary_renderable", text) or "").strip()
     return re.sub(r"(?<!\n)\n(?!\n)", " ", plain)
 
@@ -153,7 +153,7 @@ def _version() -> str:
 
 
 def run_tokens(tokens: Sequence[str]) -> int:
-    """Run one command line and return its exit code; prints a traceback only with --debug."""
+    """Run one command line, print errors, and return the exit code; a traceback is printed only with --debug."""
     app = build(tokens[0] if tokens else "")
     try:
         _refuse_other_words(tokens)
@@ -186,7 +186,10 @@ def _refuse(
     problems: Sequence[Problem] = (),
     reason: Mapping[str, object] = MappingProxyType({}),
 ) -> None:
-    """Report the reasons of a refusal: in lines for a person, or with --json as JSON."""
+    """Print why a command failed: as lines on stderr, or as JSON with --json.
+
+    `problems` have places in files, `sentences` have none; `reason` is the code of a robot's refusal.
+    """
     if "--json" in tokens:
         errors = [one for one in problems if one.severity == "error"]
         warnings = [one for one in problems if one.severity == "warning"]
@@ -201,7 +204,7 @@ def _refuse(
 
 
 def _refuse_other_words(tokens: Sequence[str]) -> None:
-    """Raise InputError for a verb of another program, with the equivalent command line."""
+    """Raise InputError, with the right command line, when the first word is a command of another program."""
     word = tokens[0] if tokens else ""
     verb = verbs.verb_for(word)
     if verb is None or word in verbs.names() or Path(word).exists():
@@ -212,16 +215,16 @@ def _refuse_other_words(tokens: Sequence[str]) -> None:
 
 
 def _without_output(tokens: Sequence[str]) -> list[str]:
-    """Return a command line without output options, which a corrected one need not repeat."""
+    """Return the words of a command line without --json and --debug."""
     return [token for token in tokens if token not in ("--json", "--debug")]
 
 
 _OF_ROBOT = ("robot", "file", "config", "f")
-"""Options of other programs for the robot file, which is positional here."""
+"""Names that other programs give to their option for the robot file, which is positional here."""
 
 
 def _right_form(error: CycloptsError, tokens: Sequence[str]) -> str:
-    """Return the intended command line with the given values; empty when unknown."""
+    """Return the command line that was probably meant, with the given values; empty when it is not known."""
     verb = list(error.command_chain or ())
     given = _without_output(tokens[len(verb) :])
     if isinstance(error, UnknownOptionError):
@@ -243,7 +246,10 @@ def _right_form(error: CycloptsError, tokens: Sequence[str]) -> str:
 
 
 def _without_options(error: UnknownOptionError, verb: Sequence[str], given: Sequence[str]) -> str:
-    """Return a command line with values in place of unknown options; empty when their place is unknown."""
+    """Return a command line whose unknown options became positional values or `name:=value`.
+
+    Empty when the place of one is not known.
+    """
     known = error.argument_collection
     places = {place.name.lower() for place in known if place.field_info.is_positional}
     options = {name for each in known for name in each.names}
@@ -271,7 +277,7 @@ def _without_options(error: UnknownOptionError, verb: Sequence[str], given: Sequ
 
 
 def _declared(words: Sequence[str]) -> tuple[str, ...]:
-    """Return the arguments that the robot file declares; empty when it cannot be read."""
+    """Return the names of the arguments that the robot file among the words declares; empty without one."""
     # Imported here because only a wrong command line needs it.
     from dxlrun.description.including import read_sources
 
@@ -286,7 +292,7 @@ def _declared(words: Sequence[str]) -> tuple[str, ...]:
 
 
 def _usage_error(error: CycloptsError, tokens: Sequence[str]) -> str:
-    """Return the mistake of a command line with the corrected line or a hint to the usage."""
+    """Return a message for a wrong command line, with the corrected line or a hint to the usage."""
     usage = " ".join(("dxlrun", *(error.command_chain or ()), "--help"))
     what, fix = " ".join(str(error).split()).removesuffix("."), f"`{usage}` shows the usage"
     if isinstance(error, UnknownOptionError):
@@ -307,7 +313,7 @@ def _usage_error(error: CycloptsError, tokens: Sequence[str]) -> str:
 
 
 def _explained(error: Exception, tokens: Sequence[str]) -> tuple[tuple[str, ...], int]:
-    """Return an error without places in files, one sentence per problem, and the exit code."""
+    """Return an exception's messages, one per problem, and the exit code for it."""
     verb = tokens[0] if tokens else ""
     if isinstance(error, DxlrunError):
         return tuple(str(error).splitlines()) or (type(error).__name__,), error.exit_code

@@ -120,7 +120,10 @@ def _asked(packets: BusesLog, buses: Sequence[BusPlan], joints: Sequence[str]) -
 
 
 def _look(result: Compiled, packets: BusesLog) -> Found:
-    """Read the servos on real ports; raises InputError without a real port."""
+    """Read the servos on the robot's real ports and compare their registers with the file.
+
+    Raises InputError when all buses are simulated.
+    """
     from dxlrun.description.bus import SIMULATED
     from dxlrun.dynamixel.tools.inspection import look
 
@@ -145,7 +148,7 @@ def _as_json(result: Compiled, found: Found | None) -> dict[str, object]:
 
 
 def _verdict(result: Compiled) -> str:
-    """Return the result in one line."""
+    """Return the line that a valid file gets: numbers of joints, controllers and warnings, and the rate."""
     loop, warnings = result.plan.loop, len(result.warnings)
     active = sum(controller.active for controller in loop.controllers)
     joints = counted(len(loop.joints), "joint", "joints")
@@ -180,7 +183,7 @@ def _tables(result: Compiled) -> Iterator[Table]:
 
 
 def _named(kind: Kind, **keys: str) -> Iterator[tuple[Column, str]]:
-    """Yield columns with the keys of their values."""
+    """Yield a column for each heading in `keys`, with the key of its values in the rows."""
     return ((Column(name, kind), key) for name, key in keys.items())
 
 
@@ -254,7 +257,7 @@ def _joints(joints: Sequence[Row]) -> Table:
 
 
 def _servos(servos: Iterable[Row]) -> Table:
-    """Return the servos of joints with gears, linear joints and joints of several servos."""
+    """Return the table of all servos, for robots with gears, linear joints or several servos on a joint."""
     from dxlrun.compile.joints.limits import degrees
 
     def gear(row: Row) -> str:
@@ -313,7 +316,7 @@ def _buses(buses: Sequence[Row], rate: float) -> Table:
 
 
 def _compared(found: Found) -> str:
-    """Return a line with the numbers of compared servos and of differences."""
+    """Return the line after a comparison with the servos: numbers of servos and differences."""
     differing = sum(row.found not in (None, row.declared) for row in found.registers)
     count = differing + len(found.deviations) + len(found.remarks)
     differences = counted(count, "difference", "differences") if count else "no differences"
@@ -322,7 +325,7 @@ def _compared(found: Found) -> str:
 
 
 def _registers(registers: Sequence[RegisterRow]) -> Table:
-    """Return a table of declared registers and the values in the servos."""
+    """Return a table of the registers that the file declares, with the values found in the servos."""
     columns = [
         *(Column(name, "name") for name in ("joint", "item", "area")),
         *numbers("address", "declared"),
@@ -338,7 +341,7 @@ def _registers(registers: Sequence[RegisterRow]) -> Table:
 
 
 def _deviations(deviations: Sequence[DeviationRow]) -> Table:
-    """Return a table of settings that differ from the factory's, and that the file does not declare."""
+    """Return a table of undeclared registers whose value in a servo is not the factory's."""
     columns: Columns[DeviationRow] = [
         *_named("name", joint="joint", servo="servo", item="item", area="area"),
         *_named("number", address="address", found="found", factory="factory"),

@@ -1,4 +1,4 @@
-"""`dxlrun doctor`: a check whether this machine can run robots."""
+"""`dxlrun doctor`: check whether this machine can run robots, with a fix for each problem."""
 
 from __future__ import annotations
 
@@ -35,7 +35,7 @@ def doctor(*, as_json: JsonFlag = False, debug: DebugFlag = False) -> int:
 
 
 def _findings(findings: Sequence[Finding], missing: int) -> Iterator[Part]:
-    """Yield a table of everything that was checked, then the fixes, then the verdict."""
+    """Yield the output of `doctor`: a table of all checks, then the fixes, then the verdict."""
     from dxlrun.output.table import Cell, Column, Sentence, Table
 
     columns = (Column("", "name"), Column("", "name"), Column("", "text"))

@@ -1,4 +1,4 @@
-"""`dxlrun examples` and `dxlrun schema`: example robots, and JSON Schemas with which editors check files."""
+"""`dxlrun examples` and `dxlrun schema`: example robots, and JSON Schemas for editors."""
 
 from __future__ import annotations
 
@@ -22,24 +22,24 @@ if TYPE_CHECKING:
 
 _HERE = Path("robots")
 _SCHEMAS = ("robot.schema.json", "motions/motion.schema.json", "motors/motor.schema.json")
-"""Schemas to which the first line of each file refers, for editors."""
+"""Schemas to which the first lines of the example files refer, for editors."""
 
 
 @dataclass(frozen=True, slots=True)
 class Example:
-    """A robot that is part of dxlrun."""
+    """An example robot that comes with dxlrun, with the files it needs."""
 
     name: str
-    """Name of its file without suffix."""
+    """Name of the robot file without suffix."""
     servos: int
     motions: tuple[str, ...]
-    """Names of motion files for its controllers; first those that can be played at once."""
+    """Names of the motion files that fit the robot; those that can be played at once come first."""
     playable: int
     """Number of motions that can be played at once; the others need a controller that is inactive at the
     start."""
     about: str
     files: tuple[str, ...]
-    """All needed files, the robot file first, relative to the directory of the examples."""
+    """Paths of all files to copy, the robot file first, relative to the directory of the examples."""
 
 
 def examples(
@@ -131,7 +131,7 @@ def _example(path: Path) -> Example:
 
 
 def _fits(motion: MotionDescription, robot: Robot) -> bool:
-    """Return whether a robot has the controllers and joints of a motion."""
+    """Return True when a robot has all controllers and joints that a motion names."""
     from dxlrun.description.motion import FormulaPart
 
     joints: set[str] = set()
@@ -145,7 +145,7 @@ def _fits(motion: MotionDescription, robot: Robot) -> bool:
 
 
 def _about(text: str) -> str:
-    """Return the first sentence of the comment at the top of a robot file."""
+    """Return the first sentence of the comment at the top of a robot file, after the line for editors."""
     comment: list[str] = []
     # The first line is for editors.
     for line in text.splitlines()[1:]:
@@ -156,7 +156,10 @@ def _about(text: str) -> str:
 
 
 def _copy(source: Path, directory: Path, files: Sequence[str]) -> None:
-    """Copy files; raises InputError before any is written if another file has one of the names."""
+    """Copy files from `source` to `directory`; identical files are skipped.
+
+    Raises InputError, before any is written, when another file has one of the names.
+    """
     texts = {directory / file: (source / file).read_bytes() for file in files}
     missing = {path: text for path, text in texts.items() if not _holds(path, text)}
     taken = [path for path in missing if os.path.lexists(path)]
@@ -177,7 +180,7 @@ def _holds(path: Path, text: bytes) -> bool:
 
 
 _SCHEMA_MARK = '"$schema": "https://json-schema.org/'
-"""Text in each JSON Schema of dxlrun; other existing files are not replaced."""
+"""Text that is in each JSON Schema of dxlrun; an existing file without it is not overwritten."""
 
 
 def schema(
@@ -208,7 +211,10 @@ def schema(
 
 
 def schema_text(kind: Literal["robot", "motion", "motor", "fragment"], *, only: str = "") -> str:
-    """Return a schema as JSON; `only` restricts it to types of distributions whose names begin with it."""
+    """Return the JSON Schema of a kind of file, with the parameters of installed plug-ins, as JSON text.
+
+    `only`: restrict the plug-ins to distributions whose names begin with it.
+    """
     from dxlrun.description.json_schema import fragment_schema, motion_schema, motor_schema, robot_schema
 
     if kind == "motion":

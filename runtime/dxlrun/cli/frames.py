@@ -1,4 +1,4 @@
-"""`dxlrun frames ROBOT.yaml`: the tree of a robot's frames, and the pose of a frame."""
+"""`dxlrun frames ROBOT.yaml`: print the tree of the frames of a robot's URDF, or the pose of one frame."""
 
 from __future__ import annotations
 
@@ -108,7 +108,7 @@ def _show_tree(plan: Plan, tree: FrameTree, *, as_json: bool) -> None:
 
 
 def _lines(plan: Plan, tree: FrameTree, branches: _Branches) -> Iterator[str]:
-    """Yield one line per frame, the root first."""
+    """Yield the lines of the drawn tree, one per frame with its motion, the root first."""
     below: dict[str, list[Frame]] = {}
     for frame in tree.frames:
         below.setdefault(frame.parent, []).append(frame)
@@ -127,7 +127,7 @@ def _lines(plan: Plan, tree: FrameTree, branches: _Branches) -> Iterator[str]:
 
 
 def _what(plan: Plan, tree: FrameTree, frame: Frame) -> str:
-    """Return a description of the frame's motion."""
+    """Return what moves a frame: the IMU, its joint with axis and servo, or `fixed`; empty for the root."""
     joint = frame.joint
     if frame.moved_by == "imu":
         return f"turned by the orientation of {tree.imu}"
@@ -209,7 +209,10 @@ def _pose_lines(pose: Transform) -> Iterator[str]:
 
 
 def _positions(plan: Plan, tree: FrameTree, words: tuple[str, ...]) -> Mapping[str, float]:
-    """Return the positions, rad or m, of a pose `elbow=30deg right_arm=0deg`. Raises InputError."""
+    """Return the positions by joint, rad or m, of the words of `--at`, such as `elbow=30deg right_arm=0deg`.
+
+    Raises InputError.
+    """
     from dxlrun.description import units
 
     kinds = {frame.joint.name: frame.joint.type for frame in tree.frames if frame.joint is not None}

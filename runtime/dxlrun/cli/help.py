@@ -1,4 +1,7 @@
-"""`dxlrun --help`: a stored text, because making it would import every command; a test compares both."""
+"""Help: prints the stored text of `dxlrun --help`, because making it would import every command.
+
+A test compares the stored text with the commands.
+"""
 
 from __future__ import annotations
 
@@ -18,11 +21,11 @@ _COLUMNS = 80
 _EVERY_DAY = "Every day"
 _MORE = "`dxlrun --help` lists all commands, `dxlrun help COMMAND` shows one with examples."
 _BEHIND = "Arguments"
-"""First heading after those of verbs."""
+"""First heading of the help after the groups of commands."""
 
 
 def print_help() -> None:
-    """Print the help, including the verbs of packages that are not part of dxlrun."""
+    """Print the stored help, with the commands of other installed packages added."""
     text = TEXT.read_text("utf-8")
     publishers = {distribution_name(each.publisher) for each in installed_plugins()}
     # Only then import the code of packages.
@@ -36,7 +39,7 @@ def print_help() -> None:
 
 
 def print_short_help() -> None:
-    """Print the usage and the commands of every day."""
+    """Print the usage and the commands of the group `Every day`."""
     parts = TEXT.read_text("utf-8").split("\n\n")
     (commands,) = (part for part in parts if part.startswith(f"{_EVERY_DAY}\n"))
     lines = [line for line in commands.splitlines() if not line.startswith("help ")]
@@ -44,7 +47,7 @@ def print_short_help() -> None:
 
 
 def _with_verb(text: str, command: Command) -> str:
-    """Return the help with an added verb, at the end of its group or in a new group."""
+    """Return the help text with a package's command added, at the end of its group or in a new group."""
     parts = text.split("\n\n")
     headings = [part.partition("\n")[0] for part in parts]
     if command.group not in headings:
@@ -60,12 +63,12 @@ def _with_verb(text: str, command: Command) -> str:
 
 
 def in_list(about: str) -> str:
-    """Return the entry of a verb in a list: its summary up to a colon or a semicolon."""
+    """Return the entry of a command in a list: its summary up to the first colon or semicolon."""
     return " ".join(re.split("[:;]", about)[0].split()).removesuffix(".") + "."
 
 
 def version() -> str:
-    """Return the version of dxlrun, and whether its compiled parts can be used."""
+    """Return the version of dxlrun, followed by whether its compiled parts can be used."""
     from importlib import metadata  # not above: only --version needs it
 
     from dxlrun.channels.compiled import missing

@@ -1,4 +1,4 @@
-"""Inputs: common parts of the commands: names, shared options, and a robot file with its arguments."""
+"""Inputs: parts that the commands share: options, reading of words and files, compiling a robot file."""
 
 from __future__ import annotations
 
@@ -23,16 +23,16 @@ if TYPE_CHECKING:
     from dxlwire.packets import PacketSink
 
 Flag = Annotated[bool, Parameter(negative=(), show_default=False)]
-"""An option without a value."""
+"""Type of an option without a value, such as `--json`; it has no `--no-` form."""
 JsonOfItsOwn = Annotated[Flag, Parameter(name="--json")]
 JsonFlag = Annotated[JsonOfItsOwn, Parameter(help="Print the result as JSON.")]
-"""`--json`; `JsonOfItsOwn` is for verbs that describe the option in their docstring."""
+"""Option `--json`; commands that describe it in their docstring use `JsonOfItsOwn`."""
 DebugFlag = Annotated[Flag, Parameter(help="Print the traceback of an error.")]
-"""`--debug`."""
+"""Option `--debug` of all commands."""
 
 
 def _switch(name: str) -> Parameter:
-    """Return an option with both forms, `--wait` and `--no-wait`; the help shows the default."""
+    """Return the declaration of an option `--name` / `--no-name`; the help shows the default form."""
     return Parameter(
         name=f"--{name}",
         negative=f"--no-{name}",
@@ -48,20 +48,20 @@ PageFlag = Annotated[bool, _switch("page")]
 GraphFile = Annotated[
     tuple[Path, ...] | None, Parameter(negative=(), show_default=False, consume_multiple=(0, 1))
 ]
-"""`--graph`, with or without a file."""
+"""Option `--graph`; without a file it is an empty tuple, and None when it is not given."""
 RobotPath = Annotated[Path, Parameter(help="Robot file.")]
 RobotName = Annotated[str | None, Parameter(help="Name of the robot, if several run.")]
 Motions = Annotated[tuple[Path, ...], Parameter(negative=(), show_default=False)]
-"""Motion files; the option may be given several times."""
+"""Motion files; the option can be given several times."""
 AssignmentOfItsOwn = Annotated[str, Parameter(name="arg:=value")]
 Assignment = Annotated[
     AssignmentOfItsOwn, Parameter(help="Arguments of the robot file, for example port:=/dev/ttyUSB0.")
 ]
-"""An argument of the robot file."""
+"""An argument of the robot file on the command line, `name:=value`."""
 
 
 def _of(quantity: str) -> Parameter:
-    """Return the parser of an option: a quantity of `description.units`, or a number in its SI unit."""
+    """Return an option's parser for a quantity of `description.units` by name; a number without unit is SI."""
 
     def read(_: object, tokens: Sequence[Token]) -> float:
         # Imported here because help and completion need no pydantic.
@@ -78,14 +78,14 @@ def _of(quantity: str) -> Parameter:
 
 
 Seconds = Annotated[float, _of("seconds")]
-"""A time, s: `3`, `3s` or `500ms`."""
+"""A time on the command line, s: `3`, `3s` or `500ms`."""
 Hertz = Annotated[float, _of("rate")]
-"""A rate, Hz: `50`, `50Hz` or `1kHz`."""
+"""A rate on the command line, Hz: `50`, `50Hz` or `1kHz`."""
 
 REPORT_MARK = '<script type="application/json" id="report">'
-"""Text in each report of `output.html`; other existing files are not replaced."""
+"""Text that is in each report of `output.html`; an existing file without it is not overwritten."""
 SHORTEST_S, LONGEST_S = 1e-6, 1e9
-"""Limits of the duration of a run, s; 31 years still fit into the log's nanoseconds."""
+"""Limits of `--duration`, s; 31 years still fit into the log's nanoseconds."""
 
 
 def compiled(
@@ -95,7 +95,12 @@ def compiled(
     duration: float | None,
     ask: Ask | None = None,
 ) -> Compiled:
-    """Read and compile a robot file; raises InputError with all mistakes of file and command line."""
+    """Read and compile a robot file with arguments and motion files; `duration` is that of the run, s.
+
+    `ask`: function that reads the models of joints with `model: auto` from their servos. Raises InputError
+    with
+    all mistakes of files and command line.
+    """
     known_file(robot)
     arguments = parse_assignments(assignments)
     duration_ns = None
@@ -116,7 +121,7 @@ def compiled(
 def read_models(
     buses: Sequence[BusPlan], joints: Sequence[str], packets: Mapping[str, PacketSink] | None = None
 ) -> Mapping[str, str]:
-    """Return the models of joints with `model: auto`.
+    """Return joint -> model as read from the servos, for joints with `model: auto`; `packets` logs each bus.
 
     The module is imported here because most robots have no such joints.
     """
@@ -126,7 +131,9 @@ def read_models(
 
 
 def parse_assignments(assignments: Sequence[str]) -> dict[str, str]:
-    """Return the arguments from `name:=value` words; raises InputError for any other word."""
+    """Return the robot file's arguments by name from words `name:=value`; raises InputError for any other
+    word.
+    """
     arguments: dict[str, str] = {}
     if len(assignments) == 3 and assignments[1] in ("=", ":=", ":"):
         # The argument was written with spaces; the sign is checked below.
@@ -142,7 +149,7 @@ def parse_assignments(assignments: Sequence[str]) -> dict[str, str]:
 
 
 def _assignment_for(word: str) -> str:
-    """Return the correct form of a word that was meant as an argument of the robot file, or as an option."""
+    """Return a suggestion for a word that is not `name:=value`: that form, or `--play` for a YAML file."""
     if word.endswith((".yaml", ".yml")):
         return f"--play {word.removeprefix('play=').removeprefix('play:')}"
     match = re.fullmatch(r"([A-Za-z_]\w*)\s*[=:]\s*(.*)", word, re.DOTALL)
@@ -150,7 +157,7 @@ def _assignment_for(word: str) -> str:
 
 
 def parse_size(option: str, text: str) -> int:
-    """Return the bytes of a size such as `10GB`; raises InputError with the name of the option."""
+    """Return a size such as `10GB` in bytes; raises InputError that names the option."""
     # Imported here for the same reason as in `_of`.
     from dxlrun.description.units import size
 
@@ -161,7 +168,7 @@ def parse_size(option: str, text: str) -> int:
 
 
 def parse_pair(word: str, example: str) -> tuple[str, str]:
-    """Return key and value of a word `key=value`. Raises InputError with an example for any other word."""
+    """Return key and value of a word `key=value`; raises InputError, with `example`, for any other word."""
     key, sign, value = (part.strip() for part in word.partition("="))
     if not sign or not value or not all(part.isidentifier() for part in key.split(".")):
         raise InputError(f"{word!r} is not key=value; write for example {example}")
@@ -169,13 +176,15 @@ def parse_pair(word: str, example: str) -> tuple[str, str]:
 
 
 def pose_text(positions: Mapping[str, str]) -> str:
-    """Return positions by joint in the form of `send` and `frames --at`: `elbow=20.0deg jaw=5.00mm`."""
+    """Return positions by joint as one line, as `send` and `frames --at` read them: `elbow=20.0deg
+    jaw=5.00mm`.
+    """
     return " ".join(f"{name}={position.replace(' ', '')}" for name, position in positions.items())
 
 
 @contextmanager
 def terminated_as_interrupted() -> Iterator[None]:
-    """Handle SIGTERM like Ctrl-C, so that the results of a measurement are kept and shown."""
+    """Within the block, handle SIGTERM like Ctrl-C, so that the results of a measurement are kept and shown."""
     before = signal.signal(signal.SIGTERM, signal.default_int_handler)
     try:
         yield
@@ -184,9 +193,9 @@ def terminated_as_interrupted() -> Iterator[None]:
 
 
 def check_report(target: Path, library: str = "matplotlib") -> None:
-    """Raise InputError for an unusable file of a report, before a measurement begins.
+    """Raise InputError, before a measurement begins, when its HTML report could not be written.
 
-    `library`: library that draws the plots.
+    `library`: Python library that draws the plots and must be installed.
     """
     if target.suffix.lower() not in {".html", ".htm"}:
         raise InputError(f"a report is an HTML file, so its name ends in .html, not as {target} does")
@@ -196,12 +205,12 @@ def check_report(target: Path, library: str = "matplotlib") -> None:
 
 
 def write_report(target: Path, page: str) -> None:
-    """Write a report, possibly in place of an older one. Raises InputError on failure."""
+    """Write a report as an HTML file; only an older report is overwritten. Raises InputError on failure."""
     write_target(target, page, REPORT_MARK)
 
 
 def known_file(robot: Path) -> None:
-    """Raise InputError, with a helpful sentence, for a word that is neither a command nor a file."""
+    """Raise InputError with a suggestion when a word is not an existing robot file."""
     if robot.is_file():
         return
     word = str(robot)
@@ -225,14 +234,17 @@ def known_file(robot: Path) -> None:
 
 
 def _other_file(robot: Path) -> str:
-    """Return a suggestion for the name of a missing robot file."""
+    """Return a suggestion for the name of a missing robot file, from the files in its directory."""
     beside = [path.name for path in robot.parent.glob("*.y*ml")] if robot.parent.is_dir() else []
     copies = f"`dxlrun examples {robot.stem}` copies the robot of this name"
     return suggestion(robot.name, beside, copies if is_example(robot.stem) else "check the path")
 
 
 def examples_directory() -> Path:
-    """Return the directory of the examples: in the installed package, or in an editable clone."""
+    """Return the directory of the example robots, in the installed package or in an editable clone.
+
+    Raises DxlrunError when it is missing.
+    """
     package = Path(__file__).parents[1]
     for place in (package / "examples", package.parents[1] / "robots"):
         if place.is_dir():
@@ -241,5 +253,5 @@ def examples_directory() -> Path:
 
 
 def is_example(name: str) -> bool:
-    """Return whether an example of this name exists."""
+    """Return True when dxlrun has an example robot of this name."""
     return (examples_directory() / f"{name}.yaml").is_file()

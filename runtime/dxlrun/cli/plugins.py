@@ -1,4 +1,4 @@
-"""`dxlrun plugins` and `dxlrun new-plugin`: a list of packages that extend dxlrun, and a template of one."""
+"""`dxlrun plugins` and `dxlrun new-plugin`: list the plug-ins of dxlrun, and create one from a template."""
 
 from __future__ import annotations
 
@@ -29,10 +29,10 @@ _TEMPLATE = "easing"
 _LEFT_OUT = ("LICENSE",)
 _NOT_COPIED = ("__pycache__", ".pytest_cache", "logs", "dist", "build")
 _OWNED = re.compile(r"^(license|license-files|authors) = .*\n", re.MULTILINE)
-"""Lines of pyproject.toml that the author must write."""
+"""Lines of the template's pyproject.toml that are removed: the author of a new package writes their own."""
 _LICENCE = re.compile(r"\n## Licence\n.*", re.DOTALL)
 Row = dict[str, Any]
-"""Row of the JSON result."""
+"""Row of `plugins --json`: one plug-in."""
 
 
 def plugins(*, as_json: JsonFlag = False, debug: DebugFlag = False) -> int:
@@ -53,7 +53,9 @@ def plugins(*, as_json: JsonFlag = False, debug: DebugFlag = False) -> int:
 
 
 def _row(name: str, distribution: str = "", contract: int | None = None, *, broken: str) -> Row:
-    """Return the row of a plug-in without offers; `broken`: reason why it cannot be used, empty if it can."""
+    """Return the row of a plug-in that offers nothing; `broken`: reason why it cannot be used, empty if it
+    can.
+    """
     about = {"name": name, "distribution": distribution, "contract": contract}
     offers = {"controllers": (), "servo_models": (), "overrun": False, **_drivers(), "verbs": ()}
     return about | offers | {"broken": broken}
@@ -79,7 +81,7 @@ def _shown(plugin: LoadedPlugIn, found: PlugIns) -> Row:
 
 
 def _offer_stages() -> Iterator[tuple[Feature, OfferStage]]:
-    """Yield the features for which plug-ins provide classes."""
+    """Yield the features for which plug-ins can provide drivers, each with its stage that describes them."""
     # Imported here because `--help` loads no pydantic.
     from dxlrun.control.controllers.offers import OfferStage
     from dxlrun.features import FEATURES, stages
@@ -116,7 +118,9 @@ def _live(model: type[BaseModel], prefix: str = "") -> Iterator[str]:
 
 
 def _references(offer: Offer) -> tuple[str, ...]:
-    """Return the references of a controller on one joint with default parameters, if there are any."""
+    """Return the references (inputs) that a controller has on one joint with default parameters; empty on
+    failure.
+    """
     try:
         # A model of foreign code, whose fields are unknown.
         given: dict[str, Any] = {"joints": ("joint",)}
@@ -139,7 +143,9 @@ _OFFERS: Columns[Row] = [
 
 
 def _table(row: Row) -> Table:
-    """Return a table with a line for each offer of a plug-in."""
+    """Return the table of a plug-in, with a line for each controller, driver, servo model and command it
+    offers.
+    """
     others = [
         *(f"{stage.kind} {one['type']}" for feature, stage in _offer_stages() for one in row[feature.name]),
         *(f"servo model {name}" for name in row["servo_models"]),
@@ -184,7 +190,7 @@ def new_plugin(
 
 
 def _module(name: str) -> str:
-    """Return the module name of a package; raises InputError for an invalid one."""
+    """Return the module name for a new package's name; raises InputError if it is invalid or already taken."""
     module = name.replace("-", "_")
     if not _NAME.fullmatch(name) or len(name) > _LONGEST_NAME:
         raise InputError(
@@ -204,7 +210,10 @@ def _known(module: str) -> bool:
 
 
 def _template() -> Path:
-    """Return the directory of the template: in the installed package, or in an editable clone."""
+    """Return the directory of the template plug-in, in the installed package or in an editable clone.
+
+    Raises DxlrunError when it is missing.
+    """
     package = Path(__file__).parents[1]
     for place in (package / "plugin_template", package.parents[1] / "plugins" / "example"):
         if place.is_dir():
@@ -213,7 +222,7 @@ def _template() -> Path:
 
 
 def _files(template: Path, module: str) -> Iterator[tuple[Path, str]]:
-    """Yield paths and texts of a package: those of the template with new names."""
+    """Yield path and text of each file of a new package: those of the template, renamed for `module`."""
     renamed: Mapping[str, str] = {
         f"dxlrun_{_TEMPLATE}": module,
         f"dxlrun-{_TEMPLATE}": module.replace("_", "-"),

@@ -1,4 +1,4 @@
-"""`dxlrun ROBOT.yaml` and `dxlrun demo`: run a robot."""
+"""`dxlrun ROBOT.yaml` and `dxlrun demo`: run a robot, and print the result."""
 
 from __future__ import annotations
 
@@ -36,7 +36,7 @@ if TYPE_CHECKING:
 
 
 DEMO = ("bioloid_torso.yaml", "motions/three_parts.yaml")
-"""Robot and motion of `dxlrun demo`, in the directory of the examples."""
+"""Robot file and motion file of `dxlrun demo`, in the directory of the examples."""
 # On a busy machine, a run takes some seconds until it can be steered.
 _START_S = 60.0
 _POLL_S = 0.1
@@ -45,7 +45,7 @@ _SHOW_PAGE = (
 )
 _WORDS = {0: "done", 130: "interrupted"}
 _MOST_DELETED = 5
-"""Upper limit of deleted logs that are listed individually."""
+"""Upper limit of the deleted logs that are listed one by one; above it, one line has their number."""
 
 
 @unblocked()
@@ -159,7 +159,7 @@ def demo(*, page: PageFlag = True, virtual: Flag = False, debug: DebugFlag = Fal
 
 @contextmanager
 def _page_beside(*, shown: bool) -> Iterator[None]:
-    """Serve the page of the next run from another process while the block runs."""
+    """Start `dxlrun view` in another process, which shows the next robot that starts, until the block ends."""
     from dxlrun.cli.verbs import packaged
 
     if not shown:
@@ -183,7 +183,9 @@ def _page_beside(*, shown: bool) -> Iterator[None]:
 
 
 def await_robot(others: Collection[str]) -> str:
-    """Wait for a robot other than `others` to start and return its name; exit with 1 when none does."""
+    """Return the name of the first robot that starts and is not in `others`; exit with 1 when none does in 60
+    s.
+    """
     from dxlrun.remote.sockets import running
 
     for _ in range(round(_START_S / _POLL_S)):
@@ -194,7 +196,7 @@ def await_robot(others: Collection[str]) -> str:
 
 
 def _check_listen(text: str, plan: Plan, *, served: bool) -> None:
-    """Raise InputError when clients of other computers could not be served."""
+    """Raise InputError when `--listen` cannot work: no gateway, no valid certificate, or a port in use."""
     from dxlrun.remote.network.listener import Listener
     from dxlrun.remote.sockets import Address
 
@@ -208,7 +210,7 @@ def _check_listen(text: str, plan: Plan, *, served: bool) -> None:
 
 
 def show_summary(summary: RunSummary, plan: Plan, console: Console) -> int:
-    """Print the result of a run: failures and refused grants to stderr, the rest to stdout.
+    """Print the result of a run: failures to stderr, verdict, log and hints to stdout.
 
     Return the exit code; it is 1 also when the verdict is bad.
     """
@@ -241,7 +243,10 @@ def _log_line(log: Path, messages: int) -> str:
 
 
 def _disk_lines(log: Path, recording: RecordingPlan) -> list[str]:
-    """Delete the oldest logs if the robot file says so; return lines about deleted logs or the total size."""
+    """Delete the oldest logs beyond `recording.keep`, and return lines about them.
+
+    Without that entry nothing is deleted; a line reports the total size when it is large.
+    """
     from rich.filesize import decimal
 
     from dxlrun.log.stored import MUCH_BYTES, oldest_beyond, stored_logs

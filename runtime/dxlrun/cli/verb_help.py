@@ -11,7 +11,7 @@ from dxlrun.errors import InputError
 from dxlrun.output.terminal import show
 
 EXAMPLES = Path(__file__).with_name("examples.txt")
-"""Example command lines; a test parses them."""
+"""File with example command lines, one a line; a test parses them."""
 
 
 def show_help(*verb: str) -> int:

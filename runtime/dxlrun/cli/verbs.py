@@ -1,4 +1,4 @@
-"""Verbs: the verbs of the command line, from the core and from installed packages."""
+"""Verbs: the names of all commands (verbs), from the core and from installed packages."""
 
 from __future__ import annotations
 
@@ -70,7 +70,7 @@ _PACKAGES = {
     "dxlrun_teleop": ("teleop",),
     "dxlrun_view": ("view",),
 }
-"""Verbs of this repository's packages, to name the package when it is not installed."""
+"""Package of this repository -> its verbs, to name the package when it is not installed."""
 
 
 _OTHER_WORDS = {
@@ -90,11 +90,11 @@ _OTHER_WORDS = {
     "examples": "init new",
     "teach": "record",
 }
-"""Words of other programs by the equivalent verb; the empty verb is `dxlrun ROBOT.yaml`."""
+"""Verb -> words that other programs use for it; the empty verb is `dxlrun ROBOT.yaml`."""
 
 
 def verb_for(word: str) -> str | None:
-    """Return the verb, or the beginning of a command line, for a word of other programs."""
+    """Return the verb, or the verb with its first argument, for a word of another program; None if unknown."""
     return next((verb for verb, words in _OTHER_WORDS.items() if word in words.split()), None)
 
 
@@ -106,16 +106,16 @@ RENAMED: Mapping[str, Mapping[str, str]] = {
     "teach": {"--speed": "--velocity"},
     "view": {"--port": "--listen :PORT"},
 }
-"""New names of renamed options, by verb and old option."""
+"""Verb -> old name of an option -> its new name."""
 
 
 def is_verb(word: str) -> bool:
-    """Return whether a word can be a verb, rather than the path of a robot file."""
+    """Return True when a word has the form of a verb and is not a path; the verb may be unknown."""
     return re.fullmatch(r"[a-z][a-z0-9-]*", word) is not None
 
 
 def packaged() -> Mapping[str, Command]:
-    """Return the verbs of installed packages; verbs of the core take precedence.
+    """Return the commands of installed packages by verb, without verbs that the core has.
 
     A package that fails adds none: `dxlrun plugins` reports the reason.
     """
@@ -135,7 +135,7 @@ def _packaged(plugins: tuple[InstalledPlugin, ...]) -> Mapping[str, Command]:
 
 
 def is_importable(command: Command) -> bool:
-    """Return whether the code of a verb can be imported; foreign code may be broken."""
+    """Return True when the module of a package's command can be imported; foreign code may be broken."""
     try:
         import_module(command.place.partition(":")[0])
     # Foreign code may raise any exception on import.
@@ -145,15 +145,15 @@ def is_importable(command: Command) -> bool:
 
 
 def names() -> list[str]:
-    """Return all verbs in alphabetical order."""
+    """Return the verbs of core and installed packages in alphabetical order."""
     return sorted({*chain(*GROUPS.values()), *packaged()})
 
 
 def package_of(verb: str) -> str:
-    """Return the package of this repository that has a verb; empty without one."""
+    """Return the name of this repository's package that has a verb; empty for other verbs."""
     return next((package for package, verbs in _PACKAGES.items() if verb in verbs), "")
 
 
 def source_of(package: str) -> str:
-    """Return the folder from which pip installs a package of this repository: the core's or its own."""
+    """Return the folder of the repository from which pip installs one of its packages."""
     return "./plugins/dxlrun_view" if package == "dxlrun_view" else "."

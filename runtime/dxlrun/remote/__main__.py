@@ -6,11 +6,13 @@ import os
 from contextlib import suppress
 
 NICENESS = 10
-"""nice(2) value. Loop, guardian and recorder take precedence over a busy gateway."""
+"""nice(2) value of the gateway's process: loop, guardian and recorder take precedence."""
 
 
 def main() -> None:
-    """Lower the priority before the imports, which are most of the gateway's work in a short run."""
+    """Lower the process's priority, then import and run the server: imports are most of its work in a short
+    run.
+    """
     with suppress(OSError):
         os.nice(NICENESS)
     from dxlrun.remote.server import main as serve_run

@@ -1,4 +1,4 @@
-"""Asked: a received request with its validated body and query, and the rate limit of each client process."""
+"""Asked: a received HTTP request with its validated body and query, and the rate limit of each client."""
 
 from __future__ import annotations
 
@@ -20,13 +20,14 @@ from dxlrun.remote.requests.table import EXAMPLES, Answer, Body, Request, Role
 from dxlrun.remote.sockets import MOST_BYTES
 
 MOST_PEERS = 256
-"""Upper limit of clients whose token bucket is stored; the least recently used bucket is dropped."""
+"""Upper limit of the clients whose rate limit is tracked; the one that was silent longest is dropped."""
 CHARGED_BYTES = 16_384
-"""Body size that costs one additional token of the rate limit."""
+"""Size of a body, bytes, that costs a token of the rate limit; smaller bodies cost only that of the request.
+"""
 BODY_S = 10.0
-"""Timeout for receiving a body."""
+"""Timeout for receiving the whole body of a request, s."""
 LONGEST_WAIT_S = 5.0
-"""Longest wait for the end of a goal in one request; a client that waits longer repeats the request."""
+"""Longest wait, s, for the end of a goal in one request; a client repeats the request to wait longer."""
 # Characters; a client chooses its name freely, so it must not fill the log.
 LONGEST_ORIGIN = 64
 
@@ -39,11 +40,13 @@ class Asked(Generic[Body]):
     body: Body
 
     def part(self, name: str = "name") -> str:
-        """Return a path parameter."""
+        """Return a parameter of the path, by default `name`."""
         return str(self.http.path_params[name])
 
     def number(self, name: str, default: float) -> float:
-        """Return a finite number of the query; raises RefusedRequest."""
+        """Return a number of the query, or `default` when it is not given; raises RefusedRequest if it is not
+        finite.
+        """
         text = self.http.query_params.get(name)
         try:
             value = default if text is None else float(text)
@@ -55,7 +58,9 @@ class Asked(Generic[Body]):
 
     @property
     def wait_s(self) -> float:
-        """Time that the client waits, s; raises RefusedRequest outside 0 to LONGEST_WAIT_S."""
+        """Time, s, that the client is willing to wait for the reply; raises RefusedRequest outside 0 to
+        LONGEST_WAIT_S.
+        """
         wait = self.number("wait", 0.0)
         if not 0 <= wait <= LONGEST_WAIT_S:
             raise invalid(texts.wait_out_of_range(wait, LONGEST_WAIT_S))
@@ -63,7 +68,7 @@ class Asked(Generic[Body]):
 
     @property
     def goal(self) -> int:
-        """Goal number in the path; raises RefusedRequest."""
+        """Number of the goal in the path; raises RefusedRequest."""
         text = self.part("number")
         if not (text.isdecimal() and text.isascii() and len(text) < 16):
             raise invalid(texts.not_a_goal_number(text))
@@ -71,7 +76,9 @@ class Asked(Generic[Body]):
 
     @property
     def origin(self) -> str:
-        """Client name for the log: printable, at most 64 characters; default: the client's process."""
+        """Name of the client for the log: its own choice, after the name in its certificate; by default its
+        process.
+        """
         given = self.http.headers.get("x-dxlrun-client", "").encode("latin-1", "replace")
         name = "".join(filter(str.isprintable, given.decode(errors="replace")))[:LONGEST_ORIGIN]
         client = client_of(self.http)
@@ -82,30 +89,32 @@ class Asked(Generic[Body]):
 
 
 def client_of(http: starlette.requests.Request) -> Client:
-    """Return the client of a request's connection."""
+    """Return the client that made a request: name and role."""
     return Client(http.client.host, Role(http.client.port)) if http.client else Client("", Role.OBSERVE)
 
 
 def peer(http: starlette.requests.Request) -> str:
-    """Return the client's process, as reported by Linux, or the name in its certificate."""
+    """Return the client's name, which counts for rate limits: process ID, or name in its certificate."""
     return client_of(http).name
 
 
 @dataclass(slots=True)
 class Allowance:
-    """Rate limit of each client process (token bucket with a capacity of 0.1 s).
+    """Rate limit of each client: a token bucket that is filled at `rate` and holds the tokens of 0.1 s.
 
     A long body costs additional tokens, because reading and checking it delays other clients.
     """
 
     rate: float
     now: Callable[[], float]
-    """Clock, s."""
+    """Clock with the current time, s."""
     _left: dict[str, tuple[float, float]] = field(default_factory=dict, init=False)
-    """Peer -> (remaining tokens, time of the last update)."""
+    """Client name -> (remaining tokens, time of the last update in s)."""
 
     def spend(self, peer: str, count: int = 1, least: int = 1) -> None:
-        """Spend `count` tokens. Raises RefusedRequest when fewer than `least` tokens remain."""
+        """Take `count` tokens from a client's bucket, or raise RefusedRequest when it holds fewer than
+        `least`.
+        """
         now, most = self.now(), self.rate / 10
         left, since = self._left.pop(peer, (most, now))
         left = min(most, left + (now - since) * self.rate)
@@ -119,7 +128,10 @@ class Allowance:
 async def received(
     request: Request[Body, Answer], http: starlette.requests.Request, allowance: Allowance | None
 ) -> Asked[Body]:
-    """Read, charge and decode the body of a request; raises RefusedRequest."""
+    """Read and decode the body of a request; a long one costs tokens of `allowance`.
+
+    Raises RefusedRequest.
+    """
     if request.body is NoneType:
         return Asked(http, cast("Body", None))
     content = await _content(http, allowance)
@@ -132,7 +144,7 @@ async def received(
 
 
 async def _content(http: starlette.requests.Request, allowance: Allowance | None) -> bytes:
-    """Read a body; raises RefusedRequest before more than MOST_BYTES are in memory."""
+    """Return a request's body; raises RefusedRequest above MOST_BYTES, or after BODY_S."""
     announced = http.headers.get("content-length", "0")
     if not announced.isdecimal() or len(announced) > 18 or int(announced) > MOST_BYTES:
         raise refused(Code.TOO_LONG, {"size": announced[:20], "most": MOST_BYTES})

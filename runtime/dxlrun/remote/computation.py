@@ -20,11 +20,11 @@ _CHUNK = 1 << 16
 
 
 async def computed(work: Callable[[], bytes], seconds: float) -> bytes | None:
-    """Return the result of `work`, computed in a forked process.
+    """Return the bytes that `work` returns, computed in a forked process.
 
     Args:
         work: Function without side effects on this process.
-        seconds: Timeout, s.
+        seconds: Timeout, s, after which the forked process is killed.
 
     Returns:
         None when `work` takes longer than the timeout, or raises.
@@ -63,7 +63,7 @@ async def computed(work: Callable[[], bytes], seconds: float) -> bytes | None:
 
 
 def _compute(work: Callable[[], bytes], writing: int) -> None:
-    """Run `work` in the copy, write its result and exit; this never returns to the gateway's own code."""
+    """Run `work` in the forked process, write its result to the pipe and exit; never returns."""
     code = 1
     with suppress(BaseException):
         ctypes.CDLL(None).prctl(PR_SET_PDEATHSIG, signal.SIGKILL)

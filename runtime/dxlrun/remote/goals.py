@@ -1,4 +1,4 @@
-"""Goals: the gateway's list of running goals and the last ended goals, built from the loop's reports."""
+"""Goals: the gateway's record of running and ended goals, built from the loop's events and messages."""
 
 from __future__ import annotations
 
@@ -17,29 +17,31 @@ from dxlrun.remote.preparation import refused
 from dxlrun.remote.requests.replies import GoalState
 
 KEPT_GOALS = 100
-"""Number of ended goals that are stored for clients."""
+"""Number of ended goals that clients can query; older ones are dropped."""
 LOST = "its result did not reach the gateway; the log has it"
-"""Text of a goal whose end is inferred from later reports."""
+"""Final text of a goal whose result was lost between loop and gateway, so its end is inferred."""
 
 
 @dataclass(slots=True)
 class GoalBook:
-    """Running and ended goals that clients can query. Used from one asyncio loop only."""
+    """Record of the running goals and the last ended goals. Used from one asyncio loop only."""
 
     last: int = 0
-    """Number of the newest goal."""
+    """Highest goal number so far."""
     running: dict[int, GoalState] = field(default_factory=dict)
     ended: dict[int, GoalState] = field(default_factory=dict)
     _waiting: dict[int, asyncio.Event] = field(default_factory=dict)
 
     def take(self, event: Event) -> None:
-        """Record an event about a goal; raises ValueError for invalid data."""
+        """Record a goal's start or end from an event, ignore other events; raises ValueError for invalid
+        data.
+        """
         if event.code not in (EventCode.GOAL_ACCEPTED, EventCode.GOAL_ENDED):
             return
         self._take(msgspec.json.decode(event.data, type=GoalState), event.t_ns * 1e-9)
 
     def take_message(self, message: object, time_s: float) -> None:
-        """Record a message of the topic /goals: progress, or the end of a goal whose event was lost."""
+        """Record a message of the topic /goals: progress of a running goal, or an end whose event was lost."""
         with suppress(msgspec.ValidationError):
             found = msgspec.convert(message, GoalState)
             found = found if found.error is None or math.isfinite(found.error) else replace(found, error=None)
@@ -50,7 +52,7 @@ class GoalBook:
                 self.running[found.number] = replace(known, progress=found.progress, error=found.error)
 
     def end(self, number: int, outcome: str, text: str, time_s: float) -> None:
-        """Record the end of a running goal whose report was lost; does nothing for any other goal."""
+        """Record the end of a running goal whose result was lost; ignore a goal that does not run."""
         if (known := self.running.get(number)) is not None:
             self._take(GoalState(number, known.controller, status=outcome, text=text), time_s)
 
@@ -83,7 +85,7 @@ class GoalBook:
             waiting.set()
 
     def status(self, number: int) -> GoalState:
-        """Return a goal; raises RefusedRequest for an unknown number, or a goal that is no longer stored."""
+        """Return the state of a goal; raises RefusedRequest for a number that is unknown or no longer stored."""
         found = self.running.get(number) or self.ended.get(number)
         if found is not None:
             return found
@@ -92,7 +94,7 @@ class GoalBook:
         raise refused(Code.UNKNOWN_GOAL, {"goal": number, "last": self.last})
 
     async def wait(self, number: int, timeout_s: float) -> None:
-        """Wait until a running goal has ended, or until the timeout."""
+        """Wait until a running goal has ended, or until the timeout; return at once for any other goal."""
         if number in self.running:
             ended = self._waiting.setdefault(number, asyncio.Event())
             try:

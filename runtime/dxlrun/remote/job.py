@@ -1,4 +1,4 @@
-"""Job of the gateway's process. It imports little, because the process in the terminal imports it."""
+"""Job: the parameters that the supervisor gives to the gateway's process. It imports little."""
 
 from __future__ import annotations
 
@@ -7,7 +7,7 @@ from dataclasses import dataclass
 
 @dataclass(frozen=True, slots=True)
 class Descriptors:
-    """File descriptors of the memory that the gateway shares with the loop's process."""
+    """File descriptors of the shared memory between the gateway and the loop, one for each ring or mailbox."""
 
     heartbeat: int
     cycles: int
@@ -20,14 +20,14 @@ class Descriptors:
 
 @dataclass(frozen=True, slots=True)
 class GatewayJob:
-    """Parameters of the gateway's process for one run."""
+    """Parameters of the gateway's process for one run, which it reads as JSON at its start."""
 
     plan: int
-    """Descriptor of the plan's JSON."""
+    """Descriptor of the memory file with the plan's JSON."""
     memory: Descriptors
     log: str | None
-    """Absolute path of the log; None without a log."""
+    """Absolute path of the run's log; None when no log is written."""
     epoch_offset_ns: int = 0
-    """Wall time minus the run's clock."""
+    """Wall time minus the run's clock, ns."""
     listen: str = ""
     """Address for clients of other computers, `[NAME@]HOST:PORT`; empty: no network access."""

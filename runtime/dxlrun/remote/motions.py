@@ -1,4 +1,7 @@
-"""Motions for a running robot: checked as at start-up, with a slow approach from the present positions."""
+"""Motions: prepare a motion file or a position command as goals of a running robot's loop.
+
+A motion is checked as at start-up and begins with a slow approach from the present positions.
+"""
 
 from __future__ import annotations
 
@@ -34,55 +37,57 @@ from dxlrun.plan.loop_plan import SETTLE_NS, JointPlan, ScheduledCommand
 from dxlrun.remote.preparation import Known, Prepared, travel_s
 
 SOFT_SPEED = 0.5
-"""rad/s; speed of the approach to the first pose, or the joint's limit, if that is lower."""
+"""Speed of the approach to the first pose, rad/s or m/s; slower joints use their highest speed."""
 LEAST_SPEED, MOST_SPEED = 0.01, 10.0
-"""Limits of the factor on a motion's speed."""
+"""Limits of the factor by which a client can change a motion's speed."""
 _STILL = 0.005
-"""rad; a joint within this distance of its first position needs no approach."""
+"""Distance from its first position, rad or m, within which a joint needs no approach."""
 _LEAST_NS = 200_000_000
-"""Shortest duration of an approach."""
+"""Shortest duration of an approach, ns."""
 _SLOWEST = 0.05
-"""rad/s; lowest speed of an approach: a servo at 0 rad/s, which is unlimited, would not come to rest."""
+"""Lowest speed that an approach commands, rad/s: a servo takes 0 rad/s as unlimited."""
 # ns; shortest step between two position commands of an approach (50 Hz).
 _RAMP_NS = 20_000_000
 _MOST_STEPS = 500
-"""Upper limit of the position commands of an approach."""
+"""Upper limit of the position commands into which an approach is split."""
 
 
 @dataclass(frozen=True, slots=True)
 class Running:
-    """Present state of the robot, for a motion to be played."""
+    """The robot's present controllers, joints and states, against which a motion is checked."""
 
     controllers: Mapping[str, CompiledController]
-    """All loaded controllers; `plan.active` is the present state."""
+    """All loaded controllers by name; `plan.active` is their present state."""
     joints: Mapping[str, JointPlan]
     record: CycleRecord
-    """The newest cycle."""
+    """Record of the newest cycle."""
 
     def position(self, joint: str) -> float:
-        """Return a joint's goal position, else its present position, rad; NaN when both are unknown."""
+        """Return a joint's newest goal position, else its measured position, rad or m; NaN when both are
+        unknown.
+        """
         row = self.record.layout.joints.index(joint)
         goal = float(self.record.goals.position[row])
         return goal if math.isfinite(goal) else float(self.record.states.position[row])
 
     def way(self, joint: str, position: float) -> float:
-        """Return the signed distance from a joint's position to another position."""
+        """Return the signed distance that a joint must move from its present position, rad or m."""
         return self.joints[joint].way(self.position(joint), position)
 
 
 class Played(msgspec.Struct, frozen=True, tag="played"):
-    """A motion prepared for the loop."""
+    """A motion or a command that was checked and encoded for the loop's command `play`."""
 
     data: bytes
-    """Payload of the loop's command `play`."""
+    """Payload of the loop's command `play`: JSON of the parts, then their samples."""
     request: bytes
-    """JSON from which the payload was prepared, see `Command.request`."""
+    """JSON of the commands from which the payload was made, for the log."""
     seconds: float
-    """Duration until all parts have ended."""
+    """Duration until all parts have ended and settled, s."""
 
 
 def goal_of(prepared: Prepared, known: Known, record: CycleRecord) -> Played | None:
-    """Return a position command as a goal of the loop; None for a command without positions.
+    """Return a prepared position command as a goal for the loop; None when it has no position for each joint.
 
     The goal's time ends when each joint can have arrived at the lower of its highest and its commanded speed.
     """
@@ -110,7 +115,7 @@ def goal_of(prepared: Prepared, known: Known, record: CycleRecord) -> Played | N
 
 @dataclass(frozen=True, slots=True)
 class _Part:
-    """Samples of one controller on the motion's time axis, at the final speed."""
+    """Samples of a motion for one controller; times are on the motion's time axis, after the change of speed."""
 
     controller: CompiledController
     kind: str
@@ -118,7 +123,7 @@ class _Part:
 
 
 def play(motion: MotionDescription, running: Running, speed: float) -> Played:
-    """Return a motion as played now, `speed` times as fast; raises InputError with all problems.
+    """Return a motion prepared for playing now, `speed` times as fast; raises InputError with all problems.
 
     Values beyond the limits of a joint are refused, as in a command. All controllers begin in one cycle and
     move their joints to the first poses. The motion begins when the slowest joint has arrived.
@@ -157,7 +162,10 @@ def play(motion: MotionDescription, running: Running, speed: float) -> Played:
 
 
 def _parts(motion: MotionDescription, running: Running, speed: float, problems: Problems) -> list[_Part]:
-    """Return one part for each controller, joined from all parts of the file for that controller."""
+    """Return one part for each controller and command, joined from all parts of the motion file for them.
+
+    Adds a problem for a controller that is unknown or not active, and for parts that overlap.
+    """
     by_name: dict[tuple[str, str], list[tuple[int, Sequence[Sample]]]] = {}
     for index, part in enumerate(motion.motion.motions):
         controller = _controller(motion, index, running, problems)
@@ -203,7 +211,9 @@ def _switch(name: str, running: Running) -> str:
 def _joined(
     pieces: Iterable[tuple[int, Sequence[Sample]]], speed: float, problems: Problems
 ) -> tuple[Sample, ...]:
-    """Return the samples of several parts on the motion's time axis, `speed` times as fast."""
+    """Return the samples of a controller's parts as one sequence, `speed` times as fast; empty if they
+    overlap.
+    """
     joined: list[Sample] = []
     for start_ns, samples in pieces:
         for sample in samples:
@@ -248,12 +258,14 @@ def _check(part: _Part, running: Running, problems: Problems) -> None:
 
 
 def _refused(warning: Problem) -> Problem:
-    """Return an error in place of a start-up warning: in a run, the gate would hold the joint."""
+    """Return a warning of the start-up check as an error: in a run, the loop would hold the joint instead."""
     return replace(warning, severity="error", fix=warning.fix.rpartition("; ")[2])
 
 
 def _way_ns(part: _Part, running: Running) -> int:
-    """Return the duration of the approach to the first pose, ns."""
+    """Return the duration of a part's approach from the present positions to its first pose, ns; 0 if it is
+    there.
+    """
     ways = (
         (abs(running.way(joint, target.position)), running.joints[joint].highest_speed)
         for joint, target in part.samples[0].targets.items()
@@ -269,7 +281,10 @@ def _way_ns(part: _Part, running: Running) -> int:
 
 
 def _commands(part: _Part, running: Running, lead_ns: int) -> tuple[ScheduledCommand, ...]:
-    """Return the commands of a part with their times; raises InputError."""
+    """Return a part's commands with their times, approach included; `lead_ns` is the delay of the motion.
+
+    Raises InputError for an invalid command.
+    """
     first_ns = lead_ns + part.samples[0].t_ns
     if part.kind == TRAJECTORY:
         return commands_of(
@@ -284,7 +299,7 @@ def _moved(samples: Iterable[Sample], by_ns: int) -> tuple[Sample, ...]:
 
 
 def _ramp(part: _Part, running: Running, first_ns: int) -> Iterable[Sample]:
-    """Yield the samples of the approach to the first pose.
+    """Yield the samples that move the joints to a part's first pose, which they reach at `first_ns`.
 
     A command with velocities needs one sample: the position and the speed to arrive in time. Other commands
     get positions in small steps.

@@ -442,7 +442,7 @@ def in_si(body: bytes, what: str, joints: Sequence[JointPlan] = ()) -> bytes:
 
 
 def _units_of(data: object, joints: Sequence[JointPlan]) -> tuple[JointUnit, ...]:
-    """Return the joint unit of each value in a command's lists; ROTARY for an unknown joint."""
+    """Return rad or m (the joint's unit) for each value in a command's lists; rad for an unknown joint."""
     units = {joint.name: joint.unit for joint in joints}
     named = data.get("joints") if isinstance(data, dict) else None
     names = named if isinstance(named, list) else [*units]
@@ -452,7 +452,7 @@ def _units_of(data: object, joints: Sequence[JointPlan]) -> tuple[JointUnit, ...
 def plain_quantities(
     values: Mapping[str, object], field: str, joints: Sequence[JointPlan]
 ) -> dict[str, object]:
-    """Return values by joint, converted from texts with the units of a command's field to numbers.
+    """Return values by joint as numbers in SI units; texts have the units of the command field `field`.
 
     Raises RefusedRequest as `in_si`.
     """
@@ -498,7 +498,9 @@ def _plain(
 
 
 def mistakes(error: ValidationError, what: str, model: type[BaseModel]) -> str:
-    """Return the mistakes of an input called `what` in one sentence, up to _MOST_MISTAKES."""
+    """Return the first _MOST_MISTAKES mistakes of an input called `what` as one text, with the number of
+    others.
+    """
     sentences = [
         sentence[:_LONGEST_SENTENCE] for sentence in sentences_of(error, what, model, _MOST_MISTAKES)
     ]
@@ -507,7 +509,7 @@ def mistakes(error: ValidationError, what: str, model: type[BaseModel]) -> str:
 
 
 def _refuse_entry(found: Sequence[Mistake]) -> RefusedRequest:
-    """Return the refusal of a controller's entry."""
+    """Return the refusal of a controller that a client wants to load, with the mistakes in its entry."""
     return invalid("; ".join(_one_line(f"{one.what}; {one.fix}") for one in found[:_MOST_MISTAKES]))
 
 

@@ -47,15 +47,19 @@ from dxlrun.remote.sockets import Address, listen
 
 MOST_CONNECTIONS = 64
 MOST_OF_PROCESS = 16
-"""Upper limit of one process: three flooding processes leave a quarter of all connections to others."""
+"""Upper limit of the connections of one process or certificate: three flooding ones leave a quarter to
+others.
+"""
 SILENCE_S = 30.0
-"""Timeout of a connection on which the client neither sends a byte nor reads the pending reply."""
+"""Timeout, s, of a connection on which the client neither sends a byte nor reads the pending reply."""
 
 _CREDENTIALS = struct.Struct("3i")
 
 
 def main() -> None:
-    """Run the gateway's process: `--job-fd N --control-fd M`."""
+    """Run the gateway's process with the arguments `--job-fd N --control-fd M`, until its control socket
+    closes.
+    """
     signal.signal(signal.SIGINT, signal.SIG_IGN)
     sys.stdout = sys.stderr = process.Printed(sys.stderr.fileno())
     # An endless `prepare` of a plug-in must not outlive the run.
@@ -86,7 +90,7 @@ def main() -> None:
 
 
 def _event_loop() -> asyncio.AbstractEventLoop:
-    """Return an event loop with timeouts below 1 ms: the default, epoll(7), rounds to milliseconds."""
+    """Return an asyncio event loop whose timeouts may be below 1 ms; the default, epoll(7), rounds to 1 ms."""
     return asyncio.SelectorEventLoop(selectors.SelectSelector())
 
 
@@ -97,7 +101,11 @@ async def serve(
     control: socket.socket,
     network: Listener | None = None,
 ) -> None:
-    """Serve until the other end of `control` is closed or the link fails; raises the link's error."""
+    """Serve clients until the other end of `control` is closed or the task that reads the loop's reports
+    fails.
+
+    Raises the error of that task.
+    """
     config = config_of(gateway.app())
     server = _Server(config)
     config.load()
@@ -144,7 +152,7 @@ async def serve_clients(
 
 
 def config_of(app: ASGIApp) -> uvicorn.Config:
-    """Return the configuration of the HTTP server."""
+    """Return the HTTP server's configuration, with the connection class and timeouts of this module."""
     return uvicorn.Config(
         app,
         http=Connection,
@@ -164,7 +172,7 @@ def config_of(app: ASGIApp) -> uvicorn.Config:
 
 
 class _Server(uvicorn.Server):
-    """Server without signal handlers: the supervisor closes the control socket to stop it."""
+    """HTTP server without signal handlers: it stops when the supervisor closes the control socket."""
 
     @contextmanager
     def capture_signals(self) -> Iterator[None]:
@@ -173,12 +181,14 @@ class _Server(uvicorn.Server):
 
 
 class Connection(H11Protocol):
-    """HTTP/1.1 connection that is closed after a silence or above the limits of connections."""
+    """HTTP/1.1 connection of a client, which is closed after a silence or when its process has too many."""
 
     def connection_made(  # type: ignore[override]  # uvicorn leaves its type open
         self, transport: asyncio.Transport
     ) -> None:
-        """Accept the connection, unless another user opened it; close another one above the limits."""
+        """Accept a connection of this user or of a valid certificate, else close it; above the limits, close
+        another.
+        """
         super().connection_made(transport)
         if listener := self.app_state.get("listener"):
             listener.admit(transport.get_extra_info("peername"))
@@ -195,10 +205,12 @@ class Connection(H11Protocol):
             min(crowded, key=lambda one: (one.busy, one.last_byte_s)).transport.abort()
 
     def _crowded(self) -> list[Connection]:
-        """Return the candidates to close because of this connection.
+        """Return the connections of which one must be closed because of this new one; empty within the
+        limits.
 
-        These are the connections of its process when that is above its limit; those of the process with the
-        most when all together are above the limit; else none.
+        These are the connections of its process when that is above its limit, or those of the process with
+        the
+        most when all together are above the limit.
         """
         others = [
             one
@@ -214,13 +226,13 @@ class Connection(H11Protocol):
         return [one for one in others if one.client == process]
 
     def connection_lost(self, exc: Exception | None) -> None:
-        """Cancel the timer, which would keep the connection in memory until the timeout."""
+        """Cancel the timer of silence, which would keep the closed connection in memory."""
         self._timer.cancel()
         self._unset_keepalive_if_required()
         super().connection_lost(exc)
 
     def data_received(self, data: bytes) -> None:
-        """Process received bytes while the certificate is valid."""
+        """Process received bytes, or close the connection when the client's certificate is no longer valid."""
         self.last_byte_s = self.loop.time()
         if self._valid():
             super().data_received(data)
@@ -228,26 +240,30 @@ class Connection(H11Protocol):
             self.transport.abort()
 
     def _valid(self) -> bool:
-        """Return whether the client's certificate is still valid; clients on this computer need none."""
+        """Return True when the client's certificate has not expired or been revoked, or the client is on this
+        computer.
+        """
         return not self._certificate or counts(self._certificate)
 
     def resume_writing(self) -> None:
-        """Continue a reply after the client has read a part."""
+        """Continue to send a reply after the client has read a part."""
         self.last_byte_s = self.loop.time()
         super().resume_writing()
 
     @property
     def busy(self) -> bool:
-        """True while a reply is not complete."""
+        """True while a request is being answered."""
         return self.cycle is not None and not self.cycle.response_complete
 
     @property
     def listening(self) -> bool:
-        """True while a reply is being sent, such as a stream without a known end."""
+        """True while a reply is being sent, such as a stream of topics."""
         return self.cycle is not None and self.cycle.response_started and not self.cycle.response_complete
 
     def _check(self) -> None:
-        """Close the connection after a silence of SILENCE_S, else set the timer again."""
+        """Close the connection when it was silent for SILENCE_S or its certificate is invalid, else set the
+        timer.
+        """
         if self.listening and not self.transport.get_write_buffer_size():
             self.last_byte_s = self.loop.time()
         silent_s = self.loop.time() - self.last_byte_s
@@ -259,14 +275,14 @@ class Connection(H11Protocol):
 
 
 def _certificate(transport: asyncio.Transport) -> Certificate:
-    """Return the verified certificate of a client; empty for a client on this computer."""
+    """Return the certificate of a client that TLS verified; empty for a client on this computer."""
     secured = transport.get_extra_info("ssl_object")
     found: Certificate = {} if secured is None else secured.getpeercert()
     return found
 
 
 def _client(transport: asyncio.Transport, certificate: Certificate) -> Client | None:
-    """Return name and role of a client; None when the client has no access."""
+    """Return name and role of a client; None for another user, or a certificate without a known role."""
     if certificate:
         subject = dict(pair for pairs in certificate["subject"] for pair in pairs)
         role = subject.get("organizationalUnitName", "").upper()

@@ -28,21 +28,22 @@ _HEAD = re.compile(rb"HTTP/1\.\d (\d{3}).*?\r\n\r\n", re.DOTALL)
 _LENGTH = re.compile(rb"\r\ncontent-length: *(\d+)")
 _CHUNK = 65536
 MOST_BYTES = 1 << 20
-"""Upper limit of a request's body; longer ones are refused before they are read."""
+"""Upper limit of a request's body, bytes; the gateway refuses longer ones before it reads them."""
 TIMEOUT_S = 10.0
-"""Timeout for a reply: about two seconds, and six more for a switch that waits for mode changes."""
+"""Timeout for a reply, s: about two for a command, and six more for a switch that waits for mode changes."""
 _IDLE_S = 20.0
-"""Longest idle time of a reused connection; the gateway closes silent connections after 30 s."""
+"""Longest idle time, s, of a connection that is used again; the gateway closes silent connections after 30 s.
+"""
 _ENDING_S = 1.0
-"""Timeout for the exit of a gateway that closed a connection at the end of a run."""
+"""Time, s, within which a gateway that closed a connection at the end of a run removes its socket."""
 LONGEST_PATH = 107
-"""Bytes; limit of Linux for the path of a Unix socket (unix(7)), without the terminating zero."""
+"""Longest path of a Unix socket on Linux, bytes without the terminating zero (unix(7))."""
 
 
 def place(runtime_directory: str | None = None) -> Path:
-    """Return the directory of this user's sockets; it may not exist yet.
+    """Return the directory for the sockets of this user's robots; it may not exist yet.
 
-    `runtime_directory`: XDG_RUNTIME_DIR of another process; empty when unset there. None: of this process.
+    `runtime_directory`: XDG_RUNTIME_DIR of another process, empty when unset there; None: of this process.
     """
     ours = os.environ.get("XDG_RUNTIME_DIR", "")
     runtime = Path(ours if runtime_directory is None else runtime_directory)
@@ -54,7 +55,9 @@ def place(runtime_directory: str | None = None) -> Path:
 
 
 def owned(directory: Path) -> bool:
-    """Return whether a directory belongs to this user and only they may enter it; links are not followed."""
+    """Return True when a path is a directory of this user that no other user may enter; a link is not
+    followed.
+    """
     try:
         found = directory.lstat()
     except OSError:
@@ -63,7 +66,7 @@ def owned(directory: Path) -> bool:
 
 
 def listen(robot: str) -> tuple[socket.socket, Path]:
-    """Create the listening socket of a robot (mode 0600); return the socket and its path.
+    """Create the listening socket of a robot's gateway (mode 0600); return the socket and its path.
 
     The path of a second run of the same robot contains its process ID. Raises DxlrunError when the directory
     is not safe.
@@ -101,7 +104,7 @@ def _bound(path: Path) -> socket.socket:
 
 @contextmanager
 def _locked(directory: Path) -> Iterator[None]:
-    """Lock the directory, so no process sees a socket before it listens, or removes it in that time."""
+    """Lock the directory of sockets, so that no process sees or removes a socket that does not listen yet."""
     descriptor = os.open(directory, os.O_RDONLY | os.O_DIRECTORY | os.O_NOFOLLOW)
     try:
         fcntl.flock(descriptor, fcntl.LOCK_EX)
@@ -111,7 +114,7 @@ def _locked(directory: Path) -> Iterator[None]:
 
 
 def alive(path: Path) -> bool:
-    """Return whether a process listens at a socket, even if it is busy or stopped; does not block."""
+    """Return True when a process listens at a socket file, even if it is busy or stopped; does not block."""
     with socket.socket(socket.AF_UNIX, socket.SOCK_STREAM) as probe:
         probe.setblocking(False)
         try:
@@ -125,7 +128,7 @@ def alive(path: Path) -> bool:
 
 
 def listener(path: Path) -> int | None:
-    """Return the ID of the listening process; None when the socket does not accept at once."""
+    """Return the ID of the process that listens at a socket; None when it does not accept at once."""
     with socket.socket(socket.AF_UNIX, socket.SOCK_STREAM) as probe:
         probe.setblocking(False)
         with suppress(OSError):
@@ -136,12 +139,12 @@ def listener(path: Path) -> int | None:
 
 
 def running() -> tuple[str, ...]:
-    """Return the names of running robots with a gateway, and remove sockets without a process."""
+    """Return the names of this user's running robots that have a gateway; stale socket files are removed."""
     return tuple(sorted(sockets()))
 
 
 def sockets() -> dict[str, Path]:
-    """Return the sockets of running robots by name, and remove those without a process."""
+    """Return the socket files of this user's running robots by name; stale socket files are removed."""
     found: dict[str, Path] = {}
     directory = place()
     if not owned(directory):
@@ -156,16 +159,16 @@ def sockets() -> dict[str, Path]:
 
 
 class Address(NamedTuple):
-    """Network address of a robot's gateway."""
+    """Address of a robot's gateway on another computer."""
 
     name: str
-    """Name in the robot's certificate."""
+    """Name in the robot's certificate, which the client checks."""
     host: str
     port: int
 
     @classmethod
     def parse(cls, text: str, name: str = "") -> Address:
-        """Parse `[NAME@]HOST:PORT`, with a default for NAME; raises InputError."""
+        """Parse `[NAME@]HOST:PORT`; `name` is the default for NAME. Raises InputError."""
         found = _ADDRESS.fullmatch(text)
         if not found or not 0 < int(found[3]) < 1 << 16 or not (found[1] or name):
             raise InputError(
@@ -178,14 +181,17 @@ class Address(NamedTuple):
 
 
 class RobotLink(Protocol):
-    """A client's connection to a robot. Its methods raise OSError or ValueError without a valid reply."""
+    """A client's connection to a robot's gateway.
+
+    Methods raise OSError or ValueError without a valid reply.
+    """
 
     def exchange(self, method: str, path: str, body: bytes | None) -> tuple[int, bytes]:
-        """Send one request; return status and body of the reply."""
+        """Send one HTTP request; return status and body of the reply."""
         ...
 
     def stream(self, path: str) -> tuple[int, bytes, socket.socket]:
-        """Send a request with a streamed reply; return status, first bytes, and a socket for the rest."""
+        """Send a GET request with a streamed reply; return status, first bytes, and a socket with the rest."""
         ...
 
     @property
@@ -194,7 +200,7 @@ class RobotLink(Protocol):
         ...
 
     def ends(self) -> bool:
-        """Return whether a stream was closed because its run has ended."""
+        """Return True if the run has ended, after the gateway closed a stream; waits up to about a second."""
         ...
 
     def close(self) -> None:
@@ -203,17 +209,20 @@ class RobotLink(Protocol):
 
 
 class SocketLink:
-    """HTTP over a run's Unix socket: one connection for sequential requests, and one for each stream."""
+    """HTTP over the Unix socket of a gateway: one connection for all requests, and one more for each stream."""
 
     def __init__(self, path: Path, client: str) -> None:
         self._path = path
         self._end: socket.socket | None = None
         self._used = time.monotonic()
         self.client = "".join(letter for letter in client if letter.isprintable())
-        """Client name for the log."""
+        """Name of this client in the robot's log."""
 
     def exchange(self, method: str, path: str, body: bytes | None) -> tuple[int, bytes]:
-        """Send one request; return status and body. No retry: the gateway may have received the first one."""
+        """Send one request; return HTTP status and body.
+
+        It is never sent twice: the gateway may have executed it.
+        """
         content = body or b""
         head = (
             f"{method} {path} HTTP/1.1\r\nHost: localhost\r\nContent-Type: application/json\r\n"
@@ -236,7 +245,9 @@ class SocketLink:
         return status, answer
 
     def stream(self, path: str) -> tuple[int, bytes, socket.socket]:
-        """Send a GET request; return status, first bytes, and the connection with the rest of the reply."""
+        """Send a GET request on a new connection; return status, first bytes, and the connection with the
+        rest.
+        """
         end = self._connected()
         try:
             end.sendall(f"GET {path} HTTP/1.0\r\n\r\n".encode())
@@ -250,20 +261,21 @@ class SocketLink:
         return _connected(self._path)
 
     def close(self) -> None:
-        """Close the connection; the robot keeps running."""
+        """Close the connection for requests; the robot keeps running, and streams stay open."""
         if self._end is not None:
             self._end.close()
             self._end = None
 
     @property
     def alive(self) -> bool:
-        """True while a gateway listens at the socket."""
+        """True while a process listens at the socket."""
         return alive(self._path)
 
     def ends(self) -> bool:
-        """Return whether the run ends within a second, when its gateway removes the socket.
+        """Return True if the gateway removes its socket file within a second, which means that the run has
+        ended.
 
-        The socket file remains after a gateway was killed, and while it still listens.
+        The file remains while the gateway runs, and after it was killed.
         """
         until = time.monotonic() + _ENDING_S
         while self._path.exists():
@@ -274,7 +286,8 @@ class SocketLink:
 
 
 def _connected(path: Path) -> socket.socket:
-    """Connect to a socket; wait in the Linux kernel's queue when the backlog is full.
+    """Connect to a gateway's socket; wait up to TIMEOUT_S in the Linux kernel's queue when its backlog is
+    full.
 
     Linux serves waiting processes first come, first served, so a process that floods the queue only delays
     this one. A Python timeout would not wait: connect fails with EAGAIN on a non-blocking socket (unix(7)).
@@ -297,16 +310,18 @@ def _connected(path: Path) -> socket.socket:
 
 
 def _hung_up(end: socket.socket) -> bool:
-    """Return whether the peer has closed the connection; an unrequested byte counts as closed, too."""
+    """Return True when an idle connection was closed by the gateway; an unrequested byte counts as closed,
+    too.
+    """
     look = select.poll()
     look.register(end, select.POLLIN)
     return bool(look.poll(0))
 
 
 def _answer(end: socket.socket) -> tuple[int, bytes, bool]:
-    """Return status and body of a reply, and whether the gateway closes the connection after it.
+    """Read a reply; return status, body, and True if the gateway closes the connection after it.
 
-    The body of a reply without a length is its beginning.
+    The body of a reply without a length is what arrived with its head.
 
     Raises:
         OSError: The connection was closed before the end of the reply.

@@ -1,4 +1,4 @@
-"""Listening: the messages of a running robot's topics, for blocking and asyncio programs."""
+"""Listening: a client's iterator over the messages of a running robot's topics, blocking or with asyncio."""
 
 from __future__ import annotations
 
@@ -23,25 +23,25 @@ _decode = msgspec.msgpack.Decoder(Frame).decode
 
 
 class TopicMessage(msgspec.Struct, frozen=True):
-    """A message of a topic, as it was received."""
+    """A message of a topic as a client received it, still encoded."""
 
     topic: str
     type: str
-    """Name of the type in ROS 2 format: `nav_msgs/msg/Odometry`."""
+    """Name of the message type in ROS 2 format: `nav_msgs/msg/Odometry`."""
     number: int
-    """Sequence number, counted from 1 by the robot."""
+    """Sequence number within the topic, counted from 1 by the robot."""
     time_ns: int
-    """Time of the message on the run's clock, ns."""
+    """Time of the message, ns of the run's clock."""
     wall_ns: int
     """Time of the message as wall time, ns since 1970."""
     lost: int
-    """Messages of the topic between the previous message and this one that were not received."""
+    """Number of messages of the topic that were missed since the previous one this client received."""
     data: bytes
-    """CDR, little-endian"""
+    """Content of the message, encoded as CDR (little-endian)."""
     definition: str
-    """Definition of the type in ROS 2 format (`ros2msg`)."""
+    """Definition of the message type in ROS 2 format (`ros2msg`)."""
     joints: tuple[str, ...] = ()
-    """Joints of the rows of its arrays; empty: the arrays have no rows of joints."""
+    """Joints of the rows of the message's arrays; empty: the arrays have no rows of joints."""
 
     @property
     def message(self) -> Mapping[str, Value]:
@@ -75,7 +75,7 @@ class Listening:
         self._bytes = bytearray(first)
         self._topics: dict[int, Opened] = {}
         self._last: dict[int, int] = {}
-        """Number of the newest message by the topic's place."""
+        """Topic's number in the stream -> sequence number of its newest received message."""
         self._ended = False
 
     def __enter__(self) -> Listening:
@@ -85,7 +85,7 @@ class Listening:
         self.close()
 
     def close(self) -> None:
-        """Close the connection."""
+        """Close the connection, which ends the stream."""
         self._end.close()
 
     def __iter__(self) -> Iterator[TopicMessage]:
@@ -119,7 +119,11 @@ class Listening:
             self.close()
 
     def _arrived(self) -> Iterator[TopicMessage]:
-        """Yield the messages that have arrived."""
+        """Yield the messages received since the last call, without waiting; only the newest of each topic if
+        asked.
+
+        Raises DxlrunError when the connection was closed and the run has not ended.
+        """
         closed = False
         with suppress(BlockingIOError):
             # A stream of all messages reads the rest later.
@@ -149,7 +153,7 @@ class Listening:
             self._ended = True
 
     def _received(self) -> bytes:
-        """Read and return received bytes; empty when the connection is closed."""
+        """Receive available bytes into the buffer and return them; empty when the connection is closed."""
         try:
             more = self._end.recv(_CHUNK)
         except ConnectionError:
@@ -158,7 +162,7 @@ class Listening:
         return more
 
     def _samples(self) -> list[Sample]:
-        """Return the complete messages, and record topics and the end of the run."""
+        """Return the complete messages in the buffer and remove them; note new topics and the end of the run."""
         found, at = [], 0
         while len(self._bytes) - at >= FRAME_LENGTH.size:
             begin = at + FRAME_LENGTH.size

@@ -1,4 +1,4 @@
-"""Live messages: the messages of the log's topics, made from the messages of a running robot."""
+"""Live messages: converts messages streamed by a gateway into the messages that the log would have."""
 
 from __future__ import annotations
 
@@ -17,31 +17,33 @@ from dxlrun.remote.live.listening import TopicMessage
 from dxlrun.remote.requests.replies import TopicState
 
 _OF_EACH_CYCLE = "dxlrun_msgs/msg/SourceStates"
-"""Type of topics that only the gateway has; the log has their values in /cycle."""
+"""Type of the topics of sources, which only the gateway has; the log has their values in /cycle."""
 
 
 class LiveMessages(RunMessages):
-    """Converter from the messages of a gateway to the messages of the log, for a viewer."""
+    """Converter from a gateway's messages to those of the run's log, for viewers."""
 
     def __init__(self, header: LogHeader) -> None:
         super().__init__(header)
         self._opened: dict[tuple[str, MessageType], int] = {}
-        """Channels by topic and type: a controller that is loaded again may publish another type."""
+        """Channel of each topic and type: a controller that is loaded again may publish another type."""
         self.on_changed: Callable[[str], object] = lambda controller: None
-        """Called when live parameters of a controller were changed."""
+        """Called with a controller's name after its live parameters were changed."""
 
     @staticmethod
     def heard(topics: Collection[TopicState]) -> set[str]:
-        """Return the topics to listen to: the log's topics, and the sources of derived topics."""
+        """Return the names of the topics to stream: all but the states of sources and /joint_states."""
         return {one.name for one in topics if one.type != _OF_EACH_CYCLE} - {schemas.LogTopic.JOINT_STATES}
 
     def read_cycle(self, message: TopicMessage) -> np.void:
-        """Return the record of a message of /cycle: a structured scalar with one row for each joint."""
+        """Return the content of a message of /cycle: a structured scalar whose fields have one row for each
+        joint.
+        """
         record: np.void = np.frombuffer(message.data[len(ENCAPSULATION) :], dtype=self._layout.dtype)[0]
         return record
 
     def take(self, message: TopicMessage) -> None:
-        """Convert a message of one of the topics of `heard`."""
+        """Convert a message of one of the topics that `heard` returns, and add it to the output."""
         if message.topic == schemas.LogTopic.CYCLE:
             self.cycle(message.data[len(ENCAPSULATION) :])
         elif message.topic == schemas.LogTopic.EVENT:

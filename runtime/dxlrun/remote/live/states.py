@@ -1,4 +1,4 @@
-"""States of a running robot in one cycle: arrays with the names and units of their rows."""
+"""States: the states of a running robot in one cycle, as arrays with the names and units of their rows."""
 
 from __future__ import annotations
 
@@ -22,13 +22,13 @@ _OF_JOINTS = (
 
 
 class RobotStates(OlderSourceNames, msgspec.Struct, frozen=True):
-    """Snapshot of the newest cycle. Arrays have one row for each name; NaN is unknown or not commanded."""
+    """States of the newest cycle. Arrays have one row for each name; NaN is unknown or not commanded."""
 
     cycle: int
     time_ns: int
-    """Wake-up of the cycle, ns of the run's clock."""
+    """Time at which the loop woke for the cycle, ns of the run's clock."""
     late_ns: int
-    """Delay of the wake-up after its scheduled time."""
+    """Delay of the loop's wake-up after its scheduled time, ns."""
     joints: tuple[str, ...]
     units: tuple[str, ...]
     """Unit of each joint's position, `rad` or `m`; the unit of its velocity is this unit per second."""
@@ -38,51 +38,54 @@ class RobotStates(OlderSourceNames, msgspec.Struct, frozen=True):
     velocity: Floats
     effort: Floats
     valid: Bools
-    """True for joints whose reply of this cycle was received intact."""
+    """True for joints whose reply in this cycle was received intact."""
     age_ns: Integers
-    """Time since the reply that the row shows; -1 before the first reply."""
+    """Age of each joint's states, ns: time since the reply that they come from; -1 before the first reply."""
     goal_position: Floats
     goal_velocity: Floats
     goal_effort: Floats
     goal_pwm: Floats
     temperature: Floats
-    """deg C"""
+    """Temperature of the servo, deg C."""
     voltage: Floats
     hardware_error: Integers
-    """Bits of the control table item Hardware Error Status."""
+    """Bits of the control table item Hardware Error Status of the servo."""
     mode: tuple[str, ...]
     torque: tuple[str, ...]
-    """`on`, `doubt`, `limp`, `lost`, `rebooting`, `given`"""
+    """State of the servo's torque: `on`, `doubt`, `limp`, `lost`, `rebooting`, `given`."""
     references: tuple[str, ...]
     reference: Floats
-    """Commands from controllers to other controllers."""
+    """Values that controllers command to the inputs of other controllers, in the order of `references`."""
     source_states: tuple[str, ...]
-    """States of devices, sensors, and controllers that provide states: `imu/orientation.x`."""
+    """Names of the states of devices, sensors, and controllers that provide states: `imu/orientation.x`."""
     source_state: Floats
-    """SI units"""
+    """Value of each source state, SI units."""
     sources: tuple[str, ...]
     source_valid: Bools
     source_age_ns: Integers
-    """-1 before the first values."""
+    """Age of each source's states, ns; -1 before the first values."""
     source_commands: tuple[str, ...] = msgspec.field(name=SOURCE_COMMANDS)
-    """Commands of devices and other sources: `board/led`."""
+    """Names of the commands of devices and other sources: `board/led`."""
     source_command: Floats = msgspec.field(name=SOURCE_COMMAND)
-    """Commanded value of each command, in its unit."""
+    """Present value of each source command, in its unit; NaN when no controller commands it."""
     controllers: tuple[str, ...]
     controller_ns: Integers
-    """Duration of each controller's update in this cycle; 0 without an update."""
+    """Computing time of each controller's update in this cycle, ns; 0 without an update."""
     source_units: dict[str, str] = {}
-    """SI units of source states that have a unit, by `imu/angular_velocity.x`."""
+    """Source state, such as `imu/angular_velocity.x`, -> its SI unit; states without unit are not in it."""
     command_units: dict[str, str] = {}
-    """SI units of source commands that have a unit, by `board/fan`."""
+    """Source command, such as `board/fan`, -> its SI unit; commands without unit are not in it."""
 
     @property
     def source_names(self) -> tuple[str, ...]:
-        """Names of sources, their states and their commands."""
+        """Names of all sources, followed by those of their states and commands."""
         return (*self.sources, *self.source_states, *self.source_commands)
 
     def joint(self, name: str) -> dict[str, object]:
-        """Return the values of a joint by field name, with `age` in s; None is unknown. Raises ValueError."""
+        """Return a joint's states and goals by field name, with `age` in s; None is unknown.
+
+        Raises ValueError for an unknown joint.
+        """
         row = self.joints.index(name)
         found = {field: _plain(getattr(self, field)[row]) for field in _OF_JOINTS}
         return {**found, "age": int(self.age_ns[row]) * 1e-9}
@@ -122,12 +125,14 @@ class RobotStates(OlderSourceNames, msgspec.Struct, frozen=True):
 
 
 def encoded(states: RobotStates) -> bytes:
-    """Return states as JSON; NaN becomes null."""
+    """Return states as JSON, arrays as lists; NaN becomes null."""
     return msgspec.json.encode(states, enc_hook=lambda array: array.tolist())
 
 
 def array(kind: type, values: object) -> object:
-    """Return the NumPy array of a field; null becomes NaN. Decoding hook of msgspec."""
+    """Return a list from JSON as the array that a field of RobotStates has; null becomes NaN (hook of
+    msgspec).
+    """
     return np.array(values, get_args(get_args(kind)[1])[0])
 
 

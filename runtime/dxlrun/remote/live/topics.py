@@ -26,9 +26,9 @@ from dxlrun.messages.definition import MessageType
 from dxlrun.remote.requests.replies import FRAME_LENGTH, Frame, Opened, Sample, TopicState
 
 MOST_RECORDS = 64
-"""Records of each ring that a stream reads at once, before the gateway serves other clients."""
+"""Upper limit of the records of each ring that a stream reads before the gateway serves other clients."""
 _TIMES = 64
-"""Number of messages over which a topic's rate is measured."""
+"""Number of recent messages from whose times a topic's rate is measured."""
 SOURCE_STATES = MessageType(
     "dxlrun_msgs/msg/SourceStates",
     """# States of a device, a sensor, or a controller that provides some, SI units; NaN = not known.
@@ -44,7 +44,7 @@ _encode = msgspec.msgpack.Encoder().encode
 
 
 class _CycleTopic(NamedTuple):
-    """Topic with one message for every cycle."""
+    """Topic that has one message for every cycle, with the function that makes it from a cycle's record."""
 
     type: MessageType
     joints: tuple[str, ...]
@@ -52,7 +52,7 @@ class _CycleTopic(NamedTuple):
 
 
 class _LoopTopic:
-    """A topic of the loop, with its newest message and the times of recent messages."""
+    """A topic that the loop publishes, with its newest message and the times of recent messages."""
 
     __slots__ = ("count", "newest", "times", "topic")
 
@@ -62,12 +62,12 @@ class _LoopTopic:
         self.times: deque[int] = deque(maxlen=_TIMES)
 
     def take(self, message: TopicMessage) -> None:
-        """Record the newest message."""
+        """Record a message as the topic's newest one."""
         self.newest, self.count = message, message.number
         self.times.append(message.t_ns)
 
     def state(self) -> TopicState:
-        """Return the entry of the list of topics."""
+        """Return name, type, number of messages and measured rate (Hz) of the topic."""
         rate = None
         if len(self.times) > 1 and (span_ns := self.times[-1] - self.times[0]) > 0:
             rate = (len(self.times) - 1) * 1e9 / span_ns
@@ -75,7 +75,7 @@ class _LoopTopic:
 
 
 class LiveTopics:
-    """All topics of a run; `events` are the events that the gateway stores, with their numbers."""
+    """All topics of a run: those of the loop, /events, and those made from each cycle."""
 
     def __init__(
         self,
@@ -86,7 +86,7 @@ class LiveTopics:
         epoch_offset_ns: int,
     ) -> None:
         self.rings = messages, cycles
-        """File descriptors of the memory of the loop's messages and cycles."""
+        """File descriptors of the loop's ring of messages and ring of cycles."""
         self.layout, self.events, self.epoch_offset_ns = layout, events, epoch_offset_ns
         self.of_loop: dict[str, _LoopTopic] = {}
         self.by_number: dict[int, _LoopTopic] = {}
@@ -100,7 +100,9 @@ class LiveTopics:
         self.ring = RingReader(messages)
 
     def collect(self) -> list[tuple[PublishedTopic, TopicMessage]]:
-        """Return the messages since the last call; the log reports lost ones."""
+        """Read the loop's messages since the last call, update their topics, and return topic and message of
+        each.
+        """
         found = []
         for message in _decoded(iter(self.ring.read, None)):
             if isinstance(message, OpenedTopic):
@@ -113,7 +115,7 @@ class LiveTopics:
         return found
 
     def described(self, name: str) -> PublishedTopic:
-        """Return the description of a topic; raises KeyError for an unknown name."""
+        """Return name, type and joints of a topic; raises KeyError for an unknown name."""
         if name in self.of_loop:
             return self.of_loop[name].topic
         if name == LogTopic.EVENT:
@@ -121,7 +123,9 @@ class LiveTopics:
         return PublishedTopic(name, self.of_cycles[name].type, self.of_cycles[name].joints)
 
     def states(self, cycles: int) -> list[TopicState]:
-        """Return the state of all topics after a number of cycles."""
+        """Return name, type, number of messages and rate of all topics; `cycles` is the number of cycles so
+        far.
+        """
         events = self.events[-1][0] if self.events else 0
         return [
             *(one.state() for one in self.of_loop.values()),
@@ -141,7 +145,7 @@ class LiveTopics:
 
 
 def _decoded(records: Iterable[Record | Gap]) -> Iterator[Tagged]:
-    """Yield the messages of records. A malformed record is skipped: only the loop encodes them."""
+    """Yield the decoded messages of a ring's records; lost and malformed records are skipped."""
     for record in records:
         if isinstance(record, Record):
             with suppress(ValueError):
@@ -157,11 +161,13 @@ def _source_states(source: str, record: CycleRecord) -> bytes:
 
 
 class TopicStream:
-    """Messages of some topics for one client, from the newest on: all of them, or the newest at each call."""
+    """Frames of some topics for one client, from the newest message on; with `newest`, older ones are
+    skipped.
+    """
 
     def __init__(self, topics: LiveTopics, names: Sequence[str], *, newest: bool) -> None:
         self.behind = False
-        """True when more records have arrived than one call reads."""
+        """True when the last call left records unread because of MOST_RECORDS."""
         self._places = {name: place for place, name in enumerate(dict.fromkeys(names))}
         self._newest, self._events, self._offset_ns = newest, topics.events, topics.epoch_offset_ns
         self._first = [self._opened(topics.described(name)) for name in self._places]
@@ -181,7 +187,7 @@ class TopicStream:
         self._event = self._events[-1][0] - 1 if self._events else 0
 
     def frames(self) -> bytes:
-        """Return the messages since the last call as frames, up to MOST_RECORDS of each ring."""
+        """Return the encoded frames since the last call, from at most MOST_RECORDS records of each ring."""
         self.behind = False
         found = [*self._first, *self._new_messages(), *self._new_cycles(), *self._new_events()]
         self._first = []
@@ -239,6 +245,6 @@ class TopicStream:
 
 
 def framed(frame: Frame) -> bytes:
-    """Return an encoded frame, preceded by its length."""
+    """Return a frame as MessagePack, preceded by its length."""
     data = _encode(frame)
     return FRAME_LENGTH.pack(len(data)) + data

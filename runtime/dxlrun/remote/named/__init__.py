@@ -1,4 +1,4 @@
-"""Lookup of names in requests: joints, registers, commands, parameters of controllers.
+"""Lookup of names in requests: joints, registers, commands and parameters of controllers.
 
 Routes and replies belong in `requests`.
 """

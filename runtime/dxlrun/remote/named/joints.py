@@ -1,4 +1,4 @@
-"""Joints: names of joints, groups and registers in requests, and the states of joints in replies."""
+"""Joints: lookup of joints, groups and registers named in requests, and the states of joints in replies."""
 
 from __future__ import annotations
 
@@ -26,13 +26,15 @@ from dxlwire.control_table import ControlTable, find_table
 from dxlwire.modes import Mode
 
 _LONGEST = 80
-"""Upper limit of characters of a name in a refusal."""
+"""Upper limit of a client's name quoted in a refusal, characters; longer names are cut."""
 _MOST_NAMES = 5
-"""Upper limit of names in a refusal."""
+"""Upper limit of the unknown names that a refusal lists."""
 
 
 def states_of(plan: Plan, record: CycleRecord, controllers: Mapping[str, int]) -> RobotStates:
-    """Return the states of a cycle; `controllers` maps names to places in the cycle's record."""
+    """Return the states in a cycle's record; `controllers` maps each name to its index in the record's
+    arrays.
+    """
     layout, states = record.layout, record.states
     row = np.frombuffer(record.raw, layout.dtype)[0]
     known = row.dtype.names or ()
@@ -64,7 +66,10 @@ def states_of(plan: Plan, record: CycleRecord, controllers: Mapping[str, int]) -
 
 
 def joint_row(plan: Plan, joint: str, others: Sequence[str] = ()) -> int:
-    """Return the row of a joint; raises RefusedRequest, with a hint from joints and `others`."""
+    """Return a joint's index in the loop's arrays.
+
+    Raises RefusedRequest, hinting at similar joints or `others`.
+    """
     names = [one.name for one in plan.loop.joints]
     if joint not in names:
         hint = suggestion(joint[:_LONGEST], (*names, *others))
@@ -73,7 +78,7 @@ def joint_row(plan: Plan, joint: str, others: Sequence[str] = ()) -> int:
 
 
 def effort_units(plan: Plan) -> dict[str, str]:
-    """Return the effort unit of each joint's servos; empty: fraction of their maximum."""
+    """Return the effort unit of each joint (`Nm`, `N`, `A`); empty for a fraction of the servo's maximum."""
     return {
         joint: servo.unit.effort_unit(find_table(servo.model, bus.protocol).effort_unit).replace("1", "")
         for joint, servos in plan.servos_by_joint.items()
@@ -82,14 +87,15 @@ def effort_units(plan: Plan) -> dict[str, str]:
 
 
 def position_unit(plan: Plan, joint: str) -> str:
-    """Return the unit of a joint's positions."""
+    """Return the unit of a joint's positions, `rad` or `m`; raises RefusedRequest for an unknown joint."""
     return plan.loop.joints[joint_row(plan, joint)].unit.si
 
 
 def named_joints(plan: Plan, controllers: Iterable[ControllerPlan], names: Sequence[str]) -> tuple[str, ...]:
-    """Return the joints for names of joints, groups, controllers (their joints), or `all`, without repeats.
+    """Return the joints that are meant by names of joints, groups, controllers (their joints) or `all`, each
+    once.
 
-    Raises RefusedRequest.
+    Raises RefusedRequest for an unknown name, or no name.
     """
     joints = tuple(one.name for one in plan.loop.joints)
     groups = {one.name: one.joints for one in controllers if one.command} | plan.groups | {ALL: joints}
@@ -144,7 +150,9 @@ def prepared_register(plan: Plan, name: str, item: str, value: int | str) -> Reg
 
 
 def prepared_reading(plan: Plan, name: str, item: str) -> RegisterReading:
-    """Return the loop's request to read an item; raises RefusedRequest."""
+    """Return the loop's request to read an item of a joint's servo; raises RefusedRequest for an unknown
+    name.
+    """
     servo, table, fields = _servo(plan, name, item)
     if item not in table.items:
         hint = suggestion(item[:_LONGEST], table.items, texts.register_list(table.model))
@@ -154,7 +162,9 @@ def prepared_reading(plan: Plan, name: str, item: str) -> RegisterReading:
 
 
 def read_register(plan: Plan, name: str, item: str, value: int | None) -> Mapping[str, object]:
-    """Return an item as clients receive it: the integer on the wire, and the value with its unit."""
+    """Return the reply for an item that was read: title, area, integer on the wire, and the same with its
+    unit.
+    """
     _, table, _ = _servo(plan, name, item)
     entry = table.items[item]
     shown = "" if value is None else meaning(entry, value, table.errors)
@@ -165,7 +175,9 @@ def read_register(plan: Plan, name: str, item: str, value: int | None) -> Mappin
 
 
 def _row(plan: Plan, name: str, servo: ServoPlan) -> int | None:
-    """Return the row of one servo of several in a request; None addresses all servos of a joint."""
+    """Return the index by which the loop addresses one servo of a joint with several; None addresses all of
+    them.
+    """
     own = plan.mechanics.coupled and name == servo.own_name
     return len(plan.loop.joints) + servo.row if own else None
 

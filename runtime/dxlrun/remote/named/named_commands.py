@@ -26,20 +26,20 @@ from dxlrun.remote import texts
 from dxlrun.remote.preparation import Known, invalid, plain_quantities, refused, travel_s
 
 POINT_SPEED = 0.5
-"""rad/s; default speed of a trajectory without a time, or the joint's limit, if that is lower."""
+"""Speed of a move of named joints without a duration, rad/s or m/s; slower joints use their highest speed."""
 _SHORTEST_S = 0.1
 _FIELDS = {"position": "positions", "velocity": "velocities", "effort": "efforts", "pwm": "pwm"}
 INTERFACES = {**{name: name for name in _FIELDS}, **{field: name for name, field in _FIELDS.items()}}
-"""Singular and plural name -> interface."""
+"""Interface as a client writes it, singular or plural -> interface: `positions` -> `position`."""
 
 
 @dataclass(frozen=True, slots=True)
 class JointCommand:
-    """A controller's command, made from values for some of its joints."""
+    """A complete command of a controller, made from a client's values for some of its joints."""
 
     kind: str
     content: bytes
-    """JSON, in SI units"""
+    """The command as JSON, in SI units."""
 
 
 def joint_command(
@@ -114,7 +114,7 @@ def joint_command(
 def _numbers(
     known: Known, kind: str, field: str, named: Mapping[str, object], units: bool
 ) -> dict[str, float]:
-    """Return the values in SI units; raises RefusedRequest."""
+    """Return the values by joint in SI units; raises RefusedRequest for one that is not a finite number."""
     si = plain_quantities(named, field, known.joints) if units else named
     for joint, value in si.items():
         # An integer of JSON may exceed the range of float.
@@ -124,7 +124,11 @@ def _numbers(
 
 
 def _command_for(known: Known, interface: str) -> tuple[str, tuple[str, ...] | None]:
-    """Return the command for an interface with its fields; the fields of a trajectory are None."""
+    """Return a controller's command for an interface, and the command's fields; None as fields for a
+    trajectory.
+
+    Raises RefusedRequest when the controller has no such command.
+    """
     field, commands = _FIELDS[interface], known.controller.Commands
     found: dict[str, tuple[str, ...]] = {}
     for kind, model in commands.items():
@@ -156,7 +160,7 @@ def _filled(
     *,
     still: bool = True,
 ) -> list[float]:
-    """Return one value for each joint: the given value, or the newest goal."""
+    """Return one value for each joint: the value of the request, or else the joint's newest goal."""
     return [
         values[joint.name] if joint.name in values else _present(joint, field, record, still=still)
         for joint in joints
@@ -164,7 +168,7 @@ def _filled(
 
 
 def _present(joint: JointPlan, field: str, record: CycleRecord, *, still: bool = True) -> float:
-    """Return a joint's present goal, or a default without a goal.
+    """Return a joint's newest goal of a field, or a default when it has none.
 
     The default holds the joint: the present position, zero velocity, zero effort. With `still` False,
     velocity and effort are upper limits, so their defaults allow motion.
@@ -186,7 +190,7 @@ def _present(joint: JointPlan, field: str, record: CycleRecord, *, still: bool =
 
 
 def _duration(joints: Sequence[JointPlan], positions: Sequence[float], record: CycleRecord) -> float:
-    """Return the duration of a movement to these positions, s."""
+    """Return the time that the slowest joint needs to reach these positions, s; at least 0.1 s."""
     ways = (
         travel_s(
             joint,
@@ -248,7 +252,11 @@ def _commander(
     active: Callable[[ControllerPlan], bool],
     takes: Callable[[ControllerPlan], Mapping[str, object]],
 ) -> str:
-    """Return the active controller that accepts values for a command of a source; raises RefusedRequest."""
+    """Return the active controller that commands this item of a source and accepts values from clients for
+    it.
+
+    Raises RefusedRequest when there is none.
+    """
     claiming = [plan for plan in controllers if name in plan.source_commands]
     now = [plan for plan in claiming if active(plan)]
     if now and SOURCE_COMMANDS in takes(now[0]):

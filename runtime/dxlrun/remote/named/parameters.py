@@ -1,4 +1,4 @@
-"""Parameters: a controller's parameters in a run, listed and changed; the model validates each change."""
+"""Parameters: list a controller's parameters in a run, and validate changes of the live ones."""
 
 from __future__ import annotations
 
@@ -25,16 +25,16 @@ _BOUNDS = (("ge", "at least"), ("gt", "above"), ("le", "at most"), ("lt", "below
 
 @dataclass(frozen=True, slots=True)
 class Change:
-    """A validated change of live parameters, prepared for the loop."""
+    """A validated change of a controller's live parameters."""
 
     request: Parameters
     plan: ControllerPlan
-    """The controller's plan with the new values."""
+    """The controller's plan with the new values, for the gateway after the loop has changed them."""
     shown: tuple[NewValue, ...]
 
 
 def parameters_of(model: BaseModel, prefix: str = "") -> Iterator[Parameter]:
-    """Yield all parameters of a controller; parameters of nested models have dotted names."""
+    """Yield all parameters of a controller with range and description; nested ones have dotted names."""
     live = frozenset(live_names(model))
     values = model.model_dump(mode="json")
     for name, field in type(model).model_fields.items():
@@ -56,7 +56,10 @@ def _range(field: FieldInfo) -> str:
 
 
 def changed(plan: ControllerPlan, now: ParametersModel, values: Mapping[str, Written]) -> Change:
-    """Return a change of live parameters with the present values `now`; raises RefusedRequest."""
+    """Return the validated change of live parameters that now have the values `now`.
+
+    Raises RefusedRequest for an unknown or fixed parameter, or an invalid value.
+    """
     if not values:
         raise invalid(texts.NO_PARAMETER)
     known = {parameter.name: parameter for parameter in parameters_of(now)}
@@ -99,7 +102,9 @@ def _require_live(controller: str, name: str, known: Mapping[str, Parameter]) ->
 
 
 def _put(written: dict[str, object], path: list[str], value: Written, now: object) -> None:
-    """Set a value in the parameters of the robot file; a nested model in short form is expanded first."""
+    """Set a value by path in parameters as written in the robot file; a short form on the path is written
+    out.
+    """
     for key in path[:-1]:
         now = now[key] if isinstance(now, Mapping) else getattr(now, key)
         inner = written.get(key)

@@ -18,11 +18,11 @@ from typing import TypedDict
 from dxlrun.errors import InputError
 
 CLIENT = "client"
-"""File name of a client's certificate and key, without suffix."""
+"""File name, without suffix, of this user's own certificate and key for connections to robots."""
 
 
 class Certificate(TypedDict, total=False):
-    """The used fields of `SSLSocket.getpeercert()`."""
+    """Fields of a peer's verified certificate that dxlrun reads, as `SSLSocket.getpeercert()` returns them."""
 
     subject: tuple[tuple[tuple[str, str], ...], ...]
     notAfter: str
@@ -30,17 +30,20 @@ class Certificate(TypedDict, total=False):
 
 
 def settings() -> Path:
-    """Return the directory of this user's settings (XDG Base Directory Specification)."""
+    """Return the directory of this user's dxlrun settings (XDG Base Directory Specification)."""
     return Path(os.environ.get("XDG_CONFIG_HOME") or Path.home() / ".config") / "dxlrun"
 
 
 def keys_place() -> Path:
-    """Return the directory of certificates and keys."""
+    """Return the directory of this user's certificates, keys and list of revoked certificates."""
     return settings() / "keys"
 
 
 def server_context(name: str) -> ssl.SSLContext:
-    """Return the TLS context of a robot's gateway; raises InputError when clients would refuse it."""
+    """Return the TLS context of a robot's gateway, which requires a certificate of each client.
+
+    Raises InputError when a file is missing or readable by others, or clients would refuse the certificate.
+    """
     context = _context(ssl.PROTOCOL_TLS_SERVER, name, f"`dxlrun keys robot {name}` makes it")
     # A ticket is sent unasked, and clients take any byte without a request for a closed connection.
     context.num_tickets = 0
@@ -50,7 +53,9 @@ def server_context(name: str) -> ssl.SSLContext:
 
 
 def client_context() -> ssl.SSLContext:
-    """Return the TLS context of a client; raises InputError."""
+    """Return this user's TLS context for connections to robots; raises InputError when a file is missing or
+    wrong.
+    """
     made = "`dxlrun keys client NAME --output DIRECTORY` on the robot's computer makes it, to be copied here"
     return _context(ssl.PROTOCOL_TLS_CLIENT, CLIENT, made)
 
@@ -74,7 +79,9 @@ def _context(protocol: int, name: str, remedy: str) -> ssl.SSLContext:
 
 
 def _try(server: ssl.SSLContext, name: str) -> None:
-    """Shake hands with a robot's certificate in memory; raises InputError when a client would refuse it."""
+    """Complete a TLS handshake with a robot's certificate in memory; raises InputError if clients would
+    refuse it.
+    """
     trusting = ssl.SSLContext(ssl.PROTOCOL_TLS_CLIENT)
     trusting.load_verify_locations(keys_place() / "ca.crt")
     here, there = ssl.MemoryBIO(), ssl.MemoryBIO()
@@ -94,13 +101,13 @@ def _try(server: ssl.SSLContext, name: str) -> None:
 
 
 def counts(certificate: Certificate) -> bool:
-    """Return whether a certificate that TLS has verified is still valid: not expired, not revoked."""
+    """Return True when a certificate that TLS verified earlier has neither expired nor been revoked since."""
     until = ssl.cert_time_to_seconds(certificate["notAfter"])
     return until > time.time() and certificate["serialNumber"] not in revoked()
 
 
 def revoked() -> frozenset[str]:
-    """Return the serial numbers of revoked certificates: one per line in the file `revoked`."""
+    """Return the serial numbers of revoked certificates from the file `revoked`; none without the file."""
     path = keys_place() / "revoked"
     try:
         found = path.stat()
@@ -111,5 +118,5 @@ def revoked() -> frozenset[str]:
 
 @lru_cache(maxsize=1)
 def _serials(path: Path, file: int, changed_ns: int) -> frozenset[str]:
-    """Return the serial numbers in a file; inode and modification time are the key of the cache."""
+    """Return the serial numbers in a file, cached while its inode and modification time stay the same."""
     return frozenset(path.read_text().upper().split())

@@ -1,4 +1,4 @@
-"""Commander: the one client that may command the robot at a time, and the roles of clients."""
+"""Commander: the one client that may command the robot at a time, and the roles that certificates give."""
 
 from __future__ import annotations
 
@@ -11,13 +11,14 @@ from dxlrun.remote.preparation import refused
 from dxlrun.remote.requests.table import HALT, STOP, TAKE_OVER, Answer, Body, Request, Role
 
 LEASE_S = 5.0
-"""A client that sends no command for this time is no longer the commander; another client may command."""
+"""Time, s, without a command after which a client is no longer the commander and another client may command.
+"""
 HERE = "this computer"
-"""Common commander name of all clients on the robot's own computer, which may command concurrently."""
+"""Name of the commander for all clients on the robot's own computer, which may command concurrently."""
 
 
 class Client(NamedTuple):
-    """Client of a connection. Takes the place of ASGI's (host, port), so every request carries it."""
+    """A connected client. It takes the place of ASGI's `(host, port)`, so that every request carries it."""
 
     name: str
     """`process N` on this computer, or `client NAME` with the name in a certificate."""
@@ -25,11 +26,11 @@ class Client(NamedTuple):
 
     @property
     def commands_as(self) -> str:
-        """Name under which the client commands."""
+        """Name of this client as commander: its own name, or HERE for every client on the robot's computer."""
         return HERE if self.name.startswith("process ") else self.name
 
     def require_role(self, request: Request[Body, Answer]) -> None:
-        """Raise RefusedRequest when the client's role does not allow a request."""
+        """Raise RefusedRequest when the client's role is lower than the role that a request needs."""
         if self.role < request.role:
             needed, role = request.role.name.lower(), self.role.name.lower()
             raise refused(Code.NOT_ALLOWED, {"client": self.name, "role": role, "needed": needed})
@@ -37,17 +38,21 @@ class Client(NamedTuple):
 
 @dataclass(slots=True)
 class Commander:
-    """Admission of one commanding client at a time; GET, halt, stop and take-over are always admitted."""
+    """Record of the present commander.
+
+    Other clients may only read, halt, stop and take over until it is silent.
+    """
 
     now: Callable[[], float]
-    """Clock, s."""
+    """Clock with the current time, s."""
     name: str = HERE
     _until: float = field(default=-1.0, init=False)
 
     def admit(self, client: Client, request: Request[Body, Answer]) -> str | None:
-        """Return the previous commander when this request changes the commander, else None.
+        """Return the previous commander's name when this request makes the client commander, else None.
 
-        Raises RefusedRequest when another client commands.
+        A request extends the commander's time by LEASE_S. Raises RefusedRequest while another client
+        commands.
         """
         if request.method == "GET" or request in (HALT, STOP, TAKE_OVER):
             return None
@@ -56,7 +61,9 @@ class Commander:
         return self.become(client)
 
     def become(self, client: Client) -> str | None:
-        """Make a client the commander, whoever is; return the previous commander, None without a change."""
+        """Make a client the commander for LEASE_S; return the name of the one before, None if it was the
+        same.
+        """
         before, self.name = self.name, client.commands_as
         self._until = self.now() + LEASE_S
         return before if before != self.name else None

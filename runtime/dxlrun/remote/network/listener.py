@@ -1,4 +1,4 @@
-"""Listener: a TCP port on which half-open connections occupy little memory and few file descriptors.
+"""Listener: a TCP port whose unproved connections occupy little memory and few file descriptors.
 
 A connection is unproved until the server admits it: TLS has checked its certificate, or it has sent a token.
 """
@@ -23,16 +23,16 @@ from dxlrun.remote.sockets import Address
 
 LOOPBACK = "127.0.0.1"
 MOST_UNPROVED = 64
-"""Upper limit of unproved connections; one more closes the oldest one of the host that has the most."""
+"""Upper limit of unproved connections; one more closes the oldest one of the host with the most of them."""
 # s; timeout of a TLS handshake or shutdown, after which a half-open connection frees its memory.
 HANDSHAKE_S = 5.0
 
 
 class Listener(socket.socket):
-    """Listening TCP socket for a server of asyncio."""
+    """Listening TCP socket for an asyncio server, with a limit on unproved connections."""
 
     def __init__(self, host: str, port: int, tls: ssl.SSLContext | None = None) -> None:
-        """Raises OSError."""
+        """Bind to host and port; `tls`: context of each connection, None for plain TCP. Raises OSError."""
         super().__init__(socket.AF_INET6 if ":" in host else socket.AF_INET, socket.SOCK_STREAM)
         self.tls = tls
         self._unproved: dict[tuple[str, int], socket.socket] = {}
@@ -50,17 +50,20 @@ class Listener(socket.socket):
 
     @classmethod
     def secured(cls, address: Address) -> Listener:
-        """Return a listener for clients with mutual TLS; raises InputError and OSError."""
+        """Return a listener at an address whose clients need a certificate (mutual TLS).
+
+        Raises InputError for missing or wrong certificates, OSError for a port that is in use.
+        """
         return cls(address.host, address.port, server_context(address.name))
 
     async def serve(self, make: Callable[[], asyncio.Protocol]) -> None:
-        """Serve connections from now on, each with a new protocol after the TLS handshake."""
+        """Start to serve connections; `make` returns a protocol for each one after its TLS handshake."""
         await asyncio.get_running_loop().create_server(
             make, sock=self, ssl=self.tls, ssl_handshake_timeout=HANDSHAKE_S, ssl_shutdown_timeout=HANDSHAKE_S
         )
 
     def accept(self) -> tuple[socket.socket, tuple[str, int]]:
-        """Accept a connection, and close another unproved one above the limit."""
+        """Accept a connection as unproved; above the limit, close the oldest one of the host with the most."""
         end, peer = super().accept()
         self._accepted += 1
         if not self._accepted % MOST_UNPROVED:
@@ -78,7 +81,7 @@ class Listener(socket.socket):
         return end, peer
 
     def admit(self, peer: tuple[str, int]) -> None:
-        """Remove a connection from the unproved ones, by its peer address (IPv6: with two more fields)."""
+        """Take a connection off the unproved ones; `peer` is its address (for IPv6 with two more fields)."""
         self._unproved.pop((peer[0], peer[1]), None)
 
 
@@ -88,15 +91,15 @@ def in_url(host: str) -> str:
 
 
 class Place(NamedTuple):
-    """Host and port of `--listen`."""
+    """Host and port at which a server listens, as given with `--listen`."""
 
     host: str = LOOPBACK
     port: int | None = None
-    """None: the default port of the command, or a free port when that is in use."""
+    """None: the server's usual port, or a free port when the usual one is in use."""
 
     @classmethod
     def parse(cls, text: str) -> Place:
-        """Parse `HOST:PORT`, `HOST` or `:PORT`. Raises InputError."""
+        """Parse `HOST:PORT`, `HOST` or `:PORT`; the default host is LOOPBACK. Raises InputError."""
         found = re.fullmatch(
             r"(\[[^\]]+\]|[^:]*)(?::(\d{1,5}))?|([\da-fA-F]*:[\da-fA-F:]*:[\da-fA-F.]*)", text
         )
@@ -107,14 +110,17 @@ class Place(NamedTuple):
 
     @property
     def is_loopback(self) -> bool:
-        """True when only this computer can connect."""
+        """True when the host is a loopback address, so that only this computer can connect."""
         try:
             return ip_address(self.host).is_loopback
         except ValueError:
             return self.host == "localhost"
 
     def listener(self, usual: int, tls: ssl.SSLContext | None = None) -> Listener:
-        """Return a socket that listens here, on port `usual` by default. Raises InputError."""
+        """Return a socket that listens at this place; `usual` is the port when none is given.
+
+        Raises InputError when the port cannot be listened on.
+        """
         port = usual if self.port is None else self.port
         try:
             return Listener(self.host, port, tls)

@@ -18,7 +18,7 @@ _CHUNK = 1 << 16
 
 
 class NetworkLink(SocketLink):
-    """Connection to a robot of another computer. A thread decrypts each stream."""
+    """Connection to the gateway of a robot on another computer. A thread decrypts each stream."""
 
     def __init__(self, address: Address, client: str) -> None:
         """Raises InputError when this user has no client certificate."""
@@ -26,7 +26,7 @@ class NetworkLink(SocketLink):
         self._address, self._context = address, client_context()
 
     def exchange(self, method: str, path: str, body: bytes | None) -> tuple[int, bytes]:
-        """Send one request; return status and body of the reply."""
+        """Send one request over TLS; return HTTP status and body of the reply."""
         try:
             return super().exchange(method, path, body)
         # In TLS 1.3, the server verifies the client's certificate after the client's handshake has ended, and
@@ -49,7 +49,9 @@ class NetworkLink(SocketLink):
         return secured
 
     def stream(self, path: str) -> tuple[int, bytes, socket.socket]:
-        """Send a request with a streamed reply; return status, first bytes, and a socket for the rest."""
+        """Send a GET request with a streamed reply; return status, first bytes, and a socket with the
+        decrypted rest.
+        """
         status, first, end = super().stream(path)
         here, there = socket.socketpair()
         threading.Thread(target=_pass_on, args=(end, there), daemon=True).start()
@@ -57,7 +59,7 @@ class NetworkLink(SocketLink):
 
     @property
     def alive(self) -> bool:
-        """True while the other computer accepts connections."""
+        """True while the gateway's port accepts connections."""
         try:
             socket.create_connection((self._address.host, self._address.port), _CONNECT_S).close()
         except OSError:
@@ -65,7 +67,9 @@ class NetworkLink(SocketLink):
         return True
 
     def ends(self) -> bool:
-        """Return whether the run ends within a second: its port then refuses connections."""
+        """Return True if the gateway's port refuses connections within a second, which means that the run has
+        ended.
+        """
         for _ in range(20):
             if not self.alive:
                 return True
@@ -74,14 +78,15 @@ class NetworkLink(SocketLink):
 
 
 def _pass_on(end: socket.socket, to: socket.socket) -> None:
-    """Forward received bytes until one of the two sockets is closed."""
+    """Forward bytes received from `end` to `to` until one of the sockets is closed, and close both."""
     with end, to, suppress(OSError):
         while data := end.recv(_CHUNK):
             to.sendall(data)
 
 
 def known_robots() -> dict[str, Address]:
-    """Return the robots of other computers in `robots.yaml` of the settings.
+    """Return the addresses of robots on other computers by name, from `robots.yaml` of the settings, if it
+    exists.
 
     Raises InputError with the place of each mistake.
     """

@@ -1,4 +1,4 @@
-"""OpenAPI: the table of requests for other programs (OpenAPI Specification 3.1).
+"""OpenAPI: the table of requests as a document for other programs (OpenAPI Specification 3.1).
 
 Bodies and replies are JSON Schemas of the types that gateway and client use. Each request lists the roles
 that may make it over TLS; the Unix socket of this user needs no certificate.
@@ -24,7 +24,7 @@ _TLS = "certificate"
 
 
 def openapi(abouts: Mapping[Request[Any, Any], str]) -> dict[str, object]:
-    """Return the OpenAPI description of all requests; `abouts` has a sentence for each request."""
+    """Return the OpenAPI document of all requests; `abouts` has the summary of each request."""
     answers = {one: RobotStates if one is requests.STATES else one.answer for one in REQUESTS}
     kinds = dict.fromkeys([NotDone, *(one.body for one in REQUESTS), *answers.values()])
     found, components = msgspec.json.schema_components(
@@ -65,7 +65,7 @@ def openapi(abouts: Mapping[Request[Any, Any], str]) -> dict[str, object]:
 
 
 def _schema(kind: object) -> dict[str, object]:
-    """Return the schema of a type that msgspec does not support."""
+    """Return the JSON Schema of a type that msgspec cannot describe: numbers for an array, else any JSON."""
     if getattr(kind, "__origin__", None) is np.ndarray:
         return {"type": "array", "description": "numbers; null: not known"}
     return {"description": "any JSON"}

@@ -1,4 +1,4 @@
-"""Robots file: `robots.yaml` of the settings, with the robots of other computers."""
+"""Robots file: `robots.yaml` of the user's settings, with the addresses of robots on other computers."""
 
 from __future__ import annotations
 
@@ -23,16 +23,16 @@ def _address(text: str) -> str:
 
 
 ListedAddress = Annotated[str, AfterValidator(_address)]
-"""`[NAME@]HOST:PORT`; the default NAME is the key of the mapping."""
+"""Address as written in the file, `[NAME@]HOST:PORT`; the default NAME is the key of the mapping."""
 
 
 class RobotsFile(Form):
-    """Addresses of the gateways of robots on other computers."""
+    """Content of `robots.yaml`."""
 
     robots: dict[str, ListedAddress] = key("Addresses by the names of certificates.", "{torso: lab3:7660}")
 
 
 def read_robots(path: Path) -> dict[str, Address]:
-    """Return the addresses in a file by robot name; raises InputError with the place of each mistake."""
+    """Return the addresses in a robots file by robot name; raises InputError with the place of each mistake."""
     robots = read_yaml(path, RobotsFile).robots
     return {name: Address.parse(text, name) for name, text in robots.items()}

@@ -1,4 +1,4 @@
-"""Replies: types of the JSON replies of a running robot, shared by gateway and client."""
+"""Replies: types of the gateway's JSON replies, shared by gateway and client."""
 
 from __future__ import annotations
 
@@ -14,47 +14,46 @@ from dxlrun.plan.loop_plan import JointValues
 
 AGoal = TypeVar("AGoal")
 Written = bool | int | float | str
-"""A value as in the robot file: `4.0`, `true`, `20 deg/s`."""
+"""A value as written in the robot file: `4.0`, `true`, `20 deg/s`."""
 
 
 class ControllerInfo(msgspec.Struct, frozen=True):
-    """A controller of a running robot."""
+    """A controller in the loop of a running robot, as clients see it."""
 
     name: str
     type: str
     active: bool
     held: bool
-    """True when the controller's joints are held because its stream ended."""
+    """True when the controller's joints are held because its stream of set-points ended."""
     rate: float
-    """Hz"""
+    """Rate of the controller's updates, Hz."""
     joints: tuple[str, ...]
     command: tuple[str, ...]
-    """Interfaces of the joints that the controller commands."""
+    """Interfaces that the controller commands at its joints: `position`, `velocity`, `effort`, `pwm`."""
     into: tuple[str, ...]
-    """Controllers that this controller commands."""
+    """Names of the lower controllers that this controller commands."""
     fallback: str
     reference: tuple[str, ...]
-    """References that controllers above this one command."""
+    """References, inputs of this controller, that controllers above this one can command."""
     reads: tuple[str, ...]
     takes: dict[str, object]
-    """JSON Schema of each command."""
+    """Command that clients can send -> JSON Schema of its fields."""
     goals: tuple[str, ...]
-    """Commands that are goals."""
+    """Names of the commands in `takes` that are goals: they run for a time and report a result."""
     motions: dict[str, float]
-    """Motions that the controller plays by name, with durations, s."""
+    """Name of each motion that the controller can play -> its duration, s."""
 
 
 @dataclass(frozen=True)
 class RunInfo:
-    """A run, with the joints and groups of its robot file."""
+    """A run: rate, cycles and state of its loop, and the joints and groups of its robot file."""
 
     robot: str
     rate: float
-    """Hz"""
+    """Rate of the loop, Hz."""
     paused: bool
     began: float | None
-    """Time of the first cycle on the clock of the events, s; 0 s of the run's log. null before the first
-    cycle."""
+    """Start of the first cycle, s on the clock of events; it is 0 s of the log. null before that cycle."""
     cycles: int
     skipped: int
     joints: tuple[str, ...]
@@ -64,25 +63,25 @@ class RunInfo:
 # Dataclasses, because a Struct cannot have the fields of two bases; the fields are in the order of the JSON.
 @dataclass(frozen=True)
 class RobotInfo(JointValues, RunInfo):
-    """A run, its controllers and the commands that they accept."""
+    """A run with its joints, its devices and its controllers, and the commands that they accept."""
 
     controllers: tuple[ControllerInfo, ...]
     sources: tuple[object, ...]
-    """Devices and sensors, with their states and commands."""
+    """Devices and sensors of the robot, with their states and commands."""
     file: str
-    """The robot file."""
+    """Absolute path of the robot file."""
     log: str | None
 
 
 class Frames(msgspec.Struct, frozen=True):
-    """URDF and the plan of its moved frames, from which a client computes the poses of frames."""
+    """The robot's URDF and a plan of the joints that move it, from which a client computes poses of frames."""
 
     urdf: str | None
     frames: object
 
 
 class EventRow(msgspec.Struct, frozen=True):
-    """An event."""
+    """An event of the run, as the log has it: number, time, severity, source and text."""
 
     number: int
     time: float
@@ -94,58 +93,58 @@ class EventRow(msgspec.Struct, frozen=True):
 
 
 class Events(msgspec.Struct, frozen=True):
-    """Stored events, and the number of the newest event."""
+    """Stored events of a run, oldest first, and the number of the newest one."""
 
     events: tuple[EventRow, ...]
     last: int
 
 
 class Executed(msgspec.Struct, Generic[AGoal], frozen=True, omit_defaults=True):
-    """Reply to a command that the robot executed."""
+    """Reply to a command that the robot executed; fields that do not apply have their defaults."""
 
     cycle: int = -1
-    """Cycle of the loop that executed the command; -1: unknown."""
+    """Number of the loop's cycle that executed the command; -1: unknown."""
     goals: tuple[AGoal, ...] = ()
-    """Goals that the command began or cancelled: numbers; in the client, RemoteGoals."""
+    """Goals that the command started or cancelled: numbers; in the client, RemoteGoals."""
     old: int | None = None
-    """Previous value of a register; None when unknown, or for any other command."""
+    """Value of the written register before; None when unknown, or for any other command."""
     value: int | None = None
-    """New value of a register."""
+    """New value of the written register, as an integer on the wire."""
     below: tuple[str, ...] = ()
-    """Lower controllers that a switch activated in addition to the named ones."""
+    """Lower controllers that a switch activated because named ones command them."""
     joints: tuple[str, ...] = ()
     """Joints whose torque was switched, or whose servos were rebooted."""
     deactivated: tuple[str, ...] = ()
-    """Controllers that a torque or reboot request deactivated."""
+    """Controllers that this torque or reboot request deactivated."""
     offered: tuple[str, ...] = ()
     """Controllers that this or an earlier torque or reboot request deactivated, and whose joints have
     torque again."""
     seconds: float | None = None
-    """Duration until all parts of a motion have ended, s."""
+    """Duration until all parts of a played motion have ended, s."""
     halted: Halted | None = None
-    """Measurements of a halt, when all joints are at rest."""
+    """Measurements of a halt, such as its duration, when all joints are at rest."""
 
     @property
     def goal(self) -> AGoal | None:
-        """Goal that the command began; None when the command is not a goal."""
+        """First goal that the command started or cancelled; None when the command is not a goal."""
         return self.goals[0] if self.goals else None
 
 
 class Clamped(msgspec.Struct, frozen=True):
-    """Reply to a set-point: number and joints of the values beyond their joints' limits."""
+    """Reply to a set-point: number and joints of the values beyond their joints' limits, which are clamped."""
 
     clamped: int
     clamped_joints: tuple[str, ...]
 
 
 class Parameter(msgspec.Struct, frozen=True):
-    """A parameter of a controller."""
+    """A parameter of a controller with its present value."""
 
     name: str
     value: object
-    """Value as in the robot file; quantities with their units."""
+    """Value as in the robot file; quantities are texts with units."""
     live: bool
-    """True when the parameter can be changed in a run."""
+    """True when the parameter can be changed during a run."""
     range: str = ""
     description: str = ""
 
@@ -157,7 +156,7 @@ class Parameters(msgspec.Struct, frozen=True):
 
 
 class NewValue(msgspec.Struct, frozen=True):
-    """A live parameter that was changed."""
+    """A live parameter that a request changed, with the values before and after."""
 
     name: str
     old: object
@@ -165,14 +164,14 @@ class NewValue(msgspec.Struct, frozen=True):
 
 
 class Changed(msgspec.Struct, frozen=True):
-    """Reply to a change of live parameters."""
+    """Reply to a change of live parameters: cycle of the change, and the parameters that differ now."""
 
     cycle: int
     changed: tuple[NewValue, ...]
 
 
 class GoalState(msgspec.Struct, frozen=True):
-    """A goal as the robot reports it."""
+    """State of a goal: progress while it runs, or its result after the end."""
 
     number: int = msgspec.field(name="goal")
     controller: str = ""
@@ -180,33 +179,35 @@ class GoalState(msgspec.Struct, frozen=True):
     origin: str = ""
     """Client that sent the goal, or its place in a motion file."""
     status: str = "running"
-    """`running`, or the outcome: `reached`, `missed`, `aborted`, `cancelled`, `preempted`."""
+    """`running`, or the result: `reached`, `missed`, `aborted`, `cancelled`, `preempted`."""
     progress: float = 0.0
-    """0 to 1, as last reported by the controller."""
+    """Fraction of the goal that is done, 0 to 1, as last reported by the controller."""
     error: float | None = None
-    """Largest distance from the desired state; after the end, the worst joint's distance from the goal. SI
-    units."""
+    """Largest distance of a joint from its desired state, SI units; after the end, from the goal.
+
+    None if unknown.
+    """
     joint: str = ""
     """Joint with the largest error at the end; empty when none was reported."""
     text: str = ""
     """Text of the controller's final report."""
     accepted: float = 0.0
-    """s of the run's clock"""
+    """Time at which the loop accepted the goal, s of the run's clock."""
     ended: float | None = None
     """Time of the end, s of the run's clock; None while the goal runs."""
 
     @property
     def seconds(self) -> float | None:
-        """Duration of the goal, s; None while it runs."""
+        """Duration from acceptance to end, s; None while the goal runs."""
         return None if self.ended is None else self.ended - self.accepted
 
     @property
     def reached(self) -> bool:
-        """True when the goal ended with `reached`."""
+        """True when the goal has ended with the result `reached`."""
         return self.status == "reached"
 
     def describe(self) -> str:
-        """Return how the goal ended: `goal 3 of left_arm reached after 1.02 s`."""
+        """Return the result as a text: `goal 3 of left_arm reached after 1.02 s`."""
         # The controller's text already has the duration.
         timed = self.seconds is None or self.text.startswith("after ")
         after = "" if timed else f" after {self.seconds:.2f} s"
@@ -215,29 +216,29 @@ class GoalState(msgspec.Struct, frozen=True):
 
 
 class Goals(msgspec.Struct, frozen=True):
-    """Running goals, and the last ended goals."""
+    """Goals that run, and the last goals that have ended."""
 
     running: tuple[GoalState, ...]
     ended: tuple[GoalState, ...]
 
 
 class TopicState(msgspec.Struct, frozen=True):
-    """A topic of a running robot."""
+    """A topic of a running robot, with its message type and how many messages it had."""
 
     name: str
-    """`/CONTROLLER/TOPIC`, `/goals`, `/events`, `/joint_states`."""
+    """Name such as `/CONTROLLER/TOPIC`, `/goals`, `/events` or `/joint_states`."""
     type: str
-    """Name of the type in ROS 2 format: `nav_msgs/msg/Odometry`."""
+    """Name of the message type in ROS 2 format: `nav_msgs/msg/Odometry`."""
     joints: tuple[str, ...]
-    """Joints of the rows of its arrays; empty: the arrays have no rows of joints."""
+    """Joints of the rows of the messages' arrays; empty: the arrays have no rows of joints."""
     count: int
-    """Number of messages so far."""
+    """Number of messages since the start of the run."""
     rate: float | None
-    """Hz; None when unknown."""
+    """Present rate of the messages, Hz; None when unknown."""
 
 
 class Topics(msgspec.Struct, frozen=True):
-    """Topics that a client can listen to."""
+    """All topics that a client can stream."""
 
     topics: tuple[TopicState, ...]
 
@@ -246,26 +247,26 @@ class Opened(msgspec.Struct, frozen=True, array_like=True, tag_field="frame", ta
     """Description of a topic in a stream, sent before its first message and when its publisher changes."""
 
     place: int
-    """Number of the topic in the stream, which its messages refer to."""
+    """Number of the topic within this stream, by which its messages name it."""
     name: str
     type: str
     definition: str
-    """Definition of the type in ROS 2 format (`ros2msg`)."""
+    """Definition of the message type in ROS 2 format (`ros2msg`)."""
     joints: tuple[str, ...]
     epoch_offset_ns: int
-    """Wall time minus the run's clock."""
+    """Wall time minus the run's clock, ns."""
 
 
 class Sample(msgspec.Struct, frozen=True, array_like=True, tag_field="frame", tag=1):
-    """One message of a stream."""
+    """One message of a topic in a stream."""
 
     place: int
     number: int
     """Sequence number, counted from 1 by the loop; a gap in the numbers shows lost messages."""
     time_ns: int
-    """Time of the message on the run's clock, ns."""
+    """Time of the message, ns of the run's clock."""
     data: bytes
-    """CDR"""
+    """Content of the message, encoded as CDR (little-endian)."""
 
 
 class RunEnded(msgspec.Struct, frozen=True, array_like=True, tag_field="frame", tag=2):
@@ -279,7 +280,7 @@ FRAME_LENGTH = struct.Struct("<I")
 
 
 class NotDone(msgspec.Struct, frozen=True):
-    """Reply to a refused request: a sentence for a person; code and fields for a program."""
+    """Reply to a refused request: `refused` is a sentence for a person, code and fields are for programs."""
 
     refused: str = ""
     code: str = ""

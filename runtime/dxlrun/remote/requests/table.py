@@ -32,7 +32,7 @@ from dxlrun.remote.requests.replies import (
 MOST_OPERATIONS = 200.0
 MOST_SET_POINTS = 4000.0
 MOST_LOOKS = 2000.0
-"""Rate limits of one process, requests per second; a burst may have up to a tenth of these at once."""
+"""Rate limits of a client, 1/s: for commands, set-points and queries; a tenth of them may be made at once."""
 _NAME = re.compile(r"\{\w+(?::path)?\}")
 
 Body = TypeVar("Body")
@@ -46,30 +46,31 @@ class Role(IntEnum):
     OBSERVE = 1
     COMMAND = 2
     ADMIN = 3
-    """Change registers, the loop's rate and its controllers; clients on the robot's own computer have this
-    role."""
+    """May change registers, the loop's rate and its controllers; role of clients on the robot's own computer.
+    """
 
 
 class Request(msgspec.Struct, Generic[Body, Answer], frozen=True):
-    """A kind of request."""
+    """A row of the table: method, path, body, reply, rate limit and role of one kind of request."""
 
     method: str
     path: str
     """Path with parameters in braces; `:path` marks parameters that may contain slashes."""
     body: type[Body]
-    """Type of the JSON body; NoneType: no body; bytes: the gateway's handler checks the content."""
+    """Type of the JSON body; NoneType: no body; bytes: the gateway's handler decodes the content."""
     answer: type[Answer]
     """Type of the JSON reply; bytes: any content."""
     rate: float = MOST_OPERATIONS
-    """Rate limit of one process, requests per second, shared by all requests with the same number; 0: no
-    limit."""
+    """Rate limit of a client, 1/s, counted over all requests with the same number; 0: no limit."""
     query: tuple[str, ...] = ()
-    """Names of query parameters."""
+    """Names of the parameters that the query may have."""
     role: Role = Role.COMMAND
-    """Lowest role that may make the request; `network/commander.py` restricts commands further."""
+    """Lowest role that may make the request; only the commander may make one that is not a GET."""
 
     def target(self, *names: object) -> str:
-        """Return the path with quoted names; a slash in a name does not change the path's structure."""
+        """Return the path with its parameters replaced by `names`, quoted so that a slash does not split the
+        path.
+        """
         path = self.path
         for name in names:
             path = _NAME.sub(quote(str(name), safe=""), path, count=1)
@@ -77,24 +78,24 @@ class Request(msgspec.Struct, Generic[Body, Answer], frozen=True):
 
 
 class Value(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
-    """Body of a request to write a register: the integer on the wire, or a quantity with its unit."""
+    """Body of a request to write a register: an integer on the wire, or a quantity with its unit."""
 
     value: int | str
 
 
 class NewValues(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
-    """Body of a change of live parameters: values as in the robot file, by dotted name."""
+    """Body of a change of live parameters: dotted name -> value as in the robot file."""
 
     values: dict[str, Written]
 
 
 class NewMotion(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
-    """Body of a request to play a motion."""
+    """Body of a request to play a motion file."""
 
     text: str
-    """Text of the motion file."""
+    """Content of the motion file."""
     file: str = "motion"
-    """Name of the motion file, for the places of mistakes and the log."""
+    """Name of the motion file, for messages and the log."""
     speed: float = 1.0
 
 
@@ -139,7 +140,7 @@ TAKE_OVER = Request("POST", "/take-over", NoneType, Done)
 DESCRIPTION = Request("GET", "/openapi.json", NoneType, Row, MOST_LOOKS, role=Role.OBSERVE)
 
 REQUESTS = tuple(one for one in tuple(globals().values()) if isinstance(one, Request))
-"""All requests. Halt and stop have no rate limit; the loop's mailbox may still be full."""
+"""All requests, in the order of the table. `halt` and `stop` have no rate limit."""
 
 EXAMPLES = {
     NewValues: '{"values": {"speed": "20 deg/s"}}',
@@ -151,4 +152,4 @@ EXAMPLES = {
     RebootRequest: '{"joints": ["elbow"]}',
     Rate: '{"rate": 100}',
 }
-"""Example of each body, for refusals."""
+"""Type of a body -> example, for refusals."""
