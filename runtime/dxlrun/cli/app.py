@@ -153,7 +153,7 @@ def _version() -> str:
 
 
 def run_tokens(tokens: Sequence[str]) -> int:
-    """Run one command line, print errors, and return the exit code; a traceback is printed only with --debug."""
+    """Run one command line, print its errors (a traceback only with --debug), and return the exit code."""
     app = build(tokens[0] if tokens else "")
     try:
         _refuse_other_words(tokens)

@@ -61,7 +61,7 @@ Assignment = Annotated[
 
 
 def _of(quantity: str) -> Parameter:
-    """Return an option's parser for a quantity of `description.units` by name; a number without unit is SI."""
+    """Return an option's parser for a quantity of `description.units`; a number without unit is SI."""
 
     def read(_: object, tokens: Sequence[Token]) -> float:
         # Imported here because help and completion need no pydantic.
@@ -184,7 +184,7 @@ def pose_text(positions: Mapping[str, str]) -> str:
 
 @contextmanager
 def terminated_as_interrupted() -> Iterator[None]:
-    """Within the block, handle SIGTERM like Ctrl-C, so that the results of a measurement are kept and shown."""
+    """Handle SIGTERM like Ctrl-C in the block, so that the results of a measurement are kept and shown."""
     before = signal.signal(signal.SIGTERM, signal.default_int_handler)
     try:
         yield

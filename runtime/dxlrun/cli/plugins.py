@@ -190,7 +190,7 @@ def new_plugin(
 
 
 def _module(name: str) -> str:
-    """Return the module name for a new package's name; raises InputError if it is invalid or already taken."""
+    """Return the module name for a new package's name; raises InputError if it is invalid or taken."""
     module = name.replace("-", "_")
     if not _NAME.fullmatch(name) or len(name) > _LONGEST_NAME:
         raise InputError(

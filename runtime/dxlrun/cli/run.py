@@ -159,7 +159,7 @@ def demo(*, page: PageFlag = True, virtual: Flag = False, debug: DebugFlag = Fal
 
 @contextmanager
 def _page_beside(*, shown: bool) -> Iterator[None]:
-    """Start `dxlrun view` in another process, which shows the next robot that starts, until the block ends."""
+    """Start `dxlrun view` in another process for the next robot that starts; end it with the block."""
     from dxlrun.cli.verbs import packaged
 
     if not shown:

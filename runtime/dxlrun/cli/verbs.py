@@ -94,7 +94,7 @@ _OTHER_WORDS = {
 
 
 def verb_for(word: str) -> str | None:
-    """Return the verb, or the verb with its first argument, for a word of another program; None if unknown."""
+    """Return the verb (with its first argument, if needed) for a word of another program; None if unknown."""
     return next((verb for verb, words in _OTHER_WORDS.items() if word in words.split()), None)
 
 

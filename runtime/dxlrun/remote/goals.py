@@ -41,7 +41,7 @@ class GoalBook:
         self._take(msgspec.json.decode(event.data, type=GoalState), event.t_ns * 1e-9)
 
     def take_message(self, message: object, time_s: float) -> None:
-        """Record a message of the topic /goals: progress of a running goal, or an end whose event was lost."""
+        """Record a message of the topic /goals: progress of a goal, or an end whose event was lost."""
         with suppress(msgspec.ValidationError):
             found = msgspec.convert(message, GoalState)
             found = found if found.error is None or math.isfinite(found.error) else replace(found, error=None)
@@ -85,7 +85,7 @@ class GoalBook:
             waiting.set()
 
     def status(self, number: int) -> GoalState:
-        """Return the state of a goal; raises RefusedRequest for a number that is unknown or no longer stored."""
+        """Return the state of a goal; raises RefusedRequest for an unknown or no longer stored number."""
         found = self.running.get(number) or self.ended.get(number)
         if found is not None:
             return found

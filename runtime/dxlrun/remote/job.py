@@ -7,7 +7,7 @@ from dataclasses import dataclass
 
 @dataclass(frozen=True, slots=True)
 class Descriptors:
-    """File descriptors of the shared memory between the gateway and the loop, one for each ring or mailbox."""
+    """File descriptors of the shared memory of gateway and loop, one for each ring or mailbox."""
 
     heartbeat: int
     cycles: int

@@ -115,7 +115,7 @@ def goal_of(prepared: Prepared, known: Known, record: CycleRecord) -> Played | N
 
 @dataclass(frozen=True, slots=True)
 class _Part:
-    """Samples of a motion for one controller; times are on the motion's time axis, after the change of speed."""
+    """Samples of a motion for one controller; times are those of the motion after the change of speed."""
 
     controller: CompiledController
     kind: str

@@ -90,7 +90,7 @@ def main() -> None:
 
 
 def _event_loop() -> asyncio.AbstractEventLoop:
-    """Return an asyncio event loop whose timeouts may be below 1 ms; the default, epoll(7), rounds to 1 ms."""
+    """Return an asyncio event loop with timeouts below 1 ms, which the default, epoll(7), rounds to 1 ms."""
     return asyncio.SelectorEventLoop(selectors.SelectSelector())
 
 
@@ -232,7 +232,7 @@ class Connection(H11Protocol):
         super().connection_lost(exc)
 
     def data_received(self, data: bytes) -> None:
-        """Process received bytes, or close the connection when the client's certificate is no longer valid."""
+        """Process received bytes; close the connection once the client's certificate is invalid."""
         self.last_byte_s = self.loop.time()
         if self._valid():
             super().data_received(data)

@@ -191,7 +191,7 @@ class RobotLink(Protocol):
         ...
 
     def stream(self, path: str) -> tuple[int, bytes, socket.socket]:
-        """Send a GET request with a streamed reply; return status, first bytes, and a socket with the rest."""
+        """Send a GET request with a streamed reply; return status, first bytes and a socket with the rest."""
         ...
 
     @property
@@ -209,7 +209,7 @@ class RobotLink(Protocol):
 
 
 class SocketLink:
-    """HTTP over the Unix socket of a gateway: one connection for all requests, and one more for each stream."""
+    """HTTP over a gateway's Unix socket: one connection for all requests, and one more for each stream."""
 
     def __init__(self, path: Path, client: str) -> None:
         self._path = path

@@ -1,4 +1,4 @@
-"""`dxlrun sim`: simulated servos for other programs, on pseudo-terminals.
+"""`dxlrun sim`: simulated servos on pseudo-terminals, for other programs.
 
 The servos themselves are in `dxlsim`.
 """

@@ -1,4 +1,4 @@
-"""`dxlrun sim`: simulated servos that other programs open as they would open an adapter."""
+"""`dxlrun sim`: serve simulated servos on ports that other programs open like those of an adapter."""
 
 from __future__ import annotations
 
@@ -155,7 +155,9 @@ def sim(
 
 
 class _Simulated(msgspec.Struct, frozen=True):
-    """Parameters of a simulation, from a robot file or `--servo`."""
+    """Simulation to be served: its buses, from a robot file, `--servo` or `--recorded`, and its real-time
+    settings.
+    """
 
     title: str
     config: SimulationConfig
@@ -208,9 +210,10 @@ def _simulated(
 
 
 def _recorded(log: Path, others: Sequence[str]) -> _Simulated:
-    """Return the buses of a log, which answer as recorded; `others`: options that exclude it.
+    """Return a simulation of the buses of a log, which answer as recorded; `others`: given options that
+    exclude it.
 
-    Raises InputError and LogError.
+    Raises InputError for such an option or a missing plan, and LogError for an unreadable log.
     """
     if others:
         raise InputError(f"--recorded and {' and '.join(others)} exclude each other; omit one of them")
@@ -232,7 +235,7 @@ def _recorded(log: Path, others: Sequence[str]) -> _Simulated:
 
 
 def check_simulated(buses: Sequence[BusConfig], faults: Sequence[Fault], seed: int) -> None:
-    """Build the buses as their process will, so that mistakes are reported before anything starts.
+    """Build the simulated buses with their faults once, so that mistakes are reported before anything starts.
 
     Raises InputError for a servo that cannot be simulated, and for each impossible fault.
     """
@@ -257,7 +260,8 @@ def check_simulated(buses: Sequence[BusConfig], faults: Sequence[Fault], seed: i
 
 
 def link_of_each(buses: Sequence[BusConfig], link: Path | None) -> dict[str, Path]:
-    """Return the link of each bus: LINK itself for one bus, LINK.NAME for several.
+    """Return the path of the symbolic link to each bus' port: LINK for one bus, LINK.NAME for several; empty
+    without.
 
     Raises InputError when a path exists and is not a link, or a link cannot be made.
     """

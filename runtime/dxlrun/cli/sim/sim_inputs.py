@@ -1,4 +1,4 @@
-"""Inputs of `dxlrun sim`: parses fault lines and adapter options into buses."""
+"""Inputs of `dxlrun sim`: parse servos, faults and options of the adapter."""
 
 from __future__ import annotations
 
@@ -21,21 +21,21 @@ Absent = Literal["silent", "slot"]
 
 
 class Mistakes:
-    """Mistakes in independent parts of a command line, reported together."""
+    """Collector of the InputErrors of independent options, which are reported together."""
 
     def __init__(self) -> None:
         self._errors: list[InputError] = []
 
     @contextmanager
     def collected(self) -> Iterator[None]:
-        """Store the InputError of a part."""
+        """Catch the InputError of a block and store it for `refuse`."""
         try:
             yield
         except InputError as error:
             self._errors.append(error)
 
     def refuse(self) -> None:
-        """Raise the stored errors as one InputError."""
+        """Raise the stored errors as one InputError; return when there are none."""
         if len(self._errors) == 1:
             raise self._errors[0]
         if self._errors:
@@ -43,7 +43,10 @@ class Mistakes:
 
 
 def servo_bus(words: Sequence[str], baud_rate: int | None, protocol: float | None) -> BusConfig:
-    """Return the bus of `--servo MODEL:IDS` words, including models of plug-ins. Raises InputError."""
+    """Return a bus with the servos of `--servo MODEL:IDS` words, whose models may be from plug-ins.
+
+    Raises InputError.
+    """
     from dxlrun.control.controllers.plugins import load_plugins
     from dxlsim.texts.servo_words import bus_of_servos
 
@@ -52,7 +55,7 @@ def servo_bus(words: Sequence[str], baud_rate: int | None, protocol: float | Non
 
 
 def read_latency(text: str | None) -> int | None:
-    """Return the time of `--latency-timer` in ns; raises InputError for an invalid one."""
+    """Return the time of `--latency-timer` in ns, None without it; raises InputError for an invalid one."""
     from dxlrun.description.units import duration
 
     try:
@@ -62,14 +65,16 @@ def read_latency(text: str | None) -> int | None:
 
 
 def with_adapter(bus: BusConfig, given: Mapping[str, object], absent: Absent | None, seed: int) -> BusConfig:
-    """Return a bus with the `given` options of its adapter; None keeps the bus' own."""
+    """Return a bus with the options of its adapter replaced by those that are given (not None), and with
+    the seed.
+    """
     keys = {name: value for name, value in given.items() if value is not None}
     absent = absent or bus.adapter.absent
     return replace(bus, adapter=replace(bus.adapter, seed=seed, absent=absent, **keys))
 
 
 def read_faults(lines: Sequence[str], file: Path | None) -> tuple[Fault, ...]:
-    """Return the faults of `--fault` and of a file; raises InputError with all wrong lines.
+    """Return the faults of `--fault` and of the file of `--faults`; raises InputError with all wrong lines.
 
     In a file, empty lines and comments after # are ignored.
     """

@@ -1,4 +1,4 @@
-"""Views of `dxlrun sim`: lines in a pipe, one JSON object per line, or a live table on a terminal."""
+"""Views of `dxlrun sim`: its output as lines in a pipe, as JSON lines, or as a live table on a terminal."""
 
 from __future__ import annotations
 
@@ -28,11 +28,11 @@ if TYPE_CHECKING:
 
 _LOOK_S = 0.25
 _AROUND = 7
-"""Lines of the screen for other parts than servos: head and rule of the table, lateness, prompt, events."""
+"""Lines of the screen that are not servos: head and rule of the table, lateness, prompt and events."""
 
 
 class Shown(msgspec.Struct, frozen=True):
-    """Simulated buses and the names of their ports."""
+    """The simulated buses with the links to their ports, as text for the views."""
 
     title: str
     buses: tuple[BusConfig, ...]
@@ -42,11 +42,15 @@ class Shown(msgspec.Struct, frozen=True):
     hint: str | None = None
 
     def port(self, bus: str, ports: Mapping[str, str]) -> str:
-        """Return the name by which another program opens a bus. A link stays when an adapter is pulled."""
+        """Return the path by which another program opens a bus: its link, else the pseudo-terminal in
+        `ports`.
+        """
         return str(self.links.get(bus, ports[bus]))
 
     def lines(self, ports: Mapping[str, str], real_time: str) -> list[str]:
-        """Return the first lines: simulated servos, ports, and grants of real time."""
+        """Return the first lines of the output: simulated servos, ports, and granted real-time settings
+        (`real_time`).
+        """
         count = sum(len(bus.servos) for bus in self.buses)
         servos, buses = counted(count, "servo", "servos"), counted(len(self.buses), "bus", "buses")
         what = f"{servos} simulated on {buses}" if count else f"{buses}, answering as recorded"
@@ -66,7 +70,9 @@ class Shown(msgspec.Struct, frozen=True):
         return lines
 
     def moves(self, ports: Mapping[str, str]) -> list[str]:
-        """Return a line for each adapter that was pulled, or came back with another name."""
+        """Return a line for each bus in `ports`: its adapter was pulled (empty port), or came back as
+        another port.
+        """
         return [
             f"{bus}: the adapter is back as {port}{self._link(bus)}"
             if port
@@ -79,7 +85,7 @@ class Shown(msgspec.Struct, frozen=True):
 
 
 class PlainView:
-    """Lines on stdout: the ports once, then each fault as it happens."""
+    """View that prints lines: the ports once, then each fault as it happens."""
 
     look_every_s: float | None = None
 
@@ -88,12 +94,14 @@ class PlainView:
         self._console: Console = out()
 
     def opened(self, ports: Mapping[str, str], real_time: str) -> None:
-        """Print the ports of the buses."""
+        """Print the first lines: buses, their ports, and granted real-time settings."""
         for line in self._shown.lines(ports, real_time):
             self._print(line)
 
     def take(self, message: SimulationMessage) -> None:
-        """Print changed ports, a fault that happened, or the interpretation of a typed line."""
+        """Print what a message of the simulation reports: moved ports, a fault that happened, or a typed
+        line's result.
+        """
         for line in self._shown.moves(message.ports or {}):
             self._print(line)
         if message.happened is not None:
@@ -108,19 +116,21 @@ class PlainView:
         print_error(sentence)
 
     def help(self) -> None:
-        """List the faults."""
+        """Print the lines that can be typed, one for each kind of fault."""
         for line in fault_lines():
             self._print(line)
 
     def look(self, look: SimulationMessage, typed: str) -> None:
-        """Print nothing, because a table in lines would scroll the faults away."""
+        """Print nothing, because a table among lines would scroll the faults away."""
 
     def _print(self, line: str, tone: Tone = "plain") -> None:
         show(Sentence(line, tone), console=self._console)
 
 
 class TableView(PlainView):
-    """Table that is redrawn four times a second, with events above and input below."""
+    """View with a table of the servos, redrawn four times a second, below the events and above the typed
+    line.
+    """
 
     look_every_s: float | None = _LOOK_S
 
@@ -134,7 +144,7 @@ class TableView(PlainView):
 
     @contextmanager
     def showing(self) -> Iterator[None]:
-        """Show the table. The terminal passes on single characters without echo while the block runs."""
+        """Show the table while the block runs; the terminal passes on single characters without echo."""
         with _letters(), self._live:
             yield
             # Pending input is obsolete now.
@@ -144,7 +154,7 @@ class TableView(PlainView):
         self._print(sentence, "error")
 
     def look(self, look: SimulationMessage, typed: str) -> None:
-        """Draw the servos and the pending input."""
+        """Redraw the table with new states of the servos and the line that is being typed."""
         self._newest = look
         self._draw(typed)
 
@@ -165,7 +175,7 @@ class TableView(PlainView):
 
 
 class JsonView:
-    """One JSON answer per line on stdout: the ports, then each fault as it happens."""
+    """View that prints one JSON object per line: the ports, then each fault as it happens."""
 
     look_every_s: float | None = None
 
@@ -173,12 +183,12 @@ class JsonView:
         self._shown = shown
 
     def opened(self, ports: Mapping[str, str], real_time: str) -> None:
-        """Write the ports of the buses."""
+        """Print the ports of the buses as JSON."""
         named = {bus: self._shown.port(bus, ports) for bus in ports}
         show_json({"ports": named, "devices": dict(ports), "real_time": real_time})
 
     def take(self, message: SimulationMessage) -> None:
-        """Write changed ports, a fault that happened, or the interpretation of a typed line."""
+        """Print what a message of the simulation reports as JSON."""
         given = {
             "devices": message.ports,
             "fault": message.happened,
@@ -189,22 +199,22 @@ class JsonView:
         show_json(found, code=len(wrong), errors=wrong)
 
     def help(self) -> None:
-        """Write the available faults."""
+        """Print the lines that can be typed, one for each kind of fault, as JSON."""
         show_json({"faults": list(fault_lines())})
 
     def look(self, look: SimulationMessage, typed: str) -> None:
-        """Write nothing."""
+        """Print nothing: states of servos are not part of this output."""
 
 
 def fault_lines() -> Sequence[str]:
-    """Return the input lines for each kind of fault."""
+    """Return the lines that can be typed, one for each kind of fault."""
     from dxlsim.faults.fault import fault_help
 
     return fault_help()
 
 
 def ending(title: str, elapsed_s: float, look: SimulationMessage) -> str:
-    """Return the last line: duration and packet counts."""
+    """Return the last line of the output: duration, numbers of packets, and delays of replies."""
     heard = sum(servo.heard for servo in look.servos or ())
     answered = sum(servo.answered for servo in look.servos or ())
     late = ", ".join(f"{name} {value:.0f} us" for name, value in look.lateness_us.items())
@@ -215,7 +225,9 @@ def ending(title: str, elapsed_s: float, look: SimulationMessage) -> str:
 
 
 def _models(bus: BusConfig) -> str:
-    """Return a short text of a bus' servos and devices: `XL430-W250 1-3; AX-12A 7; OpenCR 200`."""
+    """Return the servos and devices of a bus by model with their IDs: `XL430-W250 1-3; AX-12A 7; OpenCR
+    200`.
+    """
     ids: dict[str, list[int]] = {}
     named = [(each.model, each.servo_id) for each in bus.servos]
     for model, servo_id in named + [(each.model, each.servo_id) for each in bus.devices]:
@@ -237,7 +249,8 @@ def _ranges(ids: Sequence[int]) -> str:
 
 
 def page(look: SimulationMessage, typed: str | None, width: int, height: int, *, several: bool) -> Group:
-    """Return the lower part of a screen of `height` lines; `several` adds a column for the bus.
+    """Return the table of servos and the prompt for a screen of `height` lines; `several` adds a column for
+    the bus.
 
     `typed` is None after the end of the input.
     """
@@ -259,7 +272,7 @@ def page(look: SimulationMessage, typed: str | None, width: int, height: int, *,
 
 
 def servo_table(servos: Sequence[ServoLook], *, several: bool) -> Table:
-    """Return a table with one row per servo; servos with errors are marked."""
+    """Return a table of simulated servos; rows of servos with a hardware error are marked."""
     columns = [
         *[Column("bus", "name")] * several,
         Column("ID"),
@@ -294,7 +307,9 @@ def servo_table(servos: Sequence[ServoLook], *, several: bool) -> Table:
 
 @contextmanager
 def _letters() -> Iterator[None]:
-    """Make the terminal of stdin pass on each character without echo; Ctrl-C and Ctrl-Z keep their effect."""
+    """In the block, let the terminal of stdin pass on each character without echo; Ctrl-C and Ctrl-Z keep
+    working.
+    """
     if not sys.stdin.isatty():
         yield
         return

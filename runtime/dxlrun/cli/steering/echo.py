@@ -1,4 +1,4 @@
-"""`dxlrun echo`: the messages of a running robot's topic."""
+"""`dxlrun echo`: print the messages of a running robot's topic as they arrive."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ if TYPE_CHECKING:
     from dxlrun.remote.requests.replies import TopicState
 
 _NAMES = ("name", "joint_names")
-"""Fields of ROS 2 messages with the names of joints."""
+"""Fields of ROS 2 messages that have the names of joints, for the rows of the other fields."""
 
 
 def echo(
@@ -66,7 +66,7 @@ def echo(
 
 
 def topics(states: Sequence[TopicState]) -> Table:
-    """Return a table with a row for each topic."""
+    """Return a table of topics: name, type, number of messages and rate."""
     columns: Columns[TopicState] = [
         (Column("topic", "name"), "name"),
         (Column("type", "text"), "type"),
@@ -99,7 +99,9 @@ def print_message(message: TopicMessage, *, as_json: bool) -> None:
 
 
 def fields(message: Mapping[str, object], joints: Sequence[str]) -> list[str]:
-    """Return the lines of a message; arrays with one row per joint show the joints' names."""
+    """Return the lines of a decoded message; `joints` name the rows of arrays, unless the message names
+    them.
+    """
     for name in _NAMES:
         named = message.get(name)
         if isinstance(named, list) and named and all(isinstance(one, str) for one in named):

@@ -1,4 +1,4 @@
-"""Goals of a running robot: `dxlrun send`, `cancel`, and waiting for the end of goals."""
+"""`dxlrun send` and `cancel`, and functions that wait for the end of goals or cancel them."""
 
 from __future__ import annotations
 
@@ -21,12 +21,12 @@ if TYPE_CHECKING:
     from dxlrun.remote.requests.replies import GoalState
 
 REST_S = 10.0
-"""Timeout for the joints of a cancelled goal to come to rest."""
+"""Timeout, s, for the joints of a cancelled goal to come to rest."""
 MOST_JOINTS = 3
-"""Upper limit of joints that a result or a list names."""
+"""Upper limit of the joints that a result or a list names; more are abbreviated."""
 _PROGRESS_S = 0.1
 _BEGIN_S = 0.5
-"""Timeout for the begin of a goal whose request was interrupted."""
+"""Time, s, to wait for the number of a goal whose request was interrupted by Ctrl-C."""
 
 
 def send(
@@ -149,7 +149,11 @@ def cancel(goal: str = "", /, *, wait: WaitFlag = False, chosen: Chosen = ONLY_O
 
 @contextmanager
 def begun_or_cancelled(robot: RemoteRobot, verb: str, *, waited: bool) -> Iterator[None]:
-    """Cancel the goals of the block on Ctrl-C, if they are waited for and their numbers are not known yet."""
+    """Within the block that sends a goal, cancel that goal on Ctrl-C, even before its number is known.
+
+    Only if the command was to wait for the goal (`waited`); `verb` is the command, by which the goal is
+    found.
+    """
     last = max((state.number for state in robot.goals()), default=0) if waited else 0
     try:
         yield
@@ -207,13 +211,13 @@ def follow(
 
 
 def _joints(robot: RemoteRobot) -> dict[str, Sequence[str]]:
-    """Return the joints of each controller."""
+    """Return the joints of each controller of the robot by the controller's name."""
     listed = robot.info().get("controllers")
     return {one["name"]: one["joints"] for one in (listed if isinstance(listed, list) else [])}
 
 
 def _ended(robot: RemoteRobot, numbers: Sequence[int], motion: str, *, hidden: bool) -> list[GoalState]:
-    """Wait until all goals have ended, with a progress bar on a terminal."""
+    """Wait until all goals have ended, with a progress bar on a terminal, and return their final states."""
     states = {number: robot.goal_state(number) for number in numbers}
     with progress_bar(hidden=hidden) as draw:
         while running := [state for state in states.values() if state.status == "running"]:
@@ -227,7 +231,10 @@ def _ended(robot: RemoteRobot, numbers: Sequence[int], motion: str, *, hidden: b
 
 
 def cancel_goals(robot: RemoteRobot, numbers: Sequence[int]) -> list[GoalState]:
-    """Cancel goals, and return their states when their joints are at rest. Ended goals are unchanged."""
+    """Cancel goals, wait until their joints are at rest or REST_S, and return their final states.
+
+    Errors are printed; a goal without a result is not returned.
+    """
     for number in numbers:
         try:
             robot.cancel(number)

@@ -1,4 +1,4 @@
-"""Joints of a running robot: `dxlrun torque`, `reboot`, `get`, `set`."""
+"""`dxlrun torque`, `reboot`, `get` and `set`: the joints of a running robot and their servos."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ if TYPE_CHECKING:
     from dxlrun.remote.client import Executed, RemoteRobot
 
 Joints = Annotated[str, Parameter(name="joint", show_default=False)]
-"""Names of joints, of controllers, or `all`."""
+"""Words of the command line: names of joints, groups, controllers, or `all`."""
 DEGREES = 180 / math.pi
 _WRITTEN: Mapping[str, tuple[float, int, str]] = MappingProxyType(
     {
@@ -35,7 +35,7 @@ _WRITTEN: Mapping[str, tuple[float, int, str]] = MappingProxyType(
         "": (100.0, 0, "%"),
     }
 )
-"""Unit -> factor from SI, digits, and shown unit; other units are shown unchanged."""
+"""Unit in SI -> factor, digits and unit in the output; `deg` and `mm` values come in rad and m."""
 
 
 def torque(
@@ -117,14 +117,18 @@ def get(joint: str, item: str = "", /, *, chosen: Chosen = ONLY_ONE) -> int:
 
 
 def _meant(info: Mapping[str, Any], name: str) -> Sequence[str]:
-    """Return the joints of a group, of a controller, or of `all`; empty for another name."""
+    """Return the joints that a group, a controller or `all` stands for; empty for a joint or an unknown
+    name.
+    """
     controllers = {one["name"]: one["joints"] for one in info["controllers"]}
     known = {**controllers, **info["groups"], "all": info["joints"]}
     return () if name in info["joints"] else known.get(name, ())
 
 
 def _show_pose(robot: RemoteRobot, names: Sequence[str], chosen: Chosen) -> int:
-    """Print the positions of joints; joints that were never read are omitted."""
+    """Print the present positions of joints as words for `send`, without joints that were never read;
+    return 0.
+    """
     states = robot.states()
     ways = {name: JointUnit(unit).shown for name, unit in zip(states.joints, states.units, strict=True)}
     found = {name: states.joint(name)["position"] for name in names}
@@ -165,7 +169,7 @@ def set_register(joint: str, item: str, value: str, /, *, chosen: Chosen = ONLY_
 
 
 def source_facts(found: Mapping[str, Any]) -> list[tuple[str, str]]:
-    """Return the states of a device or a sensor, their age, and its commands."""
+    """Return names and texts of a source's states, of their age, and of the commanded values, for a table."""
     states, commands = (
         [(name, quantity_text(value, units.get(name, ""))) for name, value in values.items()]
         for values, units in (
@@ -179,7 +183,7 @@ def source_facts(found: Mapping[str, Any]) -> list[tuple[str, str]]:
 
 
 def facts(state: Mapping[str, object]) -> list[tuple[str, str]]:
-    """Return the state of a joint as texts with units."""
+    """Return names and texts of a joint's state, for a table; unknown values are omitted."""
     unit = state["effort_unit"]
     way = JointUnit(str(state["unit"])).shown
     found = [
@@ -201,7 +205,10 @@ def facts(state: Mapping[str, object]) -> list[tuple[str, str]]:
 
 
 def written(value: object, unit: object) -> str:
-    """Format a number in SI in the unit for people; empty when unknown. The empty unit becomes %."""
+    """Return an SI number as text in the unit for people; empty when it is None.
+
+    Unit "" is a fraction, shown in %.
+    """
     if not isinstance(value, int | float):
         return ""
     factor, digits, shown = _WRITTEN.get(str(unit), (1.0, 3, str(unit)))
@@ -209,7 +216,9 @@ def written(value: object, unit: object) -> str:
 
 
 def _others(done: Executed) -> str:
-    """Return clauses on the deactivated controllers, and on the command that activates them again."""
+    """Return clauses for the result: controllers that were deactivated, and the command that activates
+    them again.
+    """
     found = f"; deactivated {', '.join(done.deactivated)}" if done.deactivated else ""
     back = (
         f"; `dxlrun switch --activate {' '.join(done.offered)}` lets {', '.join(done.offered)} command again"

@@ -1,4 +1,4 @@
-"""`dxlrun parameters`: shows and changes the parameters of a controller in a run."""
+"""`dxlrun parameters`: show or change the parameters of a controller in a run."""
 
 from __future__ import annotations
 
@@ -72,7 +72,7 @@ def _table(rows: Sequence[Parameter]) -> Table:
 
 
 def written(value: object) -> str:
-    """Format a value for people: numbers with six digits, quantities with their units."""
+    """Return a parameter's value as text: numbers with six digits, times in a fitting unit."""
     if isinstance(value, bool):
         return "true" if value else "false"
     if isinstance(value, list):

@@ -1,4 +1,4 @@
-"""`dxlrun play`: plays motions on a running robot one after the other, or lists them."""
+"""`dxlrun play`: play motions on a running robot one after the other, or list them."""
 
 from __future__ import annotations
 
@@ -19,31 +19,31 @@ if TYPE_CHECKING:
     from dxlrun.remote.client import RemoteRobot
 
 PLAY = "play"
-"""Name of the command of a controller that has motions."""
+"""Name of the command by which a controller such as keyframe_player plays one of its own motions."""
 MOST_LOOPS = 10_000
 _FOLDER = "motions"
-"""Name of the folder of motions next to the robot file."""
+"""Name of the folder next to the robot file in which motion files are searched."""
 
 
 class Found(NamedTuple):
-    """Source of a requested motion."""
+    """A motion named on the command line, and where it was found."""
 
     motion: str
     path: Path
     player: str = ""
-    """Controller that has the motion; empty: the motion is in the file."""
+    """Controller that has the motion; empty: `path` is the motion file."""
 
 
 class Playable(NamedTuple):
-    """A motion that can be played by its name."""
+    """A motion that can be played by name, as `play --list` shows it."""
 
     motion: str
     controllers: Sequence[str]
     joints: Sequence[str]
     seconds: float | None
-    """Duration at speed 1 from the first pose on, s; None when its file cannot be read."""
+    """Duration at speed 1, from the first pose on, s; None when the motion file cannot be read."""
     file: str = ""
-    """Motion file; empty: the controller has the motion."""
+    """Path of the motion file; empty when a controller has the motion."""
 
 
 def play(
@@ -104,7 +104,7 @@ def _check(motions: Sequence[str], loop: int, *, listed: bool, wait: bool) -> No
 
 
 def _play(robot: RemoteRobot, found: Found, speed: float, chosen: Chosen, *, wait: bool) -> int:
-    """Play one motion until its end, and return the exit code."""
+    """Play one motion; return the exit code after its end, or at once without `wait`."""
     motion, path, player = found
     try:
         with begun_or_cancelled(robot, "play", waited=wait):
@@ -126,7 +126,10 @@ def _play(robot: RemoteRobot, found: Found, speed: float, chosen: Chosen, *, wai
 
 
 def _found(robot: RemoteRobot, name: str) -> Found:
-    """Return the file or the controller of the motion with this name; raises InputError."""
+    """Return the motion file or the controller for a motion's name or path.
+
+    Raises InputError for an unknown name, or one that several files or controllers have.
+    """
     if (path := Path(name)).is_file():
         return Found(name, path)
     info = robot.info()
@@ -149,20 +152,22 @@ def _found(robot: RemoteRobot, name: str) -> Found:
 
 
 def _players(info: Mapping[str, object]) -> dict[str, Mapping[str, float]]:
-    """Return the motions of each controller with their durations, s."""
+    """Return controller -> motion -> duration, s, for the motions that controllers have."""
     rows = cast("Sequence[Mapping[str, object]]", info["controllers"])
     return {str(row["name"]): cast("Mapping[str, float]", row["motions"]) for row in rows}
 
 
 def _files(info: Mapping[str, object]) -> list[Path]:
-    """Return the YAML files next to the robot file and in its folder of motions."""
+    """Return the YAML files next to the robot file and in its folder of motions, which may be motion
+    files.
+    """
     robot = Path(str(info["file"]))
     folders = robot.parent, robot.parent / _FOLDER
     return [file for folder in folders for file in sorted(folder.glob("*.yaml")) if file != robot]
 
 
 def _has_motions(file: Path) -> bool:
-    """Return whether a file looks like a motion file; playing it reports its mistakes."""
+    """Return True when a YAML file has a line `motions:`, as motion files have; it may still be invalid."""
     from dxlrun.description.document import read_text
 
     try:
@@ -172,7 +177,7 @@ def _has_motions(file: Path) -> bool:
 
 
 def _check_forms(robot: RemoteRobot, files: Sequence[Path]) -> None:
-    """Read all files before the first is played; raises InputError with the mistakes of a file."""
+    """Parse all motion files before the first is played; raises InputError with the mistakes of a file."""
     from dxlrun.description.motion import read_motion
 
     groups = cast("Groups", robot.info()["groups"])
@@ -203,7 +208,11 @@ def _few(joints: Sequence[str]) -> str:
 
 
 def _playable(info: Mapping[str, object]) -> Iterator[Playable]:
-    """Yield the motions that can be played by name; files for other robots are omitted."""
+    """Yield the robot's motions that have a name: those of controllers, and files for its controllers and
+    joints.
+
+    A file that cannot be read is included, without controllers and duration.
+    """
     from dxlrun.description.motion import read_motion
 
     rows = cast("Sequence[Mapping[str, object]]", info["controllers"])
@@ -223,7 +232,9 @@ def _playable(info: Mapping[str, object]) -> Iterator[Playable]:
 
 
 def _located(refused: Refused, motion: Path) -> DxlrunError:
-    """Return a refusal with the places of the mistakes in the motion file."""
+    """Return a refused motion's mistakes as an InputError with places in the file; other refusals are
+    unchanged.
+    """
     places, problems, fixes = (refused.fields.get(name) for name in ("places", "problems", "fixes"))
     if not (isinstance(places, list) and isinstance(problems, list) and isinstance(fixes, list)):
         return refused

@@ -1,4 +1,4 @@
-"""Commands to a running robot: `dxlrun list`, `switch`, `rate`, `pause`, `stop` ...
+"""`dxlrun list`, `switch`, `rate`, `halt`, `pause`, `load`, `stop` and others, and parts shared with them.
 
 Each command is one request to the gateway of the run: executed after the read phase of a cycle, or refused
 with the reason.
@@ -26,10 +26,10 @@ if TYPE_CHECKING:
     from dxlrun.run.unsteered import UnsteeredRun
 
 Names = Annotated[tuple[str, ...], Parameter(negative=(), show_default=False, consume_multiple=True)]
-"""Names of one or several controllers after the option."""
+"""Option that takes the names of one or several controllers."""
 Words = Annotated[str, Parameter(name="key=value")]
 Row = Mapping[str, Any]
-"""Row of a JSON reply of the gateway."""
+"""Object of a JSON reply of the gateway."""
 
 
 @Parameter(name="*")
@@ -49,7 +49,7 @@ class Chosen:
 
 
 ONLY_ONE = Chosen()
-"""The only running robot."""
+"""Default of `Chosen`: the only robot that runs."""
 
 
 def list_robots(
@@ -105,7 +105,9 @@ def list_robots(
 
 
 def _check_graph(files: Sequence[Path], names: Sequence[str]) -> None:
-    """Raise InputError for files without a suffix of a graph, and for several robots."""
+    """Raise InputError when `list --graph` cannot draw into the files, or more than one robot would be
+    drawn.
+    """
     # Imported here because most lists draw nothing.
     from dxlrun.output.graph_picture import check_picture
 
@@ -275,7 +277,10 @@ def stop(*, wait: WaitFlag = True, chosen: Chosen = ONLY_ONE) -> int:
 
 
 def unsteered_of(name: str | None) -> UnsteeredRun | None:
-    """Return the run of a name, or the only run, if it cannot be steered; raises InputError for several."""
+    """Return the run that `--robot` names, or the only one, if it has no gateway; None when it has.
+
+    Raises InputError when several runs are possible.
+    """
     from dxlrun.remote.sockets import running
     from dxlrun.run.unsteered import unsteered_runs
 
@@ -326,13 +331,15 @@ def _require_one(names: Sequence[str]) -> None:
 
 
 def _require_known(robot: str | None, names: Collection[str]) -> None:
-    """Raise InputError for an unknown robot; an address, NAME@HOST:PORT, always counts as known."""
+    """Raise InputError for a robot that does not run here and is not listed; an address (with @) is not
+    checked.
+    """
     if robot is not None and robot not in names and "@" not in robot:
         raise InputError(f"no robot {robot} runs; {suggestion(robot, names)}")
 
 
 def report_done(robot: RemoteRobot, chosen: Chosen, done: Executed | None, sentence: str) -> int:
-    """Print that a request was executed; return the exit code."""
+    """Print `sentence`, or with --json the robot's reply, for an executed request; return exit code 0."""
     if chosen.as_json:
         cycle: dict[str, object] = {} if done is None else {"cycle": done.cycle}
         if done is not None and done.value is not None:
@@ -351,7 +358,7 @@ def report_done(robot: RemoteRobot, chosen: Chosen, done: Executed | None, sente
 
 
 def headline(info: Row) -> str:
-    """Return the state of a robot as one line."""
+    """Return a line about a robot: rate, cycles, skipped periods and log."""
     paused = ", paused" if info["paused"] else ""
     periods = f"{info['skipped']} {'period' if info['skipped'] == 1 else 'periods'} skipped"
     log = f"log {info['log']}" if info["log"] else "no log"
@@ -359,7 +366,7 @@ def headline(info: Row) -> str:
 
 
 def controllers(info: Row) -> Table:
-    """Return a table of controllers with the commands that they accept and their joints."""
+    """Return a table of a robot's controllers: state, rate, commands that they accept, and joints."""
     columns: Columns[Row] = [
         (Column("controller", "name"), "name"),
         (Column("state", "name"), state),
@@ -372,7 +379,7 @@ def controllers(info: Row) -> Table:
 
 
 def sources(info: Row) -> Table:
-    """Return a table of devices and sensors with their states and the commands that they accept."""
+    """Return a table of a robot's devices and sensors, with states and commands."""
     columns: Columns[Row] = [
         (Column("source", "name"), "name"),
         (Column("kind", "name"), "kind"),
@@ -383,7 +390,7 @@ def sources(info: Row) -> Table:
 
 
 def groups(info: Row) -> Table:
-    """Return a table of groups with their joints."""
+    """Return a table of a robot's groups with their joints."""
     rows = [(name, ", ".join(joints)) for name, joints in info.get("groups", {}).items()]
     return Table.of("", [Column("group", "name"), Column("joints", "text")], rows)
 
@@ -398,7 +405,7 @@ def _source_commands(source: Row) -> str:
 
 
 def drawing(info: Row) -> Graph:
-    """Return the controller graph of a running robot for drawing."""
+    """Return the drawing of a running robot's controllers, with the data that they exchange."""
     from msgspec import convert
 
     # Imported here because most commands draw nothing.
@@ -414,14 +421,14 @@ def drawing(info: Row) -> Graph:
 
 
 def state(controller: Row) -> str:
-    """Return the state of a controller in one word."""
+    """Return a controller's state for a table: `active`, `inactive`, or `held` after its stream ended."""
     if not controller["active"]:
         return "inactive"
     return "held" if controller["held"] else "active"
 
 
 def command(kind: str, schema: Row) -> str:
-    """Return the keys of a command from its JSON Schema, with optional keys in brackets."""
+    """Return a command as `kind: key, [optional key]`, from its JSON Schema."""
     names, needed = schema.get("properties", {}), schema.get("required", ())
     keys = (name if name in needed else f"[{name}]" for name in names)
     return f"{kind}: {', '.join(keys)}" if names else kind

@@ -1,4 +1,4 @@
-"""`dxlrun watch`: a live view of a running robot in the terminal, or a snapshot in a pipe."""
+"""`dxlrun watch`: a live view of a running robot in the terminal, or one snapshot in a pipe."""
 
 from __future__ import annotations
 
@@ -28,28 +28,28 @@ if TYPE_CHECKING:
 
 REFRESH_S = 0.2
 _RATE_S = 1.0
-"""Time over which the rate is measured."""
+"""Time over which the loop's rate is measured, s."""
 _LONGEST_EVENTS = 200
 _TONES: Mapping[str, Tone] = {"on": "good", "doubt": "warning", "lost": "error", "limp": "warning"}
 
 
 @dataclass(slots=True)
 class Watched:
-    """Newest states, controllers and events of a running robot."""
+    """Newest states, controllers and events of a running robot, as requested by `look`."""
 
     robot: RemoteRobot
     states: RobotStates = field(init=False)
     info: Row = field(default_factory=dict)
     events: list[Row] = field(default_factory=list)
     rate: float | None = None
-    """Measured rate, Hz."""
+    """Rate of the loop measured from its cycles, Hz; None before the first measurement."""
     latest: float = 0.0
-    """Largest delay of a wake-up so far, s."""
+    """Largest delay of the loop's wake-up among the cycles that were requested, s."""
     _last: int = 0
     _cycle: tuple[int, float] = (0, 0.0)
 
     def look(self) -> None:
-        """Request the newest data; raises DxlrunError when the robot is gone."""
+        """Request states, controllers and new events from the robot; raises DxlrunError when it is gone."""
         self.info = cast("Row", self.robot.info())
         self.states = self.robot.states()
         found = cast("Row", self.robot.events(self._last))
@@ -67,7 +67,7 @@ class Watched:
             self._cycle = cycle, now
 
     def json(self) -> Row:
-        """Return the data of one line of JSON."""
+        """Return states, controllers and the events since the last call, for one line of JSON."""
         from dxlrun.remote.live.states import encoded
 
         kept = ("name", "active", "held", "rate", "joints")
@@ -119,7 +119,7 @@ def watch(*, once: Flag = False, chosen: Chosen = ONLY_ONE) -> int:
 
 
 def _first_look(watched: Watched) -> None:
-    """Request data until the run has its first cycle."""
+    """Request the first data, and wait up to about 2.5 s for the run's first cycle."""
     from dxlrun.channels.answers import Code
 
     for _ in range(50):
@@ -143,7 +143,7 @@ def _print_lines(watched: Watched, *, once: bool) -> None:
 
 
 def _show_live(watched: Watched) -> None:
-    """Draw the view until a key ends it; raises DxlrunError when the robot is gone."""
+    """Redraw the view until a key is pressed; raises DxlrunError when the robot is gone."""
     from rich.live import Live
 
     console = out()
@@ -161,7 +161,7 @@ def _show_live(watched: Watched) -> None:
 
 
 def headline(watched: Watched) -> Sentence:
-    """Return the state of the run as one line."""
+    """Return a line about the run: rate, cycle, delay of the wake-up and skipped periods."""
     info, late = watched.info, watched.states.late_ns * 1e-9
     rate = "" if watched.rate is None else f" ({watched.rate:.1f})"
     paused = ", paused" if info["paused"] else ""
@@ -237,7 +237,9 @@ def _age(row: Row) -> Cell:
 
 
 def controllers(watched: Watched) -> Table:
-    """Return a table of controllers: state, rate, and duration of the last update."""
+    """Return a table of controllers: state, rate, duration of the last update, and controllers they
+    command.
+    """
     updates = dict(zip(watched.states.controllers, watched.states.controller_ns.tolist(), strict=True))
     columns: Columns[Row] = [
         (Column("controller", "name"), "name"),
@@ -250,7 +252,7 @@ def controllers(watched: Watched) -> Table:
 
 
 def event_lines(watched: Watched, most: int) -> list[Sentence]:
-    """Return the newest events, with the newest one last."""
+    """Return lines for the last `most` events, the newest one last, with their age."""
     lines = []
     for event in watched.events[-most:] if most > 0 else []:
         severity = event["severity"]
@@ -262,7 +264,7 @@ def event_lines(watched: Watched, most: int) -> list[Sentence]:
 
 
 def snapshot(watched: Watched) -> tuple[Table | Sentence, ...]:
-    """Return all tables and events once, for a pipe."""
+    """Return the lines and tables of one snapshot, for a pipe."""
     others = sources(watched)
     between = (others,) if others.rows else ()
     return (
@@ -275,7 +277,9 @@ def snapshot(watched: Watched) -> tuple[Table | Sentence, ...]:
 
 
 def view(watched: Watched, width: int, height: int) -> Group:
-    """Return the view for a terminal: the joints first, then as much of the rest as fits."""
+    """Return the view for a terminal of this size, columns and lines: all joints, and what fits of the
+    rest.
+    """
     from rich.console import Group
 
     head, rows, other = headline(watched), joints(watched), controllers(watched)

@@ -1,4 +1,4 @@
-"""Written: reads a command in `key=value` words or a YAML file, and converts it for the gateway.
+"""Written: a command as `key=value` words or a YAML file, read for the gateway.
 
 Values are YAML, and quantities are texts with units. The gateway, which knows the command's fields, converts
 them to numbers, because `positions=[60]` may be meant in deg or in rad.
@@ -19,7 +19,7 @@ _WORDS = "command line"
 
 @dataclass(frozen=True, slots=True)
 class Written:
-    """A command or a controller's entry as written; raises InputError with all mistakes."""
+    """Keys and values of a command, or of a controller's entry, as the user wrote them."""
 
     grown: Grown
     in_words: bool
@@ -43,11 +43,15 @@ class Written:
 
     @property
     def data(self) -> dict[str, object]:
-        """Data as written."""
+        """Values by key; quantities are still texts with units."""
         return self.grown.data
 
     def located(self, refused: Refused) -> DxlrunError:
-        """Return a refusal with one line for each wrong quantity, and with places in the file."""
+        """Return a refusal with one line for each wrong quantity, or as InputError with places in the YAML
+        file.
+
+        A refusal for another reason is returned unchanged.
+        """
         from dxlrun.channels.answers import Code
 
         paths, problems = refused.fields.get("paths"), refused.fields.get("problems")
@@ -75,7 +79,9 @@ def _line(word: str) -> str:
 
 
 def _input_error(problems: Sequence[Problem], in_words: bool) -> InputError:
-    """Return the error, with places only for a file: words have no lines and columns."""
+    """Return the problems as an error; those of words have no places, because words have no lines and
+    columns.
+    """
     if not in_words:
         return InputError(problems)
     return InputError("\n".join(f"{problem.what}; {problem.fix}" for problem in problems))

@@ -1,4 +1,4 @@
-"""`dxlrun models`: the known models of servos and devices, and their control tables."""
+"""`dxlrun models`: list the known models of servos and devices, or print a model's control table."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ if TYPE_CHECKING:
     from dxlwire.control_table.device_table import DeviceTable
 
 _DEVICES_ALONE = ("offset", "state", "safe", "bit")
-"""Fields of items that apply to devices only."""
+"""Fields of control table items that only devices have; omitted from the JSON of servos."""
 _PER_SI = {
     "rad": ("deg", 180 / math.pi),
     "rad/s": ("rpm", 30 / math.pi),
@@ -30,7 +30,7 @@ _PER_SI = {
     "A": ("mA", 1e3),
     "1": ("%", 100.0),
 }
-"""SI unit -> unit for people, and its factor; other units are unchanged."""
+"""SI unit -> unit in the output and factor; other units are unchanged."""
 
 
 def models(
@@ -73,7 +73,10 @@ def models(
 
 
 def _tables(name: str | None, protocol: float | None) -> tuple[list[ControlTable], list[DeviceTable]]:
-    """Return the requested tables of servos and devices; raises InputError without one."""
+    """Return the control tables of servos and of devices that a name and a protocol choose (None: all).
+
+    Raises InputError when there is no such model.
+    """
     from dxlwire.control_table import all_tables, find_table, perhaps_meant, protocols_of
     from dxlwire.control_table.devices import device_table, device_tables, perhaps_meant_device
 
@@ -96,7 +99,7 @@ def _tables(name: str | None, protocol: float | None) -> tuple[list[ControlTable
 
 
 def _motor_json(table: ControlTable) -> dict[str, object]:
-    """Return the motor of the simulated servo, in SI units."""
+    """Return the data of the motor that the simulation uses for a servo model, in SI units."""
     from dxlsim.motion.motor import motor_of
 
     motor = motor_of(table)
@@ -135,7 +138,10 @@ def _known(table: ControlTable | DeviceTable, names: str) -> dict[str, object]:
 def _ends(
     table: ControlTable | DeviceTable, without: Collection[str] = (), *, items: bool
 ) -> dict[str, object]:
-    """Return the last keys of a table's JSON; `without`: omitted fields of items."""
+    """Return the last keys of a model's JSON: capabilities, baud rates and, with `items`, the control table.
+
+    `without`: fields of items that are omitted.
+    """
     known = {"capabilities": sorted(table.capabilities), "baud_rates": dict(table.baud_rates)}
     if not items:
         return {**known}
@@ -147,7 +153,7 @@ def _ends(
 
 
 def _overview(tables: Sequence[ControlTable]) -> Table:
-    """Return a table with one row per model."""
+    """Return the table of all servo models, one row per model."""
     columns: Columns[ControlTable] = [
         (Column("model", "name"), "model"),
         (Column("also named", "text", detail=True), _also),
@@ -167,7 +173,7 @@ def _also(table: ControlTable | DeviceTable) -> str:
 
 
 def _devices(tables: Sequence[DeviceTable]) -> Table:
-    """Return a table with one row per device."""
+    """Return the table of all models of devices, one row per model."""
     columns: Columns[DeviceTable] = [
         (Column("model", "name"), "model"),
         (Column("also named", "text", detail=True), _also),
@@ -184,7 +190,7 @@ def _commands(table: DeviceTable) -> list[str]:
 
 
 def _device_facts(table: DeviceTable) -> Table:
-    """Return the properties of a device model."""
+    """Return a device model's properties: cyclic reads, commands, capabilities and baud rates."""
     from dxlwire.control_table.device_table import CAPABILITIES
 
     known = ("ping, read and write", *(CAPABILITIES[name] for name in sorted(table.capabilities)))
@@ -198,7 +204,7 @@ def _device_facts(table: DeviceTable) -> Table:
 
 
 def _device_items(table: DeviceTable) -> Table:
-    """Return a table with one row per item of a device."""
+    """Return a device model's control table, one row per item."""
     columns: Columns[ControlItem] = [
         (Column("item", "name"), "name"),
         (Column("address"), "address"),
@@ -217,7 +223,11 @@ def _device_items(table: DeviceTable) -> Table:
 
 
 def _measure(item: ControlItem) -> tuple[str, str]:
-    """Return the value of one tick of a device's item and of tick 0. Gyroscopes use deg/s, not rpm."""
+    """Return the size of one tick of a device's item, and the value at tick 0 if that is not 0, in units for
+    people.
+
+    Angular velocity is in deg/s, for gyroscopes, not in rpm.
+    """
     unit, factor = (
         ("deg/s", 180 / math.pi) if item.unit == "rad/s" else _PER_SI.get(item.unit, (item.unit, 1.0))
     )
@@ -241,7 +251,7 @@ def _title(table: ControlTable | DeviceTable) -> str:
 
 
 def _facts(table: ControlTable) -> Table:
-    """Return the properties of a servo model."""
+    """Return a servo model's properties: travel, motor, simulation, effort, capabilities and baud rates."""
     from dxlsim.motion.motor import motor_of
     from dxlwire.control_table import CAPABILITIES
 
@@ -257,7 +267,7 @@ def _facts(table: ControlTable) -> Table:
 
 
 def _items(table: ControlTable) -> Table:
-    """Return a table with one row per item; numbered items share a row."""
+    """Return a servo model's control table, one row per item; numbered items share a row."""
     columns: Columns[Sequence[ControlItem]] = [
         (Column("item", "name"), _name),
         (Column("address"), lambda run: "..".join(dict.fromkeys(str(run[end].address) for end in (0, -1)))),
@@ -288,7 +298,7 @@ def _section(run: Sequence[ControlItem]) -> str:
 
 
 def runs(items: Sequence[ControlItem]) -> Iterator[list[ControlItem]]:
-    """Yield groups of items: adjacent items `name_1`, `name_2`, ... form a group."""
+    """Yield lists of items: adjacent items `name_1`, `name_2`, ... with equal limits form one list."""
     group: list[ControlItem] = []
     for item in items:
         if group and not _continues(group[-1], item):
@@ -310,7 +320,7 @@ def _continues(before: ControlItem, item: ControlItem) -> bool:
 
 
 def unit_of(item: ControlItem) -> str:
-    """Return the value of one tick in the unit for people."""
+    """Return the size of one tick of an item with its unit, such as `0.229 rpm`; empty without a unit."""
     if not item.unit:
         return ""
     unit, factor = _PER_SI.get(item.unit, (item.unit, 1.0))
@@ -331,7 +341,7 @@ def _torque(table: ControlTable) -> str:
 
 
 def _motor(table: ControlTable) -> str:
-    """Return the motor's data at nominal voltage, as far as the manual has them."""
+    """Return a text with the motor's data from the manual: speed, torque, current and gear."""
     known = [f"no-load speed {_speed(table)}"]
     if table.nominal_voltage:
         known[0] += f" at {table.nominal_voltage:.3g} V"
@@ -344,7 +354,7 @@ def _motor(table: ControlTable) -> str:
 
 
 def _simulated(motor: Motor) -> Iterator[tuple[str, str]]:
-    """Yield the data of the simulated servo's motor and their source."""
+    """Yield names and texts of the simulated motor's data, and of the sources of these data."""
     known = [
         f"no-load speed {motor.no_load_speed * 30 / math.pi:.4g} rpm",
         f"time constant {motor.time_constant * 1e3:.1f} ms",

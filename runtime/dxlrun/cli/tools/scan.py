@@ -1,4 +1,4 @@
-"""`dxlrun scan PORT`: finds the servos and devices on a serial port, and drafts a robot file."""
+"""`dxlrun scan PORT`: find the servos and devices on a serial port, and draft a robot file."""
 
 from __future__ import annotations
 
@@ -27,15 +27,16 @@ Rates = Annotated[tuple[int, ...], Parameter(negative=(), show_default=False)]
 HIGHEST_ID = 253
 _FASTEST = 10_500_000
 _SLOW = 30
-"""deg/s; velocity limit of each drafted joint, slow enough to step back from."""
+"""Velocity limit of each drafted joint, deg/s: slow enough to step back from."""
 _LONGEST_STEP = 3
-"""deg; longest step of a goal per cycle. At low rates it lowers the limit, as a servo takes each step at
-full speed."""
+"""Longest step of a goal per cycle, deg; at low rates it lowers the velocity limit, as servos step at full
+speed.
+"""
 _RATES = (100, 50, 25, 20, 10, 5, 2, 1)
 _SHARE = 0.5
-"""Largest share of the period that a cycle may take on the bus."""
+"""Largest share of the loop's period that the bus may need at the drafted rate."""
 _LONGEST_DELAY_NS = 500_000
-"""Default return delay when no servo reported its own: the factory's (protocol.md, Line)."""
+"""Return delay of the draft, ns, when no servo reported its own: the factory's (protocol.md, Line)."""
 
 
 def scan(
@@ -94,7 +95,9 @@ def scan(
 
 
 def read_search(protocol: float | None, baud: Sequence[int], ids: str | None) -> Search:
-    """Return the search range; raises InputError with all mistakes."""
+    """Return the protocols, baud rates and IDs to search; raises InputError with all mistakes of the
+    options.
+    """
     from dxlrun.dynamixel.tools.scanning import Search
 
     wrong = []
@@ -116,7 +119,7 @@ def read_search(protocol: float | None, baud: Sequence[int], ids: str | None) ->
 
 
 def read_ids(text: str) -> tuple[int, ...]:
-    """Return the IDs of `1-20` or `1,4,7`; raises InputError."""
+    """Return the sorted IDs of a text such as `1-20` or `1,4,7`; raises InputError."""
     found: set[int] = set()
     for part in text.split(","):
         first, dash, last = part.partition("-")
@@ -130,14 +133,18 @@ def read_ids(text: str) -> tuple[int, ...]:
 
 
 def load_models() -> None:
-    """Add the servo models of plug-ins."""
+    """Load all plug-ins, so that their servo models are known."""
     from dxlrun.control.controllers.plugins import load_plugins
 
     load_plugins()
 
 
 def _show(port: str, scanned: Scanned, rates: Mapping[int, int], *, narrowed: bool, as_json: bool) -> None:
-    """Show the result; `rates`: requested rate -> rate that the driver set instead."""
+    """Print what a scan found, with errors and warnings.
+
+    `rates`: baud rate that the port does not support -> rate that the driver set; `narrowed`: options limited
+    it.
+    """
     from dxlwire.port.adapters import warnings_for
 
     nothing = (
@@ -204,7 +211,8 @@ def _table(servos: Sequence[FoundServo]) -> Table:
 
 
 def draft_file(path: Path, port: str, servos: Sequence[FoundServo], latency_ns: int) -> str:
-    """Write a new robot file and return its text, which `dxlrun check` accepts.
+    """Write a draft of a robot file with these servos on one bus, which `dxlrun check` accepts; return its
+    text.
 
     Raises InputError when the file exists or cannot be written, ServoFault when these servos cannot share a
     bus: a port is one bus with one protocol and one rate.
@@ -216,14 +224,14 @@ def draft_file(path: Path, port: str, servos: Sequence[FoundServo], latency_ns: 
 
 
 def check_draft(path: Path) -> None:
-    """Raise InputError when `draft_file` could not write the file."""
+    """Raise InputError when a draft could not be written to a path: it exists, or does not end in .yaml."""
     check_target(path)
     if path.suffix not in (".yaml", ".yml"):
         raise InputError(f"{path} is not a name for a robot file; end it in .yaml")
 
 
 def draft(stem: str, port: str, servos: Sequence[FoundServo], latency_ns: int) -> str:
-    """Return the text of a robot file; see `draft_file`."""
+    """Return the text of a drafted robot file, compiled as a test; raises ServoFault as `draft_file`."""
     known = [servo for servo in servos if servo.model]
     if not any(not each.device for each in known):
         raise ServoFault("no servo of a known model was found, so there is no robot file to write")
@@ -340,5 +348,5 @@ def _name(servo: FoundServo) -> str:
 
 
 def _middle(table: ControlTable) -> int:
-    """Return the middle of a model's travel, in whole degrees."""
+    """Return the middle of a servo model's travel, deg from raw 0, rounded."""
     return round(math.degrees((table.min_tick + table.max_tick) / 2 * table.rad_per_tick))

@@ -1,4 +1,4 @@
-"""`dxlrun servo PORT ID VERB`: reads or changes registers, address and state of one servo."""
+"""`dxlrun servo PORT ID VERB`: read or change registers, ID, baud rate and state of one servo."""
 
 from __future__ import annotations
 
@@ -101,7 +101,7 @@ def servo(
 
 
 def _check(servo_id: int, verb: str, asked: Asked) -> None:
-    """Refuse invalid words before the port is opened; raises InputError."""
+    """Raise InputError for an invalid ID, verb, words or option, before the port is opened."""
     if not 0 <= servo_id <= HIGHEST_ID:
         raise InputError(f"{servo_id} is not an ID of a servo; they are 0..{HIGHEST_ID}")
     found = VERBS.get(verb)
@@ -118,7 +118,7 @@ def _check(servo_id: int, verb: str, asked: Asked) -> None:
 
 
 def _find(tool: ToolLine, servo_id: int, search: Search) -> FoundServo:
-    """Find the servo; raises ServoFault when it does not answer, or answers more than once."""
+    """Return the servo or device with an ID; raises ServoFault when none answers, or more than one."""
     from dxlrun.dynamixel.tools.scanning import find_servo
 
     port, found = tool.port.name, find_servo(tool, servo_id, search)
@@ -195,21 +195,24 @@ def _registers(values: Mapping[str, int], table: ControlTable, deviations: Seque
 
 @dataclass(slots=True)
 class Asked:
-    """Words and options of a verb, and its results."""
+    """Words and options that a verb was called with, and its results for the output."""
 
     words: tuple[str, ...]
     keep: Keep | None
     yes: bool
     done: list[str] = field(default_factory=list)
-    """Actions, one sentence each."""
+    """Sentences about what was done, one for each action."""
     registers: dict[str, int] = field(default_factory=dict)
-    """Values read, by item."""
+    """Values that were read, by control table item."""
     deviations: Sequence[FoundDeviation] = ()
-    """Values that differ from the factory's and affect a run."""
+    """Registers that differ from the factory's and affect a run."""
     declined: bool = False
 
     def confirmed(self, question: str) -> bool:
-        """Ask for confirmation; raises InputError without a terminal, unless --yes is given."""
+        """Ask for confirmation; return True if it is given, or --yes was.
+
+        Raises InputError without a terminal.
+        """
         if self.yes:
             return True
         if not sys.stdin.isatty():
@@ -224,15 +227,15 @@ class Asked:
 
 @dataclass(frozen=True, slots=True)
 class Verb:
-    """Definition of a verb."""
+    """A verb of `dxlrun servo`: its usage, number of words, check and action."""
 
     usage: str
-    """Usage of its words."""
+    """Words of the verb, as the help shows them."""
     fewest: int
     most: int
     do: Callable[[OneServo, Asked], Iterable[str]]
     check: Callable[[Asked], None] = lambda _: None
-    """Checks the words before the port is opened; raises InputError."""
+    """Checks the words of the verb before the port is opened; raises InputError."""
 
 
 def _get(one: OneNode, asked: Asked) -> Iterable[str]:
@@ -335,7 +338,7 @@ def _on_or_off(asked: Asked) -> None:
 
 
 _OF_DEVICES: Mapping[str, Callable[[OneNode, Asked], Iterable[str]]] = {"get": _get, "set": _set}
-"""Verbs for devices that are not servos."""
+"""Verb that devices other than servos have -> its action."""
 VERBS: Mapping[str, Verb] = MappingProxyType(
     {
         "get": Verb("[ITEM...]", 0, 1000, _get),

@@ -1,4 +1,4 @@
-"""Tool log: the traffic of a tool, for `--log FILE` of commands that access servos without a run."""
+"""Tool log: log of the packets of commands that access servos without a run (`--log FILE`)."""
 
 from __future__ import annotations
 
@@ -16,16 +16,16 @@ if TYPE_CHECKING:
     from dxlwire.packets import PacketSink
 
 TOOL_NAME = "tool"
-"""Name of the metadata record of a tool's log, which has its `command`."""
+"""Name of the log's metadata record with the `command` that wrote it."""
 
 
 @contextmanager
 def tool_log(
     path: Path | None, command: str, buses: Sequence[str] = ("line",)
 ) -> Iterator[PacketSink | None]:
-    """Yield a sink for the packets of a tool's lines, which go to a new log; None without a path.
+    """Yield a sink that writes packets to a new log, which is closed with the block; None without a path.
 
-    Raises InputError when the file exists or cannot be written.
+    `buses` are the names of the lines. Raises InputError when the file exists or cannot be written.
     """
     if path is None:
         yield None
@@ -54,7 +54,7 @@ def tool_log(
 
 
 class BusesLog:
-    """Context manager for a new log of the packets of a robot's buses, which may become known later."""
+    """Log of the packets of a robot's buses, opened when the buses are known, closed with the block."""
 
     def __init__(self, path: Path | None, command: str) -> None:
         self._path = path
@@ -69,7 +69,10 @@ class BusesLog:
         self._open.close()
 
     def of(self, buses: Sequence[BusPlan]) -> Mapping[str, PacketSink]:
-        """Return the packet sink of each bus; `buses`: all buses of the robot. Raises InputError."""
+        """Return the packet sink of each bus by name, empty without a log; the first call creates the log.
+
+        `buses`: all buses of the robot. Raises InputError when the file exists or cannot be written.
+        """
         if self._sinks is None:
             from dxlrun.dynamixel.tools.tool_line import OnBus
 

@@ -162,7 +162,7 @@ class Listening:
         return more
 
     def _samples(self) -> list[Sample]:
-        """Return the complete messages in the buffer and remove them; note new topics and the end of the run."""
+        """Remove and return the complete messages in the buffer; note new topics and the end of the run."""
         found, at = [], 0
         while len(self._bytes) - at >= FRAME_LENGTH.size:
             begin = at + FRAME_LENGTH.size

@@ -22,7 +22,7 @@ CLIENT = "client"
 
 
 class Certificate(TypedDict, total=False):
-    """Fields of a peer's verified certificate that dxlrun reads, as `SSLSocket.getpeercert()` returns them."""
+    """Fields of a peer's verified certificate that dxlrun reads, from `SSLSocket.getpeercert()`."""
 
     subject: tuple[tuple[tuple[str, str], ...], ...]
     notAfter: str

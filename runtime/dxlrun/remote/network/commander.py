@@ -26,7 +26,7 @@ class Client(NamedTuple):
 
     @property
     def commands_as(self) -> str:
-        """Name of this client as commander: its own name, or HERE for every client on the robot's computer."""
+        """Name of this client as commander: its own, or HERE for every client on the robot's computer."""
         return HERE if self.name.startswith("process ") else self.name
 
     def require_role(self, request: Request[Body, Answer]) -> None:

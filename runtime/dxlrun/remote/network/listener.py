@@ -63,7 +63,7 @@ class Listener(socket.socket):
         )
 
     def accept(self) -> tuple[socket.socket, tuple[str, int]]:
-        """Accept a connection as unproved; above the limit, close the oldest one of the host with the most."""
+        """Accept a connection as unproved; above the limit, close the oldest of the host with the most."""
         end, peer = super().accept()
         self._accepted += 1
         if not self._accepted % MOST_UNPROVED:

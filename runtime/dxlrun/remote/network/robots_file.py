@@ -33,6 +33,6 @@ class RobotsFile(Form):
 
 
 def read_robots(path: Path) -> dict[str, Address]:
-    """Return the addresses in a robots file by robot name; raises InputError with the place of each mistake."""
+    """Return the addresses in a robots file by robot name; raises InputError with places of mistakes."""
     robots = read_yaml(path, RobotsFile).robots
     return {name: Address.parse(text, name) for name, text in robots.items()}

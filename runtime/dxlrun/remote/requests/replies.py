@@ -74,7 +74,7 @@ class RobotInfo(JointValues, RunInfo):
 
 
 class Frames(msgspec.Struct, frozen=True):
-    """The robot's URDF and a plan of the joints that move it, from which a client computes poses of frames."""
+    """The robot's URDF and a plan of the joints that move it; a client computes poses of frames from them."""
 
     urdf: str | None
     frames: object
@@ -131,7 +131,7 @@ class Executed(msgspec.Struct, Generic[AGoal], frozen=True, omit_defaults=True):
 
 
 class Clamped(msgspec.Struct, frozen=True):
-    """Reply to a set-point: number and joints of the values beyond their joints' limits, which are clamped."""
+    """Reply to a set-point: number and joints of the values that are clamped to their joints' limits."""
 
     clamped: int
     clamped_joints: tuple[str, ...]
