@@ -189,7 +189,7 @@ class GatewayApp:
         self._changing = asyncio.Lock()
         self._playing = asyncio.Lock()
         self._released: dict[str, None] = {}
-        """Names of controllers, in order, that torque or reboot requests deactivated and that are not active
+        """Names of controllers that torque or reboot requests deactivated and that are not active
         again.
         """
 

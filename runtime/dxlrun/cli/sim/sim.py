@@ -213,7 +213,7 @@ def _recorded(log: Path, others: Sequence[str]) -> _Simulated:
     """Return a simulation of the buses of a log, which answer as recorded; `others`: given options that
     exclude it.
 
-    Raises InputError for such an option or a missing plan, and LogError for an unreadable log.
+    Raises InputError for one of these or a missing plan, and LogError for an unreadable log.
     """
     if others:
         raise InputError(f"--recorded and {' and '.join(others)} exclude each other; omit one of them")
