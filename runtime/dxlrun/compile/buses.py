@@ -1,4 +1,4 @@
-"""Buses of the robot file: ports, prepared packets, the time budget of a cycle, and servo monitoring."""
+"""Buses: compiles `buses` of the robot file into plans with prepared packets, time budget and monitoring."""
 
 from __future__ import annotations
 
@@ -28,9 +28,9 @@ from dxlwire.plan.reads import slow_items
 
 FAST_LATENCY_NS = 1_000_000  # shortest latency timer of an FTDI adapter (protocol.md, Time budget)
 _COMFORTABLE = 0.9
-"""Share of the period above which too little time is left for controllers and the operating system."""
+"""Share of the loop's period; a bus cycle that takes more causes a warning, as controllers lack time."""
 _LEAST_DEVICE_MARGIN_NS, _MOST_DEVICE_MARGIN_NS = 100_000, 5_000_000
-"""Bounds of the timeout margin for devices: a stock kernel wakes about 50-100 us late."""
+"""Bounds of the extra time (ns) to wait for devices: a stock kernel wakes about 50-100 us late."""
 WATCHDOG_NS = 200_000_000  # default Bus Watchdog of servos of Protocol 2.0 (failures.md)
 
 
@@ -40,7 +40,7 @@ def compile_buses(
     contributions: Collection[Contribution],
     modes: Mapping[str, Mode],
 ) -> list[BusPlan]:
-    """Return the plans of the buses with joints or devices, in the order of the file.
+    """Compile the buses that have servos or devices into plans, in file order; others cause a warning.
 
     Args:
         file: Robot file; collects the problems.
@@ -89,7 +89,7 @@ def compile_buses(
 
 
 def _check_baud_rate(file: RobotFile, name: str, tables: Sequence[ControlTable | DeviceTable]) -> None:
-    """Refuse a baud rate that no node on the bus supports, and warn if some nodes do not support it.
+    """Add an error if no servo or device on the bus supports its baud rate, a warning if some do not.
 
     A rate above those of all servos is accepted: it describes a bus without a wire, used to measure hosts.
     """
@@ -145,7 +145,7 @@ def _wiring(
 
 
 def _servo_range(servo: CompiledServo, joints: Sequence[CompiledJoint]) -> Interval:
-    """Return the range of a servo while the joints that it moves are within their limits."""
+    """Return the servo positions (after its gear) that occur while all its joints are within their limits."""
     ranges = [
         limits_of(joint.plan).scaled(joint.drive.levers[joint.servos.index(servo)], joint.plan.unit)
         for joint in joints
@@ -189,7 +189,7 @@ def _check_budget(file: RobotFile, plan: BusPlan) -> None:
 
 
 def _improvements(plan: BusPlan) -> list[str]:
-    """Return the rate that each single change would allow."""
+    """Return texts that name a change of the bus (latency, delay, second bus) and the loop rate it allows."""
     budget = plan.budget
     now = _floor(budget.highest_rate_hz)
     found: list[str] = []
@@ -217,12 +217,12 @@ def _rate(budget: Budget, *, latency_ns: int | None = None, return_delay_ns: int
 
 
 def _floor(rate: float) -> str:
-    """Return a rate that is certainly possible, Hz, rounded down to at least two digits."""
+    """Format a rate in Hz, rounded down so that it is certainly possible, with two digits at least."""
     return str(math.floor(rate)) if rate >= 10 else f"{math.floor(rate * 10) / 10:g}"
 
 
 def _with_monitoring(file: RobotFile, plan: BusPlan) -> BusPlan:
-    """Return the plan of a bus with Bus Watchdog, slow registers, and torque at start and after a reboot."""
+    """Return a copy of a bus plan with watchdog, slow registers, adapter settings and torque policies."""
     bus, joints = file.robot.buses[plan.name], first_joints(file.description)
     policies = file.robot.policies
     items = bus.slow_registers.items
@@ -246,14 +246,13 @@ def _with_monitoring(file: RobotFile, plan: BusPlan) -> BusPlan:
 
 
 def _device_margin_ns(description: Description, plan: BusPlan) -> int:
-    """Return the timeout margin of a device: half of the idle time, so a lost device does not make a cycle
-    late."""
+    """Return the extra time to wait for a device's reply, ns: half of the idle time, within bounds."""
     left_ns = round(1e9 / description.robot.loop.rate) - plan.budget.total_ns
     return max(min(_MOST_DEVICE_MARGIN_NS, left_ns // 2), _LEAST_DEVICE_MARGIN_NS)
 
 
 def slowest_period_ns(buses: Sequence[BusPlan]) -> int:
-    """Return the longest period at which no Bus Watchdog trips, ns; 0: no limit."""
+    """Return the longest loop period, ns, at which no servo's Bus Watchdog trips; 0: no watchdog is armed."""
     armed = [bus.watchdog_ticks for bus in buses if any(has_one(bus, servo) for servo in bus.servos)]
     return min(armed) * UNIT_NS // LEAST_PERIODS if armed else 0
 

@@ -1,4 +1,4 @@
-"""Contribution: the share of a feature in a plan, and the stage that creates it."""
+"""Contribution: what one feature (such as devices or sensors) adds to the plan of a robot at compilation."""
 
 from __future__ import annotations
 
@@ -20,57 +20,58 @@ from dxlwire.control_table.device_table import DeviceTable
 
 
 class Compilation(msgspec.Struct, frozen=True):
-    """A robot file with compiled joints, as input for features."""
+    """Input of a feature's compilation: the robot file, with joints, plug-ins and URDF already compiled."""
 
     file: RobotFile
-    """The robot file; it collects problems."""
+    """The robot file; the feature adds the problems that it finds to this object."""
     plugins: PlugIns
     joints: Mapping[str, CompiledJoint]
-    """Joints without mistakes; mistakes in other joints have been reported."""
+    """Compiled joints by name, without those that have mistakes (already reported)."""
     body: CompiledUrdf | None
-    """The robot's URDF; None if it has none."""
+    """The robot's compiled URDF; None if the file names none or it cannot be read."""
 
 
 class BusDevice(msgspec.Struct, frozen=True):
-    """A node on a bus that is not a servo."""
+    """A device on a bus, such as an IMU board: a node with an ID that is not a servo."""
 
     bus: str
     plan: DevicePlan
     table: DeviceTable
     simulated: Shown
-    """Its states if the bus is simulated."""
+    """States that the device has if its bus is simulated."""
 
 
 class Contribution(msgspec.Struct, frozen=True):
-    """The share of one feature in a plan."""
+    """Everything that one feature adds to the plan: sources, bus devices, files, packages and policies."""
 
     names: tuple[str, ...] = ()
-    """Names of all sources of the feature. Sources with mistakes are included, so that no controller that
-    names one of them gets an error."""
+    """Names of all sources of the feature, also of those with mistakes, so that a controller that reads one
+    does not get a second error."""
     buses: frozenset[str] = frozenset()
-    """Buses that the entries of the section name."""
+    """Buses that the entries of the feature's section name; the others may count as unused."""
     sources: tuple[SourcePlan, ...] = ()
-    """States and commands of the feature in the cycle's record."""
+    """States and commands that the feature adds to the record of each cycle."""
     devices: tuple[BusDevice, ...] = ()
     """Devices that the buses read and write in each cycle."""
     links: Mapping[str, str] = {}
-    """Links of the URDF whose orientation the sources measure, by source."""
+    """Link of the URDF whose orientation a source measures, by the name of the source."""
     texts: Mapping[str, str] = {}
-    """Contents of the files that the section names, by path."""
+    """Contents of the files that the feature's section names, by path; they are logged with the robot
+    file."""
     plan: bytes = b""
-    """Further encoded data for the feature's part in the run; see `BusContext.plan`."""
+    """Encoded data for the feature's code in the run, which gets it as `BusContext.plan`; empty: none."""
     packages: Mapping[str, str] = {}
-    """Packages of plug-ins whose code runs for the feature, with their distributions."""
+    """Python packages of plug-ins that the feature runs; package name to distribution name."""
     mechanics: MechanicsPlan | None = None
-    """Assignment of servos to joints, set by one feature only."""
+    """Which servos move which joints, for joints with transmissions; only one feature may set it."""
     recording: RecordingPlan | None = None
-    """Destination of the log, set by one feature only."""
+    """Folder and settings of the log; only one feature may set it."""
     policies: Mapping[str, str] = {}
-    """Actions of policies, for `dxlrun check`, by key, or by key and group: `on_lost_servo of wheels`."""
+    """Texts for `dxlrun check` that say what the feature's policies do, by `policy` or `policy of group`."""
 
 
 class CompileStage(msgspec.Struct, frozen=True):
-    """`STAGE` of `compile.py`: called once, after the joints and before the controllers are compiled.
+    """Hook `STAGE` in a feature's `compile.py`, called once between compiling joints and controllers.
 
     It checks the feature's section against the rest of the file, and adds every problem to the file.
     """
@@ -85,7 +86,7 @@ def check_source_names(
     contributions: Mapping[str, Contribution],
     controllers: Iterable[ControllerPlan],
 ) -> None:
-    """Check that joints, controllers with states, and the sources of features have different names.
+    """Add an error for each source that has the name of a joint, a controller with states or another source.
 
     Args:
         file: Robot file; collects the problems.

@@ -1,4 +1,4 @@
-"""Entry of a plug-in's class, such as a controller: its checks, for a robot file, a client and a replay.
+"""Controller entry: checks a plug-in's entry of the robot file, a client's request or a replay.
 
 Each mistake has its path in the robot file. The compiler converts the path into line and column; the gateway
 and a replay use only the sentences.
@@ -34,12 +34,12 @@ _OFFERED = (
 _REMOVED = {
     "joint_limiter": "remove it: the gate keeps all goals within `limits` of their joints",
 }
-"""Types of earlier versions, each with the fix."""
+"""Controller types that dxlrun no longer has, each with the fix for the error message."""
 Parameters = TypeVar("Parameters", bound=ParametersModel)
 
 
 class WrongEntry(Exception):
-    """An unusable entry, with all mistakes that a check found."""
+    """Raised for an entry of a plug-in that cannot be used; `mistakes` holds everything that was wrong."""
 
     def __init__(self, *mistakes: Mistake) -> None:
         super().__init__("; ".join(f"{one.what}; {one.fix}" for one in mistakes))
@@ -47,26 +47,26 @@ class WrongEntry(Exception):
 
 
 class CompiledController(msgspec.Struct, frozen=True):
-    """A controller with a known type and valid parameters."""
+    """A controller whose type was found and whose parameters are valid, with the plan for the run."""
 
     plan: ControllerPlan
     offer: Offer
     parameters: ParametersModel
     motors: tuple[str, ...] = ()  # figures of its joints' motors that it needs
     asked_by: Mapping[CommandName, KeyPath] = {}
-    """The parameter for which it claims a command interface, see `Interfaces`."""
+    """Path of the parameter that made the controller claim a command interface; see `Interfaces.asked_by`."""
 
 
 class PlugInCode(NamedTuple):
-    """The class of an entry, whose code may raise anything."""
+    """Calls into a plug-in's class for one entry; converts any exception of its code into WrongEntry."""
 
     kind: str
-    """Name of the section in the singular, for messages: `sensor`."""
+    """Singular name of the section, `controller` or `sensor`, for messages."""
     name: str
     distribution: str
 
     def parameters(self, written: Mapping[str, object], model: type[Parameters]) -> Parameters:
-        """Return the parameters of an entry.
+        """Validate the keys of an entry and return them as an instance of the plug-in's parameters class.
 
         Raises:
             ValidationError: The parameters are invalid.
@@ -81,14 +81,14 @@ class PlugInCode(NamedTuple):
 
     @contextmanager
     def asked_to(self, task: str) -> Iterator[None]:
-        """Run code of the plug-in; raise WrongEntry for any exception."""
+        """Context manager around plug-in code: any exception becomes WrongEntry, `cannot TASK: ...`."""
         try:
             yield
         except (Exception, SystemExit) as error:
             raise self._failed(task, error) from error
 
     def broken(self, breach: Breach) -> WrongEntry:
-        """Return the error for a class that breaks its contract."""
+        """Return the WrongEntry for a plug-in class that breaks its contract; its author must fix it."""
         what, fix = breach
         return self._at_fault(what, f"report it to its author: {fix}")
 
@@ -102,7 +102,7 @@ class PlugInCode(NamedTuple):
 
 
 def find_offer(name: str, type_name: str, plugins: PlugIns) -> Offer:
-    """Return the offer of a controller's type; raise WrongEntry if there is none."""
+    """Return the installed controller class of a type and its package; raise WrongEntry if none is found."""
     offer = plugins.controllers.get(type_name)
     if offer is not None:
         return offer
@@ -117,8 +117,7 @@ def find_offer(name: str, type_name: str, plugins: PlugIns) -> Offer:
 
 
 def where_to_get(type_name: str, known: Sequence[str], broken: Mapping[str, str]) -> str:
-    """Return the fix for an unknown type: another spelling, another package, or the repair of a broken
-    plug-in.
+    """Return the fix for an unknown controller type: a similar name, a package, or a plug-in's problem.
 
     Args:
         type_name: The type.
@@ -137,7 +136,7 @@ def where_to_get(type_name: str, known: Sequence[str], broken: Mapping[str, str]
 
 
 def plan_entry(name: str, entry: ControllerEntry, every: int) -> ControllerPlan:
-    """Return the plan of a controller from its entry, without the requests of its class."""
+    """Return the plan of a controller from its keys in the file alone, before its class adds its claims."""
     return ControllerPlan(
         name=name,
         type=entry.type,
@@ -162,7 +161,7 @@ def compile_entry(
     wrapping: Collection[str] = (),
     groups: Collection[str] = (),
 ) -> CompiledController:
-    """Return a controller with the interfaces that its class requests.
+    """Validate a controller's parameters and let its class fill in joints, claims, reads and topics.
 
     Args:
         plan: Plan of the entry, see `plan_entry`.
@@ -207,9 +206,9 @@ def compile_entry(
 
 
 def require_fit(controller: CompiledController, joints: Sequence[JointPlan], urdf: str | None) -> None:
-    """Raise WrongEntry if the robot does not fit a controller: motors, servos, the URDF.
+    """Raise WrongEntry if a controller cannot work on the robot: motor data, servos or URDF do not fit.
 
-    `joints` are the controller's joints.
+    `joints` are the controller's joints, `urdf` is the text of the URDF.
     """
     plan, offer = controller.plan, controller.offer
     with PlugInCode("controller", plan.name, offer.distribution).asked_to("compare itself with the robot"):
@@ -224,9 +223,9 @@ def require_fit(controller: CompiledController, joints: Sequence[JointPlan], urd
 def wrapped(
     parameters: dict[str, object], model: type[ParametersModel], wrapping: Collection[str]
 ) -> dict[str, object]:
-    """Return the parameters of a controller with `wrap`, if they have no `wrap` and some of its joints wrap.
+    """Add the key `wrap` with the joints that take the shorter way round, unless it is set or unsupported.
 
-    A controller that cannot wrap them, such as a velocity controller, keeps its parameters.
+    `wrapping` are all such joints of the robot. A class that refuses `wrap` gets its parameters unchanged.
     """
     joints = parameters.get("joints")
     if "wrap" not in model.model_fields or "wrap" in parameters or not isinstance(joints, list | tuple):

@@ -1,4 +1,4 @@
-"""Controllers of the robot file, checked against plug-ins, joints, each other, modes and the loop's rate."""
+"""Controllers: compiles `controllers` of the robot file and checks them against all that they depend on."""
 
 from __future__ import annotations
 
@@ -48,7 +48,7 @@ _INTERFACE: Mapping[Mode, str] = {
 
 
 def read_controller_files(file: RobotFile) -> dict[str, str]:
-    """Return the texts of the Python files with controllers next to the robot file, by name."""
+    """Read the Python files with controller classes (type `./wave.py:Wave`); return text by file name."""
     folder = file.description.path.parent
     texts: dict[str, str] = {}
     for controller, entry in file.robot.controllers.items():
@@ -72,7 +72,7 @@ def read_controller_files(file: RobotFile) -> dict[str, str]:
 def compile_controllers(
     file: RobotFile, plugins: PlugIns, contributions: Collection[Contribution]
 ) -> dict[str, CompiledController]:
-    """Return the controllers that could be compiled, by name, in the order of the file.
+    """Compile all controllers that have no mistake, by name in file order; check the whole graph of them.
 
     They can read and command the sources in `contributions`.
     """
@@ -100,7 +100,7 @@ def compile_controllers(
 
 
 def _compiled(file: RobotFile, plan: ControllerPlan, plugins: PlugIns) -> CompiledController | None:
-    """Return a compiled controller; None if a mistake prevents that."""
+    """Compile one controller; None if it has mistakes, which are added to the file."""
     name, robot = plan.name, file.robot
     offer = _offer(file, name, plan.type, plugins)
     if offer is None:
@@ -127,7 +127,7 @@ def report_entry(  # noqa: PLR0917  an entry, and what is made of it
     model: type[ParametersModel],
     make: Callable[[], Made],
 ) -> Made | None:
-    """Return the result of `make` for an entry; None if it has mistakes, which become problems of the file.
+    """Call `make` for an entry of a plug-in; report its ValidationError or WrongEntry in the file as None.
 
     Args:
         file: Robot file; collects the problems.
@@ -160,7 +160,7 @@ def _report(file: RobotFile, wrong: WrongEntry) -> None:
 
 
 def _entry_mark(description: Description, at: KeyPath) -> Mark:
-    """Return the place of an entry, of one of its keys, or of a joint in its parameters."""
+    """Return the line and column of an entry, of one of its keys, or of a joint named in its parameters."""
     if not at[2:]:
         return description.marks.key(*at)
     if description.marks.has(at):
@@ -186,7 +186,7 @@ def _check_graph(
 
 
 def _graph_mark(description: Description, plans: Mapping[str, ControllerPlan], at: KeyPath) -> Mark:
-    """Return the place of a part of a controller; for names from its class, the place of its parameters."""
+    """Return the line and column of a mistake in the graph; the entry's own if the class chose the name."""
     marks, plan = description.marks, plans[str(at[1])]
     match at[2:]:
         case ("joints", int(index)):
@@ -208,7 +208,7 @@ def _graph_mark(description: Description, plans: Mapping[str, ControllerPlan], a
 
 
 def _every(file: RobotFile, name: str, rate: float | None) -> int:
-    """Return the number of cycles per update of a controller; 0 if its rate is invalid."""
+    """Return the loop cycles per update of a controller; 0 if its rate does not divide the loop's."""
     loop = file.robot.loop.rate
     period_ns = round(1e9 / loop)
     every = rate_divider(rate, period_ns)
@@ -239,7 +239,7 @@ def check_robot(
     urdf: str | None,
     controllers: Mapping[str, CompiledController],
 ) -> None:
-    """Refuse controllers that the robot does not fit: motors, servos, the URDF."""
+    """Add an error for each controller whose joints' motors or servos, or the URDF, do not meet its needs."""
     robot = file.robot
     plans = {name: joint.plan for name, joint in joints.items()}
     for controller in controllers.values():
@@ -257,7 +257,7 @@ def check_robot(
 def check_motions(
     file: RobotFile, joints: Mapping[str, CompiledJoint], controllers: Mapping[str, CompiledController]
 ) -> None:
-    """Compare the speeds of the file's motions, which controllers play by name, with those of the joints."""
+    """Warn of or refuse motions in controllers' parameters that are faster than their joints can move."""
     for name, controller in controllers.items():
         cls, parameters = controller.offer.controller, controller.parameters
         seen: set[SpeedPeak] = set()  # a motion that follows others is contained in each of them
@@ -287,7 +287,7 @@ def _names_motor(joint: CompiledJoint) -> bool:
 def compile_modes(
     file: RobotFile, joints: Mapping[str, CompiledJoint], controllers: Mapping[str, CompiledController]
 ) -> dict[str, Mode]:
-    """Return the start mode of each joint, by name: that of its first active controller, or its rest mode.
+    """Return the operating mode of each joint at start: of its first active controller, else its rest mode.
 
     A problem is added to the file if the model of a joint lacks a mode that its controllers need, or its rest
     mode.
@@ -315,7 +315,7 @@ def compile_modes(
 def _warn_of_slow_takeovers(
     file: RobotFile, plans: Sequence[ControllerPlan], modes: Mapping[str, Mode]
 ) -> None:
-    """Warn of takeovers that change the joints' start mode: the change takes more than one cycle."""
+    """Warn if activating others makes a joint change its mode at run time, which takes several cycles."""
     named = {plan.name: plan for plan in plans}
     for plan in plans:
         for index, name in enumerate(plan.takeovers):

@@ -1,4 +1,4 @@
-"""Controller graph: the controllers, their reads, claims and commands, and every mistake in them.
+"""Controller graph: which controller reads, claims and commands what, and the mistakes in that.
 
 It is used for the controllers of a robot file and for a controller that is loaded into a run. Each mistake
 has its path in the file.
@@ -20,15 +20,16 @@ from dxlrun.output.graph import Edge, Graph, Node, listed
 from dxlrun.plan.loop_plan import ControllerPlan, SourcePlan
 
 STATES = ("position", "velocity", "effort", "temperature", "voltage", "age")
-"""Interfaces of every joint that can be read without a claim; `age` is the age of the state, s."""
+"""State interfaces that controllers can read of every joint; `age` is the age of the state, s."""
 _LONGEST = 6  # names of joints in one message
 
 
 class GraphEdge(msgspec.Struct, frozen=True):
-    """Data flow between two nodes: commands toward the servos, or values toward a reader."""
+    """A data flow from `source` to `target`, names of controllers, joints or sources."""
 
     kind: Literal["command", "reference", "read"]
-    """`command`: to the servo of a joint; `reference`: to another controller; `read`: without a claim."""
+    """`command`: controller to joint; `reference`: controller to controller; `read`: a source to its
+    reader."""
     source: str
     target: str
     joint: str
@@ -36,7 +37,7 @@ class GraphEdge(msgspec.Struct, frozen=True):
 
 
 class Mistake(NamedTuple):
-    """One mistake in the graph, with its path in the file."""
+    """A mistake of a controller: path of the key in the robot file, problem, and fix."""
 
     at: KeyPath
     what: str
@@ -47,7 +48,7 @@ Check: TypeAlias = Callable[[ControllerPlan], Iterable[Mistake]]
 
 
 class ControllerGraph:
-    """Controllers of a robot and their joints.
+    """All controllers of a robot and the joints and sources that they use; finds mistakes, draws the graph.
 
     Args:
         joints: All joints of the robot.
@@ -71,16 +72,16 @@ class ControllerGraph:
 
     @property
     def order(self) -> tuple[str, ...]:
-        """Names of the controllers in the order of updates."""
+        """Names of all controllers in the order in which a cycle updates them."""
         return update_order(self.controllers)
 
     @property
     def edges(self) -> tuple[GraphEdge, ...]:
-        """All edges of a valid graph, grouped by controller, in the order of the file."""
+        """All data flows of a graph without mistakes, grouped by controller, in file order."""
         return tuple(edge for plan in self.controllers for edge in self._edges_of(plan))
 
     def mistakes(self) -> Iterator[Mistake]:
-        """Yield every mistake of the graph."""
+        """Yield every mistake of the graph: unknown names, conflicting claims, circles, rates, fallbacks."""
         checks: Sequence[Check] = (
             self._targets,
             self._exports,
@@ -99,7 +100,7 @@ class ControllerGraph:
         yield from self._active_claims()
 
     def warnings(self) -> Iterator[Mistake]:
-        """Yield a mistake for each interface by which a controller reads its own values back."""
+        """Yield a warning for each interface in `reads` by which a controller gets its own values back."""
         for plan in self.controllers:
             for index, interface in enumerate(plan.reads):
                 if found := self._read_back(plan, interface):
@@ -108,7 +109,7 @@ class ControllerGraph:
                     yield Mistake(at, f"{plan.name} reads {interface}, {what}", fix)
 
     def _read_back(self, plan: ControllerPlan, interface: str) -> tuple[str, str] | None:
-        """Return problem and fix if an interface reads the controller's own values; None: it does not."""
+        """Return problem and fix if a controller reads a value that it produces itself; else None."""
         source, _, name = interface.rpartition("/")
         owner, _, joint = source.partition("/")
         if source == plan.name and name in plan.provides:
@@ -127,14 +128,17 @@ class ControllerGraph:
         return None
 
     def drawing(self, title: str, rate: float) -> Graph:
-        """Return the drawing of the graph for a loop at a rate, Hz.
+        """Return the graph as a picture with boxes for sources, controllers and joints;
+
+        `rate` of the loop, Hz.
 
         Joints with the same controllers are one node. Reads of a controller's own joints are drawn only for
         controllers without commands.
         """
         commanding: dict[str, list[str]] = {}
         reads: dict[tuple[str, str, str], list[str]] = {}
-        """Joints by reader, owner and interface; the owner is empty for states."""
+        """Joints by reader, owner and interface; the owner is the exporting controller, empty for joint
+        states."""
         for edge in self.edges:
             if edge.kind == "command":
                 commanding.setdefault(edge.joint, []).append(edge.source)
@@ -172,15 +176,17 @@ class ControllerGraph:
         return Graph(title, tuple(nodes.values()), tuple(edges))
 
     def _together(self, joints: Sequence[str]) -> Sequence[str]:
-        """Return names of joints, or one text if they are all joints."""
+        """Return the names of joints for a box, or one text `all N joints` if they are all of the robot."""
         return [f"all {len(joints)} joints"] if 2 < len(joints) == len(self.joints) else joints
 
     # Edges
 
     @cached_property
     def _readable(self) -> Mapping[str, tuple[str, ...]]:
-        """Interfaces that can be read without a claim, by `JOINT`, `CONTROLLER/JOINT`, device, sensor, and
-        controller with states."""
+        """Interfaces that controllers can read, by source:
+
+        `JOINT`, `CONTROLLER/JOINT`, device, sensor, controller.
+        """
         states = dict.fromkeys(self.joints, STATES)
         references = {
             f"{plan.name}/{joint}": plan.reference
@@ -193,7 +199,7 @@ class ControllerGraph:
         return {**states, **references, **others, **provided}
 
     def _edges_of(self, plan: ControllerPlan) -> Iterator[GraphEdge]:
-        """Yield the edges of one controller in a valid graph: first its reads, then its commands."""
+        """Yield the data flows of one controller: first those that it reads, then those that it commands."""
         for interface in plan.reads:
             source, _, name = interface.rpartition("/")
             owner, _, joint = source.rpartition("/")
@@ -205,7 +211,7 @@ class ControllerGraph:
                 yield GraphEdge("reference", plan.name, lower.name, joint, plan.command)
 
     def _lowers(self, plan: ControllerPlan) -> list[ControllerPlan]:
-        """Return the known controllers in `into`, without the controller itself."""
+        """Return the controllers that a controller commands (`into`), without unknown names and itself."""
         return [
             self._named[name]
             for name in dict.fromkeys(plan.into)
@@ -213,7 +219,7 @@ class ControllerGraph:
         ]
 
     def _exporters(self, plan: ControllerPlan, joint: str) -> list[ControllerPlan]:
-        """Return the controllers in `into` that export all commanded interfaces of a joint."""
+        """Return the controllers in `into` that accept all commanded interfaces as references for a joint."""
         return [
             lower
             for lower in self._lowers(plan)
@@ -223,7 +229,7 @@ class ControllerGraph:
     # Rules
 
     def _targets(self, plan: ControllerPlan) -> Iterator[Mistake]:
-        """Check that each name in `into` is another controller of the file and occurs once."""
+        """Check that `into` names other controllers of the file, each once."""
         name = plan.name
         for index, target in enumerate(plan.into):
             at = (*_path(name), "into", index)
@@ -237,7 +243,7 @@ class ControllerGraph:
                 yield Mistake(at, f"`into` of {name} names {target} twice", "name it once")
 
     def _exports(self, plan: ControllerPlan) -> Iterator[Mistake]:
-        """Check that exactly one controller in `into` exports each joint with all commanded interfaces."""
+        """Check that exactly one controller in `into` accepts the commands for each joint."""
         name, lowers = plan.name, self._lowers(plan)
         if not plan.into or name in self._incomplete:
             return
@@ -297,7 +303,7 @@ class ControllerGraph:
             yield Mistake(self._at_into(plan, idle), what, f"remove {idle.name} from `into`")
 
     def _activity(self, plan: ControllerPlan) -> Iterator[Mistake]:
-        """Check that a controller that is active from the start commands only active controllers."""
+        """Check that a controller with `active: true` commands only controllers that are active too."""
         for lower in self._lowers(plan):
             if plan.active and not lower.active:
                 what = f"{plan.name} is active from the start, but {lower.name}, which it commands, is not"
@@ -305,8 +311,7 @@ class ControllerGraph:
                 yield Mistake(self._at_into(plan, lower), what, fix)
 
     def _rates(self, plan: ControllerPlan) -> Iterator[Mistake]:
-        """Check that a controller's rate divides the rate of the controllers that it commands, so they miss
-        no command."""
+        """Check that a controller's rate divides that of those in `into`, so that they miss no command."""
         for lower in self._lowers(plan):
             if plan.every and lower.every and plan.every % lower.every:
                 what = (
@@ -322,7 +327,7 @@ class ControllerGraph:
                 )
 
     def _reads(self, plan: ControllerPlan) -> Iterator[Mistake]:
-        """Check that each interface in `reads` exists; missing interfaces of one source are one mistake."""
+        """Check that each interface in `reads` exists; the missing ones of one source are one mistake."""
         missing: dict[str, list[int]] = {}
         for index, interface in enumerate(plan.reads):
             source, _, name = interface.rpartition("/")
@@ -337,7 +342,7 @@ class ControllerGraph:
             yield Mistake(at, f"{plan.name} reads {interface}{more}, but {what}", fix)
 
     def _unreadable(self, interface: str, source: str, name: str) -> tuple[str, str]:
-        """Return problem and fix for an interface that does not exist."""
+        """Return problem and fix for an interface in `reads` that does not exist."""
         owner, _, joint = source.partition("/")
         plan = self._named.get(owner)
         if interface.count("/") not in {1, 2} or "" in interface.split("/"):
@@ -357,7 +362,7 @@ class ControllerGraph:
         return _unexported(plan, joint)
 
     def _source_commands(self, plan: ControllerPlan) -> Iterator[Mistake]:
-        """Check that each name in `source_commands` is a command of a source."""
+        """Check that each name in `source_commands` is a command of a device or sensor."""
         known = [f"{one.name}/{command}" for one in self.sources for command in one.commands]
         for index, name in enumerate(plan.source_commands):
             if name not in known and name.partition("/")[0] not in self._incomplete:
@@ -366,7 +371,7 @@ class ControllerGraph:
                 yield Mistake((*_path(plan.name), "source_commands", index), what, fix)
 
     def _takeovers(self, plan: ControllerPlan) -> Iterator[Mistake]:
-        """Check that each name in `takeovers` is another controller, and that they can be active together."""
+        """Check that `takeovers` names other controllers, and that these can be active together."""
         names = plan.takeovers
         for index, name in enumerate(names):
             at = (*_path(plan.name), "takeovers", index)
@@ -383,7 +388,7 @@ class ControllerGraph:
             yield Mistake((*_path(plan.name), "takeovers", 0), what, "remove one of them")
 
     def _needed_together(self, plan: ControllerPlan) -> Iterator[Mistake]:
-        """Check that the controllers below a controller can be active together."""
+        """Check that all controllers that a controller commands, directly or not, can be active together."""
         found = self._clashes_below(plan)
         for lower in self._lowers(plan):
             found = {pair: clash for pair, clash in found.items() if pair not in self._clashes_below(lower)}
@@ -394,12 +399,12 @@ class ControllerGraph:
             yield Mistake((*_path(plan.name), "into"), what, fix)
 
     def _clashes_below(self, plan: ControllerPlan) -> dict[tuple[str, str], list[Conflict]]:
-        """Return the conflicting claims in a controller and all controllers below it, by pair."""
+        """Return the conflicting claims among a controller and all that it commands, by pair of them."""
         names = {plan.name, *below(self.controllers, plan.name)} - self._incomplete if plan.into else set()
         return _by_pairs(conflicts(one for one in self.controllers if one.name in names))
 
     def _way(self, plan: ControllerPlan, end: str) -> str:
-        """Return the chain from a controller down to another: `arm -> limiter -> pid`."""
+        """Return the shortest chain of `into` from a controller to another: `arm -> limiter -> pid`."""
         ways: list[tuple[str, ...]] = [(plan.name,)]
         seen = {plan.name}
         for way in ways:
@@ -428,7 +433,7 @@ class ControllerGraph:
             yield Mistake(at, what, "remove one of these steps")
 
     def _active_claims(self) -> Iterator[Mistake]:
-        """Check that controllers that are active from the start claim each servo and reference only once."""
+        """Check that no two controllers with `active: true` claim the same servo or reference."""
         active = [plan for plan in self.controllers if plan.active and plan.name not in self._incomplete]
         reported = {pair for plan in self.controllers for pair in self._clashes_below(plan)}
         for (holder, other), clashes in _by_pairs(conflicts(active)).items():
@@ -446,7 +451,7 @@ class ControllerGraph:
             yield Mistake(_path(other) if at is None else _joint(other, at), what, fix)
 
     def _from_above(self, name: str) -> str:
-        """Return the chain of active controllers that ends in a controller."""
+        """Return the chain of active controllers that command a controller, as text that ends in its name."""
         way = [name]
         while upper := next(
             (p for p in self.controllers if way[0] in p.into and p.name not in way and p.active), None
@@ -455,7 +460,7 @@ class ControllerGraph:
         return " -> ".join(way)
 
     def _fallback(self, plan: ControllerPlan) -> Iterator[Mistake]:
-        """Check that a fallback can take over when it is needed."""
+        """Check that a fallback exists, is another controller, and can replace its failed controller."""
         name, at = plan.name, (*_path(plan.name), "fallback")
         if not plan.fallback:
             return
@@ -476,7 +481,7 @@ class ControllerGraph:
             yield from self._taking_over(plan, other, at)
 
     def _taking_over(self, plan: ControllerPlan, fallback: ControllerPlan, at: KeyPath) -> Iterator[Mistake]:
-        """Simulate the takeover from the controllers active at the start; yield claims that prevent it."""
+        """Yield a mistake if another active controller's claims would keep a fallback from taking over."""
         known = {one.name: one for one in self.controllers if one.name not in self._incomplete}
         taken = [name for name in (plan.name, *above(self.controllers, plan.name)) if name in known]
         active = {name: one for name, one in known.items() if one.active and name not in taken}
@@ -509,7 +514,7 @@ class ControllerGraph:
 
 
 def _unexported(plan: ControllerPlan, joint: str) -> tuple[str, str]:
-    """Return problem and fix for a reference that a controller does not export."""
+    """Return problem and fix for a reference in `reads` that an existing controller does not export."""
     if not (plan.reference and plan.joints):
         return f"{plan.name} exports no reference", "read a joint: JOINT/position"
     if not joint:

@@ -1,4 +1,4 @@
-"""Logged plan: the robot of a log, compiled again with changes."""
+"""Logged plan: compiles the robot of a log again, with changed texts or controllers, for a replay."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ _MOST_SENTENCES = 20
 
 
 def compile_texts(files: Mapping[str, str], arguments: Mapping[str, str], urdf: str | None) -> Compiled:
-    """Compile a robot from texts, in a temporary directory.
+    """Compile a robot from the texts of its files, written into a temporary directory.
 
     Args:
         files: Texts by their paths relative to the robot file; the robot file is the first.
@@ -48,7 +48,7 @@ def compile_texts(files: Mapping[str, str], arguments: Mapping[str, str], urdf: 
 
 
 def _write(root: Path, path: Path, text: str) -> None:
-    """Write one file of the log; raise InputError for a path outside the directory."""
+    """Write a file below `root`; raise InputError for a path outside of `root`."""
     place = Path(path).resolve()
     if not place.is_relative_to(root):
         raise InputError(
@@ -61,7 +61,7 @@ def _write(root: Path, path: Path, text: str) -> None:
 def replan_controller(
     change: str, plan: ControllerPlan, joints: Mapping[str, JointPlan], plugins: PlugIns, urdf: str | None
 ) -> ControllerPlan:
-    """Return the plan of a controller whose parameters or code have changed, with its new claims.
+    """Check a controller of a log with new parameters or code; return its plan with its new claims.
 
     Args:
         change: Start of the messages, which names the change.

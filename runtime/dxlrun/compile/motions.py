@@ -56,10 +56,10 @@ _EXAMPLES: Mapping[JointUnit, Mapping[Quantity, str]] = {
     LINEAR: {"position": "20 mm", "velocity": "50 mm/s", "acceleration": "200 mm/s^2"},
 }
 LEAD_NS = 1_000_000_000
-"""Time between the handover of a trajectory that begins at t = 0 and its first point, as in the thesis."""
+"""Time from the start of a trajectory command to its first point, ns, if that point is at t = 0."""
 MOST_TARGETS = 200_000
-"""Targets in all formulas of a motion file: 20 joints for 100 s at 100 Hz. A target takes about 300 bytes and
-5 us."""
+"""Most targets that all formulas of a motion file may have: 20 joints for 100 s at 100 Hz. Each takes about
+300 bytes and 5 us."""
 # Characters of formulas times evaluations; each takes up to 0.5 us, so 10 s in total.
 MOST_CHARACTERS = 20_000_000
 
@@ -71,7 +71,10 @@ def compile_motion(
     joints: Mapping[str, CompiledJoint],
     problems: Problems,
 ) -> list[MotionPart]:
-    """Return the parts that could be compiled; `names` are all controllers of the robot file."""
+    """Convert a motion file into parts with commands; parts with mistakes are omitted.
+
+    `names` are all controllers of the robot file.
+    """
     plans = {name: joint.plan for name, joint in joints.items()}
     parts: list[MotionPart] = []
     if not affordable(motion, problems):
@@ -109,7 +112,7 @@ def compile_motion(
 
 
 def check_times(parts: Sequence[MotionPart], duration_ns: int | None, problems: Problems) -> None:
-    """Refuse a part that replaces a part still playing; warn of a run that ends before a part does."""
+    """Refuse a part that starts while its controller still plays another; warn if the run ends too early."""
     by_start = sorted(parts, key=lambda part: part.start_ns)
     for index, part in enumerate(by_start):
         replaced = [
@@ -140,7 +143,7 @@ def _seconds(time_ns: int) -> str:
 
 
 def affordable(motion: MotionDescription, problems: Problems) -> bool:
-    """Return True if the formulas of a motion file can be sampled in a few seconds and about 100 MB."""
+    """Return True if the formulas of a motion file are few and short enough to evaluate; else add errors."""
     values: dict[int, int] = {}
     characters: dict[int, int] = {}
     for index, part in enumerate(motion.motion.motions):
@@ -167,7 +170,7 @@ def affordable(motion: MotionDescription, problems: Problems) -> bool:
 
 
 def samples_of(motion: MotionDescription, index: int, problems: Problems) -> tuple[Sample, ...]:
-    """Return the samples of a part, listed or computed."""
+    """Return the samples of one part of a motion, from its points or from its formulas."""
     part = motion.motion.motions[index]
     if isinstance(part, PointsPart):
         return listed_samples(motion, index, part, problems)
@@ -181,7 +184,7 @@ def _controller(
     names: tuple[str, ...],
     problems: Problems,
 ) -> CompiledController | None:
-    """Return the active controller of a part; None if it does not exist or has mistakes in the robot file."""
+    """Return the compiled controller of a part; None if it is unknown, inactive or has mistakes."""
     name = motion.motion.motions[index].controller
     mark = motion.marks.value("motions", index, "controller")
     if name not in names:
@@ -205,7 +208,7 @@ def playable(
     joints: Mapping[str, JointPlan],
     problems: Problems,
 ) -> tuple[str, tuple[Sample, ...]]:
-    """Return the kind of command that plays a part, and its samples; empty if the part has mistakes."""
+    """Return the name of the command that plays a part, and the part's samples; empty if it has mistakes."""
     samples = samples_of(motion, index, problems)
     if controller is None or not _names_own_joints(motion, index, controller, problems):
         return "", ()
@@ -224,7 +227,7 @@ def playable(
 def _names_own_joints(
     motion: MotionDescription, index: int, controller: CompiledController, problems: Problems
 ) -> bool:
-    """Return True if every joint that the part names belongs to its controller."""
+    """Return True if the part's controller moves every joint that the part names; else add errors."""
     part = motion.motion.motions[index]
     paths: list[tuple[str | int, ...]]
     if isinstance(part, PointsPart):
@@ -250,7 +253,7 @@ def _names_own_joints(
 def _right_units(
     motion: MotionDescription, index: int, joints: Mapping[str, JointPlan], problems: Problems
 ) -> bool:
-    """Return True if the units of the listed targets match their joints."""
+    """Return True if the targets of linear joints are lengths and those of others angles; else add errors."""
     part, good = motion.motion.motions[index], True
     for number, point in enumerate(part.points if isinstance(part, PointsPart) else ()):
         for joint, target in point.joints.items():
@@ -269,7 +272,7 @@ def _right_units(
 
 
 def _settle_ns(controller: CompiledController, joints: Mapping[str, JointPlan]) -> int:
-    """Return the timeout after the last target for reaching the goal."""
+    """Return the time, ns, that the joints have after the last target to reach it."""
     tolerances = getattr(controller.parameters, "tolerances", controller.parameters)
     goal_time = getattr(tolerances, "goal_time", None)
     if isinstance(goal_time, int) and goal_time > 0:
@@ -284,7 +287,7 @@ def warn_of_turns(
     wrap: Collection[str],
     problems: Problems,
 ) -> None:
-    """Warn of each continuous joint that turns the longer way, at its longest step."""
+    """Warn of each continuous joint that turns by more than half a turn between two samples."""
     longest: dict[str, tuple[float, Mark]] = {}
     before: dict[str, float] = {}
     for sample in samples:
@@ -311,7 +314,7 @@ def warn_of_turns(
 
 
 def warn_of_last_velocities(samples: Sequence[Sample], problems: Problems) -> None:
-    """Warn of joints without a position that still move when the motion ends."""
+    """Warn of joints with a velocity but no position whose last velocity is not 0."""
     last: dict[str, SampledTarget] = {}
     for sample in samples:
         last.update(sample.targets)
@@ -325,8 +328,7 @@ def warn_of_last_velocities(samples: Sequence[Sample], problems: Problems) -> No
 
 
 def last_positions(joints: Sequence[str], samples: Sequence[Sample]) -> tuple[float | None, ...]:
-    """Return the last positions of joints, rad or m; None for joints without a position, which must come to
-    rest."""
+    """Return the last position of each joint, rad or m; None for a joint that only has velocities."""
     held: dict[str, float] = {}
     for sample in samples:
         for joint, target in sample.targets.items():
@@ -336,8 +338,7 @@ def last_positions(joints: Sequence[str], samples: Sequence[Sample]) -> tuple[fl
 
 
 def last_arrival_ns(samples: Sequence[Sample], joints: Mapping[str, JointPlan]) -> int:
-    """Return the earliest arrival of the joints of single commands at their last positions, ns since the
-    part's start.
+    """Return when the joints reach their last positions at the earliest, ns since the part's start.
 
     A joint moves to a position at the speed commanded with it, else at its highest speed.
     """
@@ -360,7 +361,7 @@ def last_arrival_ns(samples: Sequence[Sample], joints: Mapping[str, JointPlan]) 
 def commands_of(
     controller: CompiledController, kind: str, samples: tuple[Sample, ...], start_ns: int, lead_ns: int
 ) -> tuple[ScheduledCommand, ...]:
-    """Return the commands of a part; raise InputError with the first invalid one."""
+    """Return a part's commands with their times: one trajectory, or one command per sample for a group."""
     joints = controller.plan.joints
     if kind == TRAJECTORY:
         payload = trajectory_command(joints, samples, lead_ns)
@@ -377,7 +378,7 @@ def commands_of(
 def prepared(
     controller: CompiledController, kind: str, payload: dict[str, object], at_ns: int, mark: Mark
 ) -> ScheduledCommand:
-    """Validate and prepare a command with the controller's own code, which may raise anything."""
+    """Let the controller validate and prepare a command; return it with its time; raise InputError."""
     cls = controller.offer.controller
     try:
         data = cls.prepare(kind, cls.Commands[kind].model_validate(payload), controller.parameters)
@@ -401,7 +402,7 @@ def prepared(
 def speed_peaks(
     controller: CompiledController, commands: Sequence[ScheduledCommand], mark: Mark
 ) -> list[SpeedPeak]:
-    """Return the highest speeds of the joints in a trajectory, computed by the controller's own code.
+    """Return the highest speeds of joints within a trajectory, as the controller's class computes them.
 
     A group controller has no path between its targets. Raises InputError.
     """
@@ -418,7 +419,7 @@ def speed_peaks(
 
 
 def command_kind(controller: type[Controller[Any]]) -> str | None:
-    """Return the name of the command that plays motions; None if the controller has none."""
+    """Return the name of a controller's command that can play motions; None if it has none."""
     if TRAJECTORY in controller.Commands:
         return TRAJECTORY
     for kind, model in controller.Commands.items():
@@ -430,7 +431,7 @@ def command_kind(controller: type[Controller[Any]]) -> str | None:
 def group_command(
     controller: type[Controller[Any]], kind: str, joints: Sequence[str], sample: Sample
 ) -> dict[str, object]:
-    """Return one command with a value for each joint.
+    """Return the fields of a group command for one sample, with one value per joint.
 
     Raises:
         InputError: The controller does not take a quantity of the sample, or a joint has no value for one.
@@ -451,7 +452,7 @@ def group_command(
 
 
 def trajectory_command(joints: Sequence[str], samples: Sequence[Sample], lead_ns: int) -> dict[str, object]:
-    """Return a trajectory through all samples, starting `lead_ns` after its handover; raise InputError."""
+    """Return the fields of a trajectory command through all samples; raise InputError for a missing value."""
     quantities: list[Quantity] = ["position"]
     derivatives: tuple[Quantity, ...] = ("velocity", "acceleration")
     for quantity in derivatives:
@@ -471,7 +472,7 @@ def trajectory_command(joints: Sequence[str], samples: Sequence[Sample], lead_ns
 
 
 def _value(sample: Sample, joint: str, quantity: Quantity) -> float:
-    """Return one value; raise InputError if the point does not have it."""
+    """Return one joint's target value in a sample; raise InputError if it is missing."""
     target = sample.targets.get(joint)
     value = None if target is None else target.get(quantity)
     if value is None:

@@ -1,4 +1,4 @@
-"""Orientations: the link of the URDF to which each belongs, by its source, its messages and its users."""
+"""Orientations: warnings if an IMU's data are assigned to different links of the URDF in several places."""
 
 from __future__ import annotations
 
@@ -23,7 +23,7 @@ def check_orientations(
     contributions: Iterable[Contribution],
     controllers: Mapping[str, CompiledController],
 ) -> None:
-    """Warn if source, frame of the messages, `model.imu_link` and users of an orientation disagree."""
+    """Warn if source, message frame, `model.imu_link` and readers put an orientation on different links."""
     links = {name: link for each in contributions for name, link in each.links.items()}
     for name, controller in controllers.items():
         frame, plan = _text(controller, "frame"), controller.plan
@@ -56,7 +56,7 @@ def check_orientations(
 def _check_frame(
     file: RobotFile, urdf: Urdf, name: str, controller: CompiledController, links: Mapping[str, str]
 ) -> None:
-    """Compare the frame of a controller's messages with the link of its first source and its mounting."""
+    """Warn if the `frame` of a controller's messages is not the link of its source plus its `mounting`."""
     frame, source = _text(controller, "frame"), controller.plan.reads[0].partition("/")[0]
     mark = file.at("controllers", name, "frame")
     if frame not in urdf.links:
@@ -73,13 +73,13 @@ def _check_frame(
 
 
 def _text(controller: CompiledController, key: str) -> str:
-    """Return a parameter that is a text; empty: it is missing."""
+    """Return a controller's parameter if it is a text; else an empty one."""
     value = getattr(controller.parameters, key, "")
     return value if isinstance(value, str) else ""
 
 
 def _turn(urdf: Urdf, link: str, other: str, expected: Quaternion = NO_TURN) -> str:
-    """Return the unexpected rotation of a link relative to another one, in words; empty: as expected."""
+    """Return in words how a link is rotated against another; empty if as `expected` or a link is unknown."""
     if link not in urdf.links or other not in urdf.links:
         return ""
     (above, place), (other_above, other_place) = _fixed(urdf, link), _fixed(urdf, other)
@@ -95,7 +95,7 @@ def _turn(urdf: Urdf, link: str, other: str, expected: Quaternion = NO_TURN) -> 
 
 
 def _fixed(urdf: Urdf, link: str) -> tuple[str, Transform]:
-    """Return the highest link to which a link is fixed, and the pose of the link in it."""
+    """Return the topmost link that is rigidly joined to a link, and the link's pose in it."""
     above = {joint.child: joint for joint in urdf.joints}
     place = Transform()
     while link in above and not above[link].moves:

@@ -1,4 +1,4 @@
-"""Policies and poses of the robot file, checked against joints, limits, servos and the exit timeout."""
+"""Policies: compiles `policies` and `poses` of the robot file and checks them against robot and timeout."""
 
 from __future__ import annotations
 
@@ -26,7 +26,7 @@ from dxlwire.joint_unit import LINEAR, ROTARY, JointUnit
 from dxlwire.plan.planning import torque_off_ns
 
 MARGIN_NS = 100_000_000
-"""Reserve for torque off: for the processor, and for servos that answer only the second request."""
+"""Part of `exit_timeout` reserved for switching torque off, ns, for CPU delays and one retry."""
 
 _EXAMPLES: Mapping[JointUnit, str] = {ROTARY: "60 deg", LINEAR: "20 mm"}
 
@@ -37,7 +37,7 @@ def compile_policies(
     buses: Sequence[BusPlan],
     keys: Iterable[PolicyKey[WrittenPolicy]],
 ) -> PolicyPlan:
-    """Return the policies of a file; add problems if they do not fit the robot or `exit_timeout`."""
+    """Compile all policies of a file; add errors if steps do not fit the robot or take too long."""
     _check_poses(file, joints)
     robot = file.robot
     limit_ns = robot.policies.exit_timeout - _reserve_ns(buses, robot.loop.rate)
@@ -145,7 +145,7 @@ def _check_torque(file: RobotFile, name: str, steps: WrittenPolicy, buses: Seque
 
 
 def _check_stopping(file: RobotFile, name: str, joints: Mapping[str, CompiledJoint], left_ns: int) -> None:
-    """Refuse joints that need longer to brake than the time left for a policy that keeps torque on."""
+    """Add an error if a joint brakes too slowly for a policy that holds it, within the time left (ns)."""
     for joint in (joint.plan for joint in joints.values()):
         stop_s = 0.0 if joint.acceleration is None else joint.highest_speed / joint.acceleration
         if stop_s * 1e9 > left_ns:
@@ -158,7 +158,7 @@ def _check_stopping(file: RobotFile, name: str, joints: Mapping[str, CompiledJoi
 
 
 def _check_groups(file: RobotFile, joints: Mapping[str, CompiledJoint]) -> None:
-    """Check that each joint is in one group at most, together with all joints that the same servos move."""
+    """Check the groups in `policies`: known joints, each in one group, coupled joints in the same group."""
     known = tuple(file.robot.joints)
     owner: dict[str, str] = {}
     for name, group in file.robot.policies.groups.items():
@@ -191,7 +191,7 @@ def _check_groups(file: RobotFile, joints: Mapping[str, CompiledJoint]) -> None:
 
 
 def _reserve_ns(buses: Sequence[BusPlan], rate: float) -> int:
-    """Return the part of the exit timeout that steps cannot use: two periods, and torque off on all lines."""
+    """Return the part of `exit_timeout` that steps cannot use, ns: two periods, and torque off."""
     return max(map(torque_off_ns, buses), default=0) + round(2e9 / rate) + MARGIN_NS
 
 

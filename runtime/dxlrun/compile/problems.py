@@ -1,4 +1,4 @@
-"""Problems of a robot file of valid form: collected by all checks, each at its place in the file."""
+"""Problems: collects the errors and warnings of all checks, each with its line and column in a file."""
 
 from __future__ import annotations
 
@@ -10,12 +10,12 @@ from dxlrun.errors import InputError, Mark, Problem, told_once
 
 
 class Problems:
-    """All problems of one compilation. A check adds its problems and continues."""
+    """List of all errors and warnings of one compilation; a check adds its problems and continues."""
 
     __slots__ = ("_found", "_joints")
 
     def __init__(self, joints: Collection[str] = ()) -> None:
-        """Start without problems.
+        """Start with an empty list.
 
         Args:
             joints: Joints that can share a mistake in their defaults, which is reported once.
@@ -24,25 +24,25 @@ class Problems:
         self._joints = joints
 
     def error(self, mark: Mark, what: str, fix: str) -> None:
-        """Add a problem that prevents the run."""
+        """Add an error, which prevents the run: place, problem, and fix."""
         self._found.append(Problem(mark, what, fix))
 
     def warning(self, mark: Mark, what: str, fix: str) -> None:
-        """Add a problem that a person should look at; the robot can run."""
+        """Add a warning: place, problem, and fix; the robot can run all the same."""
         self._found.append(Problem(mark, what, fix, severity="warning"))
 
     def extend(self, problems: Iterable[Problem]) -> None:
-        """Add the problems of another check."""
+        """Add problems that another function returned."""
         self._found.extend(problems)
 
     @property
     def errors(self) -> tuple[Problem, ...]:
-        """Errors in file order."""
+        """All errors, sorted by place in the file, without repetitions."""
         return self._of("error")
 
     @property
     def warnings(self) -> tuple[Problem, ...]:
-        """Warnings in file order."""
+        """All warnings, sorted by place in the file, without repetitions."""
         return self._of("warning")
 
     def _of(self, severity: str) -> tuple[Problem, ...]:
@@ -50,13 +50,13 @@ class Problems:
         return tuple(sorted(found, key=lambda problem: problem.mark))
 
     def refuse(self) -> None:
-        """Raise InputError with the errors, followed by the warnings, if there is any error."""
+        """Raise InputError with all errors and warnings if there is at least one error."""
         if self.errors:
             raise InputError(self.errors + self.warnings)
 
 
 class RobotFile(Problems):
-    """A robot file under compilation: its values, their places, and the problems."""
+    """A robot file during compilation: its values, their places in the file, and the problems found."""
 
     __slots__ = ("description", "marks", "robot")
 
@@ -67,16 +67,16 @@ class RobotFile(Problems):
         self.marks = description.marks
 
     def at(self, *path: str | int) -> Mark:
-        """Return the place of a value, or of its nearest parent in the file."""
+        """Return line and column of a value; if it is not in the file, those of its nearest parent."""
         return self.marks.value(*path)
 
     def key(self, *path: str | int) -> Mark:
-        """Return the place of a key, of a list item, or of the nearest parent."""
+        """Return line and column of a key or list item; if it is not in the file, of its nearest parent."""
         return self.marks.key(*path)
 
 
 def joint_mark(description: Description, controller: str, joint: str) -> Mark:
-    """Return the last place where a controller of the file names a joint, else the controller's own place."""
+    """Return line and column of a joint's name in a controller's parameters, else of the controller."""
     start = ("controllers", controller)
     parameters = description.robot.controllers[controller].parameters
     named = [path for path, text in _texts(parameters, start) if text == joint]
@@ -84,7 +84,7 @@ def joint_mark(description: Description, controller: str, joint: str) -> Mark:
 
 
 def into_mark(description: Description, controller: str, index: int) -> Mark:
-    """Return the place where a controller names an entry of `into`, which can be a list or one name."""
+    """Return line and column of a name in a controller's `into`, which is a list or a single name."""
     at: KeyPath = ("controllers", controller, "into")
     return (
         description.marks.value(*at, index)
@@ -94,7 +94,7 @@ def into_mark(description: Description, controller: str, index: int) -> Mark:
 
 
 def _texts(value: object, path: KeyPath) -> Iterator[tuple[KeyPath, str]]:
-    """Yield every text of a tree with its path."""
+    """Yield every text in nested parameters, with its path."""
     if isinstance(value, str):
         yield path, value
     elif isinstance(value, dict):

@@ -1,4 +1,4 @@
-"""Report of `dxlrun check` about a compiled robot, for JSON; the columns of its tables come from these rows.
+"""Report: the results of a compilation as rows, for `dxlrun check` as JSON and as tables.
 
 Angles in rad, those of servos from their raw 0; lengths in m, times in s, rates in Hz.
 """
@@ -26,19 +26,19 @@ from dxlwire.bus_plan import BusPlan, ServoPlan
 from dxlwire.joint_unit import LINEAR, ROTARY
 
 Source = Literal["file", "servo", "none"]
-"""Origin of a limit. `servo`: its reach, top speed or highest goal; `none`: a wheel, or not known."""
+"""Origin of a limit: the file, the servo's own range or speed, or none."""
 Row = dict[str, Any]  # JSON object of one row
 
 
 class TableStage(msgspec.Struct, frozen=True):
-    """`STAGE` of `table.py`: the table of a feature in `dxlrun check`."""
+    """Hook `STAGE` in a feature's `table.py`: the feature's rows and table in `dxlrun check`."""
 
     FILE: ClassVar[str] = "table"
 
     rows: Callable[[Plan], Iterable[Row]]
-    """Returns the rows of the feature in a plan; in JSON they are under the feature's name."""
+    """Returns the feature's rows for a plan; in JSON they are under the feature's name."""
     table: Callable[[Sequence[Row]], Table]
-    """Returns the table of these rows."""
+    """Returns a printable table of these rows."""
 
 
 def check_report(
@@ -48,7 +48,7 @@ def check_report(
     parts: Sequence[MotionPart],
     policies: Mapping[str, str],
 ) -> Row:
-    """Return all results of the compilation of a robot, for JSON."""
+    """Return everything that `dxlrun check --json` prints about a compiled robot."""
     loop, buses = plan.loop, plan.buses
     servos = {servo.own_name: servo for bus in buses for servo in bus.servos}
     return {
@@ -67,7 +67,7 @@ def check_report(
 
 
 def graph_of(loop: LoopPlan) -> ControllerGraph:
-    """Return the controller graph of a plan, which was checked when the plan was made."""
+    """Return the controller graph of a plan without checking it again."""
     return ControllerGraph([joint.name for joint in loop.joints], loop.controllers, loop.sources)
 
 
@@ -106,7 +106,7 @@ def _joint(joint: CompiledJoint, servos: Mapping[str, ServoPlan]) -> Row:
 
 
 def _properties(plan: JointPlan, limits: Limits) -> Row:
-    """Return the numeric properties of a joint with a column, and the origin of its limits."""
+    """Return a joint's numeric properties (such as speed limits) and, for limits, where they come from."""
     row: Row = {}
     for one in shown_properties():
         row[one.name] = value = one.value(plan)
@@ -116,7 +116,7 @@ def _properties(plan: JointPlan, limits: Limits) -> Row:
 
 
 def shown_properties() -> list[JointProperty]:
-    """Return the properties of joints with a column; the keys of features come last."""
+    """Return the joint properties that have a column in the table; those of features come last."""
     own = [one for one in JOINT_PROPERTIES if one.column is not None]
     return own + [_property_of(key) for key in joint_keys()]
 
@@ -197,17 +197,17 @@ def _motion(part: MotionPart) -> Row:
 
 
 class PolicyRow(msgspec.Struct, frozen=True):
-    """Actions of one policy for a deviation from the plan."""
+    """One row of the table of policies: what a policy does with the robot."""
 
     name: str
     does: str
-    """Its steps and the state in which it leaves the robot; or the joints held while the run continues."""
+    """The policy's steps and final state as text; or the joints that it holds while the run continues."""
     longest: float  # longest duration of the steps, s
     without_loop: str  # action taken by the guardian when the loop process has exited
 
 
 def policy_rows(plan: Plan, shown: Mapping[str, str]) -> list[PolicyRow]:
-    """Return the rows of all policies: those with steps come first."""
+    """Return one row per policy of a plan; `shown` are texts of policies that features carry out."""
     policies = plan.loop.policies.by_name
     found = {name: (policy.text, policy.longest_ns * 1e-9) for name, policy in policies.items()}
     found |= {
@@ -219,7 +219,7 @@ def policy_rows(plan: Plan, shown: Mapping[str, str]) -> list[PolicyRow]:
 
 
 def _on_returned_servo(buses: Sequence[BusPlan]) -> str:
-    """Return the servos that get torque after a reboot, in words."""
+    """Return as text which servos hold and which stay limp after they rebooted and returned."""
     servos = [servo for bus in buses for servo in bus.servos]
     held = [servo.joint for servo in servos if servo.torque_on_return]
     if len(held) in {0, len(servos)}:

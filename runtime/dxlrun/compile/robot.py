@@ -1,4 +1,4 @@
-"""Compiler: runs every check, reports all problems at once, then makes the plan."""
+"""Compiler: runs every check on a robot and its motions, reports all problems at once, makes the plan."""
 
 from __future__ import annotations
 
@@ -54,12 +54,12 @@ if TYPE_CHECKING:
     from dxlrun.output.graph import Graph
 
 Ask: TypeAlias = Callable[[Sequence[BusPlan], Sequence[str]], Mapping[str, str]]
-"""Reads the models of servos: takes the buses and the joints, returns models by joint."""
+"""Function that reads servo models from the buses: takes bus plans and joints, returns models by joint."""
 _HIGHEST = 98  # the guardian needs a higher priority, and 99 is the highest one (sched(7))
 
 
 class Compiled(msgspec.Struct, frozen=True):
-    """A plan that can be run, its sources, and the warnings."""
+    """Result of a compilation: the plan of a run, the compiled joints and motions, and the warnings."""
 
     plan: Plan
     warnings: tuple[Problem, ...]
@@ -70,14 +70,14 @@ class Compiled(msgspec.Struct, frozen=True):
 
     @property
     def report(self) -> Row:
-        """All results of the compilation, for JSON."""
+        """All results of the compilation, as `dxlrun check --json` prints them."""
         from dxlrun.compile.report import check_report  # imported here, because only `dxlrun check` needs it
 
         return check_report(self.plan, self.rate, self.joints, self.parts, self.policies)
 
     @property
     def drawing(self) -> Graph:
-        """Drawing of the controller graph."""
+        """Picture of the controller graph of the plan."""
         from dxlrun.compile.report import graph_of  # as above
 
         return graph_of(self.plan.loop).drawing(f"{self.plan.robot}: controllers", self.rate)
@@ -92,7 +92,7 @@ def compile_files(
     *,
     replacements: Sequence[Replacement] = (),
 ) -> Compiled:
-    """Read a robot file and motion files and compile them.
+    """Read a robot file and motion files and compile them into the plan of a run.
 
     Args:
         robot: Robot file.
@@ -132,7 +132,7 @@ def compile_files(
 
 
 def _unknown(description: Description) -> list[str]:
-    """Return the joints whose models must be read from their servos."""
+    """Return the joints on real ports with `model: auto`, whose models must be read from the servos."""
     robot = description.robot
     return [
         name
@@ -147,7 +147,7 @@ def compile_robot(
     duration_ns: int | None = None,
     models: Mapping[str, str] | None = None,
 ) -> Compiled:
-    """Convert a description and motions into a plan.
+    """Compile a robot that was read from its files, and motions, into the plan of a run.
 
     Args:
         description: The robot.
@@ -253,13 +253,13 @@ def compile_robot(
 
 
 def _models(buses: Iterable[BusPlan]) -> frozenset[str]:
-    """Return the models of all servos and devices."""
+    """Return the models of all servos and devices on the buses."""
     servos = {servo.model for bus in buses for servo in bus.servos}
     return frozenset(servos | {device.model for bus in buses for device in bus.devices})
 
 
 def _packages(features: Iterable[Feature]) -> dict[str, str]:
-    """Return the packages of the plug-ins whose features the robot file uses, with their distributions."""
+    """Return package and distribution of each plug-in whose feature the robot file uses."""
     return {
         each.package.partition(".")[0]: distribution_name(each.distribution)
         for each in features
@@ -268,7 +268,7 @@ def _packages(features: Iterable[Feature]) -> dict[str, str]:
 
 
 def _physics(simulation: SimulationPlan, buses: Iterable[BusPlan]) -> dict[str, str]:
-    """Return the package that simulates the bodies, with its distribution; empty without simulated servos."""
+    """Return package and distribution of the physics simulator; empty if no bus is simulated."""
     if not any(bus.port == SIMULATED for bus in buses):
         return {}
     return {
@@ -279,7 +279,7 @@ def _physics(simulation: SimulationPlan, buses: Iterable[BusPlan]) -> dict[str, 
 
 
 def _check_scheduler(file: RobotFile) -> None:
-    """Check the scheduler's settings; the start checks whether this machine grants them."""
+    """Check priority, polling and stop latency of the loop in the file, not what this machine grants."""
     loop = file.robot.loop
     scheduler, timeout_ns = loop.scheduler, file.robot.policies.exit_timeout
     if 1e9 / loop.rate >= timeout_ns:
@@ -304,7 +304,7 @@ def _check_scheduler(file: RobotFile) -> None:
 
 
 def _scheduler_plan(loop: Loop) -> SchedulerPlan:
-    """Return the scheduler's settings for the loop's process."""
+    """Return the operating system's scheduling settings for the loop's process."""
     scheduler = loop.scheduler
     return SchedulerPlan(
         policy=scheduler.policy,
@@ -318,7 +318,7 @@ def _scheduler_plan(loop: Loop) -> SchedulerPlan:
 
 
 def _least_period_ns(loop: Loop, buses: Sequence[BusPlan]) -> int:
-    """Return the shortest period that the slowest bus allows, ns; the buses work in parallel.
+    """Return the shortest possible loop period, ns: the longest cycle of a bus, as buses work in parallel.
 
     Not more than the file's own period, which was checked against the same budget.
     """

@@ -1,4 +1,4 @@
-"""Samples: the points of one part of a motion, listed or computed from formulas of time.
+"""Samples: the targets of one part of a motion over time, listed in the file or computed from formulas.
 
 simpleeval evaluates the formulas, within narrow bounds.
 """
@@ -26,7 +26,8 @@ Quantity = Literal["position", "velocity", "acceleration"]
 QUANTITIES: tuple[Quantity, ...] = ("position", "velocity", "acceleration")
 LONGEST_FORMULA = 1000  # characters; bounds parsing and evaluation, together with the list of operations
 DEEPEST_FORMULA = 100
-"""Levels of operations; a sum of n terms has n. Keeps the evaluator below Python's recursion limit."""
+"""Deepest nesting of operations in a formula; a sum of n terms has n. Keeps the evaluator below Python's
+recursion limit."""
 
 FUNCTIONS: Mapping[str, Callable[..., float]] = {
     "sin": math.sin,
@@ -68,7 +69,7 @@ _OPERATORS: Mapping[type[ast.AST], Callable[..., float]] = {
 
 
 class SampledTarget(msgspec.Struct, frozen=True):
-    """Position, rad, velocity, rad/s, and acceleration, rad/s^2, of a joint; None: not given."""
+    """Targets of one joint at one time: position, velocity and acceleration in rad or m; None: not given."""
 
     position: float | None
     velocity: float | None
@@ -76,13 +77,13 @@ class SampledTarget(msgspec.Struct, frozen=True):
     mark: Mark
 
     def get(self, quantity: Quantity) -> float | None:
-        """Return the value of a quantity."""
+        """Return the target of one quantity; None: not given."""
         value: float | None = getattr(self, quantity)
         return value
 
 
 class Sample(msgspec.Struct, frozen=True):
-    """Targets of all joints at one time."""
+    """Targets of all joints at one time of a motion, with their place in the file."""
 
     t_ns: int  # since the part's start
     targets: dict[str, SampledTarget]
@@ -92,7 +93,7 @@ class Sample(msgspec.Struct, frozen=True):
 def listed_samples(
     motion: MotionDescription, index: int, part: PointsPart, problems: Problems
 ) -> tuple[Sample, ...]:
-    """Return the listed points of a part; their times must increase."""
+    """Return the points of a part as samples; add an error if their times do not increase."""
     samples: list[Sample] = []
     for number, point in enumerate(part.points):
         path = ("motions", index, "points", number)
@@ -117,7 +118,7 @@ def listed_samples(
 
 
 def formula_texts(part: FormulaPart) -> tuple[str, ...]:
-    """Return every formula of a part."""
+    """Return the texts of all formulas of a part."""
     texts = (_text(formula, quantity) for formula in part.joints.values() for quantity in QUANTITIES)
     return tuple(text for text in texts if text is not None)
 
@@ -125,7 +126,7 @@ def formula_texts(part: FormulaPart) -> tuple[str, ...]:
 def formula_samples(
     motion: MotionDescription, index: int, part: FormulaPart, problems: Problems
 ) -> tuple[Sample, ...]:
-    """Return the values of the formulas at `samples` times over `duration`, both ends included."""
+    """Evaluate the formulas of a part at `samples` equal steps over `duration`; empty if one is invalid."""
     count = part.samples
     times = [round(part.duration * i / max(1, count - 1)) for i in range(count)]
     columns: dict[str, dict[Quantity, list[float]]] = {}
@@ -161,7 +162,7 @@ def _text(formula: Formula, quantity: Quantity) -> str | None:
 
 
 def _values(mark: Mark, text: str, times: Sequence[int], problems: Problems) -> list[float] | None:
-    """Return the values of a formula at the times; None if it is invalid."""
+    """Evaluate a formula at times in ns; None if it is invalid, with an error added."""
     try:
         formula = Expression(text)
     except ValueError as error:
@@ -182,7 +183,7 @@ def _values(mark: Mark, text: str, times: Sequence[int], problems: Problems) -> 
 
 
 class Expression:
-    """An expression of `t`, s, with pi, sin, cos, tan, sqrt, exp, abs and a few other functions.
+    """A formula of the time `t` in s, such as `0.5 * sin(2 * pi * t)`, parsed and checked.
 
     Raises:
         ValueError: The text is not a valid expression; one sentence.
@@ -196,7 +197,7 @@ class Expression:
         self._evaluator = SimpleEval(operators=dict(_OPERATORS), functions=dict(FUNCTIONS), names={})
 
     def at(self, t: float) -> float:
-        """Return the value at `t` s; raise ValueError with one sentence if it is undefined."""
+        """Return the formula's value at `t` s; raise ValueError if it is undefined or not finite."""
         self._evaluator.names = {"t": t, "pi": math.pi}
         try:
             value = float(self._evaluator.eval(self.text, previously_parsed=self._tree))

@@ -1,4 +1,4 @@
-"""Simulation: the `simulation` keys of the robot file, and the simulator's configuration for a plan.
+"""Simulation: compiles the `simulation` keys of the robot file into the simulator's configuration.
 
 A real port ignores these keys, so an impossible value is only a warning there.
 """
@@ -55,7 +55,7 @@ def compile_simulation(
     devices: Iterable[BusDevice],
     motors: Motors,
 ) -> SimulationPlan:
-    """Return the plan of the simulated servos and buses; add problems for contradictory keys."""
+    """Return loads, motors, delays and adapters of simulated buses; warn of contradictory values."""
     for name, joint in joints.items():
         _check_load(file, name, joint, _motor(joint, motors))
     _check_buses(file)
@@ -78,12 +78,12 @@ def compile_simulation(
 
 
 def _motor(joint: CompiledJoint, motors: Motors) -> MotorDescription | None:
-    """Return the motor file of a joint's simulated servo, or of its first servo."""
+    """Return the motor file with which a joint's first servo is simulated; None if it has none."""
     return motors.simulated(joint.servos[0].described.name)
 
 
 def _times(joint: CompiledJoint, motor: MotorDescription | None) -> ServoTimes:
-    """Return the delays of a simulated servo: from the keys, else from its motor file."""
+    """Return reply delay and write time of a simulated servo, from its keys, else from its motor file."""
     keys = joint.described.simulation
     known_ns = 0 if motor is None else motor.motor.delay_ns
     return ServoTimes(keys.response_delay or known_ns, keys.write_time)
@@ -95,7 +95,7 @@ def _adapter(bus: Bus) -> AdapterConfig:
 
 
 def _load(joint: CompiledJoint, motor: MotorDescription | None) -> Load:
-    """Return the load of simulated servos: from the keys, else from the servo's motor file."""
+    """Return the load at a simulated joint (inertia, friction, weight), from its keys or its motor file."""
     keys = joint.described.simulation
     friction = float(keys.friction or 0.0)
     if joint.plan.unit is LINEAR:
@@ -145,7 +145,7 @@ def _check_load(file: RobotFile, name: str, joint: CompiledJoint, motor: MotorDe
 
 
 def _stall(joint: CompiledJoint) -> float:
-    """Return the stall torque of all servos of a joint at the joint, Nm or N; 0: not known."""
+    """Return the stall torque of all of a joint's servos together, at the joint, Nm or N; 0: not known."""
     torques = [servo.table.stall_torque / servo.described.ratio for servo in joint.servos]
     if not all(torques):
         return 0.0
@@ -185,7 +185,9 @@ def _check_physics(file: RobotFile) -> None:
 
 
 def simulation_of(plan: Plan) -> SimulationConfig:
-    """Return the simulated lines of a plan, with each servo at its reference (q = 0), and their loads.
+    """Return the simulator's configuration for a plan: simulated buses and servos, loads, and bodies.
+
+    Each servo starts at its reference (q = 0).
 
     Raises:
         InputError: The robot file requires bodies that cannot be simulated. This is raised here, where the
@@ -211,18 +213,18 @@ def simulation_of(plan: Plan) -> SimulationConfig:
 
 
 def sensed_bodies(plan: Plan) -> UrdfBodies | None:
-    """Return the bodies that processes next to the loop sense, simulated or not; None: none are sensed."""
+    """Return the URDF's bodies if a process next to the loop (such as a sensor) needs them; else None."""
     sensed = any(one.process.has_body for one in planned_processes(plan.loop))
     return _bodies(plan) if sensed else None
 
 
 def _bodies(plan: Plan) -> UrdfBodies | None:
-    """Return the bodies of the robot's URDF, and the mechanisms that move them; None: no URDF."""
+    """Return the URDF's bodies and what moves them; None if the robot has no URDF."""
     return None if plan.urdf is None else UrdfBodies(plan.urdf, _mechanisms(plan))
 
 
 def _mechanisms(plan: Plan) -> tuple[Mechanism, ...]:
-    """Return the mechanisms of the simulated servos; servos with a joint of their own come first."""
+    """Return which simulated servos move which joints; mechanisms with a single servo come first."""
     by_row = {servo.row: (index, servo) for index, servo in enumerate(_simulated_servos(plan))}
     found: list[Mechanism] = []
     for one in plan.mechanics.mechanisms(len(plan.loop.joints)):
@@ -249,7 +251,7 @@ def _mechanism(
 
 
 def _simulated_servos(plan: Plan) -> list[ServoPlan]:
-    """Return the simulated servos, in the order in which they are added to a simulation."""
+    """Return the servos on simulated buses, in the order in which the simulator adds them."""
     return [servo for bus in plan.buses if bus.port == SIMULATED for servo in bus.servos]
 
 
@@ -283,7 +285,7 @@ def _simulated_bus(plan: Plan, bus: BusPlan) -> BusConfig:
 
 
 def _felt(servo: ServoPlan, load: Load | None) -> Load:
-    """Return the load of a joint at its single servo, through the ratio."""
+    """Convert the load of a joint into the load at its only servo, through the gear."""
     if load is None:
         return NO_LOAD
     # Through a gear an inertia scales with the square of the ratio, a torque with the ratio.

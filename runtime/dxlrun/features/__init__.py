@@ -1,4 +1,4 @@
-"""Features: a folder or a module for each section or key of the robot file, with everything that it needs.
+"""Features: one folder or module for each section or key of the robot file, from its form to its run code.
 
 It contains one feature for every stage, from its form to its part in the loop. Code that two features share
 belongs to the package of that stage. `feature.py` describes the files; `FEATURES` lists the features.
@@ -25,10 +25,7 @@ FEATURES = (
     Feature("registers", "dxlrun.features.registers"),
     Feature("recording", "dxlrun.features.recording"),
 )
-"""Built-in features, in the order in which every stage uses them and of their states in the cycle's record.
-
-Devices come first, because their plans count columns of the record from 0.
-"""
+"""Built-in features, in the order in which every stage calls them and in which their states are recorded."""
 
 _JOINTS = (
     "bus continuous direction gear_ratio id joints limits model motor ratio reference servos simulation "
@@ -38,22 +35,19 @@ _JOINTS = (
 )
 _SECTIONS = "arguments include joint_defaults loop model name poses processes read_before simulation"
 _REPORT = "robot rate joints groups controllers buses policies motions graph duration online"
-"""Keys in the report of `dxlrun check`, which has the rows of a feature under its name."""
+"""Keys of the report of `dxlrun check`; a feature cannot have such a name, because its rows are added under
+it."""
 RESERVED: Mapping[type[Section[Any] | JointKey[Any] | ServoKey[Any] | PolicyKey[Any]], str] = {
     Section: f"{_REPORT} {_SECTIONS}",
     JointKey: f"{_REPORT} {_JOINTS}",
     ServoKey: f"{_REPORT} {_JOINTS}",
     PolicyKey: f"{_REPORT} exit_timeout of_joint on_exit on_fault on_returned_servo",
 }
-"""Names of the core by kind of key. A feature's key with one of these names would replace the core's.
-
-The forms and the report are in packages above this one, so they cannot be imported here. A test compares the
-names.
-"""
+"""Names that a feature's key cannot have because the core uses them, by kind of key."""
 
 
 def stages(kind: type[S], features: Iterable[Feature]) -> Iterator[tuple[Feature, S]]:
-    """Yield the features that take part in a stage, each with its `STAGE`."""
+    """Yield each of the features that has a `STAGE` of this kind, with that object."""
     for feature in features:
         if (stage := feature.stage(kind)) is not None:
             yield feature, stage
@@ -65,13 +59,16 @@ def installed_features() -> tuple[Feature, ...]:
 
 
 def find_installed(features: Iterable[Feature]) -> tuple[Feature, ...]:
-    """Return the installed features with the given names, because a log may name any package to import."""
+    """Return the installed features with the names of the given ones, as read from a log.
+
+    The packages in a log are not imported, because a log may name any package.
+    """
     names = {feature.name for feature in features}
     return tuple(feature for feature in installed_features() if feature.name in names)
 
 
 def broken_features() -> dict[str, str]:
-    """Return the reasons why features of plug-ins cannot be used, by name."""
+    """Return the reason why each unusable feature of a plug-in cannot be used, by the feature's name."""
     return _installed(installed_plugins())[1]
 
 
@@ -95,8 +92,7 @@ def _installed(plugins: tuple[InstalledPlugin, ...]) -> tuple[tuple[Feature, ...
 
 
 def _find_fault(feature: Feature, found: Container[str]) -> str:
-    """Return the reason why a plug-in's feature cannot be used together with those found so far; empty if it
-    can."""
+    """Return why a plug-in's feature is malformed or clashes with the others; empty if it is usable."""
     name = feature.name
     try:
         keys = [key for kind in RESERVED if (key := feature.stage(kind)) is not None]
@@ -119,7 +115,7 @@ def _find_fault(feature: Feature, found: Container[str]) -> str:
 
 
 def _build_form(form: object) -> None:
-    """Build the validator of a plug-in's form, which raises for a wrong type.
+    """Build the validator of a plug-in's form; a wrong type raises before it spoils every robot file.
 
     In the form of the robot file, the wrong type would make every file unreadable.
     """
@@ -130,7 +126,7 @@ def _build_form(form: object) -> None:
 
 
 def _features_of(plugin: InstalledPlugin) -> Iterator[Feature]:
-    """Yield the features of one plug-in; raise whatever its code raises."""
+    """Yield the features that a plug-in's function `dxlrun_features` returns; its exceptions pass through."""
     hook = getattr(plugin.point.load(), "dxlrun_features", None)
     for feature in () if hook is None else hook():
         yield replace(feature, distribution=plugin.publisher)

@@ -27,22 +27,22 @@ T = TypeVar("T")
 
 
 class Stage(Protocol):
-    """Class of the object `STAGE` in one kind of file."""
+    """Class of an object `STAGE`, which a feature's module of a fixed name defines."""
 
     FILE: ClassVar[str]
-    """Name of the module in the package of a feature."""
+    """Name of the module in a feature's package that holds `STAGE`, such as `form`."""
 
 
 S = TypeVar("S", bound=Stage)
 
 
 def type_of(form: object) -> object:
-    """Return the type of a key's value, which a feature may give as a function that returns the type."""
+    """Return a pydantic type, which a feature may give directly or as a function that returns it."""
     return form() if isinstance(form, FunctionType) else form
 
 
 class Section(msgspec.Struct, Generic[T], frozen=True):
-    """Section of the robot file: `STAGE` of `form.py`, used before a file is read.
+    """A section that a feature adds to the robot file: `STAGE` of `form.py`, read before the file.
 
     The form consists of the sections of all features, so no section is named anywhere else.
     """
@@ -50,70 +50,70 @@ class Section(msgspec.Struct, Generic[T], frozen=True):
     FILE: ClassVar[str] = "form"
 
     name: str
-    """Key at the top of the robot file, such as `devices`."""
+    """Name of the section at the top of the robot file, such as `devices`."""
     form: object
-    """Type of the section's value, for pydantic, such as `dict[Name, Device]`; or a function that returns the
-    type, if features add keys to it."""
+    """Type of the section's value for pydantic, such as `dict[Name, Device]`; or a function that returns the
+    type, if other features add keys to it."""
     field: T
-    """Field of the key with its default, as `dxlrun.description.form.key` returns it."""
+    """Description and default of the section, as `dxlrun.description.form.key` returns them."""
     before: str = ""
-    """Next key in lists of all keys; if it does not exist, this key is the last."""
+    """Section before which this one is listed; if it does not exist, this section is the last."""
     moved_joints: Callable[[object], Iterable[str]] = lambda section: ()
-    """Yields the joints whose servos are in this section, which may contain mistakes. These joints get no
-    keys of servos from groups and defaults."""
+    """Yields the joints that this (not yet validated) section moves. They get no servo keys from groups and
+    defaults."""
 
     def of(self, robot: object) -> T:
-        """Return the section of a validated robot file."""
+        """Return this section's value from a validated robot file."""
         section: T = getattr(robot, self.name)
         return section
 
 
 class KeyedJoint(Protocol):
-    """Joint of a plan, with the features' keys that the robot file sets for it."""
+    """Anything with the features' values of a joint, such as `JointPlan`."""
 
     @property
     def keys(self) -> Mapping[str, object]:
-        """Values by key, in JSON types."""
+        """Values that the robot file sets for the joint, in JSON types, by the key's name."""
 
 
 class JointKey(msgspec.Struct, Generic[T], frozen=True):
-    """Key of a joint: `STAGE` of `joint_key.py`, used before a file is read.
+    """A key that a feature adds to joints, `groups` and `joint_defaults`: `STAGE` of `joint_key.py`.
 
-    Every joint can have it, and so can `groups` and `joint_defaults`. The plan of a joint has the value from
-    the robot file, with numbers in SI units; `dxlrun check` and the clients of a run show it.
+    The plan of a joint has the value from the robot file, with numbers in SI units; `dxlrun check` and the
+    clients of a run show it.
     """
 
     FILE: ClassVar[str] = "joint_key"
 
     name: str
-    """The key, such as `tolerance`; also the name of the feature."""
+    """Name of the key, such as `tolerance`; also the name of the feature."""
     form: object
-    """Type of the value in the file, for pydantic: `Position | None`."""
+    """Type of the value in the robot file for pydantic: `Position | None`."""
     field: object
-    """Field of the key with its default, as `dxlrun.description.form.key` returns it."""
+    """Description and default of the key, as `dxlrun.description.form.key` returns them."""
     value: type[T]
-    """Type of the value in the plan: `float`, or a struct of msgspec for a form."""
+    """Type of the value in a joint's plan: `float`, or a msgspec struct for a form."""
     before: str = ""
-    """Next key of a joint in lists of all keys; if it does not exist, this key is the last."""
+    """Key of joints before which this one is listed; if it does not exist, this key is the last."""
     examples: Mapping[JointUnit, str] = {}
-    """Example of a value for rotary and for linear joints; a value of the other kind is refused. Empty: the
-    unit does not depend on that of the joint."""
+    """Example value for rotary and for linear joints, which also fixes the unit that each accepts. Empty: the
+    unit does not depend on the joint."""
 
     def of(self, joint: KeyedJoint) -> T | None:
-        """Return the value of a joint in a plan; None: the robot file does not set it."""
+        """Return this key's value from a joint's plan; None if the robot file does not set it."""
         return msgspec.convert(joint.keys[self.name], self.value) if self.name in joint.keys else None
 
 
 class KeyedServo(Protocol):
-    """Servo of a robot file, with the keys of features."""
+    """Anything with the features' values of a servo, such as `DescribedServo`."""
 
     @property
     def keys(self) -> Mapping[str, object]:
-        """Values by key, as validated by the form of the key."""
+        """Validated values by the key's name."""
 
 
 class ServoKey(msgspec.Struct, Generic[T], frozen=True):
-    """Key of a servo: `STAGE` of `servo_key.py`, used before a file is read.
+    """A key that a feature adds to servos and to joints with servos: `STAGE` of `servo_key.py`.
 
     A joint with its own servos has the key for all of them, and each servo can have it for itself. So can
     `groups`, `joint_defaults`, and the servos in the section of a feature.
@@ -122,65 +122,67 @@ class ServoKey(msgspec.Struct, Generic[T], frozen=True):
     FILE: ClassVar[str] = "servo_key"
 
     name: str
-    """The key, such as `registers`; also the name of the feature."""
+    """Name of the key, such as `registers`; also the name of the feature."""
     form: object
-    """Type of the value in the file, for pydantic."""
+    """Type of the value in the robot file, for pydantic."""
     field: object
-    """Field of the key in a joint with its default, as `dxlrun.description.form.key` returns it."""
+    """Description and default of the key in a joint, as `dxlrun.description.form.key` returns them."""
     of_one: object
-    """Field of the key in one of several servos of a joint. Its default is None: the value of the joint."""
+    """Description and default of the key in one entry of a joint's `servos`. The default None means the
+    joint's value."""
     of_section: object
-    """Field of the key in a servo without a joint of its own."""
+    """Description and default of the key in a servo of a feature's section, such as `transmissions`."""
     before: str = ""
-    """Next key of a servo in lists of all keys; if it does not exist, this key is the last."""
+    """Key of servos before which this one is listed; if it does not exist, this key is the last."""
 
     def of(self, servo: KeyedServo) -> T:
-        """Return the value of a servo, which is its joint's value if the servo has none."""
+        """Return a servo's value of this key, which is that of its joint if the servo has none."""
         return cast("T", servo.keys[self.name])
 
 
 class PolicyKey(msgspec.Struct, Generic[T], frozen=True):
-    """Key of the section `policies`: `STAGE` of `policy_key.py`, used before a file is read."""
+    """A key that a feature adds to the section `policies`: `STAGE` of `policy_key.py`."""
 
     FILE: ClassVar[str] = "policy_key"
 
     name: str
-    """The key, such as `on_lost_servo`; also the name of the feature."""
+    """Name of the key, such as `on_lost_servo`; also the name of the feature."""
     form: object
-    """Type of the value, for pydantic: `Literal["stop", "limp"] | None`."""
+    """Type of the value for pydantic: `Literal["stop", "limp"] | None`."""
     field: T
-    """Field of the key with its default, as `dxlrun.description.form.key` returns it."""
+    """Description and default of the key, as `dxlrun.description.form.key` returns them."""
     does: str = ""
-    """Action of `hold`, for `dxlrun check`. With it, the value is a `WrittenPolicy`: `hold` while the run
-    continues, or steps that end the run, which are checked as those of `on_exit`."""
+    """Text for `dxlrun check` that says what `hold` does. If set, the value is `hold`, during which the run
+    continues, or steps that end the run and are checked like those of `on_exit`."""
     before: str = ""
-    """Next key of the section in lists of all keys; if it does not exist, this key is the last."""
+    """Key of `policies` before which this one is listed; if it does not exist, this key is the last."""
     group: PolicyKey[Any] | None = None
-    """The same key of `policies.groups.NAME`; None: groups do not have it."""
+    """Key of the same name in `policies.groups.NAME`; None: groups do not have it."""
 
     def of(self, policies: object) -> T:
-        """Return the value in the validated section, or in one of its groups."""
+        """Return this key's value from the validated section `policies`, or from one of its groups."""
         value: T = getattr(policies, self.name)
         return value
 
 
 class Feature(msgspec.Struct, frozen=True):
-    """Name of a feature, and the package with its files, or its one module."""
+    """One feature: its name and the Python package (or module) with its stages."""
 
     name: str
-    """Its key in the robot file, such as `devices`: at the top, of joints, of servos or of `policies`."""
+    """Name of the feature's section or key in the robot file, such as `devices`."""
     package: str
-    """Package with its files, such as `dxlrun.features.devices`, or module with `STAGES`."""
+    """Python package with the feature's files, such as `dxlrun.features.devices`, or a module with
+    `STAGES`."""
     distribution: str = ""
-    """Publisher of the plug-in with the package: `name version`. Empty for the features of dxlrun."""
+    """Plug-in package that provides the feature, `name version`; empty for features of dxlrun."""
 
     def stage(self, kind: type[S]) -> S | None:
-        """Return the feature's object for one stage; None if the feature takes no part in it."""
+        """Return the feature's object `STAGE` of a kind, importing its file; None if it has none."""
         return _stage(self.package, kind)
 
 
 _OF_PACKAGES = ("events", "process", "safe")
-"""Files that guardian, processes of sensors and readers of logs import without the rest of a feature."""
+"""Files that other processes import without the rest of the feature, so a one-module feature lacks them."""
 
 
 @cache
@@ -200,7 +202,7 @@ def _stage(package: str, kind: type[S]) -> S | None:
 
 @cache
 def _files(package: str) -> frozenset[str] | None:
-    """Return the names of the modules in a package; None for a module.
+    """Return the names of the modules in a Python package; None if it is a module.
 
     A feature has few of the files, so one list costs less than a search for each missing file.
     """

@@ -1,4 +1,4 @@
-"""Policy `on_lost_servo`: reaction of a run to servos that do not answer, of the robot and of its groups.
+"""Policy `on_lost_servo`: what a run does when servos of the robot or of a group stop answering.
 
 `dynamixel` recovers a lost servo.
 """
@@ -55,7 +55,7 @@ _ACTIONS = {
 
 
 class GroupPolicy(msgspec.Struct, frozen=True):
-    """Policy for the loss of a servo in a group of joints."""
+    """Action (`hold`, `limp` or `stop`) when a servo of one group of joints is lost."""
 
     name: str
     rows: frozenset[int]  # Rows of its joints
@@ -63,7 +63,7 @@ class GroupPolicy(msgspec.Struct, frozen=True):
 
 
 def compile_groups(compilation: Compilation) -> Contribution:
-    """Return the policies of the groups that have their own."""
+    """Return the groups with their own `on_lost_servo`, encoded for the run, and their texts for `check`."""
     rows = {name: row for row, name in enumerate(compilation.joints)}
     groups = tuple(
         GroupPolicy(name, frozenset(rows[joint] for joint in group.joints if joint in rows), action)
@@ -78,12 +78,12 @@ def compile_groups(compilation: Compilation) -> Contribution:
 
 @event_text(EventCode.POLICY, Severity.ERROR)
 def group_is_limp(group: str) -> str:
-    """Event of a group that has become limp."""
+    """Return the event that a group was made limp because it lost a servo."""
     return f"group {group} lost a servo: it is limp until a client requests torque"
 
 
 class LostServos:
-    """Applies the policies for lost servos when the set of lost joints has changed."""
+    """Carries out `on_lost_servo` in a run whenever a joint becomes lost or answers again."""
 
     def __init__(
         self,
@@ -102,12 +102,12 @@ class LostServos:
 
     @classmethod
     def build(cls, plan: LoopPlan, record: CycleRecord, actions: PolicyActions) -> Self:
-        """Return the monitor of all joints."""
+        """Return the monitor for all joints of a run, with the groups' policies from the plan."""
         groups = msgspec.json.decode(plan.feature_plans.get(NAME, b"[]"), type=tuple[GroupPolicy, ...])
         return cls(tuple(one.name for one in plan.joints), record.states, actions, groups)
 
     def check(self, time_ns: int) -> None:
-        """Count missed replies, and apply the policies if the set of lost joints has changed."""
+        """Count the cycle's missed replies; apply the policies if a joint became lost or came back."""
         if self._missed.none and self._states.valid.tobytes() == self._all_valid:
             return
         if self._missed.count(self._states):
@@ -126,7 +126,7 @@ class LostServos:
             actions.hold_controllers(self, rows, "all its joints answer again")
 
     def _judge(self) -> tuple[dict[str, list[int]], list[GroupPolicy]]:
-        """Return the policies that end the run with their lost rows, and the groups that become limp now."""
+        """Return the rows of lost joints by the policy that ends the run, and the groups to make limp now."""
         goes_on = self._actions.policies.of_features.get(NAME, HOLD).goes_on
         ending: dict[str, list[int]] = {}
         limp: list[GroupPolicy] = []
@@ -144,17 +144,17 @@ class LostServos:
 
 
 class MissedReplies:
-    """Counts the consecutive missed replies of each joint; a reboot by request does not count."""
+    """Counts the replies that each joint missed in a row; a reboot that was requested is not counted."""
 
     def __init__(self, joints: int) -> None:
         self.lost: frozenset[int] = frozenset()
-        """Rows of the joints that are lost now."""
+        """Rows of the joints that count as lost: enough missed replies in a row, and an old state."""
         self.none = True
-        """True if no joint missed a reply in the last counted cycle."""
+        """True if every joint answered in the cycle counted last."""
         self._missed = np.zeros(joints, dtype=np.int64)
 
     def count(self, states: States) -> bool:
-        """Count the states of a cycle; return True if the set of lost joints has changed.
+        """Count the missed replies of a cycle; return True if a joint became lost or answers again.
 
         Cycles without a missed reply may be skipped while `none` is true.
         """

@@ -1,4 +1,4 @@
-"""Policy `on_stale_command`: reaction of a run to a client whose stream of commands stops.
+"""Policy `on_stale_command`: what a run does when a client stops sending its stream of commands.
 
 `control/steering.py` detects that, because a command may come in the cycle in which its lease expires.
 """

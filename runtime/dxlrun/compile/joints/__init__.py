@@ -1,4 +1,4 @@
-"""Compilation of joints: their buses, models, limits, registers and motors.
+"""Joints: compiles joints, their servos, limits, registers, motors and URDF.
 
 The parent package compiles the users of joints: controllers, motions and policies.
 """

@@ -1,5 +1,4 @@
-"""Servos in the notation of the robot file: those of joints, with the joints' shared keys, and those of
-features.
+"""Described servos: all servos that a robot file names, in joints or features, before models are known.
 
 The servos of a file also decide which features it uses, because a feature's key can be a servo's key.
 """
@@ -23,7 +22,7 @@ AUTO = "auto"  # in place of a model, which is then read from the servo
 
 
 class DescribedServo(msgspec.Struct, frozen=True):
-    """One servo of the robot file, with the shared keys of its joint."""
+    """A servo as the robot file describes it; keys that it lacks come from its joint."""
 
     title: str  # name of its load in messages: `head`, `hip`, `wrist/left`
     name: str  # its own name: `head`, `hip/1`, `wrist/left`
@@ -44,11 +43,11 @@ class DescribedServo(msgspec.Struct, frozen=True):
 
     @property
     def servo(self) -> str:
-        """ID and bus, for messages."""
+        """Text for messages, `ID 3 on bus arm`."""
         return f"ID {self.id} on bus {self.bus}"
 
     def mark(self, marks: Marks, *path: str | int) -> Mark:
-        """Return the place of one of its values, which may be in its joint."""
+        """Return line and column of one of the servo's keys, or of the joint's key that applies to it."""
         own = (*self.place, *path)
         return (
             marks.value(*own) if marks.has(own[: len(self.place) + 1]) else marks.value(*self.defaults, *path)
@@ -56,7 +55,7 @@ class DescribedServo(msgspec.Struct, frozen=True):
 
 
 class ServoStage(msgspec.Struct, frozen=True):
-    """`STAGE` of `servos.py`: called for the servos in a feature's section, before their models are known."""
+    """Hook `STAGE` in a feature's `servos.py`: returns the servos in the feature's section of the file."""
 
     FILE: ClassVar[str] = "servos"
 
@@ -64,7 +63,7 @@ class ServoStage(msgspec.Struct, frozen=True):
 
 
 def described_servos(description: Description) -> list[DescribedServo]:
-    """Return all servos of a file: those of the joints in their order, then those of features."""
+    """Return all servos of a robot file: those of joints in file order, then those of features."""
     found: list[DescribedServo] = []
     for name, joint in description.robot.joints.items():
         if isinstance(joint, ServoJoint):
@@ -75,7 +74,7 @@ def described_servos(description: Description) -> list[DescribedServo]:
 
 
 def used_features(description: Description) -> tuple[Feature, ...]:
-    """Return the built-in features, and those of plug-ins whose sections or keys are in the file."""
+    """Return the features that a robot file needs: all built-in ones, and plug-ins whose keys it has."""
     robot, marks = description.robot, description.marks
     servos = described_servos(description)
     parents: dict[type[Stage], list[KeyPath]] = {
@@ -93,12 +92,12 @@ def used_features(description: Description) -> tuple[Feature, ...]:
 
 
 def find_unknown_servos(description: Description) -> frozenset[str]:
-    """Return the names of the servos with `model: auto`, whose models must be read."""
+    """Return the names of the servos with `model: auto`, whose models must be read from the bus."""
     return frozenset(servo.name for servo in described_servos(description) if servo.model == AUTO)
 
 
 def first_joints(description: Description) -> dict[str, str]:
-    """Return the first joint that each servo moves, by the name of the servo."""
+    """Return the first joint of each servo, by the name of the servo."""
     return {servo.name: servo.joints[0] for servo in described_servos(description)}
 
 

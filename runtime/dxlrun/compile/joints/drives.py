@@ -1,4 +1,4 @@
-"""Drives: relation between a joint and its servos, in figures at the joint; features compile them."""
+"""Drives: range, speed and effort of a joint that follow from its servos and their gears."""
 
 from __future__ import annotations
 
@@ -14,37 +14,37 @@ from dxlwire.modes import Mode
 
 
 class JointDrive(msgspec.Struct, frozen=True):
-    """Drive of a joint by its servos; positions and speeds in rad, or m for a linear joint."""
+    """The servos of one joint and what they can do at the joint, in rad, or m for a linear joint."""
 
     servos: tuple[CompiledServo, ...]
     together: tuple[str, ...]
-    """Joints that these servos move, including this one."""
+    """Names of all joints that the same servos move (more than one in a differential), including this one."""
     levers: tuple[float, ...]
-    """Travel of each servo, after its gear, per unit of the joint; the other joints of `together` rest."""
+    """Travel of each servo, after its gear, for one rad (m) of this joint while the other joints rest."""
     reach: Interval
-    """Positions that the servos reach, with the other joints of `together` where the range is widest."""
+    """Positions that the servos can reach, with coupled joints placed where this range is widest."""
     allowed: Interval | None
-    """Positions that the gate allows; None: a mistake in the file, which has been reported."""
+    """Position limits for the gate; None if the file has a mistake there, which has been reported."""
     modes: tuple[Mode, ...]
     top_speed: float | None
-    """Highest speed while the other joints of `together` rest; None: not known."""
+    """Highest speed at the joint, rad/s or m/s, while coupled joints rest; None: not known."""
     shared_speed: float | None
-    """Highest speed while all joints of `together` move equally fast; None: not known."""
+    """Highest speed at the joint, rad/s or m/s, if all coupled joints move equally fast; None: not known."""
     top_effort: float | None
-    """Highest effort while the other joints of `together` have none; None: a servo has no effort goal."""
+    """Highest effort at the joint while coupled joints have none; None: a servo accepts no effort goal."""
     excluded: Mapping[Mode, str] = {}
-    """Modes of the servos that do not move the joint, each with the reason."""
+    """Modes that the servos have but the joint cannot use, each with the reason."""
 
     @property
     def own(self) -> bool:
-        """True if the joint has one servo, described by the keys of the joint."""
+        """True if the joint's only servo is described by the joint's own keys, not by a transmission."""
         return self.servos[0].described.name in self.together
 
 
 class DriveStage(msgspec.Struct, frozen=True):
-    """`STAGE` of `drives.py`: called when the models of all servos are known, before joints are compiled.
+    """Hook `STAGE` in a feature's `drives.py`, called after all servo models are known.
 
-    Receives the servos by name and returns the drive of each joint that they move. A joint without a drive
+    It gets the servos by name and returns the drive of each joint that they move. A joint without a drive
     has a mistake, which the stage adds to the file.
     """
 

@@ -1,4 +1,4 @@
-"""Joints of the robot file: their servos, limits and reach."""
+"""Joints: compiles `joints` of the robot file into plans, and checks efforts, accelerations and twins."""
 
 from __future__ import annotations
 
@@ -35,17 +35,17 @@ _EXAMPLES: Mapping[str, str] = {
     "1": "40 %",
 }
 MOST_STARTING_S = 10.0
-"""Longest plausible time from rest to the highest speed; above it the limit has a wrong unit. [i]"""
+"""Longest plausible time to accelerate to full speed, s; a limit that needs more has a wrong unit. [i]"""
 _SAME = math.radians(1.0)  # references closer than this are equal: a horn has teeth, a trim does not
 
 
 _BY_ERROR = (("position",), ("position", "velocity"))
-"""Claims of controllers that send no effort, so only the position error of a servo holds a load."""
+"""Command interfaces without effort: the servo holds a load only by its position error."""
 _I_GAIN = "position_i_gain"
 
 
 class CompiledJoint(msgspec.Struct, frozen=True):
-    """A joint whose servos are known."""
+    """A joint without mistakes: its plan for the run, its keys in the file, and its servos."""
 
     plan: JointPlan
     described: JointEntry
@@ -53,27 +53,27 @@ class CompiledJoint(msgspec.Struct, frozen=True):
 
     @property
     def servos(self) -> tuple[CompiledServo, ...]:
-        """Servos that move the joint."""
+        """Compiled servos that move the joint."""
         return self.drive.servos
 
     @property
     def table(self) -> ControlTable:
-        """Control table of its first servo."""
+        """Control table of the joint's first servo."""
         return self.servos[0].table
 
     @property
     def reach(self) -> Interval:
-        """Positions that its servos reach, rad or m."""
+        """Positions that the joint's servos can reach, rad or m; the file's limits may be narrower."""
         return self.drive.reach
 
     @property
     def modes(self) -> tuple[Mode, ...]:
-        """Possible modes of the joint."""
+        """Operating modes in which controllers can command the joint."""
         return self.drive.modes
 
 
 def compile_joints(file: RobotFile, models: Mapping[str, str], motors: Motors) -> dict[str, CompiledJoint]:
-    """Return the joints that could be compiled, by name, in the order of the file.
+    """Compile all joints that have no mistakes, by name in file order.
 
     Args:
         file: Robot file; collects the problems.
@@ -101,8 +101,7 @@ def compile_joints(file: RobotFile, models: Mapping[str, str], motors: Motors) -
 
 
 def moving_servos(joints: Iterable[CompiledJoint]) -> tuple[CompiledServo, ...]:
-    """Return the servos of joints, each once, in the order of the joints, which is the order of the arrays'
-    rows."""
+    """Return the servos of joints, each once, in the row order of the run's arrays."""
     return tuple({servo.described.name: servo for joint in joints for servo in joint.servos}.values())
 
 
@@ -140,12 +139,12 @@ def _joint_plan(
 
 
 def _limited(tolerance: float | None) -> float | None:
-    """Return a tolerance for a plan: JSON has no infinity."""
+    """Return a tolerance with infinity replaced by a large number, because a plan is JSON."""
     return None if tolerance is None else min(float(tolerance), UNLIMITED)
 
 
 def _servo_label(servos: Sequence[CompiledServo]) -> str:
-    """Return IDs and bus of a joint's servos, for messages: `ID 1 and 2 on bus main`."""
+    """Return IDs and bus of a joint's servos as text for messages: `ID 1 and 2 on bus main`."""
     described = [servo.described for servo in servos]
     if len({one.bus for one in described}) == 1:
         return f"ID {' and '.join(str(one.id) for one in described)} on bus {described[0].bus}"
@@ -153,7 +152,7 @@ def _servo_label(servos: Sequence[CompiledServo]) -> str:
 
 
 def _at_joint(servo: CompiledServo, levers: Sequence[float]) -> MotorModel | None:
-    """Return one motor at the joint that is equivalent to the equal motors of its servos.
+    """Return one motor model at the joint that acts like all of its (equal) servo motors with their gears.
 
     A gear multiplies torque and back-EMF; servos in parallel divide the resistance. The load is already that
     of the joint.
@@ -185,7 +184,7 @@ def _at_joint(servo: CompiledServo, levers: Sequence[float]) -> MotorModel | Non
 
 
 def check_limp_joints(file: RobotFile, controllers: Iterable[ControllerPlan]) -> None:
-    """Refuse controllers that are active from the start and command joints without torque."""
+    """Add an error for each controller that is active at start and commands a joint with `torque: off`."""
     joints = file.robot.joints
     for plan in controllers:
         limp = [name for name in plan.joints if name in joints and not joints[name].torque]
@@ -202,7 +201,7 @@ def check_limp_joints(file: RobotFile, controllers: Iterable[ControllerPlan]) ->
 def check_tolerances(
     file: RobotFile, joints: Mapping[str, CompiledJoint], controllers: Iterable[ControllerPlan]
 ) -> None:
-    """Warn of joints that a weight moves beyond their tolerance, according to the model of their motor.
+    """Warn of each joint whose weight, by its motor model, makes it sag by more than its position tolerance.
 
     In position control only the position error holds a weight, unless the I gain is not 0 or a controller
     adds an effort.
@@ -226,7 +225,7 @@ def check_tolerances(
 
 
 def _static_error(joint: CompiledJoint) -> float | None:
-    """Return the position error that holds the weight at the worst pose within the limits, rad.
+    """Return how far a joint sags under its weight in the worst pose, rad.
 
     None: the motor's model or the weight is not known. Infinite: the servo cannot hold the weight.
     """
@@ -248,7 +247,7 @@ def _static_error(joint: CompiledJoint) -> float | None:
 
 
 def _effort(file: RobotFile, name: str, joint: JointEntry, servo: CompiledServo) -> float | None:
-    """Return the effort limit in the joint's unit; None without a limit."""
+    """Return a joint's effort limit from the file; add an error if its unit is not that of the servo."""
     if joint.limits.effort is None:
         return None
     value, unit = float(joint.limits.effort), joint.limits.effort.unit
@@ -265,7 +264,7 @@ def _effort(file: RobotFile, name: str, joint: JointEntry, servo: CompiledServo)
 
 
 def _check_acceleration(file: RobotFile, plan: JointPlan) -> None:
-    """Check an acceleration limit against the highest speed of its joint, and against the cycle."""
+    """Check that a joint reaches full speed in at most 10 s (error), but not within one cycle (warning)."""
     speed, acceleration, rate = plan.highest_speed, plan.acceleration, file.robot.loop.rate
     if acceleration is None or not math.isfinite(speed):
         return
@@ -290,7 +289,7 @@ def _check_acceleration(file: RobotFile, plan: JointPlan) -> None:
 
 
 def check_twins(file: RobotFile, tables: dict[str, ControlTable]) -> None:
-    """Warn of each pair of joints that are not mirror images of each other.
+    """Warn of `left` and `right` joints whose reference or direction are not mirror images.
 
     In a mirror image the right servo counts from the other end and turns the other way: reference_right =
     lowest + highest angle of the servo - reference_left, direction_right = -direction_left.

@@ -1,4 +1,4 @@
-"""Limits of joints: intervals of positions, and checks of motions and commands against them."""
+"""Limits: checks of positions, speeds and efforts in motions and commands against the limits of joints."""
 
 from __future__ import annotations
 
@@ -24,32 +24,32 @@ _TOLERANCE = 1e-6  # rad; far below a tick (5e-3 rad on an AX-12), far above the
 _ROUNDING = 1e-9  # relative rounding error of speeds from differences of positions and times
 _MOST_LONGER = 1000  # largest suggested extension of the time; beyond it a number is wrong
 PEAK_OVER_MEAN = 15 / 8
-"""Ratio of the highest to the mean speed of a quintic from rest to rest; a cubic has a lower one."""
+"""Highest by mean speed of a quintic that starts and ends at rest; a cubic has a lower ratio."""
 
 
 class Interval(msgspec.Struct, frozen=True):
-    """Closed interval of joint positions, rad, or m for a linear joint."""
+    """Closed range of positions, rad, or m for a linear joint."""
 
     lower: float
     upper: float
     unit: JointUnit = ROTARY
 
     def contains(self, other: Interval) -> bool:
-        """Return True if `other` is inside this interval, up to rounding."""
+        """Return True if `other` is inside this range, allowing for rounding."""
         return other.lower >= self.lower - _TOLERANCE and other.upper <= self.upper + _TOLERANCE
 
     def meet(self, other: Interval) -> Interval | None:
-        """Return the intersection; None if it is not more than a point."""
+        """Return the overlap of two ranges; None if they do not overlap by more than a point."""
         lower, upper = max(self.lower, other.lower), min(self.upper, other.upper)
         return Interval(lower, upper, self.unit) if lower < upper else None
 
     def scaled(self, ratio: float, unit: JointUnit) -> Interval:
-        """Return the interval of a part that moves by `ratio` per unit of this one."""
+        """Return the range multiplied by a ratio, in another unit, as at the other side of a gear."""
         lower, upper = sorted((self.lower * ratio, self.upper * ratio))
         return Interval(lower, upper, unit)
 
     def plus(self, other: Interval) -> Interval:
-        """Return the interval of the sums of positions in both."""
+        """Return the range of all sums of one position from each of two ranges."""
         return Interval(self.lower + other.lower, self.upper + other.upper, self.unit)
 
     def __str__(self) -> str:
@@ -58,7 +58,7 @@ class Interval(msgspec.Struct, frozen=True):
 
 
 def limits_of(joint: JointPlan) -> Interval:
-    """Return the position limits that the gate enforces for a joint."""
+    """Return the range of positions to which the gate limits a joint's goals."""
     return Interval(joint.lower, joint.upper, joint.unit)
 
 
@@ -74,7 +74,7 @@ def check_samples(
     problems: Problems,
     peaks: Iterable[SpeedPeak] = (),
 ) -> None:
-    """Check the targets of joints against their limits, and report the worst target of each joint.
+    """Check the positions and speeds of a motion against the joints' limits; report each joint's worst only.
 
     Positions beyond the limits and speeds beyond the file's limit are warnings. Speeds above the servo's top
     speed are errors. The speeds are those of the targets and the `peaks` between them.
@@ -93,9 +93,9 @@ def check_samples(
 
 
 def report_speed(joint: JointPlan, speed: float, where: str, mark: Mark, problems: Problems) -> None:
-    """Report a speed of a file that its joint cannot reach: an error, or a warning if the servo can reach it.
+    """Add a problem if a file asks a joint for too much speed: an error above the servo's top speed.
 
-    In the second case the gate limits the speed, and the joint reaches its goal late or not at all.
+    Above the joint's limit alone it is a warning: the gate limits the speed, so the joint is late.
     """
     excess = excess_speed(joint, speed, where)
     if excess is None:
@@ -108,16 +108,16 @@ def report_speed(joint: JointPlan, speed: float, where: str, mark: Mark, problem
 
 
 class ExcessSpeed(NamedTuple):
-    """A speed above the limit of a joint, with the fix."""
+    """Explanation that a requested speed is above the highest speed of a joint, with the fix."""
 
     text: str
     fix: str
     beyond_servo: bool
-    """True: above the top speed of the servo."""
+    """True if the speed is above the servo's own top speed, not only above the file's limit."""
 
 
 def excess_speed(joint: JointPlan, speed: float, where: str) -> ExcessSpeed | None:
-    """Compare a speed, rad/s or m/s, with the highest speed of a joint; None: the joint can reach it.
+    """Compare a speed, rad/s or m/s, with a joint's highest; None if the joint can reach it.
 
     All speeds in files and in clients' requests are compared here.
     """
@@ -140,7 +140,7 @@ def excess_speed(joint: JointPlan, speed: float, where: str) -> ExcessSpeed | No
 def _worst(
     samples: Sequence[Sample], joints: Mapping[str, JointPlan], peaks: Iterable[SpeedPeak]
 ) -> tuple[dict[str, tuple[float, Sample, float]], dict[str, tuple[float, int, Mark]]]:
-    """Return, by joint, the position farthest beyond the limits and the highest speed, with their places."""
+    """Return by joint the target farthest outside the limits, and the highest speed with its time."""
     farthest: dict[str, tuple[float, Sample, float]] = {}
     fastest: dict[str, tuple[float, int, Mark]] = {}
 
@@ -170,7 +170,7 @@ def _worst(
 
 
 class BeyondLimit(NamedTuple):
-    """A value of a command that its joint cannot follow."""
+    """Message for one value of a command that is beyond a limit of its joint."""
 
     joint: str
     text: str
@@ -179,7 +179,7 @@ class BeyondLimit(NamedTuple):
 def beyond_limits(
     joints: Sequence[JointPlan], command: CommandModel, peaks: Iterable[SpeedPeak] = ()
 ) -> list[BeyondLimit]:
-    """Return each value of a command that its joint cannot follow.
+    """Return a message for each position, speed, effort or PWM of a command beyond its joint's limits.
 
     Positions (rad) are compared with the position limits. Velocities (rad/s), the `peaks` and efforts are
     compared with the lower one of the file's limit and the servo's own. In a command that names its `joints`,
@@ -236,13 +236,13 @@ def _beyond(joints: Sequence[JointPlan], values: Mapping[str, object], where: st
 
 
 def _register_limit(joint: JointPlan, interface: LimitedInterface) -> str:
-    """Return the register that limits a joint's servo, for messages; empty: no register does."""
+    """Return the name of the servo register that limits a joint, for messages; empty if none does."""
     own = joint.find_servo_limit(interface)
     return "" if own is None else f"{own.text}, a register of its servo"
 
 
 def _row(joints: Sequence[JointPlan], values: Mapping[str, object], name: str) -> Sequence[float]:
-    """Return a field with one number per joint; otherwise an empty sequence."""
+    """Return a field of a command as numbers, one per joint; empty if it does not have that form."""
     row = values.get(name)
     if not isinstance(row, list | tuple) or len(row) != len(joints):
         return ()

@@ -1,4 +1,4 @@
-"""Motors: the motor files of joints, read and compared with the joints' models and registers."""
+"""Motors: reads the motor files that joints name and compares them with servo models and registers."""
 
 from __future__ import annotations
 
@@ -19,31 +19,31 @@ if TYPE_CHECKING:
     from dxlrun.description.joints.motor_file import MotorDescription
 
 P_GAINS = ("p_gain", "position_p_gain")
-"""Names of the P gain of position control: in Protocol 1.0 and the XL-320, and in all other models."""
+"""Names of the item with the P gain of position control, which differ by model."""
 
 
 class Motors(msgspec.Struct, frozen=True):
-    """The readable motor files of a robot."""
+    """Motor files of a robot that could be read, by the name of the servo."""
 
     servos: Mapping[str, MotorDescription] = {}  # by the servo that the file describes
     simulations: Mapping[str, MotorDescription] = {}  # by the servo that is simulated with another motor
 
     def of_servo(self, name: str) -> MotorDescription | None:
-        """Return the file that describes a servo, by the servo's own name."""
+        """Return the motor file that describes a servo, by the servo's name; None if it has none."""
         return self.servos.get(name)
 
     def simulated(self, name: str) -> MotorDescription | None:
-        """Return the file for the simulation of a servo, by the servo's own name."""
+        """Return the motor file for simulating a servo: that of `simulation.motor`, else its own file."""
         return self.simulations.get(name) or self.servos.get(name)
 
     @property
     def texts(self) -> dict[str, str]:
-        """Texts of the files, by path."""
+        """Texts of all these motor files, by path."""
         return {str(each.path): each.text for each in (*self.servos.values(), *self.simulations.values())}
 
 
 def read_motors(file: RobotFile) -> Motors:
-    """Read the motor files that a robot file names, each once; add the problems of all of them."""
+    """Read each motor file that a robot file names; files with mistakes are missing in the result."""
     known: dict[Path, MotorDescription | None] = {}
     servos: dict[str, MotorDescription] = {}
     simulations: dict[str, MotorDescription] = {}
@@ -94,7 +94,7 @@ def compile_motor(
     declared: Mapping[str, int],
     found: MotorDescription | None,
 ) -> MotorModel | None:
-    """Return a servo's motor model, with the P gain that the servo will have."""
+    """Return a servo's motor model with the P gain of its registers; None without a (fitting) motor file."""
     if found is None:
         return None
     name, mark = servo.title, servo.mark(file.marks, "motor")

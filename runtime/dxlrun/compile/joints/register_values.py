@@ -1,4 +1,4 @@
-"""Values of registers: integers or quantities as text, checked against an item of a control table."""
+"""Register values: converts a number or a quantity such as `60 deg` into the integer for a control table."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ from dxlwire.control_table import ControlItem, Table
 
 
 class UnfitRegister(ValueError):
-    """A register value that may not be written: `what` is the problem, `fix` the remedy."""
+    """Raised if an item of a control table cannot have a value: `what` is the problem, `fix` the remedy."""
 
     def __init__(self, what: str, fix: str) -> None:
         super().__init__(f"{what}; {fix}")
@@ -21,7 +21,7 @@ class UnfitRegister(ValueError):
 
 
 def any_value(table: Table, name: str, value: int | str) -> RegisterValue:
-    """Return the value to write into a writable item, such as that of a tool.
+    """Convert a value for a writable item of a control table, and check its range.
 
     Args:
         table: Control table of the servo or device.

@@ -1,4 +1,4 @@
-"""Servos of the robot file, of joints and of transmissions: bus, ID, model, registers and motor of each."""
+"""Servos: compiles each servo of the robot file: its control table, registers and motor."""
 
 from __future__ import annotations
 
@@ -23,17 +23,16 @@ from dxlwire.plan.mode_plan import mode_plans
 
 _USUAL = {1.0: "AX-12A", 2.0: "XM430-W350"}  # assumed model if none is known, by protocol
 MANY_TURNS = {1.0: 7, 2.0: 256}
-"""Turns that a goal position can be away from raw 0, by protocol: Multi-turn Mode of MX (e-Manual MX-64, Goal
-Position (30): -28,672..28,672), Extended Position Control Mode (e-Manual XM430-W350, Goal Position (116):
--1,048,575..1,048,575).
-"""
+"""Turns that a goal position can be away from raw 0, by protocol.  Multi-turn Mode of MX (e-Manual MX-64,
+Goal Position (30): -28,672..28,672), Extended Position Control Mode (e-Manual XM430-W350, Goal Position
+(116): -1,048,575..1,048,575)."""
 _TEMPERATURE_LIMITS = ("motor_temperature_limit", "temperature_limit")
-"""Items with the temperature limit: that of the motor in the Y series, which also has one for the inverter,
-and that of all other models."""
+"""Items with the temperature limit of the motor: Y series, and all other models. Y also has a limit for its
+inverter."""
 
 
 class CompiledServo(msgspec.Struct, frozen=True):
-    """A servo whose model is known."""
+    """A servo with its control table, the registers to write at start, and its motor model."""
 
     described: DescribedServo
     table: ControlTable
@@ -44,12 +43,12 @@ class CompiledServo(msgspec.Struct, frozen=True):
 
     @property
     def declared(self) -> dict[str, int]:
-        """Declared integers on the wire, by item."""
+        """Integers that the robot file sets in the servo's registers, by item."""
         return {setting.name: setting.value for setting in self.settings}
 
     @property
     def reach(self) -> Interval:
-        """Positions of its joint, or of its transmission's input, that its goal positions reach, rad or m."""
+        """Range of the servo's goals, rad or m, at its joint or at the input of its transmission."""
         described = self.described
         if described.continuous:
             reach = many_turns(self.table.protocol, described.reference, described.direction)
@@ -59,12 +58,12 @@ class CompiledServo(msgspec.Struct, frozen=True):
 
     @property
     def top_speed(self) -> float:
-        """Highest speed of the servo in joint units, rad/s or m/s; 0: not known."""
+        """Highest speed of the servo after its gear, rad/s or m/s; 0: not known."""
         return self.table.top_speed * self.described.ratio
 
     @property
     def top_effort(self) -> float | None:
-        """Highest effort goal of the servo in joint units; None if it has no effort goal."""
+        """Highest effort goal of the servo after its gear; None if the servo accepts none."""
         table, continuous = self.table, self.described.continuous
         scales = [plan.effort for plan in mode_plans(table, table.min_tick, table.max_tick, continuous)]
         most = max((scale.per_tick * scale.most for scale in scales if scale is not None), default=None)
@@ -72,7 +71,7 @@ class CompiledServo(msgspec.Struct, frozen=True):
 
     @property
     def servo_model(self) -> ServoModel:
-        """Figures of the servo from its manual, in joint units."""
+        """Figures of the servo's model from its manual, such as stall torque, after its gear."""
         table, ratio = self.table, self.described.ratio
         limit = next((table.items[name] for name in _TEMPERATURE_LIMITS if name in table.items), None)
         raw = None if limit is None else self.declared.get(limit.name, limit.initial)
@@ -89,7 +88,7 @@ class CompiledServo(msgspec.Struct, frozen=True):
 
 
 class SettingsStage(msgspec.Struct, frozen=True):
-    """`STAGE` of `settings.py`: items of a control table that are written before their servo gets torque.
+    """Hook `STAGE` in a feature's `settings.py`: registers to write before a servo gets torque.
 
     They are part of the servo's plan. Start-up writes those that differ, and so does the recovery of the
     servo.
@@ -98,17 +97,17 @@ class SettingsStage(msgspec.Struct, frozen=True):
     FILE: ClassVar[str] = "settings"
 
     compile: Callable[[RobotFile, DescribedServo, ControlTable], Iterable[RegisterValue]]
-    """Returns the values for one servo in the order of writing, EEPROM first. If two features set an item,
-    the later feature takes precedence."""
+    """Returns the values to write into one servo, EEPROM first. If two features set an item, the later one
+    wins."""
     check: Callable[[RobotFile, BusPlan], None] = lambda file, plan: None
-    """Checks the values against the plan of a bus."""
+    """Adds a problem to the file if the values do not fit the compiled bus."""
     change: Callable[[ControlTable, str, int | str], RegisterValue] | None = None
-    """Returns the value that a client writes into an item during a run, an integer or a quantity as text;
-    raises UnfitRegister. The first feature with this function decides for all items."""
+    """Converts the integer or quantity that a client writes into an item during a run; raises UnfitRegister.
+    Only the first feature with this function is used."""
 
 
 def compile_servos(file: RobotFile, models: Mapping[str, str], motors: Motors) -> dict[str, CompiledServo]:
-    """Return the servos whose model is known, by their names.
+    """Compile all servos whose control table is known, by name; `model: auto` gets an assumed model.
 
     Args:
         file: Robot file; collects the problems.
@@ -160,19 +159,19 @@ def _unique_ids(file: RobotFile, servos: list[DescribedServo]) -> None:
 
 
 class OnBus(Protocol):
-    """Entry of a file with a place on a bus."""
+    """An entry of the robot file with a bus and an ID: a servo or a device."""
 
     @property
     def bus(self) -> str:
-        """Name of the bus."""
+        """Name of the bus in the file."""
 
     @property
     def id(self) -> int:
-        """ID on the bus."""
+        """ID of the servo or device on its bus."""
 
 
 def check_bus(file: RobotFile, one: OnBus, name: str, at: Callable[[str], Mark], called: str) -> bool:
-    """Check bus and ID of an entry; return True if the bus is defined. `at` returns the places of keys."""
+    """Check an entry's bus and ID, add errors; return True if the bus exists. `at` returns places of keys."""
     bus = file.robot.buses.get(one.bus)
     if bus is None:
         what = f"{name} is on bus {one.bus}, which is not defined"
@@ -184,7 +183,7 @@ def check_bus(file: RobotFile, one: OnBus, name: str, at: Callable[[str], Mark],
 
 
 def _assumed_model(file: RobotFile, servo: DescribedServo, others: list[DescribedServo]) -> str:
-    """Return the model to assume until it is read: that of another servo on the bus, else the usual one."""
+    """Return the model to assume for `model: auto` before the servo was asked: that of another on the bus."""
     neighbours = [each.model for each in others if each.bus == servo.bus]
     known = [model for model in neighbours if model != AUTO]
     bus = file.robot.buses.get(servo.bus)
@@ -226,7 +225,7 @@ def _table(file: RobotFile, servo: DescribedServo, model: str) -> ControlTable |
 
 
 def _one_table(model: str) -> bool:
-    """Return True if a model has a single protocol; MX servos have one name for two firmwares."""
+    """Return True if a model speaks one protocol only; an MX name stands for two firmwares."""
     return len(protocols_of(model)) == 1
 
 
@@ -243,14 +242,14 @@ def _check_reference(file: RobotFile, servo: DescribedServo, table: ControlTable
 
 
 def many_turns(protocol: float, reference: float, direction: int) -> Interval:
-    """Return the reach of a servo that counts turns, rad: the range of its goal positions."""
+    """Return the joint angles, rad, that a multi-turn servo can reach, centred on its raw 0."""
     turns = 2 * math.pi * MANY_TURNS[protocol]
     middle = -direction * reference
     return Interval(middle - turns, middle + turns)
 
 
 def servo_travel(table: ControlTable) -> Interval:
-    """Return the angles that a servo's goal positions reach, rad from raw 0.
+    """Return the angles that a servo's goal positions reach within a turn, rad from its raw 0.
 
     From 0 upwards in Protocol 1.0 and on X and MX, to both sides of 0 on P, PRO and Y (e-Manual, Goal
     Position).
@@ -259,7 +258,7 @@ def servo_travel(table: ControlTable) -> Interval:
 
 
 def joint_reach(travel: Interval, reference: float, direction: int) -> Interval:
-    """Return the reach of a servo relative to its reference, from its `travel` in rad from raw 0.
+    """Convert a servo's range, rad from raw 0, into joint angles with its reference and direction.
 
     s = direction * (theta - reference), theta in `travel` (thesis of M. Amarante Araujo, 2017, JointID).
     """

@@ -1,4 +1,4 @@
-"""The robot's URDF, checked against the joints of the robot file.
+"""URDF: reads the robot's URDF, compares it with the joints of the robot file, and plans its frames.
 
 Joints and their limits come from the robot file alone. The URDF shows the body, in the log and in frames, and
 provides the simulation's masses. Most differences are therefore warnings.
@@ -21,7 +21,7 @@ from dxlsim.geometry.urdf import SLIDING, TURNING, Urdf, UrdfJoint, read_urdf
 from dxlwire.joint_unit import LINEAR, ROTARY, JointUnit
 
 TYPES: Mapping[JointUnit, tuple[str, ...]] = {ROTARY: TURNING, LINEAR: (SLIDING,)}
-"""Types of URDF joints whose positions have this unit."""
+"""Types that a joint of the URDF may have for a joint with this unit."""
 _UNLIKE: Mapping[JointUnit, tuple[str, str, str]] = {
     ROTARY: (
         "slides",
@@ -30,12 +30,12 @@ _UNLIKE: Mapping[JointUnit, tuple[str, str, str]] = {
     ),
     LINEAR: ("turns", "lengths", "make it prismatic there"),
 }
-"""For joints with this unit and a URDF joint of the other kind: its motion in the URDF, the unit of
-positions, the fix."""
+"""Words for a joint of this unit whose URDF joint has the other kind: what the URDF does to it, what its
+positions are, and the fix."""
 
 
 class CompiledUrdf(msgspec.Struct, frozen=True):
-    """The URDF that a robot file names."""
+    """The URDF of a robot: its text, its parsed tree, and the joints that it shares with the robot file."""
 
     text: str
     urdf: Urdf
@@ -43,7 +43,7 @@ class CompiledUrdf(msgspec.Struct, frozen=True):
 
 
 def compile_urdf(file: RobotFile, joints: Mapping[str, CompiledJoint]) -> CompiledUrdf | None:
-    """Return the robot's URDF; None if the file names none, or it cannot be read."""
+    """Read the URDF that a robot file names and compare its joints; None if there is none or it is wrong."""
     model = file.robot.model
     if model is None:
         return None
@@ -74,7 +74,7 @@ def compile_urdf(file: RobotFile, joints: Mapping[str, CompiledJoint]) -> Compil
 def compile_frames(
     file: RobotFile, body: CompiledUrdf | None, states: Mapping[str, Collection[str]]
 ) -> FramesPlan | None:
-    """Return the plan for the robot's frames and their log; None without a URDF.
+    """Return the plan for logging the robot's frames; None without a URDF or if `model.imu` is wrong.
 
     Args:
         file: Robot file; collects the problems.
@@ -113,7 +113,7 @@ def compile_frames(
 
 
 def _alike(joint: CompiledJoint, drawn: UrdfJoint) -> bool:
-    """Return True if joint and URDF joint have positions of the same kind: angles, or lengths."""
+    """Return True if a joint and its URDF joint both turn or both slide."""
     return drawn.type in TYPES[joint.plan.unit]
 
 
@@ -149,7 +149,7 @@ def _check_names(
 
 
 def _check_limits(file: RobotFile, joint: CompiledJoint, drawn: UrdfJoint) -> None:
-    """Compare limits, rad and rad/s, or m and m/s for a linear joint."""
+    """Warn if a joint's position or speed limits go beyond those of its URDF joint."""
     if not _alike(joint, drawn):
         return
     name, marks = joint.plan.name, file.marks

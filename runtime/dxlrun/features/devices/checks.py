@@ -1,4 +1,4 @@
-"""Device checks: at start-up each device of a bus must answer, be of its model, and return its states."""
+"""Device checks: at start-up each device on a bus must answer, be of its model, and return its states."""
 
 from __future__ import annotations
 
@@ -15,16 +15,16 @@ from dxlwire.plan.retry import retry, setup_line
 from dxlwire.transaction import Outcome, Program
 
 _MODEL_NUMBER = (0, 2)
-"""Address and size of Model Number, in both protocols (e-Manual AX-12A, XM430-W350, Model Number (0))."""
+"""Address and size of the item Model Number (0), in both protocols (e-Manual AX-12A, XM430-W350)."""
 
 
 _SILENCE_NS = 60_000_000
-"""Silence on the line, ns: a board that waits for a status of an earlier chain gives up after 50 ms
-(protocol.md)."""
+"""Time without traffic, ns, before a silent device is pinged again: a board that waits for a status of an
+earlier chain gives up after 50 ms (protocol.md)."""
 
 
 def survey_devices(plan: BusPlan, found: Findings) -> Program[None]:
-    """Check every device of the bus and collect the problems of all of them; only reads."""
+    """Check all devices of a bus by reading only; add problems and the devices found to `found`."""
     line = setup_line(plan)
     for device in plan.devices:
         ping = line.ping(device.servo_id)
@@ -38,7 +38,7 @@ def survey_devices(plan: BusPlan, found: Findings) -> Program[None]:
 
 
 def inspect_device(plan: BusPlan, device: DevicePlan, line: Line) -> Program[str]:
-    """Return the problem of a device, without its name; empty: none."""
+    """Ping a device, read its model number and states; return the problem, empty if there is none."""
     reply = yield from retry(line.ping(device.servo_id))
     if reply.outcome is Outcome.TIMEOUT:
         rate = f"that it runs at {plan.baud_rate} bit/s"

@@ -1,4 +1,4 @@
-"""Devices of the robot file, checked against buses, servos and control tables, and compiled."""
+"""Compiles the section `devices` of a robot file and checks it against buses, servos and control tables."""
 
 from __future__ import annotations
 
@@ -33,7 +33,7 @@ from dxlwire.wire.dialect import dialect_of
 
 
 def compile_devices(compilation: Compilation) -> Contribution:
-    """Return the devices of the file without mistakes in their bus, model or states.
+    """Return plans, sources and commands of the devices; those with a wrong bus, model or state are missing.
 
     Columns of states and commands are counted from the start of the cycle's record.
     """
@@ -143,14 +143,14 @@ def _table(file: RobotFile, name: str, device: Device) -> DeviceTable | None:
 
 
 def _file(description: Description, name: str, device: Device) -> Path | None:
-    """Return the path of a device's own table; None: dxlrun has a table of the model."""
+    """Return the path of the TOML file that a device names as its model; None for a built-in model."""
     if not device.model.endswith(".toml"):
         return None
     return Path(description.marks.value("devices", name, "model").file).parent / device.model
 
 
 def _read(path: Path) -> DeviceTable:
-    """Return the table in a file; raise OSError, or ValueError if it is not a table."""
+    """Read a control table from a TOML file; raise OSError, or ValueError if its contents are wrong."""
     text = read_file(path).decode("utf-8")
     try:
         return replace(read_device_table(text), text=text)
@@ -163,7 +163,7 @@ def _units(items: Mapping[str, ControlItem]) -> dict[str, str]:
 
 
 def _read_items(file: RobotFile, name: str, device: Device, table: DeviceTable) -> dict[str, ControlItem]:
-    """Return the items of the states, by the states' names."""
+    """Return the control table item of each state that a device reads in every cycle, by the state's name."""
     if not device.states and not table.cyclic:
         what = f"{name} names no states, and the table of {table.model} has no items that are read by default"
         fix = f"name some under states: {', '.join(table.items)}"
@@ -173,7 +173,7 @@ def _read_items(file: RobotFile, name: str, device: Device, table: DeviceTable) 
 
 
 def _written_items(file: RobotFile, name: str, device: Device, table: DeviceTable) -> dict[str, ControlItem]:
-    """Return the items of the commands, by the commands' names."""
+    """Return the control table item of each command, by its name; read-only items are errors."""
     found = _named(file, ("devices", name, "commands"), device.commands, table)
     for index, (command, item) in enumerate(found.items()):
         if item.access == "R" or item.area == "EEPROM" or item.bit is not None:
@@ -197,7 +197,7 @@ def _written_items(file: RobotFile, name: str, device: Device, table: DeviceTabl
 def _with_safe_values(
     file: RobotFile, name: str, commands: Mapping[str, DeviceCommand]
 ) -> tuple[DeviceCommand, ...]:
-    """Return the commands of a device with the safe values in the file."""
+    """Return a device's commands with the values of `safe` in the file; check their names and ranges."""
     found = dict(commands)
     for each, value in form.STAGE.of(file.robot)[name].safe.items():
         mark = file.at("devices", name, "safe", each)
@@ -215,7 +215,7 @@ def _with_safe_values(
 def _named(
     file: RobotFile, at: KeyPath, pairs: Sequence[tuple[str, str]], table: DeviceTable
 ) -> dict[str, ControlItem]:
-    """Return items by their names in the file or the table; `at` is the path of the names in the file."""
+    """Return control table items by the names that the file gives them; `at` is the path of that key."""
     found: dict[str, ControlItem] = {}
     _, name, key = at
     for index, (given, item_name) in enumerate(pairs):
@@ -235,7 +235,7 @@ def _named(
 
 
 def _item_mark(description: Description, at: KeyPath, index: int, given: str) -> Mark:
-    """Return the place where an item is named, else the device's own place."""
+    """Return line and column where the file names an item of a device, else those of the device."""
     marks = description.marks
     for path in ((*at, given), (*at, index)):
         if marks.has(path):

@@ -1,4 +1,4 @@
-"""Form of the section `devices`: nodes on a servo bus that are not servos."""
+"""Form of the section `devices` of a robot file: nodes on a servo bus that are not servos."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ _ITEM = re.compile(r"[a-z][a-z0-9_]*", re.ASCII)
 
 
 def _items(value: object) -> tuple[tuple[str, str], ...]:
-    """Return pairs of name and item. In a list the names are empty: the device's table supplies them."""
+    """Validate a list of items or a mapping NAME: ITEM into pairs; the names from a list are empty."""
     if isinstance(value, list) and value:
         pairs = [("", each) for each in value]
     elif isinstance(value, dict) and value:
@@ -63,7 +63,7 @@ Items = Annotated[
         }
     ),
 ]
-"""Pairs of name and item, in the order of the file."""
+"""Names with control table items, in file order; an empty name means the name in the control table."""
 
 
 def _numbers(value: object) -> dict[str, float]:
@@ -82,11 +82,11 @@ Numbers = Annotated[
     PlainValidator(_numbers),
     WithJsonSchema({"type": "object", "additionalProperties": {"type": "number"}}),
 ]
-"""Numbers by the names of states, SI units."""
+"""Numbers in SI units by the name of a state or command, such as `{led: 0}`."""
 
 
 class DeviceSimulation(Form):
-    """States of a simulated device."""
+    """Form of `simulation` of a device: values and noise of its simulated states."""
 
     values: Numbers = key(
         "Fixed values of states, SI units; by default the simulated quantity with the state's name, or 0.",
@@ -102,7 +102,7 @@ class DeviceSimulation(Form):
 
 
 class Device(Form):
-    """A device on a bus, such as an IMU, a foot with pressure sensors, or a power board."""
+    """Form of one device on a bus, such as an IMU, a foot with pressure sensors, or a power board."""
 
     bus: str = key("Name of the device's bus.", "main")
     id: int = key(

@@ -1,4 +1,4 @@
-"""Plan of the devices: the items of each device that controllers command."""
+"""Plan of the devices for the run: the control table items that controllers command."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ HIGHEST_FLOAT32 = 3.4028234663852886e38
 
 
 class DeviceCommand(msgspec.Struct, frozen=True):
-    """One commanded item of a device: number on the wire = (value - offset) / scale."""
+    """One control table item that controllers command; raw number = (value - offset) / scale."""
 
     name: str  # `led`
     item: str  # name in the control table
@@ -30,11 +30,12 @@ class DeviceCommand(msgspec.Struct, frozen=True):
     highest: float
     column: int  # column in the commands of sources in the cycle's record
     safe: float | None = None
-    """Value without a command, and at the end of a run, SI units; None: it keeps its value."""
+    """Value to write when no controller commands it and at the end of a run, SI units; None: leave it as it
+    is."""
 
     @classmethod
     def build(cls, name: str, item: ControlItem, column: int) -> DeviceCommand:
-        """Return the command for an item."""
+        """Return the command for a control table item; `column` is its place in the cycle's record."""
         most = HIGHEST_FLOAT32 * abs(item.scale)
         ends = (item.offset - most, item.offset + most)
         if item.encoding != "float32":
@@ -55,7 +56,7 @@ class DeviceCommand(msgspec.Struct, frozen=True):
         )
 
     def data(self, value: float) -> bytes:
-        """Return the bytes to write for a value in SI units, clamped to its range; little-endian."""
+        """Convert a value in SI units into the item's bytes, little-endian, clamped to its range."""
         exact = (min(max(value, self.lowest), self.highest) - self.offset) / self.scale
         if self.encoding == "float32":
             return struct.pack("<f", exact)
@@ -66,9 +67,9 @@ class DeviceCommand(msgspec.Struct, frozen=True):
 
 
 DevicesPlan: TypeAlias = Mapping[str, tuple[DeviceCommand, ...]]
-"""Commands of each device, in the order of the record, by the device's name."""
+"""Commands of each device by the device's name, in the order of the cycle's record."""
 
 
 def decode_devices(plan: bytes) -> DevicesPlan:
-    """Return the commands in `Contribution.plan` by device; empty for an empty plan."""
+    """Decode the commands of all devices from `Contribution.plan`; empty bytes give an empty mapping."""
     return msgspec.json.decode(plan, type=dict[str, tuple[DeviceCommand, ...]]) if plan else {}

@@ -1,4 +1,4 @@
-"""Devices of one bus from cycle to cycle: lost replies, recovery, and commands.
+"""Runtime of the devices on one bus: drops silent devices from the reads, probes them, writes commands.
 
 A device that does not answer leaves the cyclic reads at once, so that its timeouts do not delay the servos.
 It is then probed in idle time: in every cycle until it counts as lost, then once a second.
@@ -26,13 +26,13 @@ from dxlwire.transaction import Outcome, Program, Transaction
 from dxlwire.wire.dialect import dialect_of
 
 PROBE_NS = 1_000_000_000
-"""Probe period of a lost device, as for a servo (failures.md)."""
+"""Time between two probes of a device that counts as lost, ns, as for a servo (failures.md)."""
 REPEAT_NS = 1_000_000_000
-"""An unchanged command is written again after this time: the device may have rebooted unnoticed."""
+"""Time after which an unchanged command is written again, ns: the device may have rebooted unnoticed."""
 
 
 class _Loss(msgspec.Struct):
-    """Record of a device that does not answer."""
+    """State of a device that does not answer: since when, missed replies, next probe."""
 
     since_ns: int
     probe_at_ns: int
@@ -51,7 +51,7 @@ class _Written(msgspec.Struct):
 
 
 class Devices:
-    """The devices of one bus, by their index in its plan."""
+    """All devices of one bus during a run; a device is given by its index in the bus's plan."""
 
     def __init__(self, context: BusContext) -> None:
         self._plan = plan = context.idle.plan
@@ -74,25 +74,25 @@ class Devices:
         self._written = [
             [(command, _Written()) for command in commands.get(device.name, ())] for device in plan.devices
         ]
-        """Commands of each device, each with its last write."""
+        """Commands of each device, each with the bytes last written and their time."""
 
     # The cyclic reads
 
     def judge_replies(self, now_ns: int) -> None:
-        """Report changes that this cycle's replies show; a device that did not answer leaves the reads."""
+        """Report changed error bytes in the cycle's replies; stop reading devices that did not answer."""
         for index, members in enumerate(self._members):
             self._report_error(index, max(self._reads.errors[member] for member in members))
             if self._losses[index] is None and any(self._reads.blamed(member) for member in members):
                 self._miss(index, now_ns)
 
     def recover_line(self) -> None:
-        """Probe every device before it is read again: its line was lost, and possibly its power."""
+        """Stop reading all devices after their line was lost; each is probed before it is read again."""
         now_ns = self._idle.now_ns()
         for index in range(len(self._losses)):
             self._leave(index, _Loss(now_ns, now_ns, missed=0, reported=True))
 
     def recover_servo(self, servo: int) -> None:
-        """Do nothing: a device returns independently of the servos."""
+        """Do nothing: required by the interface, but devices return independently of servos."""
 
     def _miss(self, index: int, now_ns: int) -> None:
         label = self._label(index)
@@ -126,7 +126,7 @@ class Devices:
     # Idle time
 
     def schedule_idle_work(self, time_ns: int) -> None:
-        """Schedule probes of devices that do not answer, and writes of commands."""
+        """Queue, for the idle time of the bus, probes of silent devices and writes of changed commands."""
         now_ns = self._idle.now_ns()
         for index, loss in enumerate(self._losses):
             if loss is None:
@@ -137,7 +137,7 @@ class Devices:
                 self._idle.add(self._probe(index, loss), Urgency.REPAIR, name)
 
     def _probe(self, index: int, loss: _Loss) -> Program[None]:
-        """Probe a device, then read its states; return it to the cyclic reads if it answers.
+        """Probe a silent device and read its states; if it answers, resume reading it in cycles.
 
         Replies come in the order of their requests. The first probe has a reply of another length than the
         requests before it, so a late reply cannot be taken for its reply, and after it no late reply can
@@ -190,9 +190,9 @@ class Devices:
     # Commands
 
     def _command(self, index: int, now_ns: int) -> None:
-        """Schedule writes of commands that are new or were written long ago.
+        """Queue writes of a device's commands that changed or are older than `REPEAT_NS`.
 
-        A command that nothing commands any more gets its safe value.
+        A command that no controller sends any more gets its safe value.
         """
         for command, written in self._written[index]:
             value = float(self._commands[command.column])
@@ -232,7 +232,7 @@ class Devices:
 
 
 def attach_devices(context: BusContext) -> Devices | None:
-    """Return the devices of a bus; None if it has none."""
+    """Return the runtime of a bus's devices; None if the bus has no devices."""
     return Devices(context) if context.idle.plan.devices else None
 
 
@@ -240,7 +240,7 @@ STAGE = BusStage(inspect=survey_devices, attach=attach_devices)
 
 
 def _probes(line: Line, device: DevicePlan) -> list[Transaction]:
-    """Return requests that show in turn that a device answers.
+    """Return alternative requests to probe a device, with reply lengths unlike each other and its states'.
 
     The lengths of their replies differ from each other and from those of its states.
     """

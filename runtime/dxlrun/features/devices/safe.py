@@ -1,4 +1,4 @@
-"""Safe values of devices: written at the end of a run by the process that ends it.
+"""Safe values of devices: written when a run ends, by the loop or, after it died, by the guardian.
 
 This module needs neither numpy nor the loop, because the guardian uses it after the loop process died.
 """
@@ -14,7 +14,7 @@ from dxlwire.transaction import Outcome, Program
 
 
 def write_safe_values(lines: Lines, plan: bytes) -> tuple[str, ...]:
-    """Write the safe value of every command that has one; return a sentence for each failure.
+    """Write the safe value of each device command that has one; return a sentence for each failed write.
 
     Does not raise. Nothing is sent on a line without devices.
     """

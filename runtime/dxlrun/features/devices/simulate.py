@@ -1,4 +1,4 @@
-"""Simulated devices: the states of a device on a simulated bus."""
+"""Simulated devices: the values that a device on a simulated bus returns."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ def simulated_states(
     read: Mapping[str, ControlItem],
     links: Collection[str] | None,
 ) -> Shown:
-    """Return the states of a simulated device, by its items; add problems of its simulation keys.
+    """Return values, noise and link of a simulated device; add problems of its `simulation` keys to the file.
 
     Args:
         file: Robot file; collects the problems.

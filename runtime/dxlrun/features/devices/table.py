@@ -1,4 +1,4 @@
-"""Table of the devices for `dxlrun check`."""
+"""Table of the devices, as `dxlrun check` prints it."""
 
 from __future__ import annotations
 
@@ -23,7 +23,7 @@ _COLUMNS: Columns[Row] = [
 
 
 def device_rows(plan: Plan) -> Iterator[Row]:
-    """Yield a row for each device, in the order of the buses."""
+    """Yield the columns of each device in a plan as a mapping, bus by bus."""
     sources = {source.name: source for source in plan.loop.sources}
     for bus in plan.buses:
         for device in bus.devices:
@@ -31,7 +31,7 @@ def device_rows(plan: Plan) -> Iterator[Row]:
 
 
 def device_table(rows: Sequence[Row]) -> Table:
-    """Return the table of these devices."""
+    """Return the printable table `Devices` of these rows."""
     return Table.listing("Devices", _COLUMNS, rows)
 
 

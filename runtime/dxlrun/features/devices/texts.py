@@ -1,4 +1,4 @@
-"""Texts of devices: their events. `device` is a label with name, ID and bus."""
+"""Texts of the events that devices cause. `device` is a label with name, ID and bus."""
 
 from __future__ import annotations
 

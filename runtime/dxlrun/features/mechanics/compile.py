@@ -1,4 +1,4 @@
-"""Plan of the couplings of a robot."""
+"""Compiles the couplings of a robot (several servos for one or more joints) into the plan."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ from dxlrun.plan.mechanics_plan import CouplingPlan, MechanicsPlan
 
 
 def compile_mechanics(joints: Mapping[str, CompiledJoint]) -> MechanicsPlan:
-    """Return the assignment of servos to joints; an empty plan if each joint has its own servo."""
+    """Return which servos move which joints, with matrices; empty if each joint has a servo of its own."""
     drives = {name: joint.drive for name, joint in joints.items() if isinstance(joint.drive, CoupledDrive)}
     couplings = dict.fromkeys(drive.coupling for drive in drives.values() if not drive.coupling.direct)
     if not couplings:

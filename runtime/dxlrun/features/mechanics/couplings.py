@@ -1,5 +1,4 @@
-"""Couplings: checks of joints with several servos and of transmissions, and of joint limits against servo
-ranges.
+"""Couplings: checks of joints with several servos and of transmissions, and their limits and speeds.
 
 A joint with one servo is a coupling with the matrix 1.
 """
@@ -26,18 +25,18 @@ from dxlwire.modes import Mode
 from dxlwire.plan.mode_plan import model_modes
 
 MOST_CONDITION = 100.0
-"""Highest condition number of a matrix: beyond it a tick of a servo is more than a hundred ticks of a joint.
-[i]"""
+"""Highest condition number of a transmission's matrix: beyond it one tick of a servo moves a joint by more
+than a hundred ticks. [i]"""
 MOST_SPEED_RATIO = 1.5  # highest ratio between the top speeds of a joint's servos [i]
 _LEAST_SHARE = 0.01  # least share of its reach for a joint without limits [i]
 
 Rows = tuple[tuple[float, ...], ...]
 MATRICES: Mapping[str, Rows] = {"differential": ((0.5, 0.5), (0.5, -0.5))}
-"""Transmissions with a name: half of the sum and half of the difference."""
+"""Matrices of `type` in a transmission; a differential has half of the sum and half of the difference."""
 
 
 class Coupling(msgspec.Struct, frozen=True, eq=False):
-    """Servos that move joints together: q = M s."""
+    """Servos that together move some joints; joint positions = matrix * servo positions (after gears)."""
 
     name: str
     place: KeyPath  # path of its joint or its transmission
@@ -50,12 +49,12 @@ class Coupling(msgspec.Struct, frozen=True, eq=False):
 
     @property
     def direct(self) -> bool:
-        """True if one servo moves one joint, whose keys describe it."""
+        """True for an ordinary joint with a single servo and no transmission."""
         return not self.transmission and len(self.servos) == 1
 
     @property
     def modes(self) -> tuple[Mode, ...]:
-        """Modes that all servos have and in which they can move the joints together."""
+        """Operating modes that all of the servos have; a transmission cannot use PWM."""
         each = [model_modes(one.table, one.described.continuous) for one in self.servos]
         # A fraction of the voltage is neither a speed nor a torque, so a matrix cannot divide it.
         left_out = {Mode.PWM} if self.transmission else set()
@@ -63,7 +62,7 @@ class Coupling(msgspec.Struct, frozen=True, eq=False):
 
 
 def compile_couplings(file: RobotFile, servos: Mapping[str, CompiledServo]) -> list[Coupling]:
-    """Return the couplings of all joints; couplings with mistakes are omitted."""
+    """Return the coupling of each joint and each transmission; those with mistakes are omitted."""
     found: list[Coupling] = []
     for name, joint in file.robot.joints.items():
         if not isinstance(joint, ServoJoint):
@@ -113,7 +112,7 @@ def compile_couplings(file: RobotFile, servos: Mapping[str, CompiledServo]) -> l
 
 
 def _check_joints(file: RobotFile, name: str, transmission: Transmission, owners: dict[str, str]) -> bool:
-    """Check that a transmission's joints exist, belong to no other coupling, and have equal keys."""
+    """Check that a transmission's joints exist, have no other servo, and agree in two of their keys."""
     robot, good = file.robot, True
     for index, joint in enumerate(transmission.joints):
         mark = file.at("transmissions", name, "joints", index)
@@ -154,12 +153,12 @@ def _check_joints(file: RobotFile, name: str, transmission: Transmission, owners
 
 
 def _set(entry: object, key: str) -> bool:
-    """Return True if a joint's key does not have its default value."""
+    """Return True if a joint's `continuous` or `torque` differs from its default."""
     return bool(getattr(entry, key)) is (key == "continuous")
 
 
 def _check_moved(file: RobotFile, owners: Mapping[str, str]) -> None:
-    """Check that every joint has a servo or a transmission."""
+    """Add an error for each joint that has neither a servo nor a transmission."""
     for name, joint in file.robot.joints.items():
         if not isinstance(joint, ServoJoint) and name not in owners:
             file.error(
@@ -170,7 +169,7 @@ def _check_moved(file: RobotFile, owners: Mapping[str, str]) -> None:
 
 
 def _matrix(file: RobotFile, name: str, transmission: Transmission) -> tuple[Rows, Rows] | None:
-    """Return a transmission's matrix and its pseudo-inverse; None after a mistake."""
+    """Return a transmission's matrix, checked for its shape, and its pseudo-inverse; None after an error."""
     servos, joints = len(transmission.servos), len(transmission.joints)
     mark, place = file.at("transmissions", name, "matrix"), file.key("transmissions", name)
     named = MATRICES.get(transmission.type)
@@ -207,7 +206,7 @@ def _matrix(file: RobotFile, name: str, transmission: Transmission) -> tuple[Row
 
 
 def _inverted(name: str, matrix: Rows, mark: Mark, problems: Problems) -> tuple[Rows, Rows] | None:
-    """Return a matrix and its pseudo-inverse; refuse a matrix that cannot move each joint independently."""
+    """Return a matrix and its pseudo-inverse; None, with an error, if it cannot move each joint alone."""
     import numpy as np  # imported here, because most robots have no transmission
 
     values = np.array(matrix, dtype=np.float64)
@@ -244,7 +243,7 @@ def _inverted(name: str, matrix: Rows, mark: Mark, problems: Problems) -> tuple[
 
 
 def _agree(file: RobotFile, coupling: Coupling) -> bool:
-    """Check that the servos can move their joints together."""
+    """Check that a coupling's servos fit: equal protocol, baud rate and effort unit, and a common mode."""
     first, *others = coupling.servos
     marks, buses = file.marks, file.robot.buses
     good = True
@@ -294,8 +293,7 @@ def _moved(coupling: Coupling) -> str:
 
 
 def allowed_limits(file: RobotFile, coupling: Coupling) -> tuple[Interval | None, ...]:
-    """Return the limits that the gate enforces for each joint, fully within the servos' reach; None: a
-    mistake."""
+    """Return the position limits of each joint for the gate, within the servos' range; None: an error."""
     joints = file.robot.joints
     if not coupling.transmission:
         (name,) = coupling.joints
@@ -317,7 +315,7 @@ def allowed_limits(file: RobotFile, coupling: Coupling) -> tuple[Interval | None
 
 
 def _allowed(file: RobotFile, name: str, joint: JointEntry, reach: Interval, model: str) -> Interval | None:
-    """Return the limits that the gate enforces: those of the file, clamped to the reach."""
+    """Return a joint's limits from the file, cut to its servos' range; None if they do not overlap."""
     limits = joint.limits.position
     if limits is None:
         return reach
@@ -340,7 +338,7 @@ def _allowed(file: RobotFile, name: str, joint: JointEntry, reach: Interval, mod
 
 
 def shared_reach(coupling: Coupling) -> Interval | None:
-    """Return the positions that all servos of one joint reach; None: there are none."""
+    """Return the joint positions that all servos of one joint can reach; None if there are none."""
     reach: Interval | None = coupling.servos[0].reach
     for servo in coupling.servos[1:]:
         reach = None if reach is None else reach.meet(servo.reach)
@@ -348,15 +346,14 @@ def shared_reach(coupling: Coupling) -> Interval | None:
 
 
 def joint_reaches(coupling: Coupling) -> tuple[Interval, ...]:
-    """Return the reach of each joint while the other joints are where it is widest: the image of the servos'
-    ranges."""
+    """Return the widest range of each joint that its servos can reach, the others placed as needed."""
     if not coupling.transmission:
         return (shared_reach(coupling) or Interval(0.0, 0.0),)
     return tuple(_image(row, [one.reach for one in coupling.servos]) for row in coupling.matrix)
 
 
 def servo_ranges(coupling: Coupling, limits: Sequence[Interval]) -> tuple[Interval, ...]:
-    """Return the range of each servo within limits of the joints: the image of the joints' box."""
+    """Return the range in which each servo moves while all joints stay within `limits`."""
     return tuple(_image(row, limits) for row in coupling.inverse)
 
 
@@ -370,7 +367,7 @@ def _image(row: Sequence[float], intervals: Sequence[Interval]) -> Interval:
 def box(
     file: RobotFile, coupling: Coupling, written: Sequence[Interval | None]
 ) -> tuple[Interval, ...] | None:
-    """Return the limits of a transmission's joints, such that its servos reach all corners.
+    """Return limits for a transmission's joints such that the servos reach all combinations of them.
 
     Limits in the file are kept or refused. The others become as wide as the servos permit, each by the same
     share of the joint's reach.
@@ -416,7 +413,7 @@ def box(
 def _fits(
     file: RobotFile, coupling: Coupling, limits: Sequence[Interval], written: Sequence[Interval | None]
 ) -> bool:
-    """Refuse limits with a corner that a servo does not reach; report the worst corner of each servo."""
+    """Add an error for each servo that cannot reach a combination of the joints' limits; True if none."""
     good = True
     for row, servo, needed in zip(
         coupling.inverse, coupling.servos, servo_ranges(coupling, limits), strict=True
@@ -444,8 +441,7 @@ def _fits(
 
 
 def theta(servo: CompiledServo, position: float) -> float:
-    """Return the angle of a servo, rad from its raw 0, for a position of its joint or its transmission's
-    input."""
+    """Convert a position at a servo's output (after its gear) into the servo's angle, rad from its raw 0."""
     described = servo.described
     return described.direction * position / described.ratio + described.reference
 
@@ -472,8 +468,7 @@ def top_speeds(coupling: Coupling) -> tuple[tuple[float | None, float | None], .
 
 
 def top_efforts(coupling: Coupling) -> tuple[float | None, ...]:
-    """Return the highest effort of each joint while the others have none; None: its servos have no effort
-    goal."""
+    """Return each joint's highest effort while the others have none; None: a servo has no effort goal."""
     most = [one.top_effort for one in coupling.servos]
     found: list[float | None] = []
     for row in coupling.matrix:
@@ -487,13 +482,13 @@ def top_efforts(coupling: Coupling) -> tuple[float | None, ...]:
 
 
 def _least(values: Sequence[float | None]) -> float | None:
-    """Return the least of values that are all known, else None."""
+    """Return the smallest value; None if any value is None or there are none."""
     known = [value for value in values if value is not None]
     return min(known) if known and len(known) == len(values) else None
 
 
 def check_together(file: RobotFile, coupling: Coupling) -> None:
-    """Warn of limits of several joints that together exceed what a servo can do."""
+    """Warn if the velocity or effort limits of coupled joints together demand more than a servo can do."""
     written = [file.robot.joints[name].limits for name in coupling.joints]
     for which, limits, rows, most, unit in (
         (

@@ -1,4 +1,4 @@
-"""Drives of joints: figures of each coupling at its joints, and its joint limits."""
+"""Drives: compiles the range, speed, effort and modes of each joint from its coupling."""
 
 from __future__ import annotations
 
@@ -20,13 +20,13 @@ from dxlwire.modes import Mode
 
 
 class CoupledDrive(JointDrive, frozen=True, kw_only=True):
-    """Drive of a joint, with the coupling that moves it."""
+    """Drive of a joint, together with the coupling from which it was computed."""
 
     coupling: Coupling
 
 
 def compile_drives(file: RobotFile, servos: Mapping[str, CompiledServo]) -> dict[str, JointDrive]:
-    """Return the drive of each joint; joints whose servos have mistakes are omitted."""
+    """Return the drive of each joint by name; joints whose servos or limits have mistakes may be missing."""
     drives: dict[str, JointDrive] = {}
     for coupling in compile_couplings(file, servos):
         reaches, limits = joint_reaches(coupling), allowed_limits(file, coupling)

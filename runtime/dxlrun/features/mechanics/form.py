@@ -1,4 +1,4 @@
-"""Form of the section `transmissions`: several servos that move several joints together, q = M s."""
+"""Form of the section `transmissions` of a robot file: several servos that move several joints together."""
 
 from __future__ import annotations
 
@@ -22,7 +22,7 @@ from dxlrun.features.feature import Section
 
 
 class TransmissionServo(ServoEntry):
-    """One servo of a transmission."""
+    """Form of one servo of a transmission; its position is that of an input, not of a joint."""
 
     bus: str = key("Name of the servo's bus.", "main")
     id: ServoId = key("ID of the servo.", "1")
@@ -42,7 +42,7 @@ class TransmissionServo(ServoEntry):
 
 
 class Transmission(Form):
-    """Several servos that move several joints together: q = M s."""
+    """Form of one transmission: its joints, its servos, and the matrix from servo to joint positions."""
 
     type: Literal["differential", "matrix"] = key(
         "Kind of transmission: half of the sum and half of the difference of two servos "
@@ -74,13 +74,13 @@ class Transmission(Form):
 
 
 def _form() -> object:
-    """Return the type of the section, whose servos have the keys of features."""
+    """Return the pydantic type of the section; its servos also have the servo keys of other features."""
     servos = {"servos": dict[Name, section_servo(TransmissionServo)]}  # type: ignore[misc]  # made at run time
     return dict[Name, with_keys(Transmission, (), **servos)]  # type: ignore[misc]  # as above
 
 
 def _moved_joints(section: object) -> Iterator[str]:
-    """Yield the names under `joints` in a section that is not validated yet."""
+    """Yield the names under `joints` of all transmissions in a section that may contain mistakes."""
     for entry in section.values() if isinstance(section, dict) else ():
         names = entry.get("joints") if isinstance(entry, dict) else None
         yield from map(str, names if isinstance(names, list) else ())

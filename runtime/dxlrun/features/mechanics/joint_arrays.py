@@ -24,14 +24,14 @@ _WORSE: tuple[Torque, ...] = (
     Torque.LOST,
     Torque.UNKNOWN,
 )
-"""From best to worst; a joint has the worst torque state of its servos."""
+"""Torque states from best to worst; a joint has the worst torque state among its servos."""
 _LEAST_SHARE = 0.05
-"""Lowest speed of a servo as a share of the speed for all of its joints together: a load may have moved a
-servo that need not move."""
+"""Lowest speed of a servo relative to its speed if all of its joints move: a load may have moved a servo that
+need not move."""
 
 
 class JointArrays:
-    """Arrays of the servos and of the joints, with the conversion between them.
+    """States and goals of all servos and all joints of a robot, with the conversion between them.
 
     The servos' arrays have one row per servo, in the order of the plan's `servos`. A joint's row is valid if
     the rows of all its servos are valid; otherwise it keeps its values. It has the age of the oldest of these
@@ -51,7 +51,7 @@ class JointArrays:
         self._joint_rows = np.zeros((count, joints), dtype=np.intp)
         self._servo_rows = np.zeros((count, servos), dtype=np.intp)
         self._no_joint = np.ones((count, joints), dtype=np.bool_)
-        """True in the padding of couplings with fewer joints than the largest one."""
+        """True in the padding: places that a coupling with fewer joints than the largest does not use."""
         self._no_servo = np.ones((count, servos), dtype=np.bool_)
         self._matrix: Floats = np.zeros((count, joints, servos))
         self._inverse: Floats = np.zeros((count, servos, joints))
@@ -66,22 +66,23 @@ class JointArrays:
         self._efforts = np.ascontiguousarray(self._inverse.transpose(0, 2, 1))
         self._coupling, self._column = np.nonzero(~self._no_joint)
         self._rows = self._joint_rows[self._coupling, self._column]
-        """Rows of all joints of couplings; `_coupling` and `_column` are their places there."""
+        """Rows of all coupled joints in the joints' arrays; `_coupling` and `_column` are their places in the
+        stacked matrices."""
         self._single = np.array([len(one.joints) == 1 for one in plan.couplings])[:, None]
         self._rank = np.zeros(len(Torque), dtype=np.uint8)
         for rank, torque in enumerate(_WORSE):
             self._rank[torque] = rank
         self.residual: Floats = np.zeros((count, servos))
-        """Deviation of each servo from its position according to the joints, rad or m: s - M^+ M s."""
+        """Difference between each servo's position and the one that fits the joints' positions, rad or m."""
         self._offset: Floats = np.zeros((count, servos))
         self._fade: Floats = np.zeros((count, 1))
-        """Share of `_offset` that is still in the servos' goals."""
+        """Share of `_offset` that is still added to the servos' goals, 1 falling to 0."""
         self._last_goal: Floats = np.full((count, joints), np.nan)
         self._last_speed: Floats = np.full((count, joints), np.nan)
         self._speeds: Floats = np.full((count, servos), np.nan)
 
     def begin(self) -> None:
-        """Set the joints' goals to those of their servos, so that no servo moves.
+        """Set the joints' goals at start-up such that every servo keeps the goal that it has.
 
         Small deviations of the servos are kept as offsets at first; `fade` removes them.
         """
@@ -96,20 +97,19 @@ class JointArrays:
         self._fade.fill(1.0)
 
     def fade(self, share: float) -> None:
-        """Reduce the offsets in the servos' goals by a share of their initial value."""
+        """Reduce the offsets in the servos' goals by `share` of their initial value, until they are 0."""
         np.maximum(0.0, self._fade - share, out=self._fade)
 
     def anchor(self, index: int) -> None:
-        """Hold the servos of a coupling at their present positions while the joints' goals equal the joints'
-        positions.
+        """Make the servos of a coupling hold their present positions, although these do not fit each other.
 
-        Small deviations of the servos are kept as offsets at first; `fade` removes them.
+        Their deviations are added to their goals as offsets; `fade` removes them.
         """
         self._offset[index] = np.nan_to_num(self.residual[index])
         self._fade[index] = 1.0
 
     def read(self) -> None:
-        """Fill the joints' states from those of the servos."""
+        """Compute the joints' states from the servos' states of this cycle."""
         to, of = self.states, self.servo_states
         joints, servos = self._direct_joints, self._direct_servos
         to.motion[:, joints] = of.motion[:, servos]
@@ -159,7 +159,7 @@ class JointArrays:
         to.torque[self._rows] = worst[coupling]
 
     def write(self) -> None:
-        """Fill the servos' goals from those of the joints; without a joint's goal its servos get none."""
+        """Compute the servos' goals from the joints' goals; if a joint has no goal, its servos have none."""
         to, of = self.servo_goals, self.goals
         to.values[:, self._direct_servos] = of.values[:, self._direct_joints]
         wanted = of.values[:, self._joint_rows]
@@ -181,8 +181,7 @@ class JointArrays:
         to.pwm[rows[here]] = np.where(self._single, pwm[:, :1], np.nan).repeat(rows.shape[1], axis=1)[here]
 
     def _divide_speeds(self, position: Floats, velocity: Floats) -> None:
-        """Compute speeds with which the servos of a coupling arrive together, if joint goals or speeds have
-        changed.
+        """Compute servo speeds for position goals such that all servos of a coupling arrive at the same time.
 
         The speed next to a position goal is the joint's speed on its way. The duration is that of the slowest
         joint, and each servo gets the speed with which its own way takes that long.
@@ -205,7 +204,7 @@ class JointArrays:
         self._last_speed[changed] = velocity[changed]
 
     def joint_requests(self, requested: NDArray[np.uint8]) -> NDArray[np.uint8]:
-        """Return the requested mode of each servo from that of its joints; UNKNOWN: no change.
+        """Convert requested modes of joints into modes of servos; UNKNOWN: no change.
 
         The joints of one coupling must have one mode: a request that would leave one of them in another mode
         is ignored.
@@ -225,12 +224,12 @@ class JointArrays:
 
     @staticmethod
     def _times(matrices: Floats, vectors: Floats) -> Floats:
-        """Return the product of each coupling's matrix with its vector; shape (..., couplings, rows)."""
+        """Multiply each coupling's matrix with its vector; shape (..., couplings, rows)."""
         product: Floats = np.matmul(matrices, vectors[..., None])[..., 0]
         return product
 
 
 def _same(one: Floats, other: Floats) -> NDArray[np.bool_]:
-    """Compare elements; NaN equals NaN."""
+    """Compare elements of two arrays; NaN equals NaN."""
     same: NDArray[np.bool_] = (one == other) | (np.isnan(one) & np.isnan(other))
     return same

@@ -1,4 +1,4 @@
-"""Joint hardware: the loop's hardware for a robot with joints that have several servos."""
+"""Joint hardware: hardware interface with joints for the loop, on top of the hardware with servos."""
 
 from __future__ import annotations
 
@@ -20,8 +20,8 @@ from dxlrun.plan.mechanics_plan import CouplingPlan, MechanicsPlan
 from dxlwire.bus_plan import BusPlan, ServoPlan
 
 FADE_NS = 1_000_000_000
-"""Time in which small deviations between servos at the start are removed: at most 1.5 deg per second with the
-default tolerance."""
+"""Time in which deviations between servos at the start are removed from their goals, ns: at most 1.5 deg per
+second with the default tolerance."""
 AGREES = 0.7  # share of the tolerance below which servos that disagreed agree again
 _HAS_TORQUE = (Torque.ON, Torque.DOUBT, Torque.GIVEN)
 
@@ -30,7 +30,7 @@ RegisterDone = Callable[[str, int | None], None]
 
 
 class _Together(msgspec.Struct):
-    """A request to all servos of a coupling that has not been answered by all of them."""
+    """A request (such as torque off) sent to all servos of a coupling, while some have not answered."""
 
     left: int
     answers: list[Done] = []
@@ -38,7 +38,7 @@ class _Together(msgspec.Struct):
 
 
 class ServosTogether:
-    """Checks that the servos of each coupling agree in position and torque."""
+    """Checks during a run that the servos of each coupling agree in position and torque; reports events."""
 
     def __init__(
         self,
@@ -58,12 +58,11 @@ class ServosTogether:
         self._apart = [False] * len(plan.couplings)
 
     def label(self, row: int) -> str:
-        """Return ID and bus of a servo, by its row."""
+        """Return ID and bus of a servo as text; `row` is its row in the servos' arrays."""
         return self._labels[row]
 
     def at_start(self) -> list[str]:
-        """Return reasons why joints with several servos must not get torque at their positions, one sentence
-        each.
+        """Return why joints with several servos must not get torque at start, in sentences; empty if fine.
 
         Joints that stay limp at the start (`torque: off`) are not checked.
         """
@@ -75,10 +74,10 @@ class ServosTogether:
         return problems
 
     def torque_refused(self, index: int) -> str:
-        """Return the reason why the servos of a coupling must not get torque at their positions.
+        """Return why the servos of a coupling must not get torque where they are; empty if they may.
 
-        Empty: they may get torque, or have it already. Each servo is checked against its own range when it
-        gets torque. That is not enough: a wrist can be outside its limits with both servos inside theirs.
+        It is also empty if they have torque already. Each servo is checked against its own range when it gets
+        torque. That is not enough: a wrist can be outside its limits with both servos inside theirs.
         """
         coupling = self._plan.couplings[index]
         if not any(self._arrays.servo_states.torque[row] in LIMP for row in coupling.servos):
@@ -86,12 +85,12 @@ class ServosTogether:
         return "; ".join(self.unfit(index))
 
     def report_no_torque(self, index: int, problem: str) -> None:
-        """Report that the servos of a coupling get no torque."""
+        """Emit the event that torque was refused for a coupling, with the problem."""
         name = self._plan.couplings[index].name
         self._events.emit(name, texts.torque_refused(name, problem))
 
     def unfit(self, index: int) -> list[str]:
-        """Return reasons why the servos of one coupling must not get torque at their last positions."""
+        """Return why a coupling's servos must not get torque: disagreement, or a joint beyond its limits."""
         coupling = self._plan.couplings[index]
         if self._spread(index, coupling) > coupling.tolerance > 0:
             return [
@@ -114,7 +113,7 @@ class ServosTogether:
         return problems
 
     def watch(self) -> None:
-        """Report servos that start to disagree, and servos that agree again."""
+        """Emit an event when servos of a coupling start to disagree beyond the tolerance, or agree again."""
         for index, coupling in enumerate(self._plan.couplings):
             if not coupling.tolerance or not self._arrays.states.valid[coupling.joints[0]]:
                 continue
@@ -130,7 +129,7 @@ class ServosTogether:
                 self._events.emit(coupling.name, event)
 
     def partners(self) -> list[tuple[int, tuple[int, ...], tuple[int, ...]]]:
-        """Return couplings with both limp servos and servos with torque: index, and rows of both kinds."""
+        """Return couplings of which only some servos have torque: index, rows without it, rows with it."""
         torque = self._arrays.servo_states.torque
         found = []
         for index, coupling in enumerate(self._plan.couplings):
@@ -141,13 +140,13 @@ class ServosTogether:
         return found
 
     def report_torque_off(self, index: int, limp: Sequence[int], pulling: Sequence[int]) -> None:
-        """Report that servos lose their torque because other servos of their joint have none."""
+        """Emit the event that servos lose torque because others of their coupling have none."""
         name, labels = self._plan.couplings[index].name, self._labels
         event = texts.partners_released(name, [labels[row] for row in limp], [labels[row] for row in pulling])
         self._events.emit(name, event)
 
     def _spread(self, index: int, coupling: CouplingPlan) -> float:
-        """Return the disagreement of servos, rad or m: the difference for two servos on one joint."""
+        """Return by how much the servos of a coupling disagree, rad or m, at their outputs."""
         residual = self._arrays.residual[index, : len(coupling.servos)]
         return float(residual.max() - residual.min())
 
@@ -166,7 +165,7 @@ class ServosTogether:
 
 
 class JointHardware(HardwareLayer):
-    """Joints in front of a hardware of servos; implements `contract.hardware.Hardware`.
+    """Hardware with joints as rows, which converts and forwards to a hardware with servos as rows.
 
     The servos' hardware uses `arrays.servo_states` and `arrays.servo_goals`. A request for a joint applies to
     all its servos, and so to all joints of its transmission. It is answered when all servos have answered.
@@ -186,13 +185,14 @@ class JointHardware(HardwareLayer):
         self._together = together
         self._fade_share = period_ns / FADE_NS
         self._asked: dict[tuple[int, str], _Together] = {}
-        """Requests that some servos of a coupling have not answered, by its index and the kind of request."""
+        """Open requests by coupling index and kind (`on`, `off`, `reboot`) that some servos have not
+        answered."""
         self._read_limits: Mapping[int, Sequence[ServoLimit]] | None = None
-        """Limits of the servos from which those of the joints were computed."""
+        """Servo limits of the last call, to see whether `_joint_limits` must be computed again."""
         self._joint_limits: Mapping[int, Sequence[ServoLimit]] = {}
 
     def start(self, engaging: Callable[[], None] = lambda: None) -> None:
-        """Start the servos, and set the joints' goals to their positions.
+        """Start the servos' hardware, and set the joints' goals such that no servo moves.
 
         `ServosTogether.at_start` refuses disagreeing servos of a joint before that.
 
@@ -205,7 +205,7 @@ class JointHardware(HardwareLayer):
 
     @property
     def servo_limits(self) -> Mapping[int, Sequence[ServoLimit]]:
-        """Registers that limit the goals of each joint's servos, while the other joints rest."""
+        """Limits of each joint by row, from registers of its servos, while coupled joints rest."""
         own = self._hardware.servo_limits
         if own is self._read_limits:
             return self._joint_limits
@@ -219,7 +219,7 @@ class JointHardware(HardwareLayer):
     def _limits_of(
         self, coupling: CouplingPlan, column: int, own: Mapping[int, Sequence[ServoLimit]]
     ) -> tuple[ServoLimit, ...]:
-        """Return the tightest limit of each interface of one joint of a coupling."""
+        """Return the tightest velocity, effort and PWM limit of one joint from its servos' registers."""
         tightest: dict[LimitedInterface, ServoLimit] = {}
         for place, servo in enumerate(coupling.servos):
             factors = {
@@ -238,7 +238,7 @@ class JointHardware(HardwareLayer):
         return tuple(tightest.values())
 
     def read(self) -> None:
-        """Read the servos and fill the joints' states; if a servo has no torque, its partners lose theirs."""
+        """Read servos, compute joint states; if a servo of a coupling has no torque, stop the others'."""
         self._hardware.read()
         self._arrays.read()
         self._together.watch()
@@ -248,30 +248,30 @@ class JointHardware(HardwareLayer):
                 self._ask(index, "off", pulling, lambda _: None)
 
     def write(self) -> None:
-        """Send the joints' goals as goals of the servos."""
+        """Convert the joints' goals into servo goals and send them."""
         self._arrays.fade(self._fade_share)
         self._arrays.write()
         self._hardware.write()
 
     def set_modes(self, modes: NDArray[np.uint8]) -> None:
-        """Change the modes of the joints' servos."""
+        """Change the operating mode of joints; `modes` has one per joint, UNKNOWN for no change."""
         self._hardware.set_modes(self._arrays.joint_requests(modes))
 
     def set_register(self, row: int, item: str, value: int, done: RegisterDone) -> None:
-        """Write an item of all servos of a joint; `done` receives the previous value of the first servo.
+        """Write an item of all servos of a joint; `done` gets the problem and the first servo's old value.
 
         A row after those of the joints is that of a single servo, here and in `read_register`.
         """
         self._registers(row, lambda servo, each: self._hardware.set_register(servo, item, value, each), done)
 
     def read_register(self, row: int, item: str, done: RegisterDone) -> None:
-        """Read an item of all servos of a joint; `done` receives a problem if their values differ."""
+        """Read an item of all servos of a joint; `done` gets a problem, also if they differ, and a value."""
         self._registers(
             row, lambda servo, each: self._hardware.read_register(servo, item, each), done, alike=True
         )
 
     def switch_torque(self, row: int, on: bool, done: Done) -> None:
-        """Switch the torque of all servos of a joint off, or on at their positions if these agree."""
+        """Switch torque of all servos of a joint; on is refused if they disagree or exceed the limits."""
         index = self._coupling(row)
         servos = self._plan.servo_rows(row)
         if index is None:
@@ -285,14 +285,14 @@ class JointHardware(HardwareLayer):
             self._ask(index, "on" if on else "off", servos, done)
 
     def follow_goals(self, rows: Sequence[int]) -> None:
-        """Start sending goals to servos of joints that were given torque, from their present positions."""
+        """Make joints that got torque start from their present positions and follow the goals."""
         for index in dict.fromkeys(self._coupling(row) for row in rows):
             if index is not None:
                 self._arrays.anchor(index)
         self._hardware.follow_goals([servo for row in rows for servo in self._plan.servo_rows(row)])
 
     def reboot(self, row: int, done: Done) -> None:
-        """Reboot all servos of a joint."""
+        """Reboot all servos of a joint; `done` gets the problem, empty on success."""
         index = self._coupling(row)
         servos = self._plan.servo_rows(row)
         if index is None:
@@ -301,12 +301,12 @@ class JointHardware(HardwareLayer):
             self._ask(index, "reboot", servos, done)
 
     def _coupling(self, row: int) -> int | None:
-        """Return the coupling that moves a joint; None: the joint has its own servo."""
+        """Return the index of the coupling that moves a joint; None if the joint has a servo of its own."""
         places = (index for index, one in enumerate(self._plan.couplings) if row in one.joints)
         return next(places, None)
 
     def _ask(self, index: int, what: str, servos: Sequence[int], done: Done) -> None:
-        """Send a request to servos of a coupling; a repeated request waits for the same answers."""
+        """Send torque `on`, `off` or `reboot` to servos of a coupling; an open one of that kind is shared."""
         waiting = self._asked.get((index, what))
         if waiting is not None:  # for another joint of the same transmission
             waiting.answers.append(done)
@@ -337,7 +337,7 @@ class JointHardware(HardwareLayer):
         *,
         alike: bool = False,
     ) -> None:
-        """Send a request to all servos of a joint, or to one servo, and answer when all have answered."""
+        """Send a register request to all servos of a joint, or one servo; call `done` after all answers."""
         joints = len(self._arrays.states.valid)
         servos = self._plan.servo_rows(row) if row < joints else (row - joints,)
         found: dict[int, tuple[str, int | None]] = {}

@@ -1,4 +1,4 @@
-"""Layer between joints and servos, for joints with several servos and for transmissions."""
+"""Layer between the loop's joints and the servos, for robots with couplings."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ from dxlrun.plan.robot_plan import Plan
 
 
 def prepare_mechanics(plan: Plan, states: States, goals: Commands, events: EventSink) -> PreparedLayer | None:
-    """Return the layer of the couplings of a robot; None: each joint has its own servo."""
+    """Return joint-to-servo conversion for a robot; None if each joint has a servo of its own."""
     if not plan.mechanics.coupled:
         return None
     arrays = JointArrays(plan.mechanics, states, goals)

@@ -1,4 +1,4 @@
-"""Servos of transmissions in the notation of the robot file."""
+"""Servos in the section `transmissions` of a robot file, in the common form for all servos."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ from dxlwire.joint_unit import ROTARY
 
 
 def describe_servos(description: Description) -> Iterator[DescribedServo]:
-    """Yield the servos of all transmissions."""
+    """Yield the servos of all transmissions in a robot file, in file order."""
     robot = description.robot
     for name, transmission in form.STAGE.of(robot).items():
         moved = [robot.joints[joint] for joint in transmission.joints if joint in robot.joints]

@@ -1,4 +1,4 @@
-"""Texts of mechanics: events of servos that move one joint, and of transmissions."""
+"""Texts of the events about servos that move one joint together, and about transmissions."""
 
 from __future__ import annotations
 

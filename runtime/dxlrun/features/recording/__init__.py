@@ -1,4 +1,4 @@
-"""Recording: the section about the log: its directory, its parts, and the logs to keep.
+"""Recording: the section `recording` of a robot file: the log's directory, its parts, and what to keep.
 
 `log/` and `run/` write and delete logs according to its plan.
 """

@@ -1,4 +1,4 @@
-"""Recording: the size of the log's parts, and the limit for old logs."""
+"""Compiles the section `recording`: size or duration of a log's parts, and the limit for old logs."""
 
 from __future__ import annotations
 
@@ -7,11 +7,11 @@ from dxlrun.features.recording import form
 from dxlrun.plan.recording_plan import RecordingPlan
 
 _LEAST_BYTES, _LEAST_NS = 1_000_000, 1_000_000_000
-"""Smallest part of a log: each part contains the robot file and the plan again."""
+"""Smallest size and duration of a part of a log: each part contains the robot file and the plan again."""
 
 
 def compile_recording(compilation: Compilation) -> Contribution:
-    """Return the settings of the log; impossible settings become problems."""
+    """Return the log settings for the plan; add an error for tiny parts, or `keep` without `split`."""
     file, marks = compilation.file, compilation.file.marks
     written = form.STAGE.of(file.robot)
     amount = {} if written.split is None else dict([written.split])

@@ -1,4 +1,4 @@
-"""Form of the section `recording`."""
+"""Form of the section `recording` of a robot file."""
 
 from __future__ import annotations
 
@@ -8,7 +8,7 @@ from dxlrun.features.feature import Section
 
 
 class Recording(Form):
-    """Settings of the log."""
+    """Form of `recording`: where logs are written, when they are split, and which are deleted."""
 
     directory: str = key(
         "Directory of the logs, relative to the working directory.", "logs", "logs", min_length=1

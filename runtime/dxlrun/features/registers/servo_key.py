@@ -1,4 +1,4 @@
-"""Key `registers` of joints and servos."""
+"""The key `registers` of joints and servos in a robot file."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ def _register(value: object) -> object:
 
 
 Register = Annotated[int | str, BeforeValidator(_register), WithJsonSchema({"type": ["integer", "string"]})]
-"""Raw integer, or text with a quantity and its unit, which must be that of the item in the control table."""
+"""Value of a register: the raw integer, or a quantity with a unit of the item's kind, such as `500 us`."""
 
 STAGE: ServoKey[Mapping[str, Register]] = ServoKey(
     "registers",

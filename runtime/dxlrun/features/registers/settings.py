@@ -1,4 +1,4 @@
-"""Declared registers, checked against the servos' control tables, the bus, and the limits of joints.
+"""Checks register values of a robot file or a client against control tables, buses and joint limits.
 
 The same items are reserved for dxlrun in the robot file and in requests of clients.
 """
@@ -57,16 +57,16 @@ _OWN: Mapping[str, tuple[str, str]] = MappingProxyType(
         "electronic_gearratio_denominator": _TICK,
     }
 )
-"""Items that dxlrun writes itself or relies on, with the reason and the fix."""
+"""Items that a robot file or client cannot set because dxlrun writes or needs them; reason and fix."""
 _RESTORED = ("profile_velocity", "torque_limit")
-"""Items that start-up writes on some models only; on the other models they are reported."""
+"""Items that dxlrun restores at start on some models only; on the others they can be declared."""
 _ANGLE_LIMITS = ("cw_angle_limit", "ccw_angle_limit")
 
 
 def compile_registers(
     file: RobotFile, servo: DescribedServo, table: ControlTable
 ) -> tuple[RegisterValue, ...]:
-    """Return the declared registers of a servo in the order of writing: EEPROM first, by address.
+    """Return the values of a servo's `registers` in the order of writing: EEPROM first, by address.
 
     Status Return Level comes before all others, so that their writes are acknowledged.
     """
@@ -94,7 +94,7 @@ def compile_registers(
 
 
 def check_position_limits(file: RobotFile, plan: BusPlan) -> None:
-    """Refuse declared position limits narrower than those of the joint: the servo would refuse goals.
+    """Add an error for each servo whose declared position limits are narrower than its joint's limits.
 
     Multi-turn modes ignore the limits (e-Manual XM430-W350, Min/Max Position Limit (52, 48)).
     """
@@ -111,7 +111,7 @@ def check_position_limits(file: RobotFile, plan: BusPlan) -> None:
 
 
 def _place(description: Description, servo: ServoPlan, register: str) -> Mark:
-    """Return the place where a servo of the plan declares a register."""
+    """Return line and column where the robot file declares a register of a servo."""
     for described in described_servos(description):
         if described.name == servo.own_name:
             return described.mark(description.marks, "registers", register)
@@ -127,7 +127,7 @@ def _narrow(servo: ServoPlan) -> Iterator[tuple[RegisterValue, int]]:
 
 
 def register_value(table: ControlTable, name: str, value: int | str) -> RegisterValue:
-    """Return the value to write for a declared register.
+    """Check a register value that a robot file declares, and convert it into the integer to write.
 
     Args:
         table: Control table of the servo.
@@ -148,7 +148,10 @@ def register_value(table: ControlTable, name: str, value: int | str) -> Register
 
 
 def check_change(table: ControlTable, name: str, value: int | str) -> RegisterValue:
-    """Return the value to write for a register that a client changes in a run; raise UnfitRegister."""
+    """Check a register value that a client sets during a run, and convert it; raise UnfitRegister.
+
+    Items that dxlrun uses and items in the EEPROM are refused.
+    """
     item = table.items.get(name)
     if item is not None and item.access == "R":
         raise UnfitRegister(f"{item.title} can only be read", "write another item")
@@ -169,13 +172,13 @@ def check_change(table: ControlTable, name: str, value: int | str) -> RegisterVa
 
 
 def declarable(table: ControlTable) -> tuple[str, ...]:
-    """Return the items of a model that can be declared, in the order of their addresses."""
+    """Return the names of a model's items that `registers` can set, in the order of their addresses."""
     items = table.items.values()
     return tuple(item.name for item in items if item.access == "RW" and not own_reason(table, item))
 
 
 def own_reason(table: ControlTable, item: ControlItem) -> tuple[str, str] | None:
-    """Return the reason why an item is reserved for dxlrun, and the fix; None if it is not."""
+    """Return reason and fix if an item cannot be set because dxlrun uses it; else None."""
     if item.name.startswith("indirect_"):
         return "a reboot resets it", "remove it"
     if item.name in _ANGLE_LIMITS and table.protocol == 1.0:
@@ -190,7 +193,7 @@ def own_reason(table: ControlTable, item: ControlItem) -> tuple[str, str] | None
 
 
 def _check_meaning(item: ControlItem, raw: int) -> None:
-    """Refuse values that a servo accepts but that prevent every start."""
+    """Refuse a value that the servo would accept, but with which dxlrun would refuse every start."""
     rule, factory = item.deviation, item.initial
     if rule is None or rule.planned or factory is None or rule.judge(raw, factory) != "refuse":
         return

@@ -1,4 +1,4 @@
-"""Sensors of the robot file, checked against plug-ins, names, the URDF and the simulation."""
+"""Compiles the section `sensors` and checks it against plug-ins, names, the URDF and the simulation."""
 
 from __future__ import annotations
 
@@ -25,7 +25,7 @@ _TIMEOUT_PERIODS = 5
 
 
 def compile_sensors(compilation: Compilation) -> Contribution:
-    """Return the sensors of the file without mistakes in their type, parameters and names."""
+    """Return plans and sources of the sensors; those with a wrong type or parameters are missing."""
     file, body = compilation.file, compilation.body
     links = None if body is None else body.urdf.links
     described = form.STAGE.of(file.robot)
@@ -78,7 +78,7 @@ def _compiled(
 
 
 def _plan(name: str, entry: SensorEntry, offer: DriverOffer, period_ns: int) -> SensorPlan:
-    """Return the plan of a sensor, with what its class names.
+    """Return the plan of a sensor from its entry and from what its class returns (states, links, units).
 
     Raises:
         ValidationError: The parameters are invalid.
@@ -120,7 +120,7 @@ def _check_links(
     links: Collection[str],
     known: Collection[str] | None,
 ) -> None:
-    """Check that the links sensed by a simulated sensor exist."""
+    """Add errors if a sensor of simulated links has no URDF, a real bus, or a link that does not exist."""
     robot = file.robot
     if not links:
         return
@@ -148,7 +148,7 @@ def _check_links(
 
 
 def _text_mark(file: RobotFile, name: str, entry: SensorEntry, text: str) -> Mark:
-    """Return the place of a text in a sensor's parameters, else the sensor's own place."""
+    """Return line and column of a text in a sensor's parameters, else those of the sensor."""
     for key, value in entry.parameters.items():
         if value == text:
             return file.at("sensors", name, key)

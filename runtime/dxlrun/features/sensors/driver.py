@@ -1,4 +1,4 @@
-"""Sensor: base class of sensor drivers and the types of its interface."""
+"""Sensor driver: base class of sensors of plug-ins, and what dxlrun passes to them."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ P = TypeVar("P", bound=ParametersModel)
 
 
 INERTIAL = ("angular_velocity", "linear_acceleration")
-"""Quantities of an IMU. Their noise is at least about one unit of resolution: 4 and 8 for an MPU-6050."""
+"""Quantities of an IMU; their noise is about one unit of resolution or more: 4 and 8 for an MPU-6050."""
 
 
 UNITS: Mapping[str, str] = MappingProxyType(
@@ -32,22 +32,22 @@ UNITS: Mapping[str, str] = MappingProxyType(
         "voltage": "V",
     }
 )
-"""Units of quantities in messages of ROS 2 (sensor_msgs: Imu, MagneticField, Temperature, BatteryState;
-geometry_msgs: Wrench)."""
+"""Unit of each quantity, the first word of a state's name, as in ROS 2 (sensor_msgs: Imu, MagneticField,
+Temperature, BatteryState; geometry_msgs: Wrench)."""
 
 
 class SensorContext(msgspec.Struct, frozen=True):
-    """Data and functions that a sensor gets in `open`."""
+    """Argument of a sensor's `open`: its name and period, the clock, event output, simulated body."""
 
     name: str
     period_ns: int
-    """Time between two samples, from `rate` in the robot file."""
+    """Time between two samples, ns, from `rate` in the robot file."""
     now_ns: Callable[[], int]
-    """Clock of the run: CLOCK_MONOTONIC, or virtual time."""
+    """Returns the time of the run in ns: CLOCK_MONOTONIC, or virtual time."""
     say: Callable[[str], None]
-    """Log a sentence as an event (SENSOR). Of several sentences within 0.1 s, only the last one is logged."""
+    """Writes a sentence into the log as an event. Of several within 0.1 s, only the last one is logged."""
     body: Body | None = None
-    """Simulated body at the time of the sample; None: the sensor has no `links`."""
+    """Motion of the simulated robot at the time of a sample; None if the sensor has no `links`."""
 
 
 class Sensor(ABC, Generic[P]):
@@ -71,12 +71,13 @@ class Sensor(ABC, Generic[P]):
     """
 
     Parameters: ClassVar[type[ParametersModel]] = ParametersModel
-    """Model of the sensor's keys in the robot file (except type, rate, timeout and on_lost)."""
+    """Class that validates the sensor's keys in the robot file (except type, rate, timeout and on_lost)."""
     waits: ClassVar[bool] = False
-    """True if `read` waits for the device's next sample; False: `read` is called at the sensor's rate."""
+    """True if `read` blocks until the device's next sample; False if dxlrun calls `read` at the sensor's
+    rate."""
     simulated: ClassVar[bool] = False
-    """True if it works on virtual time: `read` never waits, and depends only on the clock, the parameters and
-    the body."""
+    """True if it works on virtual time: `read` never blocks, and depends only on the clock, the parameters
+    and the simulated body."""
 
     def __init__(self, parameters: P) -> None:
         self.parameters = parameters
@@ -84,11 +85,11 @@ class Sensor(ABC, Generic[P]):
     @classmethod
     @abstractmethod
     def states(cls, parameters: P) -> tuple[str, ...]:
-        """Return the names of its states in the order of a sample: `angular_velocity.x`. Units are SI."""
+        """Return the names of a sample's states, such as `angular_velocity.x`, in SI units."""
 
     @classmethod
     def units(cls, parameters: P) -> Mapping[str, str]:
-        """Return the units of states, by state: `{"illuminance": "lx"}`.
+        """Return the unit of each state that has one: `{"illuminance": "lx"}`.
 
         The default has the units of quantities in ROS 2 messages, such as rad/s for `angular_velocity.x`.
         """
@@ -97,7 +98,7 @@ class Sensor(ABC, Generic[P]):
 
     @classmethod
     def links(cls, parameters: P) -> tuple[str, ...]:
-        """Return the links of the robot's URDF whose motion it senses.
+        """Return the URDF links whose simulated motion the sensor measures; empty for a real sensor.
 
         A sensor with links is a simulated one, which requires simulated servos.
         """
@@ -105,17 +106,16 @@ class Sensor(ABC, Generic[P]):
 
     @classmethod
     def noisy(cls, parameters: P) -> tuple[str, ...]:
-        """Return the states whose noise exceeds their resolution.
+        """Return the states that always change because of noise; if all stay equal, the sensor is stuck.
 
-        A sensor counts as stuck if all of them stay constant. The default has angular velocity and linear
-        acceleration of an IMU that measures both.
+        The default has angular velocity and linear acceleration of an IMU that measures both.
         """
         noisy = [state for state in cls.states(parameters) if state.partition(".")[0] in INERTIAL]
         both = {state.partition(".")[0] for state in noisy} == {*INERTIAL}
         return tuple(noisy) if both else ()
 
     def open(self, context: SensorContext) -> None:
-        """Open the device, and store `context`."""
+        """Open the device; an override stores `context` or calls this method."""
         self.context = context
 
     @abstractmethod
@@ -130,4 +130,4 @@ class Sensor(ABC, Generic[P]):
         """
 
     def close(self) -> None:
-        """Close the device, also after an incomplete `open`."""
+        """Close the device; also called after `open` failed."""

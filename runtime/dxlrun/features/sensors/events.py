@@ -1,4 +1,4 @@
-"""Events of sensors."""
+"""Codes of the events that sensors cause."""
 
 from __future__ import annotations
 
@@ -8,14 +8,14 @@ from dxlrun.channels.events import EventStage
 
 
 class SensorEvent(IntEnum):
-    """Kind of an event of a sensor."""
+    """Code of an event about a sensor."""
 
     SENSOR = 52
-    """Report of a sensor or its process: open failed, ended, opened again, or a text of the driver."""
+    """A message of the driver, or a failure or restart of the sensor or its process."""
     SENSOR_LOST = 53
-    """A sensor had no new samples within its timeout, or values that are not finite. It is not valid."""
+    """The sensor is invalid: no new sample within its timeout, or values that are not finite."""
     SENSOR_BACK = 54
-    """A lost sensor has samples again."""
+    """The sensor is valid again after it was lost."""
 
 
 STAGE = EventStage(SensorEvent)

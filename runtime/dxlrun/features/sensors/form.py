@@ -1,4 +1,4 @@
-"""Form of the section `sensors`; the plug-in that offers a type checks the keys of that type."""
+"""Form of the section `sensors` of a robot file; the keys of each type are checked by its plug-in."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ from dxlrun.features.feature import Section
 
 
 class SensorEntry(PlugInEntry):
-    """One sensor. Keys other than type, rate, timeout and on_lost are its own parameters."""
+    """Form of one sensor. Keys other than type, rate, timeout and on_lost are parameters of its type."""
 
     type: str = key("Sensor type of a plug-in.", "serial_imu", min_length=1)
     rate: Annotated[float, Field(ge=0.001, le=100_000), units.rate] | None = key(

@@ -1,4 +1,4 @@
-"""Monitor of needed sensors: ends a run when a sensor with `on_lost: stop` delivers no new samples."""
+"""Monitor that ends a run when a sensor with `on_lost: stop` delivers no samples."""
 
 from __future__ import annotations
 
@@ -14,16 +14,16 @@ from dxlrun.plan.loop_plan import LoopPlan
 
 @dataclass(slots=True)
 class NeededSensors:
-    """Ends the run when the newest sample of a needed sensor is older than its timeout."""
+    """Sensors with `on_lost: stop`; the run ends by `on_fault` if the newest sample of one is too old."""
 
     needed: tuple[tuple[int, SensorPlan], ...]
-    """Sensors whose loss ends the run, with their rows among the sources."""
+    """These sensors, each with its row among the sources of the record."""
     record: CycleRecord
     actions: PolicyActions
 
     @classmethod
     def build(cls, plan: LoopPlan, record: CycleRecord, actions: PolicyActions) -> Self | None:
-        """Return a monitor of the needed sensors; None: there are none."""
+        """Return the monitor of all sensors with `on_lost: stop` in a plan; None if there are none."""
         needed = tuple(
             (record.layout.sources.index(one.name), one)
             for one in decode_sensors(plan.feature_plans.get("sensors", b""))
@@ -32,7 +32,7 @@ class NeededSensors:
         return cls(needed, record, actions) if needed else None
 
     def check(self, time_ns: int) -> None:
-        """Compare ages with timeouts; a sensor without a sample yet is as old as the run."""
+        """End the run if a sample is older than its sensor's timeout; without one, the run's time counts."""
         ages_ns = self.record.sources.age_ns
         for row, sensor in self.needed:
             age_ns = ages_ns.item(row)

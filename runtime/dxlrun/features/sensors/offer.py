@@ -1,4 +1,4 @@
-"""Sensor classes of plug-ins, checked against the contract when they are loaded."""
+"""Checks sensor classes of plug-ins against the contract of `Sensor` when they are loaded."""
 
 from __future__ import annotations
 
@@ -11,11 +11,11 @@ from dxlrun.features.sensors.driver import Sensor
 from dxlrun.features.sensors.form import SensorEntry
 
 _METHODS = ("__init__", "states", "units", "links", "noisy", "open", "read", "close")
-"""Methods that dxlrun calls, always with positional arguments."""
+"""Methods of a sensor that dxlrun calls, always with positional arguments."""
 
 
 def sensor_breach(sensor: object) -> Breach | None:
-    """Check a class that is offered as a sensor."""
+    """Return how an object breaks the contract of a sensor class, with the fix; None if it does not."""
     if not is_model(sensor, Sensor):
         return "which is not a sensor", "derive a class from dxlrun.Sensor"
     if breach := methods_breach(sensor, Sensor, _METHODS):
@@ -29,7 +29,10 @@ def sensor_breach(sensor: object) -> Breach | None:
 
 
 def names_breach(states: object, links: object) -> Breach | None:
-    """Check the results of a sensor's `states` and `links`."""
+    """Return what is wrong with the results of a sensor's `states` and `links`, with the fix;
+
+    None if nothing.
+    """
     for what, names in (("states", states), ("links", links)):
         if not isinstance(names, tuple) or not all(isinstance(one, str) for one in names):
             return f"returns {names!r} from {what}", "return a tuple of names, such as angular_velocity.x"
@@ -47,7 +50,7 @@ def names_breach(states: object, links: object) -> Breach | None:
 
 
 def is_units(found: object, states: Collection[str]) -> bool:
-    """Return True if the value is a mapping from states to units."""
+    """Return True if a result of a sensor's `units` maps some of its states to texts."""
     return (
         isinstance(found, Mapping)
         and set(found) <= set(states)

@@ -1,4 +1,4 @@
-"""Plan of the sensors: settings of each sensor's process, and of the loop for it."""
+"""Plan of the sensors: the settings that the loop and each sensor's process need."""
 
 from __future__ import annotations
 
@@ -8,7 +8,7 @@ import msgspec
 
 
 class SensorPlan(msgspec.Struct, frozen=True):
-    """Settings of one sensor, for its process and for the loop."""
+    """Settings of one sensor for its process and for the loop, as stored in the plan."""
 
     name: str
     type: str
@@ -18,21 +18,21 @@ class SensorPlan(msgspec.Struct, frozen=True):
     period_ns: int  # time between two samples
     timeout_ns: int  # age at which its values become invalid
     on_lost: Literal["continue", "stop"] = "continue"
-    """Reaction of the run when it delivers no sample for that time."""
+    """Reaction of the run if no sample arrives for `timeout_ns`."""
     links: tuple[str, ...] = ()
-    """Links of the URDF whose simulated motion it senses; empty: it measures the real world."""
+    """URDF links whose simulated motion the sensor measures; empty for a real sensor."""
     simulated: bool = False  # can be stepped on virtual time
     noisy: tuple[str, ...] = ()
-    """States that never all stay constant while the sensor works; if they do, the sensor is stuck."""
+    """States that always change because of noise; if all of them stay equal, the sensor is stuck."""
     units: dict[str, str] = {}
-    """SI unit of each state that has one, by its name."""
+    """SI unit of each state that has one, by the state's name."""
 
 
 def encode_sensors(sensors: tuple[SensorPlan, ...]) -> bytes:
-    """Return the sensors for `Contribution.plan`; empty without sensors."""
+    """Encode sensor plans as JSON for `Contribution.plan`; empty bytes without sensors."""
     return msgspec.json.encode(sensors) if sensors else b""
 
 
 def decode_sensors(plan: bytes) -> tuple[SensorPlan, ...]:
-    """Return the sensors in `Contribution.plan`, in the order of the file."""
+    """Decode the sensor plans from `Contribution.plan`, in file order; empty bytes give none."""
     return msgspec.json.decode(plan, type=tuple[SensorPlan, ...]) if plan else ()

@@ -1,4 +1,4 @@
-"""Processes of the sensors: one for each sensor, which samples it at its own rate."""
+"""Sensor processes: list them for the supervisor, and build the sensor inside its process."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ from dxlrun.features.sensors.plan import SensorPlan, decode_sensors
 
 
 def list_processes(plan: bytes) -> tuple[SourceProcess, ...]:
-    """Return the process of each sensor, in the order of the file."""
+    """Return one process description for each sensor in a plan, in file order."""
     return tuple(
         SourceProcess(
             source=sensor.name,
@@ -30,7 +30,7 @@ def list_processes(plan: bytes) -> tuple[SourceProcess, ...]:
 
 
 def build_sampled_sensor(plan: bytes, context: SourceContext) -> SampledSource:
-    """Build the sensor of a process; raise PlugInError."""
+    """Build the sensor of this process from its encoded plan; raise PlugInError if that fails."""
     sensor = msgspec.json.decode(plan, type=SensorPlan)
     driver = build_sensor(context.plugins, sensor)
 
@@ -41,7 +41,7 @@ def build_sampled_sensor(plan: bytes, context: SourceContext) -> SampledSource:
 
 
 def build_sensor(plugins: PlugIns, plan: SensorPlan) -> Sensor[Any]:
-    """Return a new sensor of the plan's type.
+    """Create an instance of the sensor class that a plan names.
 
     Raises:
         PlugInError: The type is not available, or its class refuses the parameters.
@@ -58,7 +58,7 @@ def build_sensor(plugins: PlugIns, plan: SensorPlan) -> Sensor[Any]:
 
 
 def refuse_virtual_time(plan: bytes) -> str:
-    """Return a sentence about sensors of the real world, which cannot follow virtual time; empty: none."""
+    """Return the error for `--virtual` if a plan has real sensors; empty if all are simulated."""
     measuring = [sensor for sensor in decode_sensors(plan) if not sensor.simulated]
     names = ", ".join(f"{sensor.name} ({sensor.type})" for sensor in measuring)
     return names and (

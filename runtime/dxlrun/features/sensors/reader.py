@@ -1,4 +1,4 @@
-"""Reader of the sensors: copies their newest samples into the cycle's record without blocking."""
+"""Sensor reader: copies each sensor's newest sample from shared memory into the cycle's record."""
 
 from __future__ import annotations
 
@@ -14,29 +14,30 @@ from dxlrun.features.sensors import texts
 from dxlrun.features.sensors.plan import SensorPlan, decode_sensors
 
 _GONE = (SlotState.FAILED, SlotState.ENDED)
-"""States of a slot without a device or without a process."""
+"""States of a sensor's shared memory in which no sample can come: its device or process is gone."""
 
 
 MOST_EQUAL = 20
-"""A sensor is stuck after this many equal samples. With noise of only 0.3 units of the last digit the six
-values of an IMU repeat in 2 of 5 samples, so 20 times in a row once in 10^8 samples. [i]"""
+"""A sensor is stuck only after this many equal samples in a row. With noise of only 0.3 units of the last
+digit the six values of an IMU repeat in 2 of 5 samples, so 20 times in a row once in 10^8 samples. [i]"""
 STUCK_NS = 200_000_000
-"""Shortest time of equal samples of a stuck sensor."""
+"""Shortest duration of equal samples, ns, after which a sensor can count as stuck."""
 STUCK_INTERVALS = 4
-"""The same time in units of the longest interval between two changes so far: a driver may be called more
+"""The same duration in multiples of the longest time between two changes so far: a driver may be called more
 often than its device measures."""
 FIRST_STUCK_NS = 2_000_000_000
-"""Longest time of equal samples, also before the first change; a Phidget measures every 250 ms by default."""
+"""Duration of equal samples, ns, that always counts as stuck, and the limit before the first change; a
+Phidget measures every 250 ms by default."""
 QUIET_NS = 100_000_000
-"""Shortest time between two messages of a working sensor, so that they do not fill the log."""
+"""Shortest time between two messages of a working sensor in the log, ns; others are dropped."""
 
 
 class Readings:
-    """The loop's end of all slots.
+    """Reads the samples of all sensors in the loop process; emits an event when one is lost or back.
 
     A row is valid if its sensor is present, and its newest sample is finite and younger than its timeout.
     Values and age remain those of the last finite sample. The samples of a stuck sensor, whose noisy values
-    stay constant, have the age of the first of them. Each change is one event.
+    stay constant, have the age of the first of them.
     """
 
     def __init__(self, context: ReaderContext) -> None:
@@ -47,7 +48,7 @@ class Readings:
         )
 
     def read(self) -> None:
-        """Fill the rows of the record."""
+        """Copy each sensor's newest sample, age and validity into the cycle's record; never blocks."""
         now_ns = self._now_ns()
         for row in self._rows:
             row.read(now_ns)
@@ -69,13 +70,13 @@ class _Row:
         self._noisy = np.array([plan.states.index(state) for state in plan.noisy], dtype=np.intp)
         quantities = [state.partition(".")[0] for state in plan.noisy]
         self._quantities = [self._noisy[[one == each for each in quantities]] for one in {*quantities}]
-        """Indices of the noisy states of each quantity."""
+        """Indices of the noisy states, one array for each quantity."""
         self._equal, self._since_ns = 0, -1
-        """Number of samples equal to the one before, and the time of the first of them."""
+        """Number of samples since the last change of the noisy states, and the time of that change, ns."""
         self._stuck_ns = FIRST_STUCK_NS
-        """Time of equal samples after which the sensor is stuck."""
+        """Duration of equal samples, ns, after which this sensor counts as stuck."""
         self._longest_ns = 0
-        """Longest time between two changes of the noisy values."""
+        """Longest time between two changes of the noisy states so far, ns."""
         self._quiet_ns = 0
         self._finite = True
         self._lost = False
@@ -107,7 +108,7 @@ class _Row:
         return self._equal >= MOST_EQUAL and self._t_ns == self._since_ns
 
     def _take(self, sample: Floats, t_ns: int) -> None:
-        """Store a sample with its time; samples that stay equal for too long get the time of the first."""
+        """Store a sample with its time; if the sensor is stuck, the time of its last change is stored."""
         noisy = self._noisy
         if noisy.size and np.array_equal(sample[noisy], self._values[noisy]):
             self._equal += 1

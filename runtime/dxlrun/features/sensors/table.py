@@ -1,4 +1,4 @@
-"""Table of the sensors for `dxlrun check`."""
+"""Table of the sensors, as `dxlrun check` prints it."""
 
 from __future__ import annotations
 
@@ -12,12 +12,12 @@ from dxlrun.plan.robot_plan import Plan
 
 
 def sensor_rows(plan: Plan) -> Iterator[Row]:
-    """Yield a row for each sensor, in the order of the file."""
+    """Yield the columns of each sensor in a plan as a mapping, in file order."""
     return map(_sensor, decode_sensors(plan.feature_plans.get("sensors", b"")))
 
 
 def sensor_table(sensors: Sequence[Row]) -> Table:
-    """Return the table of these sensors."""
+    """Return the printable table `Sensors` of these rows."""
     columns: list[tuple[Column, str | Callable[[Row], Value]]] = [
         (Column("sensor", "name"), "name"),
         (Column("type", "name"), "type"),

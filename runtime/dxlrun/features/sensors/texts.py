@@ -1,4 +1,4 @@
-"""Texts of sensors: their events."""
+"""Texts of the events that sensors cause."""
 
 from __future__ import annotations
 
