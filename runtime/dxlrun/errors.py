@@ -54,8 +54,7 @@ __all__ = [
 
 
 def told_once(problems: Iterable[Problem], names: Collection[str]) -> list[Problem]:
-    """Return the problems without repetitions: of problems at one place that differ only in one of the
-    `names`, the first.
+    """Merge problems that differ only in a joint's name (`names`) at one place into the first, with a count.
 
     A mistake in the defaults of many joints is one mistake.
     """
@@ -73,7 +72,7 @@ def told_once(problems: Iterable[Problem], names: Collection[str]) -> list[Probl
 
 
 class PlugInError(InputError, ImportError):
-    """A plug-in is missing, broken on import, or made for another version of the contract."""
+    """A plug-in is missing, fails on import, or is made for another version of dxlrun's contract."""
 
 
 class Refused(DxlrunError):
@@ -98,11 +97,11 @@ class Refused(DxlrunError):
 
 
 class GoalTimeout(DxlrunError, TimeoutError):
-    """A goal did not end within its timeout; it continues."""
+    """A goal did not end within the client's timeout; the robot still pursues it."""
 
 
 class StartUpError(DxlrunError, RuntimeError):
-    """A servo differs from the robot file; torque stayed off, or was switched off again.
+    """A servo differs from the robot file at the start of a run, so torque is off.
 
     `for_replies` is True if replies were late or missing, which a machine that was too busy may have caused.
     """
@@ -113,23 +112,23 @@ class StartUpError(DxlrunError, RuntimeError):
 
 
 class ServoFault(DxlrunError, RuntimeError):
-    """A servo refused the request of a tool, or did not answer; the message names it."""
+    """A servo refused a request of a command-line tool, or did not answer; the message names the servo."""
 
 
 class ControllerFault(DxlrunError, RuntimeError):
-    """A controller raised, or broke its contract; the message names the controller and the joint."""
+    """A controller raised an exception or broke its contract; the message names it and the joint."""
 
 
 class ProcessFault(DxlrunError, RuntimeError):
-    """A process of the run ended, hung, or could not be started."""
+    """A process of the run exited, hung, or could not be started."""
 
 
 class RunGone(DxlrunError):
-    """The run ended, or cannot be steered any more, while a client worked on it."""
+    """The run ended, or cannot be steered any more, while a client was connected."""
 
 
 class LogError(DxlrunError, ValueError):
-    """A log cannot be read, or is not one of dxlrun."""
+    """A log cannot be read, or the file is not a log of dxlrun."""
 
     exit_code = 2
 

@@ -1,4 +1,4 @@
-"""Installed plug-ins: entry points of dxlrun's groups, with their publishers.
+"""Installed plug-ins: finds Python packages with entry points of dxlrun, without importing them.
 
 Finding them reads the metadata of every installed distribution, which is done once per process.
 """
@@ -16,29 +16,28 @@ PHYSICS_GROUP = "dxlrun.physics"
 
 
 class InstalledPlugin(NamedTuple):
-    """An installed plug-in that has not been imported."""
+    """Entry point of an installed plug-in, which has not been imported."""
 
     name: str
-    """Name of the entry point."""
+    """Name of the entry point, as the plug-in's package declares it."""
     publisher: str
-    """Distribution of the plug-in: `name version`."""
+    """Package that provides the plug-in, with its version: `name version`."""
     point: EntryPoint
 
 
 def installed_plugins(group: str = GROUP) -> tuple[InstalledPlugin, ...]:
-    """Return all installed plug-ins of a group by name, then by publisher, independently of the file system's
-    order."""
+    """Return all installed plug-ins with entry points in a group, sorted by name, then by publisher."""
     return _read(tuple(sys.path))[group]
 
 
 def distribution_name(publisher: str) -> str:
-    """Return the name of a distribution from its publisher, `name version`."""
+    """Return the package's name from a publisher `name version`."""
     return publisher.rpartition(" ")[0] or publisher
 
 
 @cache
 def _read(path: tuple[str, ...]) -> Mapping[str, tuple[InstalledPlugin, ...]]:
-    """Return the plug-ins on a path, by group; the path is the key of the cache."""
+    """Read the plug-ins of all groups from the installed packages; `path` is only the key of the cache."""
     found = entry_points()
     groups = {group: found.select(group=group) for group in (GROUP, PHYSICS_GROUP)}
     publishers: dict[Distribution | None, str] = {None: "an unknown distribution"}

@@ -1,4 +1,4 @@
-"""Process table: state of a Linux process, and the runs on this computer with their processes."""
+"""Process table: reads from /proc the state of processes, and finds running runs of dxlrun."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ PROC = Path("/proc")
 # Beginning of a plan as JSON.
 _ROBOT = re.compile(rb'\{"robot":"([^"\\]+)"')
 UNKNOWN = "?"
-"""State of a process whose entry cannot be read; it may be alive."""
+"""State letter for a process whose entry in /proc cannot be read; it may be alive."""
 _DEAD = "ZXx"
 _STOPPED = "Tt"
 SUPERVISOR = "supervisor"
@@ -24,35 +24,35 @@ _ROLES = {
     b"dxlrun.remote": "gateway",
 }
 KIND = "--kind"
-"""Argument of the processes of features, which is followed by the role."""
+"""Command-line argument of a feature's process; the next argument is its role."""
 
 
 class ProcessStat(NamedTuple):
-    """An entry of the process table (proc_pid_stat(5))."""
+    """State, parent and start time of a process, from /proc/PID/stat (proc_pid_stat(5))."""
 
     state: str
     """One letter: R running, S and D waiting, T stopped by a signal, t by a debugger, Z and X dead."""
     parent: int
     start_ticks: int
-    """Start time. It distinguishes processes that reuse an ID."""
+    """Start time in clock ticks after boot, which distinguishes processes that reuse a PID."""
 
     @property
     def is_dead(self) -> bool:
-        """True when the process has exited, even if its parent has not reaped it."""
+        """True if the process has exited, even if its parent has not reaped it."""
         return self.state in _DEAD
 
     @property
     def is_stopped(self) -> bool:
-        """True when a signal or a debugger has stopped the process until it is continued."""
+        """True if a signal or a debugger has paused the process."""
         return self.state in _STOPPED
 
     def has_ended(self, start_ticks: int) -> bool:
-        """Return whether the process with this start time has exited, or its ID belongs to another one."""
+        """Return True if the process that started at this time has exited; its PID may be in use again."""
         return self.state != UNKNOWN and (self.is_dead or self.start_ticks != start_ticks)
 
 
 def read_stat(folder: Path) -> ProcessStat | None:
-    """Return the entry of a process by its folder in /proc; None when the process does not exist.
+    """Read a process's entry, by its folder /proc/PID; None if the process does not exist.
 
     Only ENOENT and ESRCH prove that. After any other error, such as EMFILE, the state is `UNKNOWN`.
     """
@@ -66,7 +66,7 @@ def read_stat(folder: Path) -> ProcessStat | None:
 
 
 class RunProcess(NamedTuple):
-    """A process of a run."""
+    """A living process of a run: PID, role (such as `loop` or `guardian`), and state."""
 
     pid: int
     role: str
@@ -77,25 +77,25 @@ class RunProcess(NamedTuple):
 
 
 class FoundRun(NamedTuple):
-    """A run on this computer with its living processes, which share the memory of its plan."""
+    """A run on this computer: its robot, and its processes, which all have the memory of its plan open."""
 
     robot: str
     processes: tuple[RunProcess, ...]
     runtime_directory: str
-    """XDG_RUNTIME_DIR in the run's environment, where its gateway listens; empty when unset."""
+    """XDG_RUNTIME_DIR of the run, the directory of its gateway's socket; empty if unset."""
 
     def process(self, role: str) -> RunProcess | None:
-        """Return the run's process of this role; None when it has exited."""
+        """Return the run's process with a role such as `loop`; None if there is none (any more)."""
         return next((one for one in self.processes if one.role == role), None)
 
     def memory(self, name: str) -> Path | None:
-        """Return the path of the run's shared memory of this name; None when no process has it open."""
+        """Return the path in /proc of the run's shared memory `name`; None if no process has it open."""
         found = (_memory_path(PROC / str(one.pid), name) for one in self.processes)
         return next((path for path in found if path is not None), None)
 
 
 def is_alive(process: RunProcess) -> bool:
-    """Return whether a process of a run is alive; its ID may belong to another process now."""
+    """Return True if this process of a run is still alive, and not another one with the same PID."""
     stat, found = read_stat(PROC / str(process.pid)), process.stat
     # Without a start time, only the ID identifies the process.
     if stat is None or found.state == UNKNOWN:
@@ -104,13 +104,13 @@ def is_alive(process: RunProcess) -> bool:
 
 
 def robot_of(process: Path) -> str | None:
-    """Return the name of the robot that a process runs, by its folder in /proc; None for other processes."""
+    """Return the robot of the run to which a process belongs, by its folder in /proc; None if to none."""
     found = _plan_memory(process)
     return found[1] if found else None
 
 
 def describe_run(process: Path) -> str:
-    """Return a text about the run of a process and how to stop it, by its folder in /proc; empty: no run."""
+    """Return a sentence on the run to which a process belongs and how to stop it; empty if to none."""
     robot = robot_of(process)
     if robot is None:
         return ""
@@ -118,7 +118,7 @@ def describe_run(process: Path) -> str:
 
 
 def found_runs() -> list[FoundRun]:
-    """Return the runs of this user (root: all users) on this computer, in any state."""
+    """Return all runs on this computer that this user can see (root: of all users)."""
     runs: dict[tuple[int, int], tuple[str, list[RunProcess]]] = {}
     for folder in PROC.iterdir():
         if not folder.name.isdigit():
@@ -133,7 +133,7 @@ def found_runs() -> list[FoundRun]:
 
 
 def _members(processes: list[RunProcess]) -> Iterator[RunProcess]:
-    """Yield the members of a run. A supervisor is the parent of members, or executes dxlrun."""
+    """Yield the processes that belong to a run, with their roles; others only share its memory."""
     parents = {one.stat.parent for one in processes}
     for one in sorted(processes):
         if one.role:
@@ -143,7 +143,7 @@ def _members(processes: list[RunProcess]) -> Iterator[RunProcess]:
 
 
 def _plan_memory(process: Path) -> tuple[tuple[int, int], str] | None:
-    """Return device and inode of the plan's memory that a process has open, and the robot of the plan."""
+    """Return (device, inode) of the plan's shared memory that a process has open, and the robot's name."""
     # The process may just have exited, or belong to another user.
     with suppress(OSError, UnicodeDecodeError):
         if descriptor := _memory_path(process, "plan"):
@@ -154,7 +154,7 @@ def _plan_memory(process: Path) -> tuple[tuple[int, int], str] | None:
 
 
 def _memory_path(process: Path, name: str) -> Path | None:
-    """Return the path of a process' shared memory with this name; None without one."""
+    """Return the path in /proc of a process's shared memory `name`; None if it has none."""
     # The process may just have exited, or belong to another user.
     with suppress(OSError):
         for descriptor in (process / "fd").iterdir():

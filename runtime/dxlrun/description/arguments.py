@@ -30,7 +30,7 @@ def _scalar(value: object) -> object:
 
 
 class Argument(Form):
-    """One argument of a robot file."""
+    """Form of one entry under `arguments:` of a robot file: its default value and help text."""
 
     default: Annotated[object, AfterValidator(_scalar)] = key(
         "Value of the argument if the command line gives none; an argument without a default is required.",
@@ -41,10 +41,10 @@ class Argument(Form):
 
 
 class Arguments:
-    """The arguments of one run: declared in the file, set on the command line."""
+    """All arguments of a robot file with their values in one run, from defaults and command line."""
 
     def __init__(self, block: object, given: Mapping[str, str], marks: Marks) -> None:
-        """Check the given values against the declarations.
+        """Compare the command line with the declared arguments; mistakes are added to `problems`.
 
         Args:
             block: The `arguments:` block as read from the file; None: there was none.
@@ -53,7 +53,7 @@ class Arguments:
         """
         self.problems: list[Problem] = []
         self.texts: dict[str, str] = {}
-        """Value of each argument as text."""
+        """Value of each argument as text, by name; arguments without a value are missing."""
         self._values: dict[str, object] = {}
         self._names: tuple[str, ...] = ()
         self._given = given
@@ -99,7 +99,7 @@ class Arguments:
         self.problems.append(Problem(self._marks.key(*path), what, fix))
 
     def fill(self, path: KeyPath, text: str, quoted: bool) -> Filled:
-        """Return the value of a scalar with its arguments inserted."""
+        """Insert the arguments into a scalar of the file, at a path; return its value and its origin."""
         if "${" not in text:
             return literal(path, text, quoted)
         if path[:1] == ("arguments",):
@@ -127,7 +127,7 @@ class Arguments:
 
 
 def refuse_arguments(path: KeyPath, text: str, quoted: bool) -> Filled:
-    """Return the value of a scalar in a file without arguments; a `${` is a problem."""
+    """Return the value of a scalar in a file without arguments, as a motion file: `${` is a problem."""
     if "${" in text:
         return _unusable("this file takes no arguments", "write the value itself")
     return literal(path, text, quoted)

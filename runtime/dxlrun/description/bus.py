@@ -1,4 +1,4 @@
-"""Bus: the form of one serial line in a robot file."""
+"""Bus: the form of one entry under `buses` of a robot file, a serial line."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ from dxlrun.description.form import Form, ItemName, key, refuse
 from dxlrun.description.units import AutoDuration, Duration, Rate
 
 HIGHEST_BAUD_RATE = 10_500_000
-"""bit/s, the rate of PRO, P and Y servos."""
+"""Highest baud rate of any servo, bit/s: that of PRO, P and Y."""
 SIMULATED = "sim"  # port of a simulated bus
 _HIGHEST_ID_OF_PROTOCOL_2 = 252  # 0xFD is in the header of each packet (e-Manual, Protocol 2.0, Packet ID)
 _LONGEST_TIMER_NS = 255_000_000  # The latency timer of an FTDI chip is one byte, ms (FTDI AN232B-04)
@@ -39,11 +39,11 @@ def _boot_time(value: int) -> int:
 
 
 _LEAST_LATENCY_NS: Mapping[str, int] = MappingProxyType({"ftdi": 1_000_000, "direct": 0})
-"""Lowest latency of each kind of adapter (protocol.md, Time budget)."""
+"""Latency of each kind of adapter, ns, if the file gives none (protocol.md, Time budget)."""
 
 
 class Adapter(Form):
-    """The adapter of a bus."""
+    """Form of `adapter` of a bus: the USB or UART adapter between computer and servos."""
 
     kind: Literal["ftdi", "direct"] | None = key(
         "Kind of adapter: an FTDI chip with its latency timer at 1 ms, or an adapter that delivers "
@@ -71,14 +71,14 @@ class Adapter(Form):
 
     @property
     def assumed_latency(self) -> int:
-        """Latency that it adds to each request, ns: as given, else by its kind, else an FTDI's default."""
+        """Delay that the adapter adds to each reply, ns: as in the file, else that of its kind, or 16 ms."""
         if self.kind is None or "latency" in self.model_fields_set:
             return self.latency
         return _LEAST_LATENCY_NS[self.kind]
 
 
 class BusSimulation(Form):
-    """Properties of a simulated bus itself, without its servos; a bus on a real port ignores them."""
+    """Form of `simulation` of a bus: how the simulated line and adapter behave; real ports ignore it."""
 
     latency_timer: Annotated[Duration, AfterValidator(_timer)] = key(
         "Latency timer of the simulated adapter, at most 255 ms; with `adapter: {kind: ftdi}`, the "
@@ -102,7 +102,7 @@ class BusSimulation(Form):
 
 
 class SlowRegisters(Form):
-    """Registers that are read periodically between the cycles."""
+    """Form of `slow_registers` of a bus: which registers are read between cycles, and how often."""
 
     items: Annotated[tuple[ItemName, ...], Field(strict=False)] | None = key(
         "Items to read, named as in the control table; temperature and voltage by default.",
@@ -113,7 +113,7 @@ class SlowRegisters(Form):
 
 
 class Bus(Form):
-    """One serial line with its servos."""
+    """Form of one bus: a serial line with its port, baud rate, adapter and protocol."""
 
     port: str = key("Serial device of the adapter, or sim for a simulated bus.", "/dev/ttyUSB0", min_length=1)
     protocol: Annotated[float, AfterValidator(_protocol)] = Field(
@@ -143,17 +143,17 @@ class Bus(Form):
 
     @property
     def latency_timer(self) -> int:
-        """Time for which the simulated adapter gathers bytes, ns: as given, else that of an FTDI, or 0."""
+        """Time for which the simulated adapter collects bytes, ns: as in the file, or that of its kind."""
         if "latency_timer" in self.simulation.model_fields_set or self.adapter.kind != "ftdi":
             return self.simulation.latency_timer
         return self.adapter.assumed_latency
 
     @property
     def latency(self) -> int:
-        """Latency that the adapter adds to each request, ns."""
+        """Delay that the (real or simulated) adapter adds to each reply, ns."""
         return self.latency_timer if self.port == SIMULATED else self.adapter.assumed_latency
 
     @property
     def highest_id(self) -> int:
-        """Highest ID of servos and devices on the bus."""
+        """Highest ID that a servo or device can have in the bus's protocol."""
         return _HIGHEST_ID_OF_PROTOCOL_2 if self.protocol == 2.0 else 253

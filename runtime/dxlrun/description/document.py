@@ -1,4 +1,4 @@
-"""Document: converts the bytes of a YAML file into plain values, each with its place in the file.
+"""Document: converts the text of a YAML file into plain values, each with its line and column.
 
 PyYAML only scans and parses (YAML's grammar has two hundred rules). It constructs no objects, so a tag in a
 file cannot name a class. Limits are checked on its stream of events, before a tree exists. Arguments are
@@ -27,9 +27,9 @@ from dxlrun.description.mistakes.syntax import explain_syntax
 from dxlrun.errors import InputError, Mark, Problem
 
 KeyPath = tuple[str | int, ...]
-"""Path from the top of a document to a value: keys of mappings, indices of lists."""
+"""Path from the top of a YAML file to a value: keys of mappings and indices of lists."""
 LARGEST_FILE = 1024 * 1024
-"""Bytes; files that a person writes are smaller."""
+"""Most bytes of a file that is read; files that a person writes are smaller."""
 _folder: ContextVar[Path | None] = ContextVar("folder", default=None)
 DEEPEST = 32  # nested mappings and lists
 MOST_NODES = 200_000  # keys, values, mappings and lists of a file; each use of an anchor counts
@@ -52,7 +52,7 @@ _Loader: type[yaml.SafeLoader] = getattr(
 
 
 class Marks(msgspec.Struct, frozen=True):
-    """Places of all keys and values of one file, and the origins of values from arguments."""
+    """Line and column of every key and value of one file, by path."""
 
     file: str
     values: Mapping[KeyPath, Mark]
@@ -60,15 +60,15 @@ class Marks(msgspec.Struct, frozen=True):
     origins: Mapping[KeyPath, str] = {}  # `rate:=100` for each value with an argument
 
     def value(self, *path: str | int) -> Mark:
-        """Return the place of a value, or of its nearest parent in the file."""
+        """Return line and column of a value; if it is not in the file, those of its nearest parent."""
         return self.values.get(path) or self._parent(path)
 
     def key(self, *path: str | int) -> Mark:
-        """Return the place of a key, of a list item (which has no key), or of the nearest parent."""
+        """Return line and column of a key or list item; if it is not in the file, of its nearest parent."""
         return self.keys.get(path) or self.values.get(path) or self._parent(path)
 
     def has(self, path: KeyPath) -> bool:
-        """Return True if the file has a value at a path."""
+        """Return True if the file has a value at this path."""
         return path in self.values
 
     def _parent(self, path: KeyPath) -> Mark:
@@ -80,14 +80,14 @@ class Marks(msgspec.Struct, frozen=True):
 
 
 class _Place(Protocol):
-    """PyYAML's mark; each of its two scanners has its own class."""
+    """Place in a YAML text, counted from 0, as PyYAML gives it; its two scanners have own classes."""
 
     line: int
     column: int
 
 
 class Tree(msgspec.Struct, frozen=True):
-    """Nodes of a file, and problems that do not prevent reading them."""
+    """Parsed YAML nodes of a file, and problems (refused tags) that do not prevent reading them."""
 
     root: yaml.MappingNode
     problems: tuple[Problem, ...]
@@ -111,7 +111,7 @@ def read_file(path: Path) -> bytes:
 
 
 def _opened(name: str, flags: int) -> int:
-    """Open a file for `open`, without blocking on a pipe."""
+    """Open a file without blocking on a pipe; raise OSError if it is not a regular file."""
     descriptor = os.open(name, flags | getattr(os, "O_NONBLOCK", 0))
     mode = os.fstat(descriptor).st_mode
     if stat.S_ISREG(mode):
@@ -124,7 +124,7 @@ def _opened(name: str, flags: int) -> int:
 
 @contextmanager
 def confined(folder: Path) -> Iterator[None]:
-    """Refuse every file outside a folder, for a robot file from an untrusted source."""
+    """Context manager in which `read_file` refuses files outside a folder, for untrusted robot files."""
     token = _folder.set(folder.resolve())
     try:
         yield
@@ -133,7 +133,7 @@ def confined(folder: Path) -> Iterator[None]:
 
 
 def read_text(path: Path, language: str = "YAML") -> str:
-    """Return the text of a file.
+    """Return the text of a file, which must be UTF-8.
 
     Args:
         path: The file.
@@ -179,7 +179,7 @@ def _decoded(data: bytes, file: str, language: str) -> str:
 
 
 def parse(text: str, file: str) -> Tree:
-    """Return the nodes of a text whose top level is a mapping; raise InputError for anything else."""
+    """Parse YAML; raise InputError if the text is not YAML, or its top level is not a mapping."""
     try:
         problems = tuple(_refused_tags(text, file))
         root = yaml.compose(text, _Loader)
@@ -195,7 +195,7 @@ def parse(text: str, file: str) -> Tree:
 
 
 def _refused_tags(text: str, file: str) -> Iterator[Problem]:
-    """Yield a problem for each tag; raise InputError beyond the limits."""
+    """Yield a problem for each tag (`!x`) in a YAML text; raise InputError if it is too deep or too large."""
     depth = nodes = documents = 0
     for event in yaml.parse(text, _Loader):
         mark = _mark(event.start_mark, file)
@@ -223,7 +223,7 @@ def _refused_tags(text: str, file: str) -> Iterator[Problem]:
 
 
 def node_mark(node: yaml.Node, file: str) -> Mark:
-    """Return the place where a node starts."""
+    """Return file, line and column where a YAML node starts."""
     return _mark(node.start_mark, file)
 
 
@@ -233,7 +233,7 @@ def _mark(place: _Place | None, file: str) -> Mark:
 
 
 def refusal(mark: Mark, what: str, fix: str) -> InputError:
-    """Return an InputError with one problem."""
+    """Return an InputError with a single problem: place, problem, fix."""
     return InputError([Problem(mark, what, fix)])
 
 
@@ -243,7 +243,7 @@ def _mark_at(text: str, index: int, file: str) -> Mark:
 
 
 def _explained(error: yaml.MarkedYAMLError, text: str, file: str) -> Problem:
-    """Return an error of the scanner or parser in dxlrun's words, with its fix."""
+    """Convert an error of PyYAML into a problem with dxlrun's words and a fix."""
     place = error.problem_mark or error.context_mark
     opened = error.context_mark
     reported = error.problem or ""
@@ -294,7 +294,7 @@ _WORDS = (
 
 
 class Filled(msgspec.Struct, frozen=True):
-    """A scalar after its arguments were inserted."""
+    """Value of one scalar of a file with its arguments `${name}` inserted, or the problems of that."""
 
     value: object
     origin: str | None = None  # `rate:=100` if it contains an argument
@@ -306,12 +306,12 @@ Fill = Callable[[KeyPath, str, bool], Filled]  # Converts path, text and quoted 
 
 
 def literal(path: KeyPath, text: str, quoted: bool) -> Filled:
-    """Return the value of a scalar without inserting arguments."""
+    """Return the value of a scalar as YAML reads it, without inserting arguments."""
     return Filled(text if quoted else plain_value(text))
 
 
 class Grown(msgspec.Struct, frozen=True):
-    """A document as plain values, with marks and the problems found so far."""
+    """All values of a file as dicts and lists, with their places and the problems found so far."""
 
     data: dict[str, object]
     marks: Marks
@@ -320,7 +320,10 @@ class Grown(msgspec.Struct, frozen=True):
 
 
 def grow(tree: Tree, file: str, fill: Fill) -> Grown:
-    """Return the values of a tree; raise InputError if its anchors make it endless or huge."""
+    """Convert parsed YAML into plain values; `fill` computes each scalar. Anchors must not be endless.
+
+    Raises InputError for an endless or huge document.
+    """
     grower = _Grower(tree, file, fill)
     return Grown(
         grower.mapping(tree.root, ()),
@@ -331,7 +334,7 @@ def grow(tree: Tree, file: str, fill: Fill) -> Grown:
 
 
 class _Grower:
-    """Walks a tree once. It may recurse, because DEEPEST bounds the depth."""
+    """Visits all YAML nodes of a file once and collects values, places and problems."""
 
     def __init__(self, tree: Tree, file: str, fill: Fill) -> None:
         self._file = file
@@ -347,7 +350,7 @@ class _Grower:
 
     @property
     def problems(self) -> list[Problem]:
-        """Problems of the file; all of its merge keys are one problem."""
+        """Problems of the file; all merge keys `<<` together are one problem."""
         if not self._merge_keys:
             return self._problems
         more = len(self._merge_keys) - 1
@@ -356,7 +359,7 @@ class _Grower:
         return [*self._problems, Problem(self._merge_keys[0], what, fix)]
 
     def value(self, node: yaml.Node, path: KeyPath) -> object:
-        """Return the value of a node."""
+        """Return the value of a YAML node at a path, and note its place."""
         if isinstance(node, yaml.MappingNode):
             return self.mapping(node, path)
         self._enter(node, path)
@@ -366,7 +369,10 @@ class _Grower:
         return self._scalar(node, path)
 
     def mapping(self, node: yaml.MappingNode, path: KeyPath) -> dict[str, object]:
-        """Return a mapping. Keys are text as written; the first of two equal keys counts."""
+        """Return a mapping as a dict.
+
+        Keys stay text; of two equal keys the first counts, the second is a problem.
+        """
         self._enter(node, path)
         result: dict[str, object] = {}
         for key_node, value_node in node.value:
@@ -397,7 +403,7 @@ class _Grower:
             self.unknown.add(path)
 
     def _key(self, node: yaml.Node, path: KeyPath) -> str | None:
-        """Return a key of the mapping at a path; None if it is not a valid key."""
+        """Return a key of a mapping as text; None, with a problem, if it is not a simple word."""
         mark = node_mark(node, self._file)
         if not isinstance(node, yaml.ScalarNode):
             self._problems.append(
@@ -434,7 +440,7 @@ def _quoted(node: yaml.ScalarNode) -> bool:
 
 
 def plain_value(text: str) -> object:
-    """Return the value of a scalar without quotes: None, bool, int, float or str.
+    """Return the value of a scalar without quotes, by YAML 1.2: None, bool, int, float or str.
 
     Follows the core schema of YAML 1.2: `yes` and `on` are text, `010` is ten. PyYAML follows YAML 1.1, where
     `no` is false and `1:30` is ninety, so only its syntax is used, not its values.
@@ -451,7 +457,7 @@ def plain_value(text: str) -> object:
 
 
 def text_of(value: object) -> str:
-    """Return a text that `plain_value` converts back to the same value."""
+    """Write a scalar as text that `plain_value` reads back to the same value."""
     if value is None:
         return "null"
     if isinstance(value, bool):

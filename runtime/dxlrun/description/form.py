@@ -1,4 +1,4 @@
-"""Form: base class of all sections of the files, valid names, and errors of validators."""
+"""Form: base class of the pydantic models of all sections, types of names, and errors of validators."""
 
 from __future__ import annotations
 
@@ -26,7 +26,7 @@ _NAME = re.compile(r"[A-Za-z][A-Za-z0-9_]*", re.ASCII)
 
 
 def refuse(what: str, fix: str) -> PydanticCustomError:
-    """Return the error of a validator, with the problem and the fix as separate texts.
+    """Return the error for a pydantic validator to raise, with problem and fix as separate texts.
 
     The error is also a ValueError.
     """
@@ -57,7 +57,7 @@ def _name_fix(name: str) -> str:
 
 
 def folded(name: str) -> str:
-    """Return a name in lower case with `_` between its words: position_p_gain for `Position P Gain`."""
+    """Return a name in snake case: position_p_gain for `Position P Gain`."""
     parts = re.sub(r"(?<=[a-z0-9])(?=[A-Z])|(?<=[A-Z])(?=[A-Z][a-z])", "_", name)
     return re.sub(r"[^a-z0-9]+", "_", parts.lower()).strip("_")
 
@@ -67,23 +67,23 @@ Name = Annotated[
     AfterValidator(_name),
     WithJsonSchema({"type": "string", "pattern": f"^{_NAME.pattern}$"}),
 ]
-"""Letters, digits and _, starting with a letter."""
+"""Name in a file: letters, digits and _, starting with a letter; anything else is refused with a fix."""
 ItemName = Annotated[
     str,
     AfterValidator(_item_name),
     WithJsonSchema({"type": "string", "pattern": f"^{_NAME.pattern}$"}),
 ]
-"""Name of an item of a control table, such as position_p_gain."""
+"""Name of a control table item in a file, in snake case, such as position_p_gain."""
 
 
 class Form(BaseModel):
-    """Base of all sections: frozen; refuses unknown keys, non-finite numbers and text in place of numbers."""
+    """Base of the models of all sections: frozen; unknown keys, infinities and wrong types are refused."""
 
     model_config = ConfigDict(frozen=True, extra="forbid", strict=True, allow_inf_nan=False, defer_build=True)
 
     @classmethod
     def of_defaults(cls) -> Self:
-        """Return the form of an absent section: every key has its default.
+        """Return the section with all of its defaults, for a file that does not have it.
 
         It is made without validation, which would build a validator for this value alone.
         """
@@ -101,7 +101,7 @@ def key(
     lt: float | None = None,
     min_length: int | None = None,
 ) -> T:
-    """Return the field of a key with its description, example, default and bounds.
+    """Declare a key of a form: its description, example, default and bounds, as a pydantic field.
 
     Args:
         description: Meaning of the key.
@@ -127,27 +127,27 @@ def key(
 
 
 class FormKey(Protocol):
-    """Key that a feature adds to a form."""
+    """A key that a feature adds to a form of the core."""
 
     @property
     def name(self) -> str:
-        """The key."""
+        """Name of the key in the file."""
 
     @property
     def form(self) -> object:
-        """Type of the key's value, or a function that returns the type."""
+        """Pydantic type of the key's value, or a function that returns it."""
 
     @property
     def field(self) -> object:
-        """Field of the key, as `key` returns it."""
+        """Description and default of the key, as `key` returns them."""
 
     @property
     def before(self) -> str:
-        """Next key in lists of all keys; if the form lacks it, this key is the last."""
+        """Key before which this one is listed; if the form lacks it, this key is the last."""
 
 
 def with_keys(form: type[F], keys: Iterable[FormKey], **replaced: object) -> type[F]:
-    """Return a form with additional keys of features.
+    """Return a subclass of a form that has additional keys of features.
 
     Args:
         form: The form without the keys.
@@ -171,7 +171,7 @@ def with_keys(form: type[F], keys: Iterable[FormKey], **replaced: object) -> typ
 
 
 class PlugInEntry(Form):
-    """An entry of a plug-in's type. Keys that are not common to all types are the type's parameters."""
+    """Base form of controllers and sensors: keys that the core does not know become `parameters`."""
 
     parameters: dict[str, object] = Field(
         default={}, description="Parameters of the entry's type: all other keys."
@@ -187,11 +187,11 @@ class PlugInEntry(Form):
 
 
 Mistake = tuple[tuple[str | int, ...], str]
-"""Path of a key below its model, such as `("motions", "walk", "next")`, and the text `problem; fix`."""
+"""Path of a wrong key below its model, such as `("motions", "walk", "next")`, and the text `problem; fix`."""
 
 
 class Mistakes(ValueError):
-    """All mistakes that a model found in combinations of its keys."""
+    """Raised by a model for several mistakes at once, in combinations of its keys."""
 
     def __init__(self, found: Sequence[Mistake]) -> None:
         self.found = tuple(found)
@@ -199,7 +199,7 @@ class Mistakes(ValueError):
 
 
 class ParametersModel(BaseModel):
-    """Base of a controller's or a sensor's parameters: frozen, unknown keys refused, finite numbers only."""
+    """Base of the parameters of a plug-in's controller or sensor: frozen, no unknown keys, no infinities."""
 
     model_config = ConfigDict(frozen=True, extra="forbid", allow_inf_nan=False, defer_build=True)
 

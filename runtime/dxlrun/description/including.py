@@ -1,4 +1,4 @@
-"""Including: merges a robot file and the fragments that it names into one document.
+"""Including: merges a robot file and the files (fragments) in its `include` into one document.
 
 `include: [fragments/head.yaml]` is relative to the file that contains it. Mappings are merged key by key at
 every depth. The including file takes precedence over its fragments, and a later fragment over an earlier one.
@@ -34,7 +34,7 @@ MOST_FILES = 64  # files of one robot
 
 
 class Source(msgspec.Struct, frozen=True):
-    """One file of a robot, as read."""
+    """One file of a robot (the robot file or an included one): its text and its parsed YAML."""
 
     path: Path
     text: str
@@ -42,12 +42,12 @@ class Source(msgspec.Struct, frozen=True):
     declared: Grown  # values before arguments are inserted
 
     def grown(self, fill: Fill) -> Grown:
-        """Return the values of the file with arguments inserted."""
+        """Return the values of the file after `fill` has inserted the arguments."""
         return grow(self.tree, str(self.path), fill)
 
 
 def read_sources(path: Path) -> tuple[Source, ...]:
-    """Return the file and all of its fragments: lowest precedence first, the file itself last.
+    """Read a robot file and all files that it includes: lowest precedence first, the robot file last.
 
     Raises:
         InputError: A file is not YAML, or includes cannot be followed; all such problems at once.
@@ -61,7 +61,7 @@ def read_sources(path: Path) -> tuple[Source, ...]:
 
 
 class _Collector:
-    """Follows the includes of each file, deepest first."""
+    """Reads included files recursively, each once, and collects the problems."""
 
     def __init__(self) -> None:
         self.sources: list[Source] = []
@@ -70,7 +70,7 @@ class _Collector:
         self._characters = 0
 
     def take(self, path: Path, text: str, tree: Tree, above: tuple[Path, ...]) -> None:
-        """Add the fragments of a file, then the file; `above` are the files that led to it."""
+        """Add all files that a file includes, then the file itself; `above` are the files that include it."""
         declared = grow(tree, str(path), literal)
         # Mark the file before its fragments, so that a second path to it does not read it again.
         self._done.add(path.resolve())
@@ -80,7 +80,7 @@ class _Collector:
         self.sources.append(Source(path, text, tree, declared))
 
     def _entries(self, declared: Grown) -> list[tuple[str, Mark]]:
-        """Return the fragments that a file names; anything else in its `include` is a problem."""
+        """Return the file names under `include` with their places; add a problem for anything else."""
         if KEY not in declared.data:
             return []
         entries, marks = declared.data[KEY], declared.marks
@@ -143,7 +143,7 @@ class _Collector:
 
 
 def merged(documents: Iterable[Grown]) -> Grown:
-    """Merge documents, lowest precedence first; the problems of all of them are kept."""
+    """Merge documents into one, lowest precedence first; the problems of all are kept."""
     first, *others = documents
     for document in others:
         first = _over(first, document)
@@ -151,7 +151,7 @@ def merged(documents: Iterable[Grown]) -> Grown:
 
 
 def _over(low: Grown, high: Grown) -> Grown:
-    """Return `high` merged over `low`: mappings are merged, other values of `high` replace those of `low`."""
+    """Merge two documents: mappings key by key, for anything else the value of `high` counts."""
     replaced: set[KeyPath] = set()
     data = _laid(low.data, high.data, (), replaced)
 

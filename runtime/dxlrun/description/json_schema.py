@@ -57,11 +57,12 @@ _ABOUT = ("description", "default", "examples")
 
 Models = Mapping[str, type[BaseModel]]  # models of parameters, by controller or sensor type
 Entries = Mapping[str, tuple[str, Models]]
-"""For each form of entries with plug-in types: the word for one entry, and the models."""
+"""For each form of plug-in entries other than controllers: its name in the singular, and its types'
+models."""
 
 
 def robot_schema(controllers: Models, entries: Entries) -> Schema:
-    """Return the schema of robot files, with the parameters of the plug-ins' types."""
+    """Return the JSON Schema of robot files, with the parameters of all installed controller types."""
     robot = _robot(controllers, entries)
     lenient = _without_required(robot)
     needed = _Needs(robot).of_root()
@@ -72,22 +73,22 @@ def robot_schema(controllers: Models, entries: Entries) -> Schema:
 
 
 def fragment_schema(controllers: Models, entries: Entries) -> Schema:
-    """Return the schema of fragments that a robot file includes."""
+    """Return the JSON Schema of fragments (included files): that of robot files without required keys."""
     return {**_without_required(_robot(controllers, entries)), "title": "dxlrun fragment of a robot file"}
 
 
 def motion_schema() -> Schema:
-    """Return the schema of motion files."""
+    """Return the JSON Schema of motion files."""
     return _without_arguments(Motion, "dxlrun motion file")
 
 
 def motor_schema() -> Schema:
-    """Return the schema of motor files."""
+    """Return the JSON Schema of motor files."""
     return _without_arguments(MotorForm, "dxlrun motor file")
 
 
 def _without_arguments(model: type[BaseModel], title: str) -> Schema:
-    """Return the schema of files without arguments."""
+    """Return the JSON Schema of a model for files that cannot use `${name}`."""
     schema = model.model_json_schema()
     shaped = _Shaper(arguments=False)
     definitions = {name: shaped.node(node) for name, node in schema.pop("$defs").items()}
@@ -96,7 +97,7 @@ def _without_arguments(model: type[BaseModel], title: str) -> Schema:
 
 
 def _robot(controllers: Models, entries: Entries) -> Schema:
-    """Return the schema of a robot file without includes."""
+    """Return the JSON Schema of a robot file in which all keys are required as in its model."""
     schema = robot_form().model_json_schema()
     shaped = _Shaper(arguments=True)
     definitions = {name: shaped.node(node) for name, node in schema.pop("$defs").items()}
@@ -125,7 +126,7 @@ def _robot(controllers: Models, entries: Entries) -> Schema:
 
 
 def _shared(forms: Mapping[str, Schema]) -> Schema:
-    """Return the keys that joints of these forms may share; `check` decides whether a joint has a key."""
+    """Return the keys that `joint_defaults` and groups accept: all keys of joints but `id`, `servos`."""
     found: dict[str, list[Schema]] = {}
     for properties in forms.values():
         for key, node in properties.items():
@@ -161,7 +162,7 @@ def _include() -> Schema:
 
 
 def _entry_of(kind: str, entry: Schema, parameters: Schema) -> Schema:
-    """Return the schema of an entry of one type: the common keys and the type's own."""
+    """Return the JSON Schema of a controller or sensor of one type: common keys and its parameters."""
     return {
         **parameters,
         "properties": {**entry["properties"], "type": {"const": kind}, **parameters.get("properties", {})},
@@ -171,7 +172,7 @@ def _entry_of(kind: str, entry: Schema, parameters: Schema) -> Schema:
 
 
 def _any_entry(entry: Schema, kinds: list[str], room: str) -> Schema:
-    """Return the schema of an entry of any type; `dxlrun check` decides about unknown types.
+    """Return the JSON Schema of a controller or sensor, which selects the parameters by `type`.
 
     Args:
         entry: Schema of the common keys.
@@ -194,8 +195,7 @@ def _any_entry(entry: Schema, kinds: list[str], room: str) -> Schema:
 
 
 def _any_joint(any_form: Schema) -> Schema:
-    """Return the schema of a joint. The keys of the joint select its form, so a mistake is reported at its
-    place."""
+    """Return the JSON Schema of a joint, in which its keys select one of the forms of joints."""
     branches: list[Schema] = []
     before: list[Schema] = []
     for form, told_by in joint_conditions():
@@ -210,10 +210,10 @@ def _and_none_of(condition: Schema, others: list[Schema]) -> Schema:
 
 
 class _Documented(GenerateJsonSchema):
-    """Pydantic's schema, with the docstrings of fields as descriptions of their keys."""
+    """Generates pydantic's JSON Schema with the docstrings of fields as descriptions."""
 
     def model_schema(self, schema: ModelSchema) -> Schema:
-        """Return the schema of a model."""
+        """Return the JSON Schema of a model, with descriptions from its fields' docstrings."""
         found = super().model_schema(schema)
         for kind in schema["cls"].__mro__:
             for key, text in _docstrings(kind).items():
@@ -224,7 +224,7 @@ class _Documented(GenerateJsonSchema):
 
 @cache  # Finding a class in its source is slow, and each of its subclasses needs it.
 def _docstrings(kind: type) -> dict[str, str]:
-    """Return the docstrings of a class's fields, by field; empty for a class without source."""
+    """Return the docstrings below the fields of a class, by field; empty if its source is not found."""
     with suppress(OSError, TypeError, SyntaxError):
         (made,) = ast.parse(textwrap.dedent(inspect.getsource(kind))).body
         return {
@@ -238,14 +238,14 @@ def _docstrings(kind: type) -> dict[str, str]:
 
 
 class _Shaper:
-    """Converts nodes of pydantic's schema; `used` are the definitions to which the new nodes refer."""
+    """Converts pydantic's JSON Schema into that of a file's text; `used` are definitions it refers to."""
 
     def __init__(self, *, arguments: bool) -> None:
         self._arguments = arguments
         self.used: dict[str, Schema] = {}
 
     def node(self, node: Schema) -> Schema:
-        """Return a node, and all nodes below it, for the text of a file."""
+        """Convert a schema node and all nodes below it."""
         shaped = {key: value for key, value in node.items() if key != "title"}
         # pydantic requires matching keys, but `patternProperties` lets other keys pass
         if "patternProperties" in shaped:
@@ -268,8 +268,7 @@ class _Shaper:
         return {key: value for key, value in shaped.items() if key not in ("default", "examples")}
 
     def _alternatives(self, shaped: Schema) -> Schema:
-        """Return the alternatives of one value: those of the model, an argument, or a number with grouped
-        digits.
+        """Convert a value's alternatives: add `${name}` where it may be used, and grouped digits for numbers.
 
         If a mapping can also be written as one value, its properties stay next to the alternatives.
         """
@@ -298,10 +297,9 @@ class _Shaper:
 
 
 def _readable(about: Schema, kinds: set[str | None], pattern: str) -> Schema:
-    """Return description, default and examples in the notation of a file.
+    """Write a schema's default and examples as in a file; `pattern` has the units of a quantity.
 
-    The default of a quantity is in SI, and gets a unit from the `pattern`. A default of None means an absent
-    key, which has no notation.
+    A default of None means an absent key, and is removed.
     """
     found = dict(about)
     text = kinds <= {"string", "null"}
@@ -318,7 +316,7 @@ def _readable(about: Schema, kinds: set[str | None], pattern: str) -> Schema:
 
 
 def _patterns(node: Schema) -> list[str]:
-    """Return the patterns of values at one place, or in a mapping there, without names."""
+    """Return the regular expressions of quantities that a schema node accepts, without those of names."""
     arms = [one for key in ("anyOf", "oneOf") for one in node.get(key, ())]
     inner = [node["additionalProperties"]] if isinstance(node.get("additionalProperties"), dict) else []
     own = [node["pattern"]] if r"\s*$" in node.get("pattern", "") else []
@@ -326,7 +324,7 @@ def _patterns(node: Schema) -> list[str]:
 
 
 def _written(default: float, pattern: str) -> str | None:
-    """Return a quantity in SI (a time in ns) with a unit from a pattern that `units` made."""
+    """Write a number in SI units (a time in ns) as text with a unit that its regular expression accepts."""
     units = pattern.rpartition("(")[2].partition(")")[0].replace("\\", "").split("|")
     if units == ["%"]:
         return f"{default * 100:g} %"
@@ -338,7 +336,7 @@ def _written(default: float, pattern: str) -> str | None:
 
 
 def _without_required(node: Any) -> Any:  # noqa: ANN401 (any part of a JSON document)
-    """Return a schema without required keys, except those in an `if`."""
+    """Return a schema without its `required` keys, except for those in conditions (`if`)."""
     if isinstance(node, list):
         return [_without_required(each) for each in node]
     if not isinstance(node, dict):
@@ -351,14 +349,14 @@ def _without_required(node: Any) -> Any:  # noqa: ANN401 (any part of a JSON doc
 
 
 class _Needs:
-    """Collects the required keys of a schema."""
+    """Collects the required keys of a schema as another schema, to apply them under a condition."""
 
     def __init__(self, schema: Schema) -> None:
         self._schema = schema
         self._above: list[str] = []
 
     def of_root(self) -> Schema:
-        """Return the required keys of the schema itself."""
+        """Return a schema that has only the required keys, on every level."""
         return self._of(self._schema)
 
     def _of(self, node: object) -> Schema:

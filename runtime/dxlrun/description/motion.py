@@ -1,4 +1,4 @@
-"""Motion: the form of a motion file and its reader."""
+"""Motion: the form of a motion file, and its reader."""
 
 from __future__ import annotations
 
@@ -26,11 +26,11 @@ def _expression(value: object) -> object:
 Expression = Annotated[
     str, BeforeValidator(_expression, json_schema_input_type=str | float), Field(min_length=1)
 ]
-"""Formula of t, s since the start of the part; `compile` evaluates it."""
+"""Formula of the time t in s since the start of the part, as text; `compile` evaluates it."""
 
 
 class Target(Form):
-    """Goal of a joint at the time of a point: position, velocity and acceleration."""
+    """Form of a joint's goal at one point: position, velocity and acceleration, one of which is required."""
 
     position: Position | None = key(
         "Position of the joint: an angle, or a length for a linear joint.", "30 deg", None
@@ -46,19 +46,19 @@ class Target(Form):
 
     @property
     def quantities(self) -> tuple[Measure | None, Measure | None, Measure | None]:
-        """Position, velocity and acceleration."""
+        """Position, velocity and acceleration, each None if the file does not give it."""
         return self.position, self.velocity, self.acceleration
 
 
 class Point(Form):
-    """Targets at one time of a part."""
+    """Form of a point of a motion: a time, and goals of some joints."""
 
     time: Duration = key("Time since the start of the part.", "1 s")
     joints: dict[Name, Target] = key("Targets by joint.", "{head_joint: {position: 30 deg}}", min_length=1)
 
 
 class Formula(Form):
-    """Motion of one joint as formulas of t, s."""
+    """Form of one joint's motion as formulas of t, s."""
 
     position: Expression = key(
         "Position as a formula of t: rad, or m for a linear joint.", "0.5 * sin(2 * t)"
@@ -72,7 +72,7 @@ class Formula(Form):
 
 
 class PointsPart(Form):
-    """Motion of one controller, point by point."""
+    """Form of a part of a motion that lists points, for one controller."""
 
     refused: ClassVar[Mapping[str, str]] = dict.fromkeys(
         ("duration", "samples", "joints"),
@@ -87,7 +87,7 @@ class PointsPart(Form):
 
 
 class FormulaPart(Form):
-    """Motion of one controller, as formulas that are sampled before the loop starts."""
+    """Form of a part of a motion with formulas, for one controller; they are sampled before the run."""
 
     controller: str = key("Name of the controller.", "head", min_length=1)
     start: Duration = key("Start of the part, as time since the loop's first deadline.", "1 s", 0)
@@ -106,11 +106,11 @@ def _kind(part: object) -> str:
 Part = Annotated[
     Annotated[PointsPart, Tag("<points>")] | Annotated[FormulaPart, Tag("<formulas>")], Discriminator(_kind)
 ]
-"""Either listed points or formulas."""
+"""Part of a motion file, with points or with formulas."""
 
 
 class Motion(Form):
-    """A motion file."""
+    """Form of a motion file: a name, and parts for one or more controllers."""
 
     name: Name = key("Name of the motion.", "three_parts")
     motions: Annotated[tuple[Part, ...], Field(strict=False)] = key(
@@ -119,12 +119,12 @@ class Motion(Form):
 
     @property
     def controllers(self) -> tuple[str, ...]:
-        """Controllers of the motion, each once."""
+        """Names of the controllers that play the motion, each once."""
         return tuple(dict.fromkeys(part.controller for part in self.motions))
 
     @property
     def joints(self) -> tuple[str, ...]:
-        """Joints that the motion moves, each once."""
+        """Names of the joints that the motion moves, each once."""
         named = (
             part.joints
             if isinstance(part, FormulaPart)
@@ -135,7 +135,7 @@ class Motion(Form):
 
     @property
     def seconds(self) -> float:
-        """Time from the start of the motion to its last target, s."""
+        """Duration of the motion, s: from its start to its last target."""
         ends = (
             part.start + (part.duration if isinstance(part, FormulaPart) else part.points[-1].time)
             for part in self.motions
@@ -144,7 +144,7 @@ class Motion(Form):
 
 
 class MotionDescription(msgspec.Struct, frozen=True):
-    """A motion file of valid form, with the places of its values."""
+    """A motion file that was read: its contents, its text, and the places of its values."""
 
     motion: Motion
     marks: Marks
@@ -153,12 +153,12 @@ class MotionDescription(msgspec.Struct, frozen=True):
 
 
 def read_motion(path: Path, groups: Groups = NO_GROUPS) -> MotionDescription:
-    """Read a motion file, which may name groups of joints; raise InputError with all problems of its form."""
+    """Read a motion file, replace its group names by joints; raise InputError with all mistakes."""
     return parse_motion(read_text(path), path, groups)
 
 
 def parse_motion(text: str, path: Path, groups: Groups = NO_GROUPS) -> MotionDescription:
-    """Parse the text of a motion file; raise InputError with all problems of its form."""
+    """Parse the text of a motion file; `path` is for messages. Raises InputError with all mistakes."""
     file = str(path)
     grown = put_in(grow(parse(text, file), file, refuse_arguments), groups)
     if "motions" not in grown.data and {"buses", "joints"} & grown.data.keys():

@@ -1,4 +1,4 @@
-"""Problems: converts errors of pydantic into sentences with the place in the file."""
+"""Problems: converts validation errors of pydantic into sentences with line, column and fix."""
 
 from __future__ import annotations
 
@@ -33,7 +33,7 @@ def problems_of(
     unknown: Set[KeyPath] = frozenset(),
     most: int | None = None,
 ) -> list[Problem]:
-    """Return one problem for each place that a model refused, in file order.
+    """Convert pydantic's errors into problems, one for each place in the file, in file order.
 
     With a model, unknown keys get the nearest known key, also from the keys in `beside`. Missing keys get an
     example.
@@ -59,7 +59,7 @@ def problems_of(
 def _explain_unknown_keys(
     found: Mapping[KeyPath, list[_Error]], marks: Marks, document: type[BaseModel] | None
 ) -> Iterator[list[_Error]]:
-    """Yield the errors of each place; unknown keys get their remedies, and a pair of such keys is one error.
+    """Yield the errors of each place, after unknown keys were explained and their consequences removed.
 
     A missing key is not an error if an unknown key means it.
     """
@@ -106,7 +106,7 @@ def _remedies_at(
 
 
 def _each_of(errors: Iterable[ErrorDetails]) -> Iterator[ErrorDetails]:
-    """Yield pydantic's errors, with one error for each of the `Mistakes` of a model."""
+    """Yield pydantic's errors, where an error with `Mistakes` is split into one for each mistake."""
     for details in errors:
         several = details.get("ctx", {}).get("error")
         if not isinstance(several, Mistakes):
@@ -119,7 +119,7 @@ def _each_of(errors: Iterable[ErrorDetails]) -> Iterator[ErrorDetails]:
 
 
 def read_form(grown: Grown, model: type[Form]) -> Form:
-    """Validate a document; raise InputError with all problems of its form."""
+    """Validate a document with a model and return it; raise InputError with all problems."""
     problems, form = [*grown.problems], None
     try:
         form = model.model_validate(grown.data)
@@ -131,16 +131,16 @@ def read_form(grown: Grown, model: type[Form]) -> Form:
 
 
 _ROUNDS = 3
-"""Attempts to repair values; a repaired value may be refused for another reason."""
+"""Attempts to repair values before giving up; a repaired value may be refused for another reason."""
 
 
 def errors_between_keys(
     data: Mapping[str, object], error: ValidationError, model: type[BaseModel]
 ) -> tuple[ValidationError, frozenset[KeyPath]] | None:
-    """Return the errors in combinations of keys that appear after the refused values were replaced.
+    """Find mistakes between keys that pydantic did not check because single values were wrong.
 
-    pydantic checks several keys together only if each of them is valid. The second part of the result
-    contains the paths of the replaced values, about which no error may be reported.
+    pydantic checks several keys together only if each of them is valid, so refused values are replaced by
+    valid ones. The second part of the result contains their paths, about which no error may be reported.
 
     Args:
         data: Data that the model refused.
@@ -178,7 +178,10 @@ def _is_between_keys(details: ErrorDetails) -> bool:
 
 
 def _repair(data: dict[str, object], error: _Error) -> KeyPath | None:
-    """Replace a refused value by a valid one, or remove it if its key has a default; return its path."""
+    """Replace a refused value by a valid one, or remove it if its key has a default.
+
+    Returns its path; None if no valid value is known.
+    """
     at: Any = data
     path: KeyPath = ()
     *above, key = error.location or ("",)
@@ -203,7 +206,7 @@ def _has_default(error: _Error) -> bool:
 
 
 def _good_value(error: _Error) -> object:
-    """Return a valid value for a place: its bound, or the example of its quantity; None: not known."""
+    """Return a value that pydantic will accept in place of a refused one; None if none is known."""
     bound = error.context.get("ge", error.context.get("le"))
     if isinstance(bound, int | float):
         units = error.units
@@ -215,7 +218,7 @@ def _good_value(error: _Error) -> object:
 
 
 def sentences_of(error: ValidationError, what: str, model: type[BaseModel], most: int) -> list[str]:
-    """Return one sentence for each place that a model refused in data without a file.
+    """Convert pydantic's errors about data that is not from a file into sentences `problem; fix`.
 
     Args:
         error: The model's errors.
@@ -233,7 +236,7 @@ def sentences_of(error: ValidationError, what: str, model: type[BaseModel], most
 
 
 class _Error:
-    """One error of pydantic, with its place in the file."""
+    """One error of pydantic, with its path in the file and what is known for a better message."""
 
     def __init__(
         self,
@@ -257,11 +260,11 @@ class _Error:
         self.at_key = of_key or self.missing or self.kind == "extra_forbidden"
         self.remedy: Remedy | None = None
         self.unindented: list[str] = []
-        """Keys of an entry with the same indentation as the entry's name, this one first."""
+        """Keys that are indented like the name of their entry, instead of below it; this one is first."""
 
     @property
     def meant(self) -> bool:
-        """False if the error follows from another one.
+        """False if the error only follows from another error, and should not be reported.
 
         A list is not too short because its items are invalid. It does not lack an item if one is a range:
         `[-90..90 deg]`.
@@ -278,17 +281,17 @@ class _Error:
 
     @property
     def name(self) -> str:
-        """Path as text: `joints.head.limits.position[1]`."""
+        """Path of the value as text: `joints.head.limits.position[1]`."""
         return path_text(self.path)
 
     @property
     def example(self) -> str | None:
-        """Example of the key's field; None: it has none."""
+        """Example of the key's value from its field; None if it has none."""
         return None if self.model is None else _example_at(self.model, self.location)
 
     @property
     def units(self) -> Mapping[str, float]:
-        """Units of the value's quantity, each with its size in the field's unit; empty: not a quantity."""
+        """Units that the value's quantity accepts, with their size in SI units; empty if it has no unit."""
         notes = () if self.model is None else _notes_at(self.model, self.location)
         return next((units for units in map(units_of, notes) if units), {})
 
@@ -298,13 +301,13 @@ def _is_range(item: object) -> bool:
 
 
 def path_text(path: KeyPath) -> str:
-    """Return a path as text: `joints.head.limits.position[1]`."""
+    """Write a path as text: `joints.head.limits.position[1]`."""
     text = "".join(f"[{step}]" if isinstance(step, int) else f".{step}" for step in path)
     return text.removeprefix(".") or "the file"
 
 
 def _in_file(location: Iterable[str | int], marks: Marks, prefix: KeyPath) -> KeyPath:
-    """Return the part of pydantic's location that is in the file; names of union members are not."""
+    """Return pydantic's location as a path in the file, without steps that name members of a union."""
     path = prefix
     for step in location:
         if marks.has((*path, step)):
@@ -313,7 +316,7 @@ def _in_file(location: Iterable[str | int], marks: Marks, prefix: KeyPath) -> Ke
 
 
 def _merged(errors: list[_Error], marks: Marks) -> Problem:
-    """Return one problem for a place, about which each member of a union has reported an error."""
+    """Return one problem for a place, from the errors of all members of a union there."""
     first = errors[0]
     mark = marks.key(*first.path) if first.at_key else marks.value(*first.path)
     expected = list(
@@ -331,7 +334,7 @@ def _merged(errors: list[_Error], marks: Marks) -> Problem:
 
 
 def shown(value: object) -> str:
-    """Return a value in the notation of error messages."""
+    """Describe a value for an error message: `the text 'abc'`, `a list`, or a number as it is."""
     if value is None:
         return "empty"
     if isinstance(value, dict):
@@ -390,7 +393,7 @@ _REMEDIES: Mapping[str, str] = {
 
 
 def _expected(error: _Error) -> str | None:
-    """Return the requirement on the value, for errors with a fixed sentence."""
+    """Return what the value must be, such as `at least 5` or `a number`; None for other kinds of errors."""
     if error.kind in _BOUNDS:
         plain = {key: _bound(value, error) for key, value in error.context.items()}
         return _BOUNDS[error.kind].format(**plain)
@@ -404,7 +407,7 @@ def _bound(value: object, error: _Error) -> str:
 
 
 def _remedy(error: _Error) -> str:
-    """Return the fix for a value of a wrong type or outside its range."""
+    """Return the fix for a value of the wrong type or outside its range."""
     expected = _TYPES.get(error.kind, "")
     if expected == "a list" and isinstance(error.input, str) and (items := list_text(error.input)):
         return f"write `{error.path[-1] if error.path else 'LIST'}: {items}`"
@@ -421,7 +424,7 @@ def _remedy(error: _Error) -> str:
 
 
 def _is_key_of_entry(error: _Error) -> bool:
-    """Return True if the name of an entry that is not a mapping is a key of such entries."""
+    """Return True if an entry's name is really a key of the entry, indented too little."""
     if _TYPES.get(error.kind) != "a mapping" or error.model is None or not error.path:
         return False
     form = _follow(error.model, error.location)
@@ -429,8 +432,7 @@ def _is_key_of_entry(error: _Error) -> bool:
 
 
 def _indentation(error: _Error) -> str:
-    """Return the fix for the indentation of a value that should be a mapping; empty: nothing is known to be
-    wrong."""
+    """Return the fix for a mapping that is indented wrongly or is a list; empty if it is neither."""
     if error.unindented:
         *others, last = error.unindented
         named = f"{', '.join(others)} and {last} are keys" if others else f"{last} is a key"
@@ -448,7 +450,7 @@ def _example(error: _Error) -> str:
 
 
 def _sentence(error: _Error) -> tuple[str, str]:
-    """Return problem and fix, for the kinds of errors that are not about a value alone."""
+    """Return problem and fix for errors about keys, lengths or patterns, and of validators."""
     sentence = _SENTENCES.get(error.kind)
     return sentence(error) if sentence is not None else (f"{error.name}: {error.kind}", "correct it")
 
@@ -489,7 +491,7 @@ def _sentence_length(error: _Error) -> tuple[str, str]:
 
 
 def _sentence_own(error: _Error) -> tuple[str, str]:
-    """Return the error of a validator, which may be a plug-in's: `problem; fix`."""
+    """Return problem and fix that a validator raised, which may be a plug-in's: `problem; fix`."""
     if "what" in error.context and "fix" in error.context:
         what, fix = str(error.context["what"]), str(error.context["fix"])
     else:
@@ -523,7 +525,7 @@ _SENTENCES: Mapping[str, Callable[[_Error], tuple[str, str]]] = {
 
 
 def _example_at(model: type[BaseModel], location: tuple[str | int, ...]) -> str | None:
-    """Return the example of the field at pydantic's location, in the notation of a file."""
+    """Return the example of the field at pydantic's location, as written in a file; None if it has none."""
     owner = _follow(model, location[:-1]) if location else None
     info = None if owner is None else owner.model_fields.get(str(location[-1]))
     return str(info.examples[0]) if info is not None and info.examples else None
@@ -532,7 +534,7 @@ def _example_at(model: type[BaseModel], location: tuple[str | int, ...]) -> str 
 def _keys_at(
     model: type[BaseModel], location: tuple[str | int, ...]
 ) -> tuple[tuple[str, ...], Mapping[str, str]]:
-    """Return the keys of the model at a location, and a sentence for each refused key.
+    """Return the keys that the model at a location has, and a fix for each key that it refuses.
 
     A model can list expected keys that are not possible (`refused`), and keys that are removed before the
     model is validated (`read_before`).
@@ -545,13 +547,13 @@ def _keys_at(
 
 
 def _follow(model: type[BaseModel], location: tuple[str | int, ...]) -> type[BaseModel] | None:
-    """Return the model at a location; a step that names a union's member selects it."""
+    """Return the model at pydantic's location; None if there is another type."""
     at = _without_none(_annotation_at(model, location))
     return at if isinstance(at, type) and issubclass(at, BaseModel) else None
 
 
 def _annotation_at(model: type[BaseModel], location: tuple[str | int, ...]) -> object:
-    """Return the annotated type of the value at a location."""
+    """Return the type, with metadata, of the value at pydantic's location."""
     at: object = model
     for step in location:
         at = _inner(at, step)
@@ -559,7 +561,7 @@ def _annotation_at(model: type[BaseModel], location: tuple[str | int, ...]) -> o
 
 
 def _notes_at(model: type[BaseModel], location: tuple[str | int, ...]) -> Iterator[object]:
-    """Yield the metadata of the `Annotated` type of the value at a location."""
+    """Yield the metadata (such as a quantity) of the type of the value at pydantic's location."""
     at = _annotation_at(model, location)
     while get_origin(at) in (Annotated, Union, UnionType):
         if get_origin(at) is Annotated:
@@ -585,7 +587,7 @@ def _inner(at: object, step: str | int) -> object:
 
 
 def _without_none(at: object) -> object:
-    """Return an annotation without `Annotated` and without the None of an optional."""
+    """Return a type without `Annotated` and without its `| None`."""
     while get_origin(at) is Annotated:
         at = get_args(at)[0]
     if get_origin(at) in (Union, UnionType):
@@ -596,7 +598,7 @@ def _without_none(at: object) -> object:
 
 
 def _names(arm: object) -> tuple[str, ...]:
-    """Return pydantic's names of a member of a union."""
+    """Return the names that pydantic uses in locations for a member of a union."""
     tags = [note.tag for note in get_args(arm) if isinstance(note, Tag)]
     plain = _without_none(arm)
     return (*tags, plain.__name__) if isinstance(plain, type) else tuple(tags)

@@ -1,4 +1,4 @@
-"""Reading: converts a robot file into a frozen description, or reports all problems of its form at once."""
+"""Reading: reads a robot file with fragments, arguments and groups, and validates it as a whole."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ from dxlrun.errors import InputError, Problem, told_once
 
 
 class Description(msgspec.Struct, frozen=True):
-    """A robot file of valid form, with the places of its values."""
+    """A robot file that was read: its contents, its text, its arguments, and the places of its values."""
 
     robot: Robot
     marks: Marks
@@ -32,12 +32,12 @@ class Description(msgspec.Struct, frozen=True):
 
     @property
     def groups(self) -> dict[str, tuple[str, ...]]:
-        """Joints of each group."""
+        """Names of the joints in each group, by the group's name."""
         return {name: group.joints for name, group in self.robot.groups.items()}
 
 
 class Replacement(msgspec.Struct, frozen=True):
-    """A value that replaces a value of a robot file, or is added to it."""
+    """A change of a robot file after reading: a path, and the value to put there."""
 
     path: KeyPath
     value: object  # in the notation of a file: `5 rad/s^2`, 0.5, true
@@ -46,7 +46,7 @@ class Replacement(msgspec.Struct, frozen=True):
 def read_robot(
     path: Path, arguments: Mapping[str, str], replacements: Sequence[Replacement] = ()
 ) -> Description:
-    """Read a robot file with the values of `name:=value`, and with some of its values replaced.
+    """Read a robot file with values for its arguments (`name:=value`), and with replaced values.
 
     Raises:
         InputError: The file or a fragment cannot be read or is not YAML; otherwise all problems of its form.
@@ -80,11 +80,11 @@ _OTHER_FILES = {
     "motions": ("motion", "run it with `dxlrun ROBOT.yaml --play {path}`"),
     "torque_constant": ("motor", "name it in a robot file, at the joint: `motor: {path}`"),
 }
-"""Keys that identify other kinds of files, with the kind and the fix."""
+"""Keys that identify a motion or motor file given as a robot file, with the fix."""
 
 
 def _refuse_other_files(source: Source) -> None:
-    """Raise InputError for a valid motion or motor file that was given in place of a robot file."""
+    """Raise InputError if a file given as a robot file is a motion file, motor file or of another program."""
     data, marks = source.declared.data, source.declared.marks
     if kind := kind_of_data(data, source.path):
         raise refusal(marks.value(), *kind)
@@ -97,7 +97,7 @@ def _refuse_other_files(source: Source) -> None:
 
 
 def _refuse_misplaced_sections(grown: Grown) -> None:
-    """Raise InputError for misnamed or misplaced sections, whose contents cannot be checked."""
+    """Raise InputError for sections that are misnamed or indented too far, before the rest is checked."""
     own = {key: value for key, value in grown.data.items() if key not in Robot.read_before}
     problems: dict[str, Problem] = {}
     for path, fix in misplaced_sections(robot_form(), own):
@@ -108,7 +108,7 @@ def _refuse_misplaced_sections(grown: Grown) -> None:
 
 
 def _with(grown: Grown, replacement: Replacement) -> Grown:
-    """Return a document with a value at a path; problems of the value are reported there.
+    """Return a document in which a value is replaced or added at a path.
 
     A place that the file does not have gets the mark of its nearest parent.
     """
@@ -124,7 +124,7 @@ def _with(grown: Grown, replacement: Replacement) -> Grown:
 
 
 def _put(at: object, path: KeyPath, value: object) -> object:
-    """Return a tree with a value at a path; missing mappings are created."""
+    """Return a copy of nested values with a new value at a path; missing mappings are created."""
     if not path:
         return value
     if isinstance(at, list):
@@ -134,5 +134,5 @@ def _put(at: object, path: KeyPath, value: object) -> object:
 
 
 def _in_order(problems: Iterable[Problem]) -> list[Problem]:
-    """Return the problems in the order of reading: first the command line, then the file from its top."""
+    """Sort problems: those of the command line first, then by place in the file."""
     return sorted(problems, key=lambda problem: (problem.mark.file != COMMAND_LINE, problem.mark))

@@ -1,4 +1,4 @@
-"""Robot: the form of a robot file. `compile` checks its sections against each other."""
+"""Robot: the form of a robot file, apart from the sections that features add."""
 
 from __future__ import annotations
 
@@ -48,7 +48,7 @@ def _one_or_more(value: object) -> object:
 
 
 class Scheduler(Form):
-    """Settings of the operating system for the loop."""
+    """Form of `loop.scheduler`: real-time settings of the operating system for the loop's process."""
 
     policy: Literal["other", "fifo", "round_robin"] = key(
         "Linux scheduling policy of the loop.", "round_robin", "other"
@@ -84,7 +84,7 @@ class Scheduler(Form):
 
 
 class Loop(Form):
-    """The control loop."""
+    """Form of the section `loop`: rate of the control loop, real-time settings, late cycles."""
 
     rate: Rate = key("Loop rate, Hz.", "50", ge=0.001, le=100_000)
     scheduler: Scheduler = key(
@@ -100,7 +100,7 @@ class Loop(Form):
 
 
 class PoseStep(Form):
-    """A step of a policy that moves to a pose."""
+    """Form of a policy's step that moves joints to a named pose."""
 
     pose: str = key("Name of the pose.", "home", min_length=1)
     speed: Annotated[AngularVelocity, Field(gt=0)] = key(
@@ -114,7 +114,7 @@ class PoseStep(Form):
 
 
 class TorqueStep(Form):
-    """A step of a policy that reduces the torque gradually."""
+    """Form of a policy's step that reduces the servos' torque gradually."""
 
     reduce_torque: float = key(
         "Remaining share of each servo's own torque limit, between 0 and 1.", "0.3", gt=0, lt=1
@@ -149,12 +149,12 @@ WrittenPolicy = Annotated[
     | Annotated[tuple[PolicyStep, ...], Field(strict=False, min_length=1), Tag("<steps>")],
     Discriminator(_kind_of_policy),
 ]
-"""Steps of a policy, in the order of execution. After the last step the robot is limp, unless that step is
-`hold`."""
+"""Form of a policy: `limp`, `hold`, or a list of steps in the order of execution. After the last step the
+robot is limp, unless that step is `hold`."""
 
 
 class Group(Form):
-    """Joints under one name. Its other keys have been copied into the joints when the file was read."""
+    """Form of a group of joints; other keys than `joints` were copied into the joints before."""
 
     joints: Annotated[tuple[Name, ...], Field(strict=False, min_length=1)] = key(
         "Joints of the group, or other groups.", "[left_shoulder, left_elbow]"
@@ -162,7 +162,7 @@ class Group(Form):
 
 
 class GroupPolicies(Form):
-    """Policies of a group of joints that differ from those of the robot."""
+    """Form of an entry of `policies.groups`: policies of some joints that differ from the robot's."""
 
     joints: Annotated[tuple[Name, ...], Field(strict=False)] = key(
         "Joints of the group, each in one group at most; by default those of the robot's group with "
@@ -178,7 +178,7 @@ class GroupPolicies(Form):
 
 
 class Policies(Form):
-    """Actions at the end of a run and on faults."""
+    """Form of the section `policies`: what the robot does when a run ends or a fault occurs."""
 
     on_exit: WrittenPolicy = key(
         "Steps at the end of a run without a fault, as by Ctrl-C, SIGTERM, `dxlrun stop` or the last motion.",
@@ -207,14 +207,14 @@ class Policies(Form):
     )
 
     def of_joint(self, name: str, joint: str) -> object:
-        """Return the value of a key for a joint: its group's, or the robot's if the group has none."""
+        """Return a policy's value for a joint: that of its group, or of the robot if the group has none."""
         groups = (group for group in self.groups.values() if joint in group.joints)
         values = (getattr(owner, name, None) for owner in (*groups, self))
         return next((value for value in values if value is not None), None)
 
 
 def policies_form() -> type[Policies]:
-    """Return the form of the section with the keys of all features."""
+    """Return the form of `policies`, extended by the keys of installed features."""
     keys = [each for _, each in stages(PolicyKey, installed_features())]
     group = with_keys(GroupPolicies, [each.group for each in keys if each.group is not None])
     return with_keys(Policies, keys, groups=dict[Name, group])  # type: ignore[valid-type]  # made at run time
@@ -224,7 +224,7 @@ _ONE_OR_MORE = {"anyOf": [{"type": "string"}, {"type": "array", "minItems": 1, "
 
 
 class ControllerEntry(PlugInEntry):
-    """One controller. Keys other than type, active, rate, fallback and into are its own parameters."""
+    """Form of one controller. Keys other than type, active, rate, fallback and into are its parameters."""
 
     type: str = key(
         "Controller type of a plug-in, or a class of a Python file: `./wave.py:Wave`.",
@@ -247,13 +247,13 @@ class ControllerEntry(PlugInEntry):
 
 
 class Gateway(Form):
-    """The process through which clients steer the run."""
+    """Form of `processes.gateway`: the process through which clients steer the run."""
 
     enabled: bool = key("Permission for other programs of this user to steer the run.", "false", True)
 
 
 class Processes(Form):
-    """Processes next to the loop."""
+    """Form of the section `processes`: processes next to the loop."""
 
     refused: ClassVar[Mapping[str, str]] = {"view": "remove it; `dxlrun view` shows a run"}
 
@@ -265,7 +265,7 @@ class Processes(Form):
 
 
 class RobotModel(Form):
-    """The robot's body."""
+    """Form of the section `model`: the robot's URDF, its IMU, and the frames in the log."""
 
     urdf: str = key(
         "URDF of the robot, relative to the folder of the file that names it; each log contains a copy.",
@@ -288,7 +288,7 @@ class RobotModel(Form):
 
 
 class Simulation(Form):
-    """Physics of the simulated servos' loads; servos on a real port ignore it."""
+    """Form of the section `simulation`: physics of the simulated servos' loads; real servos ignore it."""
 
     physics: Literal["independent", "mujoco"] = key(
         "Physics engine: each joint on its own (independent), or the whole robot in MuJoCo, from the "
@@ -302,13 +302,13 @@ _POLICIES = ("Actions on faults and at the end of a run.", "{exit_timeout: 2 s}"
 
 
 class Robot(Form):
-    """A robot file without its arguments: the sections that are not features.
+    """Form of a robot file without the sections of features, which `robot_form` adds.
 
     `robot_form` adds the sections of features; `Section.of` returns one of them.
     """
 
     read_before: ClassVar[tuple[str, ...]] = ("arguments", "include", "joint_defaults")
-    """Keys of the file that are removed before the model is validated."""
+    """Keys of the file that are used and removed before it is validated by this form."""
 
     name: Name = key("Name of the robot.", "bioloid_torso")
     buses: dict[Name, Bus] = key("Serial lines by name.", "{main: {port: sim, ...}}", min_length=1)
@@ -341,7 +341,7 @@ class Robot(Form):
 
 @cache
 def robot_form() -> type[Robot]:
-    """Return the form of a robot file with the sections of all features."""
+    """Return the form of a robot file, extended by the sections and keys of installed features."""
     policies = policies_form()
     sections = [section for _, section in stages(Section, installed_features())]
     return with_keys(

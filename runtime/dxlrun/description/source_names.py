@@ -1,4 +1,4 @@
-"""Names of commands of sources in logs, in replies and in requests.
+"""Names under which commands of sources (devices) are stored in logs, replies and requests.
 
 Devices were the first sources with commands, so logs and users' programs contain their names.
 """
@@ -12,14 +12,14 @@ if TYPE_CHECKING:  # numpy is not needed to check a robot file
     from numpy.typing import NDArray
 
 SOURCE_COMMAND = "device_command"
-"""Sequence in a cycle's record: the value of each command."""
+"""Field of a cycle's record with the values of all source commands."""
 SOURCE_COMMANDS = "device_commands"
-"""Key of the commands' names in metadata and plans. It is also the kind of a command: `{"values":
+"""Key of the list of command names in metadata and plans, and kind of the command that sets them: `{"values":
 {"board/led": 1}}`."""
 
 
 class OlderSourceNames:
-    """Attributes of `RobotStates` with these names, which programs of users read."""
+    """Older names of two attributes of `RobotStates`, which programs of users may read."""
 
     __slots__ = ()
 
@@ -28,10 +28,10 @@ class OlderSourceNames:
 
     @property
     def device_commands(self) -> tuple[str, ...]:
-        """Older name of `source_commands`."""
+        """Same as `source_commands`, by its older name."""
         return self.source_commands
 
     @property
     def device_command(self) -> NDArray[np.float64]:
-        """Older name of `source_command`."""
+        """Same as `source_command`, by its older name."""
         return self.source_command

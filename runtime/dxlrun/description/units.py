@@ -1,4 +1,4 @@
-"""Units: angles, speeds and times in the notation of a person, `60 deg` or `500 us`, converted to SI.
+"""Units: converts quantities with units as text, `60 deg` or `500 us`, to numbers in SI units.
 
 Each quantity converts text to a number in its SI unit, and is the type of a model's field, such as `Angle` or
 `Duration`. A number without a unit is an error, because `60` could be deg or rad. Two exceptions: a bare
@@ -31,30 +31,32 @@ from dxlwire.joint_unit import JointUnit
 
 
 class Measure(float):
-    """A number with its SI unit, for a quantity that can have one of several units."""
+    """A number in SI with its unit, for keys that accept different quantities (angle or length)."""
 
     __slots__ = ("unit",)
     unit: str
 
     def __new__(cls, value: float, unit: str) -> Measure:
-        """Return a number in a unit: `Measure(0.02, "m")`."""
+        """Make a number with its SI unit: `Measure(0.02, "m")`."""
         self = super().__new__(cls, value)
         self.unit = unit
         return self
 
     @property
     def joint_unit(self) -> JointUnit:
-        """Unit of the joints that have this quantity; raise LookupError if no joint has it."""
+        """Kind of joint (rotary or linear) that this unit belongs to; raise LookupError if none."""
         return JointUnit.find_by_quantity(self.unit)
 
 
 def plain(measure: Measure | None) -> float | None:
-    """Return a measure as a plain number, for JSON."""
+    """Return a measure as a float without its unit, for JSON; None stays None."""
     return None if measure is None else float(measure)
 
 
 class Quantity:
-    """One kind of quantity; a call converts text to SI, and raises ValueError with an example.
+    """A quantity such as an angle: its units, and the conversion of text to SI by a call.
+
+    The call raises ValueError with an example.
 
     Args:
         what: Name with its article, for messages.
@@ -81,7 +83,7 @@ class Quantity:
         self._bare, self._least, self._most = bare, least, most
 
     def __call__(self, text: object) -> float:
-        """Return the quantity in its SI unit."""
+        """Convert text to a number in the SI unit; raise ValueError."""
         if self._bare and isinstance(text, int | float) and not isinstance(text, bool):
             return text
         number, unit = split(text, self.what, self.units, self.examples, bare=self.si if self._bare else "")
@@ -96,11 +98,11 @@ class Quantity:
         return value
 
     def text(self, value: float) -> str:
-        """Return a text that is read to a value."""
+        """Write a number in SI as text that this quantity reads back to the same number."""
         return f"{value!r} {self.si}" if self.si in self.units else f"{value * 100:.12g} %"
 
     def __get_pydantic_core_schema__(self, source: Any, handler: GetCoreSchemaHandler) -> CoreSchema:  # noqa: ANN401 (pydantic's)
-        """Return the schema of a field with this quantity."""
+        """Return pydantic's schema, which makes a field of this type read and write text with a unit."""
         written = core_schema.plain_serializer_function_ser_schema(
             self.text, return_schema=core_schema.str_schema(), when_used="json"
         )
@@ -111,13 +113,13 @@ class Quantity:
     def __get_pydantic_json_schema__(
         self, schema: CoreSchema, handler: GetJsonSchemaHandler
     ) -> dict[str, Any]:
-        """Return the JSON schema of the quantity in a file."""
+        """Return the JSON Schema of text with one of the units."""
         text = text_schema(example_of(self), self.units)
         return {"anyOf": [handler(schema), text]} if self._bare else text
 
 
 class Either(Quantity):
-    """A quantity of one of several kinds; a call converts text to a `Measure`."""
+    """A quantity that may be of different kinds, such as an angle or a length; a call returns a `Measure`."""
 
     def __init__(
         self, what: str, kinds: tuple[Quantity, ...], examples: str, *, above_zero: bool = False
@@ -128,7 +130,7 @@ class Either(Quantity):
         super().__init__(what, "", sizes, examples)
 
     def __call__(self, text: object) -> Measure:
-        """Return the value in SI, with its unit."""
+        """Convert text to a number in SI with its unit; raise ValueError."""
         if isinstance(text, Measure):  # was read before
             return text
         number, unit = split(text, self.what, self.units, self.examples)
@@ -140,12 +142,12 @@ class Either(Quantity):
         return Measure(value, self._kinds[unit].si)
 
     def text(self, value: float) -> str:
-        """Return a text that is read to a value."""
+        """Write a `Measure` as text that is read back to the same value."""
         unit = value.unit if isinstance(value, Measure) else ""
         return f"{float(value) * 100!r} %" if unit == "1" else f"{float(value)!r} {unit}"
 
     def __get_pydantic_core_schema__(self, source: Any, handler: GetCoreSchemaHandler) -> CoreSchema:  # noqa: ANN401 (pydantic's)
-        """Return the schema of a field with one of the quantities."""
+        """Return pydantic's schema, which makes a field of this type read and write text with a unit."""
         return core_schema.no_info_plain_validator_function(
             self,
             serialization=core_schema.plain_serializer_function_ser_schema(
@@ -155,10 +157,10 @@ class Either(Quantity):
 
 
 class Unlimited(Either):
-    """A positive quantity of one of several kinds, or `inf`."""
+    """A quantity that may be of different kinds and must be above 0, or is `inf`: no limit."""
 
     def __call__(self, text: object) -> Measure:
-        """Return the value in SI with its unit; an infinite value has no unit."""
+        """Convert text to a number in SI with its unit; infinity has no unit."""
         if text == "inf" or (isinstance(text, float) and math.isinf(text) and text > 0):
             return text if isinstance(text, Measure) else Measure(math.inf, "")
         found = super().__call__(text)
@@ -167,13 +169,13 @@ class Unlimited(Either):
         return found
 
     def text(self, value: float) -> str:
-        """Return a text that is read to a value."""
+        """Write a `Measure` as text that is read back to the same value."""
         return "inf" if math.isinf(value) else super().text(value)
 
     def __get_pydantic_json_schema__(
         self, schema: CoreSchema, handler: GetJsonSchemaHandler
     ) -> dict[str, Any]:
-        """Return the JSON schema of the quantity in a file."""
+        """Return the JSON Schema of text with one of the units, or `inf`."""
         text = super().__get_pydantic_json_schema__(schema, handler)
         return {"anyOf": [text, {"type": "string", "const": "inf"}]}
 
@@ -252,7 +254,7 @@ _SIZE_BYTES: Mapping[str, int] = {
 
 
 def duration(text: object, *, bare: str = "") -> int:
-    """Return a time in ns from `500 us`, `1 ms`, `2 s` or `1 min`; raise ValueError with an example.
+    """Convert a time such as `500 us`, `1 ms`, `2 s` or `1 min` to ns; raise ValueError with an example.
 
     `bare` is the unit of numbers without a unit.
     """
@@ -265,7 +267,7 @@ def duration(text: object, *, bare: str = "") -> int:
 
 
 def quantity(text: str, unit: str) -> float:
-    """Return a quantity in an SI unit of the control tables, from text with any unit of its kind.
+    """Convert text with any unit of a kind to a number in the kind's SI unit, as control tables use it.
 
     Args:
         text: The quantity.
@@ -280,7 +282,7 @@ def quantity(text: str, unit: str) -> float:
 def split(
     text: object, what: str, units: Mapping[str, object], written: str, *, bare: str = ""
 ) -> tuple[str, str]:
-    """Return number and unit of a valid quantity; `bare` is the unit of numbers without a unit."""
+    """Split text into number and unit; `bare` is the unit if it has none. Raises an error with a fix."""
     if isinstance(text, int | float) and not isinstance(text, bool):
         raise refuse(f"{text} has no unit", f"write {what} with its unit, such as {written}")
     if not isinstance(text, str):
@@ -319,12 +321,11 @@ _UNIT_WORDS: Mapping[str, str] = {
     "g": "gram grams",
     "kg": "kilogram kilograms",
 }
-"""Units, each with other notations for it."""
+"""Units with other spellings of each, for suggestions."""
 
 
 def _meant(text: str, units: Mapping[str, object]) -> str:
-    """Return the fix for a quantity with another notation of its unit, or for two quantities; empty: not
-    known."""
+    """Return the fix for a quantity with a misspelled unit, or for two values; empty if none is known."""
     if several := list_text(text):
         return f"these are two values, so write a list: {several}"
     match = re.fullmatch(r"([-+]?[0-9_.]+(?:[eE][-+]?\d+)?)\s*(\D.*)", text.strip())
@@ -339,13 +340,13 @@ def _meant(text: str, units: Mapping[str, object]) -> str:
 
 
 def _unit_for(name: str) -> str:
-    """Return the unit for another notation, or the notation itself if it is not known."""
+    """Return the correct unit for another spelling, or the text itself if it is not known."""
     word = name.strip().lower()
     return next((unit for unit, words in _UNIT_WORDS.items() if word in words.split()), name.strip())
 
 
 def units_of(note: object) -> Mapping[str, float]:
-    """Return the units of a field's quantity, each with its size in the field's unit; empty: not a quantity.
+    """Return the units of a field's quantity and their size in its SI unit (ns); empty: not a quantity.
 
     Args:
         note: Metadata of the field's `Annotated` type.
@@ -356,15 +357,14 @@ def units_of(note: object) -> Mapping[str, float]:
 
 
 def example_of(note: object) -> str:
-    """Return an example of a field's quantity; empty: not a quantity. `note` as in `units_of`."""
+    """Return an example of a field's quantity, such as `60 deg`; empty if it is not one."""
     if isinstance(note, Quantity):
         return note.examples.split(",")[0].split(" or ")[0]
     return "1 s" if units_of(note) else ""
 
 
 def bound_text(bound: float, units: Mapping[str, float], written: object) -> str:
-    """Return a bound in the unit of the value that exceeds it: a bound of 10_000_000 ns for `5 ms` is `10
-    ms`.
+    """Write a bound in the unit of the value that exceeds it: 10_000_000 (ns) as `10 ms` for `5 ms`.
 
     Args:
         bound: In the field's unit: SI, or ns.
@@ -378,7 +378,7 @@ def bound_text(bound: float, units: Mapping[str, float], written: object) -> str
 
 
 def text_schema(example: str, units: Mapping[str, object]) -> dict[str, Any]:
-    """Return the JSON schema of a quantity as text."""
+    """Return the JSON Schema of text with a number and one of these units."""
     # JSON Schema does not allow an escaped space.
     names = "|".join(re.escape(unit).replace("\\ ", " ") for unit in units)
     pattern = rf"^\s*[-+]?[0-9_.]+([eE][-+]?[0-9]+)?\s*({names})\s*$"
@@ -424,11 +424,11 @@ Speed = Annotated[Measure, speed]
 Acceleration = Annotated[Measure, acceleration]
 TorqueOrForce = Annotated[Measure, torque_or_force]
 Tolerance = Annotated[float, Field(allow_inf_nan=True), tolerance]
-"""Distance, rad or m, above 0, or `inf`."""
+"""Distance in a file, converted to rad or m: above 0, or `inf` for no limit."""
 RestSpeed = Annotated[float, Field(allow_inf_nan=True), rest_speed]
-"""rad/s or m/s, above 0, or `inf`."""
+"""Speed in a file, converted to rad/s or m/s: above 0, or `inf` for no limit."""
 Angles = Annotated[tuple[Angle, ...], Field(strict=False)]
-"""Several angles, rad, from `[60 deg, 1 rad]`; shape (angles,)."""
+"""List of angles in a file such as `[60 deg, 1 rad]`, converted to rad."""
 
 
 def _or_word(value: object, *words: str) -> int | str:
@@ -453,7 +453,7 @@ Duration = Annotated[
     PlainSerializer(_nanoseconds, return_type=str, when_used="json"),
     WithJsonSchema(_DURATION_SCHEMA),
 ]
-"""ns, never negative, from `500 us`, `1 ms`, `2 s` or `1 min`."""
+"""Time in a file such as `500 us` or `2 s`, converted to ns; never negative."""
 
 AutoDuration = Annotated[
     int | Literal["auto"],
@@ -461,7 +461,7 @@ AutoDuration = Annotated[
     PlainSerializer(_nanoseconds, return_type=str, when_used="json"),
     WithJsonSchema({"anyOf": [_DURATION_SCHEMA, {"type": "string", "const": "auto"}]}),
 ]
-"""ns, like Duration, or the word `auto`."""
+"""Time as Duration, converted to ns, or the word `auto`."""
 
 Polling = Annotated[
     int | Literal["auto"],
@@ -469,11 +469,11 @@ Polling = Annotated[
     PlainSerializer(lambda value: _nanoseconds(value or "off"), return_type=str, when_used="json"),
     WithJsonSchema({"anyOf": [_DURATION_SCHEMA, {"type": "string", "enum": ["auto", "off"]}]}),
 ]
-"""ns, like Duration, or the word `auto`; `off` is 0."""
+"""Time as Duration, converted to ns, or the word `auto`; the word `off` becomes 0."""
 
 
 def size(text: str) -> int:
-    """Return bytes from `100 MB`, `10GB` or `64 MiB`; raise ValueError with an example."""
+    """Convert a size such as `100 MB`, `10GB` or `64 MiB` to bytes; raise ValueError with an example."""
     number, unit = split(text, "a size", _SIZE_BYTES, "10 GB")
     return round(Fraction(number) * _SIZE_BYTES[unit])
 
@@ -499,4 +499,4 @@ SizeOrDuration = Annotated[
     ),
     WithJsonSchema(text_schema("100 MB", {**_SIZE_BYTES, **DURATION_NS})),
 ]
-"""Bytes from `100 MB` or `64 MiB`, or ns from `10 min`. The first element names the unit."""
+"""Size in bytes from `100 MB`, or time in ns from `10 min`; the first element says which, `bytes` or `ns`."""

@@ -1,4 +1,4 @@
-"""YAML files with a custom form: read into a model, with the place of each mistake."""
+"""YAML file: reads a YAML file of any form into a pydantic model, with the place of each mistake."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ from dxlrun.description.problems import Form, read_form
 
 
 def read_yaml(path: Path, model: type[Form]) -> Form:
-    """Read a YAML file into a model.
+    """Read a YAML file and validate it with a model.
 
     Args:
         path: The file. It may have neither arguments `${NAME}` nor tags.

@@ -1,4 +1,4 @@
-"""Log: topics and messages, the recorder's process, the writer, the reader.
+"""Log: messages and topics of a log, its recorder process, its writer and its reader.
 
 The interpretation of a log belongs in `dxlrun_analysis`.
 """

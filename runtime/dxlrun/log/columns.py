@@ -1,4 +1,4 @@
-"""Columns: packets of a log as one NumPy array per field, and one array with the bytes of all packets."""
+"""Packet columns: the bus packets of a log as one NumPy array per field."""
 
 from __future__ import annotations
 
@@ -16,15 +16,18 @@ from dxlwire.packets import PacketKind
 
 @dataclass(frozen=True, slots=True, eq=False)
 class PacketColumns(Sequence[LoggedPacket]):
-    """Packets, one row each; as a sequence, single packets. Times are ns of the run's clock."""
+    """Packets of a log, one element of each array per packet; also a sequence of single packets.
+
+    Times are ns of the run's clock.
+    """
 
     cycle: NDArray[np.int64]
-    """Number of the cycle in whose period the packet was; BEFORE_FIRST_CYCLE before the first. The cycle
-    in which a process died has no record."""
+    """Number of the cycle in which the packet was sent or received; BEFORE_FIRST_CYCLE before the first. The
+    cycle in which a process died has no record."""
     bus: NDArray[np.uint8]
-    """Index into the log's buses."""
+    """Bus of the packet, as an index into the log's buses."""
     kind: NDArray[np.uint8]
-    """Number of a PacketKind."""
+    """Kind of packet, such as instruction or status, as a number of `PacketKind`."""
     servo_id: NDArray[np.uint8]
     first_ns: NDArray[np.int64]
     last_ns: NDArray[np.int64]
@@ -32,14 +35,14 @@ class PacketColumns(Sequence[LoggedPacket]):
     """Index of the packet's first byte in `data`."""
     length: NDArray[np.int64]
     data: NDArray[np.uint8]
-    """Bytes of all packets, possibly with bytes of other packets."""
+    """Bytes of all packets, possibly also of packets that are not in these columns."""
 
     @overload
     def __getitem__(self, index: int) -> LoggedPacket: ...
     @overload
     def __getitem__(self, index: slice) -> PacketColumns: ...
     def __getitem__(self, index: int | slice) -> LoggedPacket | PacketColumns:
-        """Return one packet, or the columns of a slice."""
+        """Return one packet, or the columns of a slice of packets."""
         if isinstance(index, slice):
             return self.take(np.arange(len(self))[index])
         start = int(self.start[index])
@@ -57,7 +60,7 @@ class PacketColumns(Sequence[LoggedPacket]):
         return len(self.bus)
 
     def __iter__(self) -> Iterator[LoggedPacket]:
-        """Yield the packets one by one; working on the columns is faster."""
+        """Yield the packets one by one; computing with the columns is faster."""
         data = self.data.tobytes()
         columns = (self.bus, self.kind, self.servo_id, self.first_ns, self.last_ns, self.start, self.length)
         for bus, kind, servo_id, first_ns, last_ns, start, length in zip(
@@ -67,16 +70,16 @@ class PacketColumns(Sequence[LoggedPacket]):
             yield LoggedPacket(bus, PacketKind(kind), servo_id, first_ns, last_ns, body)
 
     def take(self, rows: NDArray[np.int64] | NDArray[np.bool_]) -> PacketColumns:
-        """Return some packets, by indices or by a mask of shape (packets,); the bytes are shared."""
+        """Return the columns of selected packets, by indices or boolean mask; `data` is not copied."""
         return replace(self, **{name: getattr(self, name)[rows] for name in _OF_EACH})
 
     def compact(self) -> PacketColumns:
-        """Return the same packets with a copy of only their own bytes."""
+        """Return the same packets with a new `data` that contains only their bytes."""
         start = np.cumsum(self.length) - self.length
         return replace(self, start=start, data=pieces(self.data, self.start, self.length))
 
     def byte(self, index: int) -> NDArray[np.uint8]:
-        """Return the byte at an index of each packet, shape (packets,); 0 in shorter packets."""
+        """Return the byte at one offset of each packet, shape (packets,); 0 where a packet is too short."""
         found = np.zeros(len(self), np.uint8)
         there = index < self.length
         found[there] = self.data[self.start[there] + index]
@@ -84,7 +87,7 @@ class PacketColumns(Sequence[LoggedPacket]):
 
     @classmethod
     def joined(cls, parts: Sequence[PacketColumns]) -> PacketColumns:
-        """Return the concatenated packets of several columns."""
+        """Concatenate the packets of several columns."""
         if len(parts) == 1:
             return parts[0]
         if not parts:
@@ -98,7 +101,7 @@ class PacketColumns(Sequence[LoggedPacket]):
 
     @classmethod
     def of(cls, packets: Iterable[LoggedPacket], cycle: NDArray[np.int64] | None = None) -> PacketColumns:
-        """Return packets as columns; `cycle` has shape (packets,); None: all are before the first cycle."""
+        """Convert packets to columns; `cycle` has their cycle numbers, None means before the first cycle."""
         rows = list(packets)
         length = np.array([len(packet.data) for packet in rows], np.int64)
         return cls(
@@ -119,7 +122,7 @@ _OF_EACH = ("cycle", "bus", "kind", "servo_id", "first_ns", "last_ns", "start", 
 
 
 def numbers(data: NDArray[np.uint8], at: NDArray[np.int64], kind: str) -> NDArray[np.int64]:
-    """Return little-endian integers at arbitrary indices of `data`; each must lie within `data`."""
+    """Read little-endian integers of NumPy type `kind` at these byte offsets in `data`."""
     dtype = np.dtype(kind)
     count = max(len(data) - dtype.itemsize + 1, 0)
     found: NDArray[np.int64] = np.ndarray((count,), dtype, data, 0, (1,))[at].astype(np.int64)

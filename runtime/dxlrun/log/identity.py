@@ -19,22 +19,22 @@ from pathlib import Path
 from dxlrun.installed_plugins import distribution_name
 
 IDENTITY_NAME = "identity"
-"""Name of the metadata record; docs/how-to/logs.md has its keys."""
+"""Name of the log's metadata record with the identity; docs/how-to/logs.md has its keys."""
 ROBOT, INCLUDED, MOTION, URDF, PLUGIN, RUNTIME = "robot", "included", "motion", "urdf", "plugin", "runtime"
-"""First word of a hash's key: the kind of the file. All but URDF and RUNTIME are followed by the file's
-name."""
+"""First word of an entry's key: which kind of file was hashed. All but URDF and RUNTIME are followed by the
+file's name."""
 HOST, KERNEL, REVISION, CHANGED = "host", "kernel", "git revision", "git changed"
-"""Keys of values that are not hashes."""
+"""Keys of entries that are not hashes: host name, kernel, git revision, uncommitted changes."""
 _GIT_TIMEOUT_S = 2.0
-"""Timeout of all git commands together: a network folder may respond slowly, and the run waits."""
+"""Timeout of all git commands together, s: a network folder may respond slowly, and the run waits."""
 _MOST_FILES = 2_000
-"""Upper limit of the hashed files of a package, which bounds the delay before a run."""
+"""Most files of a plug-in package that are hashed, which bounds the delay before a run."""
 _BUILT = (".pyc", ".so")
-"""Suffixes of files that each machine builds from sources."""
+"""Suffixes of files that are not hashed in dxlrun's own code, because each machine builds them."""
 
 
 def identity(source_file: str, files: Mapping[str, str], packages: Mapping[str, str]) -> dict[str, str]:
-    """Return the identity of a run.
+    """Return all hashes and facts that identify a run, as key and value for the log's metadata.
 
     Args:
         source_file: Path of the robot file.
@@ -52,12 +52,12 @@ def identity(source_file: str, files: Mapping[str, str], packages: Mapping[str, 
 
 
 def file_key(what: str, name: str) -> str:
-    """Return the key of a file: `included fragments/head.yaml`."""
+    """Return the key of a file's hash: `included fragments/head.yaml`."""
     return f"{what} {name}"
 
 
 def code_hashes(packages: Iterable[tuple[str, str]] = ()) -> dict[str, str]:
-    """Return the hash of each file of some packages, and one hash of dxlrun's own code.
+    """Return the hash of each file of plug-in packages, and one hash of all of dxlrun's own code.
 
     Keys are `plugin DISTRIBUTION PACKAGE/FILE.py`, values SHA-256. Package paths begin at the top package.
     Only the first 2000 files of a package, by name, are hashed.
@@ -79,13 +79,13 @@ def code_hashes(packages: Iterable[tuple[str, str]] = ()) -> dict[str, str]:
 
 
 def package_of(key: str) -> tuple[str, str]:
-    """Return package and distribution from the key of a plug-in's file."""
+    """Split the key of a plug-in's file into Python package and distribution."""
     distribution, _, name = key.removeprefix(file_key(PLUGIN, "")).rpartition(" ")
     return name.partition("/")[0].removesuffix(".py"), distribution
 
 
 def changed_code(then: Mapping[str, str], publishers: Iterable[str]) -> tuple[str, ...]:
-    """Return a sentence for each plug-in whose files have changed since a run, and one for dxlrun itself.
+    """Compare installed code with a log's identity; return a sentence per changed plug-in, and for dxlrun.
 
     Args:
         then: Identity in the log of the run; empty in logs of earlier versions.
@@ -110,16 +110,16 @@ def changed_code(then: Mapping[str, str], publishers: Iterable[str]) -> tuple[st
 
 
 def runtime_hash() -> str:
-    """Return the hash of dxlrun's own code."""
+    """Return one hash of all files of dxlrun's own code."""
     return code_hashes()[RUNTIME]
 
 
 _imported = cache(code_hashes)
-"""Cached hashes of the code of this process, which imports it once."""
+"""`code_hashes`, computed once per process, because a process imports its code only once."""
 
 
 def module_files(module: str) -> list[tuple[str, Path]]:
-    """Return the files of a top package or module by relative name; empty without a location."""
+    """Return the files of a Python package or module, by path relative to its parent; empty if not found."""
     try:
         spec = find_spec(module)
     # ValueError: the module was created in memory.
@@ -145,7 +145,7 @@ def _named(places: Iterable[Path]) -> Iterator[tuple[str, Path]]:
 
 
 def _hash_of(path: Path) -> str:
-    """Return the hash of a file, or the reason why it cannot be read."""
+    """Return the SHA-256 of a file, or `not readable: REASON`."""
     try:
         return sha256(path.read_bytes()).hexdigest()
     except OSError as error:
@@ -153,10 +153,10 @@ def _hash_of(path: Path) -> str:
 
 
 def git_state(folder: Path, file: str) -> dict[str, str]:
-    """Return the git revision of a folder, and whether its files differ from the revision; {} without git.
+    """Return git revision of a folder and whether files in it differ from it; empty without git.
 
-    `yes` also means that git does not track the file itself. Other untracked files are ignored, because logs
-    are written there.
+    `yes` also means that git does not track the robot file itself. Other untracked files are ignored, because
+    logs are written there.
     """
     if not any((place / ".git").exists() for place in (folder.absolute(), *folder.absolute().parents)):
         # The usual case on a robot's computer: git is not started.
@@ -181,7 +181,7 @@ def git_state(folder: Path, file: str) -> dict[str, str]:
 
 
 def _git(folder: Path, arguments: tuple[str, ...], give_up: float) -> str | None:
-    """Return the output of git; None when git is missing, fails or is too slow."""
+    """Run git in a folder and return its output; None if it is missing, fails, or exceeds `give_up` (s)."""
     # Neither write the index nor start a program that the repository configures: a run only reads.
     command = ["git", "--no-optional-locks", "-c", "core.fsmonitor=false", *arguments]
     surroundings = {key: value for key, value in os.environ.items() if not key.startswith("GIT_")}

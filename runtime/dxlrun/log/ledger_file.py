@@ -1,4 +1,4 @@
-"""Ledger file: the file of the simulated buses' ledger."""
+"""Ledger file: file with the packets that simulated buses exchanged."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ _BUFFER = 1 << 16
 
 
 def open_ledger(path: Path | None) -> Ledger:
-    """Return a ledger that writes to a file, if one is given, and keeps nothing in memory.
+    """Return the ledger of the simulated buses, which writes to a new file, or discards everything for None.
 
     Raises OSError for a file that cannot be written, or is not empty.
     """

@@ -1,4 +1,4 @@
-"""Log file: unbuffered output with errors for all lost bytes; the writer holds a lock on the file."""
+"""Log file: unbuffered file output that reports lost bytes; holds a lock while a log is being written."""
 
 from __future__ import annotations
 
@@ -18,14 +18,14 @@ except ImportError:
     fcntl = None  # type: ignore[assignment]  # a module, or none
 
 LOG_MODE = 0o640
-"""Mode of a new log: commands and names of clients are only for its user and group."""
+"""Permissions of a new log file: only its user and group can read the clients' commands and names."""
 # Without locks, a file counts as being written for this time after its last change.
 _LATELY_S = 10.0
 _HELD = (errno.EWOULDBLOCK, errno.EACCES)
 
 
 def has_writer(path: Path) -> bool:
-    """Return whether a process has this file of a log open for writing.
+    """Return True if a process is writing this file of a log.
 
     The writer holds a lock (flock(2)), which Linux releases at any end of the process. On a file system
     without locks, a file that changed within 10 s counts as being written.
@@ -49,7 +49,7 @@ def has_writer(path: Path) -> bool:
 
 
 class LogFile:
-    """Unbuffered file; every method raises OSError when the disk does not accept or keep the bytes."""
+    """File of a log, opened for writing and locked; methods raise OSError if the disk refuses bytes."""
 
     __slots__ = ("_descriptor", "_path", "_size")
 
@@ -64,7 +64,7 @@ class LogFile:
         self._size = 0
 
     def write(self, data: bytes | bytearray | memoryview) -> int:
-        """Write all of `data`. Linux may write less than requested; only the rest then shows a full disk."""
+        """Write all of `data` and return its length. Raises OSError on a full disk or a truncated file."""
         if os.fstat(self._descriptor).st_size < self._size:
             raise OSError(errno.EIO, "the file was cut by another program")
         rest = memoryview(data)
@@ -74,18 +74,18 @@ class LogFile:
         return len(data)
 
     def tell(self) -> int:
-        """Return the number of bytes that were written."""
+        """Return the number of bytes written so far."""
         return self._size
 
     def flush(self) -> None:
-        """Do nothing: output is not buffered."""
+        """Do nothing: required by the MCAP library, but output is not buffered."""
 
     def sync(self) -> None:
-        """Wait until the disk has all written bytes."""
+        """Block until the disk has stored all written bytes."""
         (os.fdatasync if sys.platform == "linux" else os.fsync)(self._descriptor)
 
     def truncate(self, size: int) -> None:
-        """Truncate the file to `size`; a shorter file keeps its length."""
+        """Cut the file to `size` bytes and continue there; a shorter file keeps its length."""
         size = min(size, os.fstat(self._descriptor).st_size)
         os.ftruncate(self._descriptor, size)
         os.lseek(self._descriptor, size, os.SEEK_SET)
@@ -93,7 +93,7 @@ class LogFile:
 
     @property
     def gone(self) -> bool:
-        """True when another program deleted, moved or replaced the file."""
+        """True if another program deleted, moved or replaced the file during the run."""
         ours = os.fstat(self._descriptor)
         try:
             there = self._path.stat()
@@ -102,7 +102,7 @@ class LogFile:
         return (there.st_dev, there.st_ino) != (ours.st_dev, ours.st_ino)
 
     def close(self) -> None:
-        """Release the lock and close the file, even if a forked child still has the file descriptor."""
+        """Release the lock and close the file; the lock ends even if a forked child has the descriptor."""
         if fcntl is not None:
             with suppress(OSError):
                 fcntl.flock(self._descriptor, fcntl.LOCK_UN)

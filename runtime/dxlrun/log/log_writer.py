@@ -1,4 +1,4 @@
-"""Log writer: writes records of the rings as MCAP messages; two virtual runs give the same bytes."""
+"""Log writer: writes a run's records as messages of an MCAP file; equal virtual runs give equal bytes."""
 
 from __future__ import annotations
 
@@ -27,9 +27,9 @@ from dxlrun.messages.definition import MessageType
 
 Written = TypeVar("Written")
 CHUNK_BYTES = 512 * 1024
-"""Size of a chunk's messages, bytes, above which the chunk is written."""
+"""Size of the collected messages, bytes, above which they are written to the file as a chunk."""
 _COMPRESSED_FROM = 16 * 1024
-"""Bytes; an attachment of this size or more is compressed. Shorter ones remain readable as text."""
+"""Size from which an attachment is compressed, bytes. Smaller ones remain readable as text."""
 _LIBRARY = "dxlrun"
 _PACKAGE = "dxlrun_msgs"
 _LIBRARIES = ("dxlrun", "mcap", "numpy")
@@ -38,13 +38,13 @@ _MEDIA_TYPES = {".json": "application/json", ".yaml": "application/yaml", ".txt"
 
 @event_text(EventCode.RECORDER_GAP, Severity.ERROR)
 def records_lost(source: str, lost: int) -> str:
-    """Row of the only event of this room."""
+    """Return the event that records of a source did not reach the log."""
     what = counted(lost, f"record of {source} was", f"records of {source} were")
     return f"{what} overwritten or damaged before the recorder read {'it' if lost == 1 else 'them'}"
 
 
 class LogWriter(RunMessages):
-    """Writer of one log file from records of the rings.
+    """Writer of one MCAP file from the records that the recorder takes from the rings.
 
     A disk that accepts no more bytes (OSError) stops the writing, but not the caller. The file is then
     truncated to its last whole chunk, `error` has the reason, and later records are counted. Only a file that
@@ -52,12 +52,15 @@ class LogWriter(RunMessages):
     """
 
     def __init__(self, path: Path, header: LogHeader, span: CycleSpan | None = None) -> None:
-        """`span`: cycles in the earlier parts of the same log; it is extended."""
+        """Create the file and write header and attachments;
+
+        `span` is the cycle range of earlier parts to extend.
+        """
         super().__init__(header)
         self.span = span or self.span
         self.error: str | None = None
         self.late_metadata: dict[str, dict[str, str]] = {}
-        """Metadata that become known during the run, written at the end of the file."""
+        """Metadata records that become known during the run; written at the end of the file."""
         self._file = LogFile(path)
         self._messages = self._lost = self._unwritten = 0
         # Times of the first and the last message so far.
@@ -71,7 +74,7 @@ class LogWriter(RunMessages):
         self._chunk_bytes = 0
         self._sequences: dict[int, int] = {}
         self._known: dict[str, int] = {}
-        """Schemas by message name."""
+        """Number of each message type in the file, by the type's name."""
         try:
             self._begin()
         except BaseException:
@@ -80,7 +83,7 @@ class LogWriter(RunMessages):
 
     @property
     def size(self) -> int:
-        """Size of the file without the unfinished chunk, bytes."""
+        """Size of the file so far, bytes, without messages that are still collected for the next chunk."""
         return self._file.tell()
 
     def _begin(self) -> None:
@@ -123,7 +126,7 @@ class LogWriter(RunMessages):
         self.last_ns = max(self.last_ns, t_ns)
 
     def _end_chunk(self) -> None:
-        """Write the chunk with the packets of its cycles; later messages may be lost in a failure."""
+        """Write the collected messages as a chunk; a failure later loses only messages after this point."""
         self._write_packets()
         self._writer.flush()
         self._whole_bytes, self._whole_messages = self._file.tell(), self._messages
@@ -131,7 +134,7 @@ class LogWriter(RunMessages):
         self._chunk_bytes = 0
 
     def _guarded(self, write: Callable[[Written], None], what: Written) -> None:
-        """Write a record, or count it after the writing has stopped."""
+        """Call `write` with a record; after the writing has stopped, count the record as unwritten."""
         if self.error is None:
             write(what)
         else:
@@ -151,7 +154,7 @@ class LogWriter(RunMessages):
             self.error += f"; {self.span.last_cycle_text}"
 
     def take(self, kind: int, payload: Payload) -> None:
-        """Write one record of a ring. Raises ValueError for a record that does not fit into a log."""
+        """Write one record from a ring as a message. Raises ValueError for a kind that logs do not have."""
         if kind not in self._takers:
             raise ValueError(f"a record of kind {kind} does not belong in a log")
         self._guarded(self._takers[kind], payload)
@@ -159,11 +162,11 @@ class LogWriter(RunMessages):
             self.flush()
 
     def machine(self, t_ns: int, data: bytes) -> None:
-        """Write a message about the machine; the first one opens the topic, which virtual runs lack."""
+        """Write an encoded message about the machine's load to /machine; the first one opens the topic."""
         self._guarded(lambda message: self._machine(t_ns, message), data)
 
     def gap(self, source: str, lost: int) -> None:
-        """Add an event for `lost` records of `source` that did not reach the log."""
+        """Write an event that `lost` records of `source` did not reach the log, and count them."""
         self._lost += lost
         code, severity, text = records_lost(source, lost)
         data = msgspec.json.encode(LostRecords(source, lost))
@@ -171,7 +174,7 @@ class LogWriter(RunMessages):
         self._guarded(self.event, event)
 
     def flush(self) -> None:
-        """Finish the present chunk, so that a reader finds it even after this process was killed."""
+        """Write the collected messages, so that a reader finds them even after this process was killed."""
         if self.error is None:
             try:
                 self._end_chunk()
@@ -179,7 +182,7 @@ class LogWriter(RunMessages):
                 self._give_up(error)
 
     def sync(self) -> None:
-        """Wait until the disk has all flushed chunks, so that a reader finds them after a power failure."""
+        """Block until the disk has stored all written chunks, so that they survive a power failure."""
         if self.error is None:
             try:
                 self._file.sync()
@@ -187,7 +190,7 @@ class LogWriter(RunMessages):
                 self._give_up(error)
 
     def close(self) -> LogSummary:
-        """Finish the file and return its summary; a second call returns the same summary.
+        """Finish the file and return message count, size and error; later calls return the same summary.
 
         The summary also has an error when the file no longer exists.
         """
@@ -217,7 +220,7 @@ class LogWriter(RunMessages):
 
 
 class TopicWriter:
-    """Writer of topics into a new or empty log file.
+    """Writer of a measurement's own topics into a new log file, without a robot.
 
         log = TopicWriter(Path("heat.mcap"), "heat", 1_000_000_000, {"setup": {"room": "lab"}})
         heat = log.open_topic("/heat", Heat)  # a dataclass
@@ -255,15 +258,15 @@ class TopicWriter:
         self._codecs: list[Codec] = []
 
     def open_topic(self, name: str, message: type) -> int:
-        """Open a topic and return its number; `message` is a dataclass or msgspec struct."""
+        """Add a topic with messages of a dataclass or msgspec struct; return its number for `append`."""
         codec = Codec(declared_message(message, _PACKAGE).type)
         self._codecs.append(codec)
         return self._ring.announce(PublishedTopic(name, codec.message))
 
     def append(self, topic: int, t_ns: int, values: Sequence[Value]) -> None:
-        """Append a message; `values` are its fields in sequence, `t_ns` is a time of the monotonic clock."""
+        """Append a message to a topic; `values` are its fields in sequence, `t_ns` is monotonic time."""
         self._ring.message(topic, t_ns, self._codecs[topic].pack_row(values))
 
     def close(self) -> LogSummary:
-        """Finish the file and return its summary, which has the error of a full disk."""
+        """Finish the file and return its summary, with `error` if the disk was full."""
         return self._log.close()

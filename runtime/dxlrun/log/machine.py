@@ -1,4 +1,4 @@
-"""Machine: load and temperature of the cores, and the loop's share of the processor, once a second.
+"""Machine load: samples each core's load and frequency, temperature, and the loop process once a second.
 
 The recorder's process samples them from /proc and /sys (proc(5); cpufreq and thermal of the kernel's
 documentation). Values that a system does not provide are NaN, never an error: virtual machines have no
@@ -22,26 +22,29 @@ from dxlrun.messages.cdr import Codec
 from dxlrun.plan.machine_load import LoadSample
 
 _SHARES = ("user", "nice", "system", "idle", "iowait", "irq", "softirq", "steal")
-"""Columns of a core in /proc/stat; `user` already contains guests."""
+"""Columns of a core in /proc/stat, times in ticks; `user` already contains guests."""
 _LAST_CORE = 38
-"""Index of the field of the last used core in /proc/PID/stat, counted from 0."""
+"""Index of the field `processor` (last used core) in /proc/PID/stat, counted from 0."""
 _UNREADABLE = (OSError, ValueError, IndexError, KeyError)
 Floats = NDArray[np.float64]
 
 
 class _Counters(msgspec.Struct, frozen=True, eq=False):
-    """Monotonic counters, with one row per core."""
+    """One reading of counters that only grow: CPU times per core, memory pressure, the loop process."""
 
     t_ns: int
     ticks: Floats
-    """Shape (cores, columns of /proc/stat)."""
+    """CPU time by state, ticks, shape (cores, columns of /proc/stat)."""
     pressure_s: float
-    """Time during which some process waited for memory, s."""
+    """Total time during which some process waited for memory, s."""
     process: dict[str, float]
 
 
 class MachineSampler:
-    """Sampler of the machine and one process; `root`: root of the file system, for tests."""
+    """Samples the load of this machine and of one process, by its PID.
+
+    `root` replaces the file system's root in tests.
+    """
 
     def __init__(self, pid: int, root: Path = Path("/")) -> None:
         self._root = root
@@ -59,7 +62,7 @@ class MachineSampler:
         self._codec = Codec(MACHINE)
 
     def sample(self, t_ns: int) -> bytes | None:
-        """Return a message about the time since the last call; None at the first call.
+        """Return an encoded message of /machine about the time since the last call; None at the first call.
 
         `t_ns`: time of the run's clock.
         """
@@ -105,7 +108,7 @@ class MachineSampler:
         return math.nan
 
     def _of_process(self) -> dict[str, float]:
-        """Return the counters of the process by field name of the message."""
+        """Return the watched process's counters, by field name of the message, without unreadable ones."""
         found: dict[str, float] = {}
         with suppress(*_UNREADABLE):
             running, waiting, _ = (float(word) for word in self._text("schedstat").split())
@@ -128,7 +131,7 @@ class MachineSampler:
         return -1
 
     def _stat(self) -> list[str]:
-        """Return the fields of /proc/PID/stat without the program's name, which may contain spaces."""
+        """Return the fields of /proc/PID/stat; the first two (PID, program name) are empty texts."""
         text = self._text("stat")
         return ["", "", *text[text.rindex(")") + 1 :].split()]
 
@@ -136,7 +139,7 @@ class MachineSampler:
         return (self._process / name).read_text()
 
     def _frequency(self, core: int) -> float:
-        """Return the frequency of a core, Hz."""
+        """Return the present frequency of a core, Hz; NaN if it is not known."""
         path = self._frequencies.get(core)
         return max(_readable([path] if path else []), default=math.nan) * 1e3
 
@@ -152,7 +155,10 @@ _PROCESS = (
 
 
 def _shares(now: Floats, before: Floats, cores: int) -> Floats:
-    """Return user, system, irq, softirq, steal and idle of each core as shares of 1, shape (6, cores)."""
+    """Return the shares of time per core between two readings, shape (6, cores).
+
+    Rows are user, system, irq, softirq, steal and idle; a share is 0 to 1, NaN if not known.
+    """
     spent = np.full((cores, len(_SHARES)), np.nan)
     both = min(len(now), len(before))
     spent[:both] = now[:both] - before[:both]
@@ -169,7 +175,7 @@ def _readable(paths: Iterable[Path]) -> Iterable[float]:
 
 
 def load_sample(message: Mapping[str, object]) -> LoadSample:
-    """Return the values of a message of /machine from which the machine's load is judged."""
+    """Extract idle, steal and the loop's waiting time from a decoded message of /machine."""
     end_ns, interval_ns = cast("int", message["t_ns"]), cast("int", message["interval_ns"])
     idle, steal = (cast("Floats", message[name]) for name in ("idle", "steal"))
     return LoadSample(

@@ -1,4 +1,4 @@
-"""Part writer: a log in several files, each a complete log; with `keep`, the oldest are deleted."""
+"""Part writer: writes a log as several files, each a complete log; with `keep`, deletes the oldest."""
 
 from __future__ import annotations
 
@@ -20,16 +20,16 @@ from dxlrun.plan.recording_plan import (
 )
 
 FOLDER_MODE = 0o750
-"""Mode of a directory of parts, with the same rights as a log's file."""
+"""Permissions of a log's directory of parts, with the same rights as a log's file."""
 
 
 def open_writer(path: Path, header: LogHeader, recording: RecordingPlan) -> LogWriter | PartWriter:
-    """Open a log, a file or a directory of parts, for writing. Raises OSError when it cannot be begun."""
+    """Open a new log for writing, as one file or a directory of parts, as the plan says. Raises OSError."""
     return PartWriter(path, header, recording) if recording.in_parts else LogWriter(path, header)
 
 
 class PartWriter:
-    """Writer of a log in parts, with the interface of LogWriter.
+    """Writer of a log in several files (parts), with the interface of LogWriter.
 
     `settle` ends a part that is full or old, and deletes expired parts according to the plan; the newest part
     is never deleted.
@@ -41,26 +41,26 @@ class PartWriter:
         self._header = header
         self._plan = recording
         self.late_metadata: dict[str, dict[str, str]] = {}
-        """Metadata of the run, written at the end of each part that ends from now on."""
+        """Metadata records of the run, written at the end of each part that ends from now on."""
         self.span = CycleSpan()
-        """Time span of the cycles in all parts."""
+        """First and last cycle of the whole log, over all parts."""
         self._error: str | None = None
         self._unwritten = 0
-        """Number of records after the last writable part was closed."""
+        """Number of records that were lost after the log ended early."""
         self._closed: list[LogSummary] = []
         self._kept: deque[tuple[Path, int]] = deque()
-        """Closed parts that were not deleted, with the time of each part's newest record."""
+        """Finished parts that still exist, each with the time of its newest record, ns."""
         self._summary: LogSummary | None = None
         self._path = path / part_name(0)
         self._log = self._open(0, "start", ())
 
     @property
     def error(self) -> str | None:
-        """Reason why the log is incomplete; then nothing more is written."""
+        """Reason why the log ended early, after which nothing is written; None while all is well."""
         return self._error or self._log.error
 
     def _open(self, index: int, began: str, topics: Iterable[bytes]) -> LogWriter:
-        """Open a new part with these topics, and metadata about its reason and the retention."""
+        """Open part `index`, repeat the topics' definitions, and note in its metadata why it began."""
         part = {"index": str(index), "began": began, "keep_ns": str(self._plan.keep_ns or "")}
         self._path = self._folder / part_name(index)
         try:
@@ -77,7 +77,7 @@ class PartWriter:
         return log
 
     def _next(self, began: str) -> None:
-        """End the part and begin another one; when that fails, the log ends with this part."""
+        """Finish this part and open the next; `began` is the reason. If that fails, the log ends here."""
         if self.error is not None:
             return
         summary = self._end(last=False)
@@ -101,21 +101,21 @@ class PartWriter:
         return self._log.close()
 
     def take(self, kind: int, payload: Payload) -> None:
-        """Write one record of a ring. Raises ValueError for a record that does not fit into a log."""
+        """Write one record from a ring. Raises ValueError for a kind that logs do not have."""
         if self._error is None:
             self._log.take(kind, payload)
         else:
             self._unwritten += 1
 
     def machine(self, t_ns: int, data: bytes) -> None:
-        """Write a message about the machine."""
+        """Write an encoded message about the machine's load to /machine."""
         if self._error is None:
             self._log.machine(t_ns, data)
         else:
             self._unwritten += 1
 
     def settle(self) -> None:
-        """End the part if it is full or old, and delete expired parts; call this after a complete cycle."""
+        """Start a new part if this one is full or old; delete expired parts. Call it after a whole cycle."""
         size, age_ns, keep_ns = self._plan.split_bytes, self._plan.split_ns, self._plan.keep_ns
         now_ns = self._log.last_ns
         if size is not None and self._log.size >= size:
@@ -131,22 +131,22 @@ class PartWriter:
                 self._kept.popleft()[0].unlink()
 
     def gap(self, source: str, lost: int) -> None:
-        """Add an event for `lost` records of `source` that did not reach the log."""
+        """Write an event that `lost` records of `source` did not reach the log."""
         if self._error is None:
             self._log.gap(source, lost)
 
     def flush(self) -> None:
-        """Finish the present chunk, so that a reader finds it even after this process was killed."""
+        """Write the collected messages, so that a reader finds them even after this process was killed."""
         if self._error is None:
             self._log.flush()
 
     def sync(self) -> None:
-        """Wait until the disk has all flushed chunks."""
+        """Block until the disk has stored all written chunks."""
         if self._error is None:
             self._log.sync()
 
     def close(self) -> LogSummary:
-        """Finish the last part and return the summary of all parts; a second call returns it again."""
+        """Finish the last part; return message count, size and error of all parts together."""
         if self._summary is None:
             last = self._end(last=True)
             every = [*self._closed, last]

@@ -1,4 +1,4 @@
-"""Parts: the files of a log in a directory, in sequence, and the missing ones."""
+"""Parts: finds the files of a log in a directory, sorts them, and reports missing ones."""
 
 from __future__ import annotations
 
@@ -15,16 +15,16 @@ _PART = re.compile(r"part_(\d{4,9})\.mcap")
 
 
 class LogFiles(msgspec.Struct, frozen=True):
-    """Files of one log."""
+    """Files of one log, and what is missing between them."""
 
     files: tuple[Path, ...]
-    """Files in the sequence of writing."""
+    """Existing files, oldest first; a log that was not split has one."""
     damage: tuple[str, ...] = ()
-    """Sentences about missing parts between existing ones."""
+    """A sentence for each gap in the numbers of the parts."""
 
 
 def log_files(path: Path) -> LogFiles:
-    """Return the file at a path, or the parts in a directory; other files in it are ignored.
+    """Return the files of a log: the file itself, or the parts in a directory.
 
     Raises LogError for a directory without parts or one that cannot be read, and for a pipe or a device, on
     which a read could block forever.
@@ -49,7 +49,7 @@ def log_files(path: Path) -> LogFiles:
 
 
 def is_log_directory(path: Path) -> bool:
-    """Return whether a directory contains the parts of a log."""
+    """Return True if a directory contains at least one part of a log."""
     try:
         return path.is_dir() and any(_PART.fullmatch(each.name) and each.is_file() for each in path.iterdir())
     except OSError:
@@ -57,7 +57,7 @@ def is_log_directory(path: Path) -> bool:
 
 
 def missing_parts(first: int, end: int) -> str:
-    """Return the sentence about missing parts, from `first` to `end` - 1."""
+    """Return the sentence that the parts numbered `first` to `end` - 1 are missing."""
     if end == first + 1:
         return f"{part_name(first)} is missing"
     return f"{part_name(first)} to {part_name(end - 1)} are missing"

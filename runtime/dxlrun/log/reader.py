@@ -1,4 +1,4 @@
-"""Reader: reads logs that are complete, unfinished, damaged, or of another program, and reports damage."""
+"""Log reader: opens MCAP logs, also unfinished, damaged or foreign ones, and reports damage."""
 
 from __future__ import annotations
 
@@ -25,23 +25,23 @@ if TYPE_CHECKING:
 __all__ = ["UNREADABLE", "Log", "LogFollower", "LogReader", "Topic", "open_log", "read_log"]
 
 UNREADABLE = (msgspec.MsgspecError, ValueError, RecursionError)
-"""Exceptions of msgspec for damaged or too deep JSON in a log, such as the plan or data of a command."""
+"""Exceptions of msgspec for damaged or too deep JSON in a log, such as a plan or a command's data."""
 SLICE_BYTES = 8 << 20
-"""Size of a slice, bytes: chunks are joined up to this size, because each slice costs a number of NumPy
+"""Size to which chunks are joined before they are decoded, bytes, because each slice costs a number of NumPy
 calls."""
 
 
 class Topic(msgspec.Struct, frozen=True):
-    """Description of a topic in a log."""
+    """Message type and number of messages of a topic in a log."""
 
     type: str
-    """Name of the message type: `sensor_msgs/msg/JointState`."""
+    """Name of the message type, such as `sensor_msgs/msg/JointState`."""
     count: int | None
-    """Number of messages; None for an unfinished file, which has no statistics."""
+    """Number of messages; None if the file was not finished."""
 
 
 class LogReader:
-    """An open log: its metadata, and its records slice by slice in bounded memory.
+    """An open log file or directory: metadata, and records that are read piece by piece.
 
     Any MCAP file can be opened. A file of another program has no header and no slices, only columns. No file
     stays open between calls.
@@ -55,30 +55,30 @@ class LogReader:
         self._about: Log | None = None
         self._searched = False
         self.share = 0.0
-        """Share of the file that the yielded slices cover, 0 to 1."""
+        """Share of the file that has been read by `slices`, 0 to 1, for a progress bar."""
         self.header = _header(path, self._file)
-        """Header of a log of dxlrun; None for a file of another program."""
+        """Robot, joints and buses of a log of dxlrun; None for a file of another program."""
 
     def __enter__(self) -> LogReader:
-        """Return the reader."""
+        """Return the reader, for `with`."""
         return self
 
     def __exit__(self, *_: object) -> None:
-        """Do nothing, because no file stays open."""
+        """Do nothing: the file is open only during reads."""
 
     @property
     def metadata(self) -> dict[str, dict[str, str]]:
-        """Metadata records by name: versions, kernel, scheduler."""
+        """Metadata records by name, such as versions, kernel and scheduler, each as key and value."""
         return self._file.metadata
 
     @property
     def attachments(self) -> dict[str, bytes]:
-        """Attachments by name: robot file, plan."""
+        """Attached files by name, such as the robot file and the plan."""
         return self._file.attachments
 
     @property
     def topics(self) -> dict[str, Topic]:
-        """Topics of the file. An unfinished file is read completely for its topics."""
+        """Type and message count of each topic. In an unfinished file this reads all data."""
         if not self._file.finished:
             self._file_of_all()
         topics: dict[str, Topic] = {}
@@ -92,12 +92,14 @@ class LogReader:
 
     @property
     def damage(self) -> tuple[str, ...]:
-        """Sentences about missing or unreadable data. The first access reads the whole file."""
+        """A sentence for each missing or unreadable piece of the log. The first access reads all data."""
         return self.about.damage if self.header else tuple(self._file_of_all().damage)
 
     @property
     def about(self) -> Log:
-        """The log without its records. The first access reads the whole file to find damage.
+        """The log with metadata and damage, but no cycles, packets or events.
+
+        The first access reads all data.
 
         Raises LogError for a file of another program.
         """
@@ -109,7 +111,7 @@ class LogReader:
         return self._about
 
     def slices(self, *, packets: bool = True) -> Iterator[Log]:
-        """Yield the log in slices: cycles, packets, events, commands and topics, in the order of the file.
+        """Yield the log piece by piece, each with its cycles, packets, events, commands and topics.
 
         Each slice has complete cycles with all their packets, including those of the idle time after a cycle.
         `about` has all that belongs to no slice (attachments, damage). Without `packets`, packets are not
@@ -132,7 +134,7 @@ class LogReader:
             self._about = slicer.about()
 
     def columns(self, topic: str, *fields: str) -> dict[str, NDArray[np.generic]]:
-        """Return fields of all messages of a topic, one row each: the joined `batches`. Default: all fields.
+        """Return fields (default: all) of a topic's messages as arrays, one row per message, plus `t_ns`.
 
         A field that is not an array of constant length becomes an array of objects.
         """
@@ -147,7 +149,7 @@ class LogReader:
         return found
 
     def batches(self, topic: str, *fields: str) -> Iterator[dict[str, NDArray[np.generic]]]:
-        """Yield fields of the messages of a topic, chunk by chunk in bounded memory. Default: all fields.
+        """Yield the same arrays as `columns`, but for one piece of the file after another, to save memory.
 
         `t_ns` is added: ns of the run's clock; in files of other programs, the time in the file. Fields of
         nested messages have dots: `pose.pose.position.x`. Rows of a sequence of messages, `status.name`, are
@@ -162,7 +164,7 @@ class LogReader:
             yield {"t_ns": times, **{name: tree.leaf(name).array() for name in chosen}}
 
     def arrow(self, topic: str, *fields: str) -> pa.RecordBatchReader:
-        """Return the messages of a topic for Arrow, chunk by chunk, with nested fields. Raises as `batches`.
+        """Return a topic's messages as an Arrow stream, read piece by piece, with nested fields as structs.
 
         Raises InputError without pyarrow, which the extra `logs` has.
         """
@@ -179,7 +181,7 @@ class LogReader:
         )
 
     def _trees(self, topic: str, fields: Sequence[str] | None) -> Iterator[tuple[NDArray[np.int64], Column]]:
-        """Yield times and fields of the messages of a topic, chunk by chunk."""
+        """Yield times (ns of the run's clock) and decoded columns of a topic, for one piece after another."""
         reader = self._column_reader(topic)
         missing = reader.check(fields or ())
         if missing is not None:
@@ -203,7 +205,7 @@ class LogReader:
                 yield messages.t_ns[rows[whole]] - offset_ns, tree
 
     def _column_reader(self, topic: str) -> ColumnReader:
-        """Return the column reader of a topic. Raises LogError."""
+        """Return the decoder for a topic's messages. Raises LogError for an unknown topic or encoding."""
         channels = self._file.channels.values()
         if not any(known.topic == topic for known in channels):
             self._file_of_all()
@@ -222,7 +224,7 @@ class LogReader:
             raise LogError(f"{self.path}: messages of {topic} cannot be read: {error}") from error
 
     def _file_of_all(self) -> McapFile:
-        """Return the contents of the whole file, including channels and damage that only messages show."""
+        """Read the whole file once, because some channels and damage are only found among the messages."""
         if not self._searched:
             self._searched = True
             walk = LogWalk(self.path)
@@ -233,7 +235,7 @@ class LogReader:
 
 
 def open_log(path: str | Path) -> LogReader:
-    """Open an MCAP file.
+    """Open a log or any other MCAP file for reading.
 
     Raises:
         LogError: The file is missing, empty or not MCAP, or is a log of dxlrun that this version cannot read.
@@ -242,14 +244,14 @@ def open_log(path: str | Path) -> LogReader:
 
 
 def read_log(path: str | Path) -> Log:
-    """Read a whole log of dxlrun. Raises LogError for any other file, or a log that cannot be read."""
+    """Read a whole log of dxlrun into memory. Raises LogError for any other or unreadable file."""
     reader = LogReader(Path(path))
     slices = list(reader.slices())
     return joined(reader.about, slices)
 
 
 class LogFollower:
-    """Follower of a log that is being written: yields new records without packets.
+    """Reads a log while it is being written; each call of `new` returns what was added, without packets.
 
     Raises LogError as read_log, at each call.
     """
@@ -260,7 +262,7 @@ class LogFollower:
         self._slicer: Slicer | None = None
 
     def new(self) -> Log:
-        """Return the records since the last call, as a log."""
+        """Return cycles, events, commands and topics that were added since the last call."""
         self._walk.file.damage.clear()
         with _readable(self._path):
             slices = [self._made().take(messages) for messages in self._walk.messages()]
@@ -286,7 +288,10 @@ def _readable(path: Path) -> Iterator[None]:
 
 
 def _header(path: Path, file: McapFile) -> LogHeader | None:
-    """Return the header of a log of dxlrun; the attachment replaces damaged metadata."""
+    """Return the header of a log of dxlrun; None for another program's file.
+
+    If the header in the metadata is damaged, its copy in the attachments is used.
+    """
     text = file.metadata.get(schemas.METADATA_NAME)
     attached = file.attachments.get(schemas.HEADER_ATTACHMENT)
     if text is None and attached is None:

@@ -1,4 +1,4 @@
-"""Recorded packets: the packets of one bus of a log, from which a simulated bus answers."""
+"""Recorded packets: the packets of one bus of a log, for a simulated bus that answers from them."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ from dxlwire.packets import PacketKind
 
 
 def read_recorded_packets(path: Path, bus: str) -> RecordedPackets:
-    """Return the packets of a bus. Raises LogError for an unreadable log, or one without this bus."""
+    """Read all packets of a bus from a log. Raises LogError if the log has no such bus or no requests."""
     pieces = []
     for piece in open_log(path).slices():
         if bus not in piece.buses:

@@ -1,4 +1,4 @@
-"""Recorder: the process that reads the rings and writes the log, independently of the loop.
+"""Recorder: the process that reads the records of a run from the rings and writes the log.
 
 A record is in the file FLUSH_S after the recorder has read it, plus the disk's write time. A recorder with
 too little processor time falls behind; records then wait in the rings, which hold RING_SECONDS.
@@ -48,7 +48,7 @@ REQUESTS: Decoder[Request] = Decoder(Request)
 
 
 class Recorder:
-    """Recorder of the rings into a log. It flushes every 0.5 s and syncs every 2 s of the machine's time."""
+    """Moves records from the rings into the log; flushes every 0.5 s, syncs to disk every 2 s."""
 
     def __init__(self, job: RecorderJob, supervisor: MessageChannel[Request]) -> None:
         self._supervisor = supervisor
@@ -67,7 +67,10 @@ class Recorder:
         self._next_flush = self._next_sync = time.monotonic() + FLUSH_S
 
     def run(self, asked_to_stop: Callable[[], bool]) -> LogClosed:
-        """Record until the supervisor or a signal ends it, then drain the rings and finish the file."""
+        """Record until the supervisor or a signal stops it; then empty the rings and finish the log.
+
+        Returns the log's summary and the machine's load.
+        """
         self._supervisor.send(Ready())
         while True:
             more = self._turn()
@@ -83,7 +86,7 @@ class Recorder:
         return LogClosed(summary, *loads)
 
     def _requested_to_finish(self, seconds: float) -> bool:
-        """Wait up to `seconds` for requests and execute them; return True for Finish or a closed channel."""
+        """Handle the supervisor's requests, waiting up to `seconds`; return True if it is time to finish."""
         if not select.select([self._supervisor], [], [], seconds)[0]:
             return False
         finish = False
@@ -99,7 +102,7 @@ class Recorder:
         return finish or self._supervisor.closed
 
     def _turn(self) -> bool:
-        """Drain each ring, at most _MOST_PER_TURN records, then split, flush and sample when due.
+        """Write some records of each ring, then start a new part, flush, and sample the load when due.
 
         Returns:
             True when there may be more records.
@@ -113,7 +116,7 @@ class Recorder:
         return any(full)
 
     def _flush_when_due(self) -> None:
-        """Finish the present chunk FLUSH_S after the end of the last flush.
+        """Write the collected messages to the file FLUSH_S after the end of the last flush; sync when due.
 
         Counted from its start, a slow disk would leave no time for the rings.
         """
@@ -128,7 +131,7 @@ class Recorder:
         self._next_flush = time.monotonic() + FLUSH_S
 
     def _sample_machine(self) -> None:
-        """Write a sample of the machine when due. A run with processes uses the monotonic clock."""
+        """Write the machine's load into the log once per sampling period."""
         now_ns = time.monotonic_ns()
         if self._machine is None or now_ns < self._next_sample_ns:
             return
@@ -142,7 +145,7 @@ class Recorder:
                     meter.add(sample)
 
     def _drain(self, name: str, ring: RingReader) -> bool:
-        """Write the records of a ring, at most _MOST_PER_TURN; return whether there may be more.
+        """Write up to _MOST_PER_TURN records of one ring into the log; return True if more may be left.
 
         A due flush does not wait for the remaining records, which may take a recorder without processor time
         seconds.
@@ -168,7 +171,7 @@ class Recorder:
         return record is not None
 
     def _begin_run(self, payload: Payload) -> None:
-        """Start to measure the load of the run at its first deadline; activation is part of start-up."""
+        """Begin to measure the load of the run at its first cycle; load before that is of the start-up."""
         if len(payload) != self._layout.dtype.itemsize:
             return
         cycle = np.frombuffer(payload, self._layout.dtype)[0]
@@ -185,7 +188,7 @@ class Recorder:
 
 
 def main() -> int:
-    """Run the recorder's process: `--job-fd N --control-fd M`; return 1 for an incomplete log."""
+    """Entry point of the recorder process: `--job-fd N --control-fd M`; returns 1 for an incomplete log."""
     stop: list[int] = []
     signal.signal(signal.SIGTERM, lambda number, frame: stop.append(number))
     job, supervisor = process.begun(RecorderJob, REQUESTS)

@@ -1,4 +1,4 @@
-"""Run messages: makes messages of the log's topics from records of the rings, for a file or a live viewer."""
+"""Run messages: converts records of the rings into messages of the log's topics, for file or viewer."""
 
 from __future__ import annotations
 
@@ -23,26 +23,26 @@ from dxlrun.messages.cdr import ENCAPSULATION, Codec
 from dxlrun.messages.definition import MessageType
 
 _MOST_PACKETS, _MOST_CYCLES = 1000, 250
-"""Upper limits of one message: packets, and cycles whose packets it has. The index needs 16 bytes per
-message, and arrays of many cycles compress better."""
+"""Most packets and most cycles of one packet message. The index needs 16 bytes per message, and arrays of
+many cycles compress better."""
 JOINT_COMMANDS_NS = 10_000_000
-"""Interval of /joint_commands; /cycle has the goals of each cycle."""
+"""Time between two messages of /joint_commands, ns; /cycle has the goals of each cycle."""
 
 
 class RunMessages(ABC):
-    """Maker of the messages of all topics; subclasses store or send them."""
+    """Converts a run's records into encoded messages; a subclass writes them to a file or sends them."""
 
     def __init__(self, header: LogHeader) -> None:
         self.header = header
         self.span = CycleSpan()
-        """Time span of the processed cycles."""
+        """First and last cycle so far, with times."""
         self._layout = header.layout
         self._firsts: list[tuple[int, Callable[[Stamp], bytes]]] = []
-        """Channels with a single message, and a function that makes it from the time of the first record."""
+        """Channels that get one message only, when the first record comes, and the function that makes it."""
         self.topics: dict[bytes, None] = {}
-        """Records of opened topics."""
+        """Encoded records of all topics that controllers opened, to repeat them in a next part."""
         self._topic_channels: dict[int, int] = {}
-        """Channels by topic number."""
+        """Channel of each controller's topic, by the topic's number in the records."""
         self._machine_channel: int | None = None
         self._takers: dict[int, Callable[[Payload], None]] = {
             RecordKind.CYCLE: self.cycle,
@@ -55,11 +55,11 @@ class RunMessages(ABC):
 
     @abstractmethod
     def _channel(self, topic: str, message: MessageType, *, latched: bool = False) -> int:
-        """Open a channel and return its number; `latched`: late readers also get its one message."""
+        """Open a channel for a topic and return its number; `latched`: later readers also get its message."""
 
     @abstractmethod
     def _put(self, channel: int, t_ns: int, wall_ns: int, data: bytes) -> None:
-        """Store or send a message, with its time on the run's clock and in ns since 1970."""
+        """Write or send an encoded message; `t_ns` is the run's clock, `wall_ns` is ns since 1970."""
 
     def _add(self, channel: int, t_ns: int, data: bytes) -> None:
         # The run begins with its first record, not with the opening of the log.
@@ -70,7 +70,7 @@ class RunMessages(ABC):
         self._put(channel, t_ns, max(0, t_ns + self.header.epoch_offset_ns), data)
 
     def _open_channels(self) -> None:
-        """Open the channels of every run."""
+        """Open the channels of the topics that every run has."""
         header = self.header
         self._cycle_channel = self._channel(schemas.LogTopic.CYCLE, schemas.CYCLE)
         self._activation_channel = self._channel(schemas.LogTopic.ACTIVATION, schemas.CYCLE)
@@ -84,9 +84,9 @@ class RunMessages(ABC):
             self._channel(schemas.bus_topic(bus), schemas.BUS_PACKETS) for bus in header.buses
         ]
         self._waiting: list[list[BatchedPacket]] = [[] for _ in header.buses]
-        """Packets of each bus that are not in a message yet."""
+        """Packets of each bus that are still to be packed into a message."""
         self._oldest: int | None = None
-        """Cycle of the first waiting packet."""
+        """Number of the cycle of the first of these packets; None: there are none."""
         self._commands_slot: int | None = None
         self._publishers = [
             (
@@ -109,7 +109,7 @@ class RunMessages(ABC):
                 self._firsts.append((channel, self._frames.still))
 
     def cycle(self, payload: Payload) -> None:
-        """Make the messages of a cycle: /cycle, its goals and frames, and the states that controllers marked.
+        """Convert the record of a cycle into messages: /cycle, joint states, commands, frames, diagnostics.
 
         The record before the first cycle becomes /activation.
         """
@@ -157,7 +157,7 @@ class RunMessages(ABC):
         return divmod(max(0, t_ns + self.header.epoch_offset_ns), 1_000_000_000)
 
     def _packets(self, payload: Payload) -> None:
-        """Add a batch of packets; packets of many cycles become one message, for a small index."""
+        """Collect the packets of a record; pack them when they are many, for a small index."""
         for packet in split_packets(payload):
             if self._oldest is None:
                 self._oldest = packet[0]
@@ -167,7 +167,7 @@ class RunMessages(ABC):
                 self._write_packets()
 
     def _write_packets(self) -> None:
-        """Write the waiting packets, one message per bus, with the time of its last packet."""
+        """Pack and write the collected packets, one message per bus, with the time of its last packet."""
         self._oldest = None
         for channel, packets in zip(self._bus_channels, self._waiting, strict=True):
             if packets:
@@ -207,7 +207,7 @@ class RunMessages(ABC):
         self._add(self._taken_channel, command.t_ns, data)
 
     def event(self, event: Event) -> None:
-        """Make the messages of an event, for /events and /rosout."""
+        """Convert an event into messages of /events and /rosout."""
         data = self._event.pack(
             event.t_ns,
             event.code,

@@ -1,4 +1,4 @@
-"""Stored logs: size and age of the logs of runs, and whether they are being written."""
+"""Stored logs: finds the logs of runs in a folder, their size and age, and the oldest to delete."""
 
 from __future__ import annotations
 
@@ -14,12 +14,12 @@ from dxlrun.log.log_file import has_writer
 from dxlrun.log.parts import is_log_directory, log_files
 
 MUCH_BYTES = 10 * 10**9
-"""Size of a folder of logs above which the end of a run reports it."""
+"""Size of a folder of logs, bytes, above which the end of a run reports it to the user."""
 _NAME = re.compile(r"\w+_\d{8}_\d{6}(_\d+)?")
 
 
 class StoredLog(msgspec.Struct, frozen=True):
-    """A log of a run in a folder."""
+    """A log of a run in a folder: its path, size in bytes, and time of its last change."""
 
     path: Path
     bytes: int
@@ -27,7 +27,7 @@ class StoredLog(msgspec.Struct, frozen=True):
     """Time of the last write, s since 1970."""
 
     def delete(self) -> None:
-        """Delete the log; raises OSError. Other files in the directory of a log in parts are kept."""
+        """Delete the log's files; raises OSError. Other files in the directory of a split log are kept."""
         if not self.path.is_dir():
             self.path.unlink(missing_ok=True)
             return
@@ -38,14 +38,14 @@ class StoredLog(msgspec.Struct, frozen=True):
 
 
 def is_being_written(log: Path) -> bool:
-    """Return whether a run is writing a log, a file or a directory of parts; False without a log."""
+    """Return True if a run is writing this log, given by its file or directory of parts."""
     with suppress(LogError):
         return has_writer(log_files(log).files[-1])
     return False
 
 
 def stored_logs(folder: Path) -> tuple[StoredLog, ...]:
-    """Return the logs in a folder that have names of runs, oldest first."""
+    """Return the logs in a folder whose names are those of runs, oldest first."""
     found: list[StoredLog] = []
     # A missing or unreadable folder has no logs for this user.
     with suppress(OSError):
@@ -60,13 +60,13 @@ def stored_logs(folder: Path) -> tuple[StoredLog, ...]:
 
 
 def bytes_of(log: Path) -> int:
-    """Return the size of a log, bytes; 0 without a log."""
+    """Return the size of a log with all parts, bytes; 0 if there is no log at this path."""
     stored = _stored(log)
     return 0 if stored is None else stored.bytes
 
 
 def oldest_beyond(folder: Path, keep_bytes: int, but: Iterable[Path] = ()) -> tuple[StoredLog, ...]:
-    """Return the oldest logs to delete so that the others fit into `keep_bytes`.
+    """Return the oldest logs of a folder, whose deletion would leave at most `keep_bytes`.
 
     Logs in `but` and logs that are being written are not returned.
     """
@@ -83,7 +83,7 @@ def oldest_beyond(folder: Path, keep_bytes: int, but: Iterable[Path] = ()) -> tu
 
 
 def _stored(path: Path) -> StoredLog | None:
-    """Return the log at a path; None without one."""
+    """Return path, size and age of the log at a path; None if there is no log."""
     in_parts = is_log_directory(path)
     if not in_parts and (path.suffix != ".mcap" or not path.is_file()):
         return None

@@ -1,4 +1,4 @@
-"""Escaping: makes texts of plug-ins, logs and files harmless to a terminal or a page."""
+"""Escaping: replaces control characters in foreign texts before they reach a terminal or a page."""
 
 from __future__ import annotations
 
@@ -6,7 +6,7 @@ import json
 
 
 def escaped_json(text: str) -> str:
-    """Return JSON with escapes for all unprintable characters, some of which JSON allows unescaped."""
+    """Replace unprintable characters in a JSON text by JSON escapes, except for line ends."""
     if text.isprintable():
         return text
     return "".join(
@@ -15,7 +15,7 @@ def escaped_json(text: str) -> str:
 
 
 def escaped(text: str) -> str:
-    """Return a text with control characters and changes of the writing direction escaped: `\\x1b`.
+    """Replace control characters and direction marks in a text by visible escapes such as `\\x1b`.
 
     Line ends are kept.
     """

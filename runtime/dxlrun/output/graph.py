@@ -1,4 +1,4 @@
-"""Graph: a directed graph as data, and its layout in layers from left to right with few crossings."""
+"""Graph: nodes and edges to be drawn, and their arrangement in layers from left to right."""
 
 from __future__ import annotations
 
@@ -9,35 +9,35 @@ from typing import Literal
 import msgspec
 
 _SWEEPS = 6
-"""Number of passes that improve the order in the layers, alternately from the left and from the right."""
+"""Passes over all layers that reduce crossings, alternately from the left and from the right."""
 _LISTED = 40
-"""Characters per line of names."""
+"""Longest line of joint names in a box, characters."""
 
 
 class Node(msgspec.Struct, frozen=True):
-    """A box: a source of values, a controller, or joints that controllers move."""
+    """A box of the drawing: a source of values, a controller, or joints that controllers move."""
 
     name: str
-    """Unique in its graph."""
+    """Identifier of the node, unique in its graph, to which edges refer."""
     kind: Literal["source", "controller", "joints"]
     lines: tuple[str, ...]
-    """Text in the box."""
+    """Lines of text in the box."""
     out: str = ""
-    """Label of the outgoing edges, at the right edge."""
+    """Label of the edges that leave the node, written at its right edge."""
     about: str = ""
-    """Additional text, if it fits."""
+    """Additional line in pictures, which the text drawing omits."""
     active: bool = True
 
 
 class Edge(msgspec.Struct, frozen=True):
-    """An arrow from one node to another one."""
+    """An arrow between two nodes, given by their names."""
 
     source: str
     target: str
 
 
 class Graph(msgspec.Struct, frozen=True):
-    """Nodes and edges without cycles."""
+    """A directed graph without cycles, with a title."""
 
     title: str
     nodes: tuple[Node, ...]
@@ -45,18 +45,18 @@ class Graph(msgspec.Struct, frozen=True):
 
 
 class Placed(msgspec.Struct, frozen=True):
-    """A graph in layers. An edge that crosses a layer occupies a place there, without a node."""
+    """A graph whose nodes are arranged in layers; long edges have a placeholder in each layer they cross."""
 
     layers: tuple[tuple[str, ...], ...]
-    """Names of nodes by layer, from left to right, and within a layer from top to bottom."""
+    """Names of nodes and placeholders, layer by layer from left to right, each from top to bottom."""
     steps: tuple[Edge, ...]
-    """Edges between adjacent layers."""
+    """Edges between neighbouring layers, also to and from placeholders."""
     nodes: Mapping[str, Node]
-    """Nodes of the graph by name; other names in `layers` are places of crossing edges."""
+    """Nodes of the graph by name; names in `layers` that are missing here are placeholders."""
 
 
 def listed(names: Sequence[str]) -> tuple[str, ...]:
-    """Return names in lines, separated by commas."""
+    """Join names by commas into lines of limited length."""
     lines = [""]
     for number, name in enumerate(names):
         word = name + "," * (number + 1 < len(names))
@@ -67,7 +67,7 @@ def listed(names: Sequence[str]) -> tuple[str, ...]:
 
 
 def placed(graph: Graph) -> Placed:
-    """Return the layers of a graph, after Sugiyama, Tagawa and Toda (IEEE Trans. SMC 11, 1981).
+    """Arrange a graph in layers, after Sugiyama, Tagawa and Toda (IEEE Trans. SMC 11, 1981).
 
     Sources are on the left, joints on the right, and each controller as far right as the nodes that it
     commands allow. The order in a layer follows the mean position of the neighbours.
@@ -88,7 +88,7 @@ def placed(graph: Graph) -> Placed:
 
 
 def _columns(graph: Graph) -> dict[str, int]:
-    """Return the layer of each node, without empty layers."""
+    """Return the index of each node's layer, from the left."""
     following: dict[str, list[str]] = {node.name: [] for node in graph.nodes}
     kinds = {node.name: node.kind for node in graph.nodes}
     for edge in graph.edges:
@@ -122,7 +122,7 @@ def _columns(graph: Graph) -> dict[str, int]:
 
 
 def _ordered(layers: list[list[str]], steps: Sequence[Edge]) -> None:
-    """Order each layer by the mean position of its neighbours, in passes of alternate direction."""
+    """Sort each layer in place by the mean position of its neighbours, to reduce crossings."""
     before: dict[str, list[str]] = {}
     after: dict[str, list[str]] = {}
     for step in steps:

@@ -1,4 +1,4 @@
-"""Graph picture: a graph as SVG, with light and dark theme, and in the language DOT of Graphviz."""
+"""Graph picture: writes a graph as an SVG file, or in the language DOT of Graphviz."""
 
 from __future__ import annotations
 
@@ -15,9 +15,10 @@ from dxlrun.output.target import check_target, write_target
 
 _FONT = 'node [fontname="monospace"];'
 _MARKS = {".svg": '<rect class="paper"', ".dot": _FONT}
-"""Text that identifies a picture of dxlrun by suffix; other existing files are not replaced."""
+"""Text in a picture file that shows that dxlrun wrote it, by suffix; other files are not replaced."""
 _CHARACTER, _LINE = 7.25, 17.0
-"""Size of a character in px: a monospaced font of 12 px is 0.6 em wide, plus some margin."""
+"""Width of a character and height of a line, px: a monospaced font of 12 px is 0.6 em wide, plus some
+margin."""
 _PAD, _GAP, _ACROSS, _MARGIN = 12.0, 18.0, 74.0, 24.0
 """Distances in px: inside a box, between boxes of a layer, between layers, and around the picture."""
 _TITLE = 30.0
@@ -50,7 +51,7 @@ text { font-family: "DejaVu Sans Mono", Menlo, Consolas, monospace; font-size: 1
 
 
 def _colours(theme: Mapping[str, str | tuple[str, str]]) -> str:
-    """Return the CSS rules of one theme. Many SVG viewers do not support CSS variables."""
+    """Return the CSS rules of the light or dark theme. Many SVG viewers do not support CSS variables."""
     boxes = ((kind, values) for kind, values in theme.items() if isinstance(values, tuple))
     return "\n".join(
         (
@@ -70,7 +71,7 @@ def _style() -> str:
 
 
 def write_picture(graph: Graph, path: Path) -> None:
-    """Write a graph as `.svg` or `.dot`, possibly in place of an older one.
+    """Write a graph to an `.svg` or `.dot` file; an older picture of dxlrun is replaced.
 
     Raises InputError as `check_picture`.
     """
@@ -79,7 +80,7 @@ def write_picture(graph: Graph, path: Path) -> None:
 
 
 def check_picture(path: Path) -> None:
-    """Raise InputError for an unknown suffix, and for a file that cannot be written."""
+    """Raise InputError if a picture's suffix is not .svg or .dot, or its file cannot be written."""
     suffix = path.suffix.lower()
     if suffix not in _MARKS:
         raise InputError(
@@ -90,10 +91,10 @@ def check_picture(path: Path) -> None:
 
 
 def graph_svg(graph: Graph) -> str:
-    """Return a graph as an SVG document."""
+    """Draw a graph as an SVG document, as text."""
     laid = placed(graph)
     boxes: dict[str, tuple[float, float, float, float]] = {}
-    """Left, top, width and height by name."""
+    """Left, top, width and height of each box in px, by the node's name."""
     left, lowest = _MARGIN, _MARGIN + _TITLE
     columns = [sum(_height(laid.nodes.get(name)) + _GAP for name in layer) for layer in laid.layers]
     for layer, tall in zip(laid.layers, columns, strict=True):
@@ -132,7 +133,7 @@ def graph_svg(graph: Graph) -> str:
 
 
 def graph_dot(graph: Graph) -> str:
-    """Return the graph in DOT (graphviz.org/doc/info/lang.html), for `dot -Tpdf`."""
+    """Return a graph as text in DOT (graphviz.org/doc/info/lang.html), for `dot -Tpdf`."""
     shapes = {"source": "note", "controller": "box", "joints": "box, style=rounded"}
     rows = [f"digraph {_quoted(graph.title)} {{", "  rankdir=LR;", f"  {_FONT}"]
     for node in graph.nodes:
@@ -167,7 +168,7 @@ def _height(node: Node | None) -> float:
 def _curve(
     begin: tuple[float, float, float, float], end: tuple[float, float, float, float], passing: bool
 ) -> str:
-    """Return the SVG path from the right edge of one box to the left edge of another box."""
+    """Return an SVG path from one box to another; `passing`: the first is a placeholder of a long edge."""
     x, y = begin[0] + begin[2], begin[1] + begin[3] / 2
     to_x, to_y = end[0], end[1] + end[3] / 2
     bend = (to_x - x) / 2

@@ -1,4 +1,4 @@
-"""Graph text: a graph in characters, with boxes in columns and lines between them, or as a narrow list."""
+"""Graph text: draws a graph with box characters for a terminal, or lists its edges if it is too wide."""
 
 from __future__ import annotations
 
@@ -11,18 +11,18 @@ from dxlrun.output.graph import Graph, Node, Placed, placed
 
 _UP, _DOWN, _LEFT, _RIGHT = 1, 2, 4, 8
 _LINES = " ╵╷│╴┘┐┤╶└┌├─┴┬┼"
-"""Line characters, indexed by the sum of a line's directions."""
+"""Line characters; the index is the sum of the directions _UP, _DOWN, _LEFT, _RIGHT of a line."""
 _INACTIVE_LINES = str.maketrans("│─", "┊┄")
 _CROSSED = "╫"
-"""Crossing of lines of two nodes; ┼ is a junction."""
+"""Character where lines of two nodes cross without touching; ┼ is a junction."""
 _ASCII = str.maketrans("╵╷│╴┘┐┤╶└┌├─┴┬┼╫┊┄▶", "|||-+++-+++-+++|:.>")
 _UPRIGHT, _LEVEL = _UP | _DOWN, _LEFT | _RIGHT
 _EDGE = 2
-"""Columns between a text and the outside of its box, including the line."""
+"""Columns between the text of a box and its outside, with the border."""
 
 
 def graph_text(graph: Graph, width: int, *, ascii_only: bool = False) -> str:
-    """Return a graph as text within a width: a drawing if it fits, else a list of edges."""
+    """Draw a graph as text of at most `width` columns; if it does not fit, list its edges."""
     lines = _Drawing(placed(graph)).lines() if graph.nodes else []
     if any(len(line) > width for line in lines):
         lines = [short for line in _list(graph) for short in _wrapped(line, width)]
@@ -31,13 +31,13 @@ def graph_text(graph: Graph, width: int, *, ascii_only: bool = False) -> str:
 
 
 def shown_lines(node: Node) -> tuple[str, ...]:
-    """Return the lines of a node's box; inputs are at the first line, outputs at the last one."""
+    """Return the lines of a node's box; an inactive controller is marked in the first one."""
     first, *more = node.lines
     return (first if node.active else f"{first} (inactive)", *more)
 
 
 class _Drawing:
-    """Drawing of a graph on a grid of characters.
+    """Draws a graph on a grid of characters.
 
     Boxes begin at even rows. Lines enter at odd rows and leave at even ones, so lines of different nodes
     never share a row. Each node has its own column for outgoing lines.
@@ -46,7 +46,7 @@ class _Drawing:
     def __init__(self, graph: Placed) -> None:
         self._graph = graph
         self._lines: dict[tuple[int, int], dict[str, int]] = {}
-        """Directions of lines by (row, column), and by the node that the line leaves."""
+        """For each (row, column), the directions of the lines there, by the node that each line leaves."""
         self._texts: dict[tuple[int, int], str] = {}
         self._dashed: set[tuple[int, int]] = set()
         self._row: dict[str, int] = {}
@@ -63,7 +63,7 @@ class _Drawing:
             left = self._join(layer, left + width)
 
     def lines(self) -> list[str]:
-        """Return the rows of the drawing."""
+        """Return the drawing as lines of text."""
         cells = {at: _drawn(list(bits.values())) for at, bits in self._lines.items()}
         for at in self._dashed:
             cells[at] = cells[at].translate(_INACTIVE_LINES)
@@ -77,7 +77,7 @@ class _Drawing:
         return 1 if node is None else max(map(len, (*shown_lines(node), node.out))) + 2 * _EDGE
 
     def _height(self, name: str) -> int:
-        """Return the number of rows of a node, including the free rows below it."""
+        """Return the rows that a node needs, with the free rows below it."""
         node = self._graph.nodes.get(name)
         return 4 if node is None else _even(len(shown_lines(node)) + bool(node.out)) + 2
 
@@ -85,7 +85,7 @@ class _Drawing:
         return self._row[name] + self._height(name) - 2
 
     def _place(self, name: str, left: int, width: int) -> None:
-        """Draw a box, or a crossing edge."""
+        """Draw the box of a node, or the line of an edge that crosses this layer."""
         node, row = self._graph.nodes.get(name), self._row[name]
         right, bottom = left + width - 1, self._out_row(name) + 1
         if node is None:
@@ -105,7 +105,7 @@ class _Drawing:
         self._text(node.out, bottom - 1, right + 1 - _EDGE - len(node.out))
 
     def _join(self, layer: Sequence[str], left: int) -> int:
-        """Draw the edges from a layer to the next one; return the first column of the next layer."""
+        """Draw all edges from a layer to the next one; return the column where the next layer begins."""
         ends = {name: [step.target for step in self._graph.steps if step.source == name] for name in layer}
         leading = [name for name in layer if ends[name]]
         right = left + 2 * len(leading) + 3
@@ -140,7 +140,7 @@ class _Drawing:
 
 
 def _drawn(directions: Sequence[int]) -> str:
-    """Return the character for the lines of several nodes at one place."""
+    """Return the character for the lines that several nodes have at one place."""
     if _UPRIGHT in directions and set(directions) <= {_UPRIGHT, _LEVEL} and _LEVEL in directions:
         return _CROSSED
     return _LINES[reduce(or_, directions)]
@@ -151,13 +151,13 @@ def _even(number: int) -> int:
 
 
 def _wrapped(line: str, width: int) -> list[str]:
-    """Wrap a line of the list between words, with continuation lines indented below its target."""
+    """Wrap a line of the list of edges between words."""
     indent = " " * 6
     return textwrap.wrap(line, max(width, 20), subsequent_indent=indent, break_on_hyphens=False) or [line]
 
 
 def _list(graph: Graph) -> Iterator[str]:
-    """Yield the list of edges of each node, line by line."""
+    """Yield the list of edges as lines: each node, and below it the nodes that its edges reach."""
     named = {node.name: node for node in graph.nodes}
     for node in graph.nodes:
         ends = [named[edge.target] for edge in graph.edges if edge.source == node.name]

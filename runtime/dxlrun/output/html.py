@@ -1,4 +1,4 @@
-"""HTML: pages built as a tree, so that a page is well-formed and every text is escaped.
+"""HTML: builds report pages as element trees, so that all text is escaped and no tag stays open.
 
 A page contains its style and numbers, and loads no external resources. Its figures are SVG in the colours of
 `page.css`.
@@ -26,7 +26,7 @@ def document(  # noqa: PLR0917  what the page has, from top to bottom
     numbers: object,
     scripts: Iterable[Element] = (),
 ) -> str:
-    """Return a page: header, contents, the sections that are not empty, footer, scripts.
+    """Return a whole page as HTML text: header, contents, non-empty sections, footer, scripts.
 
     `numbers` are embedded as JSON, in the element with the identifier `report`.
     """
@@ -49,7 +49,7 @@ def document(  # noqa: PLR0917  what the page has, from top to bottom
 
 
 def data(text: str, name: str) -> Element:
-    """Return an element with embedded JSON; `name` is its identifier."""
+    """Return a script element that embeds JSON text in a page; `name` is its id."""
     element = Element("script", {"type": "application/json", "id": name})
     # Escape `<`, so that no text ends the element.
     element.text = text.replace("<", "\\u003c")
@@ -57,7 +57,7 @@ def data(text: str, name: str) -> Element:
 
 
 def script(text: str) -> Element:
-    """Return a script element. Raises ValueError for a text that would end the element."""
+    """Return an element with JavaScript. Raises ValueError if the text contains `</script`."""
     if "</script" in text.lower():
         raise ValueError("a script must not have the end of an element in it")
     element = Element("script")
@@ -73,7 +73,7 @@ def header(  # noqa: PLR0917  what stands there, from top to bottom
     good: bool,
     key_numbers: Iterable[tuple[str, str]],
 ) -> Element:
-    """Return the top of a page: title, verdict in sentences, and a few numbers for comparison.
+    """Return the header element of a report: title, verdict in sentences, and a few key numbers.
 
     A sentence may be a tuple with its remedy, which follows in bold, and the identifier of its figure.
     Remedy, identifier and verdict may be empty.
@@ -101,7 +101,7 @@ def header(  # noqa: PLR0917  what stands there, from top to bottom
 
 
 def footer(text: str) -> Element:
-    """Return the end of a page, which states its source."""
+    """Return the footer element of a page, with a text about its source."""
     element = Element("footer")
     element.append(paragraph(text))
     return element
@@ -116,7 +116,7 @@ def _contents(sections: Sequence[Element]) -> Element:
 
 
 def section(name: str, title: str, parts: Iterable[Element]) -> Element:
-    """Return a section with a heading."""
+    """Return a section element with a heading; `name` is its id."""
     element = Element("section", {"id": name})
     ET.SubElement(element, "h2").text = title
     element.extend(parts)
@@ -124,7 +124,7 @@ def section(name: str, title: str, parts: Iterable[Element]) -> Element:
 
 
 def folded(name: str, title: str, parts: Iterable[Element]) -> Element:
-    """Return a section that is folded until its heading is clicked, or a link into it is followed."""
+    """Return a section element that stays folded until its heading is clicked or a link leads into it."""
     element = section(name, title, ())
     details = ET.SubElement(element, "details")
     ET.SubElement(details, "summary").append(element[0])
@@ -134,14 +134,14 @@ def folded(name: str, title: str, parts: Iterable[Element]) -> Element:
 
 
 def paragraph(text: str, kind: str = "") -> Element:
-    """Return a paragraph; `kind` is its class."""
+    """Return a paragraph element; `kind` is its CSS class."""
     element = Element("p", {"class": kind} if kind else {})
     element.text = escaped(text)
     return element
 
 
 def figure(name: str, title: str, drawing: Element, caption: str) -> Element:
-    """Return a drawing with an optional title above and an optional caption below."""
+    """Return a figure element: an SVG drawing with optional title and caption; `name` is its id."""
     element = Element("figure", {"id": name})
     if title:
         ET.SubElement(element, "h3").text = escaped(title)
@@ -152,7 +152,7 @@ def figure(name: str, title: str, drawing: Element, caption: str) -> Element:
 
 
 def table_element(table: Table) -> Element:
-    """Return a table with its title as caption; a table without column names has only row names."""
+    """Return the HTML element of a table, with its title as caption and without a head if it has no names."""
     scroll = Element("div", {"class": "table"})
     element = ET.SubElement(scroll, "table")
     table = table.escaped()

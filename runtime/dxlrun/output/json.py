@@ -1,4 +1,4 @@
-"""JSON: answers of commands for programs, see docs/reference/commands.md."""
+"""JSON: the answers of commands with --json, see docs/reference/commands.md."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ if TYPE_CHECKING:
     from dxlrun.errors import Problem
 
 Report: TypeAlias = "Sequence[Problem | str]"
-"""Problems with places in files, or sentences `problem; fix` without a place."""
+"""Errors or warnings: problems with places in files, or sentences `problem; fix`."""
 NO_REASON: Mapping[str, object] = MappingProxyType({})
 
 
@@ -27,7 +27,7 @@ def answer_text(
     ok: bool,
     indent: int | None = None,
 ) -> str:
-    """Return the envelope of every answer: `ok`, `result`, `errors` and `warnings`.
+    """Return the JSON text of a command's answer: `ok`, `result`, `errors` and `warnings`.
 
     `reason`: code and fields of a running robot's refusal.
     """
@@ -41,7 +41,7 @@ def answer_text(
 
 
 def json_text(value: object, indent: int | None = 2) -> str:
-    """Return a value as JSON: dataclasses by field, bytes in hexadecimal, NaN and infinity as null."""
+    """Write any value as JSON: dataclasses by field, bytes in hexadecimal, NaN and infinity as null."""
     # Imported here because most commands print no JSON.
     import msgspec
 
@@ -60,7 +60,7 @@ def _plain(value: object) -> object:
 
 
 def _problem(problem: Problem | str) -> dict[str, object]:
-    """Return a problem with all keys of the envelope; the place of a sentence is null."""
+    """Return a problem as a JSON object; a sentence has null for file, line and column."""
     if isinstance(problem, str):
         what, _, fix = problem.partition("; ")
         place: tuple[object, ...] = None, None, None

@@ -1,4 +1,4 @@
-"""Live view: a table in the terminal that is redrawn until the key q is pressed."""
+"""Live view: shows a table on the whole terminal and redraws it until the key q is pressed."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ if TYPE_CHECKING:
 
 
 def show_live(table: Callable[[], Table], every_s: float) -> None:
-    """Draw a table on the whole screen until q or Ctrl-C.
+    """Show a table on the whole terminal and redraw it periodically until q or Ctrl-C.
 
     Args:
         table: Returns the present table.
@@ -39,7 +39,10 @@ def show_live(table: Callable[[], Table], every_s: float) -> None:
 
 @contextmanager
 def keys_pressed() -> Iterator[Pressed]:
-    """Yield a function that waits for the key q; without a terminal on stdin, it only waits."""
+    """Context manager that reads single keys from the terminal; yields a function that waits for q.
+
+    Without a terminal on stdin, the function only waits.
+    """
     if not sys.stdin.isatty():
         yield Pressed(None)
         return
@@ -57,12 +60,12 @@ def keys_pressed() -> Iterator[Pressed]:
 
 @dataclass(frozen=True, slots=True)
 class Pressed:
-    """Keyboard that is polled for the key q; None: no terminal."""
+    """Waits for the key q on a keyboard; None: there is no terminal."""
 
     keyboard: int | None
 
     def __call__(self, seconds: float) -> bool:
-        """Wait up to `seconds`; return True as soon as q was pressed, or the terminal is gone."""
+        """Wait up to `seconds`; return True at once if q is pressed or the terminal is gone."""
         if self.keyboard is None:
             time.sleep(seconds)
             return False
@@ -75,7 +78,7 @@ class Pressed:
 
 
 def compact(table: Table) -> RenderableType:
-    """Return a table without rules; columns of kind `text` are shortened first when space is short."""
+    """Convert a table for rich without rules; its `text` columns are shortened if space is short."""
     from rich.table import Table as RichTable
     from rich.text import Text
 

@@ -1,4 +1,4 @@
-"""Quantity: values of sources for people: numbers with SI units, and names with their units."""
+"""Quantity text: formats numbers with SI units, and names of values with their units."""
 
 from __future__ import annotations
 
@@ -6,11 +6,11 @@ from collections.abc import Iterable, Mapping
 from itertools import groupby
 
 _TEXTS = {"degC": "deg C", "1": ""}
-"""Units with another spelling than in control tables; a fraction has none."""
+"""Units that are written differently for people than in control tables; a fraction has none."""
 
 
 def quantity_text(value: float | None, unit: str = "", *, digits: int = 6) -> str:
-    """Format a number with its unit: `0.25 rad/s`; `-` when unknown.
+    """Format a number with its unit: `0.25 rad/s`; `-` if the value is None.
 
     Args:
         value: Number in SI; None when unknown.
@@ -23,12 +23,12 @@ def quantity_text(value: float | None, unit: str = "", *, digits: int = 6) -> st
 
 
 def unit_text(unit: str) -> str:
-    """Format an SI unit: `rad/s`, `deg C`; empty for a fraction."""
+    """Format an SI unit for people: `rad/s`, `deg C`; empty for a fraction."""
     return _TEXTS.get(unit, unit)
 
 
 def names_with_units(names: Iterable[str], units: Mapping[str, str]) -> str:
-    """Format names of values; adjacent ones with a common unit share it: `x, y (rad/s); voltage (V)`.
+    """Join names of values with their units; neighbours share one: `x, y (rad/s); voltage (V)`.
 
     Args:
         names: Names of values.

@@ -1,4 +1,4 @@
-"""Target: files and directories that a user names for writing.
+"""Target: writes files and directories that a user names, completely or not at all.
 
 A target appears completely or not at all. It never replaces a directory, a pipe, a device, or a file that
 dxlrun did not write.
@@ -21,13 +21,13 @@ _FLAGS = os.O_WRONLY | os.O_CREAT | getattr(os, "O_BINARY", 0) | getattr(os, "O_
 
 
 def unwritable(target: Path, reason: OSError | str) -> InputError:
-    """Return the error for a target that cannot be written."""
+    """Return the InputError that a target cannot be written, with the reason."""
     text = reason if isinstance(reason, str) else reason.strerror or str(reason)
     return InputError(f"{target} cannot be written ({text}); choose another name")
 
 
 def make_folder_of(target: Path) -> None:
-    """Make the parent directory of a target. Raises InputError on failure."""
+    """Create the directory in which a target will be. Raises InputError on failure."""
     try:
         target.parent.mkdir(parents=True, exist_ok=True)
     except (FileExistsError, NotADirectoryError):
@@ -37,7 +37,7 @@ def make_folder_of(target: Path) -> None:
 
 
 def check_target(target: Path, replaces: str | None = None) -> None:
-    """Refuse a target that cannot be written, before the work for it begins.
+    """Check, before any work is done for it, that a file or directory can be written.
 
     An empty file may always be replaced.
 
@@ -72,7 +72,7 @@ def check_target(target: Path, replaces: str | None = None) -> None:
 
 @contextmanager
 def new_target(target: Path, replaces: str | None = None) -> Iterator[Path]:
-    """Provide a path next to the target for a file or a directory, which is renamed to the target on success.
+    """Context manager with a temporary path next to the target, which is renamed to it on success.
 
     On failure, the file or directory is removed.
 
@@ -104,7 +104,7 @@ def new_target(target: Path, replaces: str | None = None) -> Iterator[Path]:
 
 
 def write_target(target: Path, content: str | bytes, replaces: str | None = None) -> None:
-    """Write a file that the user named.
+    """Write a file that the user named, completely or not at all.
 
     Args:
         target: The file that the user named.
@@ -119,7 +119,7 @@ def write_target(target: Path, content: str | bytes, replaces: str | None = None
 
 
 def open_empty(path: str | Path, mode: int) -> int:
-    """Open a file that grows while it is read, such as a log; it must be new, or empty.
+    """Open a file for writing that is read while it grows, such as a log; it must be new or empty.
 
     Args:
         path: The file.

@@ -1,4 +1,4 @@
-"""Terminal: results to stdout, errors to stderr; colours on a terminal only, plain text into a pipe.
+"""Terminal: prints results to stdout and errors to stderr, in colour on a terminal, plain in a pipe.
 
 The layout is computed here, line by line. rich only colours lines on a terminal, and is not loaded for a
 pipe.
@@ -22,39 +22,39 @@ if TYPE_CHECKING:
     from rich.console import Console
 
 Line: TypeAlias = Sequence[tuple[str, str]]
-"""Pieces of a line with their styles."""
+"""A line of output as pieces of text, each with its style for rich."""
 STYLES: dict[Tone, str] = {"plain": "", "good": "green", "warning": "yellow", "error": "red"}
 _PIPE = 200
-"""Columns of a pipe, wide enough for unwrapped tables."""
+"""Assumed width of a pipe, columns, so that tables are not wrapped."""
 _WIDEST = 120
-"""Columns at which text is wrapped, in a wide terminal or a pipe: longer lines are hard to read."""
+"""Most columns to which text is wrapped, in any terminal or pipe: longer lines are hard to read."""
 _FOLDED = 28
-"""Smallest width of a column of texts that are wrapped."""
+"""Smallest width of a table's column with wrapped text, columns."""
 _USUAL = 60
-"""Columns of a terminal in which every table of dxlrun fits as a table."""
+"""Width of a terminal, columns, from which every table of dxlrun is printed as a table."""
 _SHORTEST_TEXT = 20
 _SHORTEST_NAME = 14
-"""Smallest widths of columns that are truncated."""
+"""Smallest widths to which columns of texts and of names are truncated."""
 _LONGEST_WORD = 40
-"""A longer word, such as a path, may be broken in a table."""
+"""Longest word, such as a path, that is not broken in a table, characters."""
 _LIVE = 77
-"""Columns of a status line: together with the spinner, it fits into a terminal of 80 columns."""
+"""Most columns of a status line: together with the spinner, it fits into a terminal of 80 columns."""
 _REFRESH_S = 0.25
 _ASCII = str.maketrans({"\N{BOX DRAWINGS LIGHT HORIZONTAL}": "-", "\N{HORIZONTAL ELLIPSIS}": "~"})
 
 
 def out(pipe: int = _PIPE) -> Console:
-    """Return the console for results; a pipe receives plain text, `pipe` columns wide."""
+    """Return the console for stdout; into a pipe it writes plain text, `pipe` columns wide."""
     return _console(sys.stdout.isatty(), pipe, stderr=False)
 
 
 def err(pipe: int = _PIPE) -> Console:
-    """Return the console for progress when stdout is for a program, as `out`."""
+    """Return the console for stderr, for progress while stdout is read by a program; otherwise as `out`."""
     return _console(sys.stderr.isatty(), pipe, stderr=True)
 
 
 def show(*parts: Part, console: Console | None = None, folded: bool = False) -> None:
-    """Print lines and tables; a table without rows is omitted.
+    """Print lines, tables and graphs to stdout or a console; tables without rows are omitted.
 
     Lines are wrapped only if `folded`, so that a command in them can be copied.
     """
@@ -95,7 +95,7 @@ def _print(line: Line, console: Console | Pipe) -> None:
 
 
 def ascii_only(console: Console) -> bool:
-    """Return whether the console can only show ASCII."""
+    """Return True if the console's encoding is not a Unicode one, so that only ASCII is safe."""
     return not (getattr(console.file, "encoding", None) or "utf-8").lower().startswith("utf")
 
 
@@ -107,7 +107,7 @@ def show_json(
     warnings: Report = (),
     reason: Mapping[str, object] = NO_REASON,
 ) -> None:
-    """Print the answer of a command with --json: one line in a pipe, indented on a terminal.
+    """Print the answer of a command with --json to stdout: one line in a pipe, indented on a terminal.
 
     Args:
         result: Result of the command; None without one.
@@ -124,18 +124,18 @@ def show_json(
 
 
 def print_error(line: str) -> None:
-    """Print one error to stderr, unwrapped, so that an editor can jump to its `file:line:column`."""
+    """Print an error to stderr in one line, so that an editor can jump to its `file:line:column`."""
     _print_to_stderr(line, "bold red")
 
 
 def print_warning(line: str) -> None:
-    """Print one warning to stderr, unwrapped."""
+    """Print a warning to stderr in one line."""
     _print_to_stderr(line, "yellow")
 
 
 @contextmanager
 def progress_bar(*, hidden: bool) -> Iterator[Callable[[str, float], None]]:
-    """Yield a function that shows a text and the completed share on a terminal.
+    """Context manager that yields a function to draw a progress bar: text, and share from 0 to 1.
 
     It has no thread: the bar is drawn by the call, so a measurement between two calls is not disturbed.
     """
@@ -160,14 +160,14 @@ def progress_bar(*, hidden: bool) -> Iterator[Callable[[str, float], None]]:
 
 
 def live_line(text: str, more: str) -> str:
-    """Return a status line that fits next to its spinner: with `more`, without it, or truncated."""
+    """Return a status line that fits next to a spinner: with `more`, without it, or truncated."""
     if len(text) + len(more) <= _LIVE:
         return text + more
     return text if len(text) <= _LIVE else f"{text[: _LIVE - 1]}…"
 
 
 def fitted(table: Table, width: int) -> list[Line]:
-    """Return the lines of a table for a terminal of `width` columns.
+    """Lay out a table as lines for a terminal of `width` columns.
 
     A table that is too wide is narrowed in steps: wrap the heads, move columns that are equal in all rows to
     a caption, omit details, wrap texts, truncate texts, truncate names. On a terminal narrower than _USUAL,
@@ -202,7 +202,7 @@ def _caption(said: str, width: int) -> list[Line]:
 
 
 def _cut(table: Table, width: int) -> Table | None:
-    """Return a table with its widest texts, then its widest names, truncated; None if that is not enough."""
+    """Truncate the widest texts, then the widest names, until a table fits; None if it cannot fit."""
     widths = [
         max(map(len, (*column.name.split(" "), *(row[index].text for row in table.rows))))
         for index, column in enumerate(table.columns)
@@ -233,14 +233,14 @@ def _cut(table: Table, width: int) -> Table | None:
 
 
 def _width(table: Table, *, tight: bool) -> int:
-    """Return the smallest width of a table."""
+    """Return the smallest width of a table, columns; `tight`: with wrapped heads and narrow gaps."""
     heads = [column.name.split(" ") if tight else [column.name] for column in table.columns]
     widths = (max(*map(len, head), _least(table, index)) for index, head in enumerate(heads))
     return sum(widths) + (len(heads) - 1) * (1 if tight else 2)
 
 
 def _least(table: Table, index: int) -> int:
-    """Return the smallest width of the cells of one column; texts may be wrapped between words."""
+    """Return the smallest width of a column's cells; texts may be wrapped between words."""
     texts = [row[index].text for row in table.rows]
     longest = max(map(len, texts))
     if table.columns[index].kind != "text":
@@ -250,7 +250,7 @@ def _least(table: Table, index: int) -> int:
 
 
 def _drawn(table: Table, width: int, *, tight: bool) -> Iterator[Line]:
-    """Yield the lines of a table in `width` columns, at least its smallest width; texts are wrapped."""
+    """Yield a table as lines of at most `width` columns, with head and rule; texts are wrapped."""
     names = [column.name.replace(" ", "\n") if tight else column.name for column in table.columns]
     texts = [[name, *(row[index].text for row in table.rows)] for index, name in enumerate(names)]
     widths = [max(len(line) for text in column for line in text.split("\n")) for column in texts]
@@ -286,7 +286,7 @@ def _folded(text: str, width: int) -> list[str]:
 def _row(
     cells: Sequence[Sequence[str]], styles: Sequence[str], widths: Sequence[int], table: Table, gap: int
 ) -> Iterator[Line]:
-    """Yield the lines of a row; `cells` has the lines of each cell."""
+    """Yield the lines of one row; `cells` has the already wrapped lines of each cell."""
     for number in range(max(map(len, cells))):
         pieces = []
         for index, (cell, style, width) in enumerate(zip(cells, styles, widths, strict=True)):
@@ -300,7 +300,7 @@ def _row(
 
 
 def _paragraphs(table: Table, width: int) -> Iterator[str]:
-    """Yield each row as `joint: bus main, ID 3, ...`, wrapped between words."""
+    """Yield each row of a table as wrapped text: `joint: bus main, ID 3, ...`."""
     names = [column.name for column in table.columns]
     for first, *rest in table.rows:
         subject = f"{names[0]} {first.text}" if first.text.isdigit() else first.text
@@ -311,7 +311,7 @@ def _paragraphs(table: Table, width: int) -> Iterator[str]:
 
 
 def _filled(text: str, width: int) -> list[str]:
-    """Return the lines of a text, wrapped between words."""
+    """Wrap a text between words, with continuation lines indented."""
     return textwrap.wrap(
         text, max(width - 1, 20), subsequent_indent="  ", break_on_hyphens=False, break_long_words=False
     )
@@ -334,7 +334,7 @@ def _console(terminal: bool, pipe: int, *, stderr: bool) -> Console:
 
 
 class Pipe:
-    """A console for pipes and files: plain lines without trailing spaces, and no status."""
+    """Stands in for a rich console in pipes and files: prints plain lines, ignores status."""
 
     is_terminal = False
 
@@ -344,13 +344,13 @@ class Pipe:
         self.console = self
 
     def print(self, text: str = "", **_: object) -> None:
-        """Print a line."""
+        """Write a line without trailing spaces."""
         self.file.write(f"{text.rstrip(' ')}\n")
 
     @contextmanager
     def status(self, text: str) -> Iterator[Pipe]:
-        """Yield a status that is not shown."""
+        """Context manager like a console's status, which shows nothing."""
         yield self
 
     def update(self, text: str) -> None:
-        """Ignore a new status."""
+        """Ignore a new status text."""

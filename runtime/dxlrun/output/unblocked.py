@@ -1,4 +1,4 @@
-"""Unblocked: output that never waits for its reader, so a full pipe or stopped terminal delays no signal."""
+"""Unblocked output: stdout and stderr that never wait, so that a full pipe delays no signal."""
 
 from __future__ import annotations
 
@@ -12,13 +12,13 @@ from contextlib import contextmanager, suppress
 from typing import TextIO, cast
 
 MOST_WRITES = 1000
-"""Upper limit of the waiting writes; above it, the oldest are dropped."""
+"""Most writes that wait for a slow reader; beyond it, the oldest are dropped."""
 LAST_WRITE_S = 3.0
-"""Timeout of the last writes at the end of a command."""
+"""Longest time to wait for the reader of the last output at the end of a command, s."""
 
 
 def leave_real_time() -> None:
-    """Give up a real-time policy of the terminal (`chrt -r 31 dxlrun`) for the calling thread.
+    """Reset a real-time scheduling policy (`chrt -r 31 dxlrun`) of the calling thread to the usual one.
 
     Loop, guardian and simulated servos request their own; no other process of a run may disturb them.
     """
@@ -30,7 +30,7 @@ def leave_real_time() -> None:
 
 @contextmanager
 def unblocked() -> Iterator[None]:
-    """Make stdout and stderr accept text at once, whatever their readers do; unread text is dropped.
+    """Context manager in which stdout and stderr never block; text that no reader takes is dropped.
 
     A stream without a file descriptor (of a test) stays as it is.
     """
@@ -59,25 +59,25 @@ def _stream(stream: TextIO, writers: dict[tuple[int, int], _Writer]) -> TextIO:
 
 
 class _Unblocked:
-    """A stream that passes its text to a writer."""
+    """Replaces stdout or stderr: passes all text to a writer thread."""
 
     def __init__(self, stream: TextIO, writer: _Writer) -> None:
         self._stream, self._writer = stream, writer
 
     def write(self, text: str) -> int:
-        """Queue text for the writer."""
+        """Queue text for the writer thread and return its length."""
         self._writer.write(self._stream.fileno(), text.encode(self._stream.encoding or "utf-8", "replace"))
         return len(text)
 
     def flush(self) -> None:
-        """Do nothing: text is not buffered here."""
+        """Do nothing: the writer thread writes without buffering."""
 
     def __getattr__(self, name: str) -> object:
         return getattr(self._stream, name)
 
 
 class _Writer:
-    """Writer thread, the only one that waits for a reader.
+    """Thread that writes queued text to file descriptors, the only one that waits for their readers.
 
     It starts before anything is written: the first print may be that of a controller, which must not start a
     thread. O_NONBLOCK would also affect other processes of the same terminal or pipe, and a poll before a
@@ -91,13 +91,13 @@ class _Writer:
         threading.Thread(target=self._write_for_ever, daemon=True).start()
 
     def write(self, descriptor: int, data: bytes) -> None:
-        """Queue bytes for a file descriptor."""
+        """Queue bytes for a file descriptor and return at once."""
         with self._changed:
             self._waiting.append((descriptor, data))
             self._changed.notify_all()
 
     def settle(self) -> None:
-        """Wait until the reader has received all writes, up to LAST_WRITE_S."""
+        """Wait until all queued bytes are written, at most LAST_WRITE_S."""
         with self._changed:
             self._changed.wait_for(lambda: self._idle and not self._waiting, LAST_WRITE_S)
 

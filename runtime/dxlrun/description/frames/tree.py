@@ -1,4 +1,4 @@
-"""Tree of a robot's frames: the cause of each frame's motion, and its pose at given joint positions.
+"""Frame tree: which joint or IMU moves each link of a URDF, and the link's pose at given positions.
 
 Frames have the names of the URDF's links, after ROS REP 105: `base_link` is the robot's own frame, `odom` is
 fixed. Joints and their origins come from the URDF alone; no library is needed.
@@ -29,7 +29,7 @@ from dxlsim.geometry.urdf import SLIDING, Urdf, UrdfJoint, leader, read_urdf
 ODOM = "odom"  # fixed frame in which an IMU measures its orientation (ROS REP 105)
 _ABOVE_ODOM = ("world", "map", ODOM)
 ORIENTATION = ("orientation.x", "orientation.y", "orientation.z", "orientation.w")
-"""States of a source that rotates a body."""
+"""States (quaternion) that a device, sensor or controller must have to rotate the robot's body."""
 IMU_LINKS = ("{}", "{}_link", "{}_frame")  # possible names of an IMU's link, from the IMU's name
 
 MovedBy = Literal["root", "fixed", "servo", "mimic", "imu", "nothing"]
@@ -38,17 +38,17 @@ _NOTHING_KNOWN: Mapping[str, float] = MappingProxyType({})
 
 
 class FramesPlan(msgspec.Struct, frozen=True):
-    """Settings for logging the frames of a robot."""
+    """Settings for writing the robot's frames (/tf) into the log."""
 
     rate: float
-    """Messages of /tf per second, Hz; at most one per cycle. 0: none."""
+    """Messages of /tf per second, at most one per cycle; 0: none."""
     moved: tuple[str, ...] = ()  # joints of the robot that move joints of the URDF
     imu: str = ""  # source whose orientation rotates the body; empty: the root is fixed
     imu_link: str = ""  # link of the URDF with that orientation
 
 
 class Frame(msgspec.Struct, frozen=True):
-    """One frame of the tree."""
+    """One frame, usually a link of the URDF: its parent and what moves it."""
 
     name: str
     parent: str  # empty: none
@@ -57,12 +57,12 @@ class Frame(msgspec.Struct, frozen=True):
 
     @property
     def moves(self) -> bool:
-        """True if its pose in its parent can change."""
+        """True if the frame's pose in its parent can change during a run."""
         return self.moved_by in ("servo", "mimic", "imu")
 
 
 class FrameTree:
-    """Frames of a robot.
+    """All frames of a robot with their parents; computes poses from joint positions and the IMU.
 
     With an IMU, `odom` is the frame in which the IMU measures its orientation. There are two cases. If the
     IMU's link is a child of `odom`, the link rotates together with everything below it. If the link is
@@ -85,18 +85,18 @@ class FrameTree:
         self.imu = imu
         self.imu_link = _imu_link(urdf, imu, imu_link) if imu else ""
         self._turned = ""
-        """Frame that the IMU rotates; empty: none."""
+        """Name of the frame that the IMU's orientation rotates; empty without an IMU."""
         frames = [Frame(urdf.root, "", None, "root")]
         frames += [Frame(joint.child, joint.parent, joint, self._mover(joint)) for joint in urdf.joints]
         if self.imu_link:
             frames = self._with_imu(urdf, frames)
         self.frames: tuple[Frame, ...] = tuple(frames)
-        """All frames from the root downwards, each after its parent."""
+        """All frames, each after its parent, beginning with the root."""
         self._frames = {frame.name: frame for frame in frames}
 
     @classmethod
     def of(cls, urdf: str, plan: FramesPlan) -> FrameTree:
-        """Return the tree for the text of a URDF and a plan; raise InputError as the constructor does."""
+        """Build the tree from the text of a URDF and a plan; raise InputError as the constructor does."""
         return cls(read_urdf(urdf), plan.moved, plan.imu, plan.imu_link)
 
     def _mover(self, joint: UrdfJoint) -> MovedBy:
@@ -107,7 +107,7 @@ class FrameTree:
         return "mimic" if leader(self._joints, joint, self.moved)[0].name in self.moved else "nothing"
 
     def _with_imu(self, urdf: Urdf, frames: list[Frame]) -> list[Frame]:
-        """Return the frames with the frame that the IMU rotates."""
+        """Return the frames with `odom` and the frame that the IMU rotates in it."""
         for number, frame in enumerate(frames):
             if (frame.name, frame.parent, frame.moved_by) == (self.imu_link, ODOM, "fixed"):
                 self._turned = frame.name
@@ -122,7 +122,7 @@ class FrameTree:
         return [Frame(ODOM, "", None, "root"), Frame(urdf.root, ODOM, None, "imu"), *frames[1:]]
 
     def position(self, name: str, positions: Mapping[str, float]) -> float:
-        """Return the position of a joint of the URDF, rad or m: as given, by its mimic rule, or at rest.
+        """Return the position of a URDF joint, rad or m: as given, from the joint it mimics, or at rest.
 
         The rest position is 0, or the middle of the limits if they exclude 0.
         """
@@ -133,7 +133,7 @@ class FrameTree:
     def local(
         self, frame: Frame, positions: Mapping[str, float], orientation: Quaternion = NO_TURN
     ) -> Transform | None:
-        """Return the pose of a frame in its parent; None: a position that it needs is not known (NaN)."""
+        """Return the pose of a frame in its parent; None if a position or orientation is NaN."""
         if frame.moved_by == "root":
             return Transform()
         if frame.moved_by == "imu":
@@ -152,7 +152,7 @@ class FrameTree:
         return Transform(base.translation, product(base.rotation, turn(frame.joint.axis, position)))
 
     def orientation(self, states: Mapping[str, float | None]) -> Quaternion:
-        """Return the IMU's orientation from the states of sources, `imu/orientation.x`; NaN: not known.
+        """Return the IMU's orientation from states such as `imu/orientation.x`; NaN if one is missing.
 
         Without an IMU the orientation is the identity.
         """
@@ -174,7 +174,7 @@ class FrameTree:
         return inside and Transform(rotation=product(orientation, conjugate(inside.rotation)))
 
     def _shared(self, one: str, other: str) -> str:
-        """Return the nearest common ancestor of two frames, which can be one of them."""
+        """Return the nearest frame that is above both frames, or one of the two."""
         above = {one}
         while parent := self._frames[one].parent:
             above.add(one := parent)
@@ -185,7 +185,7 @@ class FrameTree:
     def _below(
         self, name: str, above: str, positions: Mapping[str, float], orientation: Quaternion = NO_TURN
     ) -> Transform | None:
-        """Return the pose of a frame in one of its ancestors; None: not known."""
+        """Return the pose of a frame in a frame above it; None if a position or orientation is NaN."""
         found = Transform()
         frame = self._frames[name]
         while frame.name != above:
@@ -203,7 +203,7 @@ class FrameTree:
         positions: Mapping[str, float] = _NOTHING_KNOWN,
         orientation: Quaternion = NO_TURN,
     ) -> Transform:
-        """Return the pose of a frame in another frame.
+        """Return the pose of the frame `of` in another frame, at given joint positions.
 
         Args:
             of: The frame.
@@ -233,7 +233,7 @@ class FrameTree:
 
 
 def rest(joint: UrdfJoint) -> float:
-    """Return the position of a joint without a servo: 0, or the middle of limits that exclude 0."""
+    """Return the position at which a joint without a servo is shown: 0, or the middle of its limits."""
     lower, upper = joint.limits.lower, joint.limits.upper
     if lower is None or upper is None or joint.type == "continuous" or lower <= 0.0 <= upper:
         return 0.0
@@ -241,7 +241,7 @@ def rest(joint: UrdfJoint) -> float:
 
 
 def _imu_link(urdf: Urdf, imu: str, link: str) -> str:
-    """Return the link of an IMU: the given one, or one with the IMU's name."""
+    """Return the link of an IMU: the given one, or one named like the IMU; raise InputError if none."""
     if link and link not in urdf.links:
         raise _refused(f"the URDF has no link {link} for the IMU {imu}", suggestion(link, urdf.links))
     names = [link] if link else [form.format(imu) for form in IMU_LINKS]

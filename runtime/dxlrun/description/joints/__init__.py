@@ -1,4 +1,4 @@
-"""Forms of joints, groups, mechanics, servos and motor files.
+"""Forms of joints, groups of joints, their mechanics and servos, and of motor files.
 
 `compile/joints` decides how servos on a bus move a joint.
 """

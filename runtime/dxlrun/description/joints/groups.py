@@ -1,4 +1,4 @@
-"""Groups and defaults of a robot file, merged into its joints before validation.
+"""Groups: copies `joint_defaults` and keys of `groups` into joints, and replaces group names by joints.
 
 `joint_defaults` has keys for every joint, a group has keys for its joints; a joint's own keys take
 precedence. After that a group is only a name for its joints, which replace it wherever a file names joints.
@@ -22,18 +22,20 @@ from dxlrun.features.feature import Section
 
 DEFAULTS, GROUPS, ALL = "joint_defaults", "groups", "all"
 NAMING = ("joints", "pose", "torque")
-"""Keys whose list or mapping names joints; so does each entry of `poses`."""
+"""Keys whose list or mapping names joints or groups; so does each entry of `poses`."""
 
 Groups = Mapping[str, tuple[str, ...]]  # joints of each group, by its name
 NO_GROUPS: Groups = {}
 Moves = dict[KeyPath, list[KeyPath]]
-"""New paths of each part of a document; a part can be copied to several places."""
+"""For each moved value of a document, its old path and the paths to which it was copied."""
 _Value = TypeVar("_Value")
 
 
 def with_groups(grown: Grown) -> Grown:
-    """Return a robot file with complete joints; groups keep only their names, and joints replace them
-    elsewhere."""
+    """Return a robot file's document in which each joint has its keys from `joint_defaults` and groups.
+
+    Groups keep only their joints, and their names elsewhere are replaced by the joints.
+    """
     data = grown.data
     if DEFAULTS not in data and GROUPS not in data:
         return grown
@@ -47,7 +49,7 @@ def with_groups(grown: Grown) -> Grown:
 
 
 def put_in(grown: Grown, groups: Groups) -> Grown:
-    """Return a document with joints in place of the groups that it names.
+    """Replace names of groups in a document by their joints, in lists and in keys of mappings.
 
     In a mapping, a joint that is named directly keeps its own value; a joint in two groups is a problem.
     """
@@ -58,12 +60,12 @@ def put_in(grown: Grown, groups: Groups) -> Grown:
 
 
 def without_groups(data: dict[str, object], groups: Groups) -> dict[str, object]:
-    """Return data that did not come from a file, with joints in place of groups."""
+    """Replace names of groups by their joints in data without a file, such as a client's request."""
     return put_in(Grown(data, Marks("", {}, {}), (), frozenset()), groups).data
 
 
 class _Places:
-    """Finds the groups that a document names; `moves` are the values whose paths change."""
+    """Replaces names of groups in a document by joints, and notes which values moved where."""
 
     def __init__(self, marks: Marks, groups: Groups) -> None:
         self._marks = marks
@@ -72,7 +74,7 @@ class _Places:
         self.problems: list[Problem] = []
 
     def value(self, value: object, path: KeyPath) -> object:
-        """Return a part of the document with joints in place of groups."""
+        """Return the value at a path with joints in place of groups."""
         naming = bool(path) and (path[-1] in NAMING or path[-2:-1] == ("poses",))
         if isinstance(value, dict):
             if naming and not self._groups.keys().isdisjoint(value):
@@ -109,7 +111,7 @@ class _Places:
 
 
 def _groups(data: Mapping[str, object]) -> dict[str, tuple[str, ...]]:
-    """Return the joints of each group; entries of a wrong form are skipped."""
+    """Return the joints of each group, with those of groups in it; malformed entries are skipped."""
     joints, entries = _mapping(data.get("joints")), _named(data)
     return {
         name: tuple(dict.fromkeys(one for one in _members(entries, name) if one in joints))
@@ -118,13 +120,13 @@ def _groups(data: Mapping[str, object]) -> dict[str, tuple[str, ...]]:
 
 
 def _named(data: Mapping[str, object]) -> dict[str, object]:
-    """Return the groups whose names have no other meaning."""
+    """Return the entries of `groups` without those whose name is that of a joint, or `all`."""
     joints = _mapping(data.get("joints"))
     return {name: one for name, one in _mapping(data.get(GROUPS)).items() if name not in (*joints, ALL)}
 
 
 def _members(entries: Mapping[str, object], name: str, above: tuple[str, ...] = ()) -> Iterator[str]:
-    """Yield the names in a group and in its groups; a cycle ends where it closes."""
+    """Yield the names in a group and, instead of groups in it, their names; a cycle ends where it closes."""
     for _, one in _written(entries, name):
         if one not in entries:
             yield one
@@ -133,7 +135,7 @@ def _members(entries: Mapping[str, object], name: str, above: tuple[str, ...] = 
 
 
 def _written(entries: Mapping[str, object], name: str) -> Iterator[tuple[int, str]]:
-    """Yield the names in a group's own list, with their indices."""
+    """Yield the names in a group's own list `joints`, each with its index."""
     names = _mapping(entries.get(name)).get("joints")
     for index, one in enumerate(names if isinstance(names, list) else ()):
         if isinstance(one, str):
@@ -145,7 +147,7 @@ def _mapping(value: object) -> dict[str, object]:
 
 
 def _mistakes(grown: Grown) -> Iterator[Problem]:
-    """Yield problems of names in groups; the model checks the form of a group."""
+    """Yield problems in `joint_defaults` and `groups`: unknown joints, ambiguous names, cycles."""
     joints, entries = _mapping(grown.data.get("joints")), _named(grown.data)
     if not isinstance(defaults := grown.data.get(DEFAULTS, {}), dict):
         what = f"{DEFAULTS} is {shown(defaults)}, but must be a mapping"
@@ -171,7 +173,7 @@ def _mistakes(grown: Grown) -> Iterator[Problem]:
 
 
 def _circle(entries: Mapping[str, object], way: tuple[str, ...]) -> tuple[str, ...]:
-    """Return a cycle of groups, reported only for the group in it that is first in the file; empty: none."""
+    """Return a cycle of groups that contain each other, only from its first group in the file; or ()."""
     first, last = way[0], way[-1]
     if last == first:
         return way if first == min(way, key=list(entries).index) else ()
@@ -182,7 +184,7 @@ def _circle(entries: Mapping[str, object], way: tuple[str, ...]) -> tuple[str, .
 
 
 def _layer(grown: Grown, source: KeyPath, joints: tuple[str, ...], groups: Groups) -> Grown:
-    """Return a document of joints with the keys at a path of another document."""
+    """Return a document that has, for each of these joints, the keys of `joint_defaults` or of a group."""
     at: object = grown.data
     for step in source:
         at = _mapping(at).get(str(step))
@@ -205,7 +207,7 @@ def _layer(grown: Grown, source: KeyPath, joints: tuple[str, ...], groups: Group
 
 
 def _disagreements(grown: Grown, groups: Groups, layers: list[Grown]) -> Iterator[Problem]:
-    """Yield problems of joints that get different values from two groups and have none themselves."""
+    """Yield a problem for each joint that gets different values of a key from two groups."""
     own = {path for path, _ in _leaves(_mapping(grown.data.get("joints")))}
     before: dict[KeyPath, tuple[str, object]] = {}
     for name, layer in zip(groups, layers, strict=True):
@@ -227,7 +229,7 @@ def _leaves(value: dict[str, object], path: KeyPath = ()) -> Iterator[tuple[KeyP
 
 
 def _without_defaults(grown: Grown, groups: Groups) -> Grown:
-    """Return a document without `joint_defaults`, whose groups have only the names of their joints."""
+    """Return a document without `joint_defaults`, and with groups that have no key but `joints`."""
     data = {key: value for key, value in grown.data.items() if key != DEFAULTS}
     policies = _mapping(data.get("policies"))
     if any(name in groups for name in _mapping(policies.get(GROUPS))):
@@ -246,7 +248,7 @@ def _without_defaults(grown: Grown, groups: Groups) -> Grown:
 
 
 def moved(grown: Grown, moves: Moves, *, others: bool = True) -> Grown:
-    """Return a document whose marks follow its moved parts; `others`: keep the marks of other parts."""
+    """Return a document whose places follow its moved values; `others`: keep the places of the others."""
 
     def placed(table: Mapping[KeyPath, _Value]) -> dict[KeyPath, _Value]:
         found: dict[KeyPath, _Value] = {}

@@ -1,4 +1,4 @@
-"""Joints of a robot file: forms that are selected by their keys, and the simulated loads.
+"""Joints: the forms of an entry under `joints` of a robot file: with one, several, or no own servos.
 
 `mechanics` describes how one or several servos move a joint.
 """
@@ -46,11 +46,11 @@ from dxlwire.joint_unit import LINEAR, ROTARY, JointUnit
 
 F = TypeVar("F", bound=Form)
 LONGEST_RESPONSE_DELAY_NS, LONGEST_WRITE_TIME_NS = 1_000_000_000, 100_000_000
-"""Upper bounds for simulated servos; real servos are much faster."""
+"""Upper bounds of two delays of simulated servos, ns; real servos are much faster."""
 
 
 def _on_or_off(value: object) -> object:
-    """Return a bool for the words on and off, which are text in YAML 1.2."""
+    """Validate the words on and off, which are text in YAML 1.2, into a bool."""
     if isinstance(value, bool):
         return value
     if value not in ("on", "off"):
@@ -66,7 +66,7 @@ OnOff = Annotated[
 
 
 class JointSimulation(Form):
-    """Load and delays of the simulated servos of a joint; real servos ignore it."""
+    """Form of `simulation` of a joint: load and delays of its simulated servos; real servos ignore it."""
 
     response_delay: Annotated[Duration, Field(le=LONGEST_RESPONSE_DELAY_NS)] = key(
         "Delay between an instruction to the servo and its effect on the motor; the delay in the "
@@ -99,7 +99,7 @@ class JointSimulation(Form):
 
 
 class BareJoint(Form):
-    """Keys that every joint has. A joint with only these keys has its servos in another section."""
+    """Form of a joint whose servos are in another section (`transmissions`); base of the other forms."""
 
     continuous: bool = key("Wheel or multi-turn joint, which needs no position limits.", "true", False)
     torque: OnOff = key(
@@ -136,7 +136,7 @@ class BareJoint(Form):
 
 
 class ServoJoint(BareJoint):
-    """A joint with one or several servos, for each of which q = direction * (theta - reference) * ratio.
+    """Base form of a joint with its own servos, where q = direction * (theta - reference) * ratio.
 
     A joint with `travel_per_turn` is linear: its positions are lengths.
     """
@@ -159,23 +159,23 @@ class ServoJoint(BareJoint):
 
     @property
     def unit(self) -> JointUnit:
-        """Unit of the joint's positions: lengths with `travel_per_turn`, angles without."""
+        """Unit of the joint's positions: LINEAR (m) with `travel_per_turn`, else ROTARY (rad)."""
         return ROTARY if self.travel_per_turn is None else LINEAR
 
     @property
     def ratio(self) -> float:
-        """Travel of the joint while a servo turns by 1 rad, rad or m."""
+        """Travel of the joint per rad of a servo, rad or m."""
         return 1.0 / self.gear_ratio if self.travel_per_turn is None else self.travel_per_turn / math.tau
 
 
 class Joint(ServoJoint):
-    """A joint with one servo."""
+    """Form of a joint with one servo."""
 
     id: ServoId = key("ID of the servo.", "1")
 
 
 class SharedJoint(ServoJoint):
-    """A joint with several servos, which get equal goals."""
+    """Form of a joint that several servos move together; all get the same goal."""
 
     servos: Annotated[tuple[OneOfServos, ...], Field(strict=False, min_length=2)] = key(
         "Servos of the joint, which supplies the keys that a servo omits.",
@@ -189,28 +189,28 @@ class SharedJoint(ServoJoint):
 
 
 JointEntry: TypeAlias = Joint | SharedJoint | BareJoint
-"""A joint of the robot file."""
+"""A joint of the robot file in one of its three forms."""
 
 
 def _keys_of_a_servo() -> frozenset[str]:
-    """Return the keys that show that a joint has its own servo."""
+    """Return the keys (such as `id`) that show that a joint has its own servo."""
     own = Joint.model_fields.keys() - BareJoint.model_fields.keys()
     return frozenset(own | {key.name for key in servo_keys()})
 
 
 def keys_of_servos() -> frozenset[str]:
-    """Return the keys that a joint without its own servo does not have."""
+    """Return the keys that only joints with their own servos have, in any form."""
     return _keys_of_a_servo() | SharedJoint.model_fields.keys() - BareJoint.model_fields.keys()
 
 
 def joint_conditions() -> tuple[tuple[str, dict[str, object]], ...]:
-    """Return the forms of joints with the JSON Schema of their keys; the first match counts."""
+    """Return the names of the forms of joints with the JSON Schema condition that selects each."""
     own = [{"required": [key]} for key in sorted(_keys_of_a_servo())]
     return (("SharedJoint", {"required": ["servos"]}), ("Joint", {"anyOf": own}))
 
 
 def kind_of_joint(joint: object) -> str:
-    """Return the form of a joint entry, by the keys that only one form has."""
+    """Return the tag of a joint's form: `<one servo>`, `<several servos>` or `<no servo>`."""
     if isinstance(joint, dict):
         if "servos" in joint:
             return "<several servos>"
@@ -226,28 +226,28 @@ def kind_of_joint(joint: object) -> str:
 
 
 def joint_keys() -> list[JointKey[object]]:
-    """Return the keys that features add to joints."""
+    """Return the keys that installed features add to joints."""
     return [key for _, key in stages(JointKey, installed_features())]
 
 
 def servo_keys() -> list[ServoKey[object]]:
-    """Return the keys that features add to servos."""
+    """Return the keys that installed features add to servos."""
     return [key for _, key in stages(ServoKey, installed_features())]
 
 
 def servo_values(servo: Form, joint: Form | None = None) -> dict[str, object]:
-    """Return the features' keys of a servo; a missing value is taken from its joint."""
+    """Return the values of all features' keys of a servo, by key; missing ones are those of its joint."""
     found = {key.name: getattr(servo, key.name) for key in servo_keys()}
     return {name: getattr(joint, name) if value is None else value for name, value in found.items()}
 
 
 def section_servo(form: type[F]) -> type[F]:
-    """Return the form of a servo in a feature's section, with the keys of other features."""
+    """Return the form of a servo in a feature's section, extended by other features' servo keys."""
     return with_keys(form, [replace(key, field=key.of_section) for key in servo_keys()])
 
 
 def joint_form() -> object:
-    """Return the type of a joint in the file: one of the forms, with the keys of features."""
+    """Return the pydantic type of a joint: a union of its forms, extended by the features' keys."""
     every, servos = joint_keys(), servo_keys()
     optional = [replace(key, form=Optional[key.form], field=key.of_one) for key in servos]  # noqa: UP045  an object has no |
     one_of_servos = with_keys(OneOfServos, optional)
@@ -267,13 +267,13 @@ def joint_form() -> object:
 
 
 def planned_keys(joint: BareJoint) -> dict[str, object]:
-    """Return the features' keys that the file sets for a joint, as in a plan."""
+    """Return the features' keys that the file sets for a joint, in JSON types for the plan."""
     given = {key.name: getattr(joint, key.name) for key in joint_keys() if key.name in joint.model_fields_set}
     return {name: _planned(value) for name, value in given.items() if value is not None}
 
 
 def _planned(value: object) -> object:
-    """Return a value for JSON; a quantity becomes a number in its SI unit."""
+    """Convert a validated value into JSON types; quantities become numbers in SI units."""
     if isinstance(value, Form):
         return {name: _planned(getattr(value, name)) for name in type(value).model_fields}
     if isinstance(value, dict):
@@ -294,10 +294,7 @@ _MEASURES: Mapping[KeyPath, tuple[Either, Mapping[JointUnit, str]]] = {
     ("tolerance", "position"): (position, {ROTARY: "2 deg", LINEAR: "2 mm"}),
     ("tolerance", "velocity"): (speed, {ROTARY: "2 deg/s", LINEAR: "2 mm/s"}),
 }
-"""Keys whose unit depends on the kind of joint, with an example for rotary and for linear joints.
-
-Features have further keys, see `JointKey.examples`.
-"""
+"""Keys whose unit must fit the kind of joint (angle or length), each with an example for both kinds."""
 _OF_OTHER_JOINTS: Mapping[JointUnit, Mapping[KeyPath, str]] = {
     ROTARY: {("simulation", "mass"): "write `inertia: 0.01 kg m^2`"},
     LINEAR: {
@@ -306,11 +303,11 @@ _OF_OTHER_JOINTS: Mapping[JointUnit, Mapping[KeyPath, str]] = {
         ("simulation", "gravity_angle"): "a linear joint has its weight everywhere; remove gravity_angle",
     },
 }
-"""Keys that joints with this unit do not have, each with a fix."""
+"""Keys that joints of this kind cannot have, each with a fix."""
 
 
 def misfits(joints: object) -> Iterator[tuple[KeyPath, str, str]]:
-    """Yield keys and units that belong to another kind of joint: path, problem, and fix.
+    """Yield keys and units that do not fit a rotary or linear joint: path, problem, and fix.
 
     `joints` is the section of the file; the model checks its form.
     """
@@ -330,7 +327,7 @@ def misfits(joints: object) -> Iterator[tuple[KeyPath, str, str]]:
 
 
 def units_of_key(key: JointKey[object]) -> dict[JointUnit, str]:
-    """Return the SI unit of a key's values for each kind of joint; empty if all joints have the same unit."""
+    """Return the SI unit of a key for rotary and linear joints; empty if it does not depend on that."""
     found: dict[JointUnit, str] = {}
     for kind in _kinds_of(key):
         for unit, example in key.examples.items():
@@ -340,12 +337,12 @@ def units_of_key(key: JointKey[object]) -> dict[JointUnit, str]:
 
 
 def _kinds_of(key: JointKey[object]) -> list[Either]:
-    """Return the quantity of a key whose unit depends on the kind of joint; otherwise an empty list."""
+    """Return the quantities of a feature's key whose unit depends on the kind of joint; else nothing."""
     return [*_quantities(key.form)] if key.examples else []
 
 
 def _quantities(form: object) -> Iterator[Either]:
-    """Yield the quantities in a type such as `Position | None`."""
+    """Yield the quantities (angle or length) in a pydantic type such as `Position | None`."""
     for part in get_args(form):
         if isinstance(part, Either):
             yield part
@@ -360,8 +357,7 @@ def _written(entry: object, path: KeyPath) -> object:
 
 
 def _units(kind: Either, value: object) -> Iterator[tuple[KeyPath, str]]:
-    """Yield the SI units of a value, or of the values in a list with their indices; unreadable values are
-    skipped."""
+    """Yield the SI units of a value or of the items of a list, with their index; skip unreadable ones."""
     places: list[tuple[KeyPath, object]] = [((), value)]
     if isinstance(value, list):
         places = [((index,), one) for index, one in enumerate(value)]

@@ -1,4 +1,4 @@
-"""Mechanics: limits and tolerances of a joint, and the keys of its servos.
+"""Mechanics: forms of limits, tolerances and servos of a joint, with their ranges.
 
 A servo's shaft turns by theta; s = direction * (theta - reference) * ratio is the resulting motion at the
 joint. The position of a joint is q = s with one servo, and the mean of all s with several servos.
@@ -35,14 +35,15 @@ from dxlrun.description.units import (
 from dxlwire.joint_unit import LINEAR, ROTARY, JointUnit
 
 LEAST_RATIO, MOST_RATIO = 0.01, 10_000.0
-"""Servo turns per joint turn [i]; others are mistakes: a tick would be 9 deg or 30 nrad of the joint."""
+"""Allowed range of `gear_ratio` [i]; beyond it a tick would be 9 deg or 30 nrad of the joint."""
 LEAST_TRAVEL_M, MOST_TRAVEL_M = 1e-5, 10.0  # travel per servo turn; values beyond are mistakes
 SERVO_TOLERANCES: Mapping[JointUnit, float] = {ROTARY: math.radians(3.0), LINEAR: 1e-3}
-"""Default tolerance between the servos of one joint: backlash and the elasticity of a loaded gear. [i]"""
+"""Default of the largest difference between the servos of one joint, rad or m: backlash and the elasticity of
+a loaded gear. [i]"""
 
 MotorFile = Annotated[str, Field(min_length=1)]  # name of a motor file from `dxlrun identify`
 _MOST_TOLERANCES: Mapping[JointUnit, float] = {ROTARY: math.radians(20.0), LINEAR: math.inf}
-"""Servos that are further apart pull against each other, whatever they hold. [i]"""
+"""Largest tolerance between servos that a file may set: further apart they pull against each other. [i]"""
 
 
 def _useful(value: Measure) -> Measure:
@@ -55,14 +56,14 @@ def _useful(value: Measure) -> Measure:
 
 
 Tolerance = Annotated[Position, Field(gt=0), AfterValidator(_useful)]
-"""Largest difference between the servos of one joint, rad or m."""
+"""Largest difference between the servos of one joint in a file, as an angle or a length."""
 
 
 class GoalTolerance(Form):
-    """Largest distance from the goal, and highest speed, of a joint that has reached its goal."""
+    """Form of `tolerance` of a joint: how near and how slow it must be to have reached its goal."""
 
     alone: ClassVar[str] = "position"
-    """Key that a bare value sets."""
+    """Key that is meant if the file has a single value in place of the mapping."""
     position: units.Tolerance | None = key(
         "Largest distance from the goal; 5 deg or 5 mm by default, inf for any distance.", "2 deg", None
     )
@@ -84,14 +85,14 @@ class GoalTolerance(Form):
     def __get_pydantic_json_schema__(
         cls, core_schema: CoreSchema, handler: GetJsonSchemaHandler
     ) -> dict[str, Any]:
-        """Return the schema of a mapping or of a single value."""
+        """Return the JSON Schema of the mapping or of the single value that stands for it."""
         mapping = dict(handler.resolve_ref_schema(handler(core_schema)))
         values = [one for one in mapping["properties"][cls.alone]["anyOf"] if one != {"type": "null"}]
         return mapping | {"anyOf": [{"type": mapping.pop("type")}, *values]}
 
 
 class SharedTolerance(GoalTolerance):
-    """Tolerances of a joint with several servos."""
+    """Form of `tolerance` of a joint with several servos, which may also differ from each other."""
 
     alone: ClassVar[str] = "servos"
     servos: Tolerance | None = key(
@@ -121,7 +122,7 @@ TravelPerTurn = Annotated[Length, Field(ge=LEAST_TRAVEL_M, le=MOST_TRAVEL_M)]
 
 
 class Limits(Form):
-    """Limits of a joint's position, velocity, acceleration and effort; enforced last before the bus."""
+    """Form of `limits` of a joint; the gate enforces them on every goal before it is sent."""
 
     position: Annotated[tuple[Position, Position], Field(strict=False), AfterValidator(_ordered)] | None = (
         key(
@@ -142,11 +143,11 @@ class Limits(Form):
 
 
 class ServoEntry(Form):
-    """A servo without a joint of its own; it has some of the keys of a joint."""
+    """Base form of servos that are listed below a joint or a transmission."""
 
 
 class OneOfServos(ServoEntry):
-    """One of several servos on a joint; the joint supplies the missing keys."""
+    """Form of one of several servos of a joint; keys that it lacks are those of the joint."""
 
     id: ServoId = key("ID of the servo.", "2")
     bus: str | None = key("Name of the servo's bus; the joint's by default.", "legs", None)

@@ -1,4 +1,4 @@
-"""Motor file: written by `dxlrun identify` and named by a joint's `motor`; its form, reader and writer."""
+"""Motor file: the YAML file with a servo's measured motor model: its form, reader and writer."""
 
 from __future__ import annotations
 
@@ -29,7 +29,7 @@ from dxlrun.errors import Mark
 from dxlsim.motor_model import MotorModel
 
 _ESSENTIAL = ("voltage", "torque_constant", "resistance", "inertia")
-"""Keys of every motor file; a file with none of them is something else."""
+"""Required figures of a motor file; a file that has none of them is refused as another kind of file."""
 
 
 _LONGEST_DELAY_NS = 100_000_000
@@ -42,7 +42,7 @@ def _short(delay_ns: int) -> int:
 
 
 class StribeckForm(Form):
-    """Friction near standstill."""
+    """Form of `stribeck` in a motor file: friction that decreases as the motor starts to turn."""
 
     friction: Annotated[Torque, Field(ge=0)] = key("Additional friction at standstill.", "0.05 Nm")
     velocity: Annotated[AngularVelocity, Field(gt=0)] = key(
@@ -54,7 +54,7 @@ class StribeckForm(Form):
 
 
 class LoadForm(Form):
-    """Load that the motor moves."""
+    """Form of `load` in a motor file: what the motor moved while it was identified."""
 
     inertia: Annotated[Inertia, Field(ge=0)] = key(
         "Moment of inertia of the load, in addition to the motor's own.", "0.01 kg m^2", 0.0
@@ -80,7 +80,7 @@ _UNCERTAIN: Mapping[str, tuple[object, str]] = {
     "load_gravity": (Torque, "0.01 Nm"),
     "load_gravity_angle": (Angle, "2 deg"),
 }
-"""Figures that can have an uncertainty, with their quantity and an example."""
+"""Figures of a motor file that can have an uncertainty, with their unit and an example."""
 UncertaintyForm = create_model(  # type: ignore[call-overload]  # fields by a table
     "UncertaintyForm",
     __base__=Form,
@@ -100,7 +100,7 @@ UncertaintyForm = create_model(  # type: ignore[call-overload]  # fields by a ta
 
 
 class MotorForm(Form):
-    """A motor file."""
+    """Form of a motor file, as `dxlrun identify` writes it."""
 
     model: str = key("Model of the servo.", "MX-64", min_length=1)
     source: str = key("Data of the identification: log and date.", "elbow.mcap", "")
@@ -146,24 +146,24 @@ class MotorForm(Form):
     )
 
     def motor(self) -> MotorModel:
-        """Return the motor model."""
+        """Return the motor model for simulation and control."""
         figures = self.model_dump(exclude={"delay", "uncertainty"})
         return msgspec.convert(figures | {"delay_ns": self.delay}, MotorModel)
 
 
 class MotorDescription(msgspec.Struct, frozen=True):
-    """A motor file of valid form, with the places of its values."""
+    """A motor file that was read: its motor model, its text, and the places of its values."""
 
     motor: MotorModel
     marks: Marks
     path: Path
     text: str  # text as read
     uncertainty: Mapping[str, float] = {}
-    """Half-widths of the 95 % confidence intervals, SI (the delay's in s), by key."""
+    """Half-widths of the 95 % confidence intervals by figure, in SI units (the delay in s)."""
 
 
 def read_motor(path: Path) -> MotorDescription:
-    """Read a motor file; raise InputError with all problems of its form."""
+    """Read a motor file; raise InputError with all of its mistakes."""
     file, text = str(path), read_text(path)
     grown = grow(parse(text, file), file, refuse_arguments)
     if not any(key in grown.data for key in _ESSENTIAL):
@@ -196,7 +196,7 @@ _UNITS: Mapping[str, str] = {
 
 
 def motor_text(motor: MotorModel, uncertainty: Mapping[str, float], *, comment: str = "") -> str:
-    """Return the text of a motor file, which `read_motor` reads to the same figures up to rounding.
+    """Write a motor model as the text of a motor file, which `read_motor` reads back up to rounding.
 
     Args:
         motor: The motor model; figures are written with six digits.

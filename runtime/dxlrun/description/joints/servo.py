@@ -1,4 +1,4 @@
-"""Servo: figures of a joint's servo from the e-Manual and the control table."""
+"""Servo model: a joint's servo figures from its manual and control table."""
 
 from __future__ import annotations
 
@@ -8,16 +8,16 @@ from dxlwire.modes import EffortUnit
 
 
 class ServoModel(msgspec.Struct, frozen=True):
-    """Figures of a joint's servo from its manual, at the joint; None: not known."""
+    """Manual figures of a joint's servo, converted to the joint by its gear; None: not known."""
 
     model: str
     label: str  # ID and bus, for messages
     effort_unit: EffortUnit
-    """Unit of the measured effort; `1`: a fraction of the highest load, which is the motor's output."""
+    """Unit of the effort that the servo measures; `1`: a fraction of its highest load."""
     stall_torque: float | None = None  # Nm at `voltage`
     stall_current: float | None = None  # A at `voltage`
     voltage: float | None = None  # V; supply for which the manual gives the figures
     no_load_speed: float | None = None  # rad/s at `voltage`
     temperature_limit: float | None = None
-    """degrees C; above it the servo cuts its torque. From the robot file's `registers`, else the factory's
-    value."""
+    """Temperature above which the servo cuts its torque, degrees C: from the file's `registers`, else the
+    factory's value."""

@@ -1,4 +1,4 @@
-"""Turns of continuous joints with `wrap`, for which a full turn leads to the same position."""
+"""Turns: equivalent positions of a continuous joint with `wrap`, where a full turn changes nothing."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ Positions = TypeVar("Positions", "float", "NDArray[np.float64]")
 
 
 def nearest_turn(position: Positions, near: Positions) -> Positions:
-    """Return the equivalent of a position that is at most half a turn from `near`, rad.
+    """Return a position plus or minus whole turns, such that it is at most half a turn from `near`, rad.
 
     NaN if either of them is NaN. A position within half a turn is returned unchanged.
     """

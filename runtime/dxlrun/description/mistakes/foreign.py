@@ -1,4 +1,4 @@
-"""Files of other programs: how to recognize them, their names, and what to use instead."""
+"""Foreign files: recognizes files of other programs given as a robot file, and says what to do instead."""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ from pathlib import Path
 from dxlrun.description.form import folded
 
 Kind = tuple[str, str]
-"""`this is ...`, and the fix."""
+"""Sentence that says what the file is (`this is ...`), and the fix."""
 
 _DRAFT = "`dxlrun scan PORT --output robot.yaml` writes a first robot file of the servos at a port"
 _ROSBAGS = (
@@ -25,7 +25,7 @@ _MAGIC: Mapping[bytes, Kind] = {
     b"SQLite format 3\0": ("this is a ROS 2 bag in SQLite, or another data base", _ROSBAGS),
 }
 LONGEST_MAGIC = max(map(len, _MAGIC))
-"""Bytes that `kind_of_bytes` needs."""
+"""Number of bytes at a file's start that `kind_of_bytes` needs."""
 _TEXTS: tuple[tuple[re.Pattern[str], Kind], ...] = (
     (
         re.compile(r"\s*type=motion\b|.*^page_begin\s*$|\s*<Root type=\"motion\"", re.M | re.S),
@@ -64,17 +64,17 @@ _TEXTS: tuple[tuple[re.Pattern[str], Kind], ...] = (
 
 
 def kind_of_bytes(data: bytes, path: Path) -> Kind | None:
-    """Return the kind of a file by its first bytes; None: not a known binary format."""
+    """Return what a binary file is by its first bytes, with the fix; None if it is not known."""
     return next((_filled(kind, path) for magic, kind in _MAGIC.items() if data.startswith(magic)), None)
 
 
 def kind_of_text(text: str, path: Path) -> Kind | None:
-    """Return the kind of a text that is not a YAML file of dxlrun; None: not known."""
+    """Return what a text file of another program is (URDF, Python), with the fix; None if it is not known."""
     return next((_filled(kind, path) for pattern, kind in _TEXTS if pattern.match(text)), None)
 
 
 def kind_of_data(data: Mapping[str, object], path: Path) -> Kind | None:
-    """Return the kind of a YAML or JSON file of another program; None: not known."""
+    """Return what a YAML or JSON file of another program is, with the fix; None if it is not known."""
     kind = next(_kinds(data), None)
     return None if kind is None else _filled(kind, path)
 
@@ -129,7 +129,7 @@ def _is_calibration(value: Mapping[str, object]) -> bool:
 
 
 def _lerobot(data: Mapping[str, object]) -> str | None:
-    """Return the fix for a configuration of LeRobot; None: it is something else."""
+    """Return the fix for a configuration of LeRobot; None if the data are not one."""
     parts = [data.get(key) for key in ("robot", "teleop", "follower", "leader")]
     if "buses" not in data and "joints" not in data:
         parts.append(data)
@@ -154,11 +154,11 @@ _ROS_TYPES: Mapping[str, str] = {
     "joint_velocity_controller": "joint_group_velocity_controller",
     "joint_effort_controller": "joint_group_effort_controller",
 }
-"""Types of ros2_control and ros_control whose names differ from dxlrun's, and dxlrun's names."""
+"""Controller types of ros2_control and ros_control with another name in dxlrun, and that name."""
 
 
 def ros_type(type_name: str, known: Collection[str]) -> tuple[str, str, str] | None:
-    """Return problem, fix and dxlrun's type for a controller type of ROS.
+    """Explain a controller type of ROS: return problem, fix, and dxlrun's type.
 
     Args:
         type_name: As written: `position_controllers/JointGroupPositionController`.

@@ -1,4 +1,4 @@
-"""Forms: the keys and entries that a document can have, and their places, read from its pydantic models."""
+"""Forms: finds keys, their places and their types in the pydantic model of a file."""
 
 from __future__ import annotations
 
@@ -13,12 +13,12 @@ from dxlrun.description.form import PlugInEntry
 from dxlrun.errors import near
 
 Place = tuple[str, ...]
-"""Path of a key below a form: `("limits", "position")`; NAME stands for the name of an entry."""
+"""Path of a key below a model, such as `("limits", "position")`; NAME stands for an entry's name."""
 NAME = "NAME"
 
 
 def example_at(form: type[BaseModel], place: Place) -> str:
-    """Return an example of a key's value; empty: it has none."""
+    """Return the example of a key at a path below a model; empty if it has none."""
     *above, key = place
     for step in above:
         form = next(_forms(_annotation(form, step)), form)
@@ -27,19 +27,19 @@ def example_at(form: type[BaseModel], place: Place) -> str:
 
 
 def places_of(root: type[BaseModel], key: str, value: object) -> list[Place]:
-    """Return the places of a document where a key can have a value."""
+    """Return all paths of a file's model where this key exists and accepts the value."""
     return [
         place for place, annotation in _all_places(root) if place[-1] == key and _takes(annotation, value)
     ]
 
 
 def keys_of(root: type[BaseModel]) -> set[str]:
-    """Return all keys of a document, wherever they are."""
+    """Return the names of all keys of a file's model, on every level."""
     return {place[-1] for place, _ in _all_places(root)}
 
 
 def section_of(root: type[BaseModel], value: object) -> str:
-    """Return the section whose entries have the keys of a mapping; empty: no section matches."""
+    """Guess the section whose entries have the keys of a mapping; empty if none fits well."""
     best, most = "", 1
     if not isinstance(value, dict):
         return best
@@ -55,12 +55,12 @@ def section_of(root: type[BaseModel], value: object) -> str:
 
 
 def entries_of(form: type[BaseModel], key: str) -> object:
-    """Return the type of the entries of a key whose value is a mapping by names; None: it has no entries."""
+    """Return the type of the entries of a section such as `joints`; None if it is not a mapping by name."""
     return _entries(_annotation(form, key))
 
 
 def may_be_entry(root: type[BaseModel], section: str, value: object) -> bool:
-    """Return True if a value can be an entry of a section under any name, or if the section has no forms."""
+    """Return True if a value can be an entry of a section, by its keys; also if that cannot be decided."""
     forms = list(_forms(entries_of(root, section)))
     if not forms or not isinstance(value, dict):
         return True
@@ -86,7 +86,7 @@ def _entries(annotation: object) -> object:
 
 
 def _forms(annotation: object) -> Iterator[type[BaseModel]]:
-    """Yield the possible forms of a value, without the forms of items of a list or mapping."""
+    """Yield the models that a type allows for a value, through unions, but not those of list items."""
     if isinstance(annotation, type) and issubclass(annotation, BaseModel):
         yield annotation
     elif get_origin(annotation) is Annotated:
@@ -98,7 +98,7 @@ def _forms(annotation: object) -> Iterator[type[BaseModel]]:
 
 @cache
 def _all_places(root: type[BaseModel]) -> tuple[tuple[Place, object], ...]:
-    """Return every key of a document with its type, shortest path first."""
+    """Return the path and type of every key of a file's model, shortest path first."""
     found: dict[Place, object] = {}
 
     def visit(form: type[BaseModel], above: Place) -> None:

@@ -1,4 +1,4 @@
-"""Syntax: unclosed brackets, and informal notations of units and ranges.
+"""Syntax: explains YAML errors by unclosed brackets, missing colons and units behind lists.
 
 A YAML parser fails where it cannot continue, which is often far below the mistake. The indentation of the
 keys below shows which bracket is not closed.
@@ -27,11 +27,11 @@ _BLOCK_SCALAR = re.compile(r"(?:^|[ :-])[|>][-+0-9]*\s*$")
 
 
 class _OpenQuoteError(Exception):
-    """A quote is not closed, so the rest of the text is unknown; the parser reports its place."""
+    """Raised if a quote is not closed, so that brackets after it cannot be judged."""
 
 
 class _Bracket(NamedTuple):
-    """An open bracket: its place, counted from 0, and the indentation of its line."""
+    """An open bracket: its line and column, counted from 0, and the indentation of its line."""
 
     character: str
     line: int
@@ -40,13 +40,13 @@ class _Bracket(NamedTuple):
 
 
 def explain_syntax(text: str, file: str) -> list[Problem]:
-    """Return the known mistakes in a text that is not YAML."""
+    """Return problems with fixes for a text that is not YAML; empty if no known mistake is found."""
     lines = text.splitlines()
     return [*_units_behind_lists(lines, file), *_missing_colons(lines, file)] or _open_brackets(lines, file)
 
 
 def list_text(text: str) -> str:
-    """Return a range as a list: `[-90 deg, 90 deg]` for `-90..90 deg`; empty: the text is not a range."""
+    """Rewrite a range as a YAML list: `[-90 deg, 90 deg]` for `-90..90 deg`; empty if it is not a range."""
     match = _RANGE.fullmatch(text.strip())
     if match is None:
         return ""
@@ -83,7 +83,7 @@ def _missing_colons(lines: list[str], file: str) -> Iterator[Problem]:
 
 
 def _open_brackets(lines: list[str], file: str) -> list[Problem]:
-    """Return the brackets that are not closed."""
+    """Return a problem for each bracket that is not closed or does not match."""
     try:
         if not _scanned(lines, file, by_keys=False) or _depth(lines) > _DEEPEST:
             return []
@@ -98,7 +98,7 @@ def _depth(lines: list[str]) -> int:
 
 
 def _scanned(lines: list[str], file: str, *, by_keys: bool) -> list[Problem]:
-    """Return the problems of the brackets in a text.
+    """Match the brackets of a text, and return the problems.
 
     Args:
         lines: The text.
@@ -134,7 +134,7 @@ def _scanned(lines: list[str], file: str, *, by_keys: bool) -> list[Problem]:
 
 
 def _structure(lines: list[str]) -> Iterator[tuple[int, int, str, str]]:
-    """Yield the brackets outside of quotes, comments and block scalars.
+    """Yield brackets outside of quotes, comments and block scalars, and the keys at starts of lines.
 
     Each has line and column from 0, and the last character before it that is not a space. For a key at the
     beginning of a line the bracket is empty, and the column is the indentation of the key.
@@ -165,7 +165,7 @@ def _structure(lines: list[str]) -> Iterator[tuple[int, int, str, str]]:
 
 
 def _not_closed(unclosed: list[_Bracket], lines: list[str], number: int, file: str) -> Problem:
-    """Return the problem of brackets that should be closed before a line."""
+    """Return the problem that brackets are not closed before line `number` (from 0)."""
     last = unclosed[-1]
     end = next((above for above in range(number - 1, last.line, -1) if lines[above].strip()), last.line)
     closers = "".join(_CLOSERS[each.character] for each in reversed(unclosed))

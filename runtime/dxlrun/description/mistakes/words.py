@@ -1,4 +1,4 @@
-"""Unknown keys: terms of other systems, keys at the wrong place, wrongly indented entries.
+"""Unknown keys: finds the key that was meant, for terms of other systems and misplaced keys.
 
 The terms are in `words.toml`. The forms determine which keys exist at which place.
 """
@@ -46,42 +46,42 @@ _NEEDLESS = {
     "fixed": "remove the joint: one without a servo is in the URDF only",
     "position": "remove it: the mode of a servo follows from what the joint's controller commands",
 }
-"""Values of keys that a joint does not have, each with the fix."""
+"""Values of a joint's needless keys `type` and `mode`, each with the fix."""
 
 
 class Remedy(NamedTuple):
-    """Fix for one unknown key, or for two unknown keys that are one key of dxlrun."""
+    """Fix for one unknown key, or for two unknown keys (such as lower and upper) that mean one key."""
 
     keys: tuple[str, ...]
     fix: str
     means: str = ""
-    """Key of the form that is meant; it need not be reported as missing."""
+    """Key that was meant; it is then not reported as missing."""
 
 
 class _Meaning(NamedTuple):
-    """Key that a term means, and the conversion of the term's value: a key of `_CONVERSIONS`."""
+    """Key that a foreign term means, and how to convert its value: a key of `_CONVERSIONS`."""
 
     place: Place
     kind: str
 
 
 class Context(msgspec.Struct, frozen=True):
-    """The form with the unknown keys, and its surroundings in the file."""
+    """The mapping in a file that has unknown keys: its model, its path, and its other keys."""
 
     root: type[BaseModel]
-    """Form of the whole document."""
+    """Model of the whole file."""
     form: type[BaseModel]
     path: tuple[str | int, ...]
-    """Path of the form in the document."""
+    """Path of the mapping in the file."""
     known: Collection[str]
-    """All keys that are possible at the path."""
+    """Names of all keys that the mapping may have."""
     present: Collection[str]
-    """All keys of the file at the path."""
+    """Names of the keys that the mapping has in the file."""
     sections: Mapping[str, Collection[str]]
-    """Names of the entries in each section of the file."""
+    """Names of the entries in each section of the file, such as the names of all joints."""
 
     def remedies(self, unknown: Mapping[str, object]) -> Iterator[Remedy]:
-        """Yield remedies for unknown keys with their values, if their meaning is known."""
+        """Yield fixes for unknown keys, given with their values; keys without a good guess are omitted."""
         meant = {key: meaning for key in unknown if (meaning := self.meaning(key)) is not None}
         limits = {meaning.kind: key for key, meaning in meant.items() if meaning.kind in ("lower", "upper")}
         if limits:
@@ -103,12 +103,11 @@ class Context(msgspec.Struct, frozen=True):
 
     @property
     def _is_misplaced_section(self) -> bool:
-        """True if a supposed entry of a section is a section itself, indented too far."""
+        """True if the mapping is a section of the file, indented below another section by mistake."""
         return len(self.path) == 2 and self.path[1] in self.root.model_fields.keys() - self.sections.keys()
 
     def meaning(self, key: str) -> _Meaning | None:
-        """Return the meaning of a key; None if it is not a known term, or the form does not have the key
-        meant.
+        """Return what a term of another system means here; None if it is not known or not possible here.
 
         The terms of a joint also apply to its parts: `lower` means the same in a joint as in its limits.
         """
@@ -126,7 +125,7 @@ class Context(msgspec.Struct, frozen=True):
         return meaning if _SERVO_FORM in bases and meaning.place[0] in self.known else None
 
     def _limits(self, limits: Mapping[str, str], unknown: Mapping[str, object]) -> str:
-        """Return the fix for a lower and an upper limit, one of which may be missing."""
+        """Return the fix for foreign keys of a lower and an upper limit, one of which may be missing."""
         values = [unknown.get(limits.get(side, "")) for side in ("lower", "upper")]
         of_urdf = not {"lower", "upper"}.isdisjoint(limits.values())
         length = ("m" if of_urdf else "mm") if "travel_per_turn" in self.present else ""
@@ -136,12 +135,12 @@ class Context(msgspec.Struct, frozen=True):
         return f"{said} `{self._at(('limits', 'position'), text)}`{condition}"
 
     def _at(self, place: Place, text: str) -> str:
-        """Return a key with its value in the notation of the form: `limits: {velocity: 2 rad/s}`."""
+        """Write a key below its parents as in a file: `limits: {velocity: 2 rad/s}`."""
         here = place[1:] if place[0] == _PARTS_OF_JOINT.get(self.form.__name__, "") else place
         return _in_mappings(here[:-1], f"{here[-1]}: {text}")
 
     def _said_of(self, meaning: _Meaning, word: str, value: object) -> str:
-        """Return the fix for a term with a known meaning."""
+        """Return the fix for a foreign term: remove it, or write dxlrun's key."""
         if meaning.kind == "needless" and (
             folded(word) != "type" or isinstance(value, int) or _yaml(value).lower() in _NEEDLESS
         ):
@@ -151,7 +150,7 @@ class Context(msgspec.Struct, frozen=True):
         return self._renamed(meaning, word, value)
 
     def _renamed(self, meaning: _Meaning, word: str, value: object) -> str:
-        """Return the fix that renames a term and converts its value."""
+        """Return the fix that replaces a foreign term by dxlrun's key, with its value converted."""
         place, key = meaning.place, meaning.place[0]
         called = "" if place[-1] == folded(word) else f"it is called `{'.'.join(place)}` here: "
         if key in self.present and len(place) == 1:
@@ -180,7 +179,7 @@ class Context(msgspec.Struct, frozen=True):
         return f"write `reference`, the servo's angle where the joint is at zero, such as 180 deg; {measure}"
 
     def _misplaced(self, key: str, value: object) -> str:
-        """Return the fix for a key without a known meaning at this place; empty: not known."""
+        """Return the fix for a key of dxlrun at the wrong place, or misspelled; empty if none is found."""
         if fix := self._miswritten(key, value):
             return fix
         if self._is_misplaced_section:
@@ -194,7 +193,7 @@ class Context(msgspec.Struct, frozen=True):
         return self._moved(ours, value, places) if places else ""
 
     def _miswritten(self, key: str, value: object) -> str:
-        """Return the fix for a text that is not a key at all; empty: it may be a key."""
+        """Return the fix for text that is not a key, such as `rate=50`; empty if it may be one."""
         word, sign, rest = (part.strip() for part in re.split(r"([:=]|$)", key, maxsplit=1))
         named = f"remove it: the entry is called {self.path[1]} already" if len(self.path) == 2 else ""
         if key.endswith((")", "]")) and value is None:
@@ -213,7 +212,7 @@ class Context(msgspec.Struct, frozen=True):
         return fix
 
     def _moved(self, key: str, value: object, places: list[Place]) -> str:
-        """Return the fix that moves a key to the place with the longest common path."""
+        """Return the fix that moves a key to the nearest of its possible places."""
         here = tuple(NAME if at == 1 else str(step) for at, step in enumerate(self.path))
 
         def shared(place: Place) -> int:
@@ -238,7 +237,7 @@ class Context(msgspec.Struct, frozen=True):
 def misplaced_sections(
     root: type[BaseModel], data: Mapping[str, object]
 ) -> Iterator[tuple[tuple[str, ...], str]]:
-    """Yield the path and the fix of each section that is misnamed or not at the top of the file."""
+    """Yield path and fix of each section of a robot file that is misnamed or indented too far."""
     context = Context(root, root, (), [*root.model_fields], [*data], {})
     for key, value in data.items():
         inner = value if isinstance(value, dict) else {}
@@ -258,13 +257,13 @@ def misplaced_sections(
 
 
 def words_for(form: str, keys: Collection[str]) -> frozenset[str]:
-    """Return the terms of a form that mean one of some keys."""
+    """Return the foreign terms, in this form, for any of these keys."""
     return frozenset(word for word, meaning in _table()[form].items() if meaning.place[0] in keys)
 
 
 @cache
 def _table() -> Mapping[str, Mapping[str, _Meaning]]:
-    """Return the meaning of each term, by the name of the form in which it is written."""
+    """Read `words.toml`: the meaning of each foreign term, by the name of the form where it is written."""
     text = Path(__file__).with_name("words.toml").read_text("utf-8")
     found: dict[str, dict[str, _Meaning]] = {}
     for form, meanings in tomllib.loads(text).items():
@@ -281,7 +280,7 @@ def _in_mappings(keys: Place, written: str) -> str:
 
 
 def _yaml(value: object) -> str:
-    """Return a value in the notation of a file, truncated if it is long."""
+    """Write a value as in a YAML file, cut off if it is long."""
     if isinstance(value, dict):
         text = f"{{{', '.join(f'{key}: {_yaml(each)}' for key, each in value.items())}}}"
     elif isinstance(value, list):
@@ -292,7 +291,7 @@ def _yaml(value: object) -> str:
 
 
 _Written = tuple[str, str] | None
-"""A value in dxlrun's notation, and the condition under which it is meant; None: it cannot be converted."""
+"""Value written for dxlrun, and a condition such as `, if this is in deg`; None: it cannot be converted."""
 _UNIT = re.compile(r"[-0-9.]+ ([A-Za-z/^0-9%]+)")
 _PERIOD = re.compile(r"([0-9.]+) *(s|ms|us)?")
 _SECONDS = {None: 1.0, "s": 1.0, "ms": 1e-3, "us": 1e-6}
@@ -314,7 +313,7 @@ def _plain(value: object, example: str) -> _Written:
 
 
 def _limits_text(values: list[object], *, of_urdf: bool = False, length: str = "") -> _Written:
-    """Return a lower and an upper limit as a list; a missing one (None) is a name in capitals.
+    """Write a lower and an upper limit as a list with units; a missing limit is LOWER or UPPER.
 
     Args:
         values: The limits as written.

@@ -1,4 +1,4 @@
-"""Packing: conversion of a run's records to messages of the log, field by field.
+"""Packing: converts records of a run into encoded messages of the log.
 
 The schemas of these messages are in `log/schemas.py`.
 """

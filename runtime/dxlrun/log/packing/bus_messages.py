@@ -1,4 +1,4 @@
-"""Bus messages: messages of `/bus/NAME`, with the packets of a bus as arrays; packing and reading."""
+"""Bus messages: packs the packets of a bus into messages of `/bus/NAME`, and reads them back."""
 
 from __future__ import annotations
 
@@ -16,11 +16,11 @@ from dxlwire.packets import PacketKind
 
 _CODEC, _READER = Codec(BUS_PACKETS), ColumnReader(BUS_PACKETS)
 _FIELDS = ("cycle_delta", "first_ns_delta", "duration_ns", "kind", "servo_id", "length", "data")
-"""Sequences with one element per packet, except for the last one."""
+"""Fields of the message, one element per packet; `data` has the bytes of all packets."""
 
 
 def pack_packets(packets: Sequence[BatchedPacket]) -> bytes:
-    """Return the message of one or more packets on one bus."""
+    """Pack packets of one bus into one encoded message; times and cycles are stored as differences."""
     cycle, _, kind, servo_id, first_ns, last_ns, data = zip(*packets, strict=True)
     first = np.array(first_ns, np.int64)
     took = np.array(last_ns, np.int64) - first
@@ -36,7 +36,7 @@ def read_packets(
     start: NDArray[np.int64],
     size: NDArray[np.int64],
 ) -> tuple[PacketColumns, int]:
-    """Return the packets of the messages in `data`, and the number of inconsistent messages.
+    """Return the packets of all bus messages in `data`, and how many messages were skipped as damaged.
 
     Args:
         data: Bytes that contain the messages.
@@ -70,7 +70,7 @@ def read_packets(
 
 
 def _consistent(tree: Column) -> NDArray[np.bool_]:
-    """Return a mask of consistent messages: equal lengths, known packet kinds, as many bytes as stated."""
+    """Return which messages are consistent: equal field lengths, known packet kinds, enough bytes."""
     *counts, bytes_each = (tree.leaf(name).flat[0] for name in _FIELDS)
     good = np.all([one == counts[0] for one in counts], axis=0)
     kinds, lengths = (tree.leaf(name).flat for name in ("kind", "length"))
@@ -80,7 +80,7 @@ def _consistent(tree: Column) -> NDArray[np.bool_]:
 
 
 def _summed_up(count: NDArray[np.int64], deltas: NDArray[np.generic]) -> NDArray[np.int64]:
-    """Return the cumulative sums of differences for each message; `count`: differences per message."""
+    """Add up differences separately for each message; `count` has the number of differences in each."""
     sums = np.cumsum(deltas.astype(np.int64, copy=False))
     before = np.concatenate([[0], sums])[np.cumsum(count) - count]
     found: NDArray[np.int64] = sums - np.repeat(before, count)
@@ -88,5 +88,5 @@ def _summed_up(count: NDArray[np.int64], deltas: NDArray[np.generic]) -> NDArray
 
 
 def _sums(count: NDArray[np.int64], values: NDArray[np.generic]) -> NDArray[np.number]:
-    """Return the sum of the values of each message; `count`: values per message."""
+    """Return the sum of each message's values; `count` has the number of values in each."""
     return np.bincount(np.repeat(np.arange(len(count)), count), values, len(count))

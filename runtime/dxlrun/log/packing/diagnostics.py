@@ -1,4 +1,4 @@
-"""Diagnostics: messages of /diagnostics with temperature, voltage, hardware error and mode, once a second."""
+"""Diagnostics: messages of /diagnostics with each joint's temperature, voltage, error and mode."""
 
 from __future__ import annotations
 
@@ -12,14 +12,14 @@ from dxlrun.messages.cdr import Codec
 from dxlwire.modes import Mode
 
 DIAGNOSTICS_NS = 1_000_000_000
-"""Shortest interval between two messages."""
+"""Shortest time between two messages, ns."""
 _OK, _ERROR, _STALE = 0, 2, 3
-"""Levels of diagnostic_msgs/msg/DiagnosticStatus."""
+"""Levels OK, ERROR and STALE of diagnostic_msgs/msg/DiagnosticStatus."""
 _Status = tuple[int, str, str, str, tuple[tuple[str, str], ...]]
 
 
 class Diagnostics:
-    """Diagnostics messages made from cycles, limited in rate; rows are in the order of the joints."""
+    """Makes messages of /diagnostics from cycle records, at most one per second."""
 
     def __init__(self, joints: Sequence[str]) -> None:
         self._joints = tuple(joints)
@@ -27,7 +27,10 @@ class Diagnostics:
         self._due_ns: int | None = None
 
     def of(self, record: np.void, t_ns: int, stamp: tuple[int, int]) -> bytes | None:
-        """Return the message of a cycle at `t_ns`; None within DIAGNOSTICS_NS after the previous one."""
+        """Return the encoded message of a cycle; None if the last one is younger than DIAGNOSTICS_NS.
+
+        `stamp` has seconds since 1970 and the remaining nanoseconds.
+        """
         if self._due_ns is not None and t_ns < self._due_ns:
             return None
         self._due_ns = t_ns + DIAGNOSTICS_NS

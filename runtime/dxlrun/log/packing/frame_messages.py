@@ -1,4 +1,4 @@
-"""Frame messages: messages of /tf and /tf_static, with the poses of a robot's frames from URDF and cycles.
+"""Frame messages: packs the poses of a robot's frames into messages of /tf and /tf_static.
 
 A frame is omitted until its joint was read once. A joint that is no longer read keeps its last position, as
 in the record.
@@ -20,7 +20,7 @@ Stamp = tuple[int, int]
 
 
 class FrameMessages:
-    """Messages of /tf made from cycles, limited in rate, and the message of /tf_static.
+    """Makes messages of /tf from cycle records, at the rate of the plan, and the message of /tf_static.
 
     Raises InputError when the URDF is wrong or does not fit the plan; the compiler has checked both.
     """
@@ -41,16 +41,16 @@ class FrameMessages:
 
     @property
     def any_still(self) -> bool:
-        """True when /tf_static has frames."""
+        """True if the robot has frames that never move, so that /tf_static is needed."""
         return bool(self._still)
 
     def still(self, stamp: Stamp) -> bytes:
-        """Return the message of the frames that do not move in their parents."""
+        """Return the encoded message of /tf_static: the poses of frames that never move in their parents."""
         found = [(frame, self._tree.local(frame, {})) for frame in self._still]
         return _packed(stamp, [(frame, local) for frame, local in found if local is not None])
 
     def of(self, record: np.void, stamp: Stamp) -> bytes | None:
-        """Return the message of a cycle; None within the interval of the last one, or without any pose."""
+        """Return the encoded message of /tf for a cycle; None if none is due or no pose is known."""
         slot = int(record["scheduled_ns"]) // self._interval_ns
         if slot == self._slot:
             return None
@@ -67,7 +67,7 @@ class FrameMessages:
         return _packed(stamp, found) if found else None
 
     def _continued(self, name: str, local: Transform) -> Transform:
-        """Return a transform with the quaternion's sign chosen to continue the previous one."""
+        """Return a pose with its quaternion's sign closest to the frame's last one (q and -q are equal)."""
         rotation = near(local.rotation, self._last.get(name, local.rotation))
         self._last[name] = rotation
         return Transform(local.translation, rotation)
@@ -83,7 +83,7 @@ def _packed(stamp: Stamp, found: Sequence[tuple[Frame, Transform]]) -> bytes:
 
 
 def frame_messages(header: LogHeader) -> FrameMessages | None:
-    """Return the frame messages of a log; None without a URDF, or with rate 0."""
+    """Return the maker of a log's frame messages; None without a URDF, a frames plan, or with rate 0."""
     if header.frames is None or not header.frames.rate or header.robot_description is None:
         return None
     return FrameMessages(header.robot_description, header.frames, header)

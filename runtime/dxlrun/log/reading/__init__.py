@@ -1,4 +1,4 @@
-"""Parts of the reader: chunks, topics, slices of a run, columns.
+"""Reading: chunks, slices, topics and columns of a log, for `log/reader.py`.
 
 Files are opened by `log/reader.py`. Computations on columns belong to their callers.
 """

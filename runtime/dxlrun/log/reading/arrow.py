@@ -1,4 +1,4 @@
-"""Arrow: columns of a topic as Arrow data; nested messages are structs, sequences are lists."""
+"""Arrow: converts the messages of a topic to Arrow data; nested messages are structs, sequences lists."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ from dxlrun.messages.definition import (
 
 
 def schema_of(reader: ColumnReader, fields: Sequence[str] | None) -> pa.Schema:
-    """Return the schema of a topic: `t_ns`, and the chosen fields or all fields of the message."""
+    """Return the Arrow schema of a topic: `t_ns`, and the chosen fields, or all for None."""
     top, definitions = short_name(reader.message.name), reader.definitions
     if fields is None:
         fields = [one.name for one in definitions[top]]
@@ -29,13 +29,13 @@ def schema_of(reader: ColumnReader, fields: Sequence[str] | None) -> pa.Schema:
 
 
 def batch_of(schema: pa.Schema, t_ns: NDArray[np.int64], tree: Column) -> pa.RecordBatch:
-    """Return messages as a record batch."""
+    """Convert decoded messages and their times to an Arrow record batch."""
     columns = [_array(tree.leaf(name), schema.field(name).type) for name in schema.names[1:]]
     return pa.record_batch([pa.array(t_ns), *columns], schema=schema)
 
 
 def type_of(one: MessageField, definitions: Definitions) -> pa.DataType:
-    """Return the Arrow type of a field; nested messages are structs."""
+    """Return the Arrow type of one field of a message."""
     if one.kind in definitions:
         inside: pa.DataType = struct_of(one.kind, definitions)
     elif one.kind == "string":
@@ -46,12 +46,12 @@ def type_of(one: MessageField, definitions: Definitions) -> pa.DataType:
 
 
 def message_struct(message: MessageType) -> pa.DataType:
-    """Return the Arrow type of the messages of a topic."""
+    """Return the Arrow struct type of a message type."""
     return struct_of(short_name(message.name), parse(message))
 
 
 def struct_of(message: str, definitions: Definitions) -> pa.DataType:
-    """Return the Arrow type of a message, given by its short name."""
+    """Return the Arrow struct type of a message, by its short name in `definitions`."""
     return pa.struct([(field.name, type_of(field, definitions)) for field in definitions[message]])
 
 

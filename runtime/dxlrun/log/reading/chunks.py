@@ -1,4 +1,4 @@
-"""Chunks: the messages of an MCAP file of any writer, chunk by chunk, even from a damaged file.
+"""Chunks: reads the messages of any MCAP file chunk by chunk, and skips damaged places.
 
 Source: mcap.dev/spec. Memory is bounded for any content: by _LARGEST for each record and each chunk.
 """
@@ -30,7 +30,7 @@ from dxlrun.messages.definition import MessageType
 MAGIC = b"\x89MCAP0\r\n"
 _RECORD = struct.Struct("<BQ")
 _MESSAGE_HEAD = 22
-"""Bytes of a message's header: channel, sequence, log time, publish time."""
+"""Length of a message's header, bytes: channel, sequence, log time, publish time."""
 _TIME_AT = 6
 _DAMAGE = (
     McapError,
@@ -42,50 +42,50 @@ _DAMAGE = (
     MemoryError,
 )
 _LARGEST = 64 << 20
-"""Upper limit of a record, and of a decompressed chunk, bytes; dxlrun's chunks have 512 KiB and one
-message."""
+"""Largest record and decompressed chunk that is read, bytes; dxlrun's chunks have 512 KiB and one message."""
 _MOST_EXPANDED = 256
-"""Upper limit of the decompression ratio of a file; logs of dxlrun have 8 to 50."""
+"""Largest ratio of decompressed to file size that is read, against malicious files; logs of dxlrun have 8 to
+50."""
 _LOOSE_BYTES = 1 << 20
-"""Size to which messages outside chunks are joined, bytes."""
+"""Size to which messages that are not in chunks are collected, bytes."""
 _COMPRESSIONS = (b"\4\0\0\0zstd", b"\3\0\0\0lz4")
-"""Compression fields of chunk headers, by which the next chunk after damage is found."""
+"""Bytes that a chunk's header contains (its compression), used to find the next chunk after damage."""
 _COMPRESSION_AT = _RECORD.size + 28
 _BLOCK = 1 << 20
 
 
 class OpenChannel(msgspec.Struct, frozen=True):
-    """A channel of a file."""
+    """A channel of an MCAP file: its topic, message type and encoding."""
 
     topic: str
     encoding: str
-    """Encoding of its messages: `cdr`."""
+    """Encoding of the channel's messages, such as `cdr`."""
     type_name: str
     schema_encoding: str
-    """`ros2msg`; other encodings are not read here."""
+    """Language of the message definition; only `ros2msg` is decoded."""
     text: str
-    """Definition of its messages."""
+    """Definition of the message type."""
 
     @property
     def type(self) -> MessageType:
-        """Type of its messages."""
+        """Message type of the channel, from its name and definition."""
         return MessageType(self.type_name, self.text)
 
 
 class Messages(msgspec.Struct, frozen=True, eq=False):
-    """Messages of one chunk, one element each, in the order of the file."""
+    """Messages of one chunk as arrays, one element per message, in file order."""
 
     data: NDArray[np.uint8]
-    """Bytes of the chunk."""
+    """Bytes of the whole chunk."""
     channel: NDArray[np.int64]
     t_ns: NDArray[np.int64]
-    """Log time."""
+    """Log time of each message, ns since 1970."""
     start: NDArray[np.int64]
-    """Index in `data` of each message's first byte."""
+    """Index in `data` of each message's first byte after its header."""
     size: NDArray[np.int64]
 
     def bodies(self, rows: NDArray[np.int64]) -> list[bytes]:
-        """Return the bytes of some messages."""
+        """Return the bytes of the messages with these row numbers."""
         data, start = self.data.data, self.start[rows]
         return [
             bytes(data[a:b]) for a, b in zip(start.tolist(), (start + self.size[rows]).tolist(), strict=True)
@@ -93,7 +93,7 @@ class Messages(msgspec.Struct, frozen=True, eq=False):
 
 
 def gathered(chunks: Iterable[Messages], least: int) -> Iterator[Messages]:
-    """Yield the joined messages of several chunks, at least `least` bytes each except for the last."""
+    """Join consecutive chunks until each has at least `least` bytes; the last may have fewer."""
     parts: list[Messages] = []
     size = 0
     for messages in chunks:
@@ -107,7 +107,7 @@ def gathered(chunks: Iterable[Messages], least: int) -> Iterator[Messages]:
 
 
 def _joined(parts: list[Messages]) -> Messages:
-    """Return joined messages, and clear `parts`, so that they are not in memory twice."""
+    """Concatenate the messages of chunks, and empty the list `parts` to free their memory."""
     if len(parts) == 1:
         return parts.pop()
     sizes = [len(part.data) for part in parts]
@@ -125,8 +125,7 @@ def _joined(parts: list[Messages]) -> Messages:
 
 @dataclass(slots=True)
 class McapFile:
-    """Contents of a file, found by a walk. As a file may grow, the next walk continues at the end of the
-    last.
+    """Contents of an MCAP file found so far; reading again continues where the last walk ended.
 
     The files of one log are walked in sequence: `begin` starts the next file.
     """
@@ -135,33 +134,33 @@ class McapFile:
     attachments: dict[str, bytes] = field(default_factory=dict)
     metadata: dict[str, dict[str, str]] = field(default_factory=dict)
     counts: dict[int, int] = field(default_factory=dict)
-    """Messages of each channel according to the file's statistics; empty without them."""
+    """Number of messages of each channel that the file's statistics state; empty if it has none."""
     damage: list[str] = field(default_factory=list)
     finished: bool = False
     end: int = len(MAGIC)
-    """Offset after the last complete record."""
+    """Offset in the file after the last complete record, where the next walk continues."""
     name: str = ""
-    """Name of the file in sentences; empty for a single file."""
+    """File name to mention in damage reports; empty if the log has only one file."""
     on_metadata: Callable[[str, dict[str, str]], None] = lambda name, record: None
-    """Called with each metadata record; an exception ends the walk."""
+    """Called with name and contents of each metadata record; an exception it raises ends the walk."""
     _base: int = 0
-    """Offset of channel numbers, which each file counts separately."""
+    """Number added to channel numbers, because each file of a log numbers its channels from 0."""
     _anchor: int = len(MAGIC)
-    """Offset after the last complete chunk, from which the next chunk is searched after an invalid record."""
+    """Offset after the last complete chunk, from which the next chunk is searched after damage."""
     _read: Counter[int] = field(default_factory=Counter)
-    """Messages of each channel that were read."""
+    """Number of messages of each channel that were read."""
     _schemas: dict[int, Schema] = field(default_factory=dict)
     _room: int = 0
-    """Remaining bytes for decompressed chunks."""
+    """Bytes that may still be decompressed before the file counts as malicious."""
 
     def begin(self, number: int) -> None:
-        """Start another file, with its own channels."""
+        """Reset for the next file of the same log, which is the `number`-th and has its own channels."""
         self._base, self.end, self.finished = number << 16, len(MAGIC), False
         self._anchor = self.end
         self._schemas.clear()
 
     def walk(self, stream: IO[bytes], size: int, *, chunks: bool = True) -> Iterator[Messages]:
-        """Yield the messages chunk by chunk, to the end of the file; `damage` gets what cannot be read.
+        """Read a file to its end and yield its messages chunk by chunk; add to `damage` what is unreadable.
 
         `chunks=False` skips messages, and the channels that only chunks have.
         """
@@ -198,7 +197,7 @@ class McapFile:
                 return
 
     def _head(self, stream: IO[bytes], size: int) -> tuple[int, int]:
-        """Return opcode and length of the next record; 0 without a complete record."""
+        """Return opcode and length of the record at `end`; opcode 0 if it is incomplete or invalid."""
         stream.seek(self.end)
         head = stream.read(_RECORD.size)
         if len(head) < _RECORD.size:
@@ -216,7 +215,7 @@ class McapFile:
         return opcode, length
 
     def _finish(self, *, counted: bool) -> None:
-        """Mark the file as finished; with `counted`, report missing messages that no damage explains."""
+        """Mark the file as finished; report messages that the statistics count but that were not found."""
         self.finished = True
         if counted and not self.damage:
             self.damage += [
@@ -226,7 +225,7 @@ class McapFile:
             ]
 
     def _go_on(self, stream: IO[bytes], size: int) -> bool:
-        """Find the next chunk after an invalid record; return False without one."""
+        """After an invalid record, skip to the next chunk and report it; return False if there is none."""
         begin = self.end
         found = _next_chunk(stream, self._anchor, size)
         if found is not None:
@@ -245,7 +244,7 @@ class McapFile:
         return f" of {self.name}" if self.name else ""
 
     def _chunk(self, body: bytes) -> bytes | None:
-        """Return the records of a chunk; None for a damaged chunk, which is reported."""
+        """Return the decompressed records of a chunk; None if it is damaged, which is reported."""
         try:
             return self._decompressed(Chunk.read(ReadDataStream(BytesIO(body))))
         except _DAMAGE as error:
@@ -258,7 +257,7 @@ class McapFile:
             self.damage.append(damage)
 
     def _messages(self, data: bytes) -> Iterator[Messages]:
-        """Split a chunk into its messages; all after the first damaged record is skipped."""
+        """Yield the messages in the records of a chunk; records after a damaged one are skipped."""
         starts: list[int] = []
         keep, unpack, at, end = starts.append, _RECORD.unpack_from, 0, len(data)
         message = int(Opcode.MESSAGE)
@@ -295,7 +294,7 @@ class McapFile:
         )
 
     def _decompressed(self, chunk: Chunk) -> bytes:
-        """Return the records of a chunk; raises EOFError if it contradicts its header, or exceeds a limit."""
+        """Decompress a chunk; raise EOFError if length or CRC are wrong, or it is too large."""
         size = chunk.uncompressed_size
         self._take_room(size)
         if chunk.compression == "zstd":
@@ -316,7 +315,7 @@ class McapFile:
         return data
 
     def _take_room(self, size: int) -> None:
-        """Reserve bytes for a decompression. Raises EOFError above the limits."""
+        """Count `size` bytes against the limits for decompression. Raises EOFError if one is exceeded."""
         if size > _LARGEST:
             raise EOFError(f"it is {size} bytes long when decompressed, and {_LARGEST} are read at most")
         if size > self._room:
@@ -381,7 +380,7 @@ def _of_zstd(data: bytes, most: int) -> bytes:
 
 
 def _next_chunk(stream: IO[bytes], begin: int, size: int) -> int | None:
-    """Return the offset of the next chunk; None without one."""
+    """Return the offset of the next plausible chunk in a file, from `begin`; None if there is none."""
     at = begin
     while at < size:
         stream.seek(at)
@@ -403,7 +402,7 @@ def _places(block: bytes, mark: bytes) -> Iterator[int]:
 
 
 def _is_chunk(stream: IO[bytes], start: int, size: int) -> bool:
-    """Return whether the lengths in a chunk's header are consistent."""
+    """Return True if a chunk at this offset has consistent lengths in its header."""
     stream.seek(start)
     head = stream.read(_COMPRESSION_AT + 16)
     if len(head) < _COMPRESSION_AT + 16:

@@ -1,4 +1,4 @@
-"""Slices: converts messages of a log to cycles, packets, events and topics, whole or in slices."""
+"""Slices: decodes messages of a log into cycles, packets, events, commands and topics."""
 
 from __future__ import annotations
 
@@ -39,7 +39,7 @@ _FOR_OTHERS = frozenset(
         schemas.LogTopic.STILL_FRAMES,
     )
 )
-"""Topics for other tools; other topics have the same data."""
+"""Topics written for other tools; they are not decoded, because other topics have the same data."""
 _OWN = frozenset(
     (
         schemas.LogTopic.CYCLE,
@@ -48,55 +48,59 @@ _OWN = frozenset(
         schemas.LogTopic.EVENT,
     )
 )
-"""Topics that this module decodes."""
+"""Topics of dxlrun that this module decodes into cycles, commands and events."""
 _MOST_HELD = 4096
-"""Upper limit of cycles that wait for their packets, or packets for their cycles: recorders took up to
-2000 records of one ring in turn."""
+"""Most cycles that wait for their packets, or packets for their cycles: recorders took up to 2000 records of
+one ring in turn."""
 _MOST_PACKETS_HELD = 1 << 18
 _NO_PACKETS = PacketColumns.of(())
 
 
 @dataclass(frozen=True)
 class Log:
-    """One run from its log. Times are ns of the run's clock; wall time = that + `epoch_offset_ns`."""
+    """A run, or a slice of one, decoded from its log.
+
+    Times are ns of the run's clock, which starts at no fixed date; wall time = time + `epoch_offset_ns`.
+    """
 
     path: Path
     header: LogHeader
     cycles: NDArray[np.void]
-    """Shape (cycles,), read-only; fields of CycleLayout: scalars, and rows of joints or controllers."""
+    """One record per cycle, read-only, with the fields of CycleLayout: scalars, and rows of joints or
+    controllers."""
     events: tuple[Event, ...]
     attachments: dict[str, bytes]
     metadata: dict[str, dict[str, str]]
     complete: bool
-    """True when the recorder finished the file and nothing in it is damaged."""
+    """True if the recorder finished the file and nothing in it is damaged."""
     damage: tuple[str, ...]
-    """Sentences about missing or unreadable data."""
+    """A sentence for each missing or unreadable piece of the log."""
     being_written: bool = False
-    """True when a run was writing the file as it was read."""
+    """True if a run was still writing the file when it was read."""
     packets: PacketColumns = field(default_factory=lambda: PacketColumns.of(()))
-    """All packets, bus by bus, each in the order of recording."""
+    """All packets, grouped by bus, each bus in the order of recording."""
     activation: NDArray[np.void] | None = None
-    """Shape (1,), as `cycles`: states and goals at the activation of the controllers; None: not in the
-    log."""
+    """States and goals when the controllers were activated, shape (1,), as `cycles`; None if the log lacks
+    them."""
     commands: tuple[TakenCommand, ...] = ()
-    """Commands that cycles took for controllers and for the loop, in sequence."""
+    """Commands in the order in which cycles passed them to controllers or to the loop."""
     topics: Mapping[str, LoggedTopic] = field(default_factory=dict)
-    """Topics of controllers, and `/goals` of the runtime, by name."""
+    """Messages of controllers' topics and of the runtime's `/goals`, by topic."""
 
     part: int = 0
-    """Index of the log's first part; above 0, the beginning of the run is missing."""
+    """Number of the log's first existing part; above 0, the beginning of the run was deleted."""
 
     def slices(self, *, packets: bool = True) -> Iterator[Log]:
-        """Yield the log itself, as its only slice."""
+        """Yield the log itself, as LogReader yields its pieces."""
         yield self
 
     @property
     def about(self) -> Log:
-        """The log itself, for the interface of LogReader."""
+        """The log itself, as LogReader has it without records."""
         return self
 
     def messages(self, topic: str) -> list[Mapping[str, Value]]:
-        """Return the messages of a controller's topic by field; `topics` has times and columns.
+        """Return the decoded messages of a topic as mappings from field to value.
 
         Raises LogError when the log does not have the topic.
         """
@@ -106,34 +110,34 @@ class Log:
 
     @property
     def joints(self) -> tuple[str, ...]:
-        """Names of the joints, in the order of rows."""
+        """Names of the joints, in the order of rows in `cycles`."""
         return self.header.joints
 
     @property
     def buses(self) -> tuple[str, ...]:
-        """Names of the buses; a packet's `bus` is an index into this tuple."""
+        """Names of the buses; `packets.bus` contains indices into this tuple."""
         return self.header.buses
 
     @property
     def controllers(self) -> tuple[LoggedController, ...]:
-        """Controllers, in the order of the masks' bits."""
+        """Controllers of the run; their order is that of the bits in masks of `cycles`."""
         return self.header.controllers
 
     @property
     def period_ns(self) -> int:
-        """Nominal period of the loop, ns."""
+        """Planned period of the loop, ns."""
         return self.header.period_ns
 
 
 class Slicer:
-    """Converter from messages of a log to slices of a run, which have complete cycles with all packets.
+    """Converts messages of a log, in file order, into slices with complete cycles and all their packets.
 
     Cycles and packets reach the recorder through different rings. Those without a counterpart wait for the
     next slice.
     """
 
     def __init__(self, header: LogHeader, walk: LogWalk, *, packets: bool = True) -> None:
-        """`walk`: source of the channels of messages; without `packets`, no cycle waits."""
+        """Prepare for a log; `walk` supplies the channels, `packets` says whether to decode packets."""
         self._header, self._walk, self._file = header, walk, walk.file
         self._layout = header.layout
         self._buses = {schemas.bus_topic(bus): index for index, bus in enumerate(header.buses)}
@@ -144,10 +148,13 @@ class Slicer:
         self._names: dict[int, str] = {}
         self._span = CycleSpan()
         self.wrong = 0
-        """Number of inconsistent packet messages."""
+        """Number of damaged packet messages that were skipped."""
 
     def take(self, messages: Messages) -> Log:
-        """Return the slice that is complete after more messages. Raises ValueError for unreadable ones."""
+        """Decode more messages; return all cycles that are complete now, with packets, events and topics.
+
+        Raises ValueError for messages that cannot be decoded.
+        """
         bodies: dict[str, list[bytes]] = {}
         cycle_rows = np.zeros(0, np.int64)
         topics: dict[str, LoggedTopic] = {}
@@ -192,11 +199,11 @@ class Slicer:
         )
 
     def rest(self) -> Log:
-        """Return the remaining cycles and packets after the last message."""
+        """Return the cycles and packets that were still waiting after the last message."""
         return self._slice(self._cycles, _NO_PACKETS, last=True)
 
     def about(self) -> Log:
-        """Return a log without records, with the metadata and damage found so far."""
+        """Return a log without records, with metadata, damage and topic names found so far."""
         damage = list(self._file.damage)
         if self.wrong:
             them = counted(self.wrong, "message of packets is", "messages of packets are")
@@ -231,7 +238,7 @@ class Slicer:
         )
 
     def _slice(self, cycles: NDArray[np.void], packets: PacketColumns, *, last: bool) -> Log:
-        """Return complete cycles and packets, and store the rest; `cycles` includes the stored ones."""
+        """Return the complete cycles with their packets, and keep the others for the next slice."""
         found = [part for part in (self._packets, packets) if len(part)]
         joined = PacketColumns.joined(found)
         if len(found) > 1:
@@ -242,7 +249,7 @@ class Slicer:
         return self._log(_chosen(cycles, whole), joined if ready.all() else joined.take(ready))
 
     def _bound(self, cycles: NDArray[np.void], packets: PacketColumns) -> int:
-        """Return the first cycle number whose cycles or packets may be incomplete."""
+        """Return the number of the first cycle that may still get packets; all below it are complete."""
         if len(cycles) > _MOST_HELD or len(packets) > _MOST_PACKETS_HELD:
             return _FOREVER
         newest = int(cycles["cycle"][-1]) if len(cycles) else 0
@@ -251,7 +258,7 @@ class Slicer:
         return newest
 
     def _read_packets(self, messages: Messages, buses: Mapping[int, int]) -> PacketColumns:
-        """Return the packets of channels; `buses`: channel -> bus index."""
+        """Decode the packets of all buses; `buses` maps channel numbers to bus indices."""
         rows = [np.flatnonzero(messages.channel == channel) for channel in buses]
         if not rows:
             return _NO_PACKETS
@@ -280,7 +287,7 @@ _FOREVER = int(np.iinfo(np.int64).max)
 
 
 def joined_topic(parts: Sequence[LoggedTopic]) -> LoggedTopic:
-    """Return the joined messages of several slices of one topic."""
+    """Concatenate the messages of one topic from several slices."""
     t_ns = np.concatenate([part.t_ns for part in parts])
     return structs.replace(
         parts[0], t_ns=t_ns, data=tuple(message for part in parts for message in part.data)
@@ -288,7 +295,7 @@ def joined_topic(parts: Sequence[LoggedTopic]) -> LoggedTopic:
 
 
 def joined_cycles(parts: Sequence[NDArray[np.void]]) -> NDArray[np.void]:
-    """Return concatenated cycles, including padding, which NumPy would not copy."""
+    """Concatenate cycle records byte for byte, with their padding, which NumPy would not copy."""
     some = [part for part in parts if len(part)]
     if len(some) < 2:
         return some[0] if some else parts[0]
@@ -311,7 +318,7 @@ def _bytes(dtype: np.dtype[np.void]) -> np.dtype[np.void]:
 
 
 def joined(about: Log, slices: Sequence[Log]) -> Log:
-    """Return the joined slices of a log; `about`: the log without records."""
+    """Join slices into one log; `about` supplies header, metadata and damage."""
     packets = PacketColumns.joined([part.packets.compact() for part in slices if len(part.packets)])
     if len(about.buses) > 1:
         packets = packets.take(np.argsort(packets.bus, kind="stable"))
@@ -332,7 +339,7 @@ def joined(about: Log, slices: Sequence[Log]) -> Log:
 def _cycles(
     layout: CycleLayout, data: NDArray[np.uint8], start: NDArray[np.int64], size: NDArray[np.int64]
 ) -> NDArray[np.void]:
-    """Return the cycles of messages in `data`."""
+    """Return the cycle records in messages of /cycle, checked for length and known modes."""
     if (size != len(ENCAPSULATION) + layout.size).any():
         raise ValueError("the messages of /cycle are not as long as joints and controllers ask")
     bodies = pieces(data, start + len(ENCAPSULATION), size - len(ENCAPSULATION))

@@ -1,4 +1,4 @@
-"""Topics: messages of controllers and the runtime in a log, decoded by the log's definitions."""
+"""Logged topics: the messages of a topic, decoded with the definition that the log contains."""
 
 from __future__ import annotations
 
@@ -14,19 +14,19 @@ from dxlrun.messages.definition import MessageType
 
 
 class LoggedTopic(msgspec.Struct, frozen=True, eq=False):
-    """One topic with its messages in sequence."""
+    """One topic of a log with its encoded messages in sequence."""
 
     name: str
-    """`/CONTROLLER/TOPIC`, or `/goals`."""
+    """Name of the topic, `/CONTROLLER/TOPIC` or `/goals`."""
     type: MessageType
-    """Type as in the log."""
+    """Message type, with its definition from the log."""
     t_ns: NDArray[np.int64]
-    """Time of publication of each message, ns of the run's clock: the wake-up of its cycle."""
+    """Time of the cycle that published each message, ns of the run's clock."""
     data: tuple[bytes, ...]
-    """CDR, as published."""
+    """Encoded (CDR) messages."""
 
     def messages(self) -> list[Mapping[str, Value]]:
-        """Return the fields of each message, with nested messages as mappings. Raises LogError."""
+        """Decode all messages into mappings from field to value; nested messages are mappings."""
         try:
             codec = Codec(self.type)
             return [codec.unpack(data) for data in self.data]
@@ -34,7 +34,7 @@ class LoggedTopic(msgspec.Struct, frozen=True, eq=False):
             raise LogError(f"a message of {self.name} cannot be read: {error}") from error
 
     def column(self, field: str) -> NDArray[np.generic]:
-        """Return a field of all messages, one row each: `error`, `pose.pose.position.x`.
+        """Return one field of all messages as an array: `error`, `pose.pose.position.x`.
 
         Raises LogError for an unknown field, and for an array whose length varies.
         """

@@ -1,4 +1,4 @@
-"""Walk: the files of a log, part after part, as one log; a later walk continues in files that have grown."""
+"""Log walk: reads the files of a log one after the other as a single log, also while it grows."""
 
 from __future__ import annotations
 
@@ -18,37 +18,36 @@ from dxlrun.log.schemas import METADATA_NAME
 from dxlrun.plan.recording_plan import PART_END_NAME, PART_NAME
 
 _BUFFER = 1 << 18
-"""Buffer size, bytes: most records after a chunk are skipped without a system call."""
+"""Size of the read buffer, bytes: most records after a chunk are skipped without a system call."""
 
 
 class _OtherRunError(Exception):
-    """A part belongs to another run than the first part."""
+    """Raised when a part in a directory belongs to another run than the first part."""
 
 
 @dataclass(slots=True)
 class LogWalk:
-    """Contents of a log's files; a single MCAP file of any program is a log too."""
+    """Reads all files of a log one by one; a further read continues where the last one ended."""
 
     path: Path
     file: McapFile = field(default_factory=McapFile)
-    """Contents of all files; `finished` refers to the last one."""
+    """Metadata, channels and damage of all files together; `finished` refers to the last file."""
     first_part: int = 0
-    """Index of the first existing part, according to its metadata."""
+    """Number of the first part that still exists, from its metadata."""
     share: float = 0.0
     """Share of the files that was read, 0 to 1."""
     _file: Path | None = None
-    """File at which the next walk continues; by name, because older parts may be deleted between two
-    walks."""
+    """File in which the next read continues; a path and not an index, because older parts may be deleted."""
     _part: int = 0
-    """Number of files before this one."""
+    """Number of files before `_file` that were read."""
 
     def survey(self) -> None:
-        """Read everything except for messages. Raises LogError as `messages`."""
+        """Read metadata, attachments and channels, but no messages. Raises LogError as `messages`."""
         for _ in self.messages(chunks=False):
             pass
 
     def messages(self, *, chunks: bool = True) -> Iterator[Messages]:
-        """Yield the messages chunk by chunk; each part has its own channel numbers.
+        """Yield the messages of all files chunk by chunk; `chunks=False` yields none, but reads the metadata.
 
         Raises LogError without a readable MCAP file, or for an empty one.
         """
@@ -86,12 +85,12 @@ class LogWalk:
 
     @property
     def is_being_written(self) -> bool:
-        """True while a run writes the file in which the walk ended."""
+        """True if a run is still writing the file in which reading ended."""
         return not self.file.finished and self._file is not None and has_writer(self._file)
 
     @property
     def no_end(self) -> str:
-        """Sentence about a file without an end."""
+        """Sentence that the last file read has no end, with the reason."""
         name = self.file.name or "the file"
         if self.is_being_written:
             return f"{name} has no end yet: a run is writing it"
@@ -108,13 +107,13 @@ class LogWalk:
 
 
 def _order(part: Path) -> tuple[int, str]:
-    """Return the sort key of a part: numbers have four or more digits."""
+    """Return a key by which parts are sorted; their numbers have four or more digits."""
     return len(part.name), part.name
 
 
 @contextmanager
 def _opened(path: Path) -> Iterator[tuple[IO[bytes], int]]:
-    """Yield an open MCAP file and its size; raises LogError for a missing, empty or other file."""
+    """Open an MCAP file; yield stream and size. Raises LogError if it is missing, empty or not MCAP."""
     try:
         with path.open("rb", buffering=_BUFFER) as stream:
             size = os.fstat(stream.fileno()).st_size
