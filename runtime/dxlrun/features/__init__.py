@@ -35,8 +35,8 @@ _JOINTS = (
 )
 _SECTIONS = "arguments include joint_defaults loop model name poses processes read_before simulation"
 _REPORT = "robot rate joints groups controllers buses policies motions graph duration online"
-"""Keys of the report of `dxlrun check`; a feature cannot have such a name, because its rows are added under
-it."""
+"""Keys of the report of `dxlrun check`; a feature cannot have one as its name, because its rows are added
+there under its name."""
 RESERVED: Mapping[type[Section[Any] | JointKey[Any] | ServoKey[Any] | PolicyKey[Any]], str] = {
     Section: f"{_REPORT} {_SECTIONS}",
     JointKey: f"{_REPORT} {_JOINTS}",
