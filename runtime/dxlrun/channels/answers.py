@@ -16,7 +16,7 @@ import msgspec
 Field: TypeAlias = str | int | float | tuple[str, ...]
 _MOST_BITS = 63
 MOST_NAMED = 4
-"""Most names of a list in a sentence; `fields` has all of them."""
+"""Most names of a list that a refusal's text shows; its `fields` have all of them."""
 
 
 @unique
@@ -150,27 +150,27 @@ class Code(StrEnum):
 
 
 class Halted(msgspec.Struct, frozen=True):
-    """Measurement at the end of a halt."""
+    """Measurement when a `halt` command ends: which joint was fastest, and after what time."""
 
     seconds: float
-    """Time since the loop received the command."""
+    """Time since the loop received the `halt` command, s."""
     joint: str
-    """Joint with the highest speed."""
+    """Name of the joint with the highest speed at the end."""
     velocity: float
     """Speed of that joint, rad/s or m/s."""
 
 
 class Done(msgspec.Struct, frozen=True, tag="done"):
-    """The command was executed."""
+    """Answer: the command was executed."""
 
     cycle: int
     """Cycle of the loop that executed the command."""
     place: int | None = None
-    """Place of a loaded controller, its bit in the masks of the cycles; None for other commands."""
+    """Index of a controller that was loaded, its bit in the masks of the cycles; None for other commands."""
     goals: tuple[int, ...] = ()
     """Numbers of the goals that the command started; empty if the command is not a goal."""
     value: int | None = None
-    """Value of a register that was read, or before it was written; None: not known."""
+    """Value of a register that was read, None if not known; None for other commands."""
     halted: Halted | None = None
     """Measurement of a halt; None for other commands."""
     deactivated: tuple[str, ...] = ()
@@ -178,7 +178,7 @@ class Done(msgspec.Struct, frozen=True, tag="done"):
 
 
 class Waiting(msgspec.Struct, frozen=True, tag="waiting"):
-    """The command was accepted, and another answer follows.
+    """Answer: the command was accepted, but is not complete; another answer follows.
 
     Controllers may wait for the modes of their joints. Torque requests and reboots use idle time.
     """
@@ -187,7 +187,7 @@ class Waiting(msgspec.Struct, frozen=True, tag="waiting"):
 
 
 class Refusal(msgspec.Struct, frozen=True, tag="refused"):
-    """The command was refused and had no effect. Code and fields state the reason."""
+    """Answer: the command was refused. Code and fields state the reason."""
 
     code: Code
     fields: Mapping[str, Field] = {}
@@ -199,7 +199,7 @@ class Refusal(msgspec.Struct, frozen=True, tag="refused"):
 
     @property
     def text(self) -> str:
-        """The reason in one sentence."""
+        """The reason of the refusal in one sentence, from the code's format string and the fields."""
         shown = {
             name: list_names(value) if isinstance(value, tuple) else value
             for name, value in self.fields.items()
@@ -219,11 +219,11 @@ class CommandOutcome(msgspec.Struct, frozen=True):
     origin: str
     refusal: Refusal | None = None
     place: int = 0
-    """Number of the command among the client commands of its cycle, from 1; 0: another one, or not known."""
+    """Number of the client command within its cycle, from 1; 0: not a client command, or not known."""
 
 
 def list_names(names: Sequence[str]) -> str:
-    """Return a list of names as text: all of a few, otherwise the first ones and the number of others."""
+    """Return names as text for messages: all of a few, else the first ones and the number of others."""
     beyond = len(names) - MOST_NAMED
     if beyond < 2:  # "and 1 more" would not be shorter than the name
         return ", ".join(names)
@@ -237,15 +237,15 @@ def _writable(value: Field) -> Field:
 
 
 class Answered(msgspec.Struct, frozen=True, array_like=True, tag_field="is", tag=5):
-    """Message with an answer for the gateway."""
+    """Record by which the loop passes an answer to the gateway."""
 
     number: int
-    """Number of the command."""
+    """Number of the command that is answered."""
     answer: Answer
 
 
 def encode_answer(number: int, answer: Answer, most: int) -> bytes:
-    """Encode an answer, and cut long texts and lists so that it fits.
+    """Encode an answer to a command as a record, and halve long texts and lists until it fits.
 
     Args:
         number: Number of the command.

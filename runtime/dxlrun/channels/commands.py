@@ -19,54 +19,57 @@ from dxlrun.channels.answers import Answer
 from dxlrun.channels.ring import RING_SECONDS, Appender, RecordKind, record_size
 
 LOOP = ""
-"""Name of the loop as the addressee of a command; not a valid name of a controller."""
+"""Controller name that addresses a command to the loop itself; not a valid name of a controller."""
 
 MOST_PER_CYCLE = 8
-"""Most commands in a cycle; more wait for the next one."""
+"""Most client commands that the loop executes in a cycle; more wait for the next one."""
 LONGEST_COMMAND = 256 * 1024
 """Longest record of a command, bytes: a trajectory of some thousand points for twenty joints."""
 
 _USUAL_COMMAND = 512  # bytes of a typical record, for the capacity of rings
 _NUMBER = 8
-"""Bytes of a float64."""
+"""Size of a float64, bytes."""
 
 
 class Command(msgspec.Struct, frozen=True, array_like=True, tag_field="is", tag=1):
-    """A request to a controller or to the loop."""
+    """A client command for a controller or for the loop, as a record in the loop's inbox."""
 
     number: int
-    """Number that the sender assigns; the answer refers to it."""
+    """Number that the sender assigns; the answer repeats it."""
     controller: str
     kind: str
     data: bytes
-    """Little-endian float64 from the controller's `prepare`. For the loop, JSON (UTF-8); for `play`, JSON, a
-    line break and an array."""
+    """Little-endian float64 values from the controller's `prepare`.
+
+    For the loop, JSON (UTF-8); for `play`, JSON, a line break and an array.
+    """
     origin: str
     """Client that sent the command, for the log."""
     lease_ns: Annotated[int, msgspec.Meta(ge=0)] = 0
-    """Lease: time for which the command is valid unless another one follows, ns; 0: unlimited."""
+    """Time after which the command expires unless another one follows, ns; 0: it does not expire."""
     request: bytes = b""
     """Input of `prepare` for the log: the command as JSON, for `play` a list. Empty if nothing was prepared,
     or if it was too long."""
 
 
 class TakenCommand(msgspec.Struct, frozen=True, array_like=True, tag_field="is", tag=2):
-    """A command that a cycle has executed or refused, for a controller or for the loop."""
+    """A command that a cycle has executed or refused, as a record for the log."""
 
     t_ns: int
     """Time of the cycle's wake-up, ns of the run's clock."""
     cycle: int
     planned: int
-    """Index in the plan's commands, which have the array; -1: the array is in `data`."""
+    """Index of the command in the plan, which has its data; -1: a client's command, with its data in `data`.
+    """
     controller: str
-    """Empty: the loop itself."""
+    """Name of the controller; empty: the command is for the loop itself."""
     kind: str
     origin: str
-    """The client, or the place in a motion file."""
+    """Client that sent the command, or its position in a motion file."""
     data: bytes
     """As in Command; empty for a planned command."""
     lease_ns: int = 0
-    """Lease of a setpoint in a stream; 0: unlimited."""
+    """Time after which the command of a stream expires, ns; 0: it does not expire."""
     request: bytes = b""
     """As in Command; empty for a planned command."""
 
@@ -77,7 +80,7 @@ class TakenCommand(msgspec.Struct, frozen=True, array_like=True, tag_field="is",
 
     @property
     def text(self) -> str:
-        """The data as text for the log: JSON for the loop, hexadecimal if they are not an array, else empty.
+        """Text in the command's data: JSON for the loop, hexadecimal if not an array, else empty.
 
         Invalid UTF-8 becomes escapes that are invalid in JSON, so a replay refuses the command again.
         """
@@ -87,20 +90,23 @@ class TakenCommand(msgspec.Struct, frozen=True, array_like=True, tag_field="is",
 
     @property
     def numbers(self) -> NDArray[np.float64]:
-        """The array in the data for the log; empty if `text` has the data."""
+        """Array of float64 in the command's data; empty if `text` has the data."""
         data = self.data.partition(b"\n")[2] if self.for_loop else self.data
         return np.frombuffer(data if len(data) % _NUMBER == 0 else b"", dtype="<f8")
 
 
 class ClientCommand(msgspec.Struct, frozen=True):
-    """A command that is not in the plan."""
+    """A logged command that a client sent in the run, not one of the plan, with its refusal."""
 
     command: TakenCommand
     refusal: str  # Text of the refusal; empty on success, or if the event with the refusal was lost
 
 
 def data_of(controller: str, text: str, numbers: NDArray[np.float64]) -> bytes:
-    """Return a command's data from its text and its array in the log. Raises ValueError for invalid text."""
+    """Return a command's data from the text and array that the log has.
+
+    Raises ValueError for invalid text.
+    """
     if controller and text:
         return bytes.fromhex(text)
     if controller:
@@ -117,7 +123,7 @@ class Inbox(Protocol):
         ...
 
     def answer(self, number: int, answer: Answer) -> None:
-        """Answer a command by its number. Another answer follows after `Waiting`."""
+        """Send the answer to a command, by the command's number. After `Waiting`, another answer follows."""
         ...
 
 
@@ -133,40 +139,46 @@ class NoInbox:
 
 
 class QueueInbox:
-    """Inbox for commands of the same process, on virtual time. `answers` has the last answer by number."""
+    """Inbox for client commands from the same process, on virtual time.
+
+    `answers` has the newest answer to each command by its number.
+    """
 
     def __init__(self) -> None:
         self.waiting: deque[Command] = deque()
         self.answers: dict[int, Answer] = {}
 
     def take(self) -> Sequence[Command]:
-        """Return the commands in `waiting`, at most MOST_PER_CYCLE."""
+        """Return the commands that were put into `waiting`, at most MOST_PER_CYCLE, oldest first."""
         if not self.waiting:
             return ()
         return [self.waiting.popleft() for _ in range(min(len(self.waiting), MOST_PER_CYCLE))]
 
     def answer(self, number: int, answer: Answer) -> None:
-        """Store the answer."""
+        """Store the answer in `answers`, in place of an earlier one."""
         self.answers[number] = answer
 
 
 class CommandSink(Protocol):
-    """Destination of executed commands. Never blocks and never raises."""
+    """Destination for a record of each command that a cycle executed, such as the log.
+
+    Never blocks or raises.
+    """
 
     def take(self, command: TakenCommand) -> None:
-        """Record one command."""
+        """Record one executed or refused command."""
         ...
 
 
 class NoCommands:
-    """Drops commands, for runs without a log."""
+    """Command sink that discards the records, for runs without a log."""
 
     def take(self, command: TakenCommand) -> None:
         """Do nothing."""
 
 
 class CommandRing:
-    """Appends executed commands to a ring."""
+    """Command sink that appends executed commands to a ring in shared memory, for the recorder."""
 
     __slots__ = ("_writer",)
 
@@ -174,12 +186,12 @@ class CommandRing:
         self._writer = writer
 
     def take(self, command: TakenCommand) -> None:
-        """Append one command."""
+        """Append one executed command to the ring."""
         self._writer.append(RecordKind.TAGGED, msgspec.msgpack.encode(command))
 
 
 def encode_command(command: Command, most: int = LONGEST_COMMAND) -> bytes:
-    """Encode a command for the loop. The request is omitted if the record would be longer than `most`."""
+    """Encode a client command as a record; omit its `request` if the record were longer than `most` bytes."""
     record = msgspec.msgpack.encode(command)
     if command.request and len(record) > most:
         record = msgspec.msgpack.encode(replace(command, request=b""))
@@ -187,7 +199,7 @@ def encode_command(command: Command, most: int = LONGEST_COMMAND) -> bytes:
 
 
 def command_capacity(period_ns: int, controllers: int, mailbox: int) -> int:
-    """Return the capacity of a ring, bytes, for 10 s with a command for every controller in each cycle.
+    """Return the ring size, bytes, for 10 s with a command for every controller in each cycle.
 
     Args:
         period_ns: Period of the loop.

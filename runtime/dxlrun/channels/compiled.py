@@ -12,11 +12,11 @@ SOURCES = tuple(
     Path(__file__).parents[2] / name
     for name in ("dxlrun/channels/shared_memory.c", "dxlrun/control/gate.c", "dxlwire/exchange/kernel.c")
 )
-"""C sources that the build compiles."""
+"""Paths of the C files that must be compiled when dxlrun is installed."""
 
 
 def missing() -> str:
-    """Return one sentence about a compiled object that cannot be used; empty if all can."""
+    """Return a sentence about the first compiled C object that cannot be used; empty if all can."""
     try:
         for source in SOURCES:
             load_compiled(source, ctypes.PyDLL)

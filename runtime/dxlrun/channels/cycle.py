@@ -24,7 +24,11 @@ from dxlrun.description.source_names import SOURCE_COMMAND
 from dxlwire.modes import COMMAND_INTERFACES
 
 Floats = NDArray[np.float64]
-"""Shape (joints,): rad, rad/s, Nm, A, or the fraction of maximum if the servo does not measure torque."""
+"""Array of float64.
+
+For joints, shape (joints,): rad, rad/s, Nm, A, or the fraction of maximum effort if the servo does not
+measure torque.
+"""
 LOST_CYCLES = 3
 """Consecutive missing replies after which a servo is lost, if its last reply is older than LOST_AGE_NS."""
 LOST_AGE_NS = 50_000_000
@@ -45,7 +49,7 @@ SCALARS: tuple[tuple[str, str], ...] = (
     ("published", "uint64"),
     ("command_count", "int64"),
 )
-"""Name and type of the scalar fields."""
+"""Name and type of each scalar field in a cycle record, in the order of its bytes."""
 
 SEQUENCES: tuple[tuple[str, str, str], ...] = (
     ("position", "float64", "joints"),
@@ -74,7 +78,7 @@ SEQUENCES: tuple[tuple[str, str, str], ...] = (
     ("source_age_ns", "int64", "sources"),
     ("source_valid", "bool", "sources"),
 )
-"""Name, element type and dimension of the sequences."""
+"""Name, element type and dimension of each array in a cycle record, in the order of its bytes."""
 _OWNERS = {name: per for name, _, per in SEQUENCES}
 
 
@@ -83,33 +87,41 @@ class Torque(IntEnum):
     """Torque state of a joint's servo. The log has the numbers."""
 
     UNKNOWN = 0
-    """Not recorded, in logs of older versions."""
+    """The torque state was not recorded, in logs of older versions."""
     ON = 1
     """Torque is enabled, and the servo gets goals."""
     DOUBT = 2
-    """Uncertain after a lost reply or after torque was enabled. The servo gets goals again as soon as its
-    Torque Enable was read."""
+    """Uncertain after a lost reply or after torque was enabled.
+
+    The servo gets goals again once its Torque Enable was read.
+    """
     OFF = 3
     """Torque is off because the servo was reset, its torque was cut, or it shut down."""
     RELEASED = 4
     """Torque is off because a client, a policy or the robot file disabled it."""
     LOST = 5
-    """Not known: the servo is lost."""
+    """Not known, because the servo is lost: it does not reply."""
     REBOOTING = 6
     """The servo reboots at the request of a client. Missing replies do not count as a loss."""
     GIVEN = 7
-    """Torque was just enabled. The goal becomes the measured position, and the controllers are restarted."""
+    """Torque was just enabled.
+
+    The joint's goal becomes its measured position, and its controllers are restarted.
+    """
 
     @property
     def word(self) -> str:
-        """Word for outputs. A joint without torque is `limp` for any reason."""
+        """Name of the state in outputs, in lower case.
+
+        `limp` for a joint without torque, whatever the reason.
+        """
         return "limp" if self in LIMP else self.name.lower()
 
 
 LIMP = (Torque.OFF, Torque.RELEASED)
-"""Torque states of joints that move freely."""
+"""Torque states of joints that have no torque and move freely."""
 OFFLINE = (Torque.LOST, Torque.REBOOTING)
-"""Torque states of joints whose servos are not read."""
+"""Torque states of joints whose servos are not read, because they are lost or reboot."""
 _UNABLE = {
     Torque.OFF: "is limp: it was reset, its torque was cut, or it shut itself down",
     Torque.RELEASED: "is limp: its torque was switched off",
@@ -120,7 +132,10 @@ _UNABLE = {
 
 @dataclass(frozen=True, slots=True)
 class States:
-    """States of the joints, one element a joint. Invalid ones keep their last values and grow older."""
+    """Measured states of the joints, with one element for each joint.
+
+    Without a valid reply, the last values stay.
+    """
 
     motion: Floats
     """Shape (3, joints): position, velocity and effort in one array."""
@@ -128,19 +143,22 @@ class States:
     velocity: Floats = field(init=False)
     effort: Floats = field(init=False)
     valid: NDArray[np.bool_]
-    """True if this cycle's reply arrived intact."""
+    """True for joints whose servo sent an intact reply in this cycle."""
     age_ns: NDArray[np.int64]
-    """Time since the last valid reply arrived; -1 before the first one."""
+    """Time since each servo's last valid reply arrived, ns; -1 before the first one."""
     temperature: Floats
-    """deg C, read at a low rate; NaN until first read."""
+    """Temperature of each servo, deg C, read at a low rate; NaN until first read."""
     voltage: Floats
     """Supply voltage at the servo, V, read at a low rate; NaN until first read."""
     hardware_error: NDArray[np.uint8]
-    """Bits of the e-Manual's Hardware Error Status; Protocol 1.0: the bits of ERR that are states."""
+    """Bits of each servo's Hardware Error Status (e-Manual); Protocol 1.0: the bits of ERR that are states.
+    """
     mode: NDArray[np.uint8]
-    """Mode of the servo, as a `Mode`; UNKNOWN during a change."""
+    """Operating mode of each servo, as a `Mode`; UNKNOWN during a change."""
     torque: NDArray[np.uint8]
-    """Torque state, as a `Torque`, before this cycle's read; DOUBT if the reply reports a new error."""
+    """Torque state of each servo, as a `Torque`, before this cycle's read; DOUBT if the reply reports a new
+    error.
+    """
 
     def __post_init__(self) -> None:
         for name, row in zip(("position", "velocity", "effort"), self.motion, strict=True):
@@ -148,18 +166,27 @@ class States:
 
     @property
     def has_lost(self) -> bool:
-        """True while any joint is lost. Lost joints get no commands, and their controllers are held."""
+        """True while any joint's servo is lost.
+
+        Lost joints get no commands, and their controllers are held.
+        """
         return Torque.LOST in self.torque.tobytes()
 
     def unable(self, rows: Iterable[int]) -> tuple[int, str] | None:
-        """Return the row of the first joint that cannot move, and the reason; None if all can."""
+        """Return the first of these joints that cannot move (limp, lost, rebooting): row and reason.
+
+        Returns None if all can move.
+        """
         for row in rows:
             if why := _UNABLE.get(Torque(self.torque.item(row))):
                 return row, why
         return None
 
     def doubtful(self, rows: Iterable[int]) -> tuple[int, str] | None:
-        """Return the row of the first joint with a missing reply or uncertain torque, and the reason."""
+        """Return the first of these joints without a reply or with uncertain torque: row and reason.
+
+        Returns None if all are certain.
+        """
         for row in rows:
             if not self.valid.item(row):
                 return row, "has not answered"
@@ -169,7 +196,7 @@ class States:
 
     @classmethod
     def empty(cls, joints: int) -> States:
-        """Return invalid states: NaN, age -1, unknown mode and torque."""
+        """Return states before the first reply: NaN, not valid, age -1, unknown mode and torque."""
         return cls(
             motion=np.full((3, joints), np.nan),
             valid=np.zeros(joints, dtype=np.bool_),
@@ -188,13 +215,13 @@ class SourceStates(msgspec.Struct, frozen=True):
     values: Floats
     """Shape (states,), in the order of the layout's `source_states`; NaN until first updated."""
     valid: NDArray[np.bool_]
-    """Shape (sources,): True if this cycle updated the states of the source."""
+    """Shape (sources,): True if the source delivered new states in this cycle."""
     age_ns: NDArray[np.int64]
-    """Shape (sources,): time since the states were measured; -1 before the first update."""
+    """Shape (sources,): time since the states were measured, ns; -1 before the first update."""
 
     @classmethod
     def empty(cls, sources: int = 0, states: int = 0) -> SourceStates:
-        """Return the states before the first update."""
+        """Return states of sources before the first update: NaN, not valid, age -1."""
         return cls(
             values=np.full(states, np.nan),
             valid=np.zeros(sources, dtype=np.bool_),
@@ -204,7 +231,7 @@ class SourceStates(msgspec.Struct, frozen=True):
 
 @dataclass(frozen=True, slots=True)
 class Commands:
-    """Commands of the joints, one element a joint; NaN = not commanded.
+    """Commands or goals of the joints by interface, with one element for each joint; NaN = not commanded.
 
     The joint's mode decides which commands apply, see `mode_of`.
     """
@@ -212,15 +239,18 @@ class Commands:
     values: Floats
     """Shape (4, joints): all commands in one array, in the order of COMMAND_INTERFACES."""
     position: Floats = field(init=False)
-    """rad or m."""
+    """Commanded position, rad or m."""
     velocity: Floats = field(init=False)
-    """rad/s or m/s. With a position: speed toward it, a magnitude, NaN = as fast as the servo can. Alone:
-    signed velocity of the joint."""
+    """Commanded velocity, rad/s or m/s.
+
+    With a position: speed toward it, a magnitude, NaN = as fast as the servo can. Alone: signed velocity of
+    the joint.
+    """
     effort: Floats = field(init=False)
     """Unit of the state's effort: Nm, A, or the fraction of maximum. With a position: effort limit of the
     servo, a magnitude. Alone: signed effort."""
     pwm: Floats = field(init=False)
-    """Fraction of the full voltage, -1..1."""
+    """Commanded PWM, fraction of the full voltage, -1..1."""
 
     def __post_init__(self) -> None:
         for name, row in zip(COMMAND_INTERFACES, self.values, strict=True):
@@ -228,17 +258,17 @@ class Commands:
 
     @classmethod
     def empty(cls, joints: int) -> Commands:
-        """Return arrays of NaN."""
+        """Return commands that are all NaN, "not commanded", for a number of joints."""
         return cls(np.full((len(COMMAND_INTERFACES), joints), np.nan))
 
     def clear(self) -> None:
-        """Set all commands to NaN."""
+        """Set all commands to NaN, "not commanded"."""
         self.values.fill(np.nan)
 
 
 @unique
 class Clamp(IntFlag):
-    """Clamps that the gate applied to a joint's command in a cycle. The log has the bits."""
+    """Reductions that the gate applied to a joint's command in a cycle, as bits. The log has the bits."""
 
     LOWER = 1
     """Position raised to the lower limit."""
@@ -249,7 +279,7 @@ class Clamp(IntFlag):
     VELOCITY = 8
     """Velocity reduced to the velocity limit."""
     NOT_FINITE = 16
-    """Infinite, or NaN after a finite value: a fault of the controller. The last goal was kept."""
+    """Command infinite, or NaN after a finite value: a fault of the controller. The last goal was kept."""
     EFFORT = 32
     """Effort reduced to the effort limit."""
     PWM = 64
@@ -259,7 +289,7 @@ class Clamp(IntFlag):
 
 
 class CycleLayout:
-    """Layout of a robot's cycle record, as a numpy dtype.
+    """Names of a robot's joints, controllers and sources, and the layout of its cycle record as a dtype.
 
     Args:
         joints: Names of the joints, in the order of the plan.
@@ -301,7 +331,7 @@ class CycleLayout:
         self.source_states = tuple(
             f"{source}/{state}" for source, states in (sources or {}).items() for state in states
         )
-        """Names of all states of the sources: `imu/angular_velocity.x`."""
+        """Names of all states of devices, sensors and controllers: `imu/angular_velocity.x`."""
         self.source_commands = tuple(source_commands)
         counts = {
             "joints": len(self.joints),
@@ -317,7 +347,7 @@ class CycleLayout:
         end = 8 * len(SCALARS)
         self.lengths: dict[str, int] = {}
         self.places: dict[str, slice] = {}
-        """Range of bytes of each sequence's elements in a record."""
+        """Range of bytes of each array's elements in a record, by name of the array."""
         for name, kind, per in SEQUENCES:
             element = np.dtype(kind).newbyteorder("<")
             count = counts[per]
@@ -336,27 +366,27 @@ class CycleLayout:
 
     @property
     def size(self) -> int:
-        """Size of a record, bytes."""
+        """Size of a cycle record, bytes."""
         return self.dtype.itemsize
 
     def place(self, name: str) -> int:
-        """Return the index of a 64-bit sequence's first element in `CycleRecord.floats`."""
+        """Return the index in `CycleRecord.floats` at which an array with 64-bit elements begins."""
         first: int = self.places[name].start
         return first // 8
 
     def names_of(self, sequence: str) -> tuple[str, ...]:
-        """Return the names of a sequence's elements, for sequences without joints: `light/led`."""
+        """Return the names of an array's elements, such as `light/led`, or joint names."""
         names: tuple[str, ...] = getattr(self, _OWNERS[sequence])
         return names
 
     def source_slice(self, source: str) -> slice:
-        """Return the slice of a source's states in `source_states`."""
+        """Return the slice of `source_states` that a source's states take; empty for an unknown source."""
         places = [index for index, name in enumerate(self.source_states) if name.partition("/")[0] == source]
         return slice(places[0], places[-1] + 1) if places else slice(0, 0)
 
 
 class _Scalars(ctypes.LittleEndianStructure):
-    """Scalar fields of a cycle."""
+    """Scalar fields at the begin of a cycle record, as a C struct."""
 
     _fields_ = tuple((name, getattr(ctypes, f"c_{kind}")) for name, kind in SCALARS)
 
@@ -369,30 +399,30 @@ class CycleRecord(_Scalars):
     """
 
     COMPUTED: ClassVar = {"source_state": "state", "reference": "reference", SOURCE_COMMAND: "command"}
-    """float64 sequences without joints, in the order of computation, with the noun for an element."""
+    """Arrays that replays compare, which are not of joints: name, and the noun for an element."""
 
     cycle: int
     """Number of the period since the loop's first deadline, including skipped periods."""
     scheduled_ns: int
     """Deadline of this cycle: start + cycle * period."""
     woken_ns: int
-    """Time after the wake-up."""
+    """Time at which the loop woke up for this cycle."""
     read_ns: int
-    """Time after the states were read."""
+    """Time after the servos' states were read."""
     updated_ns: int
-    """Time after the controllers and the gate."""
+    """Time after controllers and gate computed the goals."""
     written_ns: int
-    """Time after the goals were sent."""
+    """Time after the goals were sent to the servos."""
     period_ns: int
-    """Measured time since the previous cycle, capped, as controllers get it."""
+    """Measured time since the previous cycle, limited as controllers get it."""
     skipped: int
     """Number of periods skipped before this cycle."""
     active: int
     """Bit i: controller i is active."""
     published: int
-    """Bit i: controller i marked this cycle for its topics."""
+    """Bit i: controller i marked this cycle for publication on its topics of `publishes`."""
     command_count: int
-    """Commands that controllers accepted in this cycle."""
+    """Number of commands that controllers accepted in this cycle."""
     _array: NDArray[np.void]
 
     def __new__(cls, layout: CycleLayout) -> Self:
@@ -408,7 +438,7 @@ class CycleRecord(_Scalars):
         for name, count in layout.lengths.items():
             array[name] = count
         self.raw: memoryview = array.view(np.uint8).data
-        """Bytes of the record, a view."""
+        """Bytes of the whole record, as a view of its memory."""
         self.states = States(
             motion=_rows(array, "position", 3),
             valid=array["valid"][0],
@@ -423,11 +453,11 @@ class CycleRecord(_Scalars):
         self.commands = Commands(_rows(array, "command_position", len(COMMAND_INTERFACES)))
         """Merged commands of the controllers; NaN = not commanded."""
         self.goals = Commands(_rows(array, "goal_position", len(COMMAND_INTERFACES)))
-        """Goals for the servos, from the gate."""
+        """Goals that are sent to the servos, from the gate."""
         self.controller_ns: NDArray[np.int64] = array["controller_ns"][0]
-        """Duration of each controller's update; 0 without an update in this cycle."""
+        """Duration of each controller's update, ns; 0 without an update in this cycle."""
         self.clamped: NDArray[np.uint8] = array["clamped"][0]
-        """Bits of Clamp for each joint."""
+        """Clamps of each joint's command in this cycle, as bits of Clamp."""
         self.reference: Floats = _row(array, "reference")
         """Commands of controllers for the references of other controllers, in the order of the layout's
         references; NaN = not commanded."""
@@ -438,11 +468,11 @@ class CycleRecord(_Scalars):
         )
         """States of devices, sensors and controllers."""
         self.source_commands: Floats = _row(array, SOURCE_COMMAND)
-        """Commands of sources, in the order of the layout's source_commands; NaN = not commanded."""
+        """Commands for devices, in the order of the layout's source_commands; NaN = not commanded."""
         self.computed: tuple[Floats, ...] = tuple(_row(array, name) for name in self.COMPUTED)
-        """The sequences of COMPUTED."""
+        """Arrays of the sequences that COMPUTED names."""
         self.floats: Floats = np.frombuffer(self.raw[: layout.size - layout.size % 8], dtype="<f8")
-        """Record as float64. `layout.place(name)` is the index of a sequence's first element."""
+        """Whole record as an array of float64. `layout.place(name)` is the index at which an array begins."""
         for name, kind, _ in SEQUENCES:
             if kind == "float64":
                 array[name] = np.nan
@@ -454,13 +484,13 @@ class CycleRecord(_Scalars):
         )
 
     def renew(self) -> None:
-        """Reset the fields that count or mark events of a cycle."""
+        """Reset marks, command count, clamps and controllers' durations at the begin of a cycle."""
         self.published = self.command_count = 0
         for part, nothing in self._renewed:
             part[:] = nothing
 
     def wake(self, cycle: int, scheduled_ns: int, woken_ns: int, period_ns: int) -> None:
-        """Set the fields that are known at the begin of a cycle."""
+        """Set the cycle's number, deadline, wake-up time and measured period."""
         self.cycle, self.scheduled_ns, self.woken_ns, self.period_ns = (
             cycle,
             scheduled_ns,
@@ -474,12 +504,12 @@ class CycleRecord(_Scalars):
 
     @property
     def valid(self) -> NDArray[np.bool_]:
-        """True if this cycle's reply arrived intact."""
+        """True for joints whose servo sent an intact reply in this cycle."""
         return self.states.valid
 
     @property
     def age_ns(self) -> NDArray[np.int64]:
-        """Time since the last valid reply arrived; -1 before the first one."""
+        """Time since each servo's last valid reply arrived, ns; -1 before the first one."""
         return self.states.age_ns
 
 
@@ -498,7 +528,7 @@ def _rows(array: NDArray[np.void], first: str, count: int) -> Floats:
 
 
 def cycle_capacity(period_ns: int, size: int) -> int:
-    """Return the capacity of a ring, bytes, for 10 s of cycles and a margin of 1 s.
+    """Return the size of the ring for cycle records, bytes, for 11 s at the loop's period.
 
     Args:
         period_ns: Period of the loop.

@@ -18,7 +18,7 @@ from dxlwire.clock import Clock
 
 @unique
 class Severity(IntEnum):
-    """Levels of rcl_interfaces/msg/Log, so that /rosout needs no translation."""
+    """Severity of an event; the numbers of rcl_interfaces/msg/Log, so that /rosout needs no translation."""
 
     INFO = 20
     WARNING = 30
@@ -37,7 +37,7 @@ class EventCode(IntEnum):
     LOOP_STOPPED = 2
     OVERRUN = 3
     SCHEDULER = 4
-    """Result of a request for scheduler, memory or collector; the data are Granted."""
+    """Result of a real-time setting requested from the operating system; the data are Granted."""
     SIMULATION_STALLED = 5
     """The process of simulated servos did not run, and the loop waited for it; the data are Waited."""
     SETUP = 10
@@ -50,7 +50,7 @@ class EventCode(IntEnum):
     SERVO_LIMITS = 16
     """Registers of a joint's servo limit its goals further than the manual; the data are ServoLimit."""
     READ_LOST = 20
-    """First of several consecutive missing replies of a servo."""
+    """First of several consecutive missing replies of one servo."""
     READ_BACK = 21
     """The servo replies again; the text has the number of missing replies."""
     SERVO_ERROR = 22
@@ -80,7 +80,7 @@ class EventCode(IntEnum):
     STEERED = 36
     """The loop executed a client's request: switch, rate, pause, resume, load, unload, stop."""
     STALE_COMMAND = 37
-    """The lease of a command stream expired, and the policy for that begins."""
+    """The lease of a command stream or pause expired, and the policy `on_stale_command` begins."""
     CONTROLLER_LOADED = 38
     """A controller was loaded or unloaded while the loop was paused; the text has the duration."""
     POLICY = 39
@@ -114,7 +114,10 @@ class EventCode(IntEnum):
 
 
 class EventStage(msgspec.Struct, frozen=True):
-    """`STAGE` of `events.py`: kinds of events of a feature, with numbers that no other kind has."""
+    """Kinds of events of a feature: the object `STAGE` of its `events.py`.
+
+    No other kind has their numbers.
+    """
 
     FILE: ClassVar[str] = "events"
 
@@ -132,22 +135,22 @@ def event_names() -> Mapping[int, str]:
 
 
 class LostRecords(msgspec.Struct, frozen=True):
-    """Data of RECORDER_GAP."""
+    """Data of RECORDER_GAP: records of a ring that were overwritten before the recorder read them."""
 
     ring: str
     lost: int
-    """Number of lost records."""
+    """Number of lost records in this ring."""
 
 
 class Waited(msgspec.Struct, frozen=True):
-    """Data of SIMULATION_STALLED: waits since the last event of this kind."""
+    """Data of SIMULATION_STALLED: duration and number of waits since the last event of this kind."""
 
     waited_ns: int
     times: int
 
 
 class Granted(msgspec.Struct, frozen=True):
-    """Data of SCHEDULER: request of a process to the operating system."""
+    """Data of SCHEDULER: name of a real-time setting, and whether the operating system granted it."""
 
     request: str
     granted: bool
@@ -158,19 +161,19 @@ RUN_ENDED = "the run ended"
 
 
 class GoalReport(msgspec.Struct, frozen=True):
-    """Data of GOAL_ACCEPTED and GOAL_ENDED."""
+    """Data of GOAL_ACCEPTED and GOAL_ENDED: a goal of a controller and its status."""
 
     goal: int
     """Number of the goal in the run, from 1."""
     controller: str
     kind: str
-    """Kind of the command."""
+    """Kind of the command that started the goal, such as `trajectory`."""
     origin: str
-    """Client, or position in a motion file."""
+    """Client that sent the goal, or its position in a motion file."""
     status: str
     """`accepted`, or the outcome: `reached`, `missed`, `aborted`, `cancelled`, `preempted`."""
     text: str = ""
-    """Reason of the outcome, for people."""
+    """Reason of the outcome, for people; empty for an accepted goal."""
     joint: str = ""
     """Joint with the largest error at the end; empty: none."""
     error: float | None = None
@@ -178,12 +181,12 @@ class GoalReport(msgspec.Struct, frozen=True):
 
     @property
     def cut(self) -> bool:
-        """True if the goal was aborted by the end of the run."""
+        """True if the goal was aborted because the run ended."""
         return self.status == "aborted" and self.text == RUN_ENDED
 
     @property
     def failed(self) -> bool:
-        """True if the goal was missed, or aborted for another reason than the end of the run."""
+        """True if the goal was missed, or was aborted for another reason than the end of the run."""
         return self.status in ("missed", "aborted") and not self.cut
 
     @property
@@ -194,20 +197,20 @@ class GoalReport(msgspec.Struct, frozen=True):
 
 
 MOST_FAILED = 100
-"""Most failed goals that are stored, of motion files and of clients each."""
+"""Most failed goals that are stored for the summary, of motion files and of clients each."""
 
 
 class GoalTotals(msgspec.Struct, frozen=True):
-    """Totals of a run's goals."""
+    """Counts and failures of all goals of a run, for the summary."""
 
     counts: dict[str, int] = {}
-    """Number of goals by status."""
+    """Number of goals by status, such as `accepted`, `reached` or `missed`."""
     begun: dict[str, int] = {}
-    """Number of accepted goals of motion files by origin."""
+    """Number of accepted goals of motion files, by their position in the file."""
     failed: tuple[GoalReport, ...] = ()
     """Missed and aborted goals: the first hundred of motion files, and the first hundred of clients."""
     allowed: dict[str, float] = {}
-    """Largest error of reached goals by joint, rad or m."""
+    """Largest distance from the target at the end of a reached goal, by joint, rad or m."""
 
     @property
     def asked(self) -> int:
@@ -218,16 +221,19 @@ class GoalTotals(msgspec.Struct, frozen=True):
 
     @property
     def reached(self) -> int:
-        """Number of goals that were reached."""
+        """Number of goals that ended as reached."""
         return self.counts.get("reached", 0)
 
 
 class GoalHistory:
-    """Counts goals by their events. Failed goals of clients and of motion files have separate limits."""
+    """Counts a run's goals from their events.
+
+    Failed goals of clients and of motion files have separate limits.
+    """
 
     def __init__(self) -> None:
         self.planned: Container[str] = ()
-        """Origins of the goals of motion files."""
+        """Origins (positions in motion files) that identify goals of the plan."""
         self._counts: Counter[str] = Counter()
         self._begun: Counter[str] = Counter()
         self._failed: list[GoalReport] = []
@@ -235,7 +241,7 @@ class GoalHistory:
         self._allowed: dict[str, float] = {}
 
     def add(self, report: GoalReport) -> None:
-        """Count a report, and store a failed goal up to MOST_FAILED."""
+        """Count a goal's event by its status, and store a failed goal, up to MOST_FAILED."""
         planned = report.origin in self.planned
         self._counts[report.status] += 1
         if report.status == "accepted" and planned:
@@ -249,7 +255,7 @@ class GoalHistory:
 
     @property
     def totals(self) -> GoalTotals:
-        """Totals of the goals so far."""
+        """Counts and failures of the goals so far."""
         return GoalTotals(dict(self._counts), dict(self._begun), tuple(self._failed), self._allowed.copy())
 
 
@@ -257,16 +263,16 @@ Fields = ParamSpec("Fields")
 
 
 class EventBody(NamedTuple):
-    """Event without source and time, as a row of a table of texts makes it."""
+    """Code, severity and text of an event, without source and time; made by calling an `EventText`."""
 
     code: IntEnum
-    """An EventCode, or a kind of a feature."""
+    """Kind of the event: an EventCode, or a kind that a feature defines."""
     severity: Severity
     text: str
 
 
 class EventText(Generic[Fields]):
-    """Row of a table of texts: code, severity, and the function that writes the text from its fields.
+    """Template of an event: code, severity, and the function that writes the text from its arguments.
 
     A room has its rows in its `texts.py`, so that all its texts can be read at once. A call writes the text.
     """
@@ -300,10 +306,10 @@ def event_text(code: IntEnum, severity: Severity) -> Callable[[Callable[Fields, 
 
 
 class EventSink(Protocol):
-    """Destination of events. Never blocks and never raises."""
+    """Destination of a process' events, such as the log. Never blocks and never raises."""
 
     def emit(self, source: str, event: EventBody, data: bytes = b"") -> None:
-        """Record an event.
+        """Record an event with the current time.
 
         Args:
             source: Name of a joint, a controller or a process.
@@ -315,9 +321,9 @@ class EventSink(Protocol):
 
 LONGEST_SOURCE = 64  # characters; longer names are cut
 LONGEST_TEXT = 8192
-"""Characters; a longer text, such as a plug-in's traceback, is cut."""
+"""Longest text of an event, characters; a longer one, such as a plug-in's traceback, is cut."""
 LONGEST_DATA = 4096
-"""Bytes; longer data are omitted, as a part would not be valid JSON."""
+"""Longest data of an event, bytes; longer data are omitted, as a part would not be valid JSON."""
 LONGEST_EVENT = 4 * LONGEST_TEXT + 4 * LONGEST_SOURCE + LONGEST_DATA + 64
 """Longest record of an event, bytes: UTF-8 has up to 4 bytes a character."""
 _GOALS = (EventCode.GOAL_ACCEPTED, EventCode.GOAL_ENDED)
@@ -325,27 +331,27 @@ _USUAL_EVENT = 192
 
 
 class Event(msgspec.Struct, frozen=True, array_like=True, tag_field="is", tag=0):
-    """An event."""
+    """Report of something that happened in a process, joint or controller, as a record for the log."""
 
     t_ns: int
-    """ns of the run's clock."""
+    """Time of the event, ns of the run's clock."""
     code: int
     """Kind of the event; an unknown number in the log of a newer version."""
     severity: int
     source: str
-    """Name of a joint, a controller or a process."""
+    """Name of the joint, controller or process that the event is about."""
     text: str
     data: bytes = b""
     """JSON for programs; the text is for people."""
 
     @property
     def name(self) -> str:
-        """The name of the code, in lower case."""
+        """Name of the event's kind in lower case, such as `servo_lost`; `code_N` for an unknown one."""
         return event_names().get(self.code, f"code_{self.code}")
 
 
 class EventGroup(msgspec.Struct, frozen=True):
-    """Events of one kind and one source."""
+    """Events of the same kind, severity and source, counted; text and time are those of the first."""
 
     code: int
     severity: int
@@ -358,12 +364,12 @@ class EventGroup(msgspec.Struct, frozen=True):
 
     @property
     def name(self) -> str:
-        """The name of the code, in lower case."""
+        """Name of the events' kind in lower case, such as `servo_lost`."""
         return Event(self.t_ns, self.code, self.severity, self.source, self.text).name
 
 
 class EventCounts:
-    """Counts events by kind and source, so its size is bounded by joints, controllers and processes."""
+    """Counts events by kind, severity and source, so that memory stays bounded."""
 
     __slots__ = ("_groups",)
 
@@ -371,7 +377,7 @@ class EventCounts:
         self._groups: dict[tuple[int, int, str], EventGroup] = {}
 
     def add(self, event: Event) -> None:
-        """Count an event."""
+        """Count an event in its group; the first one sets the group's text and time."""
         key = (event.code, event.severity, event.source)
         group = self._groups.get(key)
         if group is None:
@@ -386,17 +392,17 @@ class EventCounts:
 
 
 class EventTotals(msgspec.Struct, frozen=True):
-    """Totals of a run's events, for the summary."""
+    """Errors and goals of a run from its events, for the summary."""
 
     errors: tuple[EventGroup, ...] = ()
-    """Errors, and takeovers that controllers requested."""
+    """Events that are errors, and takeovers that controllers requested, counted in groups."""
     goals: GoalTotals = GoalTotals()
     started_ns: int = 0
-    """Start of the loop, ns of the run's clock."""
+    """Time at which the loop started, ns of the run's clock; 0: it did not."""
 
 
 class EventRing:
-    """Appends the events of a process to its ring. Never blocks and never raises."""
+    """Event sink that appends the events of a process to its ring. Never blocks and never raises."""
 
     __slots__ = ("_clock", "_errors", "_started_ns", "_writer", "goals")
 
@@ -409,7 +415,7 @@ class EventRing:
 
     @property
     def totals(self) -> EventTotals:
-        """Totals of the events so far."""
+        """Errors and goals of the events so far."""
         return EventTotals(self._errors.groups, self.goals.totals, self._started_ns)
 
     def emit(self, source: str, event: EventBody, data: bytes = b"") -> None:
@@ -439,7 +445,7 @@ def _writable(text: str) -> str:
 
 
 def event_capacity(period_ns: int, servos: int) -> int:
-    """Return the capacity of a ring, bytes, for 10 s with an event for each servo and four more a cycle.
+    """Return the size of a ring for events, bytes: 10 s with an event per servo and four more a cycle.
 
     This is the worst case: all servos fail and recover in turn. Consecutive missing replies are one event.
     """

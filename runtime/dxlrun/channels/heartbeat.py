@@ -47,19 +47,19 @@ class Phase(IntEnum):
 
 @unique
 class Steering(IntEnum):
-    """Availability of the gateway for client commands."""
+    """Ability of clients to command the run through the gateway process."""
 
     AWAITED = 0
-    """The gateway does not listen yet."""
+    """The gateway is starting and does not listen yet."""
     POSSIBLE = 1
-    """The gateway listens."""
+    """The gateway listens: clients can send commands."""
     IMPOSSIBLE = 2
     """The run never had a gateway, or its gateway has exited."""
 
 
 @unique
 class ControllerMethod(IntEnum):
-    """Method of a controller."""
+    """Number of a controller's method, for the page that shows which method is being called."""
 
     NONE = 0
     INIT = 1
@@ -79,12 +79,12 @@ class ControllerMethod(IntEnum):
 
 
 def create() -> int:
-    """Return the descriptor of a new page."""
+    """Return the descriptor of new shared memory for a heartbeat page."""
     return shared_memory.create("heartbeat", _SIZE)
 
 
 class Heartbeat:
-    """Mapped heartbeat page. Each process writes its own fields."""
+    """Heartbeat page in shared memory, mapped into this process. Each process writes its own fields."""
 
     __slots__ = ("_beats", "_memory", "_words")
 
@@ -108,42 +108,45 @@ class Heartbeat:
             self._words[_CYCLE] = cycle
 
     def may_take(self, cycle_ns: int) -> None:
-        """Publish the timeout of a cycle, ns: the period, or more while the loop is paused."""
+        """Publish how long a cycle may take before the guardian intervenes, ns.
+
+        That is the period, or more while the loop is paused.
+        """
         store(self._words, _CYCLE_NS, cycle_ns)
 
     def enter(self, phase: Phase) -> None:
-        """Publish the begin of a phase."""
+        """Publish that the loop's process enters a phase."""
         store(self._words, _PHASE, phase)
 
     def name_controller(self, place: int, name: str) -> None:
-        """Publish the name of the controller at a place, cut to 128 bytes."""
+        """Publish the name of the controller with this index, cut to 128 bytes."""
         data = name.encode()[:_NAME_BYTES].ljust(_NAME_BYTES, b"\0")
         self._memory[_NAMES + place * _NAME_BYTES :][:_NAME_BYTES] = data
 
     def call(self, place: int, step: int) -> None:
-        """Publish the place of the controller that is called, and the method; step 0: none."""
+        """Publish index and method of the controller that is called from now on; step 0: no call."""
         self._words[_CALL] = place << _STEP_BITS | step
 
     def look(self) -> None:
-        """Increment the guardian's counter. Only the guardian calls it."""
+        """Count a check by the guardian, to show that it is alive. Only the guardian calls it."""
         self._words[_LOOKS] += 1
 
     def supervisor_look(self) -> None:
-        """Increment the supervisor's counter. Only the supervisor calls it."""
+        """Count a check by the supervisor, to show that it is alive. Only the supervisor calls it."""
         self._words[_SUPERVISOR_LOOKS] += 1
 
     def set_steering(self, steering: Steering) -> None:
-        """Publish the availability of the gateway. Only the supervisor calls it."""
+        """Publish whether clients can command the run. Only the supervisor calls it."""
         self._words[_STEERING] = steering
 
     @property
     def steering(self) -> Steering:
-        """Availability of the gateway."""
+        """Ability of clients to command the run, from the supervisor."""
         return Steering(self._words[_STEERING])
 
     @property
     def activity(self) -> str:
-        """Running call of a controller, as text: `update of controller arm`. Empty: none."""
+        """Controller method that is running now, as text: `update of controller arm`; empty: none."""
         place, step = divmod(self._words[_CALL], 1 << _STEP_BITS)
         if not step:
             return ""
@@ -152,37 +155,37 @@ class Heartbeat:
 
     @property
     def looks(self) -> int:
-        """Number of the guardian's checks."""
+        """Number of checks by the guardian so far; it increases while the guardian is alive."""
         return self._words[_LOOKS]
 
     @property
     def supervisor_looks(self) -> int:
-        """Number of the supervisor's checks of guardian and loop."""
+        """Number of checks by the supervisor so far; it increases while the supervisor is alive."""
         return self._words[_SUPERVISOR_LOOKS]
 
     @property
     def phase(self) -> Phase:
-        """Current phase of the loop."""
+        """Phase in which the loop's process is now."""
         return Phase(load(self._words, _PHASE))
 
     @property
     def beats(self) -> int:
-        """Number of the loop's beats."""
+        """Number of heartbeats of the loop so far."""
         return self._words[_BEATS]
 
     @property
     def cycles(self) -> int:
-        """Number of executed cycles."""
+        """Number of cycles that the loop has executed."""
         return load(self._words, _CYCLE)
 
     @property
     def cycle_ns(self) -> int:
-        """Timeout of a cycle, ns; 0: not set yet."""
+        """Time that a cycle may take before the guardian intervenes, ns; 0: not set yet."""
         return load(self._words, _CYCLE_NS)
 
     @property
     def skipped(self) -> int:
-        """Number of skipped periods."""
+        """Number of periods that the loop has skipped."""
         return self._words[_SKIPPED]
 
 
@@ -194,7 +197,7 @@ _LINE_WORDS = 4
 
 
 def create_progress(lines: int) -> int:
-    """Return the descriptor of new memory for the progress of a simulation with this number of lines."""
+    """Return the descriptor of new shared memory for the progress of simulated servos on `lines` buses."""
     return shared_memory.create("simulation", 8 * (_LINES + _LINE_WORDS * lines))
 
 
@@ -211,14 +214,14 @@ class SimulationProgress:
         self._words = shared_memory.mapped(descriptor).cast("Q")
 
     def note_stall(self, begin_ns: int, end_ns: int) -> None:
-        """Publish an interval in which the process should have run but did not."""
+        """Publish an interval, ns, in which the simulation should have run but got no core."""
         count = self._words[_STALLS]
         place = _FIRST_STALL + 2 * (count % _KEPT_STALLS)
         self._words[place], self._words[place + 1] = begin_ns, end_ns
         store(self._words, _STALLS, count + 1)
 
     def stalled_ns(self, since_ns: int, until_ns: int) -> int:
-        """Return the duration of stalls between two times. Only the last 16 stalls are known."""
+        """Return how long the simulation stalled between two times, ns. Only the last 16 stalls are known."""
         load(self._words, _STALLS)
         ends = self._words[_FIRST_STALL:_LINES]
         return sum(
@@ -227,13 +230,13 @@ class SimulationProgress:
         )
 
     def line(self, index: int) -> LineProgress:
-        """Return the progress on one line."""
+        """Return the simulation's progress on the bus line with this index."""
         at = _LINES + index * _LINE_WORDS
         return LineProgress(self, self._words[at : at + _LINE_WORDS])
 
 
 class LineProgress:
-    """Progress of the simulation on one line."""
+    """Progress of the process of simulated servos on one bus line, in shared memory."""
 
     __slots__ = ("_words", "process")
 
@@ -244,15 +247,15 @@ class LineProgress:
     # The simulation's side
 
     def serve(self, until_ns: int) -> None:
-        """Publish that all bytes that are due to the host before `until_ns` were delivered."""
+        """Publish that all simulated bytes due before `until_ns` were delivered to the loop."""
         store(self._words, _SERVED, until_ns)
 
     def take(self, off_wire_ns: int) -> None:
-        """Publish the time at which the last executed byte of the host has left the wire."""
+        """Publish when the last byte that the simulation has executed left the wire, ns."""
         store(self._words, _TAKEN, off_wire_ns)
 
     def give(self, due_ns: int, now_ns: int) -> None:
-        """Publish the due time of the newest bytes for the host, and that they are delivered now."""
+        """Publish that bytes for the loop are delivered now, and when the newest of them were due, ns."""
         self._words[_DUE] = due_ns
         store(self._words, _GIVEN, now_ns)
 
@@ -260,22 +263,22 @@ class LineProgress:
 
     @property
     def taken_ns(self) -> int:
-        """Time at which the last executed byte of the host has left the wire. Must be read first."""
+        """Time at which the last byte that the simulation executed left the wire, ns. Must be read first."""
         return load(self._words, _TAKEN)
 
     @property
     def served_ns(self) -> int:
-        """Time before which all bytes that are due to the host were delivered."""
+        """Time before which all simulated bytes that are due were delivered to the loop, ns."""
         return load(self._words, _SERVED)
 
     @property
     def given_ns(self) -> int:
-        """Time of the newest delivery to the host; 0: none."""
+        """Time of the newest delivery of simulated bytes to the loop, ns; 0: none."""
         return load(self._words, _GIVEN)
 
     @property
     def due_ns(self) -> int:
-        """Due time of the bytes of the newest delivery."""
+        """Time at which the newest delivered bytes were due, ns."""
         return self._words[_DUE]
 
 
@@ -295,7 +298,7 @@ class Standstill:
         self._seen: object = None
 
     def ns(self, seen: object, now_ns: int) -> int:
-        """Check the value, and return the duration for which it has not changed, ns.
+        """Compare the watched value with the last one, and return how long it has not changed, ns.
 
         Args:
             seen: Current value.
@@ -309,7 +312,7 @@ class Standstill:
 
 
 class ProcessorTime:
-    """Processor time of a watched process during a standstill, from /proc/PID.
+    """Processor time that a watched process used during a standstill, from /proc/PID.
 
     The time is in schedstat (kernel: Documentation/scheduler/sched-stats.rst), the state of the first thread
     in stat (proc_pid_stat(5)). Both are read only during a standstill. They may be missing in a kernel.
@@ -322,7 +325,7 @@ class ProcessorTime:
         self._begin_ns: int | None = None
 
     def look(self, still_ns: int) -> None:
-        """Store the processor time at the begin of a standstill.
+        """Store the processor time when a standstill begins, and forget it when the standstill ends.
 
         Args:
             still_ns: Duration of the standstill so far; 0: none.
@@ -333,7 +336,7 @@ class ProcessorTime:
             self._begin_ns = self._total_ns()
 
     def starved_ns(self, still_ns: int) -> int | None:
-        """Return the processor time since the begin of the standstill if the process was starved.
+        """Return the process's processor time since the begin of the standstill if it was starved of cores.
 
         It must be called before the process is killed.
 

@@ -1,4 +1,4 @@
-"""Kept state: format of the state that a controller keeps from one run to the next.
+"""Kept state: format of the state that a controller keeps from one run to the next, in messages and files.
 
 The loop publishes a state in pieces as messages of the topic /kept. Another process joins them to a file: a
 line of JSON that describes the file, the controller's bytes, and the CRC-32 of both.
@@ -23,24 +23,27 @@ TOPIC = "/kept"
 MOST_KEPT = 1 << 20
 """Longest state of a controller, bytes."""
 PIECE = 8192
-"""Longest piece, bytes. One piece is published a cycle, so 1 MiB takes 128 cycles."""
+"""Longest piece of a kept state, bytes. One piece is published a cycle, so 1 MiB takes 128 cycles."""
 LONGEST_FILE = MOST_KEPT + (1 << 18)
-"""Longest file, bytes, with 256 KiB for its first line."""
+"""Longest file of a kept state, bytes, with 256 KiB for its first line."""
 _MAGIC = b"dxlrun kept state 1 "
 _CRC_BYTES = 4
 
 Facts = dict[str, str]
-"""Facts on which a state depends: `elbow model` -> `MX-64`."""
+"""Facts about servos and controllers on which a kept state depends, by name: `elbow model` -> `MX-64`."""
 
 
 @dataclass(slots=True)
 class KeptPiece:
-    """Message of /kept: a piece of a file. The pieces of a file are published in sequence from 0."""
+    """Message of /kept: a piece of the file of a controller's state.
+
+    Pieces are published in sequence from 0.
+    """
 
     header: Header
     controller: str
     state: Annotated[int, Number("uint32")]
-    """Number of the state in the run, from 0."""
+    """Number of the kept state in the run, from 0; the same for all its pieces."""
     piece: Annotated[int, Number("uint32")]
     pieces: Annotated[int, Number("uint32")]
     data: NDArray[np.uint8]
@@ -49,32 +52,32 @@ class KeptPiece:
 class _FirstLine(msgspec.Struct, frozen=True):
     controller: str
     bytes: int
-    """Length of the controller's bytes."""
+    """Length of the controller's state, bytes."""
     made_with: Facts
 
 
 class KeptFile(msgspec.Struct, frozen=True):
-    """File of a controller, read at the start of a run."""
+    """File with the state that a controller kept in an earlier run, as read at the start of a run."""
 
     place: str
     """Path of the file."""
     state: bytes = b""
     made_with: Facts = msgspec.field(default_factory=dict)
     problem: str = ""
-    """Reason why the file cannot be used; empty: it can."""
+    """Reason why the file cannot be used; empty if it can."""
 
 
 class KeptStates(msgspec.Struct, frozen=True):
-    """Kept states for the controllers of a run; passed to the loop and logged as JSON."""
+    """States that controllers kept in earlier runs; passed to the loop and logged as JSON."""
 
     files: dict[str, KeptFile] = msgspec.field(default_factory=dict)
-    """Files by controller."""
+    """File of each controller that kept a state, by controller name."""
     servos: dict[str, Facts] = msgspec.field(default_factory=dict)
     """Facts about the servo of each joint. A state does not fit after the servo was replaced."""
 
 
 def file_pieces(controller: str, state: bytes, made_with: Facts) -> tuple[int, Iterator[bytes]]:
-    """Return the number of pieces of a file, and an iterator of the pieces, at most PIECE bytes each."""
+    """Encode a controller's state as a file; return the number of pieces and an iterator of the pieces."""
     line = _MAGIC + msgspec.json.encode(_FirstLine(controller, len(state), made_with)) + b"\n"
     return 1 + -(-len(line) // PIECE) + -(-len(state) // PIECE), _pieces(line, state)
 
@@ -90,7 +93,7 @@ def _pieces(line: bytes, state: bytes) -> Iterator[bytes]:
 
 
 def opened_file(data: bytes, controller: str) -> tuple[bytes, Facts]:
-    """Return state and facts of a file. Raises ValueError with the reason if the file is not valid."""
+    """Return a controller's state and its facts from a file's bytes. Raises ValueError with the reason."""
     if len(data) > LONGEST_FILE:
         raise ValueError(f"is longer than {LONGEST_FILE} bytes")
     if not data.startswith(_MAGIC):
@@ -111,7 +114,10 @@ def opened_file(data: bytes, controller: str) -> tuple[bytes, Facts]:
 
 
 def difference(then: Mapping[str, str], now: Mapping[str, str]) -> str:
-    """Return the first difference between facts, as a clause; empty if they are equal."""
+    """Return the first fact that has changed, as a clause:
+
+    `elbow model was MX-64 and is MX-28`; empty if equal.
+    """
     for name in (*now, *(name for name in then if name not in now)):
         was, is_ = then.get(name, "not there"), now.get(name, "not there")
         if was != is_:
@@ -120,7 +126,7 @@ def difference(then: Mapping[str, str], now: Mapping[str, str]) -> str:
 
 
 class Assembly:
-    """Joins pieces to files. Memory is bounded by LONGEST_FILE for each controller.
+    """Joins messages of /kept to files. Memory is bounded by LONGEST_FILE for each controller.
 
     Args:
         codec: Codec of KeptPiece, as the topic was announced.
@@ -131,7 +137,7 @@ class Assembly:
         self._parts: dict[str, tuple[int, list[bytes]]] = {}
 
     def take(self, data: bytes) -> tuple[str, bytes] | None:
-        """Add a message.
+        """Add a message of /kept; return controller and file if it was the last piece of a file.
 
         A piece out of sequence drops its file.
 
@@ -158,5 +164,5 @@ class Assembly:
 
     @property
     def unfinished(self) -> tuple[str, ...]:
-        """Controllers with incomplete files."""
+        """Names of the controllers whose files still lack pieces."""
         return tuple(self._parts)

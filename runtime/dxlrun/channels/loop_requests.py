@@ -13,14 +13,14 @@ class Switch(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
 
 
 class Rate(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
-    """Data of `rate`."""
+    """Data of `rate`: new rate of the loop."""
 
     rate: float
-    """Hz"""
+    """Rate of the loop, Hz."""
 
 
 class Unload(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
-    """Data of `unload`."""
+    """Data of `unload`: name of an inactive controller to remove from the run."""
 
     controller: str
 
@@ -44,38 +44,44 @@ class Parameters(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
 
     controller: str
     values: dict[str, bool | int | float]
-    """Values by dotted name, in SI units."""
+    """New values by dotted name, such as `gains.p`, in SI units."""
 
 
 class TorqueRequest(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
-    """Data of `torque`."""
+    """Data of `torque`: joints whose torque is enabled or disabled."""
 
     joints: tuple[str, ...]
     on: bool
     release: bool = False
-    """Deactivate the controllers that command the joints, in the same cycle. Otherwise, torque off is refused
-    while there are such controllers, and torque on restarts them at the positions of the joints."""
+    """Deactivate the controllers that command the joints, in the same cycle.
+
+    Otherwise, torque off is refused while there are such controllers, and torque on restarts them at the
+    positions of the joints.
+    """
 
 
 class RebootRequest(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
-    """Data of `reboot`."""
+    """Data of `reboot`: joints whose servos restart; `release` as in TorqueRequest."""
 
     joints: tuple[str, ...]
     release: bool = False
 
 
 class RegisterReading(msgspec.Struct, frozen=True, forbid_unknown_fields=True, omit_defaults=True):
-    """Data of `get`."""
+    """Data of `get`: a register (control table item) of a servo to read."""
 
     joint: str
     """Name of a joint, or of one of its servos if it has several."""
     item: str
     row: int | None = None
-    """Row of that servo, after the rows of the joints."""
+    """Index of the servo behind the joints' rows if `joint` names a servo; None: the row of the joint."""
 
 
 class Register(msgspec.Struct, frozen=True, forbid_unknown_fields=True, omit_defaults=True):
-    """Data of `register`. The sender has checked that the item may be written."""
+    """Data of `register`: a register (control table item) of a servo to write.
+
+    It was checked to be writable.
+    """
 
     joint: str
     """Name of a joint, or of one of its servos if it has several."""
@@ -83,4 +89,4 @@ class Register(msgspec.Struct, frozen=True, forbid_unknown_fields=True, omit_def
     value: int
     """Raw value of the register, signed if the item is."""
     row: int | None = None
-    """Row of that servo, after the rows of the joints."""
+    """Index of the servo behind the joints' rows if `joint` names a servo; None: the row of the joint."""

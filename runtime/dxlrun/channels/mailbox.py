@@ -31,10 +31,11 @@ from dxlrun.channels.shared_memory import load, store
 from dxlrun.channels.tagged import Tagged, decode
 
 LONGEST_SET_POINT = 4096
-"""Longest record of a setpoint, bytes."""
+"""Longest record of a command in a stream, bytes."""
 MOST_BYTES = 64 * 1024
-"""Bytes of operations after which a cycle reads no more, so that it reads only one long operation: copying
-256 KiB into the log takes some 2 ms [measured]."""
+"""Bytes of operations after which a cycle reads no more of them, so that it reads only one long one: copying
+256 KiB into the log takes some 2 ms [measured].
+"""
 LONGEST_ANSWER = 2048
 """Longest record of an answer, bytes; long texts of a refusal are cut."""
 ANSWERS_CAPACITY = 256 * 1024
@@ -50,7 +51,7 @@ _FIXED = struct.Struct("=QQ")
 
 
 def create(places: int) -> int:
-    """Create a mailbox with a place for each stream; return its descriptor."""
+    """Create a mailbox with a place for the stream of each controller; return its descriptor."""
     descriptor = shared_memory.create("mailbox", _size(places))
     with mmap.mmap(descriptor, 0) as mapped, memoryview(mapped) as memory:
         _FIXED.pack_into(memory, 0, _MAGIC, places)
@@ -64,7 +65,7 @@ def create(places: int) -> int:
 
 
 def capacity(places: int) -> int:
-    """Return the size of all records in a full mailbox, bytes."""
+    """Return the size of all command records in a full mailbox, bytes."""
     return _CAPACITY + places * _PLACE_CAPACITY
 
 
@@ -73,7 +74,7 @@ def _size(places: int) -> int:
 
 
 def _parts(memory: memoryview, places: int) -> list[memoryview]:
-    """Return the memory of the operations' ring and of each place."""
+    """Split a mailbox's memory into the ring of operations and the ring of each stream."""
     start = _HEADER + _OPERATIONS_SIZE
     ends = [start + index * _PLACE_SIZE for index in range(places + 1)]
     return [memory[_HEADER:start], *(memory[end : end + _PLACE_SIZE] for end in ends[:-1])]
@@ -89,7 +90,7 @@ def _mapped(descriptor: int) -> tuple[memoryview, list[memoryview]]:
 
 
 class MailboxWriter:
-    """Writer of a mailbox, in the gateway."""
+    """Writer of a mailbox, in the gateway process: passes client commands to the loop."""
 
     def __init__(self, descriptor: int) -> None:
         self._words, (operations, *places) = _mapped(descriptor)
@@ -98,11 +99,11 @@ class MailboxWriter:
 
     @property
     def used(self) -> bool:
-        """True if any process has posted an operation."""
+        """True if the gateway, or an earlier one, has ever posted an operation."""
         return self._operations.head > 0
 
     def post(self, command: Command) -> bool:
-        """Append an operation; return False if there is not enough room or the operation is too long."""
+        """Pass a single command to the loop; return False if the mailbox is full or the command too long."""
         payload = encode_command(command)
         lane = self._operations
         untaken = lane.head - lane.taken
@@ -112,7 +113,10 @@ class MailboxWriter:
         return True
 
     def set_point(self, place: int, command: Command) -> bool:
-        """Write the newest setpoint of a stream into its place; return False if it is too long."""
+        """Pass the newest command of a stream to the loop, in place of an unread one.
+
+        Returns False if too long.
+        """
         payload = encode_command(command, LONGEST_SET_POINT)
         if len(payload) > LONGEST_SET_POINT:
             return False
@@ -124,7 +128,7 @@ class MailboxWriter:
 
 
 class Mailbox:
-    """Reader of a mailbox, in the loop. Implements `Inbox`."""
+    """Reader of a mailbox, in the loop: an `Inbox` of client commands."""
 
     def __init__(self, descriptor: int, answers: Appender) -> None:
         self._words, (operations, *places) = _mapped(descriptor)
@@ -156,30 +160,30 @@ class Mailbox:
         return commands
 
     def answer(self, number: int, answer: Answer) -> None:
-        """Answer a command of the gateway. Long texts in a refusal's fields are cut."""
+        """Send the answer to a command to the gateway. Long texts in a refusal's fields are cut."""
         self._answers.append(RecordKind.TAGGED, encode_answer(number, answer, LONGEST_ANSWER))
 
 
 class Answers:
-    """Reader of the ring of answers, in the gateway."""
+    """Reader, in the gateway, of the ring with the loop's answers to commands."""
 
     def __init__(self, descriptor: int) -> None:
         self._ring = RingReader(descriptor)
 
     def new(self) -> list[Answered]:
-        """Return the answers since the last call."""
+        """Return the loop's answers since the last call."""
         found = [_found(one) for one in iter(self._ring.read, None) if isinstance(one, Record)]
         return [one for one in found if isinstance(one, Answered)]
 
 
 def _append_command(record: Record | Gap | None, commands: list[Command]) -> None:
-    """Append the command of a record; drop an invalid record."""
+    """Decode a record and append its command to the list; ignore a gap or invalid record."""
     if isinstance(record, Record) and isinstance(found := _found(record), Command):
         commands.append(found)
 
 
 def _found(record: Record) -> Tagged | None:
-    """Decode a record; return None if it is invalid."""
+    """Decode a tagged record; return None if it is invalid."""
     try:
         return decode(record.payload)
     except ValueError:

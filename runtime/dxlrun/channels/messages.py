@@ -15,7 +15,8 @@ from dxlrun.messages.definition import MessageType
 LONGEST_MESSAGE = 64 * 1024
 """Longest message as CDR, bytes. The state of a trajectory of a hundred joints has a fifth of that."""
 LEAST_CAPACITY = 1 << 20
-"""Smallest ring, bytes: for topics of the runtime, and of controllers that are loaded in the run."""
+"""Smallest ring for topic messages, bytes: for topics of the runtime, and of controllers loaded in the run.
+"""
 MOST_CAPACITY = 64 << 20
 
 
@@ -29,26 +30,26 @@ class PublishedTopic(msgspec.Struct, frozen=True):
 
 
 class OpenedTopic(msgspec.Struct, frozen=True, array_like=True, tag_field="is", tag=3):
-    """Announcement of a topic."""
+    """Record that announces a topic, with its definition, before its messages."""
 
     number: int
     """Number of the topic in its messages, in the order of announcement."""
     before: int
-    """Number of earlier messages with the same topic name."""
+    """Number of messages that earlier topics of the same name had."""
     topic: PublishedTopic
 
 
 class TopicMessage(msgspec.Struct, frozen=True, array_like=True, tag_field="is", tag=4):
-    """A message of a topic."""
+    """Record of one message that the loop published on a topic."""
 
     t_ns: int
     """Wake-up time of the cycle that published it, ns of the run's clock."""
     topic: int
-    """Number of its topic."""
+    """Number of its topic, from the announcement."""
     number: int
     """Number of the message among those with the same topic name, from 1."""
     data: bytes
-    """Payload as CDR."""
+    """Payload of the message, encoded as CDR."""
 
 
 class MessageSink:
@@ -57,15 +58,15 @@ class MessageSink:
     __slots__ = ()
 
     def announce(self, topic: PublishedTopic) -> int:
-        """Announce a topic; return its number."""
+        """Announce a topic before its first message; return the number that its messages use."""
         return 0
 
     def message(self, topic: int, t_ns: int, data: bytes) -> None:
-        """Publish a message of an announced topic, at most LONGEST_MESSAGE bytes."""
+        """Publish a message of an announced topic: its time, ns, and at most LONGEST_MESSAGE bytes."""
 
 
 class MessageRing(MessageSink):
-    """Appends topics and messages to a ring."""
+    """Message sink that appends topics and messages to a ring, for the recorder and clients."""
 
     __slots__ = ("_counts", "_numbers", "_writer")
 
@@ -74,10 +75,10 @@ class MessageRing(MessageSink):
         self._counts: list[int] = []
         """Number of messages so far, by topic number."""
         self._numbers: dict[str, int] = {}
-        """Number of the newest topic of each name."""
+        """Number of the newest topic with each name."""
 
     def announce(self, topic: PublishedTopic) -> int:
-        """Append a topic; return its number. The count of messages of its name continues."""
+        """Append the announcement of a topic; return its number. Messages of its name are counted on."""
         number, before = len(self._counts), self._numbers.get(topic.name)
         count = 0 if before is None else self._counts[before]
         self._counts.append(count)
@@ -87,14 +88,14 @@ class MessageRing(MessageSink):
         return number
 
     def message(self, topic: int, t_ns: int, data: bytes) -> None:
-        """Append a message."""
+        """Append a message of an announced topic, with its count."""
         self._counts[topic] = number = self._counts[topic] + 1
         message = TopicMessage(t_ns, topic, number, data)
         self._writer.append(RecordKind.TAGGED, msgspec.msgpack.encode(message))
 
 
 LONGEST_RECORD = LONGEST_MESSAGE + 64
-"""Longest record, bytes. A definition is far shorter."""
+"""Longest record of a message, bytes. A topic's definition is far shorter."""
 
 
 def usual_message(joints: int) -> int:
@@ -103,6 +104,6 @@ def usual_message(joints: int) -> int:
 
 
 def message_capacity(bytes_per_second: float) -> int:
-    """Return the capacity of a ring for 10 s of messages, bytes, from LEAST_CAPACITY to MOST_CAPACITY."""
+    """Return the size of a ring for 10 s of messages, bytes, from LEAST_CAPACITY to MOST_CAPACITY."""
     wanted = RING_SECONDS * int(bytes_per_second) + 2 * record_size(LONGEST_RECORD)
     return -(-min(max(LEAST_CAPACITY, wanted), MOST_CAPACITY) // 8) * 8

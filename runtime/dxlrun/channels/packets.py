@@ -1,4 +1,4 @@
-"""Packets in the log: all bytes on all buses, with their times."""
+"""Packets: records of all bytes on all buses with their times, from the loop to the log."""
 
 from __future__ import annotations
 
@@ -23,7 +23,7 @@ _WORDS = 4
 _DESK_HEADER = 8 * _WORDS
 _BATCH_AT = 8 * _EARLIER
 DESK_SIZE = _BATCH_AT + LONGEST_BATCH
-"""Bytes of memory for an unfinished batch."""
+"""Size of the memory for an unfinished batch of packets, bytes."""
 BEFORE_FIRST_CYCLE = -1
 """Cycle number of the packets that configure the servos."""
 
@@ -85,14 +85,14 @@ class PacketBatch(PacketLog):
         if self._room <= RECORD_HEADER:
             raise ValueError(f"a desk of {self._room} bytes holds no packet")
         self.commit: Callable[[], object] = self._hand_on
-        """Appends the collected packets as a batch, if there are any."""
+        """Appends the collected packets as one batch to the ring, if there are any."""
         if isinstance(writer, RingWriter):
             self.commit = writer.commits(desk, len(self._batch))
 
     def packet(  # noqa: PLR0917  called for every packet in the loop: positional is quickest
         self, bus: int, kind: int, servo_id: int, first_ns: int, last_ns: int, data: Payload
     ) -> None:
-        """Add sent or received bytes; see `LoggedPacket` for the arguments."""
+        """Add bytes that were sent or received on a bus; see `LoggedPacket` for the arguments."""
         length = len(data)
         start = self._words[_USED]
         body = start + RECORD_HEADER
@@ -106,7 +106,7 @@ class PacketBatch(PacketLog):
 
     @property
     def desk(self) -> Desk:
-        """Memory in which the batch is collected."""
+        """Memory in which the unfinished batch is collected."""
         return Desk(self._buffer, self._words[_USED : _USED + 1])
 
     def _overfull(self, head: tuple[int, int, int, int, int], data: Payload) -> None:
@@ -116,7 +116,10 @@ class PacketBatch(PacketLog):
             self.packet(*head, data[start : start + most])
 
     def wake(self, cycle: int) -> None:
-        """Mark the begin of a cycle. Packets collected before belong to the idle time of an earlier cycle."""
+        """Mark the begin of a cycle.
+
+        Earlier packets of the batch belong to the idle time of the cycle before.
+        """
         words = self._words
         words[_CYCLE] = cycle + 1 << _MARK_BITS | words[_USED]
 
@@ -133,7 +136,7 @@ class PacketBatch(PacketLog):
 
 
 def salvage(desk: memoryview, head: int, writer: Appender) -> int:
-    """Append the unfinished batch of a process that has exited.
+    """Append the unfinished batch that a process left on its desk when it was killed.
 
     The batch is ignored if the process exited after it had appended the batch and before it had cleared the
     desk.
@@ -155,11 +158,11 @@ def salvage(desk: memoryview, head: int, writer: Appender) -> int:
 
 
 BatchedPacket = tuple[int, int, int, int, int, int, bytes]
-"""Cycle, and the fields of LoggedPacket, as a tuple."""
+"""Cycle number and the fields of LoggedPacket (bus, kind, servo ID, two times, data), as a tuple."""
 
 
 def split_packets(payload: Payload) -> list[BatchedPacket]:
-    """Return the packets of a batch as tuples, because the recorder handles thousands a second.
+    """Return the packets of a logged batch as tuples, because the recorder handles thousands a second.
 
     Raises:
         ValueError: The payload is not a batch.
@@ -190,7 +193,7 @@ def split_packets(payload: Payload) -> list[BatchedPacket]:
 
 
 def packet_capacity(period_ns: int, servos: int) -> int:
-    """Return the capacity of a ring, bytes, for 10 s of packets of a robot.
+    """Return the size of the ring for packet batches, bytes, for 10 s of a robot's packets.
 
     A cycle has one instruction and one status packet a servo (Protocol 1.0 reads), goals and one probe, each
     of at most 40 bytes plus the header.

@@ -33,7 +33,7 @@ _MOST_DESCRIPTORS = 64  # in one receive
 
 
 def spare_core(taken: Collection[int]) -> int:
-    """Return the last permitted core of this process that is not taken, or the last one if all are taken."""
+    """Return the last core that this process may use and that is not in `taken`, else the last one."""
     allowed = os.sched_getaffinity(0)
     return max(allowed.difference(taken) or allowed)
 
@@ -71,12 +71,12 @@ def memory_file(name: str, content: bytes = b"") -> int:
 
 
 def whole(descriptor: int) -> bytes:
-    """Return the whole content of an anonymous file, regardless of its offset."""
+    """Return the whole content of an anonymous file (memfd), regardless of its offset."""
     return os.pread(descriptor, os.fstat(descriptor).st_size, 0)
 
 
 class Printed(io.TextIOBase):
-    """Unbuffered text stream with a size limit, so that a plug-in that prints in each cycle fills no memory.
+    """Text stream with a size limit for a process' output, so that printing plug-ins fill no memory.
 
     Args:
         descriptor: Anonymous file with the process' output, see `start_module`; --debug shows it.
@@ -97,7 +97,7 @@ class Printed(io.TextIOBase):
         return self._descriptor
 
     def write(self, text: str, /) -> int:
-        """Write the text as far as the limit allows. Never raises."""
+        """Write the text as far as the limit allows, and ignore the rest. Never raises."""
         data = text.encode(errors="replace")[: self._room]
         self._room -= len(data)
         with suppress(OSError):
@@ -109,37 +109,40 @@ class Printed(io.TextIOBase):
 
 @dataclass(frozen=True, slots=True)
 class RunMemory:
-    """Descriptors of the memory that the processes of a run share; freed when the last process exits."""
+    """Descriptors of the memory files that the processes of a run share, by purpose.
+
+    The memory is freed when the last process exits.
+    """
 
     plan: int
     heartbeat: int
     cycles: int
     packets: int
     desk: int
-    """Packets of the unfinished cycle."""
+    """Memory with the packets of the cycle that is not complete."""
     events: int
     """Ring with the loop's events and executed commands."""
     messages: int
-    """Ring with the loop's topics."""
+    """Ring with the loop's topics and their messages."""
     guardian: int
-    """Ring with packets and events of the guardian."""
+    """Ring with packets and events of the guardian process."""
     result: int
-    """Result of the loop."""
+    """File in which the loop leaves its result."""
     mailbox: int
     answers: int
     grants: int
-    """Grants of the operating system to the loop."""
+    """File with the results of the loop's real-time requests."""
     stderr: int
     kept: int
-    """States that controllers kept in earlier runs."""
+    """File with states that controllers kept in earlier runs."""
     span: int
     """Range of cycles that the log has on the disk, updated by the recorder at each flush."""
     slots: dict[str, tuple[int, ...]] = field(default_factory=dict)
-    """Slots of the processes of each feature, by name of the feature."""
+    """Slots for the samples of source processes, by name of the feature."""
     shafts: int = -1
     """Slot of the shafts of simulated servos, for processes that sense the simulated body; -1: none."""
     simulation: int = -1
-    """Progress of the simulation; -1: no bus is simulated."""
+    """Memory with the progress of simulated servos; -1: no bus is simulated."""
 
     @property
     def of_loop(self) -> tuple[int, ...]:
@@ -162,17 +165,17 @@ class RunMemory:
 
 
 class Failed(msgspec.Struct, frozen=True, tag=True):
-    """A process cannot start or continue."""
+    """Message of any process: it cannot start or continue, for the reason in the sentence."""
 
     sentence: str
 
 
 class Stop(msgspec.Struct, frozen=True, tag=True):
-    """Terminal to guardian: stop the robot by its policy."""
+    """Message from terminal to guardian: stop the robot by its exit policy."""
 
 
 class Cut(msgspec.Struct, frozen=True, tag=True):
-    """Terminal to guardian: kill the loop and cut torque."""
+    """Message from terminal to guardian: kill the loop and cut the servos' torque at once."""
 
 
 class LineLost(msgspec.Struct, frozen=True, tag=True):
@@ -183,13 +186,16 @@ class LineLost(msgspec.Struct, frozen=True, tag=True):
 
 
 class LineReturned(msgspec.Struct, frozen=True, tag=True):
-    """Guardian to loop and terminal: the port of a bus is open again. Its descriptor is attached."""
+    """Message from guardian to loop and terminal: the port of a bus is open again.
+
+    Its descriptor is attached.
+    """
 
     bus: int
 
 
 class Finish(msgspec.Struct, frozen=True, tag=True):
-    """Supervisor to recorder: drain the rings and close the log."""
+    """Message from supervisor to recorder: read all remaining records and close the log."""
 
 
 class LateMetadata(msgspec.Struct, frozen=True, tag=True):
@@ -205,11 +211,11 @@ class LoopRuns(msgspec.Struct, frozen=True, tag=True):
 
 
 class Ready(msgspec.Struct, frozen=True, tag=True):
-    """Recorder to supervisor: the log is open."""
+    """Message from recorder to supervisor: the log file is open."""
 
 
 class Draining(msgspec.Struct, frozen=True, tag=True):
-    """Recorder to supervisor: still draining the rings."""
+    """Message from recorder to supervisor: it still reads the remaining records, so the wait continues."""
 
 
 class Listening(msgspec.Struct, frozen=True, tag=True):
@@ -230,9 +236,9 @@ class MessageChannel(Generic[Received]):
         self._decoder = received
         self._pending = b""
         self.closed = False
-        """True after the end of the stream was read."""
+        """True after the other end was closed and its last message was read."""
         self.descriptors: list[int] = []
-        """Received descriptors."""
+        """Descriptors received with messages so far; the caller removes them."""
 
     def fileno(self) -> int:
         """Return the socket's descriptor for select."""
@@ -251,7 +257,10 @@ class MessageChannel(Generic[Received]):
                 self._socket.sendall(data)
 
     def receive(self) -> list[Received]:
-        """Wait for data, and return the complete messages of one read. Sets `closed` after the last one."""
+        """Wait for data; return the complete messages, possibly none.
+
+        Sets `closed` at the end of the stream.
+        """
         try:
             chunk, descriptors, _, _ = socket.recv_fds(self._socket, 65536, _MOST_DESCRIPTORS)
             self.descriptors += descriptors
@@ -263,14 +272,14 @@ class MessageChannel(Generic[Received]):
         return [self._decoder.decode(line) for line in lines]
 
     def close(self) -> None:
-        """Close this end."""
+        """Close this end of the channel, which the other end detects."""
         self._socket.close()
 
 
 def message_channel(
     received: msgspec.json.Decoder[Received],
 ) -> tuple[MessageChannel[Received], socket.socket]:
-    """Return our end and the child's end of a new channel. Close the child's end here after its start."""
+    """Return this process' end of a new channel and the child's end, to be closed after the child's start."""
     ours, theirs = socket.socketpair()
     return MessageChannel(ours, received), theirs
 
@@ -297,13 +306,13 @@ def begun(job: type[Job], received: msgspec.json.Decoder[Received]) -> tuple[Job
 
 
 def hold_foreign_code(number: signal.Signals) -> None:
-    """Limit the output of plug-ins, and request this signal when the parent exits (prctl(2))."""
+    """Limit the output of plug-ins, and let this process get the signal when its parent exits (prctl(2))."""
     sys.stdout = sys.stderr = Printed(sys.stderr.fileno())
     ctypes.CDLL(None).prctl(_PR_SET_PDEATHSIG, number)
 
 
 class Child(Generic[Received]):
-    """A child process and the channel to it."""
+    """A child process of the run and the message channel to it."""
 
     def __init__(  # noqa: PLR0917  how it is called, what is executed, and what it inherits
         self,
@@ -324,7 +333,7 @@ class Child(Generic[Received]):
         self._messages: deque[Received] = deque()
 
     def message(self, timeout_s: float) -> Received | None:
-        """Return the next message; None if the child has closed its end of the channel.
+        """Wait for the next message of the child; return None if it has closed its end of the channel.
 
         Raises:
             ProcessFault: No message arrived within the timeout.
@@ -337,7 +346,7 @@ class Child(Generic[Received]):
         return self._messages.popleft() if self._messages else None
 
     def poll(self, timeout_s: float, *others: int) -> Received | None:
-        """Return a message that arrives within a timeout, or None.
+        """Return a message of the child that arrives within a timeout, or None.
 
         Args:
             timeout_s: Timeout.
@@ -350,7 +359,7 @@ class Child(Generic[Received]):
         return self._messages.popleft() if self._messages else None
 
     def ready(self) -> Received:
-        """Return the first message.
+        """Wait for the child's first message, which reports that it has started, and return it.
 
         Raises:
             ProcessFault: The child exited, or sent no message in time.
@@ -365,7 +374,10 @@ class Child(Generic[Received]):
         return message
 
     def exited(self, timeout_s: float = 0.0) -> bool:
-        """Return whether the child exits within a timeout. It is not reaped, so its PID is not used again."""
+        """Return whether the child exits within a timeout, s.
+
+        It is not reaped, so its PID is not used again.
+        """
         if self.process.returncode is not None:
             return True
         descriptor = os.pidfd_open(self.process.pid)
@@ -375,7 +387,7 @@ class Child(Generic[Received]):
             os.close(descriptor)
 
     def kill(self) -> None:
-        """Kill the child and the processes of its group, and reap the child."""
+        """Kill the child and its process group, reap the child, and close the channel."""
         if self.process.returncode is None:
             with suppress(ProcessLookupError):
                 os.killpg(self.process.pid, signal.SIGKILL)
@@ -383,7 +395,7 @@ class Child(Generic[Received]):
         self.channel.close()
 
     def end(self) -> None:
-        """Close the channel, which requests an orderly exit; kill the child after a timeout."""
+        """Ask the child to exit by closing the channel, and wait; kill it after a timeout."""
         self.channel.close()
         try:
             self.process.wait(END_TIMEOUT_S)

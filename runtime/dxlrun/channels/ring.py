@@ -34,7 +34,7 @@ from dxlrun.channels.shared_memory import library, load, mapped, store
 from dxlwire.compiled import array_of
 
 RING_SECONDS = 10
-"""Time for which a reader may pause without loss, at the rates for which capacities are computed."""
+"""Time for which a ring's reader may pause without losing records, s; ring sizes are computed for it."""
 
 _HEADER = 64
 _MAGIC = int.from_bytes(b"dxlring2", "little")
@@ -51,7 +51,7 @@ Payload = bytes | bytearray | memoryview
 
 @unique
 class RecordKind(IntEnum):
-    """Kind of a record's payload, with the module that declares its layout."""
+    """Kind of a record's payload; each kind's docstring names the module that declares the layout."""
 
     CYCLE = 1
     """cycle.py"""
@@ -62,14 +62,14 @@ class RecordKind(IntEnum):
 
 
 class Record(NamedTuple):
-    """A record that was read. `kind` is an int, because damaged memory may have any value."""
+    """A record that was read from a ring. `kind` is an int, because damaged memory may have any value."""
 
     kind: int
     payload: bytes
 
 
 class Gap(NamedTuple):
-    """Number of records that a reader missed because they were overwritten or damaged."""
+    """Result of a read that reports how many records were overwritten or damaged before they were read."""
 
     lost: int
 
@@ -79,7 +79,7 @@ class Appender(Protocol):
 
     @property
     def head(self) -> int:
-        """Position of the next record."""
+        """Position at which the next record will be appended."""
         ...
 
     def append(self, kind: RecordKind, payload: Payload) -> int:
@@ -92,7 +92,7 @@ class Appender(Protocol):
 
 
 def record_size(length: int) -> int:
-    """Return the size of a record in a ring for a payload of `length` bytes."""
+    """Return how many bytes a record takes in a ring, with header, for a payload of `length` bytes."""
     return -(-(RECORD_HEADER + length) // _WORD) * _WORD
 
 
@@ -102,7 +102,10 @@ def memory_size(capacity: int, longest: int) -> int:
 
 
 def lay_out(memory: memoryview, capacity: int, longest: int) -> None:
-    """Initialize an empty ring in zeroed memory. Raises ValueError if it cannot hold its longest record."""
+    """Write the header of an empty ring into zeroed memory.
+
+    Raises ValueError if the ring cannot hold its longest record.
+    """
     if longest < 1 or capacity % _WORD or capacity < record_size(longest):
         raise ValueError(f"a ring of {capacity} bytes cannot hold a record of {longest} bytes")
     _FIXED.pack_into(memory, 0, _MAGIC, capacity, longest)
@@ -125,7 +128,7 @@ def create(name: str, capacity: int, longest: int) -> int:
 
 
 class _Ring:
-    """Memory of a ring, from a descriptor or from mapped memory."""
+    """Mapped memory of a ring, given as a descriptor or as memory."""
 
     __slots__ = ("_bytes", "_place", "_words", "longest")
 
@@ -178,7 +181,10 @@ class RingWriter(_Ring):
         return partial(self._append, kind, array_of(memory), len(memory))
 
     def commits(self, desk: memoryview, most: int) -> Callable[[], object]:
-        """Return a function that appends the batch on a desk, of at most `most` bytes; see `PacketBatch`."""
+        """Return a function that appends the batch on a desk to the ring, at most `most` bytes.
+
+        See `PacketBatch`.
+        """
         self._require(most)
         return partial(library().dxl_commit, *self._place, most, array_of(desk))
 
@@ -190,7 +196,10 @@ class RingWriter(_Ring):
 
     @property
     def taken(self) -> int:
-        """Position that a reader has reported with `report_taken`; `append` ignores it."""
+        """Position up to which a reader has reported (`report_taken`) that it has read.
+
+        `append` ignores it.
+        """
         return load(self._words, _TAKEN)
 
 
@@ -222,7 +231,7 @@ class RingReader(_Ring):
 
     @property
     def position(self) -> int:
-        """Position of the next record to read."""
+        """Position of the next record to read, in bytes ever appended."""
         return self._reader[_POSITION]
 
     @position.setter
@@ -231,7 +240,7 @@ class RingReader(_Ring):
 
     @property
     def passed(self) -> int:
-        """Number of records before `position`, according to the last one read; modulo 2^32."""
+        """Number of records ever appended before `position`, modulo 2^32."""
         return self._reader[_PASSED]
 
     def read(self) -> Record | Gap | None:
@@ -240,11 +249,14 @@ class RingReader(_Ring):
         return Gap(self._reader[_LOST]) if found == _GAP else self._record(found)
 
     def newest(self) -> Record | None:
-        """Return the newest record and skip to its end; None if nothing is new or the record is damaged."""
+        """Return the newest record and skip all older ones.
+
+        None if nothing is new or the record is damaged.
+        """
         return self._record(self._newest())
 
     def report_taken(self) -> None:
-        """Publish the reader's position for a queue whose writer must not overwrite unread records."""
+        """Publish this reader's position, for a queue whose writer must not overwrite unread records."""
         store(self._words, _TAKEN, self.position)
 
     def _record(self, length: int) -> Record | None:
@@ -252,14 +264,14 @@ class RingReader(_Ring):
 
 
 class Handover:
-    """Appender that passes each record to the function `take` in the same process, without a ring."""
+    """Appender without a ring: passes each record to the function `take` in the same process."""
 
     __slots__ = ("_take", "head")
 
     def __init__(self, take: Callable[[RecordKind, Payload], None]) -> None:
         self._take = take
         self.head = 0
-        """Number of records so far."""
+        """Number of records passed so far."""
 
     def append(self, kind: RecordKind, payload: Payload) -> int:
         """Pass a record to the function. The payload is valid only during the call."""

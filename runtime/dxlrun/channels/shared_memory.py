@@ -18,12 +18,11 @@ SOURCE = Path(__file__).with_name("shared_memory.c")
 
 @cache
 def library() -> ctypes.PyDLL:
-    """Return the compiled functions.
+    """Load the compiled C functions of `shared_memory.c`, once a process.
 
     They are called without releasing the GIL, because they take less time than a release.
 
-    Raises:
-        NotCompiled: The object was not built, or was built from another source.
+    Raises: NotCompiled: The object was not built, or was built from another source.
     """
     found = load_compiled(SOURCE, ctypes.PyDLL)
     address, word, number = ctypes.c_void_p, ctypes.c_uint64, ctypes.c_int64
@@ -72,5 +71,5 @@ def create(name: str, size: int) -> int:
 
 
 def mapped(descriptor: int, flags: int = 0) -> memoryview:
-    """Map shared memory; `flags` are additional flags of mmap(2)."""
+    """Map shared memory for reading and writing; `flags` are additional flags of mmap(2)."""
     return memoryview(mmap.mmap(descriptor, 0, flags=mmap.MAP_SHARED | flags))

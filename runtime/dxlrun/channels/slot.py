@@ -24,7 +24,7 @@ from dxlrun.channels.shared_memory import load, store
 
 Floats = NDArray[np.float64]
 LONGEST_TEXT = 480
-"""Bytes; longer texts are cut."""
+"""Longest text that a slot holds, bytes; longer texts are cut."""
 
 _SAMPLES, _STATE, _TEXTS = range(3)
 _HEADER_WORDS = 3
@@ -35,7 +35,7 @@ _LAST = (1 << 64) - 1
 
 @unique
 class SlotState(IntEnum):
-    """State of the writer."""
+    """State of the source process that writes a slot."""
 
     STARTING = 0
     OPEN = 1
@@ -43,21 +43,21 @@ class SlotState(IntEnum):
     FAILED = 2
     """The device is not available; the writer tries again."""
     ENDED = 3
-    """The writer's process has exited."""
+    """The source's process has exited."""
 
 
 def size(values: int) -> int:
-    """Return the size of a slot for samples with this number of values, bytes."""
+    """Return the size of a slot, bytes, for samples with this number of values."""
     return _WORD * (_HEADER_WORDS + 2 * (values + 3) + _TEXT_WORDS) + LONGEST_TEXT
 
 
 def create(name: str, values: int) -> int:
-    """Return the descriptor of a new slot."""
+    """Create a slot in shared memory for samples with this number of values; return its descriptor."""
     return shared_memory.create(name, size(values))
 
 
 def private(values: int) -> memoryview:
-    """Return a new slot in private memory."""
+    """Create a slot in private memory, for a reader in the same process."""
     return memoryview(bytearray(size(values)))
 
 
@@ -89,7 +89,7 @@ class SlotWriter(_Slot):
         self._bytes = memoryview(self._sample.data).cast("B")[:-_WORD]
 
     def write(self, t_ns: int, values: Floats) -> None:
-        """Write a sample that was measured at `t_ns`. Never waits."""
+        """Write a sample, measured at `t_ns` of the run's clock, in place of the older one. Never waits."""
         number = (self._words[_SAMPLES] + 1 & _LAST) or 1
         sample = self._sample
         sample[0], sample[1] = number, max(0, t_ns)
@@ -99,7 +99,7 @@ class SlotWriter(_Slot):
         store(self._words, _SAMPLES, number)  # release: the sample becomes visible before its number
 
     def say(self, state: SlotState, text: str) -> None:
-        """Replace the state and the text of the writer."""
+        """Publish the writer's state and a text for an event, in place of the previous ones."""
         data = text.encode(errors="replace")[:LONGEST_TEXT]
         words, number = self._text_words, (self._words[_TEXTS] + 1 & _LAST) or 1
         words[0], words[1], words[2] = number, len(data), crc32(data)
@@ -123,12 +123,12 @@ class SlotReader(_Slot):
 
     @property
     def samples(self) -> int:
-        """Number of samples written."""
+        """Number of samples that were ever written."""
         return self._words[_SAMPLES]
 
     @property
     def state(self) -> SlotState:
-        """State of the writer; FAILED if the memory is damaged."""
+        """State of the source that writes the slot; FAILED if the memory is damaged."""
         word = self._words[_STATE]
         return SlotState(word) if word < len(SlotState) else SlotState.FAILED
 
@@ -144,7 +144,7 @@ class SlotReader(_Slot):
         return sample.item(1)
 
     def hear(self) -> str:
-        """Return the newest text if it was not returned before, or an empty string."""
+        """Return the writer's newest text if it was not returned before, else an empty string."""
         number, words = load(self._words, _TEXTS), self._text_words
         if number == self._spoken:
             return ""

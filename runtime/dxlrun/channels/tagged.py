@@ -19,4 +19,4 @@ Tagged: TypeAlias = Event | TakenCommand | OpenedTopic | TopicMessage | Command 
 
 _DECODER: msgspec.msgpack.Decoder[Tagged] = msgspec.msgpack.Decoder(Tagged)
 decode = _DECODER.decode
-"""Decode the payload of a record of kind TAGGED. Raises ValueError for other data."""
+"""Decode the payload of a record of kind TAGGED to its type. Raises ValueError for other data."""
