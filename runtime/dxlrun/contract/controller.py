@@ -84,7 +84,7 @@ class Interfaces(msgspec.Struct, frozen=True):
 
     @property
     def source_commands(self) -> tuple[str, ...]:
-        """Alias of `device_commands`: commands of devices and other sources."""
+        """Alias of `device_commands`: commands of devices that the controller claims."""
         return self.device_commands
 
 
@@ -114,13 +114,13 @@ class RobotModel(msgspec.Struct, frozen=True):
 
 
 class Mismatch(msgspec.Struct, frozen=True):
-    """A mismatch between a robot and a controller."""
+    """A reason why a robot does not suit a controller, with a fix."""
 
     what: str
     """Problem, which follows the controller's name in a message: `needs the robot's URDF`."""
     fix: str
     at: str = ""
-    """Joint, or key of the controller: `payload.link`; empty: the controller itself."""
+    """Joint, or key of the controller's entry, such as `payload.link`; empty: the controller itself."""
 
 
 class SpeedPeak(msgspec.Struct, frozen=True):
@@ -177,7 +177,7 @@ class Goal(Protocol):
 
     @property
     def kind(self) -> str:
-        """Kind of its command."""
+        """Kind of the command that started the goal, a name in `Controller.Goals`."""
 
     def feedback(self, progress: float, error: float = float("nan")) -> None:
         """Report progress. It may be called in each cycle: the runtime publishes at a lower rate.
@@ -285,7 +285,7 @@ class Context(msgspec.Struct, frozen=True):
     say: Callable[[str], None]
     """Log a sentence as an event (CONTROLLER_SAYS). Not for use in every cycle."""
     warn: Callable[[str], None]
-    """Log a sentence as a warning."""
+    """Log a sentence as a warning event. Not for use in every cycle."""
     publish: Publish
     references: Commands
     """Commands of the controllers that are `into` this one, in the order of its joints; NaN = not commanded.
@@ -294,8 +294,9 @@ class Context(msgspec.Struct, frozen=True):
     are updated first.
     """
     reads: Floats
-    """Values of `Interfaces.reads`, shape (reads,), gathered before each update and before `on_activate`; NaN
-    until first known."""
+    """Values of the interfaces in `Interfaces.reads`, in that order, gathered before each update and before
+    `on_activate`; NaN until first known.
+    """
     read_names: tuple[str, ...] = ()
     """Names of the interfaces in `reads`."""
     into: tuple[str, ...] = ()
@@ -364,15 +365,15 @@ class Controller(ABC, Generic[P]):
     Parameters: ClassVar[type[ParametersModel]] = ParametersModel
     """Model of the controller's keys in the robot file (except type, active, rate and fallback)."""
     Commands: ClassVar[Mapping[str, type[CommandModel]]] = {}
-    """Typed commands that it accepts, by kind."""
+    """Models of the commands that the controller accepts, by kind."""
     Goals: ClassVar[frozenset[str]] = frozenset()
-    """Kinds of commands that are goals: passed to `on_goal`, cancellable, with an outcome."""
+    """Kinds in `Commands` that are goals: passed to `on_goal`, cancellable, with an outcome."""
     Topics: ClassVar[Mapping[str, type]] = {}
-    """Types of the messages on its own topics, by topic: dataclasses, see dxlrun.messages."""
+    """Message classes of the controller's own topics, by topic name: dataclasses, see dxlrun.messages."""
     publishes: ClassVar[tuple[str, ...]] = ()
     """Topics of the log that are written in the cycles that it marks: `/joint_states`."""
     keeps: ClassVar[bool] = False
-    """True if it calls `Context.keep`."""
+    """True if the controller keeps a state from run to run with `Context.keep`."""
 
     def __init__(self, parameters: P) -> None:
         self.parameters = parameters
@@ -400,7 +401,10 @@ class Controller(ABC, Generic[P]):
 
     @classmethod
     def topics(cls, parameters: P) -> Mapping[str, type]:
-        """Return its own topics. Override it if they depend on the parameters; the default is `Topics`."""
+        """Return message classes of the controller's topics by name.
+
+        Override if they depend on parameters.
+        """
         return cls.Topics
 
     @classmethod
@@ -440,7 +444,7 @@ class Controller(ABC, Generic[P]):
         self.context = context
 
     def on_activate(self, time_ns: int) -> None:
-        """Take over the claimed joints. `context.states` and `context.goals` are current."""
+        """Take over the claimed joints at `time_ns`. `context.states` and `context.goals` are current."""
 
     def on_restart(self, time_ns: int) -> None:
         """Start again from the measured positions, after a joint got torque or was moved in a pause.

@@ -23,8 +23,11 @@ if TYPE_CHECKING:
     from dxlrun.channels.cycle import CycleLayout
 
 TOLERATED_SKIPS = 0.1
-"""Default of the robot file. A loop at 50 Hz with simulated servos, without real-time rights and with five
-busy programs on two cores, skipped 2.6 % [measured]."""
+"""Default share of skipped periods up to which a run counts as good.
+
+A loop at 50 Hz with simulated servos, without real-time rights and with five busy programs on two cores,
+skipped 2.6 % [measured].
+"""
 
 Policy = Literal["other", "fifo", "round_robin"]
 OverrunPolicy = Literal["skip", "catch_up", "stop"]
@@ -37,7 +40,7 @@ GOAL_TOLERANCES: Mapping[JointUnit, float] = {ROTARY: math.radians(5.0), LINEAR:
 """Default tolerance of a goal, rad or m. The same number is the default speed below which a joint is at rest,
 rad/s or m/s."""
 SETTLE_NS = 1_000_000_000
-"""Default settling time: a goal may still be reached so long after the end of its motion."""
+"""Default time after the end of a motion in which joints may still reach the goal, ns."""
 UNLIMITED = 1e300
 """Replaces an infinite tolerance, because JSON does not have infinity."""
 
@@ -64,7 +67,7 @@ LimitedInterface: TypeAlias = Literal["velocity", "effort", "pwm"]
 
 
 class ServoLimit(msgspec.Struct, frozen=True):
-    """A register that limits the goals of a joint's servo, read at start-up or when the servo returned."""
+    """Limit in a servo's register that applies to goals, read at start-up or when the servo returned."""
 
     interface: LimitedInterface
     value: float  # Highest magnitude of a goal: rad/s or m/s, the unit of the effort, share of the voltage
@@ -108,7 +111,7 @@ class JointPlan(msgspec.Struct, frozen=True):
     """Settling time of goals after the end of a motion."""
     wrap: bool = False  # A continuous joint whose position is the same after a full turn
     servo_limits: tuple[ServoLimit, ...] = ()
-    """Registers of its servos that limit goals; empty in the plan, because they are read at start-up."""
+    """Limits in registers of its servos; empty in the plan, because they are read at start-up."""
     keys: dict[str, object] = {}
     """Keys of features with their values in SI units; `JointKey.of` returns a value with its type."""
 
@@ -119,7 +122,7 @@ class JointPlan(msgspec.Struct, frozen=True):
 
     @property
     def highest_speed(self) -> float:
-        """Minimum of the file's limit, the servo's top speed and its registers, rad/s or m/s."""
+        """Highest speed of goals: minimum of file's limit, servo's top speed and registers, rad/s or m/s."""
         return self._highest("velocity")
 
     @property
@@ -134,7 +137,7 @@ class JointPlan(msgspec.Struct, frozen=True):
 
     @property
     def highest_effort(self) -> float:
-        """Minimum of the file's limit, the servo's highest goal and its registers; unit as `effort`."""
+        """Highest effort of goals: minimum of file's limit, servo's limit and registers; unit as `effort`."""
         return self._highest("effort")
 
     @property
@@ -144,22 +147,25 @@ class JointPlan(msgspec.Struct, frozen=True):
 
     @property
     def immovable(self) -> str:
-        """Sentence about a register that prevents motion to a position; empty: the joint can move."""
+        """Sentence about a register whose limit of 0 prevents motion to a position.
+
+        Empty: the joint can move.
+        """
         own = self.find_servo_limit("velocity")
         return "" if own is None or own.value else f"{self.label} cannot move, as its servo has {own.text}"
 
     def find_servo_limit(self, interface: LimitedInterface) -> ServoLimit | None:
-        """Return the register that is tighter than the file and the manual, or None."""
+        """Return the servo's register that is a tighter limit than file and manual, or None."""
         own = next((one for one in self.servo_limits if one.interface == interface), None)
         return None if own is None or own.value >= self._planned_limit(interface) else own
 
     @property
     def binding_servo_limits(self) -> tuple[ServoLimit, ...]:
-        """Registers that are tighter than the file and the manual."""
+        """Registers of the servos that limit goals more tightly than file and manual."""
         return tuple(own for own in self.servo_limits if self.find_servo_limit(own.interface))
 
     def exceeds_file_limit(self, interface: LimitedInterface) -> bool:
-        """Return whether the file has a limit and a register of the servo is tighter."""
+        """Return whether a servo's register is tighter than a limit that the robot file sets."""
         given = self.velocity != self.top_speed and not self.coupled if interface == "velocity" else True
         limits = {"velocity": self.velocity, "effort": self.effort, "pwm": None}
         return given and limits[interface] is not None and self.find_servo_limit(interface) is not None
@@ -183,7 +189,7 @@ class JointPlan(msgspec.Struct, frozen=True):
 
     @property
     def goal_tolerance(self) -> float:
-        """Tolerance of the joint's goals, rad or m."""
+        """Distance from a goal within which the joint has reached it, rad or m."""
         return GOAL_TOLERANCES[self.unit] if self.tolerance is None else self.tolerance
 
     @property
@@ -242,7 +248,7 @@ class JointValues:
     limits: dict[str, tuple[float, float]]
     """Lowest and highest position of each joint with limits."""
     speeds: dict[str, float | None]
-    """Highest speed of each joint; null: no limit."""
+    """Highest speed of each joint, rad/s or m/s; null: no limit."""
     joint_keys: dict[str, dict[str, object]]
     """Values of the keys of features in the robot file, by key and joint."""
 
@@ -266,7 +272,7 @@ def _or_inf(limit: float | None) -> float:
 
 
 class SourcePlan(msgspec.Struct, frozen=True):
-    """A source of states or commands that is not a joint: an entry of a feature's section."""
+    """A device or sensor: an entry of a feature's section that has states or commands."""
 
     name: str
     kind: str  # Noun for messages: `device`
@@ -282,7 +288,7 @@ class SourcePlan(msgspec.Struct, frozen=True):
 
 
 class ControllerPlan(msgspec.Struct, frozen=True):
-    """One controller of the robot file."""
+    """Compiled entry of one controller in the robot file."""
 
     name: str
     type: str
@@ -310,7 +316,7 @@ class ControllerPlan(msgspec.Struct, frozen=True):
 
     @property
     def commands_servos(self) -> bool:
-        """True if it claims servos instead of references."""
+        """True if the controller commands servos, not references of other controllers."""
         return bool(self.command) and not self.into
 
     def split_group(self, joints: Iterable[JointPlan]) -> tuple[str, tuple[str, ...]] | None:
@@ -346,7 +352,7 @@ class ScheduledGoal(msgspec.Struct, frozen=True):
 
 
 class ScheduledCommand(msgspec.Struct, frozen=True):
-    """A prepared command for a controller with its time."""
+    """A command of a motion file for a controller, prepared, with the time at which it is due."""
 
     at_ns: int  # Time since the loop's first deadline
     controller: str
@@ -360,7 +366,7 @@ class ScheduledCommand(msgspec.Struct, frozen=True):
 
 
 class LoopPlan(msgspec.Struct, frozen=True):
-    """Data of the loop, without the hardware."""
+    """Compiled data of a robot that the loop needs, without buses and servos."""
 
     period_ns: int
     scheduler: SchedulerPlan
@@ -377,13 +383,13 @@ class LoopPlan(msgspec.Struct, frozen=True):
     sources: tuple[SourcePlan, ...] = ()  # Devices, then sensors
     urdf: str | None = None  # Text of the robot's URDF; None: the robot file does not name one
     features: tuple[Feature, ...] = FEATURES
-    """Features that take part in the run."""
+    """Features of the robot file whose code takes part in the run."""
     feature_plans: dict[str, bytes] = {}
-    """Compiled data of features, by name of the feature."""
+    """Encoded plan of each feature, by name of the feature."""
 
     @property
     def origins(self) -> frozenset[str]:
-        """Origins of the commands of motion files."""
+        """Positions in motion files from which the plan's commands come."""
         return frozenset(command.origin for command in self.commands)
 
     @property
@@ -393,7 +399,7 @@ class LoopPlan(msgspec.Struct, frozen=True):
 
     @property
     def layout(self) -> CycleLayout:
-        """Layout of the cycle records."""
+        """Layout of the cycle records, from the names of joints, controllers and sources."""
         from dxlrun.channels.cycle import CycleLayout  # not above: the doctor reads plans without numpy
 
         return CycleLayout(

@@ -11,7 +11,7 @@ import msgspec
 from dxlrun.errors import counted
 
 SAMPLE_PERIOD_NS = 1_000_000_000
-"""Time between two samples."""
+"""Time between two samples of the machine's load, ns."""
 _SILENT_NS = 2 * SAMPLE_PERIOD_NS
 """Interval after which at least one sample is missing. The sampler has ordinary priority, unlike the loop."""
 _IDLE_SHARE = 0.05  # /proc/stat counts in steps of 10 ms; a core with less idle time counts as busy
@@ -25,7 +25,7 @@ _MOST_PART = 0.5
 
 
 class LoadSample(msgspec.Struct, frozen=True):
-    """Load of the cores in an interval, ns of the run's clock; NaN: the system does not report it."""
+    """Load of the machine in an interval, sampled by the recorder; NaN: the system does not report it."""
 
     begin_ns: int
     end_ns: int
@@ -48,7 +48,7 @@ class MachineLoad(msgspec.Struct, frozen=True):
     seconds: float = 0.0
     """Length of the interval, as far as there are samples or long gaps between them."""
     busy_s: float = 0.0
-    """Time with any of the following conditions."""
+    """Time in which at least one of the following conditions was true, s."""
     no_idle_core_s: float = 0.0
     waited_s: float = 0.0
     """Time of samples in which the loop was ready to run without a core for more than 1 %."""
@@ -59,7 +59,7 @@ class MachineLoad(msgspec.Struct, frozen=True):
 
     @property
     def share(self) -> float:
-        """Share of the interval in which the machine was busy; 0 unless `too_busy`."""
+        """Share of the interval in which the machine was busy, 0..1; 0 unless `too_busy`."""
         return self.busy_s / self.seconds if self.too_busy else 0.0
 
     @property
@@ -70,7 +70,7 @@ class MachineLoad(msgspec.Struct, frozen=True):
 
     @property
     def text(self) -> str:
-        """Observations as a clause; empty if the machine was never busy."""
+        """Clause that says how long the machine was busy, and how; empty if it never was."""
         observed = (
             (self.no_idle_core_s, "no core was idle in"),
             (self.waited_s, "the loop waited for a core in"),
@@ -89,7 +89,7 @@ class SimulationWait(msgspec.Struct, frozen=True):
 
     @property
     def text(self) -> str:
-        """Observation as a clause; empty without a wait."""
+        """Clause that says how often and how long the loop waited; empty without a wait."""
         if not self.times:
             return ""
         times = counted(self.times, "time", "times")
@@ -103,13 +103,13 @@ NO_WAIT = SimulationWait()
 
 
 def describe_busy_machine(load: MachineLoad, wait: SimulationWait = NO_WAIT) -> str:
-    """Return a sentence about a machine that was too busy; empty if it was not."""
+    """Return a sentence if the machine was too busy or the simulation stalled; else an empty string."""
     observed = ", ".join(filter(None, (load.text if load.too_busy else "", wait.text)))
     return f"The machine was too busy: {observed}." if observed else ""
 
 
 class LoadMeter:
-    """Accumulates the samples of one interval, in constant memory.
+    """Sums up the load samples of one interval, in constant memory.
 
     Args:
         begin_ns: Begin of the interval, ns of the run's clock.
@@ -146,7 +146,7 @@ class LoadMeter:
             self._ns[name] += is_true * (end_ns - begin_ns)
 
     def load(self) -> MachineLoad:
-        """Return the load of the interval.
+        """Return the sums of the samples so far.
 
         Gaps of 2 s or longer before the first and after the last sample count as busy. An interval without
         samples has no load.

@@ -25,7 +25,7 @@ class CouplingPlan(msgspec.Struct, frozen=True):
 
     @property
     def own(self) -> bool:
-        """True for a single servo that moves a single joint."""
+        """True for the trivial coupling of one servo with one joint."""
         return not self.name
 
 
@@ -41,7 +41,7 @@ class MechanicsPlan(msgspec.Struct, frozen=True):
 
     @property
     def coupled(self) -> bool:
-        """True if any joints share servos or have several."""
+        """True if any joints of the robot share servos or have several."""
         return bool(self.couplings)
 
     def mechanisms(self, joints: int) -> tuple[CouplingPlan, ...]:
@@ -65,7 +65,7 @@ class MechanicsPlan(msgspec.Struct, frozen=True):
         return self.direct if self.coupled else tuple((row, row) for row in range(joints))
 
     def moving(self, joint: int) -> list[CouplingPlan]:
-        """Return the couplings of a joint, by its row; empty if it has its own servo."""
+        """Return the couplings that include a joint, by its row; empty if it has its own servo."""
         return [one for one in self.couplings if joint in one.joints]
 
     def servo_rows(self, joint: int) -> tuple[int, ...]:

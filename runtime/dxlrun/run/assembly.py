@@ -1,4 +1,4 @@
-"""Assembly: builds hardware, manager, gate and loop from a plan, ports and a clock, for both clocks."""
+"""Assembly: builds hardware, controllers, gate and loop of a run from a plan, for real and virtual time."""
 
 from __future__ import annotations
 
@@ -36,23 +36,26 @@ from dxlwire.port.ports import Ports
 
 @dataclass(slots=True)
 class Sinks:
-    """Destinations of a run's records: rings, a log, or none."""
+    """Destinations of a run's records (cycles, packets, events, commands, messages): rings or a log.
+
+    Implements the loop's CycleSink.
+    """
 
     cycles: Appender
     packets: PacketLog
-    """Receives every packet on a line."""
+    """Receives every packet that is sent or received on a bus."""
     events: EventSink
     commands: CommandSink
     progress: Callable[[int, int], None] = lambda cycles, skipped: None
     """Called after each cycle with the number of cycles and of skipped periods."""
     messages: MessageSink = field(default_factory=MessageSink)
     epoch_offset_ns: int = 0
-    """Wall time minus the run's clock, for the time stamps of messages."""
+    """Wall time minus the run's clock, ns, for the time stamps of messages."""
     wake: Callable[[int], None] = field(init=False)
-    """Mark the beginning of a cycle: later packets belong to its period."""
+    """Marks the beginning of a cycle by number: later packets belong to its period."""
     _commit: Callable[[], object] = field(init=False)
     _keep: Callable[[], object] = field(init=False)
-    """Records the cycle from memory that is reused in each cycle."""
+    """Appends the cycle record from memory that is reused in each cycle."""
     ran: int = field(default=0, init=False)
     skipped: int = field(default=0, init=False)
 
@@ -61,14 +64,14 @@ class Sinks:
         self.wake = self.packets.wake
 
     def begin(self, record: CycleRecord) -> None:
-        """Record the packets of the start-up, and the state in which the controllers are activated."""
+        """Record the packets of the start-up, and the cycle record in which controllers are activated."""
         self._commit = self.packets.commit
         self._keep = self.cycles.repeat(RecordKind.CYCLE, record.raw)
         self._commit()
         self._keep()
 
     def append(self, record: CycleRecord) -> None:
-        """Record a finished cycle and its packets."""
+        """Append a finished cycle's record and its packets, and report the progress."""
         self._commit()
         self._keep()
         self.ran += 1
@@ -78,17 +81,17 @@ class Sinks:
 
 @dataclass(slots=True)
 class AssembledRobot:
-    """A robot that is ready to start."""
+    """A robot whose controllers are configured and whose hardware has not been started."""
 
     hardware: Hardware
     manager: Manager
     loop: Loop
     record: CycleRecord
     failures: tuple[str, ...] = ()
-    """Servos and devices that could not be switched off at the end, one sentence each."""
+    """Sentences about servos and devices that could not be switched off at the end."""
 
     def run(self, enter: Callable[[Phase], None] = lambda _: None) -> LoopResult:
-        """Set up, run the loop to its end, and switch torque off unless a policy holds.
+        """Start the hardware, run the loop to its end, and disable torque unless the policy holds.
 
         Args:
             enter: Called with each phase that begins.
@@ -113,7 +116,7 @@ class AssembledRobot:
 
 
 class LoopHost(msgspec.Struct, frozen=True, kw_only=True):
-    """Environment of a loop: lines, time, log, clients, and the processes that watch the loop."""
+    """Environment of a loop: ports, clock, log, client commands, and the supervision by other processes."""
 
     ports: Ports
     clock: Clock
@@ -121,9 +124,9 @@ class LoopHost(msgspec.Struct, frozen=True, kw_only=True):
     supervision: Supervision = msgspec.field(default_factory=Unsupervised)
     inbox: Inbox = msgspec.field(default_factory=NoInbox)
     activity: Activity = msgspec.field(default_factory=Activity)
-    """Record of the controller whose code is running."""
+    """Calls the controllers' methods, and publishes which one is running."""
     slots: Slots = msgspec.field(default_factory=dict)
-    """Shared memory that processes of features write."""
+    """Shared memory into which source processes of features write their samples."""
 
 
 def assemble(
@@ -134,7 +137,7 @@ def assemble(
     take_over: bool = False,
     kept: KeptStates | None = None,
 ) -> AssembledRobot:
-    """Build everything between the ports and the log. Controllers are configured; no packet is sent.
+    """Build hardware, controllers and loop of a robot. Controllers are configured; no packet is sent.
 
     Args:
         plan: The robot.

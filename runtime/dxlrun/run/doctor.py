@@ -34,9 +34,9 @@ from dxlwire.port.serial_open import is_rate, open_serial
 NEEDED = ("memfd_create", "pidfd_open", "sched_setscheduler")
 """Functions of `os` that a run needs; Linux has all of them since 5.3."""
 NEEDED_PRIORITY = 32
-"""Default priority of the loop in the robot file, plus one for the guardian."""
+"""Real-time priority that a run needs: default of the loop in the robot file, plus one for the guardian."""
 RATES = (57_600, 115_200, 1_000_000, 2_000_000, 3_000_000, 4_000_000)
-"""Rates that are tried at each port, bit/s: those of servos (e-Manual, Baud Rate)."""
+"""Baud rates that are tried at each port, bit/s: those of servos (e-Manual, Baud Rate)."""
 FAST_MS = 1
 """Shortest latency timer of an FTDI adapter, ms (FTDI application note AN232B-04)."""
 
@@ -64,7 +64,7 @@ _TIMERS = "sys/bus/usb-serial/devices/*/latency_timer"
 _GOVERNORS = "sys/devices/system/cpu/cpu[0-9]*/cpufreq/scaling_governor"
 
 State = Literal["good", "worse", "missing"]
-"""worse: robots run, but less smoothly than possible; missing: no robot can run."""
+"""Result of a check. worse: robots run, but less smoothly than possible; missing: no robot can run."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -74,16 +74,16 @@ class Finding:
     what: str
     state: State
     found: str
-    """State of this machine."""
+    """Observed state of this machine, as text."""
     why: str
-    """Consequence for a robot."""
+    """Reason why the state matters to a robot, as text."""
     fix: str = ""
-    """Command or step that fixes the problem; empty when there is none."""
+    """Command or step that fixes the problem; empty if there is no problem or no fix."""
 
 
 @dataclass(frozen=True, slots=True)
 class _Check:
-    """Subject of a check and its consequence for a robot; makes the findings."""
+    """Subject of a check and why it matters to a robot; its methods make a Finding with the state."""
 
     what: str
     why: str
@@ -99,7 +99,7 @@ class _Check:
 
 
 def may_schedule() -> bool:
-    """Return whether the kernel grants a real-time policy, by requesting it for a moment.
+    """Return whether the kernel grants real-time scheduling, by requesting it for a moment.
 
     A container's control group may have no real-time share even when the limits allow the policy.
     """
@@ -112,7 +112,10 @@ def may_schedule() -> bool:
 
 
 def set_rates(port: Path) -> Mapping[int, int]:
-    """Set servo baud rates at a free port; return the rate that the driver chose for each, bit/s."""
+    """Set each of `RATES` at a free port; return the rate that the driver then has for each, bit/s.
+
+    Empty if the port cannot be opened.
+    """
     found: dict[int, int] = {}
     with suppress(OSError), open_serial(str(port), RATES[0]) as line:
         for rate in RATES:
@@ -130,13 +133,13 @@ class Machine:
     missing_calls: tuple[str, ...] = ()
     user: str = "nobody"
     cores: int = 1
-    """Number of cores on which this process may run."""
+    """Number of processor cores on which this process may run."""
     capabilities: tuple[str, ...] = ()
-    """Relevant capabilities: CAP_SYS_NICE, CAP_IPC_LOCK."""
+    """Names of the Linux capabilities CAP_SYS_NICE and CAP_IPC_LOCK that this process has."""
     highest_priority: int = 0
-    """Highest real-time priority; 99 with the capability, 0 without a permission."""
+    """Highest real-time priority that may be requested; 99 with the capability, 0 if none."""
     lockable: int = 0
-    """Lockable memory, bytes; UNLIMITED with the capability."""
+    """Memory that may be locked, bytes; UNLIMITED with the capability."""
     compiled: str = ""
     """Reason why the compiled exchange and gate cannot be used; empty when they can."""
     may_schedule: Callable[[], bool] = field(default=may_schedule)
@@ -147,7 +150,7 @@ class Machine:
 
     @classmethod
     def this(cls) -> Machine:
-        """Return the present machine; never raises."""
+        """Return the properties of the machine and user that run this process; never raises."""
         missing = tuple(name for name in NEEDED if not hasattr(os, name))
         if missing or not sys.platform.startswith("linux"):
             return cls(missing_calls=missing)
@@ -162,7 +165,7 @@ class Machine:
 
     @property
     def container(self) -> bool:
-        """True in a container, whose rights are set at its start, and whose kernel is the host's."""
+        """True in a container. Its rights are set at its start, and its kernel is the host's."""
         return any((self.root / name).exists() for name in (".dockerenv", "run/.containerenv"))
 
     def read(self, path: str) -> str | None:
@@ -182,7 +185,10 @@ class Machine:
 
 
 def diagnose(machine: Machine) -> tuple[Finding, ...]:
-    """Return the findings in the order in which to fix them; only the first when no robot can run here."""
+    """Check a machine; return the findings in the order in which to fix them.
+
+    If no robot can run here, only that finding is returned.
+    """
     first = _system(machine)
     if first.state == "missing":
         return (first,)

@@ -49,15 +49,19 @@ from dxlwire.port.reopening import KeptLines, Wanted
 _NEVER = 1 << 62
 
 LEAST_NAP_NS, LONGEST_NAP_NS = 5_000_000, 10_000_000
-"""Limits of the interval at which the guardian checks the loop, else the loop's period. A check takes
-about 60 us from a loop on the same core."""
+"""Shortest and longest interval at which the guardian checks the loop; the loop's period if in between.
+
+A check takes about 60 us from a loop on the same core.
+"""
 LONGEST_LOOK_NS = 20_000_000
-"""Upper limit of the time that one check adds to a standstill: while the guardian was not running, the
-loop may not have run either."""
+"""Upper limit of the time, ns, that one check adds to a standstill of the loop: while the guardian was not
+running, the loop may not have run either.
+"""
 
 Ending = Literal["done", "unused", "died", "hung", "late", "cut"]
-"""done: the loop ended normally; unused: before a byte was sent; after all others, the guardian makes the
-robot safe."""
+"""Kind of a loop's end. done: it ended normally; unused: before a byte was sent; after all others, the
+guardian makes the robot safe.
+"""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -67,72 +71,72 @@ class GuardianPlan:
     buses: tuple[BusPlan, ...]
     features: tuple[Feature, ...]
     feature_plans: Mapping[str, bytes]
-    """`Contribution.plan` by feature."""
+    """Encoded plan (`Contribution.plan`) of each feature, by name of the feature."""
     period_ns: int
     exit_timeout_ns: int
-    """Timeout of the loop after a stop request."""
+    """Time after a stop request after which a loop that still runs is killed."""
     priority: int
     """Real-time priority of the guardian; 0: none."""
     lock_memory: bool
     last: Last
-    """State in which the robot is left when the loop exits in the middle of a run."""
+    """State, limp or hold, in which the robot is left if the loop dies in the middle of a run."""
 
 
 @dataclass(frozen=True, slots=True)
 class GuardianJob:
-    """Job of the guardian: its plan, and the ports and descriptors that guardian and loop inherit."""
+    """Arguments of the guardian's process: its plan, and ports and memory for guardian and loop."""
 
     plan: GuardianPlan
     ports: tuple[str, ...]
     """Device paths in the order of `plan.buses`; for a simulated bus, its pseudo-terminal."""
     memory: RunMemory
     supervisor: int
-    """Process ID."""
+    """Process ID of the supervisor."""
     take_over: bool = False
-    """The loop accepts servos that already have torque."""
+    """True if the loop accepts servos that already have torque."""
     epoch_offset_ns: int = 0
-    """Wall time minus the run's clock."""
+    """Wall time minus the run's clock, ns."""
 
 
 @dataclass(frozen=True, slots=True)
 class LoopJob:
-    """Job of the loop's process."""
+    """Arguments of the loop's process, from the guardian."""
 
     memory: RunMemory
     take_over: bool
     ports: tuple[int, ...]
-    """File descriptors in the order of the plan's buses."""
+    """File descriptors of the open ports, in the order of the plan's buses."""
     channel: int
-    """File descriptor of the channel to the guardian, which opens lost lines again."""
+    """File descriptor of the channel to the guardian, which reopens lost lines."""
     supervisor: int
-    """Process ID."""
+    """Process ID of the supervisor."""
     guardian: int
-    """Process ID."""
+    """Process ID of the guardian."""
     epoch_offset_ns: int = 0
 
 
 class Started(msgspec.Struct, frozen=True, tag=True):
-    """Guardian to supervisor: the loop is running. The message carries the ports."""
+    """Message from guardian to supervisor: the loop's process runs. The open ports are attached."""
 
     loop: int
-    """Process ID."""
+    """Process ID of the loop."""
     grants: tuple[realtime.Grant, ...]
-    """Real-time properties that the operating system granted to the guardian."""
+    """Results of the guardian's real-time requests."""
 
 
 class Ended(msgspec.Struct, frozen=True, tag=True):
-    """Guardian to supervisor: the loop has exited, and the robot is in the state of its policy."""
+    """Message from guardian to supervisor: the loop has exited, and the robot is in its final state."""
 
     ending: Ending
     outcome: tuple[str, ...] = ()
-    """Actions of the guardian in place of supervisor or loop, one sentence each."""
+    """Sentences about what the guardian did in place of supervisor or loop."""
 
 
 GuardianMessage = Started | LineLost | LineReturned | Ended | Failed
 _REQUESTS: Decoder[Stop | Cut] = Decoder(Stop | Cut)
 _LINES_LOST = Decoder(LineLost)
 EndText: TypeAlias = EventText[[Sequence[str]]]
-"""Event about the end of a loop: `texts.loop_failed` or `texts.run_cut`."""
+"""Template of the event about the end of a loop: `texts.loop_failed` or `texts.run_cut`."""
 
 
 def make_ports(
@@ -142,7 +146,9 @@ def make_ports(
     memory: RunMemory,
     stalls: StallCounter,
 ) -> list[SerialPort]:
-    """Return the ports of all buses. Ports of simulated servos wait while the simulation has no core.
+    """Return the serial ports of all buses.
+
+    Those of simulated servos wait while the simulation has no core.
 
     Args:
         buses: The plan's buses.
@@ -164,7 +170,7 @@ def make_ports(
 
 
 class SafeStop:
-    """Switches torque off in place of a loop that has exited, and reports the result to log and terminal."""
+    """Makes the robot safe after the loop has exited, and reports the result to log and terminal."""
 
     def __init__(self, job: GuardianJob) -> None:
         self._job = job
@@ -175,9 +181,10 @@ class SafeStop:
         self._safe_end = SafeEnd.of(job.plan.features, job.plan.feature_plans)
 
     def end(self, descriptors: Sequence[int], how: str, text: EndText) -> list[str]:
-        """Apply the final state of the fault policy, without its steps; return sentences about it.
+        """Leave the robot limp or holding, as the fault policy's final state says; return sentences about it.
 
-        The robot holds only when the loop was running: during set-up, only some servos have torque.
+        The steps of the policy are skipped. The robot holds only when the loop was running: during set-up,
+        only some servos have torque.
         """
         if self._job.plan.last == "limp" or self._heartbeat.phase is not Phase.RUNNING:
             return self.limp(descriptors, how, text)
@@ -186,7 +193,7 @@ class SafeStop:
         return sentences
 
     def stand(self, descriptors: Sequence[int]) -> tuple[str, ...]:
-        """Stop the joints that would continue to move with torque on; return a sentence for each."""
+        """Stop joints that would continue to move with torque on; return a sentence for each failure."""
         lines, packets = self._take_over(descriptors)
         sentences = (*stand(lines), *self._safe_end.make_safe(lines))
         packets.commit()
@@ -209,7 +216,7 @@ class SafeStop:
         return sentences
 
     def _take_over(self, descriptors: Sequence[int]) -> tuple[Lines, PacketBatch]:
-        """Log the unfinished packets of the loop; return its lines, and the batch for further packets."""
+        """Log the loop's unfinished packets; return the robot's lines and a batch for further packets."""
         job, memory = self._job, self._job.memory
         cycle = salvage(mapped(memory.desk), RingReader(memory.packets).head, self._ring)
         ports = SerialPorts(make_ports(job.plan.buses, job.ports, descriptors, memory, StallCounter()))
@@ -217,16 +224,16 @@ class SafeStop:
         return Lines(job.plan.buses, ports, self._clock, packets, self._heartbeat.look), packets
 
     def report_grants(self, grants: Sequence[realtime.Grant]) -> None:
-        """Log the real-time properties that the operating system granted to this process."""
+        """Log the results of the guardian's real-time requests."""
         realtime.log_grants(grants, "guardian", self._events)
 
     def report(self, event: EventBody) -> None:
-        """Log an event of the guardian."""
+        """Log an event with the guardian as its source."""
         self._events.emit("guardian", event)
 
 
 class Guardian:
-    """Supervision of one loop process from its start to its end."""
+    """Starts one loop process, watches it to its end, and makes the robot safe if it fails."""
 
     def __init__(self, job: GuardianJob, control: MessageChannel[Stop | Cut]) -> None:
         self._job = job
@@ -238,9 +245,9 @@ class Guardian:
         self._supervisor_signs = SignsOfLife(job.supervisor, LONGEST_LOOK_NS, self._clock.now_ns())
         self._stop_by_ns = _NEVER
         self._unsupervised = ""
-        """Reason why the guardian asked the loop to stop without a request."""
+        """Sentence: why the guardian asked the loop to stop without a request; empty: it did not."""
         self._killed: Literal["hung", "late", "cut"] | None = None
-        """Reason for which the loop was killed."""
+        """Reason why the guardian killed the loop; None: it did not."""
         self._starved_ns: int | None = None
         """Processor time of a loop that stood still although it was ready to run, ns; None: not known."""
         self._halted = False
@@ -304,7 +311,7 @@ class Guardian:
     def _watch(
         self, loop: subprocess.Popen[bytes], lines: KeptLines, channel: MessageChannel[LineLost]
     ) -> Ending:
-        """Wait for the end of the loop, and reap it; return the kind of its end."""
+        """Watch the loop and kill it if it hangs, until it has exited; reap it and return the kind of end."""
         watched = os.pidfd_open(loop.pid)
         processor = ProcessorTime(Path(f"/proc/{loop.pid}"))
         self._loop_signs = SignsOfLife(loop.pid, LONGEST_LOOK_NS, self._clock.now_ns())
@@ -350,14 +357,14 @@ class Guardian:
         return "died"
 
     def _lose(self, lines: KeptLines, channel: MessageChannel[LineLost]) -> None:
-        """Start to open the lines again that the loop has lost."""
+        """Start to reopen the lines that the loop has reported as lost, and inform the supervisor."""
         for message in channel.receive():
             self._control.send(message)
             if not lines.lost(message.bus):
                 self._safe_stop.report(texts.line_gone())
 
     def _hand_over(self, lines: KeptLines, channel: MessageChannel[LineLost]) -> None:
-        """Pass lines that are open again to the loop and to the supervisor."""
+        """Pass the ports of lines that are open again to the loop and to the supervisor."""
         for opened in lines.returned():
             if opened.done:
                 self._safe_stop.report(texts.line_adjusted(opened.done))
@@ -369,7 +376,10 @@ class Guardian:
                 each.send(LineReturned(opened.index), [lines.descriptors[opened.index]])
 
     def _silent(self) -> frozenset[Watched]:
-        """Return the watched processes that do not respond. A dead supervisor has closed its channel."""
+        """Check the heartbeats of loop and supervisor; return which of them do not respond.
+
+        A dead supervisor has closed its channel.
+        """
         now_ns, phase = self._clock.now_ns(), self._heartbeat.phase
         # Read before the heartbeat: the loop beats first, and shortens its timeout afterwards.
         timeout_ns = self._timeout_ns()
@@ -382,7 +392,7 @@ class Guardian:
         return frozenset(which for which, is_silent in silent.items() if is_silent)
 
     def _reason_to_kill(self, duty: Duty) -> Literal["hung", "late"] | None:
-        """Return the reason to kill the loop; None without one."""
+        """Return why the loop must be killed now: hung, or late after a stop request; None: it must not."""
         if duty is Duty.KILL_LOOP:
             return "hung"
         return "late" if self._clock.now_ns() > self._stop_by_ns else None
@@ -391,13 +401,13 @@ class Guardian:
         return loop_timeout_ns(self._heartbeat, self._job.plan.period_ns)
 
     def _note_standstill(self, reason: str, processor: ProcessorTime) -> None:
-        """Record the cause of a standstill before the loop is killed for it."""
+        """Store why the loop stood still (signal, no processor) before it is killed for that."""
         if reason == "hung":
             self._halted = self._loop_signs.still_ns <= self._timeout_ns()
             self._starved_ns = processor.starved_ns(self._loop_signs.still_ns)
 
     def _report_unsupervised(self) -> None:
-        """Report that the supervisor is dead or stopped, so that nobody else can end the run."""
+        """Log that the supervisor is dead or stopped, so that nobody else can end the run."""
         what = (
             "left the run"
             if self._control.closed
@@ -409,14 +419,14 @@ class Guardian:
         self._safe_stop.report(texts.supervisor_gone(self._unsupervised))
 
     def _request(self) -> Literal["stop", "cut"] | None:
-        """Return the request of the supervisor."""
+        """Read the supervisor's messages; return `cut`, `stop` or None."""
         messages = self._control.receive()
         if any(isinstance(message, Cut) for message in messages):
             return "cut"
         return "stop" if messages else None
 
     def _how(self, ending: Ending, loop: subprocess.Popen[bytes]) -> str:
-        """Return a sentence on the end of the loop, with the controller whose code was running."""
+        """Return a sentence on how the loop ended, with the controller whose code was running."""
         if ending == "cut":
             return "torque was cut on request"
         called = self._heartbeat.activity
@@ -446,7 +456,7 @@ def _duration(time_ns: float) -> str:
 
 
 def _manner(code: int | None) -> str:
-    """Return the signal or the exit code of a process."""
+    """Return the signal that ended a process, or its exit code, as text."""
     if code is not None and code < 0:
         return f"signal {signal.Signals(-code).name}"
     return f"exit code {code}"

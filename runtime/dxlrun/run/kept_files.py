@@ -1,4 +1,4 @@
-"""Kept files: files of controllers' states, read at the start of a run and written during it.
+"""Kept files: files of the states that controllers keep, read before a run and written during it.
 
 A process other than the loop's writes them. A file is replaced atomically: the new file is written next to
 the old one, synced to the disk, and renamed. After a crash of this process or of the machine, either the old
@@ -36,7 +36,7 @@ from dxlwire.port.latency_timer import is_simulated
 SUFFIX = ".kept"
 _POLL_S = 0.1
 _WRITING_TIMEOUT_S = 10.0
-"""Timeout for the disk at the end of a run."""
+"""Longest wait for the disk at the end of a run, s."""
 
 
 def state_directory(plan: Plan) -> Path | None:
@@ -56,7 +56,10 @@ def state_directory(plan: Plan) -> Path | None:
 
 
 def read_states(plan: Plan, directory: Path | None) -> KeptStates:
-    """Return the kept states of the robot's controllers. Raises nothing."""
+    """Read the states that a robot's controllers kept in earlier runs; unreadable ones have a `problem`.
+
+    Never raises.
+    """
     files: dict[str, KeptFile] = {}
     if directory is not None:
         # Without a directory, no state was kept.
@@ -67,7 +70,7 @@ def read_states(plan: Plan, directory: Path | None) -> KeptStates:
 
 
 def _facts_by_joint(plan: Plan) -> dict[str, Facts]:
-    """Return the properties of the servos of each joint."""
+    """Return the facts about the servos of each joint on which a kept state depends, by joint name."""
     servos, found = plan.servos_by_joint, dict[str, Facts]()
     for row, joint in enumerate(plan.loop.joints):
         mine = servos[joint.name]
@@ -83,7 +86,10 @@ def _facts_by_joint(plan: Plan) -> dict[str, Facts]:
 
 
 def _facts(plan: Plan, joint: JointPlan, bus: BusPlan, servo: ServoPlan) -> Facts:
-    """Return the properties of a joint's servo that the plan has; the firmware is only known after a read."""
+    """Return the facts about one servo of a joint that the plan has.
+
+    Its firmware is only known after a read.
+    """
     facts = {
         "servo": "simulated" if is_simulated(bus.port) else "real",
         "model": servo.model,
@@ -107,7 +113,7 @@ def _facts(plan: Plan, joint: JointPlan, bus: BusPlan, servo: ServoPlan) -> Fact
 
 
 def _short(many: object) -> str:
-    """Return the checksum of many figures, for a sentence."""
+    """Return a checksum as text that stands for many figures; `none` for None."""
     return "none" if many is None else f"{crc32(repr(many).encode()):08x}"
 
 
@@ -127,17 +133,17 @@ def _read(path: Path) -> KeptFile:
 
 
 class KeptFiles:
-    """Writer of the states in the loop's messages to files."""
+    """Joins kept states from the loop's messages, and writes each to the file of its controller."""
 
     def __init__(self, directory: Path | None) -> None:
         self._directory = directory
         self._topic = -1
         self._assembly: Assembly | None = None
         self.problems: dict[str, str] = {}
-        """Controller -> reason why its newest state is not in a file."""
+        """Reasons why the newest state of a controller is not in its file, by controller."""
 
     def take(self, kind: int, payload: Payload) -> None:
-        """Process a record; records of other topics are ignored. Raises nothing."""
+        """Process a record of the loop's message ring. Other topics are ignored. Never raises."""
         # The recorder reports damaged records.
         with suppress(ValueError):
             found = decode(payload) if kind == RecordKind.TAGGED else None
@@ -166,7 +172,7 @@ class KeptFiles:
 
     @property
     def sentences(self) -> tuple[str, ...]:
-        """Problems for the user at the end of the run."""
+        """Sentences for the user about states that were not written, at the end of the run."""
         problems = dict(self.problems)
         for controller in self._assembly.unfinished if self._assembly else ():
             problems[controller] = "the loop ended while it left"
@@ -208,7 +214,7 @@ def replace_file(directory: Path, name: str, data: bytes) -> None:
 
 
 class KeptStateWriter(threading.Thread):
-    """Thread that reads the ring of the loop's messages and writes the files.
+    """Thread that reads kept states from the ring of the loop's messages and writes their files.
 
     A disk may block for seconds, and the main thread must wait for signals: a second Ctrl-C cuts torque.
     """
@@ -220,7 +226,7 @@ class KeptStateWriter(threading.Thread):
         self._ended = threading.Event()
 
     def run(self) -> None:
-        """Write until `finish` is called, then write the remaining records."""
+        """Write states until `finish` is called and all records are read."""
         while not self._ended.wait(_POLL_S):
             self._drain()
         self._drain()
@@ -232,7 +238,7 @@ class KeptStateWriter(threading.Thread):
                 self._files.take(record.kind, record.payload)
 
     def finish(self) -> tuple[str, ...]:
-        """Write the remaining records after the end of the loop; return problems for the user."""
+        """Write the remaining states after the end of the loop; return sentences about problems."""
         self._ended.set()
         self.join(_WRITING_TIMEOUT_S)
         if self.is_alive():

@@ -57,10 +57,10 @@ from dxlwire.port.ports import (
 
 
 class LoopOutcome(msgspec.Struct, frozen=True):
-    """Result of the loop's process for the supervisor."""
+    """Result that the loop's process leaves in shared memory for the supervisor."""
 
     reason: str
-    """Reason of the end: ended, stopped, fault, start-up."""
+    """Reason why the loop ended: ended, stopped, fault, or start-up (it could not start)."""
     cycles: int = 0
     skipped: int = 0
     sentences: tuple[str, ...] = ()
@@ -69,7 +69,7 @@ class LoopOutcome(msgspec.Struct, frozen=True):
     """Remarks for the user, one sentence each."""
     traceback: str = ""
     invalid: tuple[int, ...] = ()
-    """Number of cycles with an invalid state, for each joint."""
+    """Number of cycles with an invalid servo state, a value for each joint."""
     events: EventTotals = EventTotals()
     refused_for_replies: bool = False
     """True when the start was refused because of late or missing replies."""
@@ -77,7 +77,7 @@ class LoopOutcome(msgspec.Struct, frozen=True):
 
 
 def _keep_to_this_process(descriptors: Sequence[int]) -> None:
-    """Keep the ports and the channel to the guardian from executed and forked child processes.
+    """Close ports and the guardian's channel in child processes that plug-ins start.
 
     A child with a port could write to the servos, and would hold the port's lock after the run. A forked
     child also gets the default action of SIGTERM back, because only the loop reads the stop flag. It keeps
@@ -96,10 +96,11 @@ def _keep_to_this_process(descriptors: Sequence[int]) -> None:
 
 
 def _looked_at(heartbeat: Heartbeat) -> Callable[[str], None]:
-    """Return a check to call after each plug-in was imported.
+    """Return a function to call after each import of a plug-in, which refuses new threads.
 
-    The check beats the heartbeat, since an import takes time. It raises PlugInError when the newest plug-in
-    left a thread, and exits a forked child that returned from the import, which would run a second loop.
+    The function beats the heartbeat, since an import takes time. It raises PlugInError when the newest
+    plug-in left a thread, and exits a forked child that returned from the import, which would run a second
+    loop.
     """
     before, own = realtime.thread_count(), os.getpid()
 
@@ -128,7 +129,7 @@ _WAITS_EVENT_NS = 1_000_000_000
 
 
 class LineReopener:
-    """Requests lost lines from the guardian, which opens them again; the `reopened` of `SerialPorts`."""
+    """Asks the guardian to reopen lost bus lines; the `reopened` of `SerialPorts`."""
 
     def __init__(self, channel: MessageChannel[LineReturned]) -> None:
         self._channel = channel
@@ -150,11 +151,11 @@ class LineReopener:
 
 
 class AskedToStop(Exception):
-    """A stop was requested before the robot ran; torque must not be switched on any more."""
+    """Raised during set-up after a stop request: torque must not be switched on any more."""
 
 
 class StallReport:
-    """Log events about waits for simulated servos, at most one per second."""
+    """Logs events about waits for simulated servos, at most one per second."""
 
     def __init__(self, stalls: StallCounter, events: EventSink) -> None:
         self._stalls = stalls
@@ -168,11 +169,11 @@ class StallReport:
 
     @property
     def total(self) -> SimulationWait:
-        """Total of the waits since the start."""
+        """Duration and number of all waits since the start."""
         return SimulationWait(self._stalls.waited_ns, self._stalls.times)
 
     def look(self, now_ns: int) -> None:
-        """Emit an event when waits are over, or have lasted for more than a second."""
+        """Emit an event about new waits when they are over. Called at each heartbeat."""
         if self._stalls.times == self._reported_times and self._stalls.waited_ns == self._reported_ns:
             return
         if self._stalls.waited_ns != self._seen_ns:
@@ -182,7 +183,7 @@ class StallReport:
             self.emit()
 
     def emit(self) -> None:
-        """Emit an event with the waits since the last one."""
+        """Emit an event with the waits since the last event, if there were any."""
         total = self.total
         since = SimulationWait(total.waited_ns - self._reported_ns, total.times - self._reported_times)
         if since.waited_ns or since.times:
@@ -193,7 +194,7 @@ class StallReport:
 
 @dataclass(slots=True)
 class Pulse:
-    """Supervision of a loop by its own process, see `control.context.Supervision`.
+    """Supervision of a loop from inside its process, see `control.context.Supervision`.
 
     `beat` is called during waits for replies and once per cycle. It checks supervisor and guardian, reports
     waits for simulated servos, and aborts a set-up on a stop request.
@@ -206,10 +207,13 @@ class Pulse:
     stalls: StallReport
     now_ns: Callable[[], int]
     pacing: Pacing | None = None
-    """None when the clock does not poll."""
+    """Sets the polling time of the clock; None when the clock does not poll."""
 
     def beat(self) -> None:
-        """Beat. Raises AskedToStop, once, and only during set-up: the running loop reads the stop flag."""
+        """Send a heartbeat, and request a stop if supervisor and guardian are gone.
+
+        Raises AskedToStop, once, and only during set-up: the running loop reads the stop flag.
+        """
         self.heartbeat.beat()
         now_ns = self.now_ns()
         self.stalls.look(now_ns)
@@ -237,7 +241,7 @@ def _reply_polling(longest_ns: int | None) -> ReplyPolling | None:
 
 
 def beside_simulation(plan: Plan) -> SchedulerPlan:
-    """Return the scheduler's plan without the core of simulated servos, whose process has more priority."""
+    """Return the scheduler plan of the loop without the core that simulated servos use."""
     scheduler = plan.loop.scheduler
     others = os.sched_getaffinity(0) - {process.spare_core(())}
     if scheduler.policy == "other" or scheduler.cores or not others:
@@ -247,7 +251,7 @@ def beside_simulation(plan: Plan) -> SchedulerPlan:
 
 
 def _run(plan: Plan, job: LoopJob, heartbeat: Heartbeat, sinks: Sinks, stalls: StallCounter) -> LoopOutcome:
-    """Execute the plan, from the import of plug-ins to torque off."""
+    """Run the loop's process from the import of plug-ins to torque off; return its result."""
     stop = StopFlag()
     signal.signal(signal.SIGTERM, lambda *_: stop.request())
     ports = SerialPorts(
@@ -301,7 +305,7 @@ def _run(plan: Plan, job: LoopJob, heartbeat: Heartbeat, sinks: Sinks, stalls: S
 
 
 def _prepare(plan: Plan, job: LoopJob, heartbeat: Heartbeat, events: EventSink, pacing: Pacing) -> None:
-    """Request real time from the operating system, measure the wake-up delay of sleeps, and report both."""
+    """Apply real-time settings, measure the wake-up delay of sleeps, and log the results."""
     grants = realtime.apply(beside_simulation(plan))
     heartbeat.beat()
     grants = (*grants, pacing.measure(plan.loop.period_ns, heartbeat.beat))

@@ -1,4 +1,4 @@
-"""Run log: the new file of a run's log, and its header."""
+"""Run log: creates the file and the header of a new run's log."""
 
 from __future__ import annotations
 
@@ -29,7 +29,7 @@ _LIBRARIES = ("dxlrun", "mcap", "msgspec", "numpy", "pluggy", "pydantic")
 def log_header(
     plan: Plan, epoch_offset_ns: int, *, virtual: bool, kept: KeptStates | None = None
 ) -> LogHeader:
-    """Return the header that makes the log self-contained.
+    """Return the header of a run's log, with robot files and versions that make it self-contained.
 
     `epoch_offset_ns` is wall time minus the run's clock; `kept` are the states that controllers begin with.
     """
@@ -75,7 +75,7 @@ def log_header(
 
 
 def _files(plan: Plan) -> dict[str, str]:
-    """Return the texts of the files from which a plan was compiled, by their keys of identity."""
+    """Return the texts of all files from which a plan was compiled, by their keys in the run's identity."""
     return {
         file_key(ROBOT, Path(plan.source_file).name): plan.source_text,
         **{file_key(INCLUDED, name): text for name, text in plan.included.items()},
@@ -122,7 +122,7 @@ def new_log(recording: RecordingPlan, robot: str) -> Path:
 
 
 def discard_log(log: Path) -> None:
-    """Remove the log of a run that sent nothing to the robot."""
+    """Delete the log, a file or a directory of parts, of a run that sent nothing to the robot."""
     if log.is_dir():
         for part in log.glob(PART_PATTERN):
             part.unlink(missing_ok=True)
@@ -134,5 +134,5 @@ def discard_log(log: Path) -> None:
 
 
 def incomplete_log(error: str) -> str:
-    """Return the sentence about an incomplete log."""
+    """Return the sentence for the user about a log that is incomplete because of an error."""
     return f"the log is incomplete: {error}"

@@ -1,4 +1,4 @@
-"""Run processes: the shared memory and the start of each process of a run."""
+"""Run processes: create the shared memory of a run, and start each of its processes."""
 
 from __future__ import annotations
 
@@ -40,12 +40,14 @@ GatewayMessage = Listening | Failed
 Message = TypeVar("Message")
 
 RECORDER_NICE = -10
-"""nice(2) value; nine times the share of an ordinary program (sched(7)). The recorder needs a tenth of a
-core at 1 kHz."""
+"""nice(2) value of the recorder; nine times the share of an ordinary program (sched(7)).
+
+The recorder needs a tenth of a core at 1 kHz.
+"""
 _GUARDIAN_CAPACITY = 2 << 20
-"""Bytes; the guardian exchanges few packets and reports few events."""
+"""Size of the guardian's ring, bytes; it exchanges few packets and reports few events."""
 _LONGEST_TAKEN = LONGEST_COMMAND + 64
-"""Bytes of the record of a command that a cycle has taken."""
+"""Longest record of an executed command, bytes."""
 
 
 def create_memory(plan: Plan, kept: KeptStates | None = None) -> RunMemory:
@@ -96,7 +98,7 @@ def _create_slots(plan: Plan) -> dict[str, tuple[int, ...]]:
 
 
 def _published(plan: Plan) -> float:
-    """Return the controllers' published bytes per second, with one message per topic and update."""
+    """Return how many bytes per second controllers publish, with one message per topic and update."""
     return sum(
         len(one.topics) * usual_message(len(one.joints)) * 1e9 / (plan.loop.period_ns * one.every)
         for one in plan.loop.controllers
@@ -104,7 +106,7 @@ def _published(plan: Plan) -> float:
 
 
 def loop_outcome(memory: RunMemory) -> LoopOutcome | None:
-    """Return the result of the loop's process; None when it wrote none."""
+    """Read the result of the loop's process from the run's memory; None when it wrote none."""
     try:
         return msgspec.json.decode(process.whole(memory.result), type=LoopOutcome)
     # The result is missing or truncated.
@@ -113,7 +115,7 @@ def loop_outcome(memory: RunMemory) -> LoopOutcome | None:
 
 
 def loop_grants(memory: RunMemory) -> tuple[Grant, ...]:
-    """Return the real-time properties granted to the loop; empty before the loop runs."""
+    """Read the results of the loop's real-time requests; empty before the loop runs."""
     try:
         return msgspec.json.decode(process.whole(memory.grants), type=tuple[Grant, ...])
     except msgspec.MsgspecError:
@@ -148,7 +150,7 @@ def start_simulated_buses(
 def start_source(
     plan: Plan, planned: PlannedProcess, memory: RunMemory, *, restarted: bool = False
 ) -> Child[SourceMessage]:
-    """Start a process of a feature; `ready` then waits until its source is open."""
+    """Start a source process of a feature; its `ready` then waits until the source is open."""
     bodies = sensed_bodies(plan) if planned.process.has_body else None
     slot_of = memory.slots[planned.feature.name][planned.index]
     job = SourceJob(planned.feature, planned.process, slot_of, os.getpid(), restarted, bodies, memory.shafts)
@@ -235,10 +237,10 @@ def start_guardian(job: GuardianJob, others: Iterable[int]) -> Child[GuardianMes
 
 
 class Program(NamedTuple):
-    """Program of a process of a run."""
+    """Module that a process of a run executes."""
 
     name: str
-    """Name in sentences."""
+    """Name of the process in messages."""
     module: str
     arguments: tuple[str, ...] = ()
 
@@ -250,7 +252,7 @@ def _executed(
     memory: RunMemory,
     messages: Decoder[Message],
 ) -> Child[Message]:
-    """Execute a program, which reads its job from a file descriptor."""
+    """Start a process of a run, which reads its job as JSON from an inherited descriptor."""
     descriptor = process.memory_file(f"dxlrun-{program.name}", msgspec.json.encode(job))
     arguments = ["--job-fd", str(descriptor), *program.arguments]
     try:

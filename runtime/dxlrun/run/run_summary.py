@@ -29,12 +29,15 @@ if TYPE_CHECKING:
 
 _REFRESH_S = 0.1
 FEW_INVALID = 2
-"""Number of invalid states that is tolerated in any run; three in a row lose a servo."""
+"""Number of cycles with an invalid state of a joint that is tolerated in any run; three in a row lose a
+servo.
+"""
 INVALID_SHARE = 0.01
-"""Tolerated share of cycles with invalid states of a joint."""
+"""Share of cycles with an invalid state of a joint that is tolerated."""
 SHORT_RUN_NS = 2_000_000_000
-"""ns; a shorter run may skip as many periods as a run of this length: one stall of the machine is not an
-overload."""
+"""Length of a run, ns, up to which it may skip as many periods as a run of this length: one stall of the
+machine is not an overload.
+"""
 # Names or sentences of one kind in a summary, which must fit on a screen.
 _MOST = 3
 _LOSSES = {
@@ -46,7 +49,7 @@ _LOSSES = {
 _SLOW_REPLIES = frozenset((EventCode.SERVO_LOST, EventCode.DEVICE_LOST, EventCode.WATCHDOG))
 """Errors that a busy machine may cause, in addition to invalid states and skipped periods."""
 _LINE_S = 5.0
-"""Interval of progress lines in a pipe or a file."""
+"""Interval of progress lines when the output is a pipe or a file, s."""
 
 
 class RunOptions(msgspec.Struct, frozen=True):
@@ -54,15 +57,14 @@ class RunOptions(msgspec.Struct, frozen=True):
 
     record: bool = True
     take_over: bool = False
-    """Accept servos that already have torque."""
+    """True to accept servos that already have torque."""
     debug: bool = False
     verbose: bool = False
-    """Show all grants of the operating system."""
+    """True to show the results of all real-time requests."""
     ledger: Path | None = None
-    """File in which simulated buses record their traffic; None: next to the log, in virtual time not at
-    all."""
+    """File in which simulated buses record their traffic; None: next to the log; no file in virtual time."""
     gateway: bool = True
-    """Start the gateway, by which clients steer the run over a Unix socket."""
+    """True to start the gateway, by which clients command the run over a Unix socket."""
     listen: str = ""
     """Address for clients over mutual TLS; empty: none."""
 
@@ -78,12 +80,12 @@ class RunSummary(msgspec.Struct, frozen=True):
     sentences: tuple[str, ...]
     """Errors, one sentence each; empty after a good run."""
     remarks: tuple[str, ...] = ()
-    """Refused grants, and problems outside the robot."""
+    """Sentences about refused real-time requests and problems outside the robot."""
     log: str | None = None
     messages: int = 0
     """Number of messages in the log."""
     invalid: tuple[int, ...] = ()
-    """Number of cycles with an invalid state, for each joint."""
+    """Number of cycles with an invalid servo state, a value for each joint."""
     events: EventTotals = EventTotals()
     virtual: bool = False
     """True for a run in virtual time."""
@@ -94,10 +96,10 @@ class RunSummary(msgspec.Struct, frozen=True):
     run_load: MachineLoad = MachineLoad()
     """Load of the machine from the first cycle on."""
     simulation_wait: SimulationWait = SimulationWait()
-    """Time during which the loop waited for simulated servos that had no processor."""
+    """Time for which the loop waited for simulated servos that had no processor."""
 
     def describe_machine(self, plan: Plan) -> str:
-        """Return the sentence about a machine that was too busy for this run; empty otherwise."""
+        """Return a sentence with remedy if the machine was too busy for this run; else an empty string."""
         load = self.run_load if self.cycles else self.start_up_load
         observed = describe_busy_machine(load, self.simulation_wait)
         remedy = free_machine(bus.port for bus in plan.buses)
@@ -106,7 +108,7 @@ class RunSummary(msgspec.Struct, frozen=True):
 
 @contextmanager
 def caught_signals(act: Callable[[], None]) -> Iterator[None]:
-    """Call `act` at each SIGINT and SIGTERM; restore the previous handlers afterwards."""
+    """Context manager that calls `act` at each SIGINT and SIGTERM, and restores the handlers afterwards."""
     before = {number: signal.signal(number, lambda *_: act()) for number in (signal.SIGINT, signal.SIGTERM)}
     try:
         yield
@@ -119,7 +121,7 @@ class RunVerdict(NamedTuple):
     """Verdict on a run from the loop's own counters and events; `dxlrun analyze` finds the causes."""
 
     exit_code: int
-    """0 good, 1 failed, 130 interrupted."""
+    """Exit code of the command: 0 good, 1 failed, 130 interrupted."""
     line: str
     """Events of the run in one line, without the word for the verdict."""
     sentences: tuple[str, ...]
@@ -180,14 +182,14 @@ def run_verdict(run: RunSummary, plan: Plan) -> RunVerdict:
 
 
 def named(names: Iterable[str]) -> str:
-    """Return the first three names, and the number of the others."""
+    """Return the first three different names as text, and the number of the others."""
     shown = list(dict.fromkeys(names))
     more = f" and {len(shown) - _MOST} more" if len(shown) > _MOST else ""
     return ", ".join(shown[:_MOST]) + more
 
 
 def last_line(group: EventGroup) -> str:
-    """Return the last line of an event's text (of a traceback, the exception) without its full stop."""
+    """Return the last line of a group's event text (of a traceback, the exception) without full stop."""
     lines = group.text.strip().splitlines() or [group.name]
     return lines[-1].removesuffix(".")
 
@@ -218,11 +220,14 @@ class Progress:
         self._began = self._shown = time.monotonic()
 
     def setting_up(self) -> None:
-        """Show that the servos are being set up."""
+        """Show in the status line that servos are being checked and torque enabled."""
         self._status.update(f"{self._plan.robot}: checking servos, torque on")
 
     def ran(self, cycles: int, skipped: int) -> None:
-        """Show the number of cycles and of skipped periods; cheap enough for every cycle."""
+        """Update the status line from the number of cycles and skipped periods.
+
+        Cheap enough for every cycle.
+        """
         now = time.monotonic()
         if now - self._shown < self._every_s:
             return
@@ -241,7 +246,7 @@ class Progress:
 
 
 def show_grants(grants: Sequence[Grant], out: Console, *, verbose: bool = False) -> None:
-    """Print one line when everything was granted, else a table and the commands that fix refusals.
+    """Print whether all real-time requests were granted, else a table and the commands that fix refusals.
 
     Prints only on a terminal. `verbose` always prints the table.
     """
@@ -260,12 +265,12 @@ def show_grants(grants: Sequence[Grant], out: Console, *, verbose: bool = False)
 
 
 def refusals(grants: Sequence[Grant], out: Console) -> tuple[str, ...]:
-    """Return the refused grants, one sentence each; empty when a table has shown them."""
+    """Return refused real-time requests, one sentence each; empty on a terminal, where a table shows them."""
     if out.is_terminal:
         return ()
     return tuple(one.text for one in grants if not one.granted)
 
 
 def granted_text(grants: Sequence[Grant]) -> dict[str, str]:
-    """Return the grants for the log's metadata."""
+    """Return the results of real-time requests for the log's metadata, by name of the request."""
     return {one.name: f"{'yes' if one.granted else 'no'}: {one.sentence}" for one in grants}
