@@ -63,7 +63,9 @@ class AngularLimits(ParametersModel):
 
 
 _SAME = 1e-9
-"""Tolerance, m/s and rad/s, for the rounding errors of a division by a radius and a multiplication by it"""
+"""Tolerance of a comparison of speeds, m/s and rad/s, for the rounding errors of dividing by a wheel's
+radius.
+"""
 
 Multiplier = Annotated[float, Field(gt=0)]
 
@@ -125,11 +127,13 @@ class Ramp:
         self.velocity = self.acceleration = 0.0
 
     def within(self, target: float) -> float:
-        """Return the target, clamped to the velocity limit."""
+        """Return a target velocity clamped to the velocity limit."""
         return min(max(target, -self._top), self._top)
 
     def next(self, target: float, dt: float) -> float:
-        """Return the velocity after `dt` s on the way to `target`. The state only changes by `set`."""
+        """Return the velocity after `dt` s on the way to the velocity `target`; the state only changes by
+        `set`.
+        """
         gap = target - self.velocity
         falling = self.velocity * gap < 0
         if math.isinf(self._jerk):
@@ -152,12 +156,12 @@ class Ramp:
         return target if abs(gap) <= most else self.velocity + math.copysign(most, gap)
 
     def set(self, velocity: float, dt: float) -> None:
-        """Set the present velocity, reached in `dt` s, and the acceleration that follows from it."""
+        """Set the present velocity, reached in the last `dt` s, and the acceleration that follows from it."""
         self.acceleration = (velocity - self.velocity) / dt
         self.velocity = velocity
 
     def stop(self) -> None:
-        """Set velocity and acceleration to 0."""
+        """Set velocity and acceleration to 0 at once."""
         self.velocity = self.acceleration = 0.0
 
 
@@ -180,7 +184,7 @@ class DiffDriveController(Controller[DiffDriveParameters]):
         return Interfaces((*parameters.left, *parameters.right), ("velocity",))
 
     def on_configure(self, context: Context) -> None:
-        """Allocate all memory that the loop needs."""
+        """Allocate all memory that the loop needs, and start the pose at 0."""
         super().on_configure(context)
         parameters, left = self.parameters, len(self.parameters.left)
         speeds = context.limits.velocity[np.isfinite(context.limits.velocity)]
@@ -200,7 +204,7 @@ class DiffDriveController(Controller[DiffDriveParameters]):
         self.on_parameters(0)
 
     def on_parameters(self, time_ns: int) -> None:
-        """Apply a changed calibration."""
+        """Apply the calibration factors of separation and radii, which may have changed in the run."""
         parameters = self.parameters
         self._half = parameters.separation * parameters.separation_multiplier / 2
         self._radii = (
@@ -211,7 +215,7 @@ class DiffDriveController(Controller[DiffDriveParameters]):
         self._aim()
 
     def on_activate(self, time_ns: int) -> None:
-        """Stand still until the first command."""
+        """Command a standstill until the first twist is received."""
         self._linear.stop()
         self._angular.stop()
         self._command = self._target = (0.0, 0.0)
@@ -220,24 +224,28 @@ class DiffDriveController(Controller[DiffDriveParameters]):
         self.context.commands.velocity.fill(0.0)
 
     def on_command(self, kind: str, data: NDArray[np.float64], time_ns: int) -> None:
-        """Set a new twist."""
+        """Set a new twist, which is valid until `timeout`."""
         self._command = float(data[0]), float(data[1])
         self._commanded_ns = time_ns
         self._aim()
 
     def on_hold(self, time_ns: int) -> None:
-        """Decelerate to a standstill."""
+        """Set the target to a standstill; the base decelerates within its limits."""
         self._command = self._target = (0.0, 0.0)
 
     def _aim(self) -> None:
-        """Set the target to the command, scaled down on the same curve to the limits of base and wheels."""
+        """Set the target twist to the command, scaled down on the same curve to the limits of base and
+        wheels.
+        """
         linear, angular = self._linear.within(self._command[0]), self._angular.within(self._command[1])
         rim = abs(linear) + abs(angular) * self._half
         share = self._rim_limit / rim if rim > self._rim_limit else 1.0
         self._target = linear * share, angular * share
 
     def update(self, time_ns: int, period_ns: int) -> None:
-        """Ramp towards the target. After the timeout the target is a standstill."""
+        """Ramp the twist towards the target, and command the wheels; after `timeout` the target is a
+        standstill.
+        """
         dt = period_ns * 1e-9
         linear, angular = self._linear, self._angular
         self._start_from_goals()
@@ -254,7 +262,9 @@ class DiffDriveController(Controller[DiffDriveParameters]):
         velocity[right] = (forward + across) / self._radii[1]
 
     def _start_from_goals(self) -> None:
-        """Restart the ramps from the goals that were sent, if the gate has slowed or stopped the wheels."""
+        """Restart the ramps from the wheel velocities that were sent, if the loop reduced what was
+        commanded.
+        """
         forward, turn = self._rims(self.context.goals.velocity)
         if abs(forward - self._linear.velocity) > _SAME or abs(turn - self._angular.velocity) > _SAME:
             self._linear.stop()
@@ -275,7 +285,9 @@ class DiffDriveController(Controller[DiffDriveParameters]):
         return forward, turn
 
     def _rims(self, turned: NDArray[np.float64]) -> tuple[float, float]:
-        """Convert wheel angles into distance and angle of the base, or wheel velocities into its twist."""
+        """Convert wheel angles (rad) into distance (m) and turn (rad) of the base, or wheel velocities
+        into its twist.
+        """
         (left, right), (left_radius, right_radius) = self._sides, self._radii
         on_left = float(np.add.reduce(turned[left])) / len(self.parameters.left) * left_radius
         on_right = float(np.add.reduce(turned[right])) / len(self.parameters.right) * right_radius
@@ -284,7 +296,7 @@ class DiffDriveController(Controller[DiffDriveParameters]):
     # Odometry
 
     def _follow(self, time_ns: int, dt: float) -> None:
-        """Update the pose by the motion since the last update."""
+        """Update the pose by the motion since the last update, and publish it at `odometry_rate`."""
         states = self.context.states
         if self.parameters.odometry == "command":
             self._twist = self._linear.velocity, self._angular.velocity
@@ -301,7 +313,10 @@ class DiffDriveController(Controller[DiffDriveParameters]):
             self._publish()
 
     def _measure(self, time_ns: int) -> None:
-        """Update the pose by the travel of the wheels since the last complete set of replies."""
+        """Update the pose by the wheels' travel since the last cycle in which all wheels answered.
+
+        The travel is discarded, and an event reports it, after a gap in which its number of turns is unknown.
+        """
         states = self.context.states
         age_ns = self._angles.age_ns(time_ns)
         elapsed_ns = self._angles.take(states, time_ns)
@@ -317,7 +332,7 @@ class DiffDriveController(Controller[DiffDriveParameters]):
         self._holding = False
 
     def _hold(self, time_ns: int) -> None:
-        """Report once that wheels have not answered for so long that their travel is lost."""
+        """Report once that wheels have not answered for longer than the travel can be known."""
         if self._holding or self._angles.age_ns(time_ns) <= self._angles.longest_ns:
             return
         self._holding = True

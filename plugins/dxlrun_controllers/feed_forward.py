@@ -1,4 +1,4 @@
-"""feed_forward: add to a motion the feed-forward that its servos need, from the models of their motors."""
+"""feed_forward: add to a desired motion the torque that it needs, from the models of the servos' motors."""
 
 from __future__ import annotations
 
@@ -32,7 +32,7 @@ from dxlrun_controllers.joints import (
 from dxlrun_controllers.laws.feed_forward import NEEDED_FIGURES, InverseServo, MotionAhead, output_per_need
 
 STATE_NS: Final = 20_000_000
-"""Time between two messages of the state, ns"""
+"""Time between two messages of the topic `state`, ns."""
 
 
 class FeedForwardParameters(JointsParameters):
@@ -58,7 +58,7 @@ class FeedForwardParameters(JointsParameters):
     """Time constant of the filter on the measured supply voltage; 0 disables the filter."""
 
     def mistakes(self) -> Iterator[Mistake]:
-        """Yield `pass_on` if the positions are commanded anyway."""
+        """Yield the mistake of `pass_on` together with a command interface that commands positions anyway."""
         yield from super().mistakes()
         if self.pass_on and self.command_interface == "position":
             yield (
@@ -69,22 +69,22 @@ class FeedForwardParameters(JointsParameters):
 
 @dataclass(slots=True)
 class FeedForwardState:
-    """Feed-forward of the motion, one row per joint in the order of the controller's joints"""
+    """Message of the topic `state`: the feed-forward, with one row per joint of the controller."""
 
     header: Header
     velocity: Floats
     """Desired velocity, rad/s. Like all fields that follow, it is predicted for the time when the goal acts.
     """
     acceleration: Floats
-    """rad/s^2"""
+    """Desired acceleration, rad/s^2."""
     torque: Floats
-    """Nm of the motor"""
+    """Torque of the motor that the motion needs, Nm."""
     duty: Floats
-    """Fraction of the supply voltage"""
+    """Duty that the motion needs, fraction of the supply voltage, -1..1."""
     supply: Floats
-    """V"""
+    """Filtered supply voltage, V."""
     output: Floats
-    """Offset of the position (rad), or command"""
+    """Added offset of the position (rad), or command (unit of the effort, or fraction of full voltage)."""
 
 
 class FeedForward(Controller[FeedForwardParameters]):
@@ -117,7 +117,7 @@ class FeedForward(Controller[FeedForwardParameters]):
         )
 
     def on_configure(self, context: Context) -> None:
-        """Allocate all memory that the loop needs."""
+        """Allocate all memory that the loop needs. Raises ValueError for a joint without a motor file."""
         super().on_configure(context)
         parameters, joints, limits = self.parameters, context.joints, context.limits
         motors = [motor for motor in context.motors if motor is not None]
@@ -156,18 +156,18 @@ class FeedForward(Controller[FeedForwardParameters]):
         self.on_parameters(0)
 
     def on_parameters(self, time_ns: int) -> None:
-        """Set the scale."""
+        """Set the factor on the feed-forward, which may have changed in the run."""
         self._scale = row_of(self.parameters.scale, self.context.joints)
 
     def on_activate(self, time_ns: int) -> None:
-        """Hold the joints where they are."""
+        """Discard the past motion, so that the joints rest where they are until a reference is commanded."""
         self._reference.fill(np.nan)
         self._ahead.reset()
         self._inverse.supply.take(self.context.states.voltage, 1.0)
         self._state_ns = time_ns
 
     def update(self, time_ns: int, period_ns: int) -> None:
-        """Command the feed-forward of the reference."""
+        """Predict the reference motion, and command its feed-forward with or without the reference."""
         context, ahead, inverse, output = self.context, self._ahead, self._inverse, self._output
         period_s = period_ns * 1e-9
         refer(self._reference, context)

@@ -41,12 +41,12 @@ from dxlrun_controllers.laws.feed_forward import NEEDED_FIGURES, Supply, output_
 from dxlrun_controllers.laws.gravity import MOVABLE, TYPES, Bodies, bodies_of, gravity_law, up_of
 
 STATE_NS: Final = 20_000_000
-"""Time between two messages of the state, ns"""
+"""Time between two messages of the topic `state`, ns."""
 _MOVE: Final[Mapping[JointUnit, str]] = {ROTARY: "turn", LINEAR: "slide"}
 
 
 class PayloadParameters(ParametersModel):
-    """Load that the robot carries and that the URDF does not include"""
+    """Load that the robot carries and that its URDF does not include."""
 
     link: str
     """Link that carries the payload."""
@@ -77,13 +77,13 @@ class GravityParameters(JointsParameters):
 
 @dataclass(slots=True)
 class GravityState:
-    """Compensation of the weight, one row per joint in the order of the controller's joints"""
+    """Message of the topic `state`: the compensated weight, with one row per joint of the controller."""
 
     header: Header
     torque: Floats
-    """Nm"""
+    """Torque that holds the weight, Nm."""
     output: Floats
-    """Value that is added: rad, unit of the effort, or fraction of full voltage"""
+    """Value that is added to the reference: rad, unit of the effort, or fraction of full voltage."""
 
 
 class GravityCompensation(Controller[GravityParameters]):
@@ -101,7 +101,9 @@ class GravityCompensation(Controller[GravityParameters]):
 
     @classmethod
     def interfaces(cls, parameters: GravityParameters, joints: tuple[str, ...]) -> Interfaces:
-        """Command and export the same interfaces. Read all other joints and the orientation of the base."""
+        """Command and export the same interfaces; read the positions of all other joints, and the
+        orientation.
+        """
         interfaces = commanded_by(parameters.command_interface)
         source = parameters.orientation
         others = (f"{joint}/position" for joint in joints if joint not in parameters.joints)
@@ -115,7 +117,9 @@ class GravityCompensation(Controller[GravityParameters]):
 
     @classmethod
     def mismatches(cls, parameters: GravityParameters, robot: RobotModel) -> Iterator[Mismatch]:
-        """Yield a missing requirement: MuJoCo, the URDF, a joint or a mass in it, the link of the payload."""
+        """Yield a missing requirement: MuJoCo, the URDF, a joint or a mass in it, or the link of the
+        payload.
+        """
         if importlib.util.find_spec("mujoco") is None:
             yield Mismatch(
                 "needs MuJoCo, which is not installed", "`pip install 'dxlrun[physics]'` installs it"
@@ -142,7 +146,7 @@ class GravityCompensation(Controller[GravityParameters]):
         yield from found
 
     def on_configure(self, context: Context) -> None:
-        """Build the gravity law, and allocate all memory that the loop needs."""
+        """Build the gravity law of the URDF, and allocate all memory that the loop needs."""
         super().on_configure(context)
         parameters, joints, limits = self.parameters, context.joints, context.limits
         if context.urdf is None:
@@ -162,7 +166,7 @@ class GravityCompensation(Controller[GravityParameters]):
         self._command: Floats = getattr(context.commands, self._first)
         self._commanded: Floats = getattr(context.references, self._first)
         self._at = np.full(len(names), np.nan)
-        """Positions at which the weight is computed, rad: the controller's joints, then all other joints"""
+        """Positions at which the weight is computed, rad: the controller's joints, then all other joints."""
         self._up = np.array([0.0, 0.0, 1.0])
         self._reference, self._torque, self._output = np.zeros((3, count))
         # Velocity of `posvel` without a reference. A servo needs one above 0 to reach its goal position.
@@ -171,18 +175,21 @@ class GravityCompensation(Controller[GravityParameters]):
         self.on_parameters(0)
 
     def on_parameters(self, time_ns: int) -> None:
-        """Set the scale. A changed mass of the payload takes effect in the next update."""
+        """Set the compensated fraction of the weight.
+
+        A changed mass of the payload takes effect in the next update.
+        """
         self._scale = row_of(self.parameters.scale, self.context.joints)
 
     def on_activate(self, time_ns: int) -> None:
-        """Hold the joints where they are."""
+        """Discard the past references, so that the joints are held where they are."""
         self._reference.fill(np.nan)
         self._supply.take(self.context.states.voltage, 1.0)
         self._up[:] = (0.0, 0.0, 1.0)
         self._state_ns = time_ns
 
     def update(self, time_ns: int, period_ns: int) -> None:
-        """Command the references plus the compensation of the weight."""
+        """Command the references plus the value that compensates the weight."""
         context, parameters, count = self.context, self.parameters, len(self._output)
         period_s = period_ns * 1e-9
         self._supply.take(context.states.voltage, period_s / (self._filter_s + period_s))
@@ -228,7 +235,7 @@ def _hung(parameters: GravityParameters) -> tuple[str, tuple[float, ...]] | None
 
 
 def _of_joint(bodies: Bodies, joint: str, unit: JointUnit) -> Iterator[Mismatch]:
-    """Yield the first problem of the URDF with a joint."""
+    """Yield the first problem of the URDF with a joint: missing, of the wrong type, or without a mass."""
     if joint not in bodies.joints:
         yield Mismatch(
             f"needs {joint} in the URDF, which does not have it",

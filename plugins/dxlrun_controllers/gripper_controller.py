@@ -48,9 +48,9 @@ from dxlrun_controllers.group import PositionsCommand
 from dxlrun_controllers.joints import hold, or_number, take_shorter_way_from_goals
 
 STATE_NS = 50_000_000
-"""Time between two messages of the topic, ns"""
+"""Time between two messages of the topic `state`, ns."""
 REST_NS = 1_000_000_000
-"""Timeout for the gripper to come to rest after a cancel, ns"""
+"""Timeout for the gripper to come to rest after a cancel, ns."""
 
 
 Way = Angle | Length
@@ -60,7 +60,7 @@ _OF_LENGTHS: TypeAdapter[float] = TypeAdapter(Length | LinearVelocity)
 
 
 def _is_length(value: object) -> bool:
-    """Return True if a quantity is written with a unit of length or of linear velocity."""
+    """Return True if a quantity is a text with a unit of length or of linear velocity."""
     try:
         return isinstance(value, str) and _OF_LENGTHS.validate_python(value) is not None
     except ValidationError:
@@ -80,7 +80,9 @@ class GripperParameters(ParametersModel):
     """Keys of a gripper_controller in the robot file."""
 
     _units: Mapping[str, JointUnit] = PrivateAttr({})
-    """Unit of the joint that each key was written for"""
+    """Key of the parameters -> LINEAR if it was written as a length; keys for a joint that turns are not
+    in it.
+    """
     joint: str
     """Joint that opens and closes the gripper."""
     effort: Annotated[float, Field(gt=0)] | None = None
@@ -112,11 +114,13 @@ class GripperParameters(ParametersModel):
         return found
 
     def unit_of(self, key: str) -> JointUnit:
-        """Return the unit of the joint that a key, or its default, was written for."""
+        """Return the joint unit for which a key was written; ROTARY for its default."""
         return self._units.get(key, ROTARY)
 
     def mistakes(self) -> Iterator[Mistake]:
-        """Yield `widths` if they do not define a monotonic function of the angle."""
+        """Yield a table `widths` with one row, or whose widths do not all rise or all fall with the
+        position.
+        """
         yield from super().mistakes()
         if len(self.widths) == 1:
             yield ("widths",), "one width makes no line; write at least two, such as open and closed"
@@ -130,7 +134,7 @@ class GripperParameters(ParametersModel):
 
 
 _OF_THE_WAY = ("speed", "tolerance", "stall_speed")
-"""Keys whose defaults are for a joint that turns"""
+"""Keys of the parameters whose defaults are for a joint that turns."""
 _FIXES: Mapping[JointUnit, Mapping[str, str]] = {
     ROTARY: {},
     LINEAR: {
@@ -175,18 +179,18 @@ class GripCommand(CommandModel):
 
 @dataclass(frozen=True, slots=True)
 class GripperState:
-    """State of the gripper"""
+    """Message of the topic `state`: position, opening and effort of the gripper."""
 
     position: float
-    """rad, or m for a linear joint"""
+    """Measured position of the joint, rad, or m for a linear joint."""
     width: float
-    """m; NaN without a table of widths"""
+    """Opening at this position, m; NaN without a table of widths."""
     effort: float
-    """In the unit that the model measures"""
+    """Measured effort, in the unit that the model measures."""
     moving: bool
-    """True while a goal is active"""
+    """True while a goal is active."""
     stalled: bool
-    """True from a stall until the next goal: the gripper holds something"""
+    """True from a stall until the next command: the gripper holds something."""
 
 
 class GripperController(Controller[GripperParameters]):
@@ -207,7 +211,9 @@ class GripperController(Controller[GripperParameters]):
 
     @classmethod
     def mismatches(cls, parameters: GripperParameters, robot: RobotModel) -> Iterator[Mismatch]:
-        """Yield each key whose unit does not fit the joint. The defaults are for a joint that turns."""
+        """Yield each key that is written as an angle for a linear joint, or as a length for a joint that
+        turns.
+        """
         needed = (*_OF_THE_WAY, *(["widths"] if parameters.widths else []))
         for key in needed:
             unit, written = robot.units[0], parameters.unit_of(key)
@@ -226,7 +232,8 @@ class GripperController(Controller[GripperParameters]):
 
     @classmethod
     def prepare(cls, kind: str, command: CommandModel, parameters: GripperParameters) -> NDArray[np.float64]:
-        """Return the position of the joint (rad or m) and the effort limit.
+        """Return the goal position of the joint (rad or m) and the effort limit (NaN without one) of a
+        command.
 
         Raises:
             ValueError: The width is out of range, or the parameters do not allow a width or an effort.
@@ -260,7 +267,7 @@ class GripperController(Controller[GripperParameters]):
         self._target = self._way = 0.0
         self._began_ns = self._published_ns = 0
         self._still, self._still_ns, self._heard_ns = np.nan, 0, 0
-        """Position near which the gripper has stayed, the time since then, and the time of the last reply"""
+        """Position near which the gripper has stayed, since when, and the time of the last reply, ns."""
         self._cancelled = self._stalled = False
         self._unit = self.parameters.unit_of("speed").value
 
@@ -275,11 +282,11 @@ class GripperController(Controller[GripperParameters]):
         self._published_ns = time_ns - STATE_NS
 
     def on_parameters(self, time_ns: int) -> None:
-        """Set the speed. For a controller below it would be a signed velocity, so it gets 0."""
+        """Set the speed of the joint. A controller below would take it as a signed velocity, so it gets 0."""
         self.context.commands.velocity.fill(0.0 if self.context.into else self.parameters.speed)
 
     def on_goal(self, goal: Goal, data: NDArray[np.float64], time_ns: int) -> None:
-        """Start to close or open. A position beyond the joint's limits aborts the goal."""
+        """Start to move to the goal position. A position beyond the joint's limits aborts the goal."""
         self._goal, self._cancelled, self._stalled = None, False, False
         angle, effort = float(take_shorter_way_from_goals(data[:1], self.context)[0]), float(data[1])
         if not self._lower <= angle <= self._upper:
@@ -295,7 +302,7 @@ class GripperController(Controller[GripperParameters]):
         self._way = abs(angle - float(self.context.states.position[0]))
 
     def on_command(self, kind: str, data: NDArray[np.float64], time_ns: int) -> None:
-        """Set another position. An active goal ends."""
+        """Set another goal position without a result; an active goal ends as preempted."""
         self._end(Outcome.PREEMPTED, "positions came")
         self._cancelled, self._stalled = False, False
         self.on_parameters(time_ns)
@@ -311,7 +318,7 @@ class GripperController(Controller[GripperParameters]):
         self._goal = None
 
     def update(self, time_ns: int, period_ns: int) -> None:
-        """Monitor the goal until it is reached, stalled or timed out, and publish the state."""
+        """Monitor the active goal until it is reached, stalled or timed out, and publish the state."""
         states = self.context.states
         if self._goal is not None:
             if self._cancelled:
@@ -328,7 +335,7 @@ class GripperController(Controller[GripperParameters]):
             self.context.publish("state", message)
 
     def _watch(self, goal: Goal, time_ns: int) -> None:
-        """Check an active goal. Without a reply, only the timeout is checked."""
+        """End or report an active goal by the measured position; without a reply, only by the timeout."""
         if not self.context.states.valid[0]:
             if time_ns - self._began_ns >= self.parameters.timeout:
                 self._end(Outcome.MISSED, "no reply of its servo")
@@ -351,10 +358,11 @@ class GripperController(Controller[GripperParameters]):
         goal.feedback(max(0.0, 1.0 - error / self._way) if self._way else 0.0, error)
 
     def _stands_still(self, position: float, time_ns: int) -> bool:
-        """Return True if the gripper was slower than `stall_speed` for `stall_time`.
+        """Return True if the gripper was slower than `stall_speed` for `stall_time`; called once a cycle.
 
         The check compares positions, because a measured velocity is noisy near 0. A lost reply does not
-        restart the time, but a gap longer than `stall_time` does.
+        restart the
+        time, but a gap longer than `stall_time` does.
         """
         parameters = self.parameters
         silent_ns, self._heard_ns = time_ns - self._heard_ns, time_ns
@@ -364,7 +372,7 @@ class GripperController(Controller[GripperParameters]):
         return time_ns - self._still_ns >= parameters.stall_time
 
     def _stay(self) -> None:
-        """Command the measured position, clamped to the limits. Without one, keep the last command."""
+        """Command the measured position, clamped to the limits; without one, the last command stays."""
         position = float(self.context.states.position[0])
         if not np.isnan(position):
             self.context.commands.position.fill(min(max(position, self._lower), self._upper))
@@ -378,14 +386,16 @@ class GripperController(Controller[GripperParameters]):
         goal.end(outcome, f"{text} at {self._place(position)}", self.parameters.joint, error)
 
     def _hand_over(self, text: str, tolerance: float, rest_speed: float, settle_ns: int) -> None:
-        """Pass the goal to the runtime for judgement. A stall has an infinite tolerance."""
+        """Pass the active goal to the runtime, which judges it by these tolerances; a stall has infinite
+        ones.
+        """
         goal, self._goal = self._goal, None
         if goal is not None:
             tolerances = GoalTolerances(np.array([tolerance]), np.array([rest_speed]), settle_ns)
             goal.judge(np.array([self._target]), tolerances=tolerances, text=text)
 
     def _place(self, position: float) -> str:
-        """Format a position of the joint and the opening there."""
+        """Return a joint position as text, with the opening there if there is a table of widths."""
         width = self._width(position)
         place = f"{position:.4g} {self._unit}"
         return place if np.isnan(width) else f"{place}, {width * 1e3:.4g} mm"

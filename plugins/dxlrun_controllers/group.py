@@ -64,18 +64,18 @@ class PwmCommand(CommandModel):
 
 
 class _GroupController(Controller[GroupParameters]):
-    """Controller that forwards the newest command. Its fields are in the order of `claimed`."""
+    """Base of the controllers that forward the newest command to the interfaces `claimed`, in that order."""
 
     Parameters = GroupParameters
     claimed: ClassVar[tuple[Literal["position", "velocity", "effort", "pwm"], ...]]
 
     @classmethod
     def interfaces(cls, parameters: GroupParameters, joints: tuple[str, ...]) -> Interfaces:
-        """Claim the controller's interfaces of the parameters' joints."""
+        """Claim the interfaces `claimed` on the joints of the parameters."""
         return Interfaces(parameters.joints, cls.claimed)
 
     def on_activate(self, time_ns: int) -> None:
-        """Hold the joints where they are. Velocities, efforts and PWM start at 0."""
+        """Hold the joints at their last goals; velocities, efforts and PWM start at 0."""
         if "position" in self.claimed:
             hold(self.context)
         else:
@@ -89,7 +89,7 @@ class _GroupController(Controller[GroupParameters]):
             np.copyto(getattr(self.context.commands, self.claimed[0]), sent, where=np.isfinite(sent))
 
     def on_command(self, kind: str, data: NDArray[np.float64], time_ns: int) -> None:
-        """Set new values."""
+        """Set new values for the joints."""
         for name, values in zip(self.claimed, data.reshape(len(self.claimed), -1), strict=True):
             wanted = take_shorter_way_from_goals(values, self.context) if name == "position" else values
             np.copyto(getattr(self.context.commands, name), wanted)

@@ -1,4 +1,6 @@
-"""Joints: names of a controller's joints, and parameters with one value for all joints or one per joint."""
+"""Joints: parameters with one value for all joints or one per joint, and helpers for arrays of joint
+values.
+"""
 
 from __future__ import annotations
 
@@ -17,7 +19,7 @@ Positive = Annotated[float, Field(gt=0)]
 
 T = TypeVar("T")
 CommandInterface = Literal["position", "posvel", "poseffort", "velocity", "effort", "pwm"]
-"""Values of `command_interface`"""
+"""Values of the key `command_interface`."""
 
 
 def commanded_by(
@@ -34,7 +36,7 @@ def commanded_by(
 
 
 def or_number(adapter: TypeAdapter[float]) -> BeforeValidator:
-    """Return a validator that accepts a bare number in SI units or a text with a unit."""
+    """Return a validator that converts a text with a unit by `adapter` to SI; a number is SI already."""
     return BeforeValidator(lambda value: adapter.validate_python(value) if isinstance(value, str) else value)
 
 
@@ -49,13 +51,13 @@ PerJoint = Annotated[
 
 
 class JointsParameters(ParametersModel):
-    """Base class of parameters with `joints`. Mappings by joint may only name these joints."""
+    """Base class of parameters with `joints`; mappings by joint may only name these joints."""
 
     joints: JointNames
     """Joints of the controller. Commands list their values in this order."""
 
     def mistakes(self) -> Iterator[Mistake]:
-        """Yield each mapping key and each entry of `wrap` that does not name a joint of the controller."""
+        """Yield each name in a mapping by joint or in `wrap` that is not a joint of the controller."""
         yield from super().mistakes()
         for path, names in _names_of_joints(self, ()):
             for step, joint in names:
@@ -64,14 +66,14 @@ class JointsParameters(ParametersModel):
 
 
 def not_one_of(joints: Sequence[str]) -> str:
-    """Return the second half of an error message: the controller lacks the joint; it has these."""
+    """Return the end of an error message about an unknown joint: the joints that the controller has."""
     return f"not one of its joints; they are {', '.join(joints)}"
 
 
 def _names_of_joints(
     model: BaseModel, path: tuple[str, ...]
 ) -> Iterator[tuple[tuple[str, ...], Iterable[tuple[str | int, str]]]]:
-    """Yield the path of each key that names joints, with the names and their position below that key."""
+    """Yield the path of each key that names joints, with pairs of the step below that key and the name."""
     for name, value in model:
         if isinstance(value, BaseModel):
             yield from _names_of_joints(value, (*path, name))
@@ -91,23 +93,25 @@ def row_of(
 
 
 def value_for(value: T | Mapping[str, T] | None, joint: str) -> T | None:
-    """Return the value of a PerJoint parameter for a joint, or None if it has none."""
+    """Return the value that a PerJoint parameter has for a joint, or None if it has none."""
     return value.get(joint) if isinstance(value, Mapping) else value
 
 
 def finite_or(values: Floats, default: Floats | float) -> Floats:
-    """Return a copy in which `default` replaces NaN, which marks a missing limit or an unknown value."""
+    """Return a copy of `values` with NaN, which marks a missing limit or an unknown value, replaced by
+    `default`.
+    """
     return np.where(np.isnan(values), default, values)
 
 
 def clamped(values: Floats, lower: Floats | float, upper: Floats | float) -> Floats:
-    """Return the values clamped to bounds, in a third of the time that np.clip takes."""
+    """Return the values clamped to bounds, as np.clip does, in a third of its time."""
     bounded: Floats = np.minimum(np.maximum(values, lower), upper)
     return bounded
 
 
 def check_size(what: str, found: int, joints: tuple[str, ...]) -> None:
-    """Raise ValueError if a command does not have exactly one value per joint."""
+    """Raise ValueError if a command has not exactly one value per joint; `what` names the values."""
     if found != len(joints):
         raise ValueError(f"{found} {what} for {len(joints)} joints ({', '.join(joints)})")
 
@@ -122,7 +126,7 @@ def ends_unheard(goal: Goal, position: Floats, joints: tuple[str, ...]) -> bool:
 
 
 def take_shorter_way(positions: Floats, near: Floats, wrap: NDArray[np.bool_]) -> Floats:
-    """Shift positions of wrapping joints by whole turns, to within half a turn of `near`.
+    """Return positions with those of wrapping joints shifted by whole turns, to within half a turn of `near`.
 
     Args:
         positions: rad, shape (joints,).
@@ -133,7 +137,10 @@ def take_shorter_way(positions: Floats, near: Floats, wrap: NDArray[np.bool_]) -
 
 
 def take_shorter_way_from_goals(positions: Floats, context: Context) -> Floats:
-    """Shift positions of wrapping joints to the turn nearest to the last goal, or to the last reading."""
+    """Return positions with those of wrapping joints shifted to the turn nearest to the last goal.
+
+    A joint without a goal takes the turn nearest to its measured position.
+    """
     near = finite_or(context.goals.position, context.states.position)
     return take_shorter_way(positions, near, np.array(context.wrap))
 
@@ -148,7 +155,7 @@ def hold(context: Context) -> None:
 
 
 def refer(reference: Floats, context: Context) -> None:
-    """Update `reference` with the positions that other controllers command.
+    """Update `reference` (rad, one row per joint) with the positions that other controllers command.
 
     A joint without a command keeps its last reference. A joint that has never had one (NaN) starts at its
     measured position.
@@ -159,6 +166,6 @@ def refer(reference: Floats, context: Context) -> None:
 
 
 def take_where_heard(position: Floats, states: States) -> bool:
-    """Replace NaN by measured positions. Return True while a joint has not answered yet."""
+    """Replace NaN in `position` by measured positions; return True while a joint has not answered yet."""
     np.copyto(position, states.position, where=np.isnan(position))
     return bool(np.isnan(position).any())

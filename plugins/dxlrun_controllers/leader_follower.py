@@ -60,7 +60,9 @@ class LeaderFollowerParameters(ParametersModel):
     """Largest age of a leader's state, or of a command. The joints hold if it is older."""
 
     def mistakes(self) -> Iterator[Mistake]:
-        """Yield pairs with and without a leader in one controller, and keys that need a leader."""
+        """Yield pairs of which only some have a leader, keys that need a leader, and joints that lead and
+        follow.
+        """
         yield from super().mistakes()
         led = {pair.leader for pair in self.pairs if pair.leader}
         if not led and self.command_interface == "posvel":
@@ -104,7 +106,7 @@ class LeaderFollower(Controller[LeaderFollowerParameters]):
     def prepare(
         cls, kind: str, command: CommandModel, parameters: LeaderFollowerParameters
     ) -> NDArray[np.float64]:
-        """Return the positions, rad, shape (pairs,).
+        """Return the positions of a command, rad, shape (pairs,).
 
         Raises:
             ValueError: The joints follow leaders, or the number of positions is wrong.
@@ -129,7 +131,7 @@ class LeaderFollower(Controller[LeaderFollowerParameters]):
         self._posvel = self.parameters.command_interface == "posvel"
 
     def on_activate(self, time_ns: int) -> None:
-        """Hold the joints."""
+        """Hold the joints at their last goals until a leader or a command is fresh."""
         hold(self.context)
         self._in_step.fill(False)
         self._unknown = True
@@ -137,12 +139,14 @@ class LeaderFollower(Controller[LeaderFollowerParameters]):
         self._following = self._reported = False
 
     def on_command(self, kind: str, data: NDArray[np.float64], time_ns: int) -> None:
-        """Set new positions to follow."""
+        """Set new positions to follow, and note the time for `timeout`."""
         np.copyto(self._wanted, data)
         self._commanded_ns = time_ns
 
     def update(self, time_ns: int, period_ns: int) -> None:
-        """Command the leaders' positions, with a limited step for each joint that has not caught up."""
+        """Move each joint towards its leader's position, with a limited step until it has caught up; else
+        hold.
+        """
         if self.context.states.has_lost:
             hold(self.context)
             self._in_step.fill(False)
@@ -166,13 +170,16 @@ class LeaderFollower(Controller[LeaderFollowerParameters]):
             self._command_speed(step)
 
     def _age_s(self, time_ns: int) -> float:
-        """Return the age of the oldest leader's state, or of the last command, s; NaN before the first."""
+        """Return the age of the oldest leader's state, or of the last command, s; NaN while there is none."""
         if self._led:
             return float(np.maximum.reduce(self._leader_age))  # NaN if one leader has not answered yet
         return (time_ns - self._commanded_ns) * 1e-9 if self._commanded_ns >= 0 else np.nan
 
     def _rest(self, age_s: float) -> None:
-        """Hold, and report the reason once. Nothing is reported before the first command."""
+        """Hold the joints, and report once why: `age_s` is above the timeout.
+
+        Before the first command, report nothing.
+        """
         if self._following:
             self._in_step.fill(False)
             if self._posvel:
@@ -190,7 +197,7 @@ class LeaderFollower(Controller[LeaderFollowerParameters]):
         self.context.say(f"no reply of leader {leader} {since}, holding")
 
     def _command_speed(self, step: Floats) -> None:
-        """Command the leader's speed to joints that have caught up, and the approach speed to all others."""
+        """Command the leader's speed to joints that have caught up, and the approach speed to the others."""
         leading, approach = self._leader_velocity * self._scale, self.parameters.speed
         if self.context.into:  # a reference, with its sign
             velocity = np.where(self._in_step, leading, np.copysign(approach, step))

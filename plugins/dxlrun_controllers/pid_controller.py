@@ -56,7 +56,7 @@ class PidParameters(JointsParameters):
     _own_velocity = model_validator(mode="before")(feed_velocities_forward)
 
     def mistakes(self) -> Iterator[Mistake]:
-        """Yield a command interface or a `wrap` that does not fit the reference."""
+        """Yield a command interface or a `wrap` that does not fit the quantity `reference`."""
         yield from super().mistakes()
         if self.reference == "velocity" and self.command_interface == "position":
             what = "a velocity reference cannot be commanded as positions"
@@ -69,27 +69,29 @@ _KIND: Final = {"position": "positions", "velocity": "velocities"}
 
 
 STATE_NS: Final = 20_000_000
-"""Time between two messages of the state, ns"""
+"""Time between two messages of the topic `state`, ns."""
 
 
 @dataclass(slots=True)
 class PidState:
-    """Inputs and outputs of the law, one row per joint in the order of the controller's joints"""
+    """Message of the topic `state`: inputs and outputs of the law, with one row per joint of the
+    controller.
+    """
 
     header: Header
     reference: Floats
-    """rad or rad/s, like `measurement` and `error`"""
+    """Reference in rad or rad/s; `measurement` and `error` have the same unit."""
     measurement: Floats
     error: Floats
     error_rate: Floats
-    """Filtered rate of the error, rad/s or rad/s^2"""
+    """Filtered rate of the error, rad/s or rad/s^2."""
     proportional: Floats
-    """In units of the command, like all fields that follow"""
+    """Proportional term, in units of the command, as are all fields that follow."""
     integral: Floats
     derivative: Floats
     feed_forward: Floats
     output: Floats
-    """Command"""
+    """Command: the sum of the terms, clamped."""
 
 
 class PidController(Controller[PidParameters]):
@@ -122,14 +124,14 @@ class PidController(Controller[PidParameters]):
 
     @classmethod
     def interfaces(cls, parameters: PidParameters, joints: tuple[str, ...]) -> Interfaces:
-        """Command one interface. Export the reference, its rate, and an effort or PWM to add."""
+        """Command one interface; export the reference, its rate, and an effort or PWM that is added."""
         position = ("position", "velocity") if parameters.reference == "position" else ("velocity",)
         added = (parameters.command_interface,) if parameters.command_interface in {"effort", "pwm"} else ()
         return Interfaces(parameters.joints, (parameters.command_interface,), reference=(*position, *added))
 
     @classmethod
     def prepare(cls, kind: str, command: CommandModel, parameters: PidParameters) -> NDArray[np.float64]:
-        """Return the setpoints, shape (joints,).
+        """Return the setpoints of a command, shape (joints,).
 
         Raises:
             ValueError: The command does not fit the reference, or the number of values is wrong.
@@ -180,13 +182,15 @@ class PidController(Controller[PidParameters]):
         self.on_parameters(0)
 
     def on_parameters(self, time_ns: int) -> None:
-        """Set the gains."""
+        """Set the gains of the law, which may have changed in the run."""
         gains, joints = self.parameters.gains, self.context.joints
         self._pid.take(gains, joints)
         self._feed_forward = row_of(gains.feed_forward, joints, 0.0)
 
     def on_activate(self, time_ns: int) -> None:
-        """Hold the joints where they are. The output continues from the last command of the interface."""
+        """Take the present positions, or velocity 0, as reference; the output continues from the last
+        command.
+        """
         goals, pid = self.context.goals, self._pid
         self._setpoint.fill(np.nan if self._by_position else 0.0)
         self._reference.fill(np.nan)
@@ -203,15 +207,15 @@ class PidController(Controller[PidParameters]):
         pid.reset(finite_or(before, 0.0), self._error, self._bias)
 
     def on_hold(self, time_ns: int) -> None:
-        """Hold the joints where they are."""
+        """Take the present positions, or velocity 0, as reference again."""
         self.on_activate(time_ns)
 
     def on_command(self, kind: str, data: NDArray[np.float64], time_ns: int) -> None:
-        """Set new setpoints."""
+        """Set new setpoints, used for joints that no other controller commands."""
         np.copyto(self._setpoint, data)
 
     def update(self, time_ns: int, period_ns: int) -> None:
-        """Compute the output of the law and command it."""
+        """Compute the output of the law and command it; publish the state."""
         period_s = period_ns * 1e-9
         self._refer()
         if not self._by_position:
@@ -227,7 +231,7 @@ class PidController(Controller[PidParameters]):
             self.context.publish("state", self._state)
 
     def _correct(self, period_s: float) -> None:
-        """Command the sum of reference and correction, clamped to the position limits."""
+        """Command the reference plus the law's output, clamped to the position limits."""
         pid, reference = self._pid, self._reference
         pid.upper = np.minimum(self._upper - reference, self._most)
         pid.lower = np.maximum(self._lower - reference, -self._most)
@@ -239,7 +243,7 @@ class PidController(Controller[PidParameters]):
         np.add(reference, correction, out=self._output, where=np.isfinite(reference))
 
     def _refer(self) -> None:
-        """Compute the reference, the error and its rate, and the feed-forward."""
+        """Compute reference, error, rate of the error and feed-forward of this cycle."""
         setpoint, error = self._setpoint, self._error
         states, references = self.context.states, self.context.references
         free = np.isnan(self._commanded)

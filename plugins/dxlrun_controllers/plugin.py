@@ -1,4 +1,4 @@
-"""Plug-in of the standard controllers and sensors. It uses the same hooks as any other package."""
+"""Plug-in of the standard controllers and sensors, with the hooks that any other package uses."""
 
 from __future__ import annotations
 

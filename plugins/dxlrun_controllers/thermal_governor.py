@@ -35,11 +35,13 @@ from dxlrun_controllers.joints import (
 )
 
 STATE_NS: Final = 100_000_000
-"""Time between two messages of the state, ns"""
+"""Time between two messages of the topic `state`, ns."""
 WARN_BELOW, LIMIT_BELOW = 15.0, 5.0
-"""Default thresholds, K below the servo's own temperature limit [i]"""
+"""Defaults of `warn` and `limit`, K below the servo's own temperature limit [i]."""
 SMOOTHING_S: Final = 2.0
-"""Time constant of the filter on the temperature, s. Servos report whole degrees about once a second [i]."""
+"""Time constant of the low-pass filter on temperatures, s: servos report whole degrees, about once a
+second [i].
+"""
 _FULL_DUTY: Final = 1.0
 
 
@@ -65,13 +67,13 @@ class ThermalParameters(JointsParameters):
 
 @dataclass(slots=True)
 class ThermalState:
-    """Thermal state of the servos, one row per joint in the order of the controller's joints"""
+    """Message of the topic `state`: temperatures and limits, with one row per joint of the controller."""
 
     header: Header
     temperature: Floats
-    """Measured temperature, degrees C; NaN until first read"""
+    """Measured temperature, degrees C; NaN until first read."""
     scale: Floats
-    """Fraction of its torque that a servo may exert, 0..1"""
+    """Fraction of its torque that the servo may exert, 0..1."""
 
 
 class ThermalGovernor(Controller[ThermalParameters]):
@@ -99,7 +101,9 @@ class ThermalGovernor(Controller[ThermalParameters]):
 
     @classmethod
     def mismatches(cls, parameters: ThermalParameters, robot: RobotModel) -> Iterator[Mismatch]:
-        """Yield unknown figures of servos, and thresholds above a servo's own limit."""
+        """Yield joints with several servos, figures of servos that are unknown, and thresholds in a wrong
+        order.
+        """
         for joint, servo, motor in zip(robot.joints, robot.servos, robot.motors, strict=True):
             if servo is None:
                 yield Mismatch(
@@ -136,7 +140,9 @@ class ThermalGovernor(Controller[ThermalParameters]):
         self._state = ThermalState(Header(), context.states.temperature, self._scale)
 
     def on_activate(self, time_ns: int) -> None:
-        """Start from the measured temperatures, and hold the joints where they are."""
+        """Start from the measured temperatures, and discard references, so that joints hold where they
+        are.
+        """
         self._reference.fill(np.nan)
         np.copyto(self._temperature, self.context.states.temperature)
         self._is_hot.fill(False)
@@ -144,7 +150,7 @@ class ThermalGovernor(Controller[ThermalParameters]):
         self._state_ns = time_ns
 
     def update(self, time_ns: int, period_ns: int) -> None:
-        """Command the references, limited by the temperatures of the servos."""
+        """Command the references, limited by the temperatures of the servos, and publish the state."""
         context = self.context
         self._smooth(context.states.temperature, period_ns * 1e-9)
         np.copyto(self._scale, torque_scale(self._temperature, self._warn, self._limit))
@@ -168,15 +174,19 @@ class ThermalGovernor(Controller[ThermalParameters]):
             context.publish("state", self._state)
 
     def _smooth(self, measured: Floats, period_s: float) -> None:
-        """Low-pass filter the measured temperatures. A servo without a reading keeps its last value."""
+        """Low-pass filter the measured temperatures, degrees C.
+
+        A servo without a reading keeps its last value.
+        """
         before = finite_or(self._temperature, measured)  # start from the first reading
         step = (measured - before) * (period_s / (SMOOTHING_S + period_s))
         self._temperature = before + np.where(np.isfinite(step), step, 0.0)
 
     def _hold_back(self) -> None:
-        """Clamp the goals of hot servos to a distance from their positions that keeps the torque limit.
+        """Clamp the goals of hot servos to a distance from their positions at which their torque is within
+        its limit.
 
-        A servo that was not read in this cycle keeps its last position, so a lost packet causes no jump.
+        A servo that was not read in this cycle keeps its last goal, so a lost packet causes no jump.
         """
         position, goal = self.context.states.position, self.context.commands.position
         reach = self._scale * self._reach
@@ -197,7 +207,8 @@ class ThermalGovernor(Controller[ThermalParameters]):
 
 
 def torque_scale(temperature: Floats, warn: Floats, limit: Floats) -> Floats:
-    """Return the fraction of its torque that each servo may exert.
+    """Return the fraction of its torque that each servo may exert, from its temperature and thresholds,
+    degrees C.
 
     It is 1 below `warn` and while the temperature is unknown (NaN), and 0 from `limit` on.
     """
@@ -206,14 +217,16 @@ def torque_scale(temperature: Floats, warn: Floats, limit: Floats) -> Floats:
 
 
 def _thresholds(parameters: ThermalParameters, joint: str, servo: ServoModel) -> tuple[float, float]:
-    """Return the thresholds of reduced and of no torque, degrees C; NaN if unknown."""
+    """Return the temperatures of a joint above which torque is reduced, and from which it is 0; NaN if
+    unknown.
+    """
     own = np.nan if servo.temperature_limit is None else servo.temperature_limit
     warn, limit = value_for(parameters.warn, joint), value_for(parameters.limit, joint)
     return own - WARN_BELOW if warn is None else warn, own - LIMIT_BELOW if limit is None else limit
 
 
 def _reach(parameters: ThermalParameters, joint: str, motor: MotorModel | None) -> float | None:
-    """Return the position error at which a servo's own control gives full torque, rad."""
+    """Return the position error at which a joint's servo gives full torque, rad; None if unknown."""
     stiffness = None if motor is None else motor.stiffness
     return value_for(parameters.reach, joint) or (1.0 / stiffness if stiffness else None)
 

@@ -1,4 +1,5 @@
-"""Feed-forward: command that a servo needs for a motion, from the model of its motor and its load.
+"""Feed-forward: the torque and duty that a servo needs for a motion, from the model of its motor and its
+load.
 
 Inverse of the model that `dxlrun.MotorModel` documents, vectorised over joints. At the horn, in SI units:
 
@@ -24,13 +25,13 @@ LEAST_SUPPLY = 0.5
 """Lowest plausible fraction of the nominal voltage. A servo does not run below it, so a lower reading is an
 error of the measurement [i]."""
 MOST_SUPPLY = 1.5
-"""Highest plausible fraction of the nominal voltage"""
+"""Highest plausible fraction of the nominal voltage; higher readings are clamped."""
 NEEDED_FIGURES: Mapping[str, tuple[str, ...]] = {
     "position": ("resistance", "position_gain"),
     "effort": ("resistance", "torque_per_effort"),
     "pwm": ("resistance",),
 }
-"""Figures of the motor files that each command interface needs."""
+"""Command interface -> figures of the motor files that it needs."""
 
 
 class MotionAhead:
@@ -48,12 +49,14 @@ class MotionAhead:
         self._known, self._known_velocity = np.full((2, joints), np.nan)
 
     def reset(self) -> None:
-        """Discard the past motion. The next position counts as at rest unless it has a velocity."""
+        """Discard the past motion. The next update has no differences, so an unknown velocity counts as 0."""
         self._known.fill(np.nan)
         self._known_velocity.fill(np.nan)
 
     def update(self, position: Floats, velocity: Floats, period_s: float) -> None:
-        """Add the desired position (rad) and velocity (rad/s or NaN), `period_s` after the last update."""
+        """Add the desired position (rad) and velocity (rad/s, NaN if unknown), `period_s` after the last
+        update.
+        """
         slope = clamped((position - self._known) / period_s, -self._fastest, self._fastest)
         now = finite_or(finite_or(velocity, slope), 0.0)  # 0 after a reset, when no slope is known
         change = finite_or((now - self._known_velocity) / period_s, 0.0)
@@ -89,25 +92,29 @@ class Supply:
 
     def __init__(self, motors: Sequence[MotorModel]) -> None:
         self.voltage = np.array([motor.voltage for motor in motors], dtype=np.float64)
-        """V"""
+        """Filtered supply voltage of each motor, V; at first that of the motor file."""
         self._least, self._most = self.voltage * LEAST_SUPPLY, self.voltage * MOST_SUPPLY
         self._backward = np.array([motor.torque_constant for motor in motors], dtype=np.float64)
         self._per_torque = np.array([motor.resistance / motor.torque_constant for motor in motors])
 
     def take(self, measured: Floats, share: float) -> None:
-        """Low-pass filter the measured voltages, V, with the weight `share` (0..1). NaN is ignored."""
+        """Low-pass filter the measured voltages, V: add the fraction `share` (0..1) of the difference; NaN
+        is ignored.
+        """
         step = (measured - self.voltage) * share
         np.add(self.voltage, step, out=self.voltage, where=np.isfinite(step))
         np.copyto(self.voltage, clamped(self.voltage, self._least, self._most))
 
     def duty(self, torque: Floats, velocity: Floats | float) -> Floats:
-        """Return the duty, not clamped, that produces a torque (Nm) at a velocity (rad/s)."""
+        """Return the duty, fraction of the supply voltage, not clamped, for a torque (Nm) at a velocity
+        (rad/s).
+        """
         duty: Floats = (torque * self._per_torque + self._backward * velocity) / self.voltage
         return duty
 
 
 class InverseServo:
-    """Inverse model of servos. All arrays have the shape (joints,)."""
+    """Inverse model of servos: torque and duty for a desired motion. All arrays have the shape (joints,)."""
 
     def __init__(self, motors: Sequence[MotorModel], friction_speed: Floats) -> None:
         """Read the figures of the motors.
@@ -122,7 +129,7 @@ class InverseServo:
 
         count = len(motors)
         self.torque, self.duty = np.zeros((2, count))
-        """Torque of the motor, Nm, and its duty, not clamped"""
+        """Torque of the motor, Nm, and its duty, not clamped, as computed by the last update."""
         self.supply = Supply(motors)
         self._inertia = row([motor.inertia + motor.load.inertia for motor in motors])
         self._gravity = row([motor.load.gravity for motor in motors])
@@ -138,7 +145,7 @@ class InverseServo:
         self._forward = 1.0 / friction_speed
 
     def update(self, position: Floats, velocity: Floats, acceleration: Floats) -> None:
-        """Compute `torque` and `duty` for a motion (rad, rad/s, rad/s^2)."""
+        """Compute `torque` and `duty` for a motion: rad, rad/s, rad/s^2, shape (joints,)."""
         hold = np.sin(position - self._down) * self._gravity
         friction = self._coulomb
         if self._has_stribeck:

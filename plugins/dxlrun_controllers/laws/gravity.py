@@ -23,13 +23,13 @@ if TYPE_CHECKING:
     from xml.etree.ElementTree import Element
 
 GRAVITY = 9.80665
-"""m/s^2, standard"""
+"""Standard gravity, m/s^2."""
 TYPES: Mapping[JointUnit, tuple[str, ...]] = {ROTARY: ("revolute", "continuous"), LINEAR: ("prismatic",)}
-"""URDF joint types by the unit of their positions"""
+"""Unit of a joint's positions -> URDF joint types that have it."""
 MOVABLE = (*TYPES[ROTARY], *TYPES[LINEAR])
 _PAYLOAD = "payload of gravity_compensation"
 _LEAST_MASS = 1e-12
-"""Mass given to a massless link, kg. MuJoCo rejects a moving body without mass; the weight is 1e-11 N."""
+"""Mass of a link without one, kg: MuJoCo rejects a moving body without mass; the weight is 1e-11 N."""
 
 GravityLaw: TypeAlias = Callable[[Floats, Floats, float, Floats], None]
 """Function that writes the gravity torques of joints. Its arguments are the positions of all joints (rad),
@@ -38,18 +38,18 @@ output array of torques (Nm). It allocates no memory that stays."""
 
 
 class Bodies(msgspec.Struct, frozen=True):
-    """Kinematic tree and masses of a URDF"""
+    """Kinematic tree of a URDF with the masses of its links."""
 
     joints: Mapping[str, Element]
     masses: Mapping[str, float | None]
-    """kg by link; None for a link without `inertial`"""
+    """Mass of each link, kg; None for a link without `inertial`."""
     children: Mapping[str, tuple[str, ...]] = msgspec.field(default_factory=dict)
-    """Joints by their parent link"""
+    """Link -> joints whose parent it is."""
     shaped: frozenset[str] = frozenset()
-    """Links with a visual or a collision shape"""
+    """Links that have a visual or a collision shape."""
 
     def moved(self, joint: str) -> list[str]:
-        """Return all links below a joint in the tree. Links below joints that mimic it are not included."""
+        """Return all links that a joint moves. Links below joints that mimic the joint are not included."""
         links: list[str] = []
         left = [joint]
         while left:
@@ -60,7 +60,7 @@ class Bodies(msgspec.Struct, frozen=True):
         return links
 
     def mass(self, joint: str) -> float:
-        """Return the total mass of the links below a joint, kg."""
+        """Return the total mass of the links that a joint moves, kg."""
         return sum(self.masses.get(link) or 0.0 for link in self.moved(joint))
 
 
@@ -116,7 +116,7 @@ def gravity_law(
     ratio = np.array([turned[name][1] for name in order])
     offset = np.array([turned[name][2] for name in order])
     share = np.zeros((count, len(order)))
-    """Weight of each joint of the model (columns) in each requested torque (rows)"""
+    """Weight of each joint of the MuJoCo model (columns) in each requested torque (rows)."""
     for column, row in enumerate(source):
         if row < count:
             share[row, column] = ratio[column]
@@ -146,7 +146,9 @@ def _root(urdf: str) -> Element:
 
 
 def _turned(root: Element, names: Sequence[str]) -> dict[str, tuple[int, float, float]]:
-    """Return the index of the position that each joint follows, the ratio, and the offset, by joint."""
+    """Return, by URDF joint that moves, the index of the position in `names` that it follows, ratio and
+    offset.
+    """
     known = {_name(each): each for each in root.findall("joint") if each.get("type") in MOVABLE}
     own = {name: (row, 1.0, 0.0) for row, name in enumerate(names) if name in known}
     turned = dict(own)
@@ -165,7 +167,7 @@ def _turned(root: Element, names: Sequence[str]) -> dict[str, tuple[int, float, 
 
 
 def _strip(root: Element, turned: Mapping[str, object]) -> None:
-    """Reduce a URDF to its moving joints and the masses of its links."""
+    """Reduce a URDF to its moving joints, without `mimic`, and the masses of its links."""
     for joint in root.findall("joint"):
         if _name(joint) not in turned:
             joint.set("type", "fixed")
@@ -195,7 +197,7 @@ def _hang(root: Element, link: str, at: Sequence[float]) -> None:
 
 
 def up_of(quaternion: Floats, up: Floats) -> None:
-    """Write the unit vector that points up in the axes of a base.
+    """Write the unit vector that points up, in the axes of a base with this orientation, into `up`.
 
     It is the third row of the rotation matrix. An orientation that is zero or not finite leaves `up`
     unchanged.

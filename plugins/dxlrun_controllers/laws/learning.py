@@ -21,15 +21,17 @@ from numpy.typing import NDArray
 from dxlrun import Floats
 
 Table = NDArray[np.float32]
-"""Correction of a motion, rad, shape (joints, rows), with one row per cycle"""
+"""Correction of a motion that is added to its positions, rad, shape (joints, rows), with one row per
+cycle.
+"""
 
 MOST_DELAY_S: Final = 0.25
-"""Longest tracking delay of a servo that is compensated, s"""
+"""Longest tracking delay of a servo that is compensated, s."""
 _TAPS: Final = 16384
-"""Products of the convolution in one step of learning, which take some 10 us"""
+"""Upper limit of the products of the filter's convolution in one step of learning, which take some 10 us."""
 _LONGEST_STEP: Final = 256
 _WIDTH: Final = 4.0
-"""Half-width of the filter in standard deviations. The tails that are cut off have 0.006 % of the weight."""
+"""Half-width of the filter in standard deviations; the omitted tails have 0.006 % of the weight."""
 
 
 def gaussian(cutoff_hz: float, period_s: float) -> Floats:
@@ -61,19 +63,25 @@ class Repetition:
         self._part = np.zeros(self._step)
         self._desired, self._squares = np.zeros((2, joints))
         self._slow = np.zeros((2, joints))
-        """Sums of error times desired step, and of the step's square. Their quotient is the delay."""
+        """Sums of error times desired step, and of the step's square, by joint.
+
+        Their quotient is the delay in rows.
+        """
         self.most_rows = most_rows
         self.rows = 0
-        """Number of recorded rows"""
+        """Number of rows that were recorded in this repetition."""
 
     def begin(self) -> None:
-        """Start a new recording."""
+        """Start the record of a new repetition."""
         self.rows = 0
         self._squares.fill(0.0)
         self._slow.fill(0.0)
 
     def record(self, desired: Floats, measured: Floats, applied: Floats, judged: bool) -> None:
-        """Append a row (rad, shape (joints,)). Only `judged` rows count towards `error` and `delay_s`."""
+        """Append the positions and the applied correction of a cycle, rad, shape (joints,).
+
+        Only `judged` rows count towards `error` and `delay_s`.
+        """
         row, error = self.rows, desired - measured
         self._error[:, row] = error
         self._applied[:, row] = applied
@@ -87,11 +95,14 @@ class Repetition:
         self.rows = row + 1
 
     def error(self, judged_rows: int) -> float:
-        """Return the root mean square error over all joints, rad."""
+        """Return the root mean square position error over all joints and the judged rows, rad."""
         return math.sqrt(float(self._squares.sum()) / (judged_rows * len(self._squares)))
 
     def delay_s(self) -> Floats:
-        """Return the delay T of each joint, s. With q(t) = d(t - T), the error is about T d'(t)."""
+        """Return the tracking delay T of each joint, s, estimated from its errors, 0 to MOST_DELAY_S.
+
+        With q(t) = d(t - T), the error is about T d'(t).
+        """
         slow, fast = self._slow
         delay = np.divide(slow, fast, out=np.zeros_like(slow), where=fast > 0) * self._period_s
         return np.asarray(np.clip(delay, 0.0, MOST_DELAY_S), np.float64)
@@ -99,7 +110,7 @@ class Repetition:
     def learn(
         self, old: Table | None, new: Table, gain: float, delay_s: Floats, most: Floats
     ) -> Iterator[None]:
-        """Compute the next correction and yield after each small step.
+        """Compute the next correction from this repetition, and yield after each small step.
 
         Args:
             old: Correction that was applied, used for rows that were not recorded; None if there was none.

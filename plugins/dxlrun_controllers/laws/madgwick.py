@@ -12,12 +12,15 @@ Vector = tuple[float, float, float]
 
 
 class Madgwick:
-    """Unit quaternion that rotates vectors of the body into a fixed frame whose z axis points up.
+    """Madgwick's filter; its quaternion (w, x, y, z) rotates vectors of the body into a frame whose z axis
+    points up.
 
     `gain` is beta of the report, rad/s: the rate at which accelerometer and magnetometer correct the drift of
-    the integrated rates. The accelerometer measures +g upwards at rest. With a magnetometer, the x axis of
-    the fixed frame is the horizontal direction of the magnetic field (eq. 45 and 46; they need no declination
-    or inclination). Angles converge to within about gain * dt.
+    the
+    integrated rates. The accelerometer measures +g upwards at rest. With a magnetometer, the x axis of the
+    fixed
+    frame is the horizontal direction of the magnetic field (eq. 45 and 46; they need no declination or
+    inclination). Angles converge to within about gain * dt.
     """
 
     def __init__(self, gain: float) -> None:
@@ -26,7 +29,7 @@ class Madgwick:
 
     @property
     def heading(self) -> float:
-        """Angle about the vertical axis, rad"""
+        """Angle of the body about the vertical axis, rad."""
         return math.atan2(
             2.0 * (self.w * self.z + self.x * self.y), 1.0 - 2.0 * (self.y * self.y + self.z * self.z)
         )

@@ -20,20 +20,22 @@ import numpy as np
 from dxlrun import States
 
 _SMALL = 1e-4
-"""rad; below it, two terms of the series of sin(x) / x are exact to the last bit (the next is x^4 / 120)."""
+"""Half angle, rad, below which two terms of the series of sin(x) / x are exact (the next is x^4 / 120)."""
 HALF_TURN = math.pi
 FASTEST_WHEEL = 50.0
-"""rad/s; the fastest servo is the MX-12W with 470 rpm at 12 V (e-Manual, MX-12W, Specifications)."""
+"""Highest speed of a wheel when its limit is unknown, rad/s: the MX-12W has 470 rpm at 12 V (e-Manual)."""
 
 
 class Pose:
-    """Pose of a base in the frame of its start: x and y (m), and heading (rad, counts whole turns)."""
+    """Pose of a base in the frame in which it started: x and y (m), and heading (rad, counts whole turns)."""
 
     def __init__(self) -> None:
         self.x = self.y = self.heading = 0.0
 
     def move(self, way: float, angle: float) -> None:
-        """Move along an arc of the length `way`, m, that turns by `angle`, rad (positive: to the left)."""
+        """Move the pose along an arc of the length `way`, m, that turns by `angle`, rad (positive: to the
+        left).
+        """
         half = angle / 2
         chord = way * (math.sin(half) / half if abs(half) > _SMALL else 1.0 - half * half / 6.0)
         direction = self.heading + half
@@ -63,16 +65,18 @@ class WheelAngles:
         """Longest gap between two usable samples, ns. It is half the time of half a turn, because a base that
         is pushed can turn its wheels faster than their limit."""
         self.turned = np.zeros(wheels)
-        """rad; valid after a `take` that did not return None"""
+        """Rotation of each wheel between the last two samples, rad; valid after a `take` that did not
+        return None.
+        """
         self._before = np.zeros(wheels)
         self._known_ns = -1
 
     def begin(self) -> None:
-        """Discard the last sample, so that the next one starts the odometry."""
+        """Discard the last sample: the rotation until the next one is not used."""
         self._known_ns = -1
 
     def take(self, states: States, time_ns: int) -> int | None:
-        """Add a sample in which all wheels answered, and update `turned`.
+        """Add the wheel positions of a cycle in which all wheels answered, and update `turned`.
 
         Returns:
             The time since the last sample, ns; None if the rotation since then is unknown.

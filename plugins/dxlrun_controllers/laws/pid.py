@@ -38,7 +38,9 @@ class Gains(ParametersModel):
 
 
 def feed_velocities_forward(data: object) -> object:
-    """Set feed_forward to 1 in parameters that command velocities and do not set it."""
+    """Return parameters, as written, with gain `feed_forward` 1 if they command velocities and do not set
+    it.
+    """
     if not isinstance(data, dict) or data.get("command_interface") != "velocity":
         return data
     gains = data.get("gains")
@@ -64,9 +66,9 @@ class Pid:
     def __init__(self, joints: int) -> None:
         self.p, self.i, self.d = np.zeros((3, joints))
         self.filter_s = 0.0
-        """Time constant of the derivative filter, s; 0 disables it."""
+        """Time constant of the filter on the rate of the error, s; 0 disables it."""
         self.lower, self.upper = np.full(joints, -np.inf), np.full(joints, np.inf)
-        """Limits of the output."""
+        """Limits of the output, in units of the command."""
         self.integral_limit = np.full(joints, np.inf)
         """Largest magnitude of the integral term, in units of the command."""
         self._terms = np.zeros((5, joints))
@@ -75,7 +77,10 @@ class Pid:
         self._elapsed_s = np.zeros(joints)
 
     def take(self, gains: Gains, joints: tuple[str, ...]) -> None:
-        """Set the gains. A joint with the integral gain 0 loses its integral, which would stay forever."""
+        """Set the gains of the joints.
+
+        A joint whose integral gain is 0 loses its integral, which would stay forever.
+        """
         self.p, self.i, self.d = (row_of(gain, joints, 0.0) for gain in (gains.p, gains.i, gains.d))
         self.integral[self.i == 0.0] = 0.0
 
@@ -134,7 +139,7 @@ class Pid:
 
 
 class Slope:
-    """Rate of a measured value: difference of two measurements over the time between them."""
+    """Rate of a measured value of each joint: difference of two measurements over the time between them."""
 
     def __init__(self, joints: int) -> None:
         self.rate, self._last = np.zeros((2, joints))
@@ -142,13 +147,13 @@ class Slope:
         self._seen = np.zeros(joints, dtype=np.bool_)
 
     def reset(self) -> None:
-        """Discard the last measurement. The next one has the rate 0."""
+        """Discard the last measurements; the next ones have the rate 0."""
         self._seen.fill(False)
         self.rate.fill(0.0)
         self._elapsed_s.fill(0.0)
 
     def update(self, value: Floats, measured: NDArray[np.bool_], period_s: float) -> Floats:
-        """Return the rates, 1/s. A joint with `measured` False keeps its last rate."""
+        """Add measurements and return the rates, 1/s. A joint with `measured` False keeps its last rate."""
         elapsed = self._elapsed_s
         elapsed += period_s
         # `_seen` makes the rate of the first measurement 0.

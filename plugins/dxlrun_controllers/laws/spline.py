@@ -17,31 +17,35 @@ from numpy.typing import NDArray
 from dxlrun import Floats, nearest_turn
 
 LINEAR, CUBIC, QUINTIC = 2, 4, 6
-"""Number of coefficients of a piece"""
+"""Order of a piece: number of its coefficients."""
 DECELERATION: Final = 20.0
-"""Default deceleration of joints without an acceleration limit, rad/s^2. It stops an XM430 from its top speed
-in 0.25 s."""
+"""Default deceleration of joints without an acceleration limit, rad/s^2; an XM430 stops from top speed in
+0.25 s.
+"""
 
 START_IN: Final = 3
-"""Index of `start_in` in the flat array of a trajectory, after the numbers of points, joints and
-coefficients"""
+"""Index of `start_in` (s) in a flat trajectory, after the numbers of points, joints and coefficients."""
 _HEAD = 4
-"""Length of the header of the flat array"""
+"""Length of the header of a flat trajectory, before the times of the points."""
 _TRIES = 12
-"""Number of attempts to make a bridge long enough to keep the speed limits"""
+"""Upper limit of the attempts to make a bridge long enough to keep the speed limits."""
 _SHORTER = 1.001
-"""Extra factor on the duration of a bridge that is too fast, because its speed does not fall in proportion"""
+"""Extra factor on the duration of a bridge that is too fast: its speed falls less than in proportion."""
 _SHARES = np.linspace(1, 0, 17)
-"""Normalised times at which the search for the peak speed of a piece starts. A speed has at most three
-extremes. The end is first, so that a constant speed is reported at the end."""
+"""Normalised times, 1 to 0, at which the search for the peak speed of a piece starts.
+
+A speed has at most three extremes. The end is first, so that a constant speed is reported at the end.
+"""
 _APART = 1 / 16
-"""Distance between two of these times"""
+"""Distance between two of the times in `_SHARES`."""
 _STEPS = 3
-"""Iterations of Newton's method. Each doubles the correct digits; a cubic piece needs only one."""
+"""Iterations of Newton's method for a peak speed. Each doubles the correct digits; a cubic needs only one."""
 
 
 class SplineSample:
-    """Desired state of the joints at one time: rad, rad/s and rad/s^2, each of the shape (joints,)."""
+    """Desired state of the joints at one time: position (rad), velocity and acceleration, each of shape
+    (joints,).
+    """
 
     def __init__(self, joints: int) -> None:
         self.rows = np.zeros((3, joints))
@@ -60,7 +64,7 @@ def solve(
     end: Sequence[Floats] | Floats,
     out: Floats,
 ) -> None:
-    """Compute the coefficients of a piece.
+    """Write the coefficients of a polynomial piece between two states into `out`.
 
     Args:
         order: LINEAR, CUBIC or QUINTIC. A linear piece ignores velocities, and only a quintic one uses
@@ -89,7 +93,9 @@ def solve(
 
 
 def evaluate(piece: Sequence[Floats] | Floats, t: float, sample: SplineSample) -> None:
-    """Write the piece's value and derivatives at `t` s into `sample` (Horner's scheme)."""
+    """Write position, velocity and acceleration of a piece, `t` s after its start, into `sample` (Horner's
+    scheme).
+    """
     position, velocity, acceleration = sample.rows
     sample.rows.fill(0.0)
     for coefficients in piece[::-1]:
@@ -139,7 +145,8 @@ def _horner(coefficients: Floats, at: Floats) -> Floats:
 
 
 def trajectory_peaks(data: Floats) -> list[tuple[float, float, int]]:
-    """Return the peak velocity of each joint of a flat trajectory, its time (s), and its piece (from 0).
+    """Return, for each joint of a flat trajectory, its peak velocity, when it is reached (s), and its piece (from
+    0).
 
     The list is empty for a trajectory of one point, because the start of the motion is unknown.
     """
@@ -212,13 +219,15 @@ def flatten(orders: Sequence[int], times: Floats, points: Floats, start_in: floa
 
 
 def flat_size(data: Floats) -> int:
-    """Return the number of elements that the trajectory takes at the start of a flat array."""
+    """Return the number of elements of the flat trajectory with which `data` starts; other values may
+    follow.
+    """
     count, joints, order = map(int, data[:START_IN].tolist())
     return _HEAD + count + 6 * joints + (count - 1) * order * joints
 
 
 def whole_turns(data: Floats, now: Floats, wrap: NDArray[np.bool_]) -> Floats:
-    """Shift the wrapping joints of a flat trajectory by whole turns.
+    """Return a flat trajectory with wrapping joints shifted by whole turns.
 
     Their first point is then within half a turn of `now`.
 
@@ -249,7 +258,7 @@ class Trajectory:
     def __init__(self, joints: int) -> None:
         self._bridge = np.zeros((QUINTIC, joints))
         self.bridge_s = 0.0
-        """Time from `load` to the end of the bridge, s"""
+        """Time from `load` or `join` to the end of the bridge, s."""
         self._start_in = 0.0
         self._times = np.zeros(1)
         self._first = self._last = np.zeros((3, joints))
@@ -260,10 +269,10 @@ class Trajectory:
         self._begin_s = self._end_s = 0.0
         self._tail = Stop(joints)
         self._tail_s = 0.0
-        """Time from `load` to the start of the stop after the last point, s"""
+        """Time from `load` or `join` to the start of the stop after the last point, s."""
         self._joined = SplineSample(joints)
         self.duration_s = 0.0
-        """Time from `load` until all joints are at rest, s"""
+        """Time from `load` or `join` until all joints are at rest, s."""
 
     def load(self, data: Floats, now: SplineSample, waited_s: float = 0.0) -> None:
         """Start a flat trajectory from the present state.
@@ -326,7 +335,7 @@ class Trajectory:
         return True
 
     def _take(self, data: Floats, start_in: float) -> int:
-        """Set the views of a flat array. Return the order of its pieces."""
+        """Set the views of a flat trajectory, discard the last bridge, and return the order of the pieces."""
         count, joints, order = map(int, data[:START_IN].tolist())
         ends = _HEAD + count
         body, end = ends + 6 * joints, flat_size(data)
@@ -340,7 +349,7 @@ class Trajectory:
         return order
 
     def _beginning(self, order: int) -> tuple[Floats, Floats, Floats]:
-        """Return position, velocity and acceleration at the first point."""
+        """Return position, velocity and acceleration of the trajectory at its first point."""
         if len(self._pieces):
             first = self._pieces[0]
             return first[0], first[1], first[2] * 2.0 if order > LINEAR else np.zeros_like(first[0])
@@ -349,7 +358,7 @@ class Trajectory:
 
     @property
     def end(self) -> Floats:
-        """Position of the last point, rad"""
+        """Position of the joints at the last point, rad."""
         position: Floats = self._last[0]
         return position
 
@@ -359,7 +368,7 @@ class Trajectory:
         return speeds
 
     def longest_steps(self, now: SplineSample, rows: NDArray[np.intp]) -> Floats:
-        """Return the largest step from one point to the next, rad, for each joint of `rows`.
+        """Return the largest step from one point to the next, rad, for each joint of `rows` (indices).
 
         The step from `now` to the first point counts as well.
         """
@@ -369,12 +378,14 @@ class Trajectory:
         return steps
 
     def first_way(self, now: SplineSample) -> Floats:
-        """Return the displacement from `now` to the first point, rad."""
+        """Return the displacement of each joint from `now` to the first point, rad."""
         way: Floats = self._first[0] - now.position
         return way
 
     def sample(self, t: float, sample: SplineSample) -> None:
-        """Write the desired state `t` s after `load`. After the end the joints are at rest."""
+        """Write the desired state `t` s after `load` or `join` into `sample`; after the end the joints are
+        at rest.
+        """
         if t < self.bridge_s:
             evaluate(self._bridge, max(t, 0.0), sample)
         elif t < self._tail_s:
@@ -385,7 +396,9 @@ class Trajectory:
             sample.rest_at(self._last[0] if self._tail_s == self.duration_s else self._tail.end)
 
     def _sample_points(self, t: float, sample: SplineSample) -> None:
-        """Write the state on the pieces, or at the only point, `t` s after `load`."""
+        """Write the state of the points, without bridge and stop, `t` s after `load` or `join` into
+        `sample`.
+        """
         if not len(self._pieces):
             np.copyto(sample.rows, self._first)
             return
@@ -398,15 +411,15 @@ class Trajectory:
 
 
 class Limits(NamedTuple):
-    """Limits of joints on the bridge into a trajectory and in the stop after it, shape (joints,)"""
+    """Limits of joints on the bridge into a trajectory and in the stop after it, each of shape (joints,)."""
 
     speed: Floats
-    """rad/s"""
+    """Highest speed, rad/s."""
     deceleration: Floats
-    """rad/s^2"""
+    """Deceleration of the stop, rad/s^2."""
     lower: Floats
     upper: Floats
-    """rad"""
+    """Upper position limit, rad; `lower` is the lower one."""
 
 
 class Stop:
@@ -421,10 +434,10 @@ class Stop:
     def __init__(self, joints: int) -> None:
         self._duration, self.end, self._pull = np.zeros((3, joints))
         self.duration_s = 0.0
-        """Time from `load` until all joints are at rest, s"""
+        """Time from `load` until all joints are at rest, s."""
 
     def load(self, now: SplineSample, deceleration: Floats, lower: Floats, upper: Floats) -> None:
-        """Start to stop from the position and velocity of `now`.
+        """Start a stop from the position and velocity of `now`.
 
         Args:
             now: Present desired state.
@@ -443,7 +456,7 @@ class Stop:
         self.duration_s = float(self._duration.max(initial=0.0))
 
     def sample(self, t: float, sample: SplineSample) -> None:
-        """Write the state `t` s after `load` into `sample`."""
+        """Write the state of the stopping joints, `t` s after `load`, into `sample`."""
         left = np.maximum(self._duration - t, 0.0)
         np.multiply(self._pull, left, out=sample.velocity)
         np.add(sample.velocity * left * -0.5, self.end, out=sample.position)

@@ -1,4 +1,4 @@
-"""Tracking: PID and feed-forward that make joints follow a desired motion by velocities or efforts."""
+"""Tracking: PID law with feed-forward that makes joints follow a desired motion by velocities or efforts."""
 
 from __future__ import annotations
 
@@ -30,7 +30,7 @@ class TrackingGains(Gains):
 
 
 class Tracking:
-    """Tracking law that commands one interface so that joints follow a desired state"""
+    """Law that commands the velocity or the effort of joints so that they follow a desired motion."""
 
     def __init__(self, context: Context, interface: Literal["velocity", "effort"], filter_s: float) -> None:
         limits, commands = context.limits, context.commands
@@ -43,19 +43,19 @@ class Tracking:
         self._sent: Floats = context.goals.velocity if interface == "velocity" else context.goals.effort
 
     def take(self, gains: TrackingGains, joints: tuple[str, ...]) -> None:
-        """Set the gains."""
+        """Set the gains of the joints."""
         self._pid.take(gains, joints)
         self._velocity = row_of(gains.feed_forward, joints, 0.0)
         self._acceleration = row_of(gains.acceleration, joints, 0.0)
         self._friction = row_of(gains.friction, joints, 0.0)
 
     def begin(self, desired: SplineSample) -> None:
-        """Start from the command that was last sent, or from 0."""
+        """Start from the command that was last sent, or from 0, so that the output does not jump."""
         np.copyto(self._output, finite_or(self._sent, 0.0))
         self._pid.reset(self._output, desired.position - self._states.position, self._bias(desired))
 
     def update(self, desired: SplineSample, period_s: float) -> None:
-        """Update the commands, `period_s` after the last update."""
+        """Command the output of the law for a desired state, `period_s` after the last update."""
         states = self._states
         error, rate = desired.position - states.position, desired.velocity - states.velocity
         measured = np.isfinite(error) & states.valid

@@ -1,4 +1,4 @@
-"""Tracks: trajectory or stop that each joint of a controller follows.
+"""Tracks: the trajectories, and the stop, that the joints of a controller follow at the same time.
 
 A new trajectory only moves its own joints. All other joints continue on their tracks without a jump in
 position, velocity or acceleration.
@@ -13,26 +13,27 @@ from dxlrun_controllers.laws.spline import Limits, SplineSample, Stop, Trajector
 
 
 class Track:
-    """Trajectory and the joints that follow it"""
+    """A trajectory with the joints that follow it."""
 
     def __init__(self, joints: int) -> None:
         self.trajectory = Trajectory(joints)
         self.joints = np.zeros(joints, dtype=np.bool_)
         self.ahead_s = 0.0
-        """Time by which this track started before the newest one, s"""
+        """Time by which this track started before the newest one, s."""
 
 
 class Tracks:
     """Desired state of joints, from the trajectories and the stop that they follow.
 
     All memory is allocated by the constructor. Each playing track has a joint, so a pool of one track more
-    than joints always has a free one.
+    than
+    joints always has a free one.
     """
 
     def __init__(self, joints: int) -> None:
         self.desired = SplineSample(joints)
         self.still = np.ones(joints, dtype=np.bool_)
-        """True for each joint that follows neither a trajectory nor a stop, so is at rest"""
+        """True for each joint at rest: it follows neither a trajectory nor a stop."""
         self.stop = Stop(joints)
         self._stopping = np.zeros(joints, dtype=np.bool_)
         self._own = SplineSample(joints)
@@ -41,11 +42,11 @@ class Tracks:
 
     @property
     def playing(self) -> bool:
-        """True while a joint follows a trajectory"""
+        """True while a joint follows a trajectory; a stop does not count."""
         return bool(self._playing)
 
     def free(self) -> Track:
-        """Return a free track for the next trajectory."""
+        """Return a track that no joint follows, for the next trajectory."""
         return next(track for track in self._pool if track not in self._playing)
 
     def follow(self, track: Track, moved: NDArray[np.bool_], clock_s: float) -> None:
@@ -66,20 +67,20 @@ class Tracks:
         self.still &= ~moved
 
     def rest(self) -> None:
-        """End all tracks and the stop."""
+        """End all tracks and the stop at once: all joints count as at rest."""
         self._playing = ()
         self._stopping.fill(False)
         self.still.fill(True)
 
     def come_to_rest(self, limits: Limits) -> None:
-        """End all tracks and stop all joints from the desired state."""
+        """End all tracks, and decelerate all joints to rest from the desired state."""
         self.rest()
         self.stop.load(self.desired, limits.deceleration, limits.lower, limits.upper)
         self._stopping.fill(True)
         self.still.fill(False)
 
     def sample(self, clock_s: float, rate: float, slope: float, stop_s: float) -> None:
-        """Compute the desired state, and remove tracks that have ended.
+        """Compute the desired state of this cycle, and remove tracks that have ended.
 
         Args:
             clock_s: Time since the newest track started, s.

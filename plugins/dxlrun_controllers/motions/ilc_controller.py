@@ -1,4 +1,4 @@
-"""ilc_controller: play trajectories, and reduce the tracking error with each repetition."""
+"""ilc_controller: play trajectories, and reduce their tracking error with each repetition."""
 
 from __future__ import annotations
 
@@ -25,24 +25,25 @@ from dxlrun_controllers.motions.learned_motions import LearnedMotion, LearnedMot
 from dxlrun_controllers.motions.trajectory_command import TrajectoryCommand
 
 TAIL_S: Final = 0.5
-"""Time after the end of a motion that is still recorded and corrected, s. The servos arrive in it, and the
-correction fades out."""
+"""Time after the end of a motion that is still recorded and corrected, s: servos arrive, the correction
+fades.
+"""
 WORSE: Final = 1.05
-"""Factor on the error without a correction, above which the correction is to blame for the error"""
+"""Ratio of an error to that without a correction, above which the correction counts as harmful."""
 LEAST: Final = math.radians(0.088)
-"""Smallest error that is compared, rad: one tick of most servos"""
+"""Smallest error that is compared with others, rad: one tick of most servos."""
 FADE_S: Final = 0.2
-"""Shortest time in which one correction fades into another, s"""
+"""Shortest time in which one correction fades into another, s."""
 STEP_NS: Final = 15_000
-"""Duration of one step of learning, ns, measured by tests/bench/controllers.py"""
+"""Duration of one step of learning, ns, measured by tests/bench/controllers.py."""
 SHARE: Final = 0.05
-"""Fraction of a period that the steps of learning in one cycle may take"""
+"""Fraction of a period that the steps of learning in one cycle may take."""
 _SAME: Final = 1e-6
-"""Largest difference of goal and command of a goal that was not clamped, rad and rad/s"""
+"""Largest difference between command and goal of a joint that the loop did not clamp, rad and rad/s."""
 _NOT_LEARNED: Final = ("timeout", "goal_tolerance", "path_tolerance", "goal_time_tolerance")
-"""Fields of a trajectory that do not change the identity of its motion"""
+"""Fields of a trajectory command that do not change the identity of its motion."""
 _KEY_BYTES: Final = 6
-"""Bytes in each of the two numbers of a motion's key. A float64 represents them exactly."""
+"""Bytes of a hash in each of the two numbers of a motion's key; a float64 represents them exactly."""
 
 
 class IlcParameters(TrajectoryParameters):
@@ -74,15 +75,15 @@ class LearnedRepetition:
 
     header: Header
     motion: str
-    """Short name of the motion, which depends on trajectory, joints and command interface"""
+    """Short name of the motion, which depends on trajectory, joints and command interface."""
     repetition: int
-    """Number of repetitions that were learned before this one"""
+    """Number of repetitions that were learned before this one."""
     error: float
-    """Root mean square of desired minus measured position, rad"""
+    """Root mean square of desired minus measured position, rad."""
     best: float
-    """Smallest error of this motion so far, rad"""
+    """Smallest error of this motion so far, rad."""
     correction: float
-    """Largest correction in this repetition, rad"""
+    """Largest correction in this repetition, rad."""
 
 
 class IlcController(JointTrajectoryController):
@@ -102,7 +103,10 @@ class IlcController(JointTrajectoryController):
     def prepare(
         cls, kind: str, command: CommandModel, parameters: TrajectoryParameters
     ) -> NDArray[np.float64]:
-        """Return the array of a joint_trajectory_controller, followed by the motion's key (two numbers)."""
+        """Return the flat trajectory of a command, followed by the motion's key (two numbers).
+
+        Raises ValueError as a joint_trajectory_controller, and for a spliced trajectory.
+        """
         data = super().prepare(kind, command, parameters)
         if not isinstance(command, TrajectoryCommand):
             return data
@@ -118,7 +122,7 @@ class IlcController(JointTrajectoryController):
         return np.concatenate([data, np.array(key, np.float64)])
 
     def on_configure(self, context: Context) -> None:
-        """Allocate all memory for learning, and load the corrections that were kept.
+        """Allocate all memory for learning, and load the corrections of earlier runs.
 
         Raises:
             ValueError: The corrections would exceed the size that can be kept.
@@ -136,19 +140,19 @@ class IlcController(JointTrajectoryController):
         """Present correction; correction at the start of the fade; last commanded position and speed"""
         self._fade_ns = self._faded_ns = 0
         self._playing: LearnedMotion | None = None
-        """Motion whose correction is applied; None if there is none"""
+        """Motion whose correction is applied; None if there is none."""
         self._frozen = True
-        """True while the correction does not change"""
+        """True while the applied correction stays as it is."""
         self._key = (0.0, 0.0)
         self._judged = self._rows = 0
-        """Number of rows of the motion, without and with its tail"""
+        """Number of rows (cycles) of the motion, without and with its tail."""
         self._row_ns = -1
-        """Time of row 0, ns; -1 before it"""
+        """Time of row 0, ns; -1 before it."""
         self._open = False
-        """True while the present repetition is usable for learning"""
+        """True while the present repetition is usable for learning."""
         self._largest = 0.0
         self._pupil: LearnedMotion | None = None
-        """Motion that `_learning` is updating"""
+        """Motion whose correction `_learning` is computing."""
         self._learning: Iterator[None] = iter(())
         self._take_kept(context.kept)
 
@@ -159,14 +163,14 @@ class IlcController(JointTrajectoryController):
         self._playing, self._frozen, self._open, self._row_ns = None, True, False, -1
 
     def on_deactivate(self, time_ns: int) -> None:
-        """Drop the goal and end its repetition."""
+        """Drop the goal, which the runtime ends, and end its repetition."""
         super().on_deactivate(time_ns)
         self._close()
 
     # A repetition
 
     def on_goal(self, goal: Goal, data: NDArray[np.float64], time_ns: int) -> None:
-        """Start a trajectory, with the correction of this motion if there is one."""
+        """Start a trajectory, with the learned correction of its motion if there is one."""
         self._close()
         super().on_goal(goal, data, time_ns)
         if self._goal is not goal:
@@ -189,7 +193,9 @@ class IlcController(JointTrajectoryController):
             self._spoil("it is longer than `longest`")
 
     def _play(self, motion: LearnedMotion | None, time_ns: int) -> None:
-        """Fade to the correction of a motion, until its first point or after FADE_S, whichever is later."""
+        """Fade to the correction of a motion (None: to 0), until its first point or for FADE_S, whichever
+        is later.
+        """
         np.copyto(self._from, self._correction)
         self._playing, self._frozen = motion, False
         first_ns = self._start_ns + round(self._trajectory.bridge_s * 1e9)
@@ -197,7 +203,7 @@ class IlcController(JointTrajectoryController):
         self._faded_ns = max(first_ns, time_ns + round(FADE_S * 1e9))
 
     def _stop_from(self, time_ns: int) -> None:
-        """Freeze the correction while the joints come to rest."""
+        """Stop the joints, with the correction frozen; the repetition is not learned."""
         super()._stop_from(time_ns)
         self._frozen = True
         self._spoil("it was not played to its end")
@@ -210,7 +216,9 @@ class IlcController(JointTrajectoryController):
             )
 
     def update(self, time_ns: int, period_ns: int) -> None:
-        """Command the corrected state of the trajectory, record the tracking error, and learn."""
+        """Command the corrected state of the trajectory, record the tracking error, and do some steps of
+        learning.
+        """
         row = -1 if self._frozen else self._row(time_ns)
         super().update(time_ns, period_ns)
         if self._open and row >= 0:
@@ -222,7 +230,9 @@ class IlcController(JointTrajectoryController):
             self._learn(time_ns)
 
     def _row(self, time_ns: int) -> int:
-        """Return the row of the motion that belongs to this cycle, or -1 before the first."""
+        """Return the row of the motion for this cycle, or -1 before its first point; row 0 begins the
+        record.
+        """
         if self._row_ns < 0:
             first_ns = self._start_ns + self._trajectory.bridge_s * 1e9
             if time_ns < first_ns - self.context.period_ns / 2:
@@ -235,7 +245,7 @@ class IlcController(JointTrajectoryController):
         return round((time_ns - self._row_ns) / self.context.period_ns)
 
     def _look(self, row: int, time_ns: int) -> None:
-        """Discard the repetition if it is not usable for learning."""
+        """Discard the repetition if it is not usable for learning, such as at another speed."""
         if self._rate != 1.0 or self._speed != 1.0:
             self._spoil("it is played at another speed")
             self._play(None, time_ns)
@@ -332,7 +342,7 @@ class IlcController(JointTrajectoryController):
             )
 
     def _doubt(self, motion: LearnedMotion, error: float) -> None:
-        """Ignore a repetition with a much larger error. Drop the correction at the second one in a row.
+        """Ignore a repetition with a much larger error, and forget the motion at the second one in a row.
 
         Two in a row mean that the servo or its load has changed.
         """
@@ -347,7 +357,7 @@ class IlcController(JointTrajectoryController):
         self.context.say(f"what was learned of motion {motion.name} is dropped: again {worse}")
 
     def _stay(self, motion: LearnedMotion) -> None:
-        """Freeze the correction if it belongs to a motion that was forgotten."""
+        """Freeze the applied correction if it belongs to a motion that was forgotten."""
         if motion is self._playing:
             self._frozen, self._playing = True, None
 

@@ -1,4 +1,4 @@
-"""joint_trajectory_controller: move joints along a trajectory, sampled by time."""
+"""joint_trajectory_controller: move joints along a trajectory, whose desired state depends on the time."""
 
 from __future__ import annotations
 
@@ -61,11 +61,11 @@ from dxlrun_controllers.motions.trajectory_command import (
 )
 
 SPEED_SLOPE: Final = 2.0
-"""Rate of change of the speed factor, 1/s: from 1 to 0 in 0.5 s, so that no velocity jumps"""
+"""Rate of change of the speed factor, 1/s: from 1 to 0 in 0.5 s, so that no velocity jumps."""
 FEEDBACK_NS: Final = 100_000_000
-"""Time between two feedback messages of a goal, ns"""
+"""Time between two feedback messages of a goal, ns."""
 _STILL: Final = 1e-3
-"""Speed factor below which the time of a trajectory counts as stopped"""
+"""Speed factor below which the time of a trajectory counts as stopped."""
 
 
 class Tolerances(ParametersModel):
@@ -105,7 +105,9 @@ class TrajectoryParameters(JointsParameters):
     _own_velocity = model_validator(mode="before")(feed_velocities_forward)
 
     def mistakes(self) -> Iterator[Mistake]:
-        """Yield missing gains, and gains that the command interface does not use."""
+        """Yield missing gains of `velocity` and `effort`, and gains that the command interface does not
+        use.
+        """
         yield from super().mistakes()
         tracks = self.command_interface in ("velocity", "effort")
         if tracks and self.gains is None:
@@ -170,14 +172,14 @@ class JointTrajectoryController(Controller[TrajectoryParameters]):
         self._still = self._tracks.still
         self._desired, self._path = self._tracks.desired, SplineSample(count)
         self._trajectory = self._tracks.free().trajectory
-        """Trajectory that was started last"""
+        """Trajectory that was started last."""
         self._error = np.zeros(count)
         self._moved, self._unmoved = np.ones(count, dtype=np.bool_), np.zeros(count, dtype=np.bool_)
-        """Joints of the trajectory that was started last, and all other joints"""
+        """True for each joint of the trajectory that was started last, and for each of the others."""
         self._spliced: NDArray[np.float64] | None = None
-        """Trajectory that waits for its start while another one is played"""
+        """Flat trajectory that waits for its start while another one is played; None without one."""
         self._anchor_ns: int | None = None
-        """Time at which the sender's clock of a stream of chunks was 0, ns; None without a stream"""
+        """Time at which the sender's clock of a stream of chunks was 0, ns; None without a stream."""
         self._moves = self._unknown = False
         self._phase = _Phase.RESTING
         self._goal: Goal | None = None
@@ -186,7 +188,7 @@ class JointTrajectoryController(Controller[TrajectoryParameters]):
         self._base_s = self._splice_s = 0.0
         self._speed = self._rate = parameters.speed
         self._slope = 0.0
-        """Rate of change of the present speed factor `_rate` towards the requested one `_speed`, 1/s"""
+        """Rate of change of the present speed factor `_rate` towards the requested one `_speed`, 1/s."""
         tolerances = parameters.tolerances
         self._own = GoalLimits(
             path=row_of(tolerances.path, joints),
@@ -196,11 +198,11 @@ class JointTrajectoryController(Controller[TrajectoryParameters]):
             settle_s=np.nan if tolerances.goal_time is None else tolerances.goal_time * 1e-9,
         )
         self._within = self._own
-        """Tolerances of the active goal"""
+        """Tolerances of the active goal."""
         self._lower, self._upper = limits.lower, limits.upper
         self._wrap = np.array([joint in parameters.wrap for joint in joints])
         self._turns = np.isinf(limits.upper) & np.isinf(limits.lower) & ~self._wrap
-        """Continuous joints that count whole turns"""
+        """True for each continuous joint that counts whole turns."""
         own = row_of(parameters.deceleration, joints, np.nan)
         deceleration = finite_or(np.fmin(own, limits.acceleration), DECELERATION)
         speed = self._speed_limit = finite_or(limits.velocity, np.inf)
@@ -209,7 +211,9 @@ class JointTrajectoryController(Controller[TrajectoryParameters]):
         self._interface = parameters.command_interface
         self._tracking: Tracking | None = None
         self._tracked = SplineSample(count)
-        """State that is tracked: the desired state, or at rest while a joint is lost"""
+        """State that is tracked by efforts or velocities: the desired one, or at rest while a joint is
+        lost.
+        """
         if parameters.gains is not None:
             tracked: Literal["velocity", "effort"] = "velocity" if self._interface == "velocity" else "effort"
             self._tracking = Tracking(context, tracked, parameters.derivative_filter * 1e-9)
@@ -217,7 +221,7 @@ class JointTrajectoryController(Controller[TrajectoryParameters]):
         self._to_servos = not context.into
 
     def on_parameters(self, time_ns: int) -> None:
-        """Set the gains and the speed factor, which is approached with SPEED_SLOPE."""
+        """Set the gains and the requested speed factor, which is approached with SPEED_SLOPE."""
         if self._tracks.playing:
             self._base_s, self._base_ns = self._warped(time_ns), time_ns
         self._speed = self.parameters.speed
@@ -225,7 +229,7 @@ class JointTrajectoryController(Controller[TrajectoryParameters]):
             self._tracking.take(self.parameters.gains, self.context.joints)
 
     def on_activate(self, time_ns: int) -> None:
-        """Hold the joints where they are."""
+        """Hold the joints at their last goals, or where they are when a law tracks them."""
         commands, states = self.context.commands, self.context.states
         self._phase, self._goal, self._spliced, self._anchor_ns = _Phase.RESTING, None, None, None
         self._tracks.rest()
@@ -247,7 +251,9 @@ class JointTrajectoryController(Controller[TrajectoryParameters]):
     # Goals
 
     def on_goal(self, goal: Goal, data: NDArray[np.float64], time_ns: int) -> None:
-        """Start a trajectory from the desired state, or splice it into the active one."""
+        """Start the goal's trajectory from the desired state, or let it wait as a splice into the active
+        one.
+        """
         self._goal = self._spliced = None
         self._know_begin(time_ns)
         self._anchor_ns = None
@@ -264,7 +270,7 @@ class JointTrajectoryController(Controller[TrajectoryParameters]):
     def _begin(
         self, data: NDArray[np.float64], time_ns: int, clock_s: float, *, waited_s: float = 0.0
     ) -> None:
-        """Start a trajectory on its joints.
+        """Start a prepared trajectory on its joints; abort its goal if it is too fast.
 
         Args:
             data: Prepared trajectory.
@@ -287,7 +293,9 @@ class JointTrajectoryController(Controller[TrajectoryParameters]):
             self._base_ns, self._base_s = time_ns, since_s
 
     def _warn_of_turns(self, trajectory: Trajectory, begin: SplineSample, rows: NDArray[np.intp]) -> None:
-        """Warn of steps in which a continuous joint, one of `rows`, turns by more than half a turn."""
+        """Warn of steps between points in which a joint of `rows` (indices) turns by more than half a
+        turn.
+        """
         if not rows.size:  # skip: the steps of thousands of points would take milliseconds of the cycle
             return
         for row, step in zip(rows.tolist(), trajectory.longest_steps(begin, rows).tolist(), strict=True):
@@ -323,22 +331,22 @@ class JointTrajectoryController(Controller[TrajectoryParameters]):
         self._trajectory, self._moved, self._unmoved = track.trajectory, moved, ~moved
 
     def on_cancel(self, goal: Goal, time_ns: int) -> None:
-        """Stop the joints from their desired velocity. The goal ends when they are at rest."""
+        """Stop all joints from their desired velocity. The goal ends when they are at rest."""
         self._stop_from(time_ns)
 
     def on_hold(self, time_ns: int) -> None:
-        """Stop the joints from their desired velocity, and hold them."""
+        """Stop all joints from their desired velocity, and hold them."""
         self._anchor_ns, self._moves = None, True
         if not self._still.all():
             self._stop_from(time_ns)
 
     @property
     def _moving(self) -> bool:
-        """True while a trajectory is played."""
+        """True while a trajectory is played, not during a stop."""
         return self._phase is _Phase.MOVING
 
     def _know_begin(self, time_ns: int) -> None:
-        """Update the desired state from which a new trajectory starts now."""
+        """Update the speed factor and the desired state from which a new trajectory starts now."""
         if not self._tracks.playing:
             self._rate = 1.0 if not self._still.all() and self._speed <= _STILL else self._speed
             self._slope = 0.0 if self._rate == self._speed else -SPEED_SLOPE
@@ -346,21 +354,24 @@ class JointTrajectoryController(Controller[TrajectoryParameters]):
         self._know_where(time_ns)
 
     def _leave_stream(self) -> None:
-        """Drop the stream of chunks. The runtime holds the joints at their goals."""
+        """End the stream of chunks at once, because a servo is lost.
+
+        The runtime holds the joints at their goals.
+        """
         self._anchor_ns, self._phase = None, _Phase.RESTING
         self._tracks.rest()
         held = self.context.goals if self._tracking is None else self.context.states
         self._desired.rest_at(finite_or(held.position, self._desired.position))
 
     def _know_where(self, time_ns: int) -> None:
-        """Update the desired state."""
+        """Update the desired state to this cycle; joints without one take their measured position."""
         if self._unknown:
             self._unknown = take_where_heard(self._desired.position, self.context.states)
         if not self._still.all():
             self._sample(time_ns)
 
     def _path_of(self, moved: NDArray[np.bool_]) -> SplineSample:
-        """Return the desired state with derivatives by the path's own time, without the speed factor.
+        """Return the desired state with derivatives by the trajectory's own time, without the speed factor.
 
         The derivatives are 0 for joints that are not moved.
         """
@@ -374,10 +385,11 @@ class JointTrajectoryController(Controller[TrajectoryParameters]):
         return path
 
     def _refused_for_haste(self) -> bool:
-        """Abort a goal whose first point is too far away for its time. Return True if it was aborted.
+        """Abort the goal if its first point is too far away for its time; return True if it was aborted.
 
         The check needs the present position, so it is only possible when the goal starts. A first point at
-        time 0 must be reachable within one period.
+        time 0
+        must be reachable within one period.
         """
         trajectory, period_s = self._trajectory, self.context.period_ns * 1e-9
         way = np.abs(trajectory.first_way(self._path)) * self._moved * self._speed
@@ -401,7 +413,9 @@ class JointTrajectoryController(Controller[TrajectoryParameters]):
         return True
 
     def _end(self, outcome: Outcome, time_ns: int, text: str = "", row: int = -1) -> None:
-        """End the goal, and report the joint of `row`, or the one with the largest error if that is -1."""
+        """End the active goal with the error of a joint: that of index `row`, or the largest one if it is
+        -1.
+        """
         goal, self._goal = self._goal, None
         if goal is None:
             return
@@ -419,7 +433,7 @@ class JointTrajectoryController(Controller[TrajectoryParameters]):
     # In a cycle
 
     def update(self, time_ns: int, period_ns: int) -> None:
-        """Command the desired state at `time_ns`. Hold without a trajectory."""
+        """Command the desired state at `time_ns`, check the goal, and hold without a trajectory."""
         if self._anchor_ns is not None and self.context.states.has_lost:
             self._leave_stream()
         if self._spliced is not None:
@@ -434,7 +448,7 @@ class JointTrajectoryController(Controller[TrajectoryParameters]):
         self._command(period_ns)
 
     def _splice(self, data: NDArray[np.float64], time_ns: int) -> None:
-        """Start the waiting trajectory when its start time has come, from the desired state of that time."""
+        """Start the waiting trajectory once its start time has come, from the desired state of that time."""
         if self._warped(time_ns) >= self._splice_s:
             self._spliced = None
             self._sample_at(self._splice_s, time_ns)
@@ -458,7 +472,7 @@ class JointTrajectoryController(Controller[TrajectoryParameters]):
             self._goal.feedback(elapsed / self._trajectory.duration_s, float(self._error.max()))
 
     def _sample(self, time_ns: int) -> float:
-        """Update the desired state. Return the time of the newest trajectory, s."""
+        """Update the desired state to a time of the run, ns; return the time of the newest trajectory, s."""
         elapsed = self._warped(time_ns) if self._tracks.playing else self._base_s
         self._sample_at(elapsed, time_ns)
         return elapsed
@@ -468,7 +482,9 @@ class JointTrajectoryController(Controller[TrajectoryParameters]):
         self._moves = True
 
     def _warped(self, time_ns: int) -> float:
-        """Return the time of the trajectory, s. Its rate approaches `speed` with SPEED_SLOPE."""
+        """Return the time of the newest trajectory, s, which passes at the speed factor; updates that
+        factor.
+        """
         since_s, wanted = (time_ns - self._base_ns) * 1e-9, self._speed
         if self._rate == wanted:
             self._slope = 0.0
@@ -484,7 +500,9 @@ class JointTrajectoryController(Controller[TrajectoryParameters]):
         return self._base_s
 
     def _hand_over(self, time_ns: int, text: str = "") -> None:
-        """Pass the goal to the runtime for judgement by its last point."""
+        """Pass the active goal to the runtime, which judges it by the trajectory's last point and its
+        tolerances.
+        """
         goal, self._goal = self._goal, None
         if goal is None:
             return
@@ -508,7 +526,7 @@ class JointTrajectoryController(Controller[TrajectoryParameters]):
         self._hand_over(time_ns, text)
 
     def _stop_from(self, time_ns: int) -> None:
-        """Stop all joints from their desired velocity."""
+        """Start to stop all joints from their desired velocity in this cycle."""
         self._know_where(time_ns)
         self._brake(time_ns)
         self._sample(time_ns)
@@ -548,13 +566,15 @@ class JointTrajectoryController(Controller[TrajectoryParameters]):
     # How far off
 
     def _measure(self) -> None:
-        """Compute the position errors of the goal's joints, rad or m. Joints without a reply have 0."""
+        """Update the position errors of the goal's joints, rad or m; those of joints without a reply are
+        0.
+        """
         states = self.context.states
         self._error = np.where(states.valid, np.abs(states.position - self._desired.position), 0.0)
         np.copyto(self._error, 0.0, where=self._unmoved)
 
     def _find_off_path(self) -> int:
-        """Return the row of the joint that violates its path tolerance with the largest error, or -1."""
+        """Return the index of the joint with the largest error among those beyond a path tolerance, or -1."""
         self._measure()
         states, within = self.context.states, self._within
         slip = np.abs(states.velocity - self._desired.velocity)

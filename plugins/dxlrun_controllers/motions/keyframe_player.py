@@ -56,9 +56,9 @@ from dxlrun_controllers.laws.spline import (
 from dxlrun_controllers.laws.tracking import CLOSING_SPEED
 
 HIGHEST_RATE = 10.0
-"""Highest ratio of a motion's time to the loop's time. It bounds the number of steps in one period."""
+"""Highest ratio of a motion's time to the loop's time, which bounds the number of steps in one period."""
 PEAK = 1.5
-"""Ratio of the peak speed to the mean speed of a cubic from rest to rest"""
+"""Ratio of the peak speed to the mean speed of a cubic from rest to rest."""
 
 
 class Step(ParametersModel):
@@ -90,7 +90,7 @@ class Motion(ParametersModel):
     """Name of the motion that follows."""
 
     def duration_s(self, repeat: int) -> float:
-        """Return the duration with `repeat` repetitions, at the goal's speed 1, s."""
+        """Return the duration of the steps with `repeat` repetitions at the motion's own speed, s."""
         return repeat * sum(step.time * 1e-9 + step.pause * 1e-9 for step in self.steps) / self.speed
 
 
@@ -142,7 +142,9 @@ class KeyframeParameters(ParametersModel):
             yield ("motions", circle[0], "next"), f"motions follow each other in a circle: {way}; end it"
 
     def _circles(self) -> Iterator[list[str]]:
-        """Yield the motions of each circle, starting with the first one in the file."""
+        """Yield the names of the motions of each circle of `next`, starting with the first one in the
+        file.
+        """
         done: set[str] = set()
         for name in self.motions:
             way: list[str] = []
@@ -155,20 +157,24 @@ class KeyframeParameters(ParametersModel):
                 yield way[way.index(after) :]
 
     def chain(self, name: str | None) -> Iterator[str]:
-        """Yield the names of a motion and of all motions that follow it."""
+        """Yield a motion's name and the names of all motions that follow it; nothing for None."""
         while name is not None:
             yield name
             name = self.motions[name].next
 
     def steps(self, first: str, repeat: int) -> Iterator[tuple[str, int, Step]]:
-        """Yield all steps as they are played, with the name of the motion and the step's number (from 1)."""
+        """Yield motion name, step number (from 1) and step in the order of playing, for a motion and its
+        followers.
+
+        `repeat` replaces the repetitions of the first motion.
+        """
         for name in self.chain(first):
             for _ in range(repeat if name == first else self.motions[name].repeat):
                 for number, step in enumerate(self.motions[name].steps, 1):
                     yield name, number, step
 
     def first_torque(self) -> tuple[str | int, ...]:
-        """Return the path of the first key `torque` with a limit, or an empty path."""
+        """Return the path in the parameters of the first `torque` with a limit; empty if there is none."""
         steps = (
             ("motions", name, "steps", number, "torque")
             for name, motion in self.motions.items()
@@ -213,7 +219,7 @@ class KeyframePlayer(Controller[KeyframeParameters]):
 
     @classmethod
     def motions(cls, parameters: KeyframeParameters) -> Mapping[str, float]:
-        """Return the duration of each motion at speed 1, including the motions that follow, s."""
+        """Return motion -> duration at speed 1, including the motions that follow, s."""
         known = parameters.motions
         lengths = {name: motion.duration_s(motion.repeat) for name, motion in known.items()}
         return {name: sum(map(lengths.__getitem__, parameters.chain(name))) for name in known}
@@ -259,7 +265,9 @@ class KeyframePlayer(Controller[KeyframeParameters]):
 
     @classmethod
     def prepare(cls, kind: str, command: CommandModel, parameters: KeyframeParameters) -> NDArray[np.float64]:
-        """Return index, speed and repetitions of the motion. Raises ValueError for an unknown motion."""
+        """Return index, speed and repetitions of the motion of a command; raises ValueError for an unknown
+        motion.
+        """
         if not isinstance(command, PlayCommand):
             return super().prepare(kind, command, parameters)
         names = list(parameters.motions)
@@ -278,27 +286,27 @@ class KeyframePlayer(Controller[KeyframeParameters]):
         self._posvel = parameters.command_interface == "posvel"
         self._wrap = np.array([joint in parameters.wrap for joint in context.joints])
         self._now = SplineSample(count)
-        """Present goals, rad, and velocities by the motion's own time, rad/s"""
+        """Present goals, rad, and velocities by the motion's own time, rad/s."""
         self._piece = np.zeros((CUBIC, count))
         self._ends = np.zeros((2, 2, count))
-        """Position and velocity at the start and at the end of a step"""
+        """Position and velocity at the start and at the end of the present step."""
         self._stop = Stop(count)
         self._deceleration = finite_or(context.limits.acceleration, DECELERATION)
         self._order = CUBIC
         self._limp = np.zeros(count, dtype=np.bool_)
-        """Joints that have no torque now; only used with `partial`"""
+        """True for each joint that has no torque now; only used with `partial`."""
         self._out = np.zeros(count, dtype=np.bool_)
-        """Joints that are skipped until the next step. They hold where they last had no torque."""
+        """True for each joint that is skipped until the next step. It holds where it last had no torque."""
         self._asked = np.full(count, np.nan)
-        """Newest requested pose of each joint before clamping, rad; NaN without one"""
+        """Newest requested pose of each joint before clamping, rad; NaN without one."""
         self._missed = np.zeros(count, dtype=np.bool_)
-        """Joints that were skipped in a part of the goal"""
+        """True for each joint that was skipped in a part of the goal."""
         self._stand = np.zeros(count)
-        """Last measured positions of joints without torque, rad"""
+        """Last measured position of each joint while it had no torque, rad."""
         self._rate = 1.0
 
     def on_activate(self, time_ns: int) -> None:
-        """Hold the joints where they are."""
+        """Hold the joints at their last goals; the motion `start` starts in the next update."""
         hold(self.context)
         self._now.rest_at(self.context.commands.position)
         self._limp.fill(False)
@@ -318,7 +326,7 @@ class KeyframePlayer(Controller[KeyframeParameters]):
         self._goal = None
 
     def on_goal(self, goal: Goal, data: NDArray[np.float64], time_ns: int) -> None:
-        """Start a motion from the present goals and velocities."""
+        """Start the goal's motion from the present goals and velocities."""
         if self._unknown:
             self._hold_where_heard()
         if ends_unheard(goal, self._now.position, self.context.joints):
@@ -327,7 +335,7 @@ class KeyframePlayer(Controller[KeyframeParameters]):
         self._begin(list(self.parameters.motions)[int(data[0])], float(data[1]), int(data[2]))
 
     def _begin(self, motion: str, speed: float, repeat: int) -> None:
-        """Start a motion from the present goals and velocities."""
+        """Start a motion by name from the present goals and velocities, first slowly to its first pose."""
         self._now.velocity *= self._rate if self._playing or self._stopping else 0.0
         self._playing, self._stopping, self._starting = True, False, False
         self._asked.fill(np.nan)
@@ -343,7 +351,7 @@ class KeyframePlayer(Controller[KeyframeParameters]):
         self._next_step(softly=True)
 
     def on_cancel(self, goal: Goal, time_ns: int) -> None:
-        """Decelerate each joint to rest."""
+        """Decelerate each joint to rest; the goal ends then. A goal whose motion is over is not changed."""
         if self._stopping:
             return
         if not self._playing:  # the motion is over, and the runtime is judging its goal
@@ -354,7 +362,7 @@ class KeyframePlayer(Controller[KeyframeParameters]):
         self._playing, self._stopping, self._time_s = False, True, 0.0
 
     def update(self, time_ns: int, period_ns: int) -> None:
-        """Command the present pose. Hold the last one after the end."""
+        """Command the pose of this cycle, and hold the last one after the end."""
         dt = period_ns * 1e-9
         if self.parameters.partial:
             self._leave_out()
@@ -368,7 +376,7 @@ class KeyframePlayer(Controller[KeyframeParameters]):
             self._hold_where_heard()
 
     def _leave_out(self) -> None:
-        """Skip joints without torque, and command their measured positions."""
+        """Skip joints without torque: their goals become their measured positions until the next step."""
         states = self.context.states
         if states.has_lost:  # the torque state of a lost servo is unknown until it returns
             return
@@ -386,7 +394,7 @@ class KeyframePlayer(Controller[KeyframeParameters]):
         self._now.velocity[self._out] = 0.0
 
     def _start(self) -> None:
-        """Start the motion of the activation once all joints have answered."""
+        """Start the motion `start` once all joints have answered."""
         if self._unknown:
             self._hold_where_heard()
         if not self._unknown and self.parameters.start is not None:
@@ -427,11 +435,11 @@ class KeyframePlayer(Controller[KeyframeParameters]):
             self._goal.feedback(min(self._done_s / self._total_s, 1.0), self._worst()[0])
 
     def _reach(self) -> None:
-        """Set the state to the end of the step, at rest."""
+        """Set the present state to the end of the step, at rest."""
         self._now.rest_at(self._ends[1, 0])
 
     def _next_step(self, softly: bool = False) -> bool:
-        """Start the next step from the present state.
+        """Compute the way of the next step from the present state.
 
         Args:
             softly: Limit the speed to `approach`.
@@ -494,7 +502,7 @@ class KeyframePlayer(Controller[KeyframeParameters]):
     # The end
 
     def _hand_over(self) -> None:
-        """Pass the goal to the runtime for judgement by the last requested pose of each joint."""
+        """Pass the goal to the runtime, which judges it by the last requested pose of each joint."""
         moved, text = self._moved_joints(f"played {self._name}")
         if not moved:
             self._finish(Outcome.ABORTED, f"played {self._name}")
@@ -508,21 +516,23 @@ class KeyframePlayer(Controller[KeyframeParameters]):
         goal.judge(self._asked.copy(), joints=moved, tolerances=tolerances, text=text)
 
     def _worst(self) -> tuple[float, str]:
-        """Return the largest position error, rad, and its joint; infinite for a servo without a reply."""
+        """Return the largest position error, rad, and its joint; the error is infinite without a reply."""
         states = self.context.states
         error = np.where(states.valid, np.abs(states.position - self.context.commands.position), np.inf)
         row = int(error.argmax())
         return float(error[row]), self.context.joints[row]
 
     def _finish(self, outcome: Outcome, text: str) -> None:
-        """End the goal without judgement."""
+        """End the active goal with an outcome, without judgement of the positions."""
         goal, self._goal = self._goal, None
         if goal is not None:
             (worst, joint), (_, text) = self._worst(), self._moved_joints(text)
             goal.end(outcome, text, joint, worst)
 
     def _moved_joints(self, text: str) -> tuple[list[str], str]:
-        """Return the joints that the goal moves now, and append the skipped joints to a text."""
+        """Return the joints that the goal moves now, and the text with the joints that were skipped
+        appended.
+        """
         joints = self.context.joints
         named = {joint for motion in self._motions for step in motion.steps for joint in step.pose}
         moved = [each for each, out in zip(joints, self._out, strict=True) if each in named and not out]

@@ -1,4 +1,4 @@
-"""Learned motions: store of the corrections of an ilc_controller, and their binary format between runs."""
+"""Learned motions: store of an ilc_controller's corrections, and their binary format between runs."""
 
 from __future__ import annotations
 
@@ -13,48 +13,48 @@ from dxlrun import Floats
 from dxlrun_controllers.laws.learning import MOST_DELAY_S, Table
 
 Key = tuple[float, float]
-"""Identity of a motion: two numbers from a hash of its trajectory"""
+"""Identity of a motion: two numbers from a hash of its trajectory."""
 
 _MOST_KEPT: Final = 1 << 20
-"""Bytes; the limit of `Context.keep`"""
+"""Upper limit of the serialized motions, bytes; that of `Context.keep`."""
 _FORM: Final = 1
-"""Version of the binary format"""
+"""Version of the binary format."""
 _HEAD: Final = struct.Struct("<IqII")
-"""Header: version, period (ns), number of joints, number of motions"""
+"""Header of the binary format: version, period (ns), number of joints, number of motions."""
 _ENTRY: Final = struct.Struct("<ddIIdd")
-"""Motion: key, rows, repetitions, first and smallest error. Delays (float64) and table (float32) follow."""
+"""Entry of a motion: key, rows, repetitions, first and smallest error. Delays (f8) and table (f4) follow."""
 
 
 def motion_name(key: Key) -> str:
-    """Return a short name of a motion for messages."""
+    """Return a short name of a motion for messages, from its key."""
     return f"{int(key[0]):012x}"[:8]
 
 
 class LearnedMotion(msgspec.Struct):
-    """Motion with a learned correction"""
+    """A motion with a learned correction, whose table LearnedMotions stores."""
 
     key: Key
     rows: int
     first: float
-    """Error without a correction, rad"""
+    """Error of the repetition without a correction, rad."""
     best: float
-    """Smallest error, rad"""
+    """Smallest error of all repetitions, rad."""
     delay_s: Floats
-    """s, shape (joints,)"""
+    """Tracking delay of each joint, s."""
     repetitions: int = 0
     place: int = -1
-    """Index of the table; -1 without one"""
+    """Index of the motion's table in the store; -1 without one."""
     grown: int = 0
-    """Number of consecutive repetitions with a too large error"""
+    """Number of repetitions in a row whose error was too large."""
 
     @property
     def name(self) -> str:
-        """Short name for messages"""
+        """Short name of the motion for messages."""
         return motion_name(self.key)
 
 
 class LearnedMotions:
-    """Bounded store of motions and their tables. All memory is allocated by the constructor.
+    """Bounded store of motions and the tables of their corrections, allocated by the constructor.
 
     There is one table more than motions, because the next table is written while the previous one is played.
     """
@@ -84,11 +84,11 @@ class LearnedMotions:
         self._tables: NDArray[np.float32] = np.zeros((motions + 1, joints, rows), np.float32)
         self._free: list[int] = []
         self._known: list[LearnedMotion] = []
-        """Motions, the least recently played one first"""
+        """Motions in the store, the least recently played one first."""
         self.clear()
 
     def clear(self) -> None:
-        """Forget all motions."""
+        """Forget all motions and their tables."""
         self._known = []
         self._free = list(range(len(self._tables)))
 
@@ -97,25 +97,30 @@ class LearnedMotions:
         return next((motion for motion in self._known if motion.key == key), None)
 
     def touch(self, motion: LearnedMotion) -> None:
-        """Mark a motion as played most recently. The least recently played one is forgotten first."""
+        """Mark a motion as played most recently; the least recently played one is replaced first."""
         self._known.remove(motion)
         self._known.append(motion)
 
     def row(self, motion: LearnedMotion, row: int) -> Table:
-        """Return the correction of a row, rad, shape (joints,). The row is clamped to those of the motion."""
+        """Return the correction of one row, rad, shape (joints,); `row` is clamped to the motion's rows."""
         correction: Table = self._tables[motion.place, :, min(max(row, 0), motion.rows - 1)]
         return correction
 
     def table(self, motion: LearnedMotion) -> Table | None:
-        """Return the correction of a motion, or None if it has none yet."""
+        """Return the correction of a motion, shape (joints, rows), or None if it has none yet."""
         return None if motion.place < 0 else self._tables[motion.place, :, : motion.rows]
 
     def next_table(self, motion: LearnedMotion) -> Table:
-        """Return the free table for the next correction. `learned` makes it the current one."""
+        """Return a free table of the motion's size, for the next correction; `learned` makes it the
+        current one.
+        """
         return self._tables[self._free[0], :, : motion.rows]
 
     def learned(self, motion: LearnedMotion) -> LearnedMotion | None:
-        """Make the next table of a motion its current one. Return the motion that was replaced, or None."""
+        """Make the table that was just written the motion's current one.
+
+        A new motion is added to the store. Returns the motion that it replaced, or None.
+        """
         forgotten = None
         if motion.place >= 0:
             self._free.append(motion.place)
@@ -129,12 +134,12 @@ class LearnedMotions:
         return forgotten
 
     def forget(self, motion: LearnedMotion) -> None:
-        """Forget a motion."""
+        """Remove a motion from the store and free its table."""
         self._known.remove(motion)
         self._free.append(motion.place)
 
     def packed(self) -> bytes:
-        """Serialize all motions."""
+        """Return all motions with their corrections as bytes, which `unpack` reads."""
         parts = [_HEAD.pack(_FORM, self._period_ns, len(self._most), len(self._known))]
         for one in self._known:
             parts.append(_ENTRY.pack(*one.key, one.rows, one.repetitions, one.first, one.best))

@@ -41,9 +41,9 @@ from dxlrun_controllers.laws.spline import DECELERATION, SplineSample, Stop
 from dxlrun_controllers.motions.trajectory_command import Near
 
 _HEAD: Final = 3
-"""Length of the header before the rows of a goal"""
+"""Number of values before the rows of a prepared goal: period, settling time and tolerance."""
 MOST_PIECES: Final = 256
-"""Largest number of pieces of a table: the `rows` commands before its goal, and the goal's own rows"""
+"""Upper limit of the pieces of a table: `rows` commands before its goal, and the goal's own rows."""
 
 
 class Bounds(ParametersModel):
@@ -67,7 +67,7 @@ class SampleParameters(JointsParameters):
     bounds: Bounds = Bounds()
 
     def mistakes(self) -> Iterator[Mistake]:
-        """Yield the ranges whose lower end is not below the upper end."""
+        """Yield the ranges of `bounds` whose lower end is not below the upper end."""
         yield from super().mistakes()
         for joint, (lower, upper) in self.bounds.range.items():
             if not lower < upper:
@@ -76,7 +76,7 @@ class SampleParameters(JointsParameters):
 
     @property
     def width(self) -> int:
-        """Number of values in a row"""
+        """Number of values in a row of the table."""
         return len(self.joints) * (2 if self.command_interface == "posvel" else 1)
 
 
@@ -130,7 +130,8 @@ class SamplePlayer(Controller[SampleParameters]):
 
     @classmethod
     def prepare(cls, kind: str, command: CommandModel, parameters: SampleParameters) -> NDArray[np.float64]:
-        """Return the rows as a flat array. For `samples`, period, settling time and tolerance come first.
+        """Return the rows of a command as a flat array; `samples` has period, settling time and tolerance
+        before them.
 
         Raises:
             ValueError: A row has the wrong size, or exceeds the range of a joint.
@@ -164,13 +165,13 @@ class SamplePlayer(Controller[SampleParameters]):
             self._rest_lower = np.maximum(self._lower, limits.lower)
             self._rest_upper = np.minimum(self._upper, limits.upper)
         self._primary: Floats = getattr(context.commands, commanded_by(self._interface)[0])
-        """Command array for the first values of a row"""
+        """Command array for the first values of a row."""
         self._forget()
 
     # Life
 
     def on_activate(self, time_ns: int) -> None:
-        """Hold the joints where they are. Velocities, efforts and PWM start at 0."""
+        """Discard all rows, and hold the joints; velocities, efforts and PWM start at 0."""
         self._forget()
         if self._by_position:
             hold(self.context)
@@ -185,19 +186,22 @@ class SamplePlayer(Controller[SampleParameters]):
         self._phase = _Phase.RESTING
         self._goal: Goal | None = None
         self._pieces: list[Floats] = []
-        """Pieces of the table. Those that were received without a goal belong to the next goal."""
+        """Pieces of the table, each a flat array of rows.
+
+        Those received without a goal are for the next goal.
+        """
 
     # Commands
 
     def on_command(self, kind: str, data: NDArray[np.float64], time_ns: int) -> None:
-        """Store rows for the next goal. An active table is aborted."""
+        """Store rows for the next goal. A table that is being played is aborted."""
         if self._phase is _Phase.PLAYING:
             self._end(Outcome.ABORTED, "rows of another table came")
             self._begin_stop(time_ns)
         self._keep(data)
 
     def on_goal(self, goal: Goal, data: NDArray[np.float64], time_ns: int) -> None:
-        """Play the stored rows and those of the goal."""
+        """Play the stored rows followed by those of the goal."""
         if self._phase is _Phase.PLAYING:  # drop the rows of the goal that was preempted
             self._pieces = []
         self._keep(data[_HEAD:])
@@ -218,14 +222,17 @@ class SamplePlayer(Controller[SampleParameters]):
         self._begin_stop(time_ns)
 
     def _keep(self, rows: Floats) -> None:
-        """Append rows. At most one piece too many is stored, so that `on_goal` can abort the goal."""
+        """Store a piece of a table.
+
+        At most one piece too many is stored, so that `on_goal` can abort the goal.
+        """
         if len(self._pieces) <= MOST_PIECES:
             self._pieces.append(rows)
 
     # In a cycle
 
     def update(self, time_ns: int, period_ns: int) -> None:
-        """Command the present row or the stop. At rest, the last command stays."""
+        """Command the row of this cycle, or the stop; at rest, the last command stays."""
         if self._phase is _Phase.PLAYING:
             self._play(time_ns, period_ns)
         elif self._phase is _Phase.STOPPING:
@@ -275,7 +282,9 @@ class SamplePlayer(Controller[SampleParameters]):
     # The end
 
     def _breach(self) -> tuple[int, str] | None:
-        """Return the row of the first joint that violates a bound and a description, or None."""
+        """Return index and description of the first joint that violates a bound; None while all are
+        within.
+        """
         states, valid = self.context.states, self.context.states.valid
         lower, upper, most, effort = self._lower, self._upper, self._strongest, np.abs(states.effort)
         # The runtime holds positions while a joint is lost, but not the other interfaces.
@@ -297,7 +306,9 @@ class SamplePlayer(Controller[SampleParameters]):
         return None
 
     def _end(self, outcome: Outcome, text: str = "", row: int = -1) -> None:
-        """End the goal, if there is one, and name the joint of `row` as the reason."""
+        """End the goal, if there is one; the joint with the index `row`, if not -1, is named as the
+        reason.
+        """
         goal, self._goal = self._goal, None
         if goal is None:
             return
@@ -305,7 +316,7 @@ class SamplePlayer(Controller[SampleParameters]):
         goal.end(outcome, f"joint {joint} {text}" if joint else text, joint)
 
     def _hand_over(self) -> None:
-        """Pass the goal to the runtime for judgement by its last row.
+        """Pass the goal to the runtime, which judges it by the table's last row.
 
         Efforts and PWM are not judged by position or rest, because they define neither.
         """
@@ -342,7 +353,7 @@ class SamplePlayer(Controller[SampleParameters]):
 
 
 def _checked(rows: Rows, parameters: SampleParameters) -> Floats:
-    """Return rows as an array, shape (rows, width). Raises ValueError for the first invalid row."""
+    """Return the rows of a command as an array, shape (rows, width); raises ValueError for an invalid row."""
     width, joints = parameters.width, parameters.joints
     if not rows:
         raise ValueError("there is no row; give at least one")

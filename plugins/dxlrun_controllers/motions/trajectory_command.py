@@ -20,13 +20,15 @@ from dxlrun_controllers.laws.spline import (
 )
 
 SPLICED: Final = 2.0
-"""Mark of a moved joint after a spliced flat trajectory. It is 1 without a splice, and 0 for all other
-joints."""
+"""Mark of a moved joint at the end of a spliced flat trajectory.
+
+Without a splice it is 1; other joints have 0.
+"""
 _DURATION: TypeAdapter[int] = TypeAdapter(Duration)
 
 
 def _seconds(value: object) -> object:
-    """Convert a text with a unit, such as `500 ms`, to seconds. A bare number is in seconds already."""
+    """Return a text with a unit, such as `500 ms`, in seconds; a number is in seconds already."""
     return _DURATION.validate_python(value) * 1e-9 if isinstance(value, str) else value
 
 
@@ -51,7 +53,7 @@ class JointTolerance(CommandModel):
     @model_validator(mode="before")
     @classmethod
     def _from_position(cls, data: object) -> object:
-        """Accept a bare position tolerance."""
+        """Accept a position tolerance in place of a mapping."""
         return data if isinstance(data, Mapping | JointTolerance) else {"position": data}
 
 
@@ -116,27 +118,29 @@ class GoalLimits(NamedTuple):
     """Tolerances of a goal, shape (joints,). NaN in a command selects the tolerance of the robot file."""
 
     path: Floats
-    """Position error on the way, rad or m; infinite if it is not checked"""
+    """Largest position error on the way, rad or m; infinite if it is not checked."""
     path_velocity: Floats
-    """Velocity error on the way, rad/s or m/s; infinite if it is not checked"""
+    """Largest velocity error on the way, rad/s or m/s; infinite if it is not checked."""
     position: Floats
-    """Position error at the end, rad or m"""
+    """Largest position error at the end, rad or m."""
     velocity: Floats
-    """Speed at the end, rad/s or m/s"""
+    """Highest speed at the end, rad/s or m/s, at which a joint counts as at rest."""
     settle_s: float
-    """Time after the end in which the goal may still be reached, s"""
+    """Time after the end in which the goal may still be reached, s."""
 
     @property
     def checks_path(self) -> bool:
-        """True if there is a tolerance on the way"""
+        """True if there is a position or velocity tolerance on the way."""
         return bool(np.isfinite(self.path).any() or np.isfinite(self.path_velocity).any())
 
     def flatten(self) -> Floats:
-        """Return the tolerances as one array."""
+        """Return the tolerances as one array: `settle_s`, then the four rows."""
         return np.concatenate([[self.settle_s], *self[:-1]])
 
     def replaced_by(self, flat: Floats, joints: int) -> Self:
-        """Return a copy in which the values of a flat array that are not NaN replace these tolerances."""
+        """Return a copy in which the values of a flattened GoalLimits that are not NaN replace these
+        tolerances.
+        """
         settle_s, rows = float(flat[0]), flat[1 : 1 + 4 * joints].reshape(4, joints)
         own = [np.where(np.isnan(new), old, new) for old, new in zip(self[:-1], rows, strict=True)]
         return type(self)(
@@ -149,7 +153,7 @@ class GoalLimits(NamedTuple):
 
 
 class ChunkHead(NamedTuple):
-    """Header before the flat array of a chunk, s"""
+    """Header of a flat chunk: the sender's time and the blending time, s."""
 
     now: float
     blend: float
@@ -221,7 +225,10 @@ def flat_trajectory(
 
 
 def _goal_limits(command: TrajectoryCommand, named: tuple[str, ...], joints: tuple[str, ...]) -> GoalLimits:
-    """Return the tolerances of a command. Raises ValueError if one names a joint that is not moved."""
+    """Return the tolerances in a command, NaN where it has none.
+
+    Raises ValueError if one names a joint that is not moved.
+    """
     given = {"path_tolerance": command.path_tolerance or {}, "goal_tolerance": command.goal_tolerance or {}}
     for key, tolerances in given.items():
         if unknown := [joint for joint in tolerances if joint not in named]:
@@ -254,7 +261,9 @@ def trajectory_speed_peaks(
 
 
 def _columns(named: tuple[str, ...], joints: tuple[str, ...]) -> list[int]:
-    """Return the columns of named joints. Raises ValueError for a joint that is unknown or named twice."""
+    """Return the indices of named joints in `joints`; raises ValueError for a joint unknown or named
+    twice.
+    """
     for index, joint in enumerate(named):
         if joint not in joints:
             raise ValueError(f"{joint} is not one of its joints ({', '.join(joints)})")

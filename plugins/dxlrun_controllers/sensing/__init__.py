@@ -1,4 +1,4 @@
 """Controllers that compute messages, states and decisions from the states of devices and sensors.
 
-The drivers are in `sensors`.
+The sensors' drivers are in `sensors`.
 """

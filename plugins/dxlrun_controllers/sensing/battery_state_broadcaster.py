@@ -20,7 +20,7 @@ from dxlrun import (
 from dxlrun.messages import BatteryState, Header
 
 PUBLISH_NS = 1_000_000_000
-"""Time between two messages, ns"""
+"""Time between two messages of the topic `battery_state`, ns."""
 
 
 class BatteryParameters(ParametersModel):
@@ -49,7 +49,7 @@ class BatteryParameters(ParametersModel):
     """Name of the frame in the messages."""
 
     def mistakes(self) -> Iterator[Mistake]:
-        """Yield voltages in the wrong order, and names that are not states."""
+        """Yield `stop` if it is not below `warn`, and names that are not states of an owner."""
         yield from super().mistakes()
         if self.stop >= self.warn:
             yield ("stop",), "stop is not below warn; the warning comes first"
@@ -98,7 +98,7 @@ class BatteryStateBroadcaster(Controller[BatteryParameters]):
         self._heard_ns = self._publish_ns = time_ns
 
     def update(self, time_ns: int, period_ns: int) -> None:
-        """Filter the voltage, compare it with the thresholds, and publish it."""
+        """Filter the median of the fresh voltages, compare it with the thresholds, and publish it."""
         parameters, count = self.parameters, len(self.parameters.voltages)
         values = self.context.reads.tolist()
         fresh = [

@@ -44,7 +44,7 @@ class DeviceCommandController(Controller[DeviceCommandParameters]):
     def prepare(
         cls, kind: str, command: CommandModel, parameters: DeviceCommandParameters
     ) -> NDArray[np.float64]:
-        """Return the values, shape (commands,); NaN leaves a command unchanged.
+        """Return the values of a command, shape (commands,); NaN leaves one unchanged.
 
         Raises:
             ValueError: A command is unknown, or a value is not finite.
@@ -59,7 +59,7 @@ class DeviceCommandController(Controller[DeviceCommandParameters]):
         return np.array([command.values.get(name, np.nan) for name in known])
 
     def on_command(self, kind: str, data: NDArray[np.float64], time_ns: int) -> None:
-        """Set new values."""
+        """Set new values for the device commands that the command names."""
         np.copyto(self.context.device_commands, data, where=np.isfinite(data))
 
     def update(self, time_ns: int, period_ns: int) -> None:

@@ -19,7 +19,7 @@ from dxlrun import (
 from dxlrun_controllers.sensing.imu_sensor_broadcaster import ORIENTATION
 
 Bounds = Annotated[tuple[Angle, ...], Field(min_length=2, max_length=2)]
-"""Lowest and highest angle, rad"""
+"""Lowest and highest angle, rad."""
 
 
 class FallParameters(ParametersModel):
@@ -43,7 +43,7 @@ class FallParameters(ParametersModel):
     """Reaction to a missing orientation after `timeout`: an event, or the controllers take over as well."""
 
     def mistakes(self) -> Iterator[Mistake]:
-        """Yield the bounds that do not include 0."""
+        """Yield bounds of roll or pitch that do not include 0."""
         yield from super().mistakes()
         for name, (lower, upper) in (("roll", self.roll), ("pitch", self.pitch)):
             if not lower < 0 < upper:
@@ -63,7 +63,7 @@ class FallReflex(Controller[FallParameters]):
 
     @classmethod
     def interfaces(cls, parameters: FallParameters, joints: tuple[str, ...]) -> Interfaces:
-        """Read the orientation."""
+        """Read the orientation of `imu` and its age, and provide `fallen`."""
         return Interfaces(
             (),
             reads=tuple(f"{parameters.imu}/{name}" for name in (*ORIENTATION, "age")),
@@ -72,13 +72,13 @@ class FallReflex(Controller[FallParameters]):
         )
 
     def on_activate(self, time_ns: int) -> None:
-        """Start as upright. A robot that is lying triggers again."""
+        """Assume that the robot is upright; if it is lying, the reflex triggers again."""
         self._fallen = self._silent = False
         self._since_ns = -1
         self._heard_ns = time_ns
 
     def update(self, time_ns: int, period_ns: int) -> None:
-        """Compare the orientation with the bounds."""
+        """Detect a fall, or that the robot is upright again, from the orientation of this cycle."""
         x, y, z, w, age_s = self.context.reads.tolist()
         parameters = self.parameters
         square = x * x + y * y + z * z + w * w  # a device may send zeros, or a quaternion of another length

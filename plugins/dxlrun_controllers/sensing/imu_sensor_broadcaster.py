@@ -36,12 +36,12 @@ RATE = tuple(f"angular_velocity.{axis}" for axis in AXES)
 ACCELERATION = tuple(f"linear_acceleration.{axis}" for axis in AXES)
 _ZERO = (0.0, 0.0, 0.0)
 _BIAS_TIME_CONSTANT = 2.0
-"""Time constant of the low-pass filter that estimates the gyroscope bias at rest, s"""
+"""Time constant of the low-pass filter that estimates the gyroscope bias at rest, s."""
 _BIAS_AFTER = 2.0
-"""Time of slow rotation after which a body counts as at rest, s"""
+"""Time of slow rotation after which a body counts as at rest, s."""
 
 Diagonal = Annotated[tuple[Annotated[float, Field(ge=0)], ...], Field(min_length=3, max_length=3)]
-"""Variances about x, y and z"""
+"""Variances about x, y and z."""
 
 
 class ImuCovariance(ParametersModel):
@@ -110,7 +110,9 @@ class ImuSensorBroadcaster(Controller[ImuParameters]):
 
     @classmethod
     def interfaces(cls, parameters: ImuParameters, joints: tuple[str, ...]) -> Interfaces:
-        """Read the states of the sensor, and optionally those of the magnetometer."""
+        """Read the states of the sensor and, with a magnetometer, its field; provide the states of the
+        link.
+        """
         names = (*RATE, *ACCELERATION, *(ORIENTATION if parameters.orientation == "sensor" else ()), "age")
         reads = [f"{parameters.sensor}/{name}" for name in names]
         if parameters.magnetometer is not None:
@@ -146,11 +148,11 @@ class ImuSensorBroadcaster(Controller[ImuParameters]):
         self._silent = self._wrong = False
 
     def on_parameters(self, time_ns: int) -> None:
-        """Set the gain."""
+        """Set the gain of the filter, which may have changed in the run."""
         self._filter.gain = self.parameters.gain
 
     def update(self, time_ns: int, period_ns: int) -> None:
-        """Process a new sample, if there is one."""
+        """Filter, provide and publish a new sample, if there is one."""
         provided = self.context.provided
         provided.fill(np.nan)  # NaN: no new value
         values = self.context.reads.tolist()
@@ -185,7 +187,7 @@ class ImuSensorBroadcaster(Controller[ImuParameters]):
         return a * x + b * y + c * z, d * x + e * y + f * z, g * x + h * y + i * z
 
     def _orientation(self, rate: Vector, acceleration: Vector, values: list[float]) -> tuple[float, ...]:
-        """Return the orientation of the link, x, y, z, w."""
+        """Return the orientation of the link as quaternion x, y, z, w, from the filter or from the sensor."""
         if self.parameters.orientation == "sensor":
             x, y, z, w = self._mounting
             return _product((values[6], values[7], values[8], values[9]), (-x, -y, -z, w))
@@ -199,7 +201,9 @@ class ImuSensorBroadcaster(Controller[ImuParameters]):
         return _product(self._east, (law.x, law.y, law.z, law.w))
 
     def _field(self, values: list[float]) -> Vector | None:
-        """Return the magnetic field, or None if it is missing or older than the timeout."""
+        """Return the magnetic field in the axes of the link, T; None if it is missing or older than the
+        timeout.
+        """
         if self.parameters.magnetometer is None:
             return None
         x, y, z, age_s = values[7:11]
@@ -208,7 +212,9 @@ class ImuSensorBroadcaster(Controller[ImuParameters]):
         return self._turned([x, y, z])
 
     def _unbiased(self, rate: Vector, dt: float) -> Vector:
-        """Return the rate without the gyroscope bias, which is estimated while the body is at rest."""
+        """Return the angular velocity without the gyroscope bias, rad/s; at rest, the bias is estimated
+        from it.
+        """
         rest = self.parameters.rest
         if rest is None:
             return rate
@@ -221,7 +227,7 @@ class ImuSensorBroadcaster(Controller[ImuParameters]):
         return rate[0] - x, rate[1] - y, rate[2] - z
 
     def _look_for_silence(self, time_ns: int) -> None:
-        """Report once that samples are missing."""
+        """Report once that no sample was received for `timeout`."""
         timeout = self.parameters.timeout
         if not self._silent and self._times.age_s(time_ns) * 1e9 > timeout:
             self._silent = True
@@ -231,7 +237,7 @@ class ImuSensorBroadcaster(Controller[ImuParameters]):
             )
 
     def _is_finite(self, values: list[float], own: int) -> bool:
-        """Return True if all values of a sample are finite. Report once if they are not."""
+        """Return True if the first `own` values of a sample are finite; report once if they are not."""
         if all(map(math.isfinite, values[:own])):
             return True
         if not (self._wrong or math.isnan(values[own])):  # age NaN: the first sample is still to come
@@ -241,7 +247,7 @@ class ImuSensorBroadcaster(Controller[ImuParameters]):
 
 
 Quaternion = tuple[float, float, float, float]
-"""x, y, z, w"""
+"""Quaternion x, y, z, w."""
 
 
 def _product(a: Quaternion, b: Quaternion) -> Quaternion:
@@ -273,6 +279,8 @@ def _matrix(roll: float, pitch: float, yaw: float) -> tuple[Vector, Vector, Vect
 
 
 def _fill(matrix: Floats, variances: tuple[float, ...] | None) -> None:
-    """Write variances into the diagonal of a covariance matrix, shape (9,)."""
+    """Write variances about x, y, z into the diagonal of a 3x3 covariance, shape (9,); None changes
+    nothing.
+    """
     if variances is not None:
         matrix[[0, 4, 8]] = variances

@@ -1,12 +1,14 @@
-"""Samples of a device or sensor: detection of new samples, and their times."""
+"""Samples: detection of new samples of a device or sensor from their ages, and the time between them."""
 
 from __future__ import annotations
 
 import math
 
 FRESH = 0.25
-"""Fraction of the controller's period by which two samples must differ in time. The time of one sample varies
-by some microseconds, because its age is computed again in each cycle."""
+"""Fraction of the controller's period by which the times of two samples must differ.
+
+The time of one sample varies by some microseconds, because its age is computed again in each cycle.
+"""
 
 
 class SampleTimes:
@@ -18,11 +20,12 @@ class SampleTimes:
         self.forget()
 
     def forget(self) -> None:
-        """Discard the last sample. The next one counts as the first."""
+        """Discard the last sample, so that the next one counts as the first."""
         self.time_s = self.elapsed_s = math.nan
 
     def take(self, time_ns: int, age_s: float) -> bool:
-        """Return True for a new sample, and set `elapsed_s` to the time since the last one, or to NaN.
+        """Return True if the sample is new, and set `elapsed_s` to the time since the last one, NaN for the
+        first.
 
         Args:
             time_ns: Time of the cycle, ns.

@@ -41,9 +41,9 @@ MESSAGES: Mapping[MessageName, tuple[str, type]] = {
     "Temperature": ("temperature", Temperature),
     "WrenchStamped": ("wrench", WrenchStamped),
 }
-"""Topic and type of each message. The topics have the names that the broadcasters of ROS 2 use."""
+"""Name of each message -> its topic, as the broadcasters of ROS 2 call it, and its type."""
 Cell = Annotated[tuple[Length, ...], Field(min_length=2, max_length=2)]
-"""Position of a force sensor in the frame of the sole: x forward and y to the left, m"""
+"""Position of a force sensor in the frame of the sole, m: x forward and y to the left."""
 
 
 class SensorParameters(ParametersModel):
@@ -89,7 +89,8 @@ class SensorParameters(ParametersModel):
 
     @property
     def weights(self) -> dict[str, dict[str, float]]:
-        """Factors of the states, by field. Fields with a constant number are not included.
+        """Field of the message -> state -> factor of its weighted sum; fields with a constant are not
+        included.
 
         An upward force F at (x, y) has the torque (y F, -x F, 0) about the origin.
         """
@@ -126,12 +127,12 @@ class SensorBroadcaster(Controller[SensorParameters]):
 
     @classmethod
     def topics(cls, parameters: SensorParameters) -> Mapping[str, type]:
-        """Return the topic of the message."""
+        """Return the topic of the message and its type."""
         topic, message = MESSAGES[parameters.message]
         return {topic: message}
 
     def on_configure(self, context: Context) -> None:
-        """Allocate the message, and the matrix that computes its fields."""
+        """Allocate the message, and the matrix that computes its fields from the states."""
         super().on_configure(context)
         parameters = self.parameters
         states, weights = _states(parameters), parameters.weights
@@ -155,7 +156,7 @@ class SensorBroadcaster(Controller[SensorParameters]):
         self._silent = False
 
     def update(self, time_ns: int, period_ns: int) -> None:
-        """Publish the message if there is a new sample."""
+        """Publish the message if a state has a new sample and all are fresh and finite."""
         reads = self.context.reads
         ages = reads[self._count :].tolist()
         new = False
@@ -191,7 +192,7 @@ def _owners(states: tuple[str, ...]) -> tuple[str, ...]:
 
 
 def _numbers(message: MessageName) -> dict[str, type[int] | type[float]]:
-    """Return the paths and types of all numeric fields of a message, except those of the header."""
+    """Return path -> type of all numeric fields of a message, except those of the header."""
     found: dict[str, type[int] | type[float]] = {}
 
     def add(value: object, path: str) -> None:
@@ -206,6 +207,6 @@ def _numbers(message: MessageName) -> dict[str, type[int] | type[float]]:
 
 
 def _place(message: object, path: str) -> tuple[object, str]:
-    """Resolve the path of a field to the object that contains it and its name there."""
+    """Return the object within a message that contains the field of a path, and the field's name there."""
     outer, _, name = path.rpartition(".")
     return attrgetter(outer)(message) if outer else message, name

@@ -1,4 +1,4 @@
-"""Standard sensors. Each runs in a process of its own.
+"""Standard sensors, whose drivers run in a process of their own.
 
 The controllers that use their samples are in `sensing`.
 """

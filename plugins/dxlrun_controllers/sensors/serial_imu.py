@@ -34,11 +34,13 @@ _SIX = (
 )
 _IGNORED = "-"
 _LONGEST_LINE = 4096
-"""Length above which a line is discarded, bytes. It lacks its line feed, for example at a wrong baud rate."""
+"""Length of received bytes without a line feed, above which they are discarded, for example at a wrong
+baud rate.
+"""
 _LOOK_S = 0.5
-"""Timeout of one `read`, s, so that the sensor process can stop"""
+"""Longest wait of one `read`, s, so that the sensor process can stop."""
 _REPORT_NS = 1_000_000_000
-"""Shortest time between two reports of garbage, ns"""
+"""Shortest time between two reports of garbage, ns."""
 
 
 class SerialImuParameters(ParametersModel):
@@ -84,7 +86,7 @@ class SerialImuParameters(ParametersModel):
 
 
 class SerialImu(Sensor[SerialImuParameters]):
-    """Sensor that reads the newest line. The time of a sample is the arrival of its line.
+    """Sensor that reads the newest line of the port. The time of a sample is the arrival of its line.
 
     `read` raises an error if the device is unplugged. The runtime then tries to open it once a second.
     """
@@ -115,7 +117,11 @@ class SerialImu(Sensor[SerialImuParameters]):
             port.close()
 
     def read(self, values: Floats) -> int | None:
-        """Wait for a line, at most 0.5 s. Raises OSError if the device is unplugged."""
+        """Wait for lines, at most 0.5 s, and write the newest one's numbers, in SI units, into `values`.
+
+        Returns the time of its arrival, ns, or None without a valid line. Raises OSError if the device is
+        unplugged.
+        """
         if not select.select([self._port.fileno()], [], [], _LOOK_S)[0]:
             return None
         data = os.read(self._port.fileno(), 65536)
@@ -143,7 +149,7 @@ class SerialImu(Sensor[SerialImuParameters]):
             self._begun = True
 
     def _numbers(self, line: bytes) -> list[float] | None:
-        """Parse the numbers of a line. Return None for garbage, and count it."""
+        """Return the used numbers of a line; None for garbage, which is counted."""
         prefix = self.parameters.prefix.encode()
         text: bytes | None = line if line.startswith(prefix) else None
         if text is not None and self.parameters.checksum:
@@ -169,7 +175,7 @@ class SerialImu(Sensor[SerialImuParameters]):
 
 
 def checked(line: bytes) -> bytes | None:
-    """Return a line without its checksum, or None if the checksum is missing or wrong."""
+    """Return a line without its checksum `*HH`; None if the checksum is missing or wrong."""
     text, star, digits = line.rpartition(b"*")
     try:
         given = int(digits, 16)

@@ -11,7 +11,7 @@ from pydantic import Field
 from dxlrun import AngularVelocity, Body, Floats, LinearAcceleration, ParametersModel, Sensor, SensorContext
 
 GRAVITY = np.array((0.0, 0.0, -9.81))
-"""m/s^2 in the world frame; the default of MuJoCo"""
+"""Gravity in the world frame, m/s^2; the default of MuJoCo."""
 _AXES = ("x", "y", "z")
 
 Density = Annotated[float, Field(ge=0)]
@@ -87,7 +87,7 @@ class ImuParameters(ParametersModel):
 
 
 class _Noise:
-    """White noise and random walk of the bias, for three axes.
+    """White noise and random walk of the bias of a sensor with three axes.
 
     The discrete standard deviations are those of Kalibr's IMU model: density * sqrt(rate) for the noise, and
     walk / sqrt(rate) for the step of the bias per sample.
@@ -99,7 +99,7 @@ class _Noise:
         self._walk = walk / math.sqrt(rate)
 
     def sample(self, generator: np.random.Generator) -> Floats:
-        """Return the errors of one sample."""
+        """Return the errors of the next sample on the three axes, and move the bias by a random step."""
         draws = generator.standard_normal((2, 3))
         self._bias = self._bias + self._walk * draws[0]
         errors: Floats = self._bias + self._white * draws[1]
@@ -107,7 +107,8 @@ class _Noise:
 
 
 class SimulatedImu(Sensor[ImuParameters]):
-    """Simulated specific force, angular velocity and magnetic field, in the frame of the link.
+    """Simulated unit that measures angular velocity, specific force and magnetic field in the frame of its
+    link.
 
     At rest the accelerometer measures +9.81 m/s^2 upwards (sensor_msgs/Imu; REP 145).
     """
@@ -118,14 +119,16 @@ class SimulatedImu(Sensor[ImuParameters]):
 
     @classmethod
     def states(cls, parameters: ImuParameters) -> tuple[str, ...]:
-        """Return the states: those of ros2_control's IMU sensors, and optionally the magnetic field."""
+        """Return the states: those of ros2_control's IMU sensors, and with a magnetometer the magnetic
+        field.
+        """
         groups = ["angular_velocity", "linear_acceleration"]
         groups += ["magnetic_field"] if parameters.magnetometer is not None else []
         return tuple(f"{group}.{axis}" for group in groups for axis in _AXES)
 
     @classmethod
     def noisy(cls, parameters: ImuParameters) -> tuple[str, ...]:
-        """Return the states with noise. All others are constant while the link is at rest."""
+        """Return the states with noise; the others are constant while the link is at rest."""
         gyroscope, accelerometer = parameters.gyroscope, parameters.accelerometer
         groups = ["angular_velocity"] if gyroscope.noise_density or gyroscope.random_walk else []
         groups += ["linear_acceleration"] if accelerometer.noise_density or accelerometer.random_walk else []
@@ -133,11 +136,11 @@ class SimulatedImu(Sensor[ImuParameters]):
 
     @classmethod
     def links(cls, parameters: ImuParameters) -> tuple[str, ...]:
-        """Return the link that carries the unit."""
+        """Return the link that carries the unit, whose motion the simulation provides."""
         return (parameters.link,)
 
     def open(self, context: SensorContext) -> None:
-        """Restart the noise from its seed."""
+        """Restart the noise from its seed. Raises RuntimeError without a simulated body."""
         super().open(context)
         if context.body is None:
             raise RuntimeError("there is no simulated body")
@@ -153,7 +156,9 @@ class SimulatedImu(Sensor[ImuParameters]):
         self._magnet_noise = None if magnet is None else _Noise(magnet.noise_density, magnet.bias, 0.0, rate)
 
     def read(self, values: Floats) -> int:
-        """Measure the present motion of the body."""
+        """Write the measurements of the link's present motion, with noise, into `values`; return their
+        time, ns.
+        """
         t_ns = self.context.now_ns()
         motion = self._body.motion(self.parameters.link)
         generator = self._generator
@@ -167,7 +172,9 @@ class SimulatedImu(Sensor[ImuParameters]):
 
 
 def turned_back(orientation: Floats, vector: Floats) -> Floats:
-    """Rotate a vector from the world frame into the frame of a body with the orientation x, y, z, w."""
+    """Return a vector of the world frame in the frame of a body whose orientation is the quaternion x, y,
+    z, w.
+    """
     axis, w = -orientation[:3], orientation.item(3)
     twice = 2.0 * np.cross(axis, vector)
     turned: Floats = vector + w * twice + np.cross(axis, twice)

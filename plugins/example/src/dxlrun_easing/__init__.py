@@ -1,4 +1,4 @@
-"""Controller for dxlrun that moves joints to their goals gently.
+"""Example plug-in: a controller for dxlrun that moves joints to their goals gently.
 
 The package imports only the public package `dxlrun`.
 """

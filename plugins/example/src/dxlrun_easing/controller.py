@@ -1,4 +1,4 @@
-"""Easing: move joints fast while they are far from their goals, and slowly on arrival."""
+"""Easing: controller that moves joints fast while they are far from their goals, and slowly on arrival."""
 
 from __future__ import annotations
 
@@ -34,11 +34,14 @@ class Easing(JointController):
         self.now = self.goal = self.start
 
     def on_command(self, kind: str, data: Floats, time_ns: int) -> None:
-        """Set new goals."""
+        """Set new goal positions, rad."""
         self.goal = data
 
     def positions(self, time: float, dt: float) -> Floats:
-        """Return the next positions. `dt` is the measured period, so a late cycle makes a longer step."""
+        """Return the positions to command in this cycle, rad.
+
+        `dt` is the measured period, so a late cycle makes a longer step.
+        """
         share = -math.expm1(-dt / self.time_constant)
         longest = self.speed * dt
         self.now = self.now + np.clip((self.goal - self.now) * share, -longest, longest)

@@ -1,4 +1,4 @@
-"""Checks of the lights against joints and control tables."""
+"""Check of the section `lights` against the robot's joints and the control tables of their servos."""
 
 from __future__ import annotations
 
@@ -11,7 +11,10 @@ from dxlrun_lights.plan import Light
 
 
 def compile_lights(compilation: Compilation) -> Contribution:
-    """Return the lights as commands of one source, `lights/NAME`, from 0 (off) to 1 (on)."""
+    """Return the lights as commands of one source, `lights/NAME`, from 0 (off) to 1 (on).
+
+    Reports an error for each light whose joint or LED does not exist, or that another light has.
+    """
     file, found, owners = compilation.file, dict[str, Light](), dict[tuple[str, int], str]()
     lights = form.STAGE.of(file.robot)
     for name, light in lights.items():

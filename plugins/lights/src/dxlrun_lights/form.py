@@ -1,4 +1,4 @@
-"""Form of the section `lights`."""
+"""Form of the section `lights` of the robot file."""
 
 from __future__ import annotations
 
@@ -7,7 +7,7 @@ from dxlrun.tooling.files import Form, Name, key
 
 
 class Light(Form):
-    """A light: the LED of a servo."""
+    """An entry of the section `lights`: the LED of a servo."""
 
     joint: Name = key("Joint whose first servo has the LED.", "pan_joint")
 

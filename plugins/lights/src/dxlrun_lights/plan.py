@@ -1,4 +1,4 @@
-"""Plan of the lights: data of the section for the run."""
+"""Plan of the lights: the checked section as the processes of a run read it."""
 
 from __future__ import annotations
 
@@ -6,7 +6,7 @@ import msgspec
 
 
 class Light(msgspec.Struct, frozen=True):
-    """A light that was found on its servo."""
+    """A light with the bus, ID and address at which its LED is written."""
 
     joint: str
     bus: str
@@ -15,5 +15,5 @@ class Light(msgspec.Struct, frozen=True):
 
 
 def decode_lights(plan: bytes) -> dict[str, Light]:
-    """Return the lights of `Contribution.plan` by name."""
+    """Return the lights by name from the JSON of `Contribution.plan`."""
     return msgspec.json.decode(plan, type=dict[str, Light])

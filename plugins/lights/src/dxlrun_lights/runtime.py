@@ -1,4 +1,4 @@
-"""Lights in a run: writes LEDs in idle time when their commands change."""
+"""Lights in a run: write the LEDs of servos, in idle time of the bus, when their commands change."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ RETRY_NS = 1_000_000_000  # a servo that does not reply costs a timeout, so it i
 
 
 class Led(msgspec.Struct):
-    """The LED of a light."""
+    """The LED of a light on a bus, with its last acknowledged state."""
 
     light: Light
     servo: int  # Index in the servos of the bus
@@ -22,7 +22,7 @@ class Led(msgspec.Struct):
 
 
 class Lights:
-    """The lights of one bus."""
+    """The lights of the servos on one bus, called by the process that drives the bus."""
 
     def __init__(self, context: BusContext, leds: list[Led]) -> None:
         self._context = context

@@ -1,4 +1,4 @@
-"""Lights at the end of a run: switched off by the process that ends it."""
+"""Lights at the end of a run: switched off by the process that brings the robot to a safe state."""
 
 from __future__ import annotations
 

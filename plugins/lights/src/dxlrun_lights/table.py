@@ -1,4 +1,4 @@
-"""Table of the lights for `dxlrun check`."""
+"""Table of the lights in the output of `dxlrun check`."""
 
 from __future__ import annotations
 
@@ -11,13 +11,13 @@ from dxlrun_lights.plan import decode_lights
 
 
 def light_rows(plan: Plan) -> Iterator[Row]:
-    """Yield a row for each light."""
+    """Yield name, joint, bus and ID of each light of a plan."""
     for name, light in decode_lights(plan.feature_plans["lights"]).items():
         yield {"name": name, "joint": light.joint, "bus": light.bus, "id": light.servo_id}
 
 
 def light_table(rows: Sequence[Row]) -> Table:
-    """Return the table of these lights."""
+    """Return the table that shows the rows of `light_rows`."""
     columns = [
         (Column("light", "name"), "name"),
         (Column("joint", "name"), "joint"),

@@ -18,16 +18,18 @@ if TYPE_CHECKING:
     from Phidget22.Devices.Spatial import Spatial
 
 G = 9.80665
-"""Standard gravity, m/s^2"""
+"""Standard gravity, m/s^2."""
 TESLA_PER_GAUSS = 1e-4
 UNKNOWN = 1e300
-"""PUNK_DBL of phidget22.h: placeholder of the library for an unknown value"""
+"""Placeholder of the library for an unknown value (PUNK_DBL of phidget22.h)."""
 _AXES = ("x", "y", "z")
 _LOOK_S = 0.5
-"""Timeout of one `read`, s, so that the sensor process can stop"""
+"""Longest wait of one `read`, s, so that the sensor process can stop."""
 _FIELD_NS = 100_000_000
-"""Time for which the last magnetic field replaces an unknown one, ns. The magnetometer is slower than the
-other sensors, and pauses for its internal calibration."""
+"""Time for which the last magnetic field replaces an unknown one, ns.
+
+The magnetometer is slower than the other sensors, and pauses for its internal calibration.
+"""
 
 
 class PhidgetSpatialParameters(ParametersModel):
@@ -50,7 +52,9 @@ class PhidgetSpatialParameters(ParametersModel):
 
 
 class PhidgetSpatial(Sensor[PhidgetSpatialParameters]):
-    """Sensor that reads the newest event. The library calls the handlers in a thread of its own."""
+    """Sensor that reads the newest sample of a Phidget Spatial, whose library calls handlers in its own
+    thread.
+    """
 
     Parameters = PhidgetSpatialParameters
     waits = True
@@ -58,7 +62,9 @@ class PhidgetSpatial(Sensor[PhidgetSpatialParameters]):
 
     @classmethod
     def states(cls, parameters: PhidgetSpatialParameters) -> tuple[str, ...]:
-        """Return the states, in SI units."""
+        """Return the states of the unit: acceleration, angular velocity and, if wanted, magnetic field, in
+        SI units.
+        """
         groups = ["linear_acceleration", "angular_velocity"]
         groups += ["magnetic_field"] * parameters.magnetometer
         return tuple(f"{group}.{axis}" for group in groups for axis in _AXES)
@@ -88,7 +94,10 @@ class PhidgetSpatial(Sensor[PhidgetSpatialParameters]):
             raise OSError(f"{unit}: {error.description or error}") from error
 
     def read(self, values: Floats) -> int | None:
-        """Wait for the next event, at most 0.5 s. Raises OSError if the unit is unplugged."""
+        """Wait for the next sample, at most 0.5 s, and write it into `values`.
+
+        Returns its time of arrival, ns, or None without one. Raises OSError if the unit is unplugged.
+        """
         with self._news:
             self._news.wait_for(lambda: self._sample is not None or self._detached, _LOOK_S)
             sample, self._sample = self._sample, None
@@ -101,7 +110,7 @@ class PhidgetSpatial(Sensor[PhidgetSpatialParameters]):
         return t_ns
 
     def close(self) -> None:
-        """Close the unit."""
+        """Close the connection to the unit."""
         channel, self._channel = self._channel, None
         if channel is not None:
             channel.close()
@@ -114,7 +123,9 @@ class PhidgetSpatial(Sensor[PhidgetSpatialParameters]):
         field: list[float],
         _timestamp: float,
     ) -> None:
-        """Store the values of an event and the time of its arrival."""
+        """Handle data of the library: convert them to SI units, and store them as the newest sample with
+        their time.
+        """
         t_ns = self.context.now_ns()
         found = [-G * _known(value) for value in acceleration]
         found += [math.radians(_known(value)) for value in rate]
