@@ -183,10 +183,9 @@ class ThermalGovernor(Controller[ThermalParameters]):
         self._temperature = before + np.where(np.isfinite(step), step, 0.0)
 
     def _hold_back(self) -> None:
-        """Clamp the goals of hot servos to a distance from their positions at which their torque is within
-        its limit.
+        """Clamp the goals of hot servos to a distance from their positions that keeps the torque limit.
 
-        A servo that was not read in this cycle keeps its last goal, so a lost packet causes no jump.
+        The states keep the last position of a servo that was not read, so a lost packet causes no jump.
         """
         position, goal = self.context.states.position, self.context.commands.position
         reach = self._scale * self._reach

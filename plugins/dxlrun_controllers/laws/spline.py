@@ -145,8 +145,7 @@ def _horner(coefficients: Floats, at: Floats) -> Floats:
 
 
 def trajectory_peaks(data: Floats) -> list[tuple[float, float, int]]:
-    """Return, for each joint of a flat trajectory, its peak velocity, when it is reached (s), and its piece (from
-    0).
+    """Return the peak velocity, its time (s) and its piece (from 0) of each joint of a flat trajectory.
 
     The list is empty for a trajectory of one point, because the start of the motion is unknown.
     """

@@ -235,9 +235,7 @@ class GatewayApp:
 
     @_answers(requests.ROBOT)
     async def robot(self, asked: Asked[None]) -> RobotInfo:
-        """Return the robot's name, rate, joints, sources and files, and its controllers with the commands
-        they accept.
-        """
+        """Return the robot's name, rate, joints, sources, files, and controllers with their commands."""
         link, plan = self._link, self._link.plan
         joints, began_ns = plan.loop.joints, link.began_ns
         return RobotInfo(
@@ -293,25 +291,19 @@ class GatewayApp:
 
     @_answers(requests.FRAMES)
     async def frames(self, asked: Asked[None]) -> Frames:
-        """Return the text of the URDF and the joints that move its links; a client computes poses of frames
-        from them.
-        """
+        """Return the text of the URDF, and the joints that move its links, to compute poses of frames."""
         plan = self._link.plan
         return Frames(plan.urdf, plan.frames)
 
     @_answers(requests.LOG_HEADER)
     async def log_header(self, asked: Asked[None]) -> Response:
-        """Return the header (joints, controllers, layout of a cycle record) with which a client decodes log
-        messages.
-        """
+        """Return the header (joints, controllers, layout of a cycle) to decode log messages with."""
         header = LogHeader.of(self._link.plan, self._link.topics.epoch_offset_ns)
         return Response(msgspec.json.encode(header), media_type="application/json")
 
     @_answers(requests.EVENTS)
     async def events(self, asked: Asked[None]) -> Events:
-        """Return the stored events with a number above the query's `after`; `last` is the newest event's
-        number.
-        """
+        """Return the stored events with a number above `after`; `last` is the newest event's number."""
         after, kept = asked.number("after", 0.0), self._link.events
         rows = (
             EventRow(number, one.t_ns * 1e-9, one.name, one.severity, one.source, one.text)
@@ -327,9 +319,7 @@ class GatewayApp:
 
     @_answers(requests.STREAM)
     async def stream(self, asked: Asked[None]) -> Response:
-        """Stream the messages of the queried topics as frames, see `Frame`, until the run ends; with `once`,
-        only one batch.
-        """
+        """Stream the messages of topics as frames, see `Frame`, until the run ends; `once`: one batch."""
         query, rate = asked.http.query_params, asked.number("rate", requests.MOST_LOOKS)
         topics = query.getlist("topic")
         if not topics or rate <= 0:
@@ -379,9 +369,7 @@ class GatewayApp:
     @_answers(requests.CANCEL)
     @_answers(requests.CANCEL_OF)
     async def cancel(self, asked: Asked[None]) -> Executed[int]:
-        """Cancel a goal by its number, or the running goals of a controller; reply with the numbers of these
-        goals.
-        """
+        """Cancel a goal by number, or the running goals of a controller; reply with their numbers."""
         if "number" in asked.http.path_params:
             wanted = Cancel(goal=asked.goal)
             goals = [wanted.goal]
@@ -480,9 +468,7 @@ class GatewayApp:
 
     @_answers(requests.COMMAND)
     async def command(self, asked: Asked[bytes]) -> Executed[int]:
-        """Check a typed command, refuse values beyond joint limits, and send it to the loop; reply once it is
-        executed.
-        """
+        """Check a typed command, also against joint limits; reply once the loop has executed it."""
         kind, content = asked.part("kind"), asked.body
         query, source = asked.http.query_params, self._commanded.get(asked.part())
         if source is not None and kind == SOURCE_COMMANDS:
@@ -520,8 +506,7 @@ class GatewayApp:
 
     @_answers(requests.SET_POINT)
     async def set_point(self, asked: Asked[bytes]) -> Clamped:
-        """Replace the set-point of a stream that waits for the loop; a refusal by the loop is an event, not a
-        reply.
+        """Replace the set-point of a stream that the loop reads next; its refusal is an event, not a reply.
 
         The loop clamps values beyond their joints' limits; the reply counts them.
         """
@@ -542,9 +527,7 @@ class GatewayApp:
 
     @_answers(requests.SWITCH)
     async def switch(self, asked: Asked[Switch]) -> Executed[int]:
-        """Activate and deactivate controllers in one cycle; reply after the servos have changed their
-        operating modes.
-        """
+        """Activate and deactivate controllers in one cycle; reply after servos have changed their modes."""
         switch, known = asked.body, tuple(self._link.controllers)
         if unknown := [name for name in (*switch.activate, *switch.deactivate) if name not in known]:
             raise unknown_controllers(unknown, known)
@@ -577,9 +560,7 @@ class GatewayApp:
 
     @_answers(requests.REGISTER)
     async def register(self, asked: Asked[Value]) -> Executed[int]:
-        """Write a RAM item of a joint's servo; reply with the old and new value when the new one was read
-        back.
-        """
+        """Write a RAM item of a joint's servo; reply with old and new value once it was read back."""
         joint, item = asked.part(), asked.part("item")
         register = prepared_register(self._link.plan, joint, item, asked.body.value)
         done = await self._link.for_loop("register", register, asked.origin)
@@ -587,9 +568,7 @@ class GatewayApp:
 
     @_answers(requests.READ_REGISTER)
     async def read_register(self, asked: Asked[None]) -> Row:
-        """Read a control table item of a joint's servo, in the loop's idle time, and return its value with
-        unit.
-        """
+        """Read a control table item of a joint's servo in idle time; reply with value and unit."""
         plan, joint, item = self._link.plan, asked.part(), asked.part("item")
         reading = prepared_reading(plan, joint, item)
         done = await self._link.for_loop("get", reading, asked.origin)
@@ -677,9 +656,7 @@ class GatewayApp:
 
     @_answers(requests.TAKE_OVER)
     async def take_over(self, asked: Asked[None]) -> Executed[int]:
-        """Make this client the commander, the only client of another computer that may command, in place of
-        the present one.
-        """
+        """Make this client the commander, the only client that may command, in place of another one."""
         before = self._commander.become(client_of(asked.http))
         return await self._note_commander(before or self._commander.name, asked.origin)
 
@@ -701,9 +678,7 @@ class GatewayApp:
 
     @_answers(requests.LOAD)
     async def load(self, asked: Asked[Row]) -> Executed[int]:
-        """Check a controller's entry, written as in the robot file, and load the controller into a paused
-        loop.
-        """
+        """Check a controller's entry as in the robot file, and load it into a paused loop."""
         others = {name: loaded.plan for name, loaded in self._link.controllers.items()}
         plan = self._preparation.controller(asked.body, others, self._link.rate)
         return await self._for_loop("load", plan, asked.origin, partial(self._link.loaded, plan))
