@@ -39,10 +39,8 @@ class Command(msgspec.Struct, frozen=True, array_like=True, tag_field="is", tag=
     controller: str
     kind: str
     data: bytes
-    """Little-endian float64 values from the controller's `prepare`.
-
-    For the loop, JSON (UTF-8); for `play`, JSON, a line break and an array.
-    """
+    """Little-endian float64 values from the controller's `prepare`. For the loop, JSON (UTF-8); for `play`,
+    JSON, a line break and an array."""
     origin: str
     """Client that sent the command, for the log."""
     lease_ns: Annotated[int, msgspec.Meta(ge=0)] = 0

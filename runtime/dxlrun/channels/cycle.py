@@ -24,11 +24,8 @@ from dxlrun.description.source_names import SOURCE_COMMAND
 from dxlwire.modes import COMMAND_INTERFACES
 
 Floats = NDArray[np.float64]
-"""Array of float64.
-
-For joints, shape (joints,): rad, rad/s, Nm, A, or the fraction of maximum effort if the servo does not
-measure torque.
-"""
+"""Array of float64. For joints, shape (joints,): rad, rad/s, Nm, A, or the fraction of maximum effort if the
+servo does not measure torque."""
 LOST_CYCLES = 3
 """Consecutive missing replies after which a servo is lost, if its last reply is older than LOST_AGE_NS."""
 LOST_AGE_NS = 50_000_000
@@ -91,10 +88,8 @@ class Torque(IntEnum):
     ON = 1
     """Torque is enabled, and the servo gets goals."""
     DOUBT = 2
-    """Uncertain after a lost reply or after torque was enabled.
-
-    The servo gets goals again once its Torque Enable was read.
-    """
+    """Uncertain after a lost reply or after torque was enabled. The servo gets goals again once its Torque
+    Enable was read."""
     OFF = 3
     """Torque is off because the servo was reset, its torque was cut, or it shut down."""
     RELEASED = 4
@@ -104,10 +99,8 @@ class Torque(IntEnum):
     REBOOTING = 6
     """The servo reboots at the request of a client. Missing replies do not count as a loss."""
     GIVEN = 7
-    """Torque was just enabled.
-
-    The joint's goal becomes its measured position, and its controllers are restarted.
-    """
+    """Torque was just enabled. The joint's goal becomes its measured position, and its controllers are
+    restarted."""
 
     @property
     def word(self) -> str:
@@ -241,11 +234,8 @@ class Commands:
     position: Floats = field(init=False)
     """Commanded position, rad or m."""
     velocity: Floats = field(init=False)
-    """Commanded velocity, rad/s or m/s.
-
-    With a position: speed toward it, a magnitude, NaN = as fast as the servo can. Alone: signed velocity of
-    the joint.
-    """
+    """Commanded velocity, rad/s or m/s. With a position: speed toward it, a magnitude, NaN = as fast as the
+    servo can. Alone: signed velocity of the joint."""
     effort: Floats = field(init=False)
     """Unit of the state's effort: Nm, A, or the fraction of maximum. With a position: effort limit of the
     servo, a magnitude. Alone: signed effort."""

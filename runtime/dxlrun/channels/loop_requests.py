@@ -53,11 +53,8 @@ class TorqueRequest(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     joints: tuple[str, ...]
     on: bool
     release: bool = False
-    """Deactivate the controllers that command the joints, in the same cycle.
-
-    Otherwise, torque off is refused while there are such controllers, and torque on restarts them at the
-    positions of the joints.
-    """
+    """Deactivate the controllers that command the joints, in the same cycle. Otherwise, torque off is refused
+    while there are such controllers, and torque on restarts them at the positions of the joints."""
 
 
 class RebootRequest(msgspec.Struct, frozen=True, forbid_unknown_fields=True):

@@ -20,10 +20,8 @@ from dxlwire.joint_unit import LINEAR, ROTARY, JointUnit
 from dxlwire.modes import Mode
 
 MOVED_DISTANCES: Mapping[JointUnit, float] = {ROTARY: 0.0873, LINEAR: 0.005}
-"""Distance from which a joint counts as moved in a pause: 5 deg or 5 mm.
-
-It restarts at its measured position. A joint in effort mode coasts or sags by less. [i]
-"""
+"""Distance from which a joint counts as moved in a pause: 5 deg or 5 mm. It restarts at its measured
+position. A joint in effort mode coasts or sags by less. [i]"""
 _HOLDING = (Mode.POSITION, Mode.EFFORT_POSITION)
 """Modes in which a servo with torque keeps its position goal while the loop is paused."""
 

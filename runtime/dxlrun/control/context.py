@@ -72,10 +72,8 @@ class ControlContext:
     """Arrays of states, commands and goals of the current cycle, in memory that all users share."""
     clock: Clock
     hardware: Hardware
-    """Interface to the servos.
-
-    The code that builds the context starts it before the loop and stops it after.
-    """
+    """Interface to the servos. The code that builds the context starts it before the loop and stops it
+    after."""
     events: EventSink
     command_log: CommandSink = field(default_factory=NoCommands)
     """Log of the commands that cycles executed; discards them by default."""

@@ -54,10 +54,8 @@ _LIMITED: Mapping[Clamp, LimitedInterface] = {
 }
 """Clamps whose limit a register of the servo may tighten, with the command interface of that register."""
 CLAMP_ENDS_NS = 1_000_000_000
-"""Time without a clamp after which its end is reported.
-
-A joint pressed against a limit oscillates there. [i]
-"""
+"""Time without a clamp after which its end is reported. A joint pressed against a limit oscillates there.
+[i]"""
 _NEUTRAL = {Mode.VELOCITY: "velocity", Mode.EFFORT: "effort", Mode.PWM: "pwm"}
 """Command interface whose goal is set to 0 to keep a joint in this mode at rest."""
 

@@ -14,17 +14,13 @@ from dxlwire.joint_unit import LINEAR, ROTARY, JointUnit
 from dxlwire.modes import Mode
 
 STILL_SPEEDS: Mapping[JointUnit, float] = {ROTARY: 0.1, LINEAR: 0.003}
-"""Speed below which a joint counts as at rest, rad/s or m/s.
-
-Servos report velocity in steps of 0.024 rad/s (XM430) or less, with noise of some steps. [i]
-"""
+"""Speed below which a joint counts as at rest, rad/s or m/s. Servos report velocity in steps of 0.024 rad/s
+(XM430) or less, with noise of some steps. [i]"""
 STILL_NS = 100_000_000
 """Time for which all joints must be at rest, with unchanged goals, before a halt is answered as done."""
 HALT_NS = 5_000_000_000
-"""Time after which a halt is refused if joints still move.
-
-Joints may need that long to change their modes.
-"""
+"""Time after which a halt is refused if joints still move. Joints may need that long to change their
+modes."""
 _HOLDING = (Mode.POSITION, Mode.VELOCITY)
 _FREE = (*LIMP, *OFFLINE)
 """Torque states (limp or offline) of joints that a halt ignores: the run does not move them."""

@@ -51,15 +51,11 @@ class LoopResult(msgspec.Struct, frozen=True):
     detail: str = ""
     """Explanation in one sentence if the reason is a fault; may be empty otherwise."""
     last: Last = "limp"
-    """Final state of the robot after the exit policy:
-
-    `limp` or `hold`. The code that stops the hardware applies it.
-    """
+    """Final state of the robot after the exit policy: `limp` or `hold`. The code that stops the hardware
+    applies it."""
     invalid: tuple[int, ...] = ()
-    """Number of cycles with an invalid servo state, a value for each joint.
-
-    Requested reboots do not count.
-    """
+    """Number of cycles with an invalid servo state, a value for each joint. Requested reboots do not
+    count."""
 
 
 class Loop:
@@ -116,10 +112,8 @@ class Loop:
         self._anchoring = self.steering.anchoring
         self._motion: SafeMotion | None = None
         self._servo_limits: Mapping[int, Sequence[ServoLimit]] = {}
-        """Register limits of the servos that the gate has.
-
-        Compared by identity: the hardware replaces the mapping when a servo returns.
-        """
+        """Register limits of the servos that the gate has. Compared by identity: the hardware replaces the
+        mapping when a servo returns."""
 
     def run(self) -> LoopResult:
         """Run cycles until the plan's end, a stop request or a fault, then execute the policy for that end.

@@ -30,10 +30,8 @@ _PR_SET_TIMERSLACK = 29  # linux/prctl.h
 _RESET_ON_FORK = 1  # SCHED_FLAG_RESET_ON_FORK, linux/sched.h: for this process, not for its children
 _TASKS = Path("/proc/self/task")
 IDLE_LATENCY = Path("/dev/cpu_dma_latency")
-"""Device file that limits the wake-up time of idle cores, int32 in us.
-
-The request ends when the file is closed (kernel: Documentation/power/pm_qos_interface.rst).
-"""
+"""Device file that limits the wake-up time of idle cores, int32 in us. The request ends when the file is
+closed (kernel: Documentation/power/pm_qos_interface.rst)."""
 _AGAIN = "and log in again"
 P = ParamSpec("P")
 
@@ -315,10 +313,8 @@ def raise_share(process: int, nice: int) -> None:
 # Memory
 
 HEAP = 8 << 20
-"""Bytes of heap that `touch` writes before the loop.
-
-A loop of 20 servos allocates and frees a few kB in a cycle [i].
-"""
+"""Bytes of heap that `touch` writes before the loop. A loop of 20 servos allocates and frees a few kB in a
+cycle [i]."""
 _STACK_DEPTH = 800
 """Depth of nested lists for `repr`, which makes one C call a level: 800 levels touch some 100 kB of stack
 [measured]. Python's recursion limit is 1000."""
@@ -373,16 +369,12 @@ AUTO_SHARE = 10
 """Divider: without `polling` in the robot file, the polling time is at most period / AUTO_SHARE."""
 _TRIES = 32
 _NAP_NS = 2_000_000
-"""Longest sleep of a try, ns.
-
-All tries together take 64 ms. Longer sleeps overshoot more, which _RESERVE covers.
-"""
+"""Longest sleep of a try, ns. All tries together take 64 ms. Longer sleeps overshoot more, which _RESERVE
+covers."""
 _QUANTILE = 0.95
 _RESERVE = 1.5
-"""Factor on the measured delay.
-
-Sleeps of 20 ms overshoot 1.4 times as much as those of 2 ms [measured, round_robin, x86-64].
-"""
+"""Factor on the measured delay. Sleeps of 20 ms overshoot 1.4 times as much as those of 2 ms [measured,
+round_robin, x86-64]."""
 
 
 def overshoot_ns(nap_ns: int) -> int:

@@ -43,10 +43,8 @@ class RunInputs(msgspec.Struct, frozen=True, eq=False):
 
     log: Log  # Without packets and topics; only the scalars of cycles
     loop: LoopPlan
-    """The loop's plan, including the planned commands that cycles executed.
-
-    The recording decides when it ends, skips periods and begins a policy.
-    """
+    """The loop's plan, including the planned commands that cycles executed. The recording decides when it
+    ends, skips periods and begins a policy."""
     activation: np.void  # States and goals when the controllers were activated
     start_ns: int  # Deadline of cycle 0
     steered: tuple[ClientCommand, ...]  # Commands of clients

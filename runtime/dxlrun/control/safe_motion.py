@@ -19,15 +19,11 @@ from dxlwire.joint_unit import LINEAR, ROTARY, JointUnit
 from dxlwire.modes import Mode
 
 ARRIVED: Mapping[JointUnit, float] = {ROTARY: 0.05, LINEAR: 0.002}
-"""Distance within which a joint counts as arrived at a pose, rad or m: ten ticks of an AX-12.
-
-Friction stops it some ticks short of its goal.
-"""
+"""Distance within which a joint counts as arrived at a pose, rad or m: ten ticks of an AX-12. Friction stops
+it some ticks short of its goal."""
 MODES_NS = 500_000_000
-"""Longest wait for mode changes before the steps, within the policy's time limit.
-
-They take some twenty transactions a servo. [i]
-"""
+"""Longest wait for mode changes before the steps, within the policy's time limit. They take some twenty
+transactions a servo. [i]"""
 STAND_NS = 100_000_000
 """Shortest time for which a pose, or a goal of 0 rad/s for joints that keep their torque, is sent. A write
 may be lost, and a servo that missed a reply gets its goal a cycle later."""

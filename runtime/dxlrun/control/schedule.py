@@ -37,10 +37,8 @@ class Schedule:
     grid_ns: int = 0
     """Controllers' time at the deadline of `cycle`: time since the first deadline, without pauses."""
     time_ns: int = 0
-    """Controllers' time in the running cycle: ns since the first deadline, without pauses.
-
-    It never goes back.
-    """
+    """Controllers' time in the running cycle: ns since the first deadline, without pauses. It never goes
+    back."""
 
     def start(self, now_ns: int) -> None:
         """Reset cycle and controllers' time to 0, and set the first deadline to one period after `now_ns`."""

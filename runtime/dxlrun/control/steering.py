@@ -39,17 +39,13 @@ from dxlrun.plan.policy_plan import HOLD
 MOST_RATE = 100_000.0
 """Highest loop rate that clients can request, Hz; same limit as in the robot file."""
 LEAST_RATE = 1.0
-"""Lowest loop rate that clients can request, Hz.
-
-Commands, also `stop`, are executed once a cycle, and the guardian's timeout follows the rate.
-"""
+"""Lowest loop rate that clients can request, Hz. Commands, also `stop`, are executed once a cycle, and the
+guardian's timeout follows the rate."""
 PAUSE_LEASE_NS = 60_000_000_000
 """Time without a command for the loop after which a pause ends by the policy `on_stale_command`."""
 PAUSED_CYCLE_NS = 200_000_000
-"""Guardian's timeout of a cycle while the loop is paused.
-
-It is longer because a cycle may load a controller.
-"""
+"""Guardian's timeout of a cycle while the loop is paused. It is longer because a cycle may load a
+controller."""
 LONGEST_SHOWN = 120
 """Number of characters after which a command's data are cut in its event."""
 

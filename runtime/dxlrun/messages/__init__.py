@@ -32,10 +32,10 @@ from dxlrun.messages.declared import Number as Number
 
 Floats = NDArray[np.float64]
 Covariance = Annotated[Floats, Length(36)]
-"""6 x 6 covariance in row-major order: x, y, z, and rotation about X, Y, Z."""
+"""Covariance matrix of a pose or twist, 6 x 6 in row-major order: x, y, z, and rotation about X, Y, Z."""
 Covariance3 = Annotated[Floats, Length(9)]
-"""3 x 3 covariance in row-major order, about x, y, z. All 0: unknown; first element -1: the quantity is
-not measured."""
+"""Covariance matrix, 3 x 3 in row-major order, about x, y, z. All 0: unknown; first element -1: the quantity
+is not measured."""
 Float32 = Annotated[float, Number("float32")]
 Unsigned8 = Annotated[int, Number("uint8")]
 Signed32 = Annotated[int, Number("int32")]
@@ -51,7 +51,7 @@ def _no_cells() -> NDArray[np.float32]:
 
 
 class Time(msgspec.Struct):
-    """A point in time: seconds since 1970 and the remaining nanoseconds."""
+    """ROS 2 message with a point in time: seconds since 1970 and the remaining nanoseconds."""
 
     ros_type: ClassVar[str] = "builtin_interfaces/msg/Time"
     sec: Signed32 = 0
@@ -59,7 +59,7 @@ class Time(msgspec.Struct):
 
 
 class Duration(msgspec.Struct):
-    """A span of time."""
+    """ROS 2 message with a span of time: seconds and the remaining nanoseconds."""
 
     ros_type: ClassVar[str] = "builtin_interfaces/msg/Duration"
     sec: Signed32 = 0
@@ -67,7 +67,7 @@ class Duration(msgspec.Struct):
 
 
 class Header(msgspec.Struct):
-    """Time and frame of a message. The runtime sets the stamp of a first field `header`."""
+    """ROS 2 message header: time and frame. The runtime sets the stamp of a first field `header`."""
 
     ros_type: ClassVar[str] = "std_msgs/msg/Header"
     stamp: Time = msgspec.field(default_factory=Time)
@@ -78,49 +78,49 @@ class Header(msgspec.Struct):
 
 
 class Bool(msgspec.Struct):
-    """A truth value."""
+    """ROS 2 message with a truth value."""
 
     ros_type: ClassVar[str] = "std_msgs/msg/Bool"
     data: bool = False
 
 
 class Float64(msgspec.Struct):
-    """A number."""
+    """ROS 2 message with a number of 64 bits."""
 
     ros_type: ClassVar[str] = "std_msgs/msg/Float64"
     data: float = 0.0
 
 
 class Int32(msgspec.Struct):
-    """A whole number of 32 bits."""
+    """ROS 2 message with a signed integer of 32 bits."""
 
     ros_type: ClassVar[str] = "std_msgs/msg/Int32"
     data: Signed32 = 0
 
 
 class UInt32(msgspec.Struct):
-    """A whole number of 32 bits without a sign."""
+    """ROS 2 message with an unsigned integer of 32 bits."""
 
     ros_type: ClassVar[str] = "std_msgs/msg/UInt32"
     data: Unsigned32 = 0
 
 
 class Int64(msgspec.Struct):
-    """A whole number of 64 bits."""
+    """ROS 2 message with a signed integer of 64 bits."""
 
     ros_type: ClassVar[str] = "std_msgs/msg/Int64"
     data: int = 0
 
 
 class String(msgspec.Struct):
-    """A text."""
+    """ROS 2 message with a text."""
 
     ros_type: ClassVar[str] = "std_msgs/msg/String"
     data: str = ""
 
 
 class MultiArrayDimension(msgspec.Struct):
-    """One dimension of an array."""
+    """Name, size and stride of one dimension of a ROS 2 array message."""
 
     ros_type: ClassVar[str] = "std_msgs/msg/MultiArrayDimension"
     label: str = ""
@@ -129,7 +129,7 @@ class MultiArrayDimension(msgspec.Struct):
 
 
 class MultiArrayLayout(msgspec.Struct):
-    """Layout of the dimensions of an array in its data."""
+    """Dimensions of a ROS 2 array message, and where its data begin."""
 
     ros_type: ClassVar[str] = "std_msgs/msg/MultiArrayLayout"
     dim: tuple[MultiArrayDimension, ...] = ()
@@ -137,7 +137,7 @@ class MultiArrayLayout(msgspec.Struct):
 
 
 class Float64MultiArray(msgspec.Struct):
-    """Array of numbers with a layout."""
+    """ROS 2 message with an array of several dimensions; `data` has the numbers, `layout` the dimensions."""
 
     ros_type: ClassVar[str] = "std_msgs/msg/Float64MultiArray"
     layout: MultiArrayLayout = msgspec.field(default_factory=MultiArrayLayout)
@@ -237,7 +237,7 @@ class Odometry(msgspec.Struct):
 
 
 class JointState(msgspec.Struct):
-    """States of joints: rad, rad/s, Nm; one row per name, or an empty array."""
+    """States of joints by `name`: rad, rad/s, Nm; an element per joint in each array, or an empty array."""
 
     ros_type: ClassVar[str] = "sensor_msgs/msg/JointState"
     header: Header = msgspec.field(default_factory=Header)
@@ -275,7 +275,7 @@ class Range(msgspec.Struct):
     ros_type: ClassVar[str] = "sensor_msgs/msg/Range"
     header: Header = msgspec.field(default_factory=Header)
     radiation_type: Unsigned8 = 0
-    """0: ultrasound, 1: infrared"""
+    """Kind of sensor. 0: ultrasound, 1: infrared"""
     field_of_view: Float32 = 0.0
     min_range: Float32 = 0.0
     max_range: Float32 = 0.0
@@ -313,11 +313,11 @@ class BatteryState(msgspec.Struct):
     design_capacity: Float32 = math.nan
     percentage: Float32 = math.nan
     power_supply_status: Unsigned8 = 0
-    """0: unknown, 1: charging, 2: discharging, 3: not charging, 4: full"""
+    """State of charging. 0: unknown, 1: charging, 2: discharging, 3: not charging, 4: full"""
     power_supply_health: Unsigned8 = 0
-    """0: unknown, 1: good, 2: overheat, 3: dead, 4: overvoltage"""
+    """Health of the battery. 0: unknown, 1: good, 2: overheat, 3: dead, 4: overvoltage"""
     power_supply_technology: Unsigned8 = 0
-    """0: unknown, 1: NiMH, 2: Li-ion, 3: LiPo, 4: LiFe, 5: NiCd, 6: LiMn"""
+    """Battery type. 0: unknown, 1: NiMH, 2: Li-ion, 3: LiPo, 4: LiFe, 5: NiCd, 6: LiMn"""
     present: bool = True
     cell_voltage: NDArray[np.float32] = msgspec.field(default_factory=_no_cells)
     cell_temperature: NDArray[np.float32] = msgspec.field(default_factory=_no_cells)
@@ -326,7 +326,7 @@ class BatteryState(msgspec.Struct):
 
 
 class JointTrajectoryPoint(msgspec.Struct):
-    """A point of a trajectory: one row per joint, or an empty array."""
+    """Point of a joint trajectory, with its time: one element per joint in each array, or an empty array."""
 
     ros_type: ClassVar[str] = "trajectory_msgs/msg/JointTrajectoryPoint"
     positions: Floats = msgspec.field(default_factory=_zeros(0))

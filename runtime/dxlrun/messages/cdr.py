@@ -22,7 +22,7 @@ from numpy.typing import NDArray
 from dxlrun.messages.definition import PRIMITIVES, Definitions, MessageField, MessageType, parse, short_name
 
 ENCAPSULATION = b"\x00\x01\x00\x00"
-"""Encapsulation header: CDR, little-endian, no options."""
+"""First four bytes of each message: CDR, little-endian, no options."""
 
 Numbers: TypeAlias = "NDArray[np.generic] | bytes | bytearray | memoryview"
 Value: TypeAlias = "int | float | str | Numbers | Sequence[Value] | Mapping[str, Value]"
@@ -30,7 +30,7 @@ Value: TypeAlias = "int | float | str | Numbers | Sequence[Value] | Mapping[str,
 _HEAD = len(ENCAPSULATION)
 _LENGTH = struct.Struct("<I")
 _WIDEST = 8
-"""Bytes of the widest number, the largest alignment."""
+"""Size of the widest number, bytes, which is the largest alignment."""
 
 Write: TypeAlias = "Callable[[bytearray, Value], None]"
 Read: TypeAlias = "Callable[[memoryview, int], tuple[Value, int]]"
@@ -51,12 +51,12 @@ class Codec:
         top = short_name(message.name)
         self.fields: tuple[str, ...] = tuple(field.name for field in definitions[top])
         self.leaves: tuple[str, ...] = tuple(place for place, _ in _leaves(top, definitions, ""))
-        """Paths of all values: `header.stamp.sec`."""
+        """Dotted names of all values of a message, with nested messages flattened: `header.stamp.sec`."""
         self._write = _row_writer(top, definitions)
         _, self._read = _nested(top, definitions)
 
     def pack(self, *values: Value) -> bytes:
-        """Return the message with these values, in the order of its fields; nested messages are tuples.
+        """Encode a message from its field values, in the order of its fields; nested messages are tuples.
 
         Sequences of numbers are NumPy arrays of the field's type, or bytes. Raises struct.error or ValueError
         when a value does not fit its field.
@@ -66,20 +66,22 @@ class Codec:
         return self.pack_row(row)
 
     def pack_row(self, row: Sequence[Value]) -> bytes:
-        """Return the message with one value for each of its `leaves`, in their order. Raises as `pack`."""
+        """Encode a message from one value for each of its `leaves`, in their order. Raises as `pack`."""
         buffer = bytearray(ENCAPSULATION)
         self._write(buffer, row)
         return bytes(buffer)
 
     def pack_field(self, name: str, value: Value) -> bytes:
-        """Return one field alone, as if it were the first; finds the field that does not fit."""
+        """Encode one field alone, to find out whether its value fits. Raises as `pack`."""
         fields = self._definitions[short_name(self.message.name)]
         buffer = bytearray(ENCAPSULATION)
         _field(fields[self.fields.index(name)], self._definitions)[0](buffer, value)
         return bytes(buffer)
 
     def unpack(self, data: bytes | memoryview) -> Mapping[str, Value]:
-        """Return the values by field; nested messages are dictionaries, sequences of numbers are arrays.
+        """Decode a message to its values by field.
+
+        Nested messages are dictionaries, numbers in sequences arrays.
 
         Raises ValueError when the bytes are not a message of this type.
         """
@@ -95,7 +97,7 @@ class Codec:
 
 
 def _leaves(name: str, definitions: Definitions, place: str) -> Iterator[tuple[str, MessageField]]:
-    """Yield the fields of a message, with nested messages flattened."""
+    """Yield dotted name and definition of each field of a message, with nested messages flattened."""
     for field in definitions[name]:
         if field.kind in definitions and not field.sequence and not field.length:
             yield from _leaves(field.kind, definitions, f"{place}{field.name}.")
@@ -115,7 +117,7 @@ def _flatten(values: Value, name: str, definitions: Definitions, row: list[Value
 
 
 def _row_writer(name: str, definitions: Definitions) -> Callable[[bytearray, Sequence[Value]], None]:
-    """Return a function that writes the values of a message in the order of `_flatten`."""
+    """Return a function that encodes the flattened values of a message, in the order of `_leaves`."""
     steps = tuple(_steps([field for _, field in _leaves(name, definitions, "")], definitions))
 
     def write(buffer: bytearray, row: Sequence[Value]) -> None:
@@ -132,7 +134,7 @@ def _row_writer(name: str, definitions: Definitions) -> Callable[[bytearray, Seq
 
 
 def _steps(fields: Sequence[MessageField], definitions: Definitions) -> Iterator[tuple[Write, int]]:
-    """Yield functions that write values, and how many numbers each writes in one call; 0: one value."""
+    """Yield functions that encode fields, each with the count of numbers it encodes; 0: one other value."""
     numbers = ""
     for field in fields:
         if field.kind in PRIMITIVES and not field.sequence and not field.length:
@@ -147,7 +149,7 @@ def _steps(fields: Sequence[MessageField], definitions: Definitions) -> Iterator
 
 
 def _run(codes: str) -> Write:
-    """Return a function that writes adjacent numbers; their padding depends on the first one's offset."""
+    """Return a function that encodes adjacent numbers, given their `struct` codes, in one call."""
     layouts = []
     for start in range(_WIDEST):
         form, at = "<", start
@@ -188,7 +190,7 @@ def _number(kind: str) -> tuple[Write, Read]:
 
 
 def _row(value: Value, element: np.dtype[np.generic]) -> bytes | bytearray | memoryview:
-    """Return the bytes of one row of numbers."""
+    """Return the bytes of a sequence of numbers; raise ValueError for another element type or shape."""
     if isinstance(value, np.ndarray):
         if value.dtype != element:
             raise ValueError(f"{value.dtype} is given where {element} is asked")
@@ -201,7 +203,10 @@ def _row(value: Value, element: np.dtype[np.generic]) -> bytes | bytearray | mem
 
 
 def _numbers(kind: str, fixed: int) -> tuple[Write, Read]:
-    """Return writer and reader of sequences, or of arrays of `fixed` length, which is not written."""
+    """Return writer and reader of a field with many numbers: a sequence, or an array of `fixed` length.
+
+    The length of an array is not written.
+    """
     element = np.dtype(PRIMITIVES[kind]).newbyteorder("<")
 
     def write(buffer: bytearray, value: Value) -> None:
@@ -277,7 +282,7 @@ def _many(one: tuple[Write, Read]) -> tuple[Write, Read]:
 
 
 def _texts() -> tuple[Write, Read]:
-    """Return writer and reader of sequences of texts.
+    """Return writer and reader of a field that is a sequence of texts.
 
     Names of joints are the same in every message, so their bytes are cached.
     """

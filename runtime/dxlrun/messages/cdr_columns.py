@@ -27,9 +27,9 @@ Indices = NDArray[np.int64]
 Flags = NDArray[np.bool_]
 _HEAD = len(ENCAPSULATION)
 _SPARE = 16
-"""Zero bytes after the messages, which a cursor reads that has left its message."""
+"""Number of zero bytes after the messages, which a cursor reads that has left its message."""
 _DEEPEST = 32
-"""Upper limit of nested messages: a definition that contains itself would not end."""
+"""Most levels of nested messages: a definition that contains itself would not end."""
 
 
 @dataclass(slots=True)
@@ -37,16 +37,18 @@ class Column:
     """One field of many messages: values, sequences of elements, or the fields of nested messages."""
 
     values: NDArray[np.generic] | None = None
-    """Shape (rows,): numbers, or texts as objects."""
+    """Values of the field, shape (messages,): numbers, or texts as objects; None for other kinds of fields.
+    """
     counts: Indices | None = None
-    """Shape (rows,): number of elements in each row."""
+    """Number of elements of each message's sequence, shape (messages,); None unless the field is a sequence.
+    """
     elements: Column | None = None
-    """Concatenated elements of all rows."""
+    """Elements of all messages' sequences, concatenated; None unless the field is a sequence."""
     fields: dict[str, Column] = field(default_factory=dict)
 
     @property
     def leaves(self) -> tuple[str, ...]:
-        """Paths of all values, including those in sequences of messages: `header.stamp.sec`."""
+        """Dotted names of all values in this column, also in sequences of messages: `header.stamp.sec`."""
         inside = self.elements if self.elements is not None else self
         return tuple(
             f"{name}.{leaf}" if leaf else name
@@ -55,7 +57,10 @@ class Column:
         )
 
     def leaf(self, place: str) -> Column:
-        """Return the column at a path. Raises KeyError for an unknown path."""
+        """Return the column of a value inside this one by its dotted name.
+
+        Raises KeyError for an unknown name.
+        """
         if not place:
             return self
         if self.elements is not None:
@@ -81,14 +86,17 @@ class Column:
 
     @property
     def flat(self) -> tuple[Indices, NDArray[np.generic]]:
-        """Number of elements in each row, and the elements of all rows; empty unless a sequence of values."""
+        """Number of elements in each message's sequence, and all elements.
+
+        Empty if the field is not a sequence.
+        """
         inside = None if self.elements is None else self.elements.values
         if self.counts is None or inside is None:
             return np.zeros(0, np.int64), np.zeros(0)
         return self.counts, inside
 
     def take(self, rows: Indices) -> Column:
-        """Return the column of some rows."""
+        """Return a column with these rows (messages) only."""
         if self.values is not None:
             return Column(values=self.values[rows])
         if self.counts is not None and self.elements is not None:
@@ -103,7 +111,7 @@ class Column:
 
     @classmethod
     def joined(cls, parts: Sequence[Column]) -> Column:
-        """Return the concatenated rows of columns of one kind."""
+        """Concatenate the rows of columns of the same field."""
         first = parts[0]
         if first.values is not None:
             return cls(values=np.concatenate([part.values for part in parts if part.values is not None]))
@@ -117,21 +125,21 @@ class Column:
 
 @dataclass(slots=True)
 class _Cursors:
-    """Read positions of all messages."""
+    """Position in each of many messages up to which fields were read."""
 
     data: NDArray[np.uint8]
     at: Indices
     end: Indices
     origin: Indices
-    """Origin of the alignment of each message."""
+    """Index from which the alignment of each message's fields counts."""
     good: Flags
-    """False for a message that ended before its fields."""
+    """False for messages that ended before all their fields were read."""
 
     def align(self, size: int) -> None:
         self.at += (self.origin - self.at) % size
 
     def ahead(self, sizes: Indices | int) -> Indices:
-        """Advance by `sizes` bytes and return the previous positions. A message without as many is bad."""
+        """Advance each cursor and return the previous positions. A message that is too short becomes bad."""
         fits = self.at + sizes <= self.end
         self.good &= fits
         begin = np.where(fits, self.at, len(self.data) - _SPARE)
@@ -145,7 +153,10 @@ class _Cursors:
         return found
 
     def counted(self, least: int) -> Indices:
-        """Read lengths of sequences. One beyond the message, at `least` bytes per element, is 0 and bad."""
+        """Read the length of a sequence from each message.
+
+        One beyond its message becomes 0, the message bad.
+        """
         self.align(4)
         begin = self.ahead(4)
         counts = self.numbers(begin, "uint32").astype(np.int64)
@@ -158,7 +169,7 @@ class _Cursors:
 
 
 Read = Callable[[_Cursors, bool], Column]
-"""Function that reads one field, or skips it and returns an empty column."""
+"""Function that reads one field of all messages. If it is to skip the field, the column is empty."""
 
 
 class ColumnReader:

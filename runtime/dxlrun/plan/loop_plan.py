@@ -23,11 +23,8 @@ if TYPE_CHECKING:
     from dxlrun.channels.cycle import CycleLayout
 
 TOLERATED_SKIPS = 0.1
-"""Default share of skipped periods up to which a run counts as good.
-
-A loop at 50 Hz with simulated servos, without real-time rights and with five busy programs on two cores,
-skipped 2.6 % [measured].
-"""
+"""Default share of skipped periods up to which a run counts as good. A loop at 50 Hz with simulated servos,
+without real-time rights and with five busy programs on two cores, skipped 2.6 % [measured]."""
 
 Policy = Literal["other", "fifo", "round_robin"]
 OverrunPolicy = Literal["skip", "catch_up", "stop"]

@@ -12,16 +12,16 @@ from dxlrun.plan.loop_plan import LoopPlan, ScheduledCommand
 
 
 class UnreachedGoal(NamedTuple):
-    """A goal of a played motion that a run did not reach."""
+    """A goal of a played motion file that a run did not reach, with the reason."""
 
     controller: str
     name: str
-    """Motion and controller: `wave of arm`."""
+    """Name for messages, of motion and controller: `wave of arm`."""
     sentence: str
     """Reason as a sentence, without its full stop."""
     remedy: str = ""
     report: GoalReport | None = None
-    """Report of its outcome; None: it never began."""
+    """Event data with its outcome; None: the goal never began."""
 
     @property
     def failed(self) -> bool:

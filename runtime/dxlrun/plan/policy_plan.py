@@ -24,7 +24,7 @@ SLOW_SPEEDS: Mapping[JointUnit, float] = {
     ROTARY: SLOW_SPEED,
     LINEAR: 0.05,  # a gripper's fingers close in a second [i]
 }
-"""SLOW_SPEED for each unit of joints, rad/s or m/s."""
+"""Speed limit of goals in the first second after torque was enabled, by unit of the joint, rad/s or m/s."""
 SLOW_START_NS = 1_000_000_000  # Duration of the slow speed after `ease_in` (failures: limit violation)
 _NEVER_S = 1e9  # Upper bound of durations, so that they fit an int of ns
 SETTLE_NS = 300_000_000
@@ -65,7 +65,8 @@ class Step(msgspec.Struct, frozen=True):
     text: str  # Text for people: `pose home at 60 deg/s`
     longest_ns: int  # Longest duration
     targets: tuple[float | None, ...] = ()
-    """Target of each joint, rad or m; None: not in the pose. Empty: the step does not have a pose."""
+    """Target position of each joint, rad or m; None: not in the pose. Empty: the step reduces torque
+    instead."""
     speed: float = 0.0  # Speed toward the pose, rad/s
     linear_speed: float | None = None  # Speed of linear joints, m/s; None: not in the pose
     fraction: float = 1.0  # Torque limit at the end of the step, as a share of each servo's own limit
@@ -77,14 +78,14 @@ class Step(msgspec.Struct, frozen=True):
 
 
 class Policy(msgspec.Struct, frozen=True):
-    """Sequence of steps, and the final state of the robot."""
+    """Steps that a robot executes, such as at the end of a run, and its final state: limp or hold."""
 
     steps: tuple[Step, ...] = ()
     last: Last = "limp"
 
     @property
     def text(self) -> str:
-        """The policy as text."""
+        """Steps and final state of the policy as text for messages."""
         return ", then ".join([*(step.text for step in self.steps), self.last])
 
     @property
@@ -94,7 +95,7 @@ class Policy(msgspec.Struct, frozen=True):
 
     @property
     def longest_ns(self) -> int:
-        """Longest duration of all steps, ns."""
+        """Longest duration of all steps together, ns."""
         return sum(step.longest_ns for step in self.steps)
 
 
@@ -103,7 +104,7 @@ HOLD = Policy(last="hold")
 
 
 class PolicyPlan(msgspec.Struct, frozen=True):
-    """Policies of a robot."""
+    """Compiled policies of a robot: for the end of a run, for faults, and for events of features."""
 
     on_exit: Policy = LIMP  # After a stop request, or at the end of the plan
     on_fault: Policy = LIMP  # After a fault of the loop, a bus, or a controller without an available fallback
@@ -114,7 +115,7 @@ class PolicyPlan(msgspec.Struct, frozen=True):
 
     @property
     def by_name(self) -> dict[str, Policy]:
-        """All policies by name."""
+        """All policies of the robot by name, such as `on_exit`."""
         return {"on_exit": self.on_exit, "on_fault": self.on_fault, **self.of_features}
 
     def slowest_period_ns(self, planned_ns: int) -> int:
@@ -131,5 +132,5 @@ class PolicyPlan(msgspec.Struct, frozen=True):
         return planned_ns + (left_ns // 2 if longest_ns else planned_ns + left_ns)
 
     def named(self, name: str) -> Policy:
-        """Return a policy by name. Raises KeyError for an unknown name."""
+        """Return the policy of this name, such as `on_exit`. Raises KeyError for an unknown name."""
         return self.by_name[name]

@@ -10,7 +10,7 @@ PART_PATTERN = "part_[0-9][0-9][0-9][0-9]*.mcap"
 
 
 class RecordingPlan(msgspec.Struct, frozen=True):
-    """Settings of the log in the robot file."""
+    """Settings of logs from the section `recording` of the robot file."""
 
     directory: str = "logs"
     split_bytes: int | None = None  # Size at which a new part begins
@@ -27,5 +27,5 @@ class RecordingPlan(msgspec.Struct, frozen=True):
 
 
 def part_name(index: int) -> str:
-    """Return the file name of a part."""
+    """Return the file name of a log's part with this index."""
     return f"part_{index:04d}.mcap"

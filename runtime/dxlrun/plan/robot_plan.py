@@ -35,7 +35,7 @@ class SimulationPlan(msgspec.Struct, frozen=True):
 
 
 class Plan(msgspec.Struct, frozen=True):
-    """Plan of a robot, complete without the robot file."""
+    """Compiled robot with all data of a run; complete without the robot file. It is JSON in the log."""
 
     robot: str
     loop: LoopPlan
@@ -63,12 +63,12 @@ class Plan(msgspec.Struct, frozen=True):
 
     @property
     def features(self) -> tuple[Feature, ...]:
-        """Features that take part in the run."""
+        """Features of the robot file whose code takes part in the run."""
         return self.loop.features
 
     @property
     def feature_plans(self) -> dict[str, bytes]:
-        """Compiled data of features, by name of the feature."""
+        """Encoded plan of each feature, by name of the feature."""
         return self.loop.feature_plans
 
     @property
@@ -78,7 +78,7 @@ class Plan(msgspec.Struct, frozen=True):
 
     @property
     def servos_by_joint(self) -> dict[str, tuple[tuple[BusPlan, ServoPlan], ...]]:
-        """Servos of each joint with their buses, by joint name."""
+        """Buses and servos that move each joint, by joint name."""
         servos = {servo.row: (bus, servo) for bus in self.buses for servo in bus.servos}
         return {
             joint.name: tuple(servos[each] for each in self.mechanics.servo_rows(row) if each in servos)
@@ -87,7 +87,7 @@ class Plan(msgspec.Struct, frozen=True):
 
     @property
     def simulated(self) -> bool:
-        """True if any bus is simulated."""
+        """True if the servos of any bus are simulated."""
         return any(bus.port == "sim" for bus in self.buses)
 
 

@@ -49,10 +49,8 @@ from dxlwire.port.reopening import KeptLines, Wanted
 _NEVER = 1 << 62
 
 LEAST_NAP_NS, LONGEST_NAP_NS = 5_000_000, 10_000_000
-"""Shortest and longest interval at which the guardian checks the loop; the loop's period if in between.
-
-A check takes about 60 us from a loop on the same core.
-"""
+"""Shortest and longest interval at which the guardian checks the loop; the loop's period if in between. A
+check takes about 60 us from a loop on the same core."""
 LONGEST_LOOK_NS = 20_000_000
 """Upper limit of the time, ns, that one check adds to a standstill of the loop: while the guardian was not
 running, the loop may not have run either.

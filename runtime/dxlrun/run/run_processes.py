@@ -40,10 +40,8 @@ GatewayMessage = Listening | Failed
 Message = TypeVar("Message")
 
 RECORDER_NICE = -10
-"""nice(2) value of the recorder; nine times the share of an ordinary program (sched(7)).
-
-The recorder needs a tenth of a core at 1 kHz.
-"""
+"""nice(2) value of the recorder; nine times the share of an ordinary program (sched(7)). The recorder needs a
+tenth of a core at 1 kHz."""
 _GUARDIAN_CAPACITY = 2 << 20
 """Size of the guardian's ring, bytes; it exchanges few packets and reports few events."""
 _LONGEST_TAKEN = LONGEST_COMMAND + 64

@@ -36,25 +36,25 @@ from dxlsim.motion.link_motion import LinkMotion, Shafts
 from dxlsim.simulation_plan import UrdfBodies
 
 END_S = 1.0
-"""Timeout for a source to close its device."""
+"""Time that a source gets to close its device at the end, s."""
 _SHORTEST_NAP_S = 0.001
 """Shortest sleep between samples: a device whose read fails to block must not use a whole core."""
 
 
 @dataclass(frozen=True, slots=True)
 class SourceJob:
-    """Job of a process that samples a source."""
+    """Arguments of a process that samples a source, such as a sensor."""
 
     feature: Feature
     process: SourceProcess
     slot: int
-    """File descriptor of the slot for samples."""
+    """File descriptor of the shared memory for samples."""
     supervisor: int
-    """Process ID."""
+    """Process ID of the supervisor, whose exit ends this process."""
     restarted: bool = False
     """True for a restarted process, which continues even when its device cannot be opened."""
     bodies: UrdfBodies | None = None
-    """Bodies that the simulated servos move."""
+    """Bodies that the simulated servos move; for sources that measure a simulated robot."""
     shafts: int = -1
     """File descriptor of the slot with the state of the simulated shafts."""
 
@@ -85,7 +85,7 @@ class RemoteBody:
 
 
 class _Stop(BaseException):
-    """SIGTERM arrived. Not an Exception, so handlers of driver errors do not catch it."""
+    """Raised by the handler of SIGTERM. Not an Exception, so handlers of driver errors do not catch it."""
 
 
 def _stop(*_: object) -> None:

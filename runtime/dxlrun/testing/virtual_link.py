@@ -35,7 +35,7 @@ from dxlrun.remote.requests.table import Role
 from dxlrun.run.virtual_run import VirtualRobot
 
 _EVENTS_CAPACITY = 1 << 20
-"""Bytes; small, because the gateway reads the events after each cycle."""
+"""Size of the ring of events, bytes; small, because the gateway reads the events after each cycle."""
 
 
 class VirtualLink:
@@ -139,7 +139,7 @@ class VirtualLink:
 
     @property
     def now_s(self) -> float:
-        """Virtual time, s."""
+        """Time of the virtual run, s."""
         return self.simulated.clock.now_ns() * 1e-9
 
     def turn(self) -> None:

@@ -167,10 +167,8 @@ def _line_of(raised: BaseException | None) -> str:
 
 
 _NOT_THE_AUTHORS = (str(Path(__file__).parents[2]), str(Path(np.__file__).parent))
-"""Folders of dxlrun and numpy.
-
-Their lines in tracebacks are skipped: the author of a controller cannot correct them.
-"""
+"""Folders of dxlrun and numpy. Their lines in tracebacks are skipped: the author of a controller cannot
+correct them."""
 _STARTS = {
     "os.fork": "a child process",
     "os.forkpty": "a child process",

@@ -70,10 +70,8 @@ class PlayedPart(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     end_ns: int = 0
     """Time at which the motion of this part ends, ns since the start of the motion."""
     positions: tuple[float | None, ...] = ()
-    """Final position of each joint of the controller, rad or m, None for joints without one.
-
-    Empty: the part has no positions.
-    """
+    """Final position of each joint of the controller, rad or m, None for joints without one. Empty: the part
+    has no positions."""
 
 
 class PlayedMotion(msgspec.Struct):
@@ -153,17 +151,13 @@ class _Judgement(NamedTuple):
     settle_ns: int
     """Time that joints have after the motion to come within their tolerances."""
     back_ns: int
-    """Deadline for a lost joint to respond again, ns of the controllers' time.
-
-    Its settling time starts then.
-    """
+    """Deadline for a lost joint to respond again, ns of the controllers' time. Its settling time starts
+    then."""
     settled_ns: int
     """Deadline for joints to come within their tolerances, ns of the controllers' time."""
     certain_ns: int
-    """Deadline for missing replies and uncertain torque, ns of the controllers' time.
-
-    The goal is aborted then.
-    """
+    """Deadline for missing replies and uncertain torque, ns of the controllers' time. The goal is aborted
+    then."""
 
 
 class RunningGoal:

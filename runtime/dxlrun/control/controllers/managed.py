@@ -74,11 +74,9 @@ TRANSITIONS: Mapping[State, Mapping[Event, State]] = MappingProxyType(
         State.ACTIVE: {Event.AWAIT: State.ACTIVE, Event.COMMAND: State.ACTIVE, **_OUT},
     }
 )
-"""Next state of a controller by its state and the event.
-
-A missing entry is a bug of dxlrun, which ends the controller with a ControllerFault. Only `activate` and
-commands can cause one, and their callers handle the fault.
-"""
+"""Next state of a controller by its state and the event. A missing entry is a bug of dxlrun, which ends the
+controller with a ControllerFault. Only `activate` and commands can cause one, and their callers handle the
+fault."""
 
 
 class Request(NamedTuple):
@@ -130,19 +128,15 @@ class Managed:
         """True after the controller broke its contract."""
         self.held = False
         """True while its joints are held because one that it commands, directly or through others, is lost.
-
-        Updates continue.
-        """
+        Updates continue."""
         self.withheld = False
         """True while its commands are not merged, because its command stream ended and it has no `on_hold`.
         Updates continue."""
         self.uppers: tuple[Managed, ...] = ()
         """Controllers that can command its references: they do so while active."""
         self.due_cycle = 0
-        """Number of the cycle of the next update.
-
-        If that cycle is skipped, the update happens in the following one.
-        """
+        """Number of the cycle of the next update. If that cycle is skipped, the update happens in the
+        following one."""
         self.until_ns = 0
         """Time at which its command stream ends without another command, ns of the run's clock; 0: no stream.
         """

@@ -75,18 +75,14 @@ class Manager:
         )
         self._schedule = context.schedule
         self._managed: tuple[Managed, ...] = ()
-        """All controllers by index (their bit in the record's masks).
-
-        An unloaded one keeps its index until a new controller gets that.
-        """
+        """All controllers by index (their bit in the record's masks). An unloaded one keeps its index until a
+        new controller gets that."""
         self._named = self.switching.named
         self._order: tuple[Managed, ...] = ()
         """Loaded controllers in update order: upper controllers of a chain before lower ones."""
         self.streams: dict[int, Managed] = {}
-        """Controllers that receive a stream of commands with a lease, by index.
-
-        `stale` removes those whose stream has ended.
-        """
+        """Controllers that receive a stream of commands with a lease, by index. `stale` removes those whose
+        stream has ended."""
         self.providers: tuple[Provided, ...] = ()
         """States that controllers provide; their age increases in each cycle."""
         self._next = 0  # index into the plan's commands
@@ -95,10 +91,8 @@ class Manager:
         self._motions: dict[str, PlayedMotion] = {}
         """Motions that the runtime plays with plain commands, by name of the controller."""
         self._pursued: dict[str, RunningGoal] = {}
-        """Goals that the runtime pursues with commands of the plan, by controller name.
-
-        They may have ended.
-        """
+        """Goals that the runtime pursues with commands of the plan, by controller name. They may have
+        ended."""
 
     def configure(self) -> None:
         """Build and configure every controller. Allocates, so it runs before real time.

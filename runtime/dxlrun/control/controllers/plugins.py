@@ -182,10 +182,8 @@ class PlugIns(msgspec.Struct, frozen=True):
     loaded: tuple[LoadedPlugIn, ...] = ()
     """Plug-ins without errors, in load order."""
     after_each: Callable[[str], None] = _any_threads
-    """Called with a name after plug-in code was imported or configured, to count threads.
-
-    May raise PlugInError.
-    """
+    """Called with a name after plug-in code was imported or configured, to count threads. May raise
+    PlugInError."""
     drivers: Mapping[str, Mapping[str, DriverOffer]] = msgspec.field(default_factory=dict)
     """Offered classes for the sections of features, such as sensors, by feature and type name."""
 

@@ -26,19 +26,14 @@ from dxlrun.errors import ControllerFault
 from dxlwire.modes import Mode
 
 MODE_TIMEOUT_NS = 5_000_000_000
-"""Time after which controllers that wait for mode changes are dropped.
-
-Twenty servos, one after the other in short idle times, need less than one second; a servo after a reset needs
-somewhat more. [i]
-"""
+"""Time after which controllers that wait for mode changes are dropped. Twenty servos, one after the other in
+short idle times, need less than one second; a servo after a reset needs somewhat more. [i]"""
 _STILL = (Mode.POSITION, Mode.VELOCITY)
 """Modes in which a joint without commands holds still, so it stays in them when no controller claims it."""
 
 _Failed = tuple[tuple[Managed, ...], str]
-"""A controller that broke its contract, with the controllers that left with it, and the reason as text.
-
-The exception is not stored: it refers to a frame, and the loop has no collector for reference cycles.
-"""
+"""A controller that broke its contract, with the controllers that left with it, and the reason as text. The
+exception is not stored: it refers to a frame, and the loop has no collector for reference cycles."""
 
 
 class Group(msgspec.Struct, frozen=True):
@@ -58,11 +53,8 @@ class Switching:
 
     def __init__(self, context: ControlContext) -> None:
         self.fault: str | None = None
-        """Reason to end the run; None: it continues.
-
-        Set by the first controller that requested the end or broke its contract without a fallback that took
-        over.
-        """
+        """Reason to end the run; None: it continues. Set by the first controller that requested the end or
+        broke its contract without a fallback that took over."""
         self.named: dict[str, Managed] = {}
         """Loaded controllers by name."""
         self.ended: list[tuple[int, Refusal | None]] = []

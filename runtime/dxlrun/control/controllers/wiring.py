@@ -20,17 +20,13 @@ from dxlrun.plan.loop_plan import ControllerPlan
 from dxlwire.modes import COMMAND_INTERFACES
 
 READABLE = ("position", "velocity", "effort", "temperature", "voltage", "age")
-"""States of a joint that any controller may read, as `JOINT/position`.
-
-The age (time since the last reply) is in s.
-"""
+"""States of a joint that any controller may read, as `JOINT/position`. The age (time since the last reply) is
+in s."""
 
 _Element = TypeVar("_Element", bound=np.generic)
 Columns = slice | NDArray[np.intp]
-"""Indices of joints in an array.
-
-Indices at equal distances are a slice, which numpy indexes in a tenth of the time.
-"""
+"""Indices of joints in an array. Indices at equal distances are a slice, which numpy indexes in a tenth of
+the time."""
 
 
 def _columns(rows: NDArray[np.intp]) -> Columns:
@@ -193,10 +189,8 @@ class Outputs:
         self._parts: list[_Part] = []
         self._owner = plan.name
         self._names = [""] * own.size
-        """Name of each command in `own`:
-
-        `shoulder/position`, `arm_pid/shoulder/position`, `light/led`; empty: not commanded.
-        """
+        """Name of each command in `own`: `shoulder/position`, `arm_pid/shoulder/position`, `light/led`;
+        empty: not commanded."""
         self._rows: NDArray[np.intp] | None = None if plan.into else rows
         """Rows of the commanded servos; None: the controller commands references."""
         self._clamped = record.clamped
