@@ -222,7 +222,7 @@ def _floor(rate: float) -> str:
 
 
 def _with_monitoring(file: RobotFile, plan: BusPlan) -> BusPlan:
-    """Return a copy of a bus plan with watchdog, slow registers, adapter settings and torque policies."""
+    """Return a bus plan with Bus Watchdog, slow registers, adapter settings, and torque policies."""
     bus, joints = file.robot.buses[plan.name], first_joints(file.description)
     policies = file.robot.policies
     items = bus.slow_registers.items

@@ -63,7 +63,7 @@ class Contribution(msgspec.Struct, frozen=True):
     packages: Mapping[str, str] = {}
     """Python packages of plug-ins that the feature runs; package name to distribution name."""
     mechanics: MechanicsPlan | None = None
-    """Which servos move which joints, for joints with transmissions; only one feature may set it."""
+    """Assignment of servos to joints, if some joints have several servos; only one feature may set it."""
     recording: RecordingPlan | None = None
     """Folder and settings of the log; only one feature may set it."""
     policies: Mapping[str, str] = {}

@@ -127,7 +127,7 @@ def report_entry(  # noqa: PLR0917  an entry, and what is made of it
     model: type[ParametersModel],
     make: Callable[[], Made],
 ) -> Made | None:
-    """Call `make` for an entry of a plug-in; report its ValidationError or WrongEntry in the file as None.
+    """Return what `make` returns for an entry; None if it raises an error, which is added to the file.
 
     Args:
         file: Robot file; collects the problems.
@@ -257,7 +257,7 @@ def check_robot(
 def check_motions(
     file: RobotFile, joints: Mapping[str, CompiledJoint], controllers: Mapping[str, CompiledController]
 ) -> None:
-    """Warn of or refuse motions in controllers' parameters that are faster than their joints can move."""
+    """Check the speeds of motions in controllers' parameters against those that the joints can reach."""
     for name, controller in controllers.items():
         cls, parameters = controller.offer.controller, controller.parameters
         seen: set[SpeedPeak] = set()  # a motion that follows others is contained in each of them

@@ -128,9 +128,7 @@ class ControllerGraph:
         return None
 
     def drawing(self, title: str, rate: float) -> Graph:
-        """Return the graph as a picture with boxes for sources, controllers and joints;
-
-        `rate` of the loop, Hz.
+        """Return the graph as a picture with boxes for sources, controllers and joints; `rate` is in Hz.
 
         Joints with the same controllers are one node. Reads of a controller's own joints are drawn only for
         controllers without commands.
@@ -183,10 +181,7 @@ class ControllerGraph:
 
     @cached_property
     def _readable(self) -> Mapping[str, tuple[str, ...]]:
-        """Interfaces that controllers can read, by source:
-
-        `JOINT`, `CONTROLLER/JOINT`, device, sensor, controller.
-        """
+        """Readable interfaces by source: `JOINT`, `CONTROLLER/JOINT`, or device, sensor, controller."""
         states = dict.fromkeys(self.joints, STATES)
         references = {
             f"{plan.name}/{joint}": plan.reference

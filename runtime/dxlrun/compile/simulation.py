@@ -83,7 +83,7 @@ def _motor(joint: CompiledJoint, motors: Motors) -> MotorDescription | None:
 
 
 def _times(joint: CompiledJoint, motor: MotorDescription | None) -> ServoTimes:
-    """Return reply delay and write time of a simulated servo, from its keys, else from its motor file."""
+    """Return the response delay (from keys, else motor file) and write time of a simulated servo."""
     keys = joint.described.simulation
     known_ns = 0 if motor is None else motor.motor.delay_ns
     return ServoTimes(keys.response_delay or known_ns, keys.write_time)

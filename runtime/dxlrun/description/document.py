@@ -369,10 +369,7 @@ class _Grower:
         return self._scalar(node, path)
 
     def mapping(self, node: yaml.MappingNode, path: KeyPath) -> dict[str, object]:
-        """Return a mapping as a dict.
-
-        Keys stay text; of two equal keys the first counts, the second is a problem.
-        """
+        """Return a mapping as a dict with keys as text; of two equal keys, the second is a problem."""
         self._enter(node, path)
         result: dict[str, object] = {}
         for key_node, value_node in node.value:

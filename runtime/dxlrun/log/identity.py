@@ -181,7 +181,7 @@ def git_state(folder: Path, file: str) -> dict[str, str]:
 
 
 def _git(folder: Path, arguments: tuple[str, ...], give_up: float) -> str | None:
-    """Run git in a folder and return its output; None if it is missing, fails, or exceeds `give_up` (s)."""
+    """Run git in a folder and return its output; None if it fails, or runs beyond `give_up` (monotonic s)."""
     # Neither write the index nor start a program that the repository configures: a run only reads.
     command = ["git", "--no-optional-locks", "-c", "core.fsmonitor=false", *arguments]
     surroundings = {key: value for key, value in os.environ.items() if not key.startswith("GIT_")}

@@ -52,10 +52,7 @@ class LogWriter(RunMessages):
     """
 
     def __init__(self, path: Path, header: LogHeader, span: CycleSpan | None = None) -> None:
-        """Create the file and write header and attachments;
-
-        `span` is the cycle range of earlier parts to extend.
-        """
+        """Create the file, write header and attachments; `span` holds the cycles of earlier parts."""
         super().__init__(header)
         self.span = span or self.span
         self.error: str | None = None

@@ -40,7 +40,7 @@ class RunMessages(ABC):
         self._firsts: list[tuple[int, Callable[[Stamp], bytes]]] = []
         """Channels that get one message only, when the first record comes, and the function that makes it."""
         self.topics: dict[bytes, None] = {}
-        """Encoded records of all topics that controllers opened, to repeat them in a next part."""
+        """Encoded records that opened the topics so far, to repeat them in the log's next part."""
         self._topic_channels: dict[int, int] = {}
         """Channel of each controller's topic, by the topic's number in the records."""
         self._machine_channel: int | None = None

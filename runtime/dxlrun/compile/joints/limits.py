@@ -24,7 +24,7 @@ _TOLERANCE = 1e-6  # rad; far below a tick (5e-3 rad on an AX-12), far above the
 _ROUNDING = 1e-9  # relative rounding error of speeds from differences of positions and times
 _MOST_LONGER = 1000  # largest suggested extension of the time; beyond it a number is wrong
 PEAK_OVER_MEAN = 15 / 8
-"""Highest by mean speed of a quintic that starts and ends at rest; a cubic has a lower ratio."""
+"""Ratio of highest to mean speed of a quintic from rest to rest; for a cubic it is lower."""
 
 
 class Interval(msgspec.Struct, frozen=True):

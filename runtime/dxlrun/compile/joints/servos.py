@@ -23,7 +23,7 @@ from dxlwire.plan.mode_plan import mode_plans
 
 _USUAL = {1.0: "AX-12A", 2.0: "XM430-W350"}  # assumed model if none is known, by protocol
 MANY_TURNS = {1.0: 7, 2.0: 256}
-"""Turns that a goal position can be away from raw 0, by protocol.  Multi-turn Mode of MX (e-Manual MX-64,
+"""Turns that a goal position can be away from raw 0, by protocol. Multi-turn Mode of MX (e-Manual MX-64,
 Goal Position (30): -28,672..28,672), Extended Position Control Mode (e-Manual XM430-W350, Goal Position
 (116): -1,048,575..1,048,575)."""
 _TEMPERATURE_LIMITS = ("motor_temperature_limit", "temperature_limit")

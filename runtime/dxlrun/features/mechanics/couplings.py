@@ -1,4 +1,4 @@
-"""Couplings: checks of joints with several servos and of transmissions, and their limits and speeds.
+"""Couplings: compiles joints with several servos, and transmissions, with their limits and top speeds.
 
 A joint with one servo is a coupling with the matrix 1.
 """

@@ -238,7 +238,7 @@ class JointHardware(HardwareLayer):
         return tuple(tightest.values())
 
     def read(self) -> None:
-        """Read servos, compute joint states; if a servo of a coupling has no torque, stop the others'."""
+        """Read servos, compute joint states; if one servo of a coupling is limp, release its other servos."""
         self._hardware.read()
         self._arrays.read()
         self._together.watch()

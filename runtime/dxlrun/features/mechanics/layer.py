@@ -11,7 +11,7 @@ from dxlrun.plan.robot_plan import Plan
 
 
 def prepare_mechanics(plan: Plan, states: States, goals: Commands, events: EventSink) -> PreparedLayer | None:
-    """Return joint-to-servo conversion for a robot; None if each joint has a servo of its own."""
+    """Return the layer that converts joints to servos; None if each joint has a servo of its own."""
     if not plan.mechanics.coupled:
         return None
     arrays = JointArrays(plan.mechanics, states, goals)

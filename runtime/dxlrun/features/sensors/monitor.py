@@ -32,7 +32,7 @@ class NeededSensors:
         return cls(needed, record, actions) if needed else None
 
     def check(self, time_ns: int) -> None:
-        """End the run if a sample is older than its sensor's timeout; without one, the run's time counts."""
+        """End the run if a sensor's newest sample (without one: the run) is older than its timeout."""
         ages_ns = self.record.sources.age_ns
         for row, sensor in self.needed:
             age_ns = ages_ns.item(row)

@@ -29,10 +29,7 @@ def sensor_breach(sensor: object) -> Breach | None:
 
 
 def names_breach(states: object, links: object) -> Breach | None:
-    """Return what is wrong with the results of a sensor's `states` and `links`, with the fix;
-
-    None if nothing.
-    """
+    """Return what is wrong with a sensor's results of `states` and `links`, with the fix; None if nothing."""
     for what, names in (("states", states), ("links", links)):
         if not isinstance(names, tuple) or not all(isinstance(one, str) for one in names):
             return f"returns {names!r} from {what}", "return a tuple of names, such as angular_velocity.x"

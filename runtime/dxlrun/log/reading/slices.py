@@ -60,7 +60,7 @@ _NO_PACKETS = PacketColumns.of(())
 class Log:
     """A run, or a slice of one, decoded from its log.
 
-    Times are ns of the run's clock, which starts at no fixed date; wall time = time + `epoch_offset_ns`.
+    Times are ns of the run's clock; wall time = time + `epoch_offset_ns`.
     """
 
     path: Path
