@@ -1,4 +1,5 @@
-"""Dynamixel: the servos and devices of a robot, from states and goals of joints down to transactions.
+"""Dynamixel: reads, commands and supervises the servos and devices of a robot, from joint states and goals
+down to transactions on a bus.
 
-Packets, ports and control tables are a library of their own, `dxlwire`.
+Packets, serial ports and control tables are in the library `dxlwire`.
 """

@@ -1,4 +1,6 @@
-"""Bus part: the runtime of a feature on one bus, and the stages that create it."""
+"""Bus part: interface for features (sections of the robot file, such as lights) that read or write on a bus
+during a run.
+"""
 
 from __future__ import annotations
 
@@ -23,43 +25,49 @@ if TYPE_CHECKING:  # the guardian makes the robot safe without numpy
 
 
 class BusContext(msgspec.Struct, frozen=True):
-    """One bus with the objects that a feature's part uses on it.
+    """One bus with the objects that a feature may use on it; passed to `BusStage.attach`.
 
     A part reads and writes with programs: generators that yield transactions of `plan_line(idle.plan)` and
     receive a `Reply` for each. `idle` executes them between two cycles, in the order of their `Urgency`.
     """
 
     idle: IdleScheduler
-    """Scheduler of the time between two cycles; it also has the plan of the bus."""
+    """Executes programs on this bus in the time between two cycles; `idle.plan` is the plan of the bus."""
     reads: CyclicReads
-    """The reads of every cycle."""
+    """Reads every servo and device of the bus in each cycle."""
     samples: BusSamples
-    """The newest samples of the bus."""
+    """Newest values that the servos and devices of this bus returned."""
     commands: Floats
-    """Commands of all sources in the cycle's record, SI units; NaN where nothing is commanded."""
+    """Commands of all clients and controllers to features, SI units, in the order of `command_names`; NaN: no
+    command.
+    """
     command_names: Sequence[str]
     """Names of these commands, such as `light/led`."""
     plan: bytes
-    """`Contribution.plan` of the feature; empty if it has none."""
+    """Bytes that the feature returned as `Contribution.plan` when the robot file was read; empty if it has
+    none.
+    """
     events: EventSink
-    """Sink of events for the log."""
+    """Receives events for the log of the run."""
 
 
 class FeatureParts(msgspec.Struct, frozen=True):
-    """Features of a robot and the commands that they execute on its buses."""
+    """The features of a robot with their plans and commands; creates the parts of these features on each bus."""
 
     features: Sequence[Feature]
     command_names: Sequence[str]
-    """Names of the commands of all sources, in the order of the cycle's record."""
+    """Names of the commands of all sources, such as `light/led`, in the order of `commands`."""
     commands: Floats
-    """Values of these commands in the record, SI units."""
+    """Values of these commands in the present cycle, SI units; NaN: no command."""
     plans: Mapping[str, bytes]
     """`Contribution.plan` of each feature, by its name."""
 
     def attach(
         self, idle: IdleScheduler, reads: CyclicReads, samples: BusSamples, events: EventSink
     ) -> tuple[BusPart, ...]:
-        """Return the features' parts on one bus, in the order of the features."""
+        """Return the parts that the features have on one bus, in the order of the features; a feature without
+        work there has none.
+        """
         found: list[BusPart] = []
         for feature, stage in stages(BusStage, self.features):
             plan = self.plans.get(feature.name, b"")
@@ -70,27 +78,30 @@ class FeatureParts(msgspec.Struct, frozen=True):
 
 
 class BusPart(Protocol):
-    """Part of a feature on one bus. The loop's thread calls all methods; none of them may block."""
+    """Code of one feature that runs with the cycles of one bus. The loop's thread calls all methods; none of
+    them may block.
+    """
 
     def judge_replies(self, now_ns: int) -> None:
-        """Report changes that the replies of this cycle show.
+        """Inspect the replies of this cycle and report changes.
 
-        Called only in cycles that the parser read. The exchange kernel reads the other cycles, in which every
-        reply came as planned. Work that is due at a certain time belongs in `schedule_idle_work`.
+        Called only in cycles that the packet parser read. The compiled exchange kernel reads the other
+        cycles, in which every reply came as planned. Work that is due at a certain time belongs in
+        `schedule_idle_work`.
 
         Args:
             now_ns: Time of the run's clock, the same as `Reply.last_ns`.
         """
 
     def recover_line(self) -> None:
-        """Assume that all nodes of the bus lost power: their line was lost and has been opened again.
+        """Assume that all nodes of the bus lost power: the serial line was lost and has been opened again.
 
         The servos answer later; `recover_servo` is called for each.
         """
 
     def recover_servo(self, servo: int) -> None:
-        """Assume that a servo has lost its RAM registers: it was lost or rebooted, and has been checked
-        again.
+        """Restore what the feature wrote to a servo's RAM registers: the servo was lost or rebooted, and has
+        passed the checks again.
 
         Also called when a client switched the servo's torque on, because a limp servo may have rebooted
         unnoticed.
@@ -100,7 +111,7 @@ class BusPart(Protocol):
         """
 
     def schedule_idle_work(self, time_ns: int) -> None:
-        """Add programs to the idle time before the coming cycle; called once a cycle.
+        """Add programs to `idle` for the time before the coming cycle; called once a cycle.
 
         A program that is added in every cycle fills the bus. Add a program only when it has work to do and
         the previous one has ended.
@@ -112,51 +123,60 @@ class BusPart(Protocol):
 
 
 def inspect_nothing(plan: BusPlan, found: Findings) -> Program[None]:
-    """Read nothing at start-up."""
+    """Default of `BusStage.inspect`: the feature reads nothing at start-up."""
     yield from ()
 
 
 class BusStage(msgspec.Struct, frozen=True):
-    """`STAGE` of `runtime.py`: creates the part of a feature in the loop's process."""
+    """`STAGE` in a feature's file `runtime.py`: creates the feature's part on each bus, in the loop process."""
 
     FILE: ClassVar[str] = "runtime"
 
     attach: Callable[[BusContext], BusPart | None]
-    """Called once for each bus before the start. Returns None if the feature has nothing on this bus."""
+    """Called once for each bus before the start. Returns the feature's part, or None if the feature has
+    nothing on this bus.
+    """
     inspect: Callable[[BusPlan, Findings], Program[None]] = inspect_nothing
-    """Reads at start-up, after the servos were inspected and before any of them gets torque. A sentence that
-    it adds to `Findings.problems` refuses the start. It does not receive `Contribution.plan`."""
+    """Program that reads at start-up, after the servos were inspected and before any of them gets torque. A
+    sentence that it adds to `Findings.problems` refuses the start. It does not receive
+    `Contribution.plan`.
+    """
 
 
 class SafeStage(msgspec.Struct, frozen=True):
-    """`STAGE` of `safe.py`: makes the outputs of a feature safe at the end of a run.
+    """`STAGE` in a feature's file `safe.py`: makes the outputs of the feature safe at the end of a run.
 
     Called at every end of a run: after torque off, or after the joints were stopped if torque stays on. The
-    caller is the loop's process, or the guardian after the loop process died. The file therefore does not
-    import numpy and uses nothing that `runtime.py` has found.
+    caller is the loop process, or the guardian after the loop process died. The file therefore does not
+    import numpy and uses no result of `runtime.py`.
     """
 
     FILE: ClassVar[str] = "safe"
 
     make_safe: Callable[[Lines, bytes], tuple[str, ...]]
-    """Receives the lines and `Contribution.plan` of the feature. Returns a sentence for each failure, which
-    becomes a warning in the log. Must not raise. `lines.run` executes one program for each of `lines.plans`.
+    """Receives the serial lines and `Contribution.plan` of the feature. Returns a sentence for each failure,
+    which becomes a warning in the log. Must not raise. `lines.run` executes one program for each of
+    `lines.plans`.
     """
 
 
 class SafeEnd(msgspec.Struct, frozen=True):
-    """The stages that make a robot safe, each with its feature and that feature's plan."""
+    """The `safe.py` stages of a robot's features, each with its feature and `Contribution.plan`; run at the
+    end of a run.
+    """
 
     stages: tuple[tuple[Feature, SafeStage, bytes], ...]
 
     @classmethod
     def of(cls, features: Iterable[Feature], plans: Mapping[str, bytes]) -> SafeEnd:
-        """Import the code of every `make_safe` now: at the end of a run an import may be impossible."""
+        """Import the `safe.py` of every feature now, because an import may be impossible at the end of a run."""
         found = stages(SafeStage, features)
         return cls(tuple((feature, stage, plans.get(feature.name, b"")) for feature, stage in found))
 
     def make_safe(self, lines: Lines) -> tuple[str, ...]:
-        """Make the features' outputs on the lines safe; return a sentence for each failure."""
+        """Run every stage on the serial lines; return a sentence for each failure. An exception in one stage
+        does not stop the others.
+        """
         sentences: list[str] = []
         for feature, stage, plan in self.stages:
             try:

@@ -1,4 +1,4 @@
-"""Findings: problems and events that start-up, servo recovery and tools found on one bus."""
+"""Findings: problems and events collected on one bus at start-up, when a servo returns, and by tools."""
 
 from __future__ import annotations
 
@@ -12,24 +12,26 @@ _MOST_NAMED = 6  # settings of one servo that an event lists, to keep it readabl
 
 
 class Findings(msgspec.Struct):
-    """Problems and events, in the order in which they were found."""
+    """Collects problems, events for the log and unusual settings, each in the order in which they were found."""
 
     problems: list[str] = []  # reasons to refuse the start, one sentence each
     events: list[tuple[str, EventBody]] = []
-    """Events for the log, each with its joint or device."""
+    """Events for the log, each with the name of its joint or device."""
     deviations: list[tuple[str, str, FoundDeviation]] = []
-    """Settings that differ from the factory's: joint, `ID 4 on bus main`, and the deviation."""
+    """Settings that differ from the factory's: joint, place such as `ID 4 on bus main`, and the deviation."""
 
     def note(self, source: str, event: EventBody) -> None:
-        """Add an event of a joint or a device for the log."""
+        """Add an event for the log; `source` is the name of a joint or a device."""
         self.events.append((source, event))
 
     def texts(self, code: EventCode) -> list[tuple[str, str]]:
-        """Return the events with a code, each as its source and text."""
+        """Return source and text of each event that has this code."""
         return [(source, event.text) for source, event in self.events if event.code is code]
 
     def describe_deviations(self) -> list[tuple[str, str]]:
-        """Return a sentence for each servo whose settings differ from the factory's, with its joint."""
+        """Return (joint, sentence) for each servo with settings that differ from the factory's; the sentence
+        names settings and remedy.
+        """
         return [(joint, event.text) for joint, event in self._deviation_events()]
 
     def _deviation_events(self) -> list[tuple[str, EventBody]]:
@@ -50,6 +52,8 @@ class Findings(msgspec.Struct):
         return events
 
     def log(self, events: EventSink) -> None:
-        """Log the events, and one event per servo for its settings that differ from the factory's."""
+        """Send the events to the log, and one event per servo for its settings that differ from the
+        factory's.
+        """
         for source, event in (*self.events, *self._deviation_events()):
             events.emit(source, event)

@@ -1,4 +1,6 @@
-"""Dynamixel hardware: joints on serial lines of either protocol, all lines at once in one thread."""
+"""Dynamixel hardware: reads states from and writes goals to the servos of all serial lines, in one thread, in
+each cycle.
+"""
 
 from __future__ import annotations
 
@@ -39,21 +41,26 @@ STOP_LIMIT_NS = 1_000_000_000  # deadline for retries of torque off: half of the
 LINE_TIMEOUT_NS = 300_000_000  # an adapter that was just unplugged may be back by then
 LINE_STEP_NS = 10_000_000
 TAKEN_BACK = "torque was switched off again on every servo"
-"""Note on an exception of `start` after every servo confirmed torque off."""
+"""Note that `DynamixelHardware.start` adds to its exception if every servo confirmed torque off afterwards.
+"""
 FIRST_READS_NS = (0, 60_000_000, 240_000_000)
-"""Pauses before the attempts to read the first states, which must all be fresh. Noise, or a host or adapter
-that stalls, may spoil one or two attempts."""
+"""Pauses (ns) before the attempts to read the first states of all servos. Noise, or a host or adapter that
+stalls, may spoil one or two attempts.
+"""
 IDLE_MARGIN_NS = 150_000
-"""Time that stays free before the deadline: a stock kernel wakes about 50-100 us late."""
+"""Part of the idle time that no work uses, before the next cycle: a stock kernel wakes about 50-100 us late.
+"""
 
 
 class ServoArrays(msgspec.Struct, frozen=True):
-    """States and goals of the servos: the cycle's record, or the arrays below a hardware layer."""
+    """Arrays that the hardware fills with states and from which it sends goals: the record of the cycle, or
+    the arrays below a `HardwareLayer`.
+    """
 
     states: States
     goals: Commands
     sources: SourceStates = msgspec.field(default_factory=SourceStates.empty)
-    """States of the devices."""
+    """States of the devices that are not servos, such as IMUs."""
 
 
 class DynamixelHardware:
@@ -75,7 +82,7 @@ class DynamixelHardware:
         refusals: Callable[[], Sequence[str]] | None = None,
         take_over: bool = False,
     ) -> None:
-        """Plan the exchange without sending anything.
+        """Create the objects for every bus without sending anything.
 
         Args:
             lines: The robot's lines.
@@ -102,13 +109,18 @@ class DynamixelHardware:
         self._refusals = refusals
         self._full_torque: list[list[int]] = []
         self._by_kernel: bool | None = None
-        """True if the kernel reads the next states, False if the parser does; None: not planned yet."""
+        """True if the compiled kernel reads the next cycle, False if the packet parser does; None: not
+        planned yet.
+        """
         self._look = True
-        """True while a cycle needs more than reading and writing. `_rest` clears it; an answer of the kernel,
-        a request, or `_due_ns` sets it again."""
+        """True while a cycle needs more than reading states and writing goals. `_rest` clears it; an answer
+        of the kernel, a request, or `_due_ns` sets it again.
+        """
         self._due_ns = 0  # time at which idle work is due
         self._waiting: list[tuple[array[int], int]] = []
-        """Words of each line with waiting idle work, and the shortest idle time (ns) for that work."""
+        """For each bus with waiting idle work: the state words of the bus, and the shortest idle time (ns) in
+        which that work fits.
+        """
         reports = WireReports(events)
         self._idle = tuple(IdleScheduler(bus, reports) for bus in self._buses)
         self._samples = Samples(self._plans, states, arrays.sources, reports)
@@ -124,7 +136,7 @@ class DynamixelHardware:
             for plan, servos in zip(self._plans, self._servos, strict=True)
             for index, servo in enumerate(plan.servos)
         }
-        """Servo of each joint by row: the servos of its bus and the index there."""
+        """Index of each joint's servo on its bus, and the `Servos` of that bus, by row of the joint."""
         shared = [KernelGoals(one.goals, one.life.torqued, one.life.ceiling) for one in self._servos]
         self._kernel = Kernel(self._lines, shared, self._samples, goals.values, packets)
         self._read, self._write = self._kernel.read, self._kernel.write
@@ -132,7 +144,8 @@ class DynamixelHardware:
         self.servo_limits: Mapping[int, Sequence[ServoLimit]] = {}
 
     def start(self, engaging: Callable[[], None] = lambda: None) -> None:
-        """Check every servo, hold each at its present position, and fill the first states and goals.
+        """Run the start-up: check every servo, switch torque on at the present positions, and fill the first
+        states and goals.
 
         After a failure torque is switched off again. A note on the exception says whether every servo
         confirmed it.
@@ -168,10 +181,11 @@ class DynamixelHardware:
             raise
 
     def read(self) -> None:
-        """Read every servo once, on all lines at once; all rows of a lost line become invalid.
+        """Read the states of every servo once, on all lines in parallel; all rows of a lost line become
+        invalid.
 
-        The kernel reads while every reply comes as planned. The parser takes over at the first deviation from
-        the plan.
+        The compiled kernel reads while every reply comes as planned. The packet parser takes over at the
+        first deviation from the plan.
         """
         if self._look:
             self._prepare_read()
@@ -193,7 +207,7 @@ class DynamixelHardware:
             self._collect_limits()
 
     def _collect_limits(self) -> None:
-        """Publish the registers that limit the servos' goals to the loop."""
+        """Update `servo_limits`, from which the loop learns the registers that limit the servos' goals."""
         self.servo_limits = {row: own for servos in self._servos for row, own in servos.limits.items()}
         for servos in self._servos:
             servos.goals.limits_changed = False
@@ -227,7 +241,7 @@ class DynamixelHardware:
                 servos.show_torque(self._states.torque)
 
     def _plan_reads(self) -> bool:
-        """Plan the next reads, once a cycle and before any of them is sent.
+        """Plan the reads of the next cycle, before any of them is sent.
 
         Returns:
             True if the kernel can do the reads: every open line has a program for it.
@@ -279,7 +293,7 @@ class DynamixelHardware:
             self._report_plain_reads()
 
     def write(self) -> None:
-        """Send the goals on every open line, one sync write per line and goal layout."""
+        """Send the goals to the servos of every open line, one sync write per line and goal layout."""
         if self._look:
             for servos in self._servos:
                 servos.prepare_goals(self._goals, self._states)
@@ -292,7 +306,7 @@ class DynamixelHardware:
             self._rest()
 
     def _rest(self) -> None:
-        """Stop looking for changes if everything is as planned, until an event requires it again."""
+        """Return to plain reading and writing if nothing else is due on any bus, until an event or `_due_ns`."""
         self._due_ns = min((servos.due_ns for servos in self._servos), default=NEVER)
         self._waiting = [
             (bus.words, work.least_ns)
@@ -308,44 +322,54 @@ class DynamixelHardware:
         self._look = self._by_kernel is None
 
     def set_modes(self, modes: NDArray[np.uint8]) -> None:
-        """Change the operating modes of joints in idle time; UNKNOWN keeps the mode."""
+        """Request operating modes for joints, shape (joints,), which the servos enter in idle time; UNKNOWN
+        keeps a joint's mode.
+        """
         self._look = True
         for servos in self._servos:
             servos.desired.change_modes(modes)
 
     def set_register(self, row: int, item: str, value: int, done: RegisterDone) -> None:
-        """Write a RAM item of a joint's servo in idle time and read it back; see `DesiredState`."""
+        """Write a RAM item of a joint's servo in idle time and read it back; `done` receives the problem and
+        the previous value.
+        """
         servos, index = self._place(row)
         servos.desired.write_register(index, item, value, done)
 
     def read_register(self, row: int, item: str, done: RegisterDone) -> None:
-        """Read an item of a joint's servo in idle time."""
+        """Read an item of a joint's servo in idle time; `done` receives the problem and the value."""
         servos, index = self._place(row)
         servos.desired.read_register(index, item, done)
 
     def switch_torque(self, row: int, on: bool, done: Done = ignore) -> None:
-        """Switch the torque of a joint's servo in idle time; see `Requests`."""
+        """Switch the torque of a joint's servo on or off in idle time; `done` receives the problem, empty on
+        success.
+        """
         servos, index = self._place(row)
         (servos.requests.torque_on if on else servos.requests.torque_off)(index, done)
 
     def follow_goals(self, rows: Sequence[int]) -> None:
-        """Start sending goals to servos that were given torque; see `Servos.follow_goals`."""
+        """Resume sending goals to the servos of these joints, whose goals now equal the positions at which
+        they got torque.
+        """
         for row in rows:
             servos, index = self._place(row)
             servos.follow_goals(index)
 
     def reboot(self, row: int, done: Done) -> None:
-        """Reboot a joint's servo in idle time; see `Requests`."""
+        """Reboot a joint's servo in idle time; `done` receives the problem, empty once the servo is back."""
         servos, index = self._place(row)
         servos.requests.reboot(index, done)
 
     def _place(self, row: int) -> tuple[Servos, int]:
-        """Return the servo of a joint, and look at all servos in the next cycle."""
+        """Return the servo of a joint as the `Servos` of its bus and the index there, and let the next cycle
+        check all servos.
+        """
         self._look = True
         return self._places[row]
 
     def limit_torque(self, fraction: float) -> None:
-        """Limit the torque of every servo to a fraction of its own limit until the next start."""
+        """Limit the torque of every servo to a fraction (0 to 1) of its own limit until the next start."""
         self._look = True
         for servos in self._servos:
             servos.goals.weaken(fraction)
@@ -357,9 +381,11 @@ class DynamixelHardware:
                     bus.send(packet)
 
     def idle(self, until_ns: int, time_ns: int = 0) -> None:
-        """Execute waiting idle work on each line if it fits before the deadline.
+        """Execute waiting idle work, such as register reads and recovery of servos, on each line if it fits
+        before the deadline.
 
-        `IdleScheduler` lists the work that it executes even if it does not fit.
+        Also tries to reopen lost lines. `IdleScheduler` lists the work that it executes even if it does not
+        fit.
 
         Args:
             until_ns: Deadline, the start of the next cycle.
@@ -396,7 +422,9 @@ class DynamixelHardware:
         self._by_kernel = self._plan_reads()  # Plan here, where no deadline is near.
 
     def stop(self) -> tuple[str, ...]:
-        """Switch torque off on every servo and read it back; return a sentence for each failure."""
+        """Switch torque off on every servo, read it back, and make the features' outputs safe; return a
+        sentence for each servo that did not confirm.
+        """
         outcomes = self._limp()
         self._make_rest_safe()
         failures = tuple(f"{one}" for one in outcomes if not one.confirmed)
@@ -410,9 +438,10 @@ class DynamixelHardware:
         return failures
 
     def release(self) -> None:
-        """Leave the robot with its torque on: disarm the Bus Watchdogs, then stop sending.
+        """End the exchange but leave torque on: disarm the Bus Watchdogs, and make the features' outputs
+        safe.
 
-        Features make their outputs safe. A servo that its Bus Watchdog has already stopped stays stopped.
+        A servo that its Bus Watchdog has already stopped stays stopped.
         """
         # Disarm first: a silent device can delay the programs by more than the watchdogs' timeout.
         programs = [limit_patience(watchdog.release_all(plan), any_age=True) for plan in self._plans]
@@ -426,8 +455,9 @@ class DynamixelHardware:
             self._events.emit("hardware", texts.output_not_made_safe(problem))
 
     def _disarm(self, limp: Set[tuple[str, int]]) -> None:
-        """Disarm the Bus Watchdogs of servos without torque, by (bus, ID); the other servos must still stop
-        without a host."""
+        """Disarm the Bus Watchdogs of the servos in `limp`, (bus, ID), which have no torque. The other servos
+        must still stop without a host.
+        """
         for plan, bus in zip(self._plans, self._buses, strict=True):
             servos = [servo for servo in plan.servos if (plan.name, servo.servo_id) in limp]
             for packet in watchdog.to_all(plan, servos, 0):
@@ -435,7 +465,9 @@ class DynamixelHardware:
                     bus.send(packet)
 
     def _reopen_lines(self) -> None:
-        """Try to reopen lost lines, and resume the exchange on those that are back."""
+        """Try to reopen lost lines. The servos of a reopened line count as offline until they pass the
+        checks.
+        """
         for index, (bus, servos) in enumerate(self._pairs):
             if bus.failure is not None and self._lines.ports.reopen(index):
                 bus.renew(self._lines.ports.ports[index])
@@ -445,7 +477,7 @@ class DynamixelHardware:
                 servos.reads.plan()
 
     def _limp(self) -> tuple[LimpOutcome, ...]:
-        """Switch torque off at once on every open line, and again if a lost line comes back in time."""
+        """Switch torque off on every open line, and repeat if a lost line comes back within LINE_TIMEOUT_NS."""
         now_ns = self._clock.now_ns()
         deadline_ns, timeout_ns = now_ns + STOP_LIMIT_NS, now_ns + LINE_TIMEOUT_NS
         while True:
@@ -486,7 +518,9 @@ class DynamixelHardware:
         self._start_up.confirm()
 
     def _await_states_of_all(self, when: str) -> None:
-        """Read until the states of all servos are fresh; raise StartUpError if some stay silent."""
+        """Read states up to three times until every servo has answered; raise StartUpError, which names the
+        servos that did not.
+        """
         for pause_ns in FIRST_READS_NS:
             if pause_ns:
                 self._lines.run([pause(pause_ns) for _ in self._plans])

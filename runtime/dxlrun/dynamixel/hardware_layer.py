@@ -1,7 +1,8 @@
-"""Hardware layers: transforms between the joints of the loop and the servos, such as couplings of servos.
+"""Hardware layers: convert between the joints of the loop and the servos, for example where several servos
+move one joint.
 
-A layer converts the goals of the layer above into arrays of its own for the layer below. It converts states
-in the other direction if it changes them. Without layers the servos' hardware uses the arrays of the loop.
+A layer converts the goals of the layer above into arrays of its own for the layer below, and, if it changes
+them, states in the other direction. Without layers the servos' hardware uses the arrays of the loop.
 """
 
 from __future__ import annotations
@@ -22,9 +23,9 @@ from dxlrun.plan.robot_plan import Plan
 
 
 class HardwareLayer:
-    """Forwards every request to the hardware below.
+    """Base class of layers: forwards every call to the hardware below.
 
-    A layer overrides the methods whose behaviour it changes. A layer that transforms only goals needs
+    A subclass overrides the methods whose behaviour it changes. A layer that converts only goals needs
     `start`, after which the goals below equal the present positions, `write` and `follow_goals`.
     """
 
@@ -32,7 +33,9 @@ class HardwareLayer:
         self._hardware = hardware
 
     def start(self, engaging: Callable[[], None] = lambda: None) -> None:
-        """Run the start-up sequence to torque on."""
+        """Check the servos and switch their torque on at the present positions; `engaging` is called before
+        any gets torque.
+        """
         self._hardware.start(engaging)
 
     @property
@@ -41,84 +44,91 @@ class HardwareLayer:
         return self._hardware.servo_limits
 
     def read(self) -> None:
-        """Fill the state arrays."""
+        """Read the servos' states into the state arrays."""
         self._hardware.read()
 
     def write(self) -> None:
-        """Send the goal arrays."""
+        """Send the goals in the goal arrays to the servos."""
         self._hardware.write()
 
     def set_modes(self, modes: NDArray[np.uint8]) -> None:
-        """Change the operating modes of joints."""
+        """Request operating modes for joints, shape (joints,); UNKNOWN keeps a joint's mode."""
         self._hardware.set_modes(modes)
 
     def set_register(self, row: int, item: str, value: int, done: Callable[[str, int | None], None]) -> None:
-        """Write a RAM item of a joint's servo."""
+        """Write a RAM item of a joint's servo; `done` receives the problem and the previous value."""
         self._hardware.set_register(row, item, value, done)
 
     def read_register(self, row: int, item: str, done: Callable[[str, int | None], None]) -> None:
-        """Read an item of a joint's servo."""
+        """Read an item of a joint's servo; `done` receives the problem and the value."""
         self._hardware.read_register(row, item, done)
 
     def switch_torque(self, row: int, on: bool, done: Callable[[str], None]) -> None:
-        """Switch the torque of a joint."""
+        """Switch the torque of a joint on or off; `done` receives the problem, empty on success."""
         self._hardware.switch_torque(row, on, done)
 
     def follow_goals(self, rows: Sequence[int]) -> None:
-        """Start sending goals to joints that were just given torque."""
+        """Start sending goals to the joints of these rows, which were just given torque."""
         self._hardware.follow_goals(rows)
 
     def reboot(self, row: int, done: Callable[[str], None]) -> None:
-        """Reboot a joint's servo."""
+        """Reboot a joint's servo; `done` receives the problem, empty on success."""
         self._hardware.reboot(row, done)
 
     def limit_torque(self, fraction: float) -> None:
-        """Limit the torque of every servo to a fraction of its own limit."""
+        """Limit the torque of every servo to a fraction (0 to 1) of its own limit."""
         self._hardware.limit_torque(fraction)
 
     def idle(self, until_ns: int, time_ns: int) -> None:
-        """Execute waiting work in the idle time of the buses."""
+        """Execute waiting reads and writes of registers until the next cycle starts at `until_ns`."""
         self._hardware.idle(until_ns, time_ns)
 
     def stop(self) -> tuple[str, ...]:
-        """Switch torque off on every servo."""
+        """Switch torque off on every servo; return a sentence for each failure."""
         return self._hardware.stop()
 
     def release(self) -> None:
-        """Leave the robot with its torque on."""
+        """End the exchange but leave the servos' torque on."""
         self._hardware.release()
 
 
 class PreparedLayer(msgspec.Struct, frozen=True):
-    """A layer of this robot, before the hardware below it is built."""
+    """A layer that a robot needs, with its arrays and the function that creates it once the hardware below
+    exists.
+    """
 
     states: States
-    """States that the hardware below fills."""
+    """State arrays that the hardware below the layer fills."""
     goals: Commands
-    """Goals that the hardware below sends."""
+    """Goal arrays that the hardware below the layer sends."""
     build: Callable[[Hardware], Hardware]
-    """Puts the layer in front of the hardware below."""
+    """Creates the layer; the argument is the hardware below."""
     refusals: Callable[[], Sequence[str]] | None = None
-    """Returns reasons to refuse the start at the present positions, one sentence each; None: no check."""
+    """Returns the reasons to refuse the start at the present positions, one sentence each; None: no check."""
 
 
 class LayerStage(msgspec.Struct, frozen=True):
-    """`STAGE` of `layer.py`: called when a robot is assembled, before the hardware of its servos is built.
+    """`STAGE` in a feature's file `layer.py`: called when a robot is assembled, before the hardware of its
+    servos is built.
 
     The stages are called in the order of their features: the first is next to the loop, the last next to the
-    servos. Each receives the arrays of the layer above. It returns None if the plan does not need its layer.
+    servos. `prepare` receives the arrays of the layer above. It returns None if the plan does not need its
+    layer.
     """
 
     FILE: ClassVar[str] = "layer"
 
     prepare: Callable[[Plan, States, Commands, EventSink], PreparedLayer | None]
     to_servos: bool = False
-    """True if the arrays below have a row per servo and those above a row per joint. Such layers come last.
+    """True if the arrays below have a row per servo and those above a row per joint. Such a layer is placed
+    below all others.
     """
 
 
 class HardwareLayers:
-    """The layers that a robot needs, and the arrays of its servos below them."""
+    """The layers that a robot needs; `states` and `goals` are the arrays below the lowest layer, for the
+    servos' hardware.
+    """
 
     def __init__(self, plan: Plan, states: States, goals: Commands, events: EventSink) -> None:
         self.states = states
@@ -133,12 +143,16 @@ class HardwareLayers:
 
     @property
     def refusals(self) -> Callable[[], Sequence[str]] | None:
-        """Checks before any servo gets torque, from the lowest layer up; None: no layer has one."""
+        """Function that returns the reasons of all layers to refuse the start, from the lowest layer up;
+        None: no layer checks.
+        """
         checks = [one.refusals for one in reversed(self._layers) if one.refusals is not None]
         return (lambda: [text for check in checks for text in check()]) if checks else None
 
     def build(self, hardware: Hardware) -> Hardware:
-        """Put the layers in front of the servos' hardware; without layers return the hardware unchanged."""
+        """Put the layers above the servos' hardware and return the top one; without layers return the
+        hardware unchanged.
+        """
         for layer in reversed(self._layers):
             hardware = layer.build(hardware)
         return hardware

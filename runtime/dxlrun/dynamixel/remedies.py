@@ -1,4 +1,4 @@
-"""Remedies for late and missing replies: the instruction to the user, decided in one place.
+"""Remedies: instructions to the user for late and missing replies of servos.
 
 Start-up, the cycle, tools, the end of a run and the analysis of a log share these rules. A machine that was
 too busy is named first. For simulated servos no hardware check is suggested. A cause is named only on direct
@@ -40,7 +40,9 @@ def choose_remedy(
 
 
 def free_machine(ports: Iterable[str]) -> str:
-    """Return the remedy for a machine that was too busy for a robot with these ports; see `choose_remedy`."""
+    """Return the instruction for a machine that was too busy: end other programs. It adds `--virtual` if one
+    of the ports is simulated.
+    """
     virtual = ", or use --virtual" if any(map(is_simulated, ports)) else ""
     return f"end other programs{virtual}"
 
@@ -48,7 +50,7 @@ def free_machine(ports: Iterable[str]) -> str:
 def late_replies(
     bus: str, port: str, extra_ns: float, planned_ns: float, load: MachineLoad = _IDLE
 ) -> tuple[str, str]:
-    """Return a sentence about replies that usually come later than planned, and the remedy.
+    """Return (observation, remedy) for a bus whose replies usually come later than planned.
 
     Both have no full stop; the remedy is empty if none is known. A delay that looks like the default latency
     timer of an FTDI adapter is named, unless the bus is simulated or the machine was too busy.
@@ -77,7 +79,7 @@ def late_replies(
 def describe_late_start(
     bus: str, port: str, late_ns: Sequence[int], planned_ns: int, system: Path = SYSTEM
 ) -> str:
-    """Return a sentence about late replies at start-up, without a full stop.
+    """Return a sentence about the late replies of a bus at start-up, without a full stop.
 
     The sentence reports the observation. It names the adapter's latency timer if the kernel reports that the
     timer is longer than planned.

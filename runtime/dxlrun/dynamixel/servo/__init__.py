@@ -1,4 +1,4 @@
-"""Life of a servo: start-up, checks, modes, registers, loss, return, torque off.
+"""Servo programs: start-up, checks, modes, registers, loss and return, torque off.
 
-Each step is a program of transactions. Sending these on a line belongs in `dxlwire.exchange`.
+Each step is a program, a generator that yields transactions; `dxlwire.exchange` sends these on a line.
 """

@@ -1,4 +1,4 @@
-"""Access: a servo or a device on its line, with reads and writes of control items by name."""
+"""Access: reads and writes control items of one servo or device by name."""
 
 from __future__ import annotations
 
@@ -13,17 +13,19 @@ from dxlwire.plan.retry import ATTEMPTS, limit_patience, retry, setup_line
 from dxlwire.transaction import Outcome, Program, Reply, Transaction
 
 NEAR = 16
-"""Gap in bytes up to which one longer read is faster than a second read."""
+"""Gap in bytes between two items up to which one read that covers both is faster than two reads."""
 LONGEST_READ = 64  # bytes; a longer reply would not fit between two cycles
 
 
 class ItemAccess:
-    """A node with an ID, as programs reach it. Its `str` is its name in messages."""
+    """One servo or device on a line; its methods make transactions and programs for its items. `str` gives
+    its name for messages.
+    """
 
     __slots__ = ("line", "name", "servo_id")
 
     def __init__(self, line: Line, servo_id: int, name: str) -> None:
-        """Store the address.
+        """Store the line and the ID.
 
         Args:
             line: Makes the transactions and decides their timeouts.
@@ -36,36 +38,36 @@ class ItemAccess:
 
     @property
     def table(self) -> Table:
-        """Control table of the node."""
+        """Control table of the servo's or device's model."""
         raise NotImplementedError
 
     @property
     def items(self) -> Mapping[str, ControlItem]:
-        """Control items of the node, by name."""
+        """Control items of the servo or device, by name."""
         return self.table.items
 
     def spare(self, end: int) -> int:
-        """Return the number of readable bytes after an end address."""
+        """Return the number of readable bytes from an address on, at most MOST_SPARE."""
         return self.table.spare(end, MOST_SPARE)
 
     def reading(self, address: int, size: int) -> Transaction:
-        """Return a transaction that reads bytes."""
+        """Return a transaction that reads `size` bytes from an address, without sending it."""
         return self.line.read(self.servo_id, address, size, self.spare(address + size))
 
     def writing(self, address: int, data: bytes) -> Transaction:
-        """Return a transaction that writes bytes."""
+        """Return a transaction that writes bytes at an address, without sending it."""
         return self.line.write(self.servo_id, address, data)
 
     def read_bytes(self, address: int, size: int) -> Program[Reply]:
-        """Read bytes, with up to three attempts."""
+        """Read `size` bytes from an address, with up to three attempts; return the last reply."""
         return retry(self.reading(address, size))
 
     def write_bytes(self, address: int, data: bytes) -> Program[Reply]:
-        """Write bytes, with up to three attempts."""
+        """Write bytes at an address, with up to three attempts; return the last reply."""
         return retry(self.writing(address, data))
 
     def read_one(self, name: str) -> Program[int | None]:
-        """Read an item; None without a reply, or if the model does not have the item."""
+        """Read one item, decoded; return None without a reply, or if the model does not have the item."""
         item = self.items.get(name)
         if item is None:
             return None
@@ -73,7 +75,9 @@ class ItemAccess:
         return item.decode(reply.parameters) if reply.answered else None
 
     def read(self, names: Iterable[str]) -> Program[dict[str, int] | None]:
-        """Read items, adjacent ones with one read; None if one reply is missing."""
+        """Read items, adjacent ones with one read; return their values by name, or None if one reply is
+        missing.
+        """
         found = dict[str, int]()
         for block in side_by_side(self.items[name] for name in names):
             start, end = block[0].address, block[-1].address + block[-1].size
@@ -86,7 +90,7 @@ class ItemAccess:
     def read_near(
         self, names: Iterable[str], optional: Collection[str] = ()
     ) -> Program[tuple[dict[str, int], Reply]]:
-        """Read items with few reads: a read covers the bytes between two items that are close together.
+        """Read items with few reads: one read also covers the gap between items at most NEAR bytes apart.
 
         A read that the servo refuses is split at once, down to single items.
 
@@ -143,7 +147,9 @@ class ItemAccess:
         return (yield from self._explain(item, value, problem))
 
     def _explain(self, item: ControlItem, value: int, problem: str) -> Program[str]:
-        """Return the cause of a failed write: closed EEPROM or the bounding item; else `problem`."""
+        """Find the cause of a failed write and return it as the problem: closed EEPROM, or the item that
+        limits this one; otherwise return `problem`.
+        """
         if item.area == "EEPROM":
             closed = yield from self.closed_eeprom(f"{item.title} = {value}", unread=problem)
             return closed or problem
@@ -154,11 +160,11 @@ class ItemAccess:
         return f"{problem}; its {title} is {bound}: write {abs(value)} or more there"
 
     def read_bound(self, name: str) -> Program[int | None]:
-        """Read the item that bounds another item, such as PWM Limit for Goal PWM; None: no bound is known."""
+        """Read the item that limits another item, such as PWM Limit for Goal PWM; None: no limit is known."""
         return (yield from self.read_one(self.items[name].limited_by))
 
     def closed_eeprom(self, names: str, *, release: str = "", unread: str = "") -> Program[str]:
-        """Return the reason why the EEPROM cannot be written now, and the remedy; empty if it can.
+        """Return why the EEPROM cannot be written now, with the remedy; an empty string if it can.
 
         Lock (47) closes the EEPROM of Protocol 1.0 until the power is switched off (e-Manual AX-12A, Lock
         (47)), torque that of Protocol 2.0 (e-Manual XM430-W350, Control Table of EEPROM Area).
@@ -182,14 +188,18 @@ class ItemAccess:
         return ""
 
     def reason(self, reply: Reply) -> str:
-        """Return the error of a refused write after a colon; empty if the reply is not a refusal."""
+        """Return `: ` and the error of a refused reply in words; an empty string if the reply is not a
+        refusal.
+        """
         return (
             f": {self.line.dialect.describe_error(reply.error)}" if reply.outcome is Outcome.REFUSED else ""
         )
 
 
 class Access(ItemAccess):
-    """A servo of a bus. `reach` uses the timeouts of the plan, `first_reach` the longest ones."""
+    """One servo of a bus; `str` is its label in the plan. Create it with `reach` (timeouts of the plan) or
+    `first_reach` (longest timeouts).
+    """
 
     __slots__ = ("plan", "servo")
 
@@ -207,15 +217,15 @@ class Access(ItemAccess):
         return find_table(self.servo.model, self.plan.protocol)
 
     def spare(self, end: int) -> int:
-        """Return the number of readable bytes after an end address."""
+        """Return the number of readable bytes from an address on, at most MOST_SPARE."""
         return _spare(self.servo.model, self.plan.protocol, end)
 
     def read_torque(self) -> Program[Reply]:
-        """Read torque enable."""
+        """Read Torque Enable, with up to three attempts; return the reply."""
         return self.read_bytes(self.servo.torque_address, 1)
 
     def torque_off(self) -> Program[Reply]:
-        """Write torque enable = 0."""
+        """Write Torque Enable = 0, with up to three attempts; return the reply. Does not read it back."""
         return limit_patience(self.write_bytes(self.servo.torque_address, b"\0"))
 
 
@@ -225,17 +235,17 @@ def _spare(model: str, protocol: float, end: int) -> int:
 
 
 def reach(plan: BusPlan, servo: ServoPlan) -> Access:
-    """Return access to a servo whose return delay is as planned."""
+    """Return access to a servo with the timeouts of the plan, for servos whose return delay is as planned."""
     return Access(plan, servo, plan_line(plan))
 
 
 def first_reach(plan: BusPlan, servo: ServoPlan) -> Access:
-    """Return access to a servo whose return delay is not known yet."""
+    """Return access to a servo with the longest timeouts, for servos whose return delay is not known yet."""
     return Access(plan, servo, setup_line(plan))
 
 
 def _near(items: Iterable[ControlItem]) -> list[list[ControlItem]]:
-    """Group items by address; one read covers a group and the gaps in it."""
+    """Group items by address so that each group takes one read, including gaps of up to NEAR bytes."""
     groups: list[list[ControlItem]] = []
     for item in sorted(items, key=lambda one: one.address):
         if groups:

@@ -1,4 +1,5 @@
-"""Checks: conditions that a servo must meet before it may get torque, at start-up and when it returns.
+"""Checks: conditions that a servo must meet before it may get torque, at start-up and when it returns after a
+loss.
 
 `CHECKS` is the table of comparisons with the plan: control item, predicate, sentence. The control table
 (`deviations.toml`) judges every other setting that differs from the factory's. `inspect` applies both to one
@@ -39,10 +40,13 @@ from dxlwire.wire.protocol1 import describe_error
 RETURN_ALL = 2  # Status Return Level: the servo answers every instruction
 PINGS = 3  # two servos with one ID collide in most of three answers
 LISTEN_NS = 2_000_000
-"""Listening time after a ping. A second servo with the same ID may answer with another return delay, at most
-0.508 ms."""
+"""Listening time after a ping, for the answer of a second servo with the same ID, whose return delay may be
+up to 0.508 ms.
+"""
 STATUS_ERROR = "status_error"
-"""Pseudo item for the error byte of Protocol 1.0. In Protocol 2.0 an item reports hardware errors."""
+"""Key under which `Inspected.values` holds the error byte of a Protocol 1.0 reply. In Protocol 2.0 an item
+has the hardware errors.
+"""
 
 _IDENTITY = ("model_number", "firmware_version")
 _MODES = {"operating_mode", "control_mode"}
@@ -50,29 +54,30 @@ _MOST_NAMED = 4  # servos that one message names, to keep it readable
 
 
 class Inspected(msgspec.Struct, frozen=True):
-    """Register values of one servo, and the plan with which they are compared."""
+    """Register values of one servo at its inspection, and the plan with which they are compared."""
 
     plan: BusPlan
     servo: ServoPlan
     items: Mapping[str, ControlItem]
     values: Mapping[str, int]
-    """Integers on the wire, by item. A register that the robot file declares has the declared value, because
-    start-up writes it."""
+    """Integers on the wire, by item. A register that the robot file declares counts with its declared value,
+    because start-up writes it.
+    """
     errors: HardwareErrors
     take_over: bool
 
     def title(self, name: str) -> str:
-        """Return the title of an item for messages."""
+        """Return the title of an item, such as `Torque Enable (64)`, for messages."""
         return self.items[name].title
 
 
 class Check(NamedTuple):
-    """One row of the table."""
+    """One row of CHECKS: applies to the value of one item, and yields a sentence if the value fails."""
 
     item: str  # the check applies if the servo has this item
     fails: Callable[[Inspected, int], bool]  # predicate on the item's value
     sentence: Callable[[Inspected, int], str]
-    """Problem and fix, without the servo's name at the start."""
+    """Returns the problem and its fix, without the servo's name at the start."""
     refuses: bool = True  # True: the servo gets no torque. False: the difference is only reported
 
 
@@ -191,11 +196,15 @@ CHECKS: tuple[Check, ...] = (
         ),
     ),
 )
-"""Checks in the order in which problems are reported; failures.md lists the condition that each refuses."""
+"""Checks of a servo's registers in the order in which problems are reported; failures.md lists the condition
+that each refuses.
+"""
 
 
 def survey(plan: BusPlan, take_over: bool, found: Findings) -> Program[None]:
-    """Check every servo of the bus and collect the problems of all of them."""
+    """Check that every servo of a bus is present and fit for torque; add the problems of all servos to
+    `found`. Only reads.
+    """
     yield listen(LISTEN_NS)
     every = [first_reach(plan, servo) for servo in plan.servos]
     if every and (yield from _echoes(every[0], found)):
@@ -219,7 +228,8 @@ def survey(plan: BusPlan, take_over: bool, found: Findings) -> Program[None]:
 
 
 def inspect(one: Access, found: Findings, *, take_over: bool) -> Program[Mode | None]:
-    """Read the relevant registers of a servo, apply the table, and judge settings that another program left.
+    """Read the registers of a servo that matter for a start, and add the problems, events and unusual
+    settings to `found`.
 
     Returns:
         The present mode of the servo, which start-up changes to the first mode before torque on; None if it
@@ -266,7 +276,7 @@ def inspect(one: Access, found: Findings, *, take_over: bool) -> Program[Mode | 
 def deviations(
     one: Access, values: Mapping[str, int], mode: Mode, declared: Collection[str] = ()
 ) -> tuple[FoundDeviation, ...]:
-    """Return the values of a servo that differ from the factory's and matter.
+    """Return the settings of a servo that differ from the factory's and matter to a run.
 
     `declared` items are not judged, nor are the goals of the present mode or the start mode: all of these are
     written before torque on.
@@ -286,7 +296,7 @@ def deviations(
 
 @functools.cache
 def _inspected(model: str, protocol: float) -> tuple[tuple[str, ...], tuple[str, ...]]:
-    """Return the items of a model that can refuse a start, and those that can only differ."""
+    """Return (essential, optional) items: those that can refuse a start, and those only reported."""
     items = find_table(model, protocol).items
     essential = {check.item for check in CHECKS} | _MODES
     optional = set[str]()
@@ -309,7 +319,8 @@ def _refusal(one: Access, found: FoundDeviation) -> str:
 
 
 def inspect_states(servos: Sequence[tuple[Access, Mode]], found: Findings) -> Program[None]:
-    """Read every state twice, and check that it is within the limits and does not jump.
+    """Read the position of every servo twice; add a problem if it is outside the limits or jumps faster than
+    the servo can move.
 
     Args:
         servos: Each servo with its present mode.
@@ -338,7 +349,9 @@ def inspect_states(servos: Sequence[tuple[Access, Mode]], found: Findings) -> Pr
 
 
 def _echoes(one: Access, found: Findings) -> Program[bool]:
-    """Return True if the adapter echoes. A read is sent because it cannot be mistaken for its own answer."""
+    """Return True, and add a problem, if the adapter receives what it sends. A read is sent because it cannot
+    be mistaken for its own answer.
+    """
     reply = yield one.reading(0, 3)
     if reply.echoed:
         found.problems.append(
@@ -349,7 +362,9 @@ def _echoes(one: Access, found: Findings) -> Program[bool]:
 
 
 def _answers(one: Access, found: Findings) -> Program[bool | None]:
-    """Ping a servo three times, and report ID collisions and loose contacts. None: no answer."""
+    """Ping a servo three times; return True if it answers well, False if a problem (two servos with one ID,
+    loose contact) was added, None without any answer.
+    """
     answered = disturbed = 0
     for _ in range(PINGS):
         reply = yield one.line.ping(one.servo.servo_id)
@@ -373,7 +388,9 @@ def _answers(one: Access, found: Findings) -> Program[bool | None]:
 
 
 def _silence(plan: BusPlan, silent: Sequence[ServoPlan]) -> str:
-    """Return one sentence about all silent servos of a bus, with the command that finds them."""
+    """Return one sentence that names all servos of a bus that do not answer, with the remedy and the command
+    that finds them.
+    """
     look = "" if plan.port == SIMULATED else f"; `dxlrun scan {plan.port}` shows which servos are there"
     rate = f"that it runs at {plan.baud_rate} bit/s{look}"
     if len(silent) == 1:
@@ -396,7 +413,7 @@ def _silence(plan: BusPlan, silent: Sequence[ServoPlan]) -> str:
 
 
 def _unreadable(one: Access, title: str, reply: Reply) -> str:
-    """Return the reason why a servo that answered its pings could not be read.
+    """Return the reason why a servo that answered its pings could not be read; `title` is the item.
 
     A timeout is not evidence against a certain register.
     """
@@ -423,7 +440,9 @@ def _misplaced(servo: ServoPlan, raw: int, mode: Mode) -> str:
 
 
 def _jump(servo: ServoPlan, before: tuple[int, int], after: tuple[int, int]) -> str:
-    """Return the problem between two positions, each (ticks, time in ns), or an empty string."""
+    """Return the problem if a servo moved faster between two readings, each (ticks, time in ns), than it can;
+    otherwise an empty string.
+    """
     moved = abs(after[0] - before[0]) * servo.rad_per_tick
     fastest = servo.max_speed_tick * servo.rad_s_per_tick * (after[1] - before[1]) * 1e-9
     # Allow a rounding error of one tick in each reading.

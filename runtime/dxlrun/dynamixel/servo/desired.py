@@ -1,4 +1,5 @@
-"""Desired state of the servos of one bus: modes and registers that can change in a run and survive a reset.
+"""Desired state: the mode and the register values that each servo of a bus should have, as changed during a
+run.
 
 Clients and controllers request changes. Programs write them in idle time and read them back. A servo that was
 offline is brought to the newest desired state again.
@@ -27,21 +28,26 @@ from dxlwire.plan.line import listen
 from dxlwire.transaction import Program
 
 PAUSES_NS = (50_000_000, 150_000_000, 0)
-"""Pauses after attempts to reach a register. A request must not fail because the machine or the adapter
-stalls for a moment."""
+"""Pauses (ns) between the attempts to read or write a register. A request must not fail because the machine
+or the adapter stalls for a moment.
+"""
 RegisterDone = Callable[[str, int | None], None]
-"""Callback with the problem (empty on success) and the previous value of the register; None: not known."""
+"""Callback of a register request: the problem (empty on success), and the value, of a write the previous one;
+None: not known.
+"""
 
 
 class DesiredState:
-    """The desired mode and the desired registers of each servo of one bus.
+    """The desired mode and the desired registers of each servo of one bus; servos are indices in the plan.
 
     While a mode changes, the robot's `mode` is UNKNOWN and no goal is sent. If a servo refuses or does not
     answer, its mode is read again. If that fails, the mode stays UNKNOWN until the servo has been recovered.
     """
 
     def __init__(self, life: Life, goals: GoalArrays, reboots: Reboots, mode: NDArray[np.uint8]) -> None:
-        """Store the arrays; `mode` is the robot's array of the joints' present modes."""
+        """Start with the modes and registers of the plan; `mode` is the robot's array of the joints' present
+        modes, which this object fills.
+        """
         self._servos = life.plan.servos
         self._life = life
         self._goals = goals
@@ -56,21 +62,27 @@ class DesiredState:
         return self._modes[index]
 
     def mode_shown(self, index: int) -> Mode:
-        """Return the mode in the robot's states; UNKNOWN while the mode changes."""
+        """Return the confirmed mode of a servo, which the robot's states show; UNKNOWN while the mode
+        changes.
+        """
         return self._goals.modes[index]
 
     def resting(self, index: int) -> tuple[int, bytes] | None:
-        """Return address and bytes of the goal that stops a servo; None if it follows a position."""
+        """Return address and bytes of the goal 0 that stops a servo without a position goal; None if it
+        follows a position or its mode is unknown.
+        """
         mode = self._goals.modes[index]
         goal = None if mode is Mode.UNKNOWN else self._servos[index].mode_plan(mode).goals[-1]
         return None if goal is None or goal.position is not None else (goal.address, bytes(goal.length))
 
     def settings(self, index: int) -> tuple[RegisterValue, ...]:
-        """Return the desired registers of a servo, in the order in which a reset servo gets them again."""
+        """Return the register values that a servo should have, in the order in which they are written after a
+        reset.
+        """
         return self._settings[index]
 
     def change_modes(self, requested: NDArray[np.uint8]) -> None:
-        """Request modes for servos; a later request replaces this one.
+        """Request operating modes, which the servos enter in idle time; a later request replaces this one.
 
         Args:
             requested: Mode of each joint, shape (joints,); UNKNOWN: no change.
@@ -84,14 +96,17 @@ class DesiredState:
                 self._begin_change(index)
 
     def entered(self, index: int, mode: Mode) -> None:
-        """Record that a servo is in a mode: after start-up, after a change, or on its return."""
+        """Record that a servo is in a mode now, and make it the desired one: after start-up, after a change,
+        or on its return.
+        """
         self._modes[index] = mode
         self._show(index, mode)
 
     def returned(self, index: int, mode: Mode) -> None:
-        """Record that a servo returned in a mode; start a change if another mode was requested by then.
+        """Record that a servo is back from a loss, in this mode; start a mode change if another mode is
+        desired now.
 
-        Features restore the registers that they wrote.
+        The features restore the registers that they wrote.
         """
         for part in self._life.parts:
             part.recover_servo(index)
@@ -112,7 +127,8 @@ class DesiredState:
         self._life.do(index, self._change_mode(index), "the mode", Urgency.MODE)
 
     def _change_mode(self, index: int) -> Program[None]:
-        """Change to the newest requested mode and report the result.
+        """Bring one servo to its newest requested mode, restore its torque limit, and report success or the
+        problem.
 
         A servo that reboots during the change does not get its torque back here: it counts as lost, and
         returns by the policy. A servo that is already lost is not changed: its watchdog may have stopped it,
@@ -157,16 +173,18 @@ class DesiredState:
             life.report(index, texts.mode_entered(life.name(index), _words(mode)))
 
     def read_limits(self, index: int) -> Program[None]:
-        """Read the limits beyond which a servo refuses goals; the servo may have been replaced."""
+        """Read a servo's limit registers, beyond which it refuses goals, and use them for its goals; the
+        servo may have been replaced.
+        """
         self._goals.set_limits(index, (yield from modes.read_limits(self._life.reach(index))))
 
     def restore_torque_limit(self, index: int, mode: Mode, found: Findings) -> Program[None]:
-        """Restore the torque limit of a servo that holds in a mode, unless a policy reduced it."""
+        """Restore a servo's own torque limit in this mode, unless a policy reduced the torque of the robot."""
         if self._goals.fraction >= 1.0:
             yield from restore_torque_limit(self._life.reach(index), mode, found)
 
     def read_register(self, index: int, item: str, done: RegisterDone) -> None:
-        """Read an item in idle time; `done` receives the problem and the value."""
+        """Read an item of a servo in idle time; `done` receives the problem and the value."""
         one = self._life.reach(index)
         entry = one.items.get(item)
         if entry is None:
@@ -186,7 +204,7 @@ class DesiredState:
         done("" if found is not None else f"{one} did not answer when {title} was read", found)
 
     def write_register(self, index: int, item: str, value: int, done: RegisterDone) -> None:
-        """Write a RAM item in idle time if the servo has another value.
+        """Write a RAM item of a servo in idle time if it has another value, and keep the value as desired.
 
         `done` receives the problem and the previous value.
         """
@@ -199,7 +217,9 @@ class DesiredState:
         self._life.do(index, self._write(index, register, done), entry.title, Urgency.STEERED)
 
     def _write(self, index: int, register: RegisterValue, done: RegisterDone) -> Program[None]:
-        """Write one register, and retry after a pause if the servo is silent."""
+        """Write one register with up to three attempts, with a pause after each in which the servo was
+        silent.
+        """
         life, one = self._life, self._life.reach(index)
         for pause_ns in PAUSES_NS:
             found = Findings()
