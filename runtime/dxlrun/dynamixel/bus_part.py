@@ -52,7 +52,8 @@ class BusContext(msgspec.Struct, frozen=True):
 
 
 class FeatureParts(msgspec.Struct, frozen=True):
-    """The features of a robot with their plans and commands; creates the parts of these features on each bus."""
+    """The features of a robot with their plans and commands; creates the parts of these features on each
+    bus."""
 
     features: Sequence[Feature]
     command_names: Sequence[str]
@@ -128,7 +129,8 @@ def inspect_nothing(plan: BusPlan, found: Findings) -> Program[None]:
 
 
 class BusStage(msgspec.Struct, frozen=True):
-    """`STAGE` in a feature's file `runtime.py`: creates the feature's part on each bus, in the loop process."""
+    """`STAGE` in a feature's file `runtime.py`: creates the feature's part on each bus, in the loop
+    process."""
 
     FILE: ClassVar[str] = "runtime"
 
@@ -169,7 +171,8 @@ class SafeEnd(msgspec.Struct, frozen=True):
 
     @classmethod
     def of(cls, features: Iterable[Feature], plans: Mapping[str, bytes]) -> SafeEnd:
-        """Import the `safe.py` of every feature now, because an import may be impossible at the end of a run."""
+        """Import the `safe.py` of every feature now, because an import may be impossible at the end of a
+        run."""
         found = stages(SafeStage, features)
         return cls(tuple((feature, stage, plans.get(feature.name, b"")) for feature, stage in found))
 

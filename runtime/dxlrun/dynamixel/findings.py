@@ -12,7 +12,8 @@ _MOST_NAMED = 6  # settings of one servo that an event lists, to keep it readabl
 
 
 class Findings(msgspec.Struct):
-    """Collects problems, events for the log and unusual settings, each in the order in which they were found."""
+    """Collects problems, events for the log and unusual settings, each in the order in which they were
+    found."""
 
     problems: list[str] = []  # reasons to refuse the start, one sentence each
     events: list[tuple[str, EventBody]] = []

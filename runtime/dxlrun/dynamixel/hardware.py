@@ -306,7 +306,8 @@ class DynamixelHardware:
             self._rest()
 
     def _rest(self) -> None:
-        """Return to plain reading and writing if nothing else is due on any bus, until an event or `_due_ns`."""
+        """Return to plain reading and writing if nothing else is due on any bus, until an event or
+        `_due_ns`."""
         self._due_ns = min((servos.due_ns for servos in self._servos), default=NEVER)
         self._waiting = [
             (bus.words, work.least_ns)
@@ -477,7 +478,8 @@ class DynamixelHardware:
                 servos.reads.plan()
 
     def _limp(self) -> tuple[LimpOutcome, ...]:
-        """Switch torque off on every open line, and repeat if a lost line comes back within LINE_TIMEOUT_NS."""
+        """Switch torque off on every open line, and repeat if a lost line comes back within
+        LINE_TIMEOUT_NS."""
         now_ns = self._clock.now_ns()
         deadline_ns, timeout_ns = now_ns + STOP_LIMIT_NS, now_ns + LINE_TIMEOUT_NS
         while True:

@@ -1,6 +1,7 @@
-"""Texts of the servos' room: events of servos, buses and settings.
+"""Texts of events about servos, buses and settings in the log of a run.
 
-Each row has the code, the severity and the fields of one event. `servo` is a label with joint, ID and bus.
+Each function takes the fields of one event and returns its text; the decorator has code and severity. `servo`
+is a label with joint, ID and bus.
 """
 
 from __future__ import annotations
@@ -129,7 +130,9 @@ def servo_unfit(servo: str, problems: Sequence[str]) -> str:
 
 
 def unfit_clause(problems: Sequence[str]) -> str:
-    """Return the reason why a servo that answers again stays lost."""
+    """Return the clause `answers again, but cannot take part: ...` with the problems of a servo that stays
+    lost.
+    """
     return f"answers again, but cannot take part: it {'; it '.join(problems)}"
 
 

@@ -1,4 +1,4 @@
-"""Reports of dxlwire as events of a run."""
+"""Wire reports: turns reports of the library `dxlwire` into events of a run."""
 
 from __future__ import annotations
 
@@ -7,15 +7,15 @@ from dxlrun.dynamixel import texts
 from dxlwire.exchange.reports import Reason
 
 _EVENTS = {Reason.IMPLAUSIBLE: texts.values_implausible, Reason.NO_IDLE_TIME: texts.idle_time_short}
-"""Event of each reason."""
+"""Function that makes the event of each reason of a report."""
 
 
 class WireReports:
-    """Emits reports of dxlwire as events; a `ReportSink`."""
+    """`ReportSink` of dxlwire that sends each report to the log of the run as an event."""
 
     def __init__(self, events: EventSink) -> None:
         self._events = events
 
     def report(self, reason: Reason, source: str, text: str) -> None:
-        """Emit a report as the event of its reason."""
+        """Send a report to the log as the event of its reason."""
         self._events.emit(source, _EVENTS[reason](text))

@@ -179,7 +179,8 @@ class DesiredState:
         self._goals.set_limits(index, (yield from modes.read_limits(self._life.reach(index))))
 
     def restore_torque_limit(self, index: int, mode: Mode, found: Findings) -> Program[None]:
-        """Restore a servo's own torque limit in this mode, unless a policy reduced the torque of the robot."""
+        """Restore a servo's own torque limit in this mode, unless a policy reduced the torque of the
+        robot."""
         if self._goals.fraction >= 1.0:
             yield from restore_torque_limit(self._life.reach(index), mode, found)
 

@@ -58,58 +58,66 @@ from dxlwire.transaction import Program
 
 @unique
 class ServoState(Enum):
-    """State of a servo."""
+    """State of one servo of a run, as seen by the host: whether it has torque, gets goals, and is read."""
 
     LIMP = "limp"
     """Read in every cycle, without torque. It gets no goals, because a goal may switch torque on."""
     HOLDING = "holding"
-    """Read in every cycle. It holds its last goal, and gets no other before its torque enable was read as 1.
+    """Read in every cycle. It holds its last goal, and gets no new goals before its torque enable was read as
+    1.
     """
     TORQUED = "torqued"  # torque is confirmed; gets goals
     STOPPED = "stopped"
-    """Like HOLDING, after its watchdog stopped it or after it was offline. It will move to its goal slowly.
+    """Like HOLDING, after its Bus Watchdog stopped it or after it was offline. Once its torque is confirmed
+    it moves to its goal slowly.
     """
     RETURNING = "returning"
-    """Torque is confirmed; it moves to its goal at RETURN_SPEED at most, until it has caught up."""
+    """Torque is confirmed. It moves to its goal at RETURN_SPEED at most, until it has caught up."""
     GIVEN = "given torque"
-    """Has torque again and holds its position. It gets no goals before the loop's goals equal that position.
+    """Got torque during the run and holds its position. It gets no goals before the loop's goals equal that
+    position.
     """
     OFFLINE = "offline"
-    """Not in the cyclic reads. It is probed periodically, and recovered when it passes the checks."""
+    """Lost: not read in the cycles. It is probed periodically, and recovered when it passes the checks."""
     RELEASED = "released"
-    """Read in every cycle. A client, a policy or the robot file switched its torque off. No policy switches
-    it on again; only a client's request does."""
+    """Read in every cycle, without torque, which a client, a policy or the robot file switched off. Only a
+    client's request switches it on again.
+    """
 
 
 @unique
 class ServoEvent(Enum):
-    """Event in the life of a servo."""
+    """Event that changes the state of a servo; see TRANSITIONS."""
 
     ENGAGED = "engaged"  # start-up: goal = present position, torque on, both read back
     TORQUE_ON = "torque on"  # torque enable was read as 1
     TORQUE_OFF = "torque off"
-    """Torque enable was read as 0 for a known reason, or a shutdown cut the torque."""
+    """Torque enable was read as 0 for a known reason, or the servo's own shutdown cut its torque."""
     DOUBT = "doubt"
     """Torque may be off: a reply was lost, an error was raised, or a mode change was not confirmed."""
     WATCHDOG = "watchdog"  # its Bus Watchdog has stopped it
     CAUGHT_UP = "caught up"  # it is near its goal again
     LOST = "lost"
-    """It leaves the cyclic reads: it is silent, it rebooted, its line was lost, or it cannot be trusted."""
+    """The servo leaves the cyclic reads: it is silent, it rebooted, its line was lost, or it cannot be
+    trusted.
+    """
     RETURNED = "returned"  # back in the exchange, and kept its torque and its goal while offline
     RETURNED_LIMP = "returned limp"  # back in the exchange, without torque
     TORQUE_GIVEN = "torque given"
-    """Its torque was switched on at its present position, or it has torque with a goal that this run did not
-    send."""
+    """The servo's torque was switched on at its present position, or the servo has torque with a goal that
+    this run did not send.
+    """
     ANCHORED = "anchored"  # the loop's goals for it equal its position
     REQUESTED = "requested"
-    """A client requests torque. TORQUE_GIVEN follows, or RELEASE if the servo cannot get it."""
+    """A client requests torque for a servo. TORQUE_GIVEN follows, or RELEASE if the servo cannot get torque.
+    """
     RELEASE = "release"  # a client, a policy or the robot file switches its torque off
 
 
 _ONLINE = {ServoEvent.LOST: ServoState.OFFLINE, ServoEvent.RELEASE: ServoState.RELEASED}
-"""Transitions from every state in which a servo is read."""
+"""Transitions that every state except OFFLINE has."""
 _ENGAGED = {**_ONLINE, ServoEvent.TORQUE_GIVEN: ServoState.GIVEN}
-"""Transitions from every state in which a servo may have torque."""
+"""Transitions that every state has in which a servo may have torque."""
 _S, _E = ServoState, ServoEvent
 
 TRANSITIONS: Mapping[ServoState, Mapping[ServoEvent, ServoState]] = MappingProxyType(
@@ -158,11 +166,11 @@ TRANSITIONS: Mapping[ServoState, Mapping[ServoEvent, ServoState]] = MappingProxy
         },
     }
 )
-"""Every legal transition. Any other event in a state is a bug in this program."""
+"""Next state by present state and event. An event that a state does not list is a bug in this program."""
 
 GETS_GOALS = frozenset((ServoState.TORQUED, ServoState.RETURNING))
 IN_DOUBT = frozenset((ServoState.HOLDING, ServoState.STOPPED))
-"""States of servos whose torque enable is read as soon as idle time permits."""
+"""States of servos that may have torque; their torque enable is read as soon as idle time permits."""
 POWERLESS = frozenset((ServoState.LIMP, ServoState.RELEASED))
 _SLOW = frozenset((ServoState.STOPPED, ServoState.RETURNING, ServoState.OFFLINE))
 _SHOWN: Mapping[ServoState, Torque] = {
@@ -173,18 +181,18 @@ _SHOWN: Mapping[ServoState, Torque] = {
     ServoState.OFFLINE: Torque.LOST,
     ServoState.RELEASED: Torque.RELEASED,
 }
-"""Torque value in the robot's states for each servo state."""
+"""Value in `torque` of the robot's states for each servo state."""
 
 Done = Callable[[str], None]
-"""Callback with the problem of a request for a servo; empty on success."""
+"""Callback for the result of a request for a servo: the problem; empty on success."""
 
 
 class IllegalTransition(LookupError):
-    """An event that the present state does not allow."""
+    """A servo event that the servo's present state does not allow."""
 
 
 class RequestedReboot(msgspec.Struct):
-    """A reboot that a client requested, until the servo is back or the timeout has passed."""
+    """A reboot of a servo that a client requested, until the servo is back or the timeout has passed."""
 
     had_torque: bool  # had torque before, and gets it back
     until_ns: int  # deadline for the answer to the client
@@ -192,11 +200,12 @@ class RequestedReboot(msgspec.Struct):
 
 
 class Loss(msgspec.Struct):
-    """Record of a servo while it is OFFLINE."""
+    """Record of one servo while it is OFFLINE; it decides about torque on the servo's return."""
 
     had_torque: bool
-    """True if it had torque when it was lost. Torque off on its return then shows a reboot, which matters for
-    servos without Realtime Tick."""
+    """True if the servo had torque when it was lost. Torque off on its return then shows a reboot, which
+    matters for servos without Realtime Tick.
+    """
     kept_goal: bool  # its goal is the last one that the loop sent
     limp_reported: bool  # the missing torque has been reported
     released: bool  # becomes RELEASED when it is back
@@ -208,20 +217,23 @@ class Loss(msgspec.Struct):
 
     @property
     def kept_torque(self) -> bool:
-        """True if torque that is still on is the servo's own earlier torque, with its earlier goal."""
+        """True if the servo, when it still has torque, follows its old goal: it had torque and that goal when
+        lost, and no reboot was seen.
+        """
         return self.had_torque and self.kept_goal and not self.rebooted
 
 
 class Life:
-    """The state of each servo of one bus, with the consequences of each state.
-
-    Programs that change states are scheduled in `idle`.
+    """The state machine of each servo of one bus, by index in the plan; it updates reads, goals and shown
+    torque when a state changes.
     """
 
     def __init__(
         self, idle: IdleScheduler, reads: CyclicReads, events: EventSink, parts: Sequence[BusPart] = ()
     ) -> None:
-        """Start with every servo LIMP; `parts` are the features' parts that learn of a servo's return."""
+        """Start with every servo LIMP; `parts` are the features' parts on this bus, called when a servo
+        returns.
+        """
         count = len(idle.plan.servos)
         self._all_torqued = b"\1" * count
         self.plan = idle.plan
@@ -232,15 +244,18 @@ class Life:
         self.states = [ServoState.LIMP] * count  # state of each servo
         self.losses: dict[int, Loss] = {}  # record of each OFFLINE servo, by index
         self.torqued: NDArray[np.bool_] = np.zeros(count, dtype=np.bool_)
-        """Servos that get goals, shape (servos,); memory shared with the exchange kernel."""
+        """True for servos that get goals, shape (servos,); memory shared with the exchange kernel."""
         self.torque: NDArray[np.uint8] = np.full(count, Torque.OFF, dtype=np.uint8)
-        """A Torque per servo, shape (servos,): published in the robot's states from the next read on."""
+        """Torque value per servo for the robot's states, shape (servos,); copied there before the next cycle.
+        """
         self.torque_changed = True  # `torque` differs from the robot's states
         self.ceiling: Floats = np.full(count, np.nan)
-        """Highest speed toward a position, rad/s, shape (servos,); NaN: only the goal's own limit."""
+        """Highest speed toward a position goal, rad/s, shape (servos,), for the exchange kernel; NaN: only
+        the goal's own limit.
+        """
 
     def on(self, index: int, event: ServoEvent) -> ServoState:
-        """Change a servo's state by an event and return the new state.
+        """Apply an event to a servo, update what depends on its state, and return the new state.
 
         Raises:
             IllegalTransition: The present state does not allow the event.
@@ -269,9 +284,10 @@ class Life:
         return after
 
     def give_torque(self, index: int) -> None:
-        """Record that `modes.hold` gave a servo torque at its present position.
+        """Record that `modes.hold` switched a servo's torque on at its present position.
 
-        A lost servo stays lost; only its goal changed.
+        An OFFLINE servo stays lost, but its old goal counts as replaced. A limp or released servo does not
+        change.
         """
         if self.offline(index):
             self.losses[index].kept_goal = False
@@ -279,21 +295,25 @@ class Life:
             self.on(index, ServoEvent.TORQUE_GIVEN)
 
     def lose(self, index: int, probe_after_ns: int = 0) -> Loss:
-        """Remove a servo from the exchange. It is probed after a delay, until it passes the checks."""
+        """Remove a servo from the cyclic reads and return its record. It is first probed after
+        `probe_after_ns`.
+        """
         self.on(index, ServoEvent.LOST)
         loss = self.losses[index]
         loss.probe_at_ns += probe_after_ns
         return loss
 
     def reboot(self, index: int, request: RequestedReboot, probe_after_ns: int) -> Loss:
-        """Remove a servo from the exchange for a requested reboot, until its return or `answered`."""
+        """Remove a servo from the cyclic reads for a reboot that a client requested; the states show it as
+        rebooting.
+        """
         loss = self.lose(index, probe_after_ns)
         loss.reboot = request
         self._show(index, Torque.REBOOTING)
         return loss
 
     def answered(self, index: int) -> None:
-        """Show a servo as lost if its requested reboot is over and it is still OFFLINE."""
+        """End the display of a requested reboot: a servo that is still OFFLINE is shown as lost."""
         if self.offline(index):
             self._show(index, Torque.LOST)
 
@@ -302,7 +322,9 @@ class Life:
         self.torque_changed = True
 
     def _loss(self, before: ServoState, earlier: Loss | None) -> Loss:
-        """Return the record of a lost servo; `earlier` is its record if it was OFFLINE already."""
+        """Return the record of a servo that is lost in state `before`; `earlier` is its record if it was
+        OFFLINE already.
+        """
         powerless = before in POWERLESS if earlier is None else earlier.limp_reported
         return Loss(
             had_torque=not powerless,
@@ -316,35 +338,36 @@ class Life:
 
     @property
     def calm(self) -> bool:
-        """True if every servo gets goals: none is offline, none in doubt."""
+        """True if every servo of the bus gets goals: none is limp, offline, or in doubt."""
         return self.torqued.tobytes() == self._all_torqued  # ten times faster than comparing the states
 
     def offline(self, index: int) -> bool:
-        """Return True if a servo is out of the exchange."""
+        """Return True if a servo is OFFLINE, so no cycle reads it."""
         return self.states[index] is ServoState.OFFLINE
 
     def now_ns(self) -> int:
-        """Return the time of the run's clock."""
+        """Return the time of the run's clock, ns."""
         return self.idle.now_ns()
 
     def reach(self, index: int) -> Access:
-        """Return access to a servo."""
+        """Return access to a servo's items with the timeouts of the plan."""
         return reach(self.plan, self.plan.servos[index])
 
     def name(self, index: int) -> str:
-        """Return the name of a servo for messages."""
+        """Return the label of a servo for messages: joint, ID and bus."""
         return self.plan.label(self.plan.servos[index])
 
     def do(self, index: int, program: Program[None], what: str, urgency: Urgency = Urgency.REPAIR) -> None:
-        """Schedule a program for a servo in idle time; `what` names its object in messages, as in `torque
-        enable`."""
+        """Schedule a program for a servo in idle time; `what` names its object in messages, such as `torque
+        enable`.
+        """
         self.idle.add(program, urgency, f"{what} of {self.name(index)}", index)
 
     def report(self, index: int, event: EventBody) -> None:
-        """Log an event of a servo under the name of its joint."""
+        """Log an event of a servo; its source is the servo's joint."""
         self.events.emit(self.plan.servos[index].joint, event)
 
     def report_limp(self, index: int, enabled: int) -> None:
-        """Log that a servo was found without torque."""
+        """Log that a servo was found without torque; `enabled` is the value of its torque enable."""
         address = self.plan.servos[index].torque_address
         self.report(index, texts.torque_lost(self.name(index), address, enabled))

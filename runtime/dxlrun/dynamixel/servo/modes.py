@@ -1,6 +1,6 @@
-"""Mode switches of one servo: torque off, mode registers, registers that the switch resets, a goal without
-motion.
+"""Modes: programs that switch one servo into an operating mode, and hold it at its present position.
 
+A mode switch has torque off, mode registers, registers that the switch resets, and a goal without motion.
 These programs run at start-up and in idle time. A switch keeps the torque as it was: it is switched on again
 only if it was on before. A servo that refuses the new mode gets torque back in its old mode.
 
@@ -26,10 +26,13 @@ from dxlwire.plan.mode_plan import in_mode, mode_in
 from dxlwire.transaction import Outcome, Program
 
 ENGAGE_SPEED = 0.5
-"""rad/s. The goal is the present position; if that was misread, the servo moves to the goal slowly."""
+"""Speed limit (rad/s) when a servo gets torque. The goal is the present position; if that was misread, the
+servo moves to the goal slowly.
+"""
 FARTHEST_INWARD = 1.0
-"""rad [i]. A continuous servo is not moved back into its limits from farther away: after more turns than its
-counter holds it would unwind all of them."""
+"""Distance (rad [i]) from which a continuous servo is still moved back into its limits: after more turns than
+its counter holds it would unwind all of them.
+"""
 LONGEST_BACK = 64  # bytes; items farther apart are read back one by one
 STARTED_ANEW = "rebooted while its mode was changed"
 _RESET = (
@@ -42,19 +45,20 @@ _RESET = (
     "feedforward_1st_gain",
     "profile_acceleration",
 )
-"""Registers that a change of the operating mode resets, in addition to the goals and the profile velocity in
-their blocks."""
+"""Registers that a change of the operating mode resets and that are restored. It also resets the goals and
+the profile velocity.
+"""
 
 
 class Held(msgspec.Struct, frozen=True):
-    """Result of holding a servo at its present position."""
+    """Result of `hold`: torque on for one servo at its present position."""
 
     problem: str  # problem; empty on success
     goal: int | None = None  # goal position in ticks; None if the mode has none
 
 
 def never() -> Program[bool]:
-    """Return False without a read: at start-up no reboot policy applies yet."""
+    """Default of `enter`: return False without a read, because at start-up no reboot is watched."""
     yield from ()
     return False
 
@@ -67,7 +71,7 @@ def enter(
     inward: bool = False,
     rebooted: Callable[[], Program[bool]] = never,
 ) -> Program[str]:
-    """Switch one servo into a mode, in which it then holds its position.
+    """Switch one servo into a mode. If it had torque it then holds its position, otherwise it stays limp.
 
     Args:
         one: The servo.
@@ -113,7 +117,8 @@ def enter(
 
 
 def settle_modes(plan: BusPlan, found: Findings) -> Program[list[dict[OwnLimit, int]]]:
-    """Switch every servo that is in another mode into its start mode, before it gets torque.
+    """Switch every servo of a bus into its start mode if it is in another mode, before it gets torque.
+    Problems go to `found`.
 
     Returns:
         The limits in ticks beyond which each servo refuses goals, in the order of the plan's servos.
@@ -140,7 +145,9 @@ def settle_modes(plan: BusPlan, found: Findings) -> Program[list[dict[OwnLimit, 
 
 
 def mode_now(one: Access) -> Program[Mode]:
-    """Read the present mode of a servo; UNKNOWN if it does not answer, or the plan does not have its mode."""
+    """Read the mode registers of a servo and return its mode; UNKNOWN without an answer, or if the plan lacks
+    the mode.
+    """
     names = dict.fromkeys(register.name for mode in one.servo.modes for register in mode.operating)
     found = yield from one.read(names)
     return Mode.UNKNOWN if found is None else mode_in(one.servo, found)
@@ -149,7 +156,9 @@ def mode_now(one: Access) -> Program[Mode]:
 def read_limits(
     one: Access, kinds: Collection[str] = ("speed", "effort", "pwm")
 ) -> Program[dict[OwnLimit, int]]:
-    """Read the limits beyond which a servo refuses goals, ticks; unanswered ones are omitted."""
+    """Read the servo's limit registers of these kinds, in ticks; a goal beyond one is refused. Registers
+    without a reply are omitted.
+    """
     found: dict[OwnLimit, int] = {}
     for limit in one.servo.own_limits:
         if limit.of not in kinds:
@@ -161,7 +170,9 @@ def read_limits(
 
 
 def servo_limits(one: Access, limits: Mapping[OwnLimit, int]) -> tuple[ServoLimit, ...]:
-    """Return the registers that limit a servo's goals below the maximum of its modes, in joint units."""
+    """Return the limit registers of a servo that are tighter than the maximum of its modes, converted to
+    joint units and with text.
+    """
     servo, table, found = one.servo, one.table, list[ServoLimit]()
     for limit, raw in limits.items():
         scales = [scale for mode in servo.modes if (scale := getattr(mode, limit.of)) is not None]
@@ -181,8 +192,8 @@ def servo_limits(one: Access, limits: Mapping[OwnLimit, int]) -> tuple[ServoLimi
 
 
 def hold(one: Access, wanted: Mode, *, inward: bool = False) -> Program[Held]:
-    """Hold a servo at its present position: write a goal that causes no motion, switch torque on, read both
-    back.
+    """Switch a servo's torque on at its present position: write a goal that causes no motion, then torque on,
+    and read both back.
 
     A servo outside its limits is refused. With `inward` it moves back to them slowly instead: a servo that
     followed an effort may have coasted beyond its limits, and without torque its joint would fall.
@@ -226,8 +237,7 @@ def hold(one: Access, wanted: Mode, *, inward: bool = False) -> Program[Held]:
 
 
 def _most_effort(one: Access, mode: ModePlan) -> Program[tuple[int, str]]:
-    """Return the servo's own effort limit in ticks, and the reason why it must not become its goal (or
-    empty).
+    """Read the servo's own effort limit; return (ticks, problem). With a problem it must not become the goal.
 
     If the goal register is Torque Limit, a value of 0 shows a shutdown, which a goal would undo.
     """
@@ -243,7 +253,9 @@ def _most_effort(one: Access, mode: ModePlan) -> Program[tuple[int, str]]:
 
 
 def _resting(mode: ModePlan, layout: GoalLayout, position: int | None, slow: int, most_effort: int) -> bytes:
-    """Return a block of goals without motion: present position, slow speed, full effort; 0 in other modes."""
+    """Return the bytes of a goal block that causes no motion: present position, slow speed, full effort; 0 in
+    modes without a position.
+    """
     block = bytearray(layout.length)
     goals: list[tuple[Field, int]] = []
     if layout.position is not None and position is not None:
@@ -282,7 +294,9 @@ def _read_back(one: Access, layout: GoalLayout, data: bytes) -> Program[str]:
 
 
 def _change(one: Access, desired: ModePlan, found: Mapping[str, int], *, enabled: bool) -> Program[str]:
-    """Change the mode with torque off, and restore the registers that the change resets."""
+    """Change the mode registers of a servo with torque off, and restore the registers that the change resets;
+    return the problem.
+    """
     kept = yield from one.read(_forgotten(one, desired, found))
     if kept is None:
         return "did not answer when its gains were read before its mode was changed"
@@ -312,7 +326,8 @@ def _change(one: Access, desired: ModePlan, found: Mapping[str, int], *, enabled
 
 
 def _forgotten(one: Access, desired: ModePlan, found: Mapping[str, int]) -> tuple[str, ...]:
-    """Return the items that a change of the operating mode resets and that must be restored."""
+    """Return the names of the items that this change of the operating mode resets and that must be
+    restored."""
     items = one.items
     if "operating_mode" not in items:
         return ()

@@ -1,4 +1,5 @@
-"""Offline servos of one bus: probed in idle time, checked as at start-up, and recovered.
+"""Offline servos: servos of one bus that were lost are probed in idle time, checked as at start-up, and
+recovered.
 
 A servo returns in its desired mode and with its desired registers. It has torque in three cases only: it kept
 its torque; the policy for returned servos gives torque back after a reboot and the servo does not reboot
@@ -28,13 +29,14 @@ from dxlwire.transaction import Outcome, Program, Reply
 
 PROBE_NS = 1_000_000_000  # probe period of an offline servo (failures.md)
 FIRST_PROBE_NS = 200_000_000
-"""Delay of the first probe. Most losses are a loose plug or a boot, which is over by then."""
+"""Delay of the first probe after a loss, ns. Most losses are a loose plug or a boot, which is over by then.
+"""
 REBOOT_NS = 3_000_000_000
-"""Timeout for a servo that a client rebooted to pass the checks again [i]."""
+"""Timeout (ns) for a servo that a client rebooted to pass the checks again [i]."""
 
 
 class Offline:
-    """Probes the offline servos of one bus and recovers them."""
+    """Probes the offline servos of one bus and recovers those that answer. Servos are indices in the plan."""
 
     def __init__(self, life: Life, reboots: Reboots, desired: DesiredState) -> None:
         self.life = life
@@ -42,15 +44,18 @@ class Offline:
         self.desired = desired
 
     def lose(self, index: int) -> None:
-        """Remove a silent servo from the exchange, and stop it if it follows no position."""
+        """Remove a servo that stopped answering from the cyclic reads; send it a goal of 0 if it follows no
+        position.
+        """
         loss = self.life.lose(index, FIRST_PROBE_NS)
         if loss.had_torque and self.desired.resting(index) is not None:
             loss.kept_goal = False
             self.life.do(index, limit_patience(self._stop(index)), "the stop")
 
     def _stop(self, index: int) -> Program[None]:
-        """Write a goal of 0 to a servo that follows no position: it may still receive even if it does not
-        answer."""
+        """Write a goal of 0 to an offline servo that follows no position: it may still receive even if it
+        does not answer.
+        """
         for _ in range(ATTEMPTS):
             goal = self.desired.resting(index)
             if goal is None or not self.life.offline(index):
@@ -59,7 +64,9 @@ class Offline:
                 return
 
     def look(self) -> None:
-        """Schedule probes of the servos that are due; called once a cycle while a servo is offline."""
+        """Schedule a ping for each offline servo whose next probe is due; called once a cycle while a servo
+        is offline.
+        """
         self.expire()
         now = self.life.now_ns()
         for index, loss in sorted(self.life.losses.items()):
@@ -68,7 +75,7 @@ class Offline:
                 self.life.do(index, self._probe(index, loss), "the return")
 
     def expire(self) -> None:
-        """Answer the clients whose reboot requests have timed out."""
+        """Report failure to the clients whose requested reboot did not bring the servo back in time."""
         now = self.life.now_ns()
         for index, loss in sorted(self.life.losses.items()):
             if loss.reboot is not None and loss.reboot.until_ns <= now:
@@ -77,7 +84,7 @@ class Offline:
                 self._answer(index, loss, f"{text}: {remedy}; it is probed until it is ready")
 
     def switch_off(self, index: int, done: Done) -> None:
-        """Switch off the torque of a RELEASED servo in idle time."""
+        """Switch off the torque of a RELEASED servo in idle time; `done` receives the problem."""
         self.life.do(index, self._switch_off(index, done), "torque off")
 
     def _switch_off(self, index: int, done: Done) -> Program[None]:
@@ -89,7 +96,7 @@ class Offline:
         done(problem)
 
     def limp(self, index: int) -> Program[bool]:
-        """Switch a servo's torque off and read it back.
+        """Write torque off to a servo and read it back; return True if it is confirmed.
 
         A servo that does not confirm counts as lost, so its return switches its torque off.
         """
@@ -104,7 +111,9 @@ class Offline:
         return False
 
     def _probe(self, index: int, loss: Loss) -> Program[None]:
-        """Ping a servo; when it answers, check and recover it."""
+        """Ping an offline servo; if it answers, check and recover it, otherwise set the time of the next
+        probe.
+        """
         life, one = self.life, self.life.reach(index)
         reply = yield one.line.ping(one.servo.servo_id)
         if reply.answered and (read := self.reboots.read(index)) is not None:
@@ -133,7 +142,9 @@ class Offline:
         loss.probing, loss.probe_at_ns = False, life.now_ns() + PROBE_NS
 
     def _rejoin(self, index: int, reply: Reply, found: Findings) -> Program[tuple[bool, Mode]]:
-        """Bring a servo that answered to its desired state; return True if it has torque, and its mode."""
+        """Bring a servo that answered a probe to its desired registers and mode; return (has torque, mode).
+        Problems go to `found`.
+        """
         life, one, servo = self.life, self.life.reach(index), self.life.plan.servos[index]
         if self.reboots.judge(index, reply) is None:
             enabled = yield from one.read_torque()
@@ -163,7 +174,7 @@ class Offline:
         return torqued, mode
 
     def _may_get_torque(self, index: int) -> bool:
-        """Return True if a servo gets torque back.
+        """Return True if a returning servo without torque gets torque back.
 
         The policy gives it back after a reboot, unless the servo reboots repeatedly. A requested reboot gives
         it back if the servo had torque before. A released servo gets none.
@@ -210,13 +221,14 @@ class Offline:
 
 
 def ignore(problem: str) -> None:
-    """Ignore the result of an internal request; an event reports a problem."""
+    """Callback for requests whose result nobody awaits; an event already reports the problem."""
 
 
 def rejoin(
     one: Access, found: Findings, mode: Mode, registers: Sequence[RegisterValue], *, torque: bool
 ) -> Program[bool]:
-    """Recover one servo that was lost or reset, as at start-up: check it, write its registers, then hold it.
+    """Bring one servo that was lost or reset into the run again: check it, write its registers and mode, then
+    hold it.
 
     Without `torque` a limp servo stays limp and gets no goal, because a goal may switch torque on
     (protocol.md). A servo that still holds keeps its torque without a write: if it rebooted a moment ago, the

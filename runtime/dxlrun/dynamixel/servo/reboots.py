@@ -1,4 +1,4 @@
-"""Reboots: detected by a servo's Realtime Tick or by a lit LED, reported, and counted."""
+"""Reboots of servos: detected by Realtime Tick or by an LED that went out, reported, and counted."""
 
 from __future__ import annotations
 
@@ -14,18 +14,19 @@ from dxlwire.transaction import Program, Reply, Transaction
 TICK_MODULUS_MS = 32_768
 """Realtime Tick counts milliseconds modulo this (e-Manual XM430-W350, Realtime Tick (120))."""
 BLIND_NS = 16_000_000_000
-"""Longest time between two readings. After half a turn of the counter the direction of a difference is
-ambiguous (protocol.md)."""
+"""Longest time between two readings of Realtime Tick that can be compared. After half a turn of the counter
+the direction of a difference is ambiguous (protocol.md).
+"""
 DRIFT = 0.02  # largest relative drift between the clocks of servo and host [i] (protocol.md)
 SLACK_MS = 20.0
-"""Error of a reading in addition to the time between request and reply [i] (protocol.md)."""
+"""Tolerated error of a tick reading, in addition to the time between request and reply [i] (protocol.md)."""
 WITHIN_NS = 60_000_000_000
 TOO_MANY_REBOOTS = 2
-"""After this many reboots within a minute a servo gets no torque back in this run (failures.md)."""
+"""After this many reboots within WITHIN_NS a servo gets no torque back in this run (failures.md)."""
 
 
 class TickReading(NamedTuple):
-    """A reading of a servo's millisecond counter, which a reboot resets to 0."""
+    """One reading of a servo's Realtime Tick, a millisecond counter that a reboot resets to 0."""
 
     tick: int
     middle_ns: int
@@ -33,12 +34,12 @@ class TickReading(NamedTuple):
 
     @classmethod
     def of(cls, reply: Reply) -> TickReading:
-        """Return the reading in a reply."""
+        """Return the reading in the reply to a read of Realtime Tick."""
         half_ns = (reply.last_ns - reply.asked_ns) // 2
         return cls(reply.word(), reply.asked_ns + half_ns, half_ns * 1e-6)
 
     def rebooted(self, before: TickReading | None) -> bool | None:
-        """Return True if the servo rebooted since a reading.
+        """Return True if the servo rebooted between the reading `before` and this one.
 
         None: the earlier reading is missing or too old to decide.
         """
@@ -52,14 +53,14 @@ class TickReading(NamedTuple):
 
 
 class RebootCount:
-    """Counts the reboots of a servo; after two within a minute it gets no torque back."""
+    """Counts the reboots of one servo; after TOO_MANY_REBOOTS within a minute it gets no torque back."""
 
     def __init__(self) -> None:
         self._times: deque[int] = deque(maxlen=TOO_MANY_REBOOTS)
         self.exhausted = False  # it has rebooted TOO_MANY_REBOOTS times within a minute
 
     def add(self, now_ns: int) -> bool:
-        """Count a reboot; return True once, when the limit is reached."""
+        """Count a reboot at this time; return True only for the one that reaches the limit."""
         times = self._times
         times.append(now_ns)
         if self.exhausted or len(times) < TOO_MANY_REBOOTS or now_ns - times[0] > WITHIN_NS:
@@ -69,7 +70,7 @@ class RebootCount:
 
 
 class Reboots:
-    """Detects the reboots of the servos of one bus.
+    """Detects and counts the reboots of the servos of one bus; servos are indices in the plan.
 
     Servos of Protocol 1.0 have no Realtime Tick. Between `watch` and `unwatch` their LED is lit instead: a
     reboot switches it off.
@@ -79,18 +80,19 @@ class Reboots:
         count = len(life.plan.servos)
         self._life = life
         self._lit: list[int | None] = [None] * count
-        """State of the LED before `watch` lit it; None: not watched."""
+        """Value of each servo's LED before `watch` lit it; None: the servo is not watched."""
         self._ticks: list[TickReading | None] = [None] * count
         self._counts = [RebootCount() for _ in range(count)]
 
     def read(self, index: int) -> Transaction | None:
-        """Return the read of a servo's Realtime Tick; None if it does not have one."""
+        """Return the transaction that reads a servo's Realtime Tick; None if the model does not have it."""
         one = self._life.reach(index)
         item = one.items.get("realtime_tick")
         return None if item is None else one.reading(item.address, item.size)
 
     def tick(self, index: int) -> Program[bool]:
-        """Read a servo's Realtime Tick; return True if it shows a reboot, which is counted.
+        """Read a servo's Realtime Tick and compare it with the last reading; return True if it shows a
+        reboot, which is counted.
 
         For a watched servo without Realtime Tick: return True if its LED is off.
         """
@@ -104,7 +106,9 @@ class Reboots:
         return True
 
     def watch(self, index: int) -> Program[bool]:
-        """Make sure that `tick` detects every reboot from now on; return True if there was one before."""
+        """Read Realtime Tick, or light the LED, so that a later `tick` detects a reboot; return True if this
+        read shows a reboot.
+        """
         lamp = self._lamp(index)
         if lamp is not None and self._lit[index] is None:
             self._lit[index] = yield from self._lamp_is(index)
@@ -115,20 +119,22 @@ class Reboots:
         return (yield from self.tick(index))
 
     def unwatch(self, index: int) -> Program[None]:
-        """Switch off the LED that `watch` lit."""
+        """Switch off the LED of a servo that `watch` lit; a LED that was lit before stays lit."""
         before, lamp = self._lit[index], self._lamp(index)
         self._lit[index] = None
         if before == 0 and lamp is not None:
             yield from self._life.reach(index).write_bytes(lamp, b"\0")
 
     def _lamp(self, index: int) -> int | None:
-        """Return the address of the LED of a servo without Realtime Tick; None if it has no LED."""
+        """Return the address of the LED that shows a reboot; None for a servo with Realtime Tick or without
+        LED.
+        """
         one = self._life.reach(index)
         item = None if "realtime_tick" in one.items else one.items.get("led", one.items.get("led_red"))
         return None if item is None else item.address
 
     def _lamp_is(self, index: int) -> Program[int | None]:
-        """Read the LED; None if the read failed."""
+        """Read the LED of a servo; None if it has none or the read failed."""
         lamp = self._lamp(index)
         if lamp is None:
             return None
@@ -136,7 +142,9 @@ class Reboots:
         return reply.parameters[0] if reply.answered else None
 
     def judge(self, index: int, reply: Reply) -> bool | None:
-        """Return True if a reply with Realtime Tick shows a reboot; None if it cannot be decided."""
+        """Compare a reply with Realtime Tick with the last reading; return True for a reboot, which is
+        counted, None if undecided.
+        """
         if self.read(index) is None or not reply.answered:
             return None
         before, now = self._ticks[index], TickReading.of(reply)
@@ -147,7 +155,7 @@ class Reboots:
         return rebooted
 
     def count(self, index: int) -> None:
-        """Report a reboot, and count it unless a client requested it."""
+        """Log a reboot of a servo, and count it toward TOO_MANY_REBOOTS unless a client requested it."""
         life, loss = self._life, self._life.losses.get(index)
         if loss is not None:
             loss.rebooted, loss.had_torque = True, False
@@ -161,5 +169,5 @@ class Reboots:
         life.report(index, event)
 
     def exhausted(self, index: int) -> bool:
-        """Return True if a servo rebooted so often that no policy gives it torque any more."""
+        """Return True if a servo rebooted so often that no policy gives it torque any more in this run."""
         return self._counts[index].exhausted

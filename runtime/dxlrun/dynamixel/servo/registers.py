@@ -1,4 +1,4 @@
-"""Settings of a servo: read, written only if they differ, and read back.
+"""Registers: writes the settings of a servo only if they differ, and reads them back; texts of values.
 
 EEPROM wears. A servo of Protocol 2.0 refuses to write it while it holds torque (e-Manual XM430-W350, Control
 Table of EEPROM Area), so it is never written then.
@@ -20,8 +20,9 @@ _RELEASE = "switch its torque off and start again, without --take-over"
 
 
 def read_registers(one: ItemAccess, registers: Sequence[RegisterValue]) -> Program[dict[str, int | None]]:
-    """Read registers of one servo; return the integers on the wire by item, None for those without an
-    answer."""
+    """Read registers of one servo or device; return the integers on the wire by name, None for those without
+    an answer.
+    """
     present: dict[str, int | None] = {}
     for register in registers:
         reply = yield from one.read_bytes(register.address, register.size)
@@ -31,9 +32,11 @@ def read_registers(one: ItemAccess, registers: Sequence[RegisterValue]) -> Progr
 
 
 def settle(one: ItemAccess, registers: Sequence[RegisterValue], found: Findings) -> Program[dict[str, int]]:
-    """Write the registers that differ and read them back; return the previous values by item.
+    """Write the registers that differ from their desired values and read them back; return the values before,
+    by name.
 
-    Nothing is written if one of them cannot be read, or if a closed EEPROM prevents one of the writes.
+    Problems go to `found`. Nothing is written if one register cannot be read, or if a closed EEPROM prevents
+    one of the writes.
     """
     present = yield from read_registers(one, registers)
     before = {name: found for name, found in present.items() if found is not None}
@@ -56,23 +59,27 @@ def settle(one: ItemAccess, registers: Sequence[RegisterValue], found: Findings)
 
 
 def settle_bus(plan: BusPlan, found: Findings) -> Program[None]:
-    """Write the settings of all servos of a bus; a failure does not prevent the next servo."""
+    """Write the settings of the robot file to all servos of a bus; problems go to `found` and do not stop the
+    next servo.
+    """
     for servo in plan.servos:
         yield from settle(first_reach(plan, servo), servo.settings, found)
 
 
 def merged(registers: Sequence[RegisterValue], newer: RegisterValue) -> tuple[RegisterValue, ...]:
-    """Return registers with one of them replaced, or with a new one at the end."""
+    """Return `registers` with `newer` in place of the register of that name, or at the end."""
     return tuple({**{one.name: one for one in registers}, newer.name: newer}.values())
 
 
 def tripped(item: ControlItem, raw: int) -> bool:
-    """Return True if a value is that of a Bus Watchdog that timed out and stopped its servo."""
+    """Return True if the item is the Bus Watchdog and its value means that it timed out and stopped its
+    servo.
+    """
     return item.name == "bus_watchdog" and raw in (-1, (1 << 8 * item.size) - 1)
 
 
 def shown(item: ControlItem, raw: int) -> str:
-    """Return a value of an item for messages; the value of a tripped Bus Watchdog is `255 (tripped)`.
+    """Return a value of an item as text for messages; a tripped Bus Watchdog gives `255 (tripped)`.
 
     e-Manual XM430-W350, Bus Watchdog (98): -1 is "Bus Watchdog Error Status".
     """
@@ -80,7 +87,9 @@ def shown(item: ControlItem, raw: int) -> str:
 
 
 def meaning(item: ControlItem, value: int, errors: HardwareErrors) -> str:
-    """Return a value of an item with its unit, or its hardware errors in words; empty if it has neither."""
+    """Return the meaning of an item's raw value: the quantity with unit, or hardware errors in words; empty
+    if it has neither.
+    """
     if tripped(item, value):
         return "tripped"
     if item.name == errors.item:

@@ -1,4 +1,4 @@
-"""Requests of clients for single servos of one bus: torque on or off and reboot, executed in idle time.
+"""Requests of clients for single servos of one bus: torque on, torque off and reboot, executed in idle time.
 
 Torque is switched on as for a returning servo: check, registers, mode, goal := measured position, torque,
 read back, Bus Watchdog. The loop's goal also becomes the measured position. A servo whose torque a client
@@ -26,7 +26,9 @@ from dxlwire.wire import protocol2
 
 
 class Requests:
-    """Torque switches and reboots that clients request for the servos of one bus; each is answered once."""
+    """Executes clients' torque and reboot requests for the servos of one bus; `done` receives the problem of
+    each, once.
+    """
 
     def __init__(self, offline: Offline) -> None:
         self._offline = offline
@@ -35,14 +37,18 @@ class Requests:
         self._desired = offline.desired
 
     def torque_off(self, index: int, done: Done) -> None:
-        """Switch a servo's torque off and keep it off; an offline servo follows when it is back."""
+        """Switch a servo's torque off until a client requests it again; an offline servo gets torque off when
+        it is back.
+        """
         if self._life.on(index, ServoEvent.RELEASE) is ServoState.RELEASED:
             self._offline.switch_off(index, done)
         else:
             done(f"{self._life.name(index)} does not answer: its torque stays off when it is back")
 
     def torque_on(self, index: int, done: Done) -> None:
-        """Switch a limp servo's torque on at its present position."""
+        """Switch a limp servo's torque on at its present position; a servo that already has torque only
+        confirms it.
+        """
         state = self._life.states[index]
         if state is ServoState.OFFLINE:
             done(f"{self._life.name(index)} does not answer")
@@ -52,7 +58,7 @@ class Requests:
         self._life.do(index, self._torque_on(index, done), "torque on")
 
     def reboot(self, index: int, done: Done) -> None:
-        """Reboot a servo of Protocol 2.0; it returns with torque if it has torque now."""
+        """Reboot a servo of Protocol 2.0; it gets torque again when it is back if it has torque now."""
         one = self._life.reach(index)
         if "reboot" not in one.table.capabilities:
             done(f"{one} knows no reboot instruction: switch its power off and on")
@@ -94,7 +100,9 @@ class Requests:
         return f"{name} did not confirm its torque; ask again when it answers"
 
     def _hold(self, index: int) -> Program[tuple[str, Mode]]:
-        """Check, set up and hold a limp servo; return the problem, without the servo's name, and its mode."""
+        """Check a limp servo, write its registers and mode, and switch its torque on; return (problem without
+        the servo's name, mode).
+        """
         one, name, found = self._life.reach(index), f"{self._life.name(index)} ", Findings()
         yield from self._reboots.tick(index)
         yield from watchdog.disarm(one)

@@ -1,4 +1,4 @@
-"""Servos of one bus from cycle to cycle: lost replies, errors, alerts, and reads in idle time.
+"""Servos of one bus in every cycle: lost replies, errors, alerts, and reads in idle time.
 
 Each of them becomes an event of the state machine in `life.py`, and an event of the log if a person should
 know.
@@ -36,16 +36,21 @@ from dxlwire.wire.dialect import dialect_of
 NOISE_EVENT_NS = 1_000_000_000  # shortest time between two events about a noisy line
 UNREQUESTED_EVENT_NS = 10_000_000_000
 LEAST_UNREQUESTED = 2
-"""Unexplained packets that cause an event: an instruction of another host, and the reply to that. A single
-one can be noise that looks like a packet: the checksum of Protocol 1.0 is one byte [i]."""
+"""Number of unexplained packets that causes an event: an instruction of another host, and the reply to that.
+A single one can be noise that looks like a packet: the checksum of Protocol 1.0 is one byte [i].
+"""
 ALERT_AGAIN = 50
-"""Cycles between two reads of a persistent alert: a second error does not change the alert bit."""
+"""Cycles between two reads of the hardware error while an alert bit stays set: a second error does not change
+the bit.
+"""
 _RESTING = frozenset((ServoState.TORQUED, ServoState.LIMP, ServoState.RELEASED))
 CAUGHT_UP = 0.05  # rad; a returning servo this close to its goal has caught up
 
 
 class Servos:
-    """The servos of one bus: their life, cyclic reads, goals and desired state."""
+    """Supervises the servos of one bus: creates and owns their state machine, cyclic reads, goals and desired
+    state.
+    """
 
     def __init__(
         self,
@@ -55,7 +60,7 @@ class Servos:
         parts: FeatureParts,
         events: EventSink,
     ) -> None:
-        """Create the parts; `parts` are the features, which also get a part on the bus."""
+        """Create the objects of the bus and its features' parts, from `parts`, the features of the robot."""
         plan, count = idle.plan, len(idle.plan.servos)
         self._plan = plan
         self._bus = idle.bus
@@ -69,15 +74,15 @@ class Servos:
         self._every_fresh = b"\1" * count
         self.goals = GoalArrays(plan)  # builds the sync write
         self.reads = CyclicReads(plan, samples, idle.bus.owed)
-        """The job that reads every servo and every device once."""
+        """Reads the states of all servos and devices once a cycle."""
         self._parts = parts.attach(idle, self.reads, samples, events)
-        """Parts of features on this bus, in the order of the features."""
+        """Parts that features have on this bus, in the order of the features."""
         self.life = Life(idle, self.reads, events, self._parts)  # The state of each servo
         self._reboots = Reboots(self.life)
         self.desired = DesiredState(self.life, self.goals, self._reboots, states.mode)
-        """Desired modes and registers of the servos."""
+        """Modes and registers that the servos should have."""
         self.watchdogs = WatchdogMonitor(self.life, self.desired)
-        """Monitor of the Bus Watchdogs."""
+        """Detects pauses that trip the servos' Bus Watchdogs."""
         self._offline = Offline(self.life, self._reboots, self.desired)
         self.requests = Requests(self._offline)  # clients' requests: torque and reboots
         self._slow = SlowReads(self.life, self._reboots, states)
@@ -97,7 +102,7 @@ class Servos:
 
     @property
     def silent(self) -> list[str]:
-        """Names of the servos whose newest reply did not arrive."""
+        """Labels of the servos whose newest read got no valid reply."""
         servos = zip(self._plan.servos, self.reads.missed, strict=False)  # the devices follow the servos
         return [self._plan.label(servo) for servo, missed in servos if missed]
 
@@ -105,26 +110,31 @@ class Servos:
 
     @property
     def limits(self) -> Mapping[int, Sequence[ServoLimit]]:
-        """Registers that limit the goals of each servo, by row of its joint."""
+        """Registers that limit the goals of each servo, in joint units, by row of the servo's joint."""
         return {
             row: servo_limits(self.life.reach(index), self.goals.own_limits[index])
             for index, row in enumerate(self._rows)
         }
 
     def engaged(self) -> None:
-        """Mark each servo as holding or limp, according to the torque state read back at start-up."""
+        """Mark each servo as HOLDING or, if the robot file starts it limp, RELEASED, after torque was
+        switched on at start-up.
+        """
         for index, servo in enumerate(self._plan.servos):
             self.life.on(index, ServoEvent.ENGAGED if servo.torque_at_start else ServoEvent.RELEASE)
 
     def confirmed(self) -> None:
-        """Start sending goals to every servo with torque, which was read again after the first states."""
+        """Start sending goals to every servo that start-up gave torque; call it after a second read confirmed
+        the torque.
+        """
         for index, servo in enumerate(self._plan.servos):
             if servo.torque_at_start:
                 self.life.on(index, ServoEvent.TORQUE_ON)
             self.desired.entered(index, servo.start_mode)
 
     def watch(self, found: Findings) -> Program[None]:
-        """Read every servo's Realtime Tick for the first time, and arm the Bus Watchdogs.
+        """Read every servo's Realtime Tick for the first time, and arm the Bus Watchdogs; problems go to
+        `found`.
 
         This is the last step of start-up: from now on the exchange must not stop.
         """
@@ -133,25 +143,29 @@ class Servos:
         yield from self.watchdogs.arm(found)
 
     def withhold_goals(self) -> None:
-        """Stop sending goals, because torque is being switched off."""
+        """Stop sending goals to all servos of the bus, because torque is being switched off."""
         for index in range(len(self._rows)):
             self.life.on(index, ServoEvent.DOUBT)
 
     def show_torque(self, torque: NDArray[np.uint8]) -> None:
-        """Write a Torque per servo into the rows of these servos, shape (joints,)."""
+        """Copy the Torque value of each servo into its row of `torque`, the array of the robot's states,
+        shape (joints,).
+        """
         torque[self._rows] = self.life.torque
         self.life.torque_changed = False
 
     # The line
 
     def lost(self, text: str) -> None:
-        """Report once that the line is lost."""
+        """Report that the serial line is lost, once until `found`; `text` names bus and error."""
         if not self._line_lost:
             self._line_lost = True
             self._events.emit(self._plan.name, texts.line_lost(text))
 
     def found(self) -> None:
-        """Report that the line is back. Its servos had no host, and may have had no power."""
+        """Report that the serial line is back, and treat all its servos as lost: they had no host, and may
+        have had no power.
+        """
         self._line_lost = False
         for index in range(len(self._rows)):
             self.life.lose(index).kept_goal = False
@@ -179,7 +193,9 @@ class Servos:
     # A cycle
 
     def settle(self, now_ns: int) -> None:
-        """Report changes that this cycle's replies show."""
+        """Evaluate the replies of a cycle: count lost replies, report error bytes, and call the features'
+        parts.
+        """
         if self._samples.fresh.tobytes() != self._every_fresh or any(self.reads.missed):
             self._count_losses(now_ns)
         for part in self._parts:
@@ -188,9 +204,9 @@ class Servos:
             self._report_errors()
 
     def prepare_goals(self, goals: Commands, states: States) -> None:
-        """Lift the speed limit of returning servos that are close to their goals again.
+        """Remove the speed limit of returning servos that are closer than CAUGHT_UP to their goals.
 
-        A servo that follows no position has no goal to catch up with.
+        A servo that follows no position counts as close.
         """
         if ServoState.RETURNING not in self.life.states:
             return
@@ -200,7 +216,8 @@ class Servos:
                 self.life.on(index, ServoEvent.CAUGHT_UP)
 
     def follow_goals(self, index: int) -> None:
-        """Start sending goals to a servo that was given torque, once its torque has been read again."""
+        """Resume sending goals to a servo that was given torque, once its torque enable has been read
+        again."""
         if self.life.states[index] is ServoState.GIVEN:
             self.life.on(index, ServoEvent.ANCHORED)
 
@@ -250,9 +267,10 @@ class Servos:
 
     @property
     def at_rest(self) -> bool:
-        """True if nothing needs attention before `due_ns`, as long as replies come as planned.
+        """True if this bus needs no work beyond plain reads and writes before `due_ns`, as long as replies
+        come as planned.
 
-        A feature's part is called in each cycle, because it may have commands.
+        Always False with a feature's part, which is called in each cycle because it may have commands.
         """
         return not (
             self._bus.failure is not None
@@ -269,7 +287,7 @@ class Servos:
 
     @property
     def due_ns(self) -> int:
-        """Time at which the next periodic work in idle time is due."""
+        """Time (ns) at which the next read of a slow register is due."""
         return self._slow.due_ns
 
     @property
@@ -278,16 +296,18 @@ class Servos:
         return bus.noise_bytes > self._noise_seen or bus.unrequested > self._unrequested_seen
 
     def abandon(self) -> None:
-        """Answer clients' requests that have timed out, while the line is lost."""
+        """Fail clients' reboot requests that have timed out, while the line is lost and no other work can
+        run.
+        """
         if not self.life.calm:
             self._offline.expire()
 
     def look(self, time_ns: int) -> None:
-        """Schedule the reads that are due in addition to the cyclic reads, one servo at a time.
+        """Report noise, and schedule the reads and probes that are due in idle time, one servo at a time.
 
-        These are the hardware error of a servo that raised an alert, the torque limit of a servo that may
-        have shut down, and torque enable of a servo that waits for its goals. Only a servo that answers is
-        read.
+        The reads are the hardware error of a servo that raised an alert, the torque limit of a servo that may
+        have shut down, torque enable of a servo that waits for its goals, and slow registers. Only a servo
+        that answers is read.
 
         Args:
             time_ns: Controllers' time of the coming cycle, for the parts of features.
@@ -304,7 +324,7 @@ class Servos:
             self.life.do(index, program, what)
 
     def _due(self) -> tuple[int, str, Program[None]] | None:
-        """Return the next servo to read, the name of the item, and the program; None: nothing is due."""
+        """Return (servo, name of the item, program) of the most urgent extra read; None: nothing is due."""
         if any(self._reported_errors) or self._alert_cycles:
             self._repeat_alerts()
         servos, fresh = self._plan.servos, self._samples.fresh
@@ -326,7 +346,9 @@ class Servos:
         return None
 
     def _repeat_alerts(self) -> None:
-        """Schedule another read of the hardware error for persistent alerts, every `ALERT_AGAIN` cycles."""
+        """Request another read of the hardware error of servos whose alert bit stays set, every `ALERT_AGAIN`
+        cycles.
+        """
         bit = self._dialect.ALERT
         standing = [index for index, error in enumerate(self._reported_errors) if error & bit]
         self._alert_cycles = self._alert_cycles + 1 if standing else 0
@@ -340,7 +362,9 @@ class Servos:
         return reply
 
     def _read_torque(self, index: int) -> Program[None]:
-        """Read torque enable: a servo with torque gets goals again, one without gets none."""
+        """Read torque enable of a servo in doubt: with 1 it gets goals again, otherwise it counts as limp or
+        lost.
+        """
         read = self.life.reach(index).reading(self._plan.servos[index].torque_address, 1)
         reply = yield from self._read(read)
         if not reply.answered or index in self._strained or self.life.states[index] not in IN_DOUBT:
@@ -357,8 +381,9 @@ class Servos:
         self.life.report_limp(index, enabled)
 
     def _read_torque_limit(self, index: int, read: Transaction, name: str) -> Program[None]:
-        """Read the torque limit of a servo of Protocol 1.0: 0 means a shutdown, although torque enable stays
-        1."""
+        """Read the torque limit of a servo of Protocol 1.0 after an error: 0 means a shutdown, although
+        torque enable stays 1.
+        """
         reply = yield from self._read(read)
         if not reply.answered:
             return
@@ -369,7 +394,9 @@ class Servos:
             self.life.report(index, texts.servo_shut_down(self.life.name(index), name))
 
     def _read_hardware_error(self, index: int, read: Transaction) -> Program[None]:
-        """Read and report a new hardware error; its shutdown may have cut the torque."""
+        """Read the hardware error of a servo with an alert and report it if it is new; its shutdown may have
+        cut the torque.
+        """
         reply = yield from self._read(read)
         if not reply.answered:
             return

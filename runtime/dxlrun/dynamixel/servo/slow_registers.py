@@ -1,4 +1,6 @@
-"""Slow registers: registers that change slowly, read in turn in idle time."""
+"""Slow registers: temperature, voltage and other registers that change slowly, read block by block in idle
+time.
+"""
 
 from __future__ import annotations
 
@@ -20,7 +22,8 @@ _Block = tuple[ControlItem, ...]  # adjacent items, read by one instruction; emp
 
 
 class SlowReads:
-    """Reads one block of one servo at a time; each servo's registers are read once per period of the plan.
+    """Reads the slow registers of the servos of one bus, one block at a time, each once per period of the
+    plan.
 
     Temperature and voltage go into the states; other items are logged when they change. Realtime Tick is read
     as well, because it shows a reboot between two cycles.
@@ -40,11 +43,11 @@ class SlowReads:
 
     @property
     def due_ns(self) -> int:
-        """Time of the next read; NEVER while a read is waiting."""
+        """Time (ns) of the next read; NEVER while a read is waiting."""
         return NEVER if self._reading or not self._round else self._due_ns
 
     def look(self) -> None:
-        """Schedule the read of the next block if it is due; called once a cycle."""
+        """Schedule the read of the next block in idle time if it is due; called once a cycle."""
         if self._life.now_ns() < self.due_ns:
             return
         for _ in self._round:
@@ -110,7 +113,9 @@ class SlowReads:
 
 
 def _round(plan: BusPlan) -> list[tuple[int, _Block]]:
-    """Return the reads in turn: the first block of every servo, then the second blocks, then the ticks."""
+    """Return (servo, block) of all slow reads of a bus: the first block of every servo, then the second
+    blocks, then the ticks.
+    """
     if not plan.slow_period_ns:
         return []
     found: list[tuple[int, int, _Block]] = []

@@ -46,27 +46,31 @@ from dxlwire.plan.retry import (
 from dxlwire.transaction import Program, Result
 
 GROUP = 3
-"""Servos that get torque between two pauses: eight at once could pull the supply down."""
+"""Number of servos that get torque between two pauses: eight at once could pull the supply down."""
 GROUP_PAUSE_NS = 20_000_000
 RETURN_DELAY_STEP_NS = 2_000  # unit of Return Delay Time (e-Manual AX-12A (5), XM430-W350 (9))
 _SOME = 8
-"""Fewest replies for a judgement of their usual lateness: three pings per servo, and its model."""
+"""Fewest replies from which a bus's usual lateness is judged: three pings per servo, and its model."""
 
 
 Stage: TypeAlias = Callable[[BusPlan, Findings], Program[Result]]
-"""Creates the program of a stage for one bus; the program adds its findings."""
+"""Creates the program of one start-up stage for one bus; the program adds its problems and events to the
+findings.
+"""
 
 
 class Probed(msgspec.Struct):
-    """Measured properties of the cyclic reads of one bus."""
+    """Properties of the cyclic reads of one bus that start-up has measured."""
 
     return_delays: dict[int, int] = {}  # return delay of each servo, by ID, ns
     refused: dict[int, str] = {}
-    """Groups that do not answer the fast form, with the reason, a sentence without its subject."""
+    """Groups that do not answer the fast sync or bulk read, by number in the plan, with the reason, a
+    sentence without its subject.
+    """
 
 
 class StartUp:
-    """Runs each stage on all lines.
+    """Start-up of all servos of a robot: runs each stage on all lines in parallel.
 
     A stage raises StartUpError with all of its problems, or PortError if a line is gone.
     """
@@ -80,10 +84,12 @@ class StartUp:
         self._events = events
         self._features = features
         self._times = [ReplyTimes() for _ in lines.plans]
-        """Lateness of the replies on each bus."""
+        """Lateness of the replies on each bus, from which slow adapters are found."""
 
     def look(self, take_over: bool) -> None:
-        """Check every servo, bring registers and modes to the plan, and learn the servos' return delays."""
+        """Check every servo, write registers and modes as planned, and read the servos' return delays; torque
+        is not switched on.
+        """
         found = [Findings() for _ in self._plans]
         self._run(lambda plan, found: survey(plan, take_over, found), found)
         for _, stage in stages(BusStage, self._features):
@@ -100,7 +106,9 @@ class StartUp:
         self.stage(watchdog.disarm_all)
 
     def engage(self, goals: Commands) -> None:
-        """Hold every servo at its present position, and set the goals to these positions."""
+        """Switch torque on at the present position of every servo that starts with torque, and set `goals` to
+        these positions.
+        """
         engaged = self.stage(_engage)
         for plan, servos, ticks in zip(self._plans, self._servos, engaged, strict=True):
             servos.engaged()
@@ -114,7 +122,7 @@ class StartUp:
                 self._events.emit(plan.name, texts.joints_start_limp(limp))
 
     def confirm(self) -> None:
-        """Read torque enable of every servo again, and start sending goals.
+        """Read torque enable of every servo again, and start sending goals to those with torque.
 
         Torque on draws current. A servo that browned out answers again, but limp, and must not get a goal.
         """
@@ -123,18 +131,20 @@ class StartUp:
             servos.confirmed()
 
     def watch(self) -> None:
-        """Arm the Bus Watchdogs, which stop the servos if a reply is awaited for too long."""
+        """Arm the Bus Watchdogs, which stop the servos when the host sends no instruction for too long."""
         mine = dict(zip((plan.name for plan in self._plans), self._servos, strict=True))
         longer_ns = [watchdog.longer_ns(plan) or LONGER_NS for plan in self._plans]
         self.stage(lambda plan, found: limit_patience(mine[plan.name].watch(found), any_age=True), longer_ns)
 
     def raise_failures(self) -> None:
-        """Raise PortError if a line is gone: a start needs every line."""
+        """Report lost lines, and raise PortError if there is one: a start needs every line."""
         if error := report_failures(self._lines, self._servos):
             raise error
 
     def _probe_reads(self) -> None:
-        """Learn the return delays, and use plain reads for each group that does not answer the fast form."""
+        """Measure the return delays, and use plain reads for each group of servos that does not answer the
+        fast form.
+        """
         probes = self.stage(_probe_reads)
         for plan, servos, probed in zip(self._plans, self._servos, probes, strict=True):
             servos.reads.learn(probed.return_delays)
@@ -147,7 +157,8 @@ class StartUp:
                 self._events.emit(plan.name, event)
 
     def stage(self, stage: Stage[Result], most_ns: Sequence[int] = ()) -> list[Result]:
-        """Run a stage on all lines, log its findings and raise its problems; return the result of each line.
+        """Run a stage on all lines and log its events; return its result on each line. Raise StartUpError if
+        it found problems.
 
         Args:
             stage: The stage.
@@ -163,7 +174,9 @@ class StartUp:
     def _run(
         self, stage: Stage[Result], found: Sequence[Findings], most_ns: Sequence[int] = ()
     ) -> list[Result]:
-        """Run one program per bus with longer timeouts: at start-up no cycle waits for it."""
+        """Run one program per bus with timeouts that are longer than in a cycle, which does not wait here;
+        raise PortError for a lost line.
+        """
         most_ns = most_ns or [LONGER_NS] * len(found)
         slow = [
             extend_timeouts(stage(plan, one), most, times)
@@ -180,7 +193,7 @@ class StartUp:
         _refuse((problem for one in found for problem in one.problems), for_replies=missing)
 
     def _late_replies(self) -> Iterable[str]:
-        """Yield a sentence for each bus whose replies usually come after the timeout of the cyclic reads."""
+        """Yield a sentence for each bus whose median reply comes after the timeout of the cyclic reads."""
         for plan, times in zip(self._plans, self._times, strict=True):
             late_ns = times.late_ns
             # Use the median: a few late replies may be due to the machine's load.
@@ -191,7 +204,9 @@ class StartUp:
 
 
 def report_failures(lines: Lines, servos: Sequence[Servos]) -> PortError | None:
-    """Report each lost line once; return the first failure."""
+    """Report each lost line to the `Servos` of its bus, which logs it once; return the first failure, None if
+    no line is lost.
+    """
     first: PortError | None = None
     for plan, bus, mine in zip(lines.plans, lines.buses, servos, strict=True):
         if bus.failure is not None:
@@ -202,7 +217,8 @@ def report_failures(lines: Lines, servos: Sequence[Servos]) -> PortError | None:
 
 
 def _engage(plan: BusPlan, found: Findings) -> Program[list[int | None]]:
-    """Hold every servo at its present position: goal := present, torque on, both read back, group by group.
+    """Switch torque on at every servo's present position: goal := present, torque on, both read back, GROUP
+    servos at a time.
 
     A servo that the robot file declares limp gets no torque, and loses torque that it has. The program ends
     at the first problem; the caller then switches torque off again.
@@ -240,7 +256,7 @@ def _let_go(one: Access) -> Program[str]:
 
 
 def _confirm(plan: BusPlan, found: Findings) -> Program[None]:
-    """Read torque enable of every servo again, after the last one got torque."""
+    """Read torque enable of every servo that starts with torque again; a value other than 1 is a problem."""
     for servo in plan.servos:
         if not servo.torque_at_start:
             continue
@@ -256,7 +272,7 @@ def _confirm(plan: BusPlan, found: Findings) -> Program[None]:
 
 
 def _probe_reads(plan: BusPlan, _: Findings) -> Program[Probed]:
-    """Read the return delay of every servo, and try the fast form on every group that is planned for it."""
+    """Read the return delay of every servo, and try the fast read on every group that is planned with it."""
     found = Probed()
     for servo in plan.servos:
         raw = yield from first_reach(plan, servo).read_one("return_delay_time")
@@ -288,7 +304,8 @@ def _why_not_fast(plan: BusPlan, servos: list[ServoPlan]) -> Program[str]:
 
 
 def _extra_ns(plan: BusPlan, refused: Mapping[int, str]) -> int:
-    """Return the additional time of a cycle if these groups are read in the plain form."""
+    """Return the additional time (ns) of a cycle if these groups are read with plain instead of fast
+    reads."""
     line, extra_ns = plan_line(plan), 0
     for number in refused:
         members = [plan.members[index] for index in plan.groups[number]]
@@ -302,7 +319,9 @@ def _refuse(problems: Iterable[str], *, for_replies: bool) -> None:
 
 
 def _first_goals(goals: Commands, servo: ServoPlan, raw: int | None) -> None:
-    """Set the goals of a servo to its present position without a speed, or to 0."""
+    """Set the goals of a servo, in its joint's row, for its start mode: present position without a speed, or
+    velocity, effort or PWM 0.
+    """
     row, mode = servo.row, servo.start_mode
     goals.position[row] = float("nan") if raw is None else servo.joint_position(raw)
     goals.velocity[row] = 0.0 if mode is Mode.VELOCITY else float("nan")

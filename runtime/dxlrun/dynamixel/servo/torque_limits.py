@@ -1,4 +1,5 @@
-"""Torque limits of servos: reduced by policies; restored at start-up, on return and after a mode change.
+"""Torque limits of servos: registers that policies reduce, restored at start-up, on a servo's return and
+after a mode change.
 
 Protocol 1.0: Torque Limit (34), whose initial value is Max Torque (14) (e-Manual AX-12A). 2.0: Goal PWM
 (100), which in position control limits the PWM, up to PWM Limit (36) (e-Manual XM430-W350); XL-320 has Torque
@@ -21,7 +22,7 @@ SILENT = "did not answer when its torque limit was read"
 
 
 def restore_torque_limits(plan: BusPlan, found: Findings) -> Program[list[int]]:
-    """Restore the torque limit of every servo of a bus at start-up, after torque on.
+    """Raise the torque limit of every servo of a bus to its own full limit at start-up, after torque on.
 
     Returns:
         The servos' own limits in ticks, in the order of the plan; 0: not known.
@@ -33,7 +34,7 @@ def restore_torque_limits(plan: BusPlan, found: Findings) -> Program[list[int]]:
 
 
 def restore_torque_limit(one: Access, mode: Mode, found: Findings) -> Program[int]:
-    """Restore the torque limit of a servo that holds its present position.
+    """Raise the torque limit of a servo that holds its present position to its own full limit.
 
     Before that, an old goal would make it spring back. A policy, a mode with an effort limit or another
     program may have lowered the limit. It is not changed in a mode that uses the register as its goal, nor in
@@ -65,7 +66,8 @@ def restore_torque_limit(one: Access, mode: Mode, found: Findings) -> Program[in
 def reduced_torque_limits(
     plan: BusPlan, full: Sequence[int], fraction: float, modes: Sequence[Mode]
 ) -> list[bytes]:
-    """Return the packets that reduce each servo to a fraction of its own limit, at least one tick.
+    """Return the packets that set the torque limit of each servo to a fraction of its own limit, at least one
+    tick.
 
     Args:
         plan: The bus.
@@ -83,8 +85,9 @@ def reduced_torque_limits(
 
 
 def limits_positions(servo: ServoPlan, mode: ModePlan) -> bool:
-    """Return True if the effort limit of a position mode is the register that policies reduce: Torque Limit
-    (34)."""
+    """Return True if the servo's effort goal in effort-position mode is written to the torque limit register
+    that policies reduce.
+    """
     place = servo.torque_limit
     return (
         mode.mode is Mode.EFFORT_POSITION
@@ -94,8 +97,9 @@ def limits_positions(servo: ServoPlan, mode: ModePlan) -> bool:
 
 
 def _limits(servo: ServoPlan, mode: Mode) -> bool:
-    """Return True if the torque limit is a limit in a mode. Where Goal PWM is the goal, a write would move
-    the servo."""
+    """Return True if the torque limit register only limits in a mode. Where it is itself the goal, as Goal
+    PWM, a write would move the servo.
+    """
     place = servo.torque_limit
     if place is None or mode is Mode.UNKNOWN:
         return False

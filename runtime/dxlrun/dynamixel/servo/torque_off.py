@@ -21,22 +21,25 @@ from dxlwire.plan.retry import limit_patience
 from dxlwire.transaction import Outcome, Program, Reply
 
 LONGER_NS = (0, 60_000_000, 180_000_000)
-"""Additional timeout of the read-back in each attempt.
+"""Additional timeout of the read-back in each attempt, ns.
 
 Noise rarely hits three times, and hosts and adapters rarely stall for so long; a cut cable always fails.
 """
 LIMIT_NS = 1_000_000_000
 LATE_NS = 20_000_000
-"""Listening time after a missing reply: a request that was sent twice is answered twice, and the log should
-have both replies."""
+"""Listening time after a missing reply, ns: a request that was sent twice is answered twice, and the log
+should have both replies.
+"""
 SETTLE_NS = 500_000
-"""Listening time for a reply that is still being sent: it would collide with the broadcast."""
+"""Listening time before torque off, ns, for a reply that is still being sent: it would collide with the
+broadcast.
+"""
 _HOLD = (Mode.POSITION, Mode.EFFORT_POSITION)
-"""Modes in which a servo holds its last goal without a host; in the other modes it keeps moving."""
+"""Modes with a position goal, which a servo holds without a host; in the other modes it keeps moving."""
 
 
 class LimpOutcome(msgspec.Struct, frozen=True):
-    """Result of torque off for one servo."""
+    """Result of torque off for one servo: confirmed by a read, or the reason why not."""
 
     bus: str
     joint: str
@@ -49,7 +52,7 @@ class LimpOutcome(msgspec.Struct, frozen=True):
 
 
 def limp(lines: Lines, deadline_ns: int | None = None) -> tuple[LimpOutcome, ...]:
-    """Drain the lines and switch torque off on every servo at once; return the result for each servo.
+    """Switch torque off on every servo of all lines and read it back; return the result for each servo.
 
     Does not raise: a lost line is part of the result.
 
@@ -67,7 +70,8 @@ def limp(lines: Lines, deadline_ns: int | None = None) -> tuple[LimpOutcome, ...
 
 
 def stand(lines: Lines) -> tuple[str, ...]:
-    """Stop every joint that has torque and follows a velocity, an effort or a PWM.
+    """Stop every servo that has torque and follows a velocity, an effort or a PWM, when a run ends with
+    torque on.
 
     A servo that does not accept a goal of 0, or whose mode cannot be read, loses its torque. Does not raise.
 
@@ -79,7 +83,8 @@ def stand(lines: Lines) -> tuple[str, ...]:
 
 
 def _limp(plan: BusPlan, now_ns: Callable[[], int], deadline_ns: int) -> Program[tuple[LimpOutcome, ...]]:
-    """Switch torque off on one bus: first with a broadcast, then servo by servo with read-back.
+    """Switch torque off on one bus: first with a broadcast, then servo by servo with read-back; return the
+    results.
 
     A servo that did not confirm is tried again after the other servos. Each servo is tried at least once, but
     none again after `deadline_ns`.
@@ -129,7 +134,9 @@ def _stand(plan: BusPlan) -> Program[list[str]]:
 
 
 def _stop(one: Access) -> Program[str | None]:
-    """Stop a servo; return the reason for a failure, empty on success, None if it needs no stop."""
+    """Stop a servo that follows no position; return the reason for a failure, empty on success, None if it
+    needs no stop.
+    """
     mode = yield from modes.mode_now(one)
     if mode in _HOLD:
         return None
@@ -142,7 +149,9 @@ def _stop(one: Access) -> Program[str | None]:
 
 
 def _off(one: Access, longer_ns: int) -> Program[tuple[Reply, Reply]]:
-    """Write torque off once and read it back; return both replies."""
+    """Write torque off to a servo once and read it back; return the acknowledgement and the reply to the
+    read.
+    """
     acknowledged = yield one.writing(one.servo.torque_address, b"\0")
     read = one.reading(one.servo.torque_address, 1)
     back = yield replace(read, timeout_ns=read.timeout_ns + longer_ns)

@@ -1,4 +1,5 @@
-"""Bus Watchdog: stops a servo of Protocol 2.0 when it receives no more instructions.
+"""Bus Watchdog: register of a servo of Protocol 2.0 that stops the servo when it receives no more
+instructions.
 
 It is armed last at start-up, because only the cyclic exchange keeps it from tripping, and disarmed at the
 end. After it has stopped a servo it reads -1, and the servo refuses goals until 0 is written (e-Manual
@@ -21,27 +22,31 @@ from dxlwire.wire.dialect import dialect_of, sync_writes
 UNIT_NS = 20_000_000  # one step of the register (e-Manual XM430-W350, Bus Watchdog (98))
 MOST_TICKS = 127  # longest timeout; higher values mean that it has tripped
 RAMP = "profile_acceleration"
-"""Register that is 0 after a watchdog stop, as is Profile Velocity (e-Manual XM430-W350, Bus Watchdog (98),
-step 4 of the example)."""
+"""Register of a servo that a watchdog stop sets to 0, as it does Profile Velocity (e-Manual XM430-W350, Bus
+Watchdog (98), step 4 of the example).
+"""
 RETURN_SPEED = 1.5
-"""rad/s. Highest speed of a returning servo toward its goal. The goal may have moved far, in a step that no
-limit has checked."""
+"""Highest speed (rad/s) of a returning servo toward its goal. The goal may have moved far, in a step that no
+limit has checked.
+"""
 _FOLLOWED = {0: "goal_current", 1: "goal_velocity", 16: "goal_pwm"}
-"""Goal register that a servo follows, by Operating Mode without a position goal (e-Manual XM430-W350, (11)).
+"""Goal register that a servo follows in the modes without a position goal, by value of Operating Mode
+(e-Manual XM430-W350, (11)).
 """
 LEAST_PERIODS = 3  # the timeout must be longer than two lost cycles (failures.md)
 
 
 def arm(one: Access) -> Program[str]:
-    """Arm a servo's watchdog if the plan requires it and the model has one; return the problem or an empty
-    string."""
+    """Write the planned timeout to a servo's Bus Watchdog; return the problem. Empty on success, or if plan
+    or model has none.
+    """
     if not has_one(one.plan, one.servo):
         return ""
     return (yield from _write(one, one.plan.watchdog_ticks))
 
 
 def disarm(one: Access) -> Program[str]:
-    """Clear a servo's watchdog if it is armed or has tripped; return the problem or an empty string.
+    """Write 0 to a servo's Bus Watchdog if it is armed or has tripped; return the problem, empty on success.
 
     This is done even if the plan requires no watchdog: an earlier run that was killed may have left it armed.
     After the clear a servo that was stopped with torque moves to its old goal [i], at full speed because its
@@ -73,24 +78,29 @@ def disarm(one: Access) -> Program[str]:
 
 
 def revive(one: Access) -> Program[str]:
-    """Clear and arm a servo's watchdog again after a pause in the instructions."""
+    """Clear a servo's tripped Bus Watchdog and arm it again, after a pause in the instructions; return the
+    problem, empty on success.
+    """
     return (yield from disarm(one)) or (yield from arm(one))
 
 
 def longer_ns(plan: BusPlan) -> int:
-    """Return the additional timeout of a reply that armed servos tolerate."""
+    """Return by how much (ns) the timeout of a reply may be extended without tripping the Bus Watchdogs; 0 if
+    none is planned.
+    """
     return plan.watchdog_ticks * UNIT_NS // 3
 
 
 def disarm_all(plan: BusPlan, found: Findings) -> Program[None]:
-    """Clear the watchdog of every servo of a bus, before torque on."""
+    """Clear the Bus Watchdog of every servo of a bus before torque on; problems go to `found`."""
     for servo in plan.servos:
         if problem := (yield from disarm(reach(plan, servo))):
             found.problems.append(problem)
 
 
 def release_all(plan: BusPlan) -> Program[list[str]]:
-    """Disarm the servos of a bus that keep holding; return a sentence for each servo that was not disarmed.
+    """Disarm the Bus Watchdogs of a bus whose servos keep their torque after the run; return a sentence for
+    each servo not disarmed.
 
     A servo that its watchdog has stopped stays stopped: after a clear it would move to its old goal [i], at
     full speed because its profile was reset, without a loop that could stop it. A servo that does not answer
@@ -120,7 +130,9 @@ def release_all(plan: BusPlan) -> Program[list[str]]:
 
 
 def to_all(plan: BusPlan, servos: Sequence[ServoPlan], ticks: int) -> list[bytes]:
-    """Return the packets that write the same timeout to servos; empty if the plan requires no watchdog."""
+    """Return the packets that write one Bus Watchdog timeout (in steps of UNIT_NS) to all these servos; empty
+    if none is planned.
+    """
     if not plan.watchdog_ticks:
         return []
     items = [(servo.servo_id, item) for servo in servos if (item := item_of(plan, servo))]
@@ -129,12 +141,12 @@ def to_all(plan: BusPlan, servos: Sequence[ServoPlan], ticks: int) -> list[bytes
 
 
 def has_one(plan: BusPlan, servo: ServoPlan) -> bool:
-    """Return True if the plan arms a servo's watchdog."""
+    """Return True if the plan arms the Bus Watchdog of this servo, which then has one."""
     return bool(plan.watchdog_ticks) and item_of(plan, servo) is not None
 
 
 def item_of(plan: BusPlan, servo: ServoPlan) -> ControlItem | None:
-    """Return the watchdog item of a servo; None if the model has none."""
+    """Return the Bus Watchdog item of a servo's control table; None if the model has none."""
     return find_table(servo.model, plan.protocol).items.get("bus_watchdog")
 
 

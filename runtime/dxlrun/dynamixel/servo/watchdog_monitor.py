@@ -1,5 +1,6 @@
 """Watchdog monitor: detects pauses in the instructions on a bus that trip the Bus Watchdogs, and revives the
-servos."""
+servos.
+"""
 
 from __future__ import annotations
 
@@ -14,7 +15,9 @@ from dxlwire.transaction import Program
 
 
 class WatchdogMonitor:
-    """Keeps the time of the last packet to the servos of one bus, which the exchange kernel checks, too."""
+    """Keeps the time of the last packet to the servos of one bus, which the exchange kernel checks, too.
+    After a pause longer than the watchdogs' timeout it revives the servos.
+    """
 
     def __init__(self, life: Life, desired: DesiredState) -> None:
         self._life = life
@@ -22,11 +25,13 @@ class WatchdogMonitor:
         self._words = life.idle.bus.words
         self._words[SILENCE_NS] = life.plan.watchdog_ticks * watchdog.UNIT_NS
         self._reviving: set[int] = set()
-        """Servos whose revival already waits for idle time; a second late cycle must not schedule it again.
+        """Indices of servos whose revival already waits for idle time; a second late cycle must not schedule
+        it again.
         """
 
     def arm(self, found: Findings) -> Program[None]:
-        """Arm every servo and read it back, at the end of start-up.
+        """Arm the Bus Watchdog of every servo and read it back, at the end of start-up; problems go to
+        `found`.
 
         All servos are armed at once, and again before each read-back, so none trips while the other servos
         are read. A servo that is being revived receives instructions all the time.
@@ -51,7 +56,9 @@ class WatchdogMonitor:
                 self._words[ASKED_NS] = life.now_ns()
 
     def sent(self, now_ns: int) -> None:
-        """Record that the servos are sent a packet now, and revive them if the pause before was too long."""
+        """Record that packets are sent to the servos now. If the pause before tripped their watchdogs, revive
+        the servos.
+        """
         words = self._words
         if not (words[SILENCE_NS] and words[ASKED_NS]):
             return
@@ -78,7 +85,9 @@ class WatchdogMonitor:
             life.events.emit(plan.name, texts.watchdog_stopped_servos(silent_ms))
 
     def _revive(self, index: int) -> Program[None]:
-        """Restore the desired registers that the watchdog stop reset, then clear and arm the watchdog."""
+        """Program for one stopped servo: restore the desired registers that the stop reset, then clear and
+        arm its watchdog.
+        """
         life, one, found = self._life, self._life.reach(index), Findings()
         ramp = [each for each in self._desired.settings(index) if each.name == watchdog.RAMP]
         yield from settle(one, ramp, found)

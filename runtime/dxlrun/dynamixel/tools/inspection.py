@@ -1,4 +1,6 @@
-"""Inspection before a run: connected models and the problems that a start would find; nothing is written."""
+"""Inspection before a run: reads the connected models, and finds the problems that a start would find;
+nothing is written.
+"""
 
 from __future__ import annotations
 
@@ -35,7 +37,7 @@ NO_JOINTS: Mapping[int, JointPlan] = {}
 
 
 class Identity(msgspec.Struct, frozen=True):
-    """Result of the identification of one joint's servo; either `model` or `problem` is empty."""
+    """Result of reading the model of one joint's servo; either `model` or `problem` is empty."""
 
     joint: str
     model: str  # name of the control table
@@ -43,7 +45,7 @@ class Identity(msgspec.Struct, frozen=True):
 
 
 class RegisterRow(msgspec.Struct, frozen=True):
-    """One declared register and its value in the servo."""
+    """One register that the robot file declares, with its value in the servo."""
 
     joint: str
     item: str
@@ -55,7 +57,7 @@ class RegisterRow(msgspec.Struct, frozen=True):
 
 
 class DeviationRow(msgspec.Struct, frozen=True):
-    """One setting of a servo that differs from the factory's and that a start reports."""
+    """One setting of a servo that differs from the factory's and that a start would report."""
 
     joint: str
     servo: str  # `ID 4 on bus main`
@@ -68,7 +70,7 @@ class DeviationRow(msgspec.Struct, frozen=True):
 
 
 class Found(msgspec.Struct):
-    """Values read from the servos, in the order of the plans."""
+    """Result of an inspection of all servos of a robot, in the order of the plans."""
 
     compared: int = 0  # number of servos that were compared with the file
     registers: list[RegisterRow] = []
@@ -78,14 +80,15 @@ class Found(msgspec.Struct):
 
     @property
     def as_declared(self) -> bool:
-        """True if a run would start and would not write a register."""
+        """True if a run would start and would write no register."""
         return not self.problems and all(row.found == row.declared for row in self.registers)
 
 
 def read_models(
     buses: Sequence[BusPlan], joints: Sequence[str], packets: Mapping[str, PacketSink] = NOWHERE
 ) -> Mapping[str, str]:
-    """Read the models of servos with `model: auto`; open their ports and close them again.
+    """Read which model each servo with `model: auto` in the robot file is; open the ports and close them
+    again.
 
     Args:
         buses: Plans of the lines.
@@ -113,7 +116,8 @@ def look(
     packets: Mapping[str, PacketSink] = NOWHERE,
     joints: Mapping[int, JointPlan] = NO_JOINTS,
 ) -> Found:
-    """Check every servo and every declared register as a start does; open the ports and close them again.
+    """Check every servo and every declared register as a start does, without writing; open the ports and
+    close them again.
 
     Args:
         buses: Plans of the lines.
@@ -139,7 +143,8 @@ def look(
 
 
 def compare_servos(tool: ToolLine, plan: BusPlan, servos: Sequence[ServoPlan]) -> Findings:
-    """Compare servos with the robot file, as a start does, and with `stored_registers`. Writes nothing.
+    """Compare connected servos of one bus with the robot file, as a start does, and with `stored_registers`.
+    Writes nothing.
 
     Args:
         tool: The line of their bus.
@@ -177,10 +182,10 @@ def _compare_servos(plan: BusPlan, servos: Sequence[ServoPlan]) -> Program[Findi
 
 
 def stored_registers(table: ControlTable, plan: BusPlan, servo: ServoPlan) -> tuple[RegisterValue, ...]:
-    """Return the registers that belong in the EEPROM of a servo: its own, and the return delay time of its
-    bus.
+    """Return the EEPROM registers that a servo should have: those that the robot file declares, and the
+    return delay of its bus.
 
-    Every run writes the RAM registers.
+    RAM registers are omitted, because every run writes them.
     """
     declared = [one for one in servo.settings if one.eeprom]
     item = table.items.get("return_delay_time")
@@ -198,7 +203,7 @@ def identify(
     clock: Clock,
     packets: Mapping[str, PacketSink] = NOWHERE,
 ) -> Mapping[str, Identity]:
-    """Read the model numbers of the servos of some joints; return their models, by joint.
+    """Read the model numbers of the servos of these joints; return model or problem of each, by joint.
 
     The plans can have any model of the bus' protocol: only ports, IDs and times are used.
 
@@ -216,7 +221,8 @@ def _run(
     clock: Clock,
     packets: Mapping[str, PacketSink],
 ) -> list[Result]:
-    """Run one program per bus with longer timeouts; raise PortError if a line is gone."""
+    """Run one program per bus with longer timeouts and return the results; raise PortError if a line is
+    gone."""
     lines = Lines(plans, ports, clock, [packets.get(plan.name) or PacketSink() for plan in plans])
     found = lines.run([extend_timeouts(program) for program in programs])
     if lines.failure is not None:
@@ -241,7 +247,9 @@ def _look(plan: BusPlan, joints: Mapping[int, JointPlan]) -> Program[Found]:
 
 
 def _tighter_limits(one: Access, joint: JointPlan | None) -> Program[list[str]]:
-    """Return a sentence for each register of a servo that is tighter than the limits of its joint."""
+    """Return a sentence for each limit register of a servo that is tighter than the limits of its joint in
+    the robot file.
+    """
     if joint is None:
         return []
     limits = servo_limits(one, (yield from read_limits(one)))

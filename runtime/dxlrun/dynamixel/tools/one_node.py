@@ -1,4 +1,4 @@
-"""Node of a tool: one servo or device on a tool's line, whose items are read and written.
+"""Base of the tools for one servo or device on a port: reads and writes its items.
 
 The programs are those of a run: registers are compared, only differences are written, and each is read back.
 """
@@ -23,19 +23,21 @@ from dxlwire.plan.retry import extend_timeouts
 from dxlwire.transaction import Outcome, Program, Result
 
 Confirm: TypeAlias = Callable[[str], bool]
-"""Asks for confirmation of a change before it is made."""
+"""Asks the user the question in its argument before a change; returns True if the change may be made."""
 
 
 def agree(question: str) -> bool:
-    """Confirm every change."""
+    """Default of `Confirm`: return True without asking."""
     return True
 
 
 class OneNode:
-    """The servo or device that a tool works on. Its methods block, and raise ServoFault or PortError."""
+    """The servo or device that a tool works on. Its methods block; they raise ServoFault for a problem of the
+    node, PortError for a lost line.
+    """
 
     NOT_SET: ClassVar[Mapping[str, str]] = MappingProxyType({})
-    """Reason why an item is not set like other items, with the alternative, by its name."""
+    """Items that a tool must not set as plain registers, by name, with the reason and the alternative."""
 
     def __init__(self, tool: ToolLine, found: FoundServo, table: Table) -> None:
         self.tool = tool
@@ -45,34 +47,39 @@ class OneNode:
 
     @property
     def called(self) -> str:
-        """Name of the node in messages."""
+        """Name of the node in messages: model, ID and rate."""
         return f"{self.table.model}, ID {self.servo_id} at {self.baud_rate} bit/s"
 
     @property
     def command(self) -> str:
-        """Start of a command line for the node."""
+        """Start of the `dxlrun servo` command line for the node, with port and ID."""
         return f"dxlrun servo {self.tool.port.name} {self.servo_id}"
 
     @property
     def access(self) -> ItemAccess:
-        """Access to the items of the node."""
+        """Access to the node's items on the tool's line."""
         raise NotImplementedError
 
     def fail(self, text: str) -> ServoFault:
-        """Return an error with the node's name."""
+        """Return an error whose text starts with the node's name; the caller raises it."""
         return ServoFault(f"{self.called}: {text}")
 
     def run(self, program: Program[Result]) -> Result:
-        """Run a program with longer timeouts: the node has answered before."""
+        """Run a program on the tool's line and return its result, with longer timeouts than a scan: the node
+        has answered before.
+        """
         return self.tool.run(extend_timeouts(program))
 
     def register(self, name: str, value: int) -> RegisterValue:
-        """Return an item with a value, as the integer on the wire."""
+        """Return a register for `write`: the item's address and size with a desired value, the integer on the
+        wire.
+        """
         item = self.table.items[name]
         return RegisterValue(item.address, item.size, value, name, item.area == "EEPROM")
 
     def read(self, names: Sequence[str], *, refused: bool = False) -> Mapping[str, int]:
-        """Return items by name: integers on the wire, signed if the item is, 0 or 1 for a bit.
+        """Read items and return their values by name: integers on the wire, signed if the item is, 0 or 1 for
+        a bit.
 
         Args:
             names: The items to read.
@@ -84,24 +91,27 @@ class OneNode:
         return {name: found[name] for name in names if name in found}
 
     def deviations(self, values: Mapping[str, int]) -> tuple[FoundDeviation, ...]:
-        """Return the values that differ from the factory's and matter to a run."""
+        """Return the given values that differ from the factory's and matter to a run; none for a device."""
         return ()
 
     def writable(self, desired: Sequence[RegisterValue]) -> None:
-        """Check that registers can be written; raise ServoFault if the EEPROM is closed."""
+        """Raise ServoFault, before anything is written, if one of the registers is in a closed EEPROM."""
         stored = [self.table.items[one.name].title for one in desired if one.eeprom]
         release = f"switch the torque off first: {self.command} torque off"
         if stored and (problem := self.run(self.access.closed_eeprom(stored[0], release=release))):
             raise self.fail(problem)
 
     def write(self, desired: Sequence[RegisterValue]) -> tuple[str, ...]:
-        """Write the registers that differ, in the given order, and read each back; return a text for each
-        write."""
+        """Write the registers that differ from their desired values, in the given order, and read each back;
+        return a text for each write.
+        """
         self.writable(desired)
         return self._settle(desired)
 
     def set_register(self, target: RegisterValue, confirm: Confirm = agree) -> tuple[str, ...]:
-        """Write one item, an EEPROM item only after confirmation; return the actions."""
+        """Write one item, an EEPROM item only after confirmation; return a text for each action, none if it
+        was not confirmed.
+        """
         item = self.table.items[target.name]
         before = self.read([target.name])[target.name]
         if before == target.value:
@@ -143,7 +153,7 @@ class OneNode:
 
 
 class DeviceAccess(ItemAccess):
-    """Access to a device."""
+    """Access to the items of a device that is not a servo."""
 
     __slots__ = ("_called", "_table")
 
@@ -156,12 +166,12 @@ class DeviceAccess(ItemAccess):
 
     @property
     def table(self) -> Table:
-        """Control table of the device."""
+        """Control table of the device's model."""
         return self._table
 
 
 class OneDevice(OneNode):
-    """A device that is not a servo, such as an IMU or a power board."""
+    """A device that is not a servo, such as an IMU or a power board, on a tool's line."""
 
     NOT_SET = MappingProxyType(
         {

@@ -1,7 +1,9 @@
-"""Servo of a tool: its control table, torque, ID, rate, reboot, reset and own backup.
+"""Servo of a tool: changes one servo on a port, such as torque, ID, rate, reboot, factory reset and the
+backup in the servo.
 
 The programs are those of a run: registers are compared, only differences are written, and each is read back;
 torque is switched on with a goal at the present position. Every change is confirmed by a read afterwards.
+
 Sources: e-Manual, Protocol 1.0 and 2.0: Factory Reset (0x06), Reboot (0x08), Control Table Backup (0x20).
 """
 
@@ -49,7 +51,7 @@ _SET_BY: Mapping[str, str] = {
     "torque_enable": "`dxlrun servo PORT ID torque on` or `off` switches it",
     "protocol_type": "dxlrun would not find the servo again; use the maker's tool",
 }
-"""Items that are not set like other items, because a change needs more than one write, with the alternative.
+"""Items that `set` refuses, because a change needs more than one write, with the command that changes each.
 """
 _KEPT: Mapping[Reset, str] = {
     Reset.ALL: "ID and baud rate too",
@@ -60,7 +62,9 @@ _LEDS = ("led", "led_red", "led_green", "led_blue")
 
 
 class OneServo(OneNode):
-    """The servo that a tool works on. Its methods block, and raise ServoFault or PortError."""
+    """The servo that a tool works on. Its methods block; they raise ServoFault for a problem of the servo,
+    PortError for a lost line.
+    """
 
     NOT_SET = MappingProxyType({name: f"{name} is not set like others; {_SET_BY[name]}" for name in _SET_BY})
     table: ControlTable
@@ -72,7 +76,7 @@ class OneServo(OneNode):
         self.move_to(found.servo_id, found.baud_rate)
 
     def move_to(self, servo_id: int, baud_rate: int) -> None:
-        """Address the servo by another ID and at another rate from now on."""
+        """Use another ID and rate (bit/s) for the servo from now on. Nothing is sent to the servo."""
         self.servo_id, self.baud_rate = servo_id, baud_rate
         self.tool.speak(self.table.protocol, baud_rate)
         self.plan = self._plan()
@@ -83,25 +87,27 @@ class OneServo(OneNode):
 
     @property
     def access(self) -> Access:
-        """Access to the items of the servo."""
+        """Access to the servo's items on the tool's line."""
         return Access(self.plan, self._servo, self.tool.line)
 
     # Registers
 
     def deviations(self, values: Mapping[str, int]) -> tuple[FoundDeviation, ...]:
-        """Return the values that differ from the factory's and matter to a run."""
+        """Return the given register values that differ from the factory's and matter to a run."""
         return deviations(self.access, values, mode_in(self._servo, values))
 
     def differences(self, desired: Sequence[RegisterValue]) -> tuple[RegisterValue, ...]:
-        """Return the registers that differ from their desired values; raise ServoFault without an answer."""
+        """Read registers and return those that differ from their desired values; raise ServoFault without an
+        answer.
+        """
         present = self.run(read_registers(self.access, desired))
         if silent := [self.table.items[name].title for name, found in present.items() if found is None]:
             raise self.fail(f"did not answer when {', '.join(silent)} was read")
         return tuple(each for each in desired if each.value != present[each.name])
 
     def write(self, desired: Sequence[RegisterValue]) -> tuple[str, ...]:
-        """Write the registers that differ, in the given order, and read each back; return a text for each
-        write.
+        """Write the registers that differ from their desired values, in the given order, and read each back;
+        return a text for each write.
 
         A servo refuses goals while its Bus Watchdog is tripped, so a tripped watchdog is cleared before a
         goal is written, and before the watchdog itself is written.
@@ -112,7 +118,7 @@ class OneServo(OneNode):
         return (*cleared, *self._settle(desired))
 
     def clear_watchdog(self, *, armed: bool) -> tuple[str, ...]:
-        """Clear a tripped Bus Watchdog; return a text for each action.
+        """Clear a tripped Bus Watchdog; return a text for each action, none if there was nothing to clear.
 
         A run that was killed leaves the watchdog armed or tripped. After the clear a servo that was stopped
         with torque would move to its old goal, at full speed because its profile was reset. Its torque is
@@ -144,11 +150,12 @@ class OneServo(OneNode):
     # Torque and LED
 
     def holds_torque(self) -> bool:
-        """Return True if Torque Enable is on."""
+        """Read Torque Enable; return True if it is on."""
         return bool(self.read(["torque_enable"])["torque_enable"])
 
     def torque(self, on: bool) -> tuple[str, ...]:
-        """Switch torque on at the present position, or off, and read it back; return a text for each action.
+        """Switch the servo's torque on at its present position, or off, and read it back; return a text for
+        each action.
 
         Before torque on, a Bus Watchdog that is armed or tripped is cleared.
         """
@@ -170,7 +177,7 @@ class OneServo(OneNode):
         return f"holds torque in {mode.name.lower().replace('_', '-')} mode{where}"
 
     def blink(self, times: int = 5) -> str:
-        """Blink the LED and restore its state; return a text."""
+        """Blink the LED `times` times and restore its state; return a text about it."""
         names = [name for name in _LEDS if name in self.table.items]
         if not names:
             raise self.fail("this model has no LED that can be switched")
@@ -188,7 +195,8 @@ class OneServo(OneNode):
     # Mode and plan
 
     def _mode(self) -> Mode:
-        """Return the present mode and plan for it; raise ServoFault if the mode is not known."""
+        """Return the servo's present mode and set `plan` for it; raise ServoFault if the mode is not
+        known."""
         for continuous in (False, True):
             try:
                 self.plan = self._plan(continuous)
@@ -227,7 +235,7 @@ class OneServo(OneNode):
     # Verbs: each returns a text about the change, empty if it was not confirmed by the user.
 
     def change_id(self, new: int, confirm: Confirm = agree) -> str:
-        """Change the ID of the servo.
+        """Change the ID of the servo in its EEPROM; return a text, empty if it was not confirmed.
 
         Raises:
             ServoFault: The change failed, or another servo has the ID.
@@ -254,7 +262,8 @@ class OneServo(OneNode):
         return f"has ID {new}; it had {old}"
 
     def change_rate(self, new: int, confirm: Confirm = agree) -> str:
-        """Change the baud rate of the servo, bit/s.
+        """Change the baud rate of the servo in its EEPROM to `new`, bit/s; return a text, empty if it was not
+        confirmed.
 
         Raises:
             ServoFault: The change failed, the adapter does not support the rate, or another servo there has
@@ -296,11 +305,11 @@ class OneServo(OneNode):
         return f"runs at {new} bit/s; before that, at {old}"
 
     def rate_item(self) -> str:
-        """Return the name of the item with the baud rate; the Y series has two rates."""
+        """Return the name of the item with the baud rate of the bus; the Y series has two rates."""
         return "baud_rate" if "baud_rate" in self.table.items else "baud_rate_bus"
 
     def reboot(self, confirm: Confirm = agree) -> str:
-        """Reboot the servo and wait for its answer; ask for confirmation first if it holds torque."""
+        """Reboot the servo and wait until it answers; ask for confirmation first if it holds torque."""
         if self.holds_torque() and not confirm(
             f"{self.called} holds torque: its torque goes off, and what it holds falls"
         ):
@@ -321,10 +330,10 @@ class OneServo(OneNode):
         return f"rebooted, and {'holds torque' if self.holds_torque() else 'is limp'}"
 
     def factory_reset(self, keep: Reset | None = None, confirm: Confirm = agree) -> str:
-        """Reset the control table to the factory's values.
+        """Reset the servo's control table to the factory's values and wait for the servo.
 
-        Protocol 2.0 keeps ID and baud rate unless `keep` says otherwise; Protocol 1.0 keeps neither. The ID
-        and the rate of the factory must be free if the servo will get them.
+        Protocol 2.0 keeps ID and baud rate unless `keep` says otherwise; Protocol 1.0 keeps neither. If ID or
+        rate becomes that of the factory, no other servo may have them.
         """
         old = self.table.protocol == 1.0
         if old and keep not in (None, Reset.ALL):
@@ -360,7 +369,7 @@ class OneServo(OneNode):
         return f"has the factory's values, ID {servo_id} at {baud_rate} bit/s"
 
     def back_up(self, confirm: Confirm = agree) -> str:
-        """Store the control table in the servo's own backup."""
+        """Store the servo's control table in the backup memory inside the servo."""
         if not confirm(f"{self.called}: the backup that it keeps itself is overwritten"):
             return ""
         self._has_backup()
@@ -370,7 +379,7 @@ class OneServo(OneNode):
         return "stored its control table in its own backup"
 
     def take_back(self, confirm: Confirm = agree) -> str:
-        """Restore the EEPROM from the servo's own backup and reboot the servo."""
+        """Restore the servo's EEPROM from the backup memory inside the servo; the servo reboots."""
         if not confirm(f"{self.called}: its EEPROM becomes that of the backup that it keeps itself"):
             return ""
         self._has_backup()
@@ -384,7 +393,7 @@ class OneServo(OneNode):
     def restore(
         self, desired: Sequence[RegisterValue], path: Path, confirm: Confirm = agree
     ) -> tuple[str, ...]:
-        """Restore the registers of a backup file."""
+        """Write the registers of a backup file, `desired`, read from `path`; return a text for each write."""
         if not (differing := self.differences(desired)):
             return (f"has everything that {path} restores already",)
         self.writable(differing)
@@ -405,7 +414,9 @@ class OneServo(OneNode):
             raise self.fail(f"holds torque; switch it off first: {self.command} torque off")
 
     def _written(self, transaction: Transaction, what: str) -> None:
-        """Send a change. A missing acknowledgement is not a failure: the read afterwards decides."""
+        """Send an instruction that changes the servo; raise ServoFault if it is refused. A missing
+        acknowledgement is not a failure: a read afterwards decides.
+        """
 
         def program() -> Program[Reply]:
             reply = yield transaction

@@ -1,4 +1,4 @@
-"""Scanning: finds the servos on a line, with protocol and rate; nothing is written.
+"""Scanning: finds the servos and devices on a port by ping, with protocol and rate; nothing is written.
 
 Protocol 2.0 gets one broadcast ping per rate, which each servo answers in its own slot. Protocol 1.0 is
 pinged ID by ID, because all its servos would answer a broadcast at once (e-Manual, Protocol 1.0 and 2.0,
@@ -25,24 +25,27 @@ from dxlwire.transaction import BROADCAST_ID, Outcome, Program, Reply, Transacti
 from dxlwire.wire.dialect import dialect_of
 
 SHORT_TIMEOUT_NS = 2_000_000
-"""Timeout for an improbable reply, beyond the latest time by the wire."""
+"""Timeout (ns) of a ping that is probably not answered, beyond the latest time by the wire."""
 SLOT_NS = 3_000_000
-"""Slot of each ID after a broadcast ping, in addition to the bytes of its answer (dynamixel-sdk,
-broadcastPing)."""
+"""Time (ns) for each ID after a broadcast ping, in addition to the bytes of its answer (dynamixel-sdk,
+broadcastPing).
+"""
 LATE_NS = 20_000_000  # listening time after the last request at a rate, for replies that the adapter delays
 LATE_OF_FEW_NS = 100_000_000
-"""The same if few IDs are pinged: then the machine may be late, too."""
+"""Listening time (ns) like LATE_NS, but if few IDs are pinged: then the machine may be late, too."""
 FEW = 20  # up to this many IDs, single pings are faster than a broadcast
 _USUAL = (1_000_000, 57_600, 115_200)
 _IDENTITY_LENGTH = 3
-"""Model number (2) and firmware version (1): the reply to a ping of Protocol 2.0, bytes 0..2 in 1.0."""
+"""Bytes that identify a node, model number (2) and firmware version (1): the reply to a ping of Protocol 2.0,
+bytes 0..2 of the table in 1.0.
+"""
 _LIMITS = (("min_position_limit", "max_position_limit"), ("cw_angle_limit", "ccw_angle_limit"))
 _TRIES = 2  # pings at each of several rates
 _TRIES_ALONE = 4  # pings if protocol and rate are given; their timeouts are longer
 
 
 class FoundServo(msgspec.Struct, frozen=True):
-    """A servo or device that answered."""
+    """A servo or device that answered a scan, with the values that a robot file needs."""
 
     protocol: float
     baud_rate: int  # bit/s
@@ -60,20 +63,20 @@ class FoundServo(msgspec.Struct, frozen=True):
 
     @property
     def models(self) -> frozenset[str]:
-        """Models of servos with its model number and firmware; some models share a number."""
+        """Names of all models with this model number and firmware; some models share a number."""
         tables = models_by_number(self.model_number, self.protocol, self.firmware)
         return frozenset(table.model for table in tables)
 
 
 class Search(msgspec.Struct, frozen=True):
-    """Protocols, rates and IDs of a scan."""
+    """Protocols, baud rates and IDs that a scan tries."""
 
     protocols: tuple[float, ...] = (2.0, 1.0)
     baud_rates: tuple[int, ...] = ()  # bit/s; empty: all rates in the protocol's control tables
     ids: tuple[int, ...] = ()  # empty: all IDs of the protocol
 
     def lines(self) -> tuple[tuple[float, int], ...]:
-        """Return every combination of protocol and rate."""
+        """Return every (protocol, baud rate in bit/s) that the scan tries."""
         return tuple(
             (protocol, rate)
             for protocol in self.protocols
@@ -86,7 +89,7 @@ Progress = Callable[[str, float], None]
 
 
 def known_rates(protocol: float) -> tuple[int, ...]:
-    """Return the rates that servos of a protocol can have, bit/s, the usual ones first."""
+    """Return the baud rates (bit/s) that the control tables of a protocol have, the usual ones first."""
     rates = {
         rate for table in all_tables() if table.protocol == protocol for rate in table.baud_rates.values()
     }
@@ -94,14 +97,14 @@ def known_rates(protocol: float) -> tuple[int, ...]:
 
 
 class Scanned(msgspec.Struct, frozen=True):
-    """Result of a scan."""
+    """Result of a scan of one port."""
 
     servos: tuple[FoundServo, ...]
     left_out: tuple[int, ...]  # rates that the adapter does not support, bit/s
 
 
 def scan(tool: ToolLine, search: Search = EVERYWHERE, progress: Progress = lambda *_: None) -> Scanned:
-    """Search for servos.
+    """Search a port for servos and devices; `progress` receives a text and the fraction done.
 
     Raises:
         PortError: The line is gone, or its adapter echoes.
@@ -125,7 +128,7 @@ def scan(tool: ToolLine, search: Search = EVERYWHERE, progress: Progress = lambd
 
 
 def find_servo(tool: ToolLine, servo_id: int, search: Search = EVERYWHERE) -> tuple[FoundServo, ...]:
-    """Search for one ID in every protocol and at every rate; raise PortError as `scan` does."""
+    """Search a port for one ID in every protocol and at every rate; raise PortError as `scan` does."""
     found: list[FoundServo] = []
     lines = search.lines()
     tries = _TRIES_ALONE if len(lines) == 1 else _TRIES
@@ -180,7 +183,7 @@ def _search(tool: ToolLine, ids: Sequence[int], beat: Callable[[float], None]) -
 def _one_by_one(
     tool: ToolLine, ids: Sequence[int], timeout_ns: int | None, beat: Callable[[float], None]
 ) -> Program[set[int]]:
-    """Ping every ID and return the IDs that answered.
+    """Ping every ID one after the other and return the IDs that answered.
 
     An ID with a damaged reply counts if a second ping is answered, too, or a late reply names it.
     """
@@ -202,7 +205,9 @@ def _one_by_one(
 
 
 def _answering(line: Line, suspected: Sequence[int]) -> Program[set[int]]:
-    """Ping each suspected ID again: the bytes may have been a late answer of the previous ID."""
+    """Ping each ID with a damaged reply again and return those that reply: the bytes may have been a late
+    answer of the previous ID.
+    """
     there: set[int] = set()
     for servo_id in suspected:
         reply = yield from retry(line.ping(servo_id))
@@ -216,7 +221,9 @@ def _hurried(tool: ToolLine, transaction: Transaction, timeout_ns: int) -> Trans
 
 
 def identity(line: Line, servo_id: int) -> Program[tuple[Reply, Reply]]:
-    """Ping a servo; return the reply to the ping, and the reply with model number and firmware version."""
+    """Ping a servo; return the reply to the ping, and the reply that contains model number and firmware
+    version.
+    """
     ping = yield from retry(line.ping(servo_id))
     if not ping.answered or line.dialect.PING_LENGTH >= _IDENTITY_LENGTH:
         return ping, ping
@@ -224,7 +231,9 @@ def identity(line: Line, servo_id: int) -> Program[tuple[Reply, Reply]]:
 
 
 def look(line: Line, servo_id: int, port: str) -> Program[FoundServo]:
-    """Read the model and the settings of a servo that answered; `port` is the port's name. Writes nothing."""
+    """Read model and settings of a servo or device that answered a ping; `port` is the port's name. Writes
+    nothing.
+    """
     dialect = line.dialect
     servo = FoundServo(dialect.PROTOCOL, line.baud_rate, servo_id)
     ping, reply = yield from identity(line, servo_id)
@@ -252,7 +261,9 @@ def look(line: Line, servo_id: int, port: str) -> Program[FoundServo]:
 
 
 def _hardware_error(line: Line, servo_id: int, table: ControlTable) -> Program[str]:
-    """Read the item with hardware errors; return the errors in words, empty if there are none."""
+    """Read a servo's item with hardware errors; return the errors in words, empty if there are none or no
+    reply came.
+    """
     item = table.items.get(table.errors.item)
     if item is None:
         return ""
@@ -269,7 +280,9 @@ def _look_closer(
     servo: FoundServo,
     port: str,
 ) -> Program[FoundServo]:
-    """Read the values for a robot file. Two servos with one ID show by different positions."""
+    """Add position, return delay and limits of a node to its record. Garbled replies, as of two servos with
+    one ID, become a remark.
+    """
     values: dict[str, int] = {}
     names = ["present_position", "return_delay_time", *(name for pair in _LIMITS for name in pair)]
     items = [table[name] for name in names if name in table]

@@ -1,5 +1,6 @@
-"""Servo backup: a file with all writable registers of a servo, its model, ID and rate; and the registers to
-restore."""
+"""Servo backup: a file with all writable registers of a servo, its model, ID and rate. Selects the registers
+to restore.
+"""
 
 from __future__ import annotations
 
@@ -20,12 +21,12 @@ _MOMENTARY = frozenset(
     ("torque_enable", "bus_watchdog", "lock", "hybrid_save", "moving_speed", "registered_instruction")
 )
 _MODES = ("operating_mode", "control_mode")
-"""Mode registers. A mode resets gains and profile, so it is restored before them."""
+"""Mode registers, which are restored before gains and profile, because a mode resets these."""
 _LAST = "status_return_level"  # restored last, because a servo may not answer reads afterwards
 
 
 class ServoBackup(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
-    """Content of a backup file."""
+    """Content of a backup file of one servo."""
 
     format: Literal["dxlrun servo backup 1"]
     model: str
@@ -38,7 +39,9 @@ class ServoBackup(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
 
 
 def kept_items(table: ControlTable) -> tuple[str, ...]:
-    """Return the items in a backup of a model: every writable item except indirect data."""
+    """Return the names of the items that a backup of a model contains: every writable item except indirect
+    data.
+    """
     return tuple(
         item.name
         for item in table.items.values()
@@ -47,13 +50,13 @@ def kept_items(table: ControlTable) -> tuple[str, ...]:
 
 
 def write_backup(path: Path, backup: ServoBackup) -> None:
-    """Write a new file; raise InputError if it exists already or cannot be written."""
+    """Write a backup to a new file; raise InputError if the file exists already or cannot be written."""
     text = msgspec.json.format(msgspec.json.encode(backup), indent=2) + b"\n"
     write_target(path, text)
 
 
 def read_backup(path: Path) -> ServoBackup:
-    """Read a file; raise InputError if it cannot be read or is not a backup."""
+    """Read a backup file; raise InputError if it cannot be read or is not a backup."""
     try:
         return msgspec.json.decode(path.read_bytes(), type=ServoBackup)
     except OSError as error:
@@ -65,7 +68,8 @@ def read_backup(path: Path) -> ServoBackup:
 
 
 def registers_to_restore(path: Path, backup: ServoBackup, table: ControlTable) -> tuple[RegisterValue, ...]:
-    """Return the registers to write, in the order of writing: EEPROM first. ID, rate and goals are omitted.
+    """Return the registers of a backup file that are written to a servo, EEPROM first. ID, rate, goals and
+    torque are omitted.
 
     Raises:
         InputError: Registers do not fit the model; a sentence for each.
@@ -95,7 +99,7 @@ def registers_to_restore(path: Path, backup: ServoBackup, table: ControlTable) -
 def stamped(
     table: ControlTable, firmware: int, address: tuple[int, int], values: Mapping[str, int]
 ) -> ServoBackup:
-    """Return the backup of a servo; `address` is its ID and its rate, bit/s."""
+    """Return the content of a backup file for a servo; `address` is its ID and its rate, bit/s."""
     servo_id, rate = address
     number, protocol = table.model_number, table.protocol
     return ServoBackup(FORMAT, table.model, number, firmware, protocol, servo_id, rate, dict(values))

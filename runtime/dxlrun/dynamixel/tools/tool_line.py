@@ -1,4 +1,4 @@
-"""Tool line: one serial line for tools, in one protocol and at one rate after the other; never in a run."""
+"""Tool line: a port that tools use outside of a run, with one protocol and baud rate at a time."""
 
 from __future__ import annotations
 
@@ -20,16 +20,20 @@ from dxlwire.wire.dialect import dialect_of
 
 FIRST_RATE = 57_600  # first rate of a port, bit/s; every adapter supports it
 BOOT_NS = 2_000_000_000
-"""Time for the boot loader of a board that resets when its port is opened [i: Optiboot of Arduino, 1 s]."""
+"""Waiting time (ns) for the boot loader of a board that resets when its port is opened [i: Optiboot of
+Arduino, 1 s].
+"""
 LATENCY_NS = 1_000_000
-"""Latency of an adapter whose latency timer is not known: one frame of full-speed USB."""
+"""Assumed latency (ns) of an adapter whose latency timer is not known: one frame of full-speed USB."""
 MOST_LATENCY_NS = 16_000_000
-"""Its highest latency: the default latency timer of an FTDI chip (FTDI AN232B-04)."""
+"""Highest latency (ns) of an adapter whose timer is not known: the default latency timer of an FTDI chip
+(FTDI AN232B-04).
+"""
 _NOTHING = Budget(0, 0, 0, 0, 0, 0)
 
 
 class TunablePort:
-    """A serial port with a variable rate, opened exclusively; a context manager that closes it.
+    """A serial port whose baud rate tools can change, opened exclusively; a context manager that closes it.
 
     Raises:
         PortError: The port cannot be opened: it does not exist, or another process, which is named, has it.
@@ -39,7 +43,7 @@ class TunablePort:
         self._serial = open_serial(path, FIRST_RATE, boot_ns=BOOT_NS)
         self._tuned = FIRST_RATE
         self.other_rates: dict[int, int] = {}
-        """Rates that the driver did not set as requested, with the rates that it set; bit/s."""
+        """Rates that the driver did not set as requested, with the rates that it set instead; bit/s."""
         self.name = path
         self.clock: Clock = MonotonicClock()
         self.ports: Ports = SerialPorts([SerialPort(self._serial.fileno(), path)])
@@ -47,9 +51,9 @@ class TunablePort:
         timer = latency_timer(path)
         found_ns = 0 if timer is None else timer.found_ms * 1_000_000
         self.latency_ns = max(LATENCY_NS, found_ns)
-        """Known latency of the adapter."""
+        """Latency of the adapter, ns: that of its timer as found, at least LATENCY_NS."""
         self.most_latency_ns = found_ns or MOST_LATENCY_NS
-        """Highest latency of the adapter: timeout for a servo that has already answered once."""
+        """Highest latency of the adapter, ns: used in timeouts for a servo that has already answered once."""
 
     def __enter__(self) -> TunablePort:
         return self
@@ -58,7 +62,8 @@ class TunablePort:
         self._serial.close()
 
     def tune(self, baud_rate: int) -> bool:
-        """Change to a rate, bit/s, and discard unread bytes; return False if the adapter does not support it.
+        """Set the baud rate, bit/s, and discard unread bytes; return False if the adapter does not support
+        the rate.
 
         Raises:
             PortError: The port is gone.
@@ -77,7 +82,9 @@ class TunablePort:
 
 
 class Heard(PacketSink):
-    """Records the IDs that answered on a line, expected or not."""
+    """Packet sink that records the IDs which answered on a line, expected or not, and counts noise; forwards
+    packets to a log.
+    """
 
     def __init__(self, log: PacketSink | None = None) -> None:
         self._log = log
@@ -85,14 +92,14 @@ class Heard(PacketSink):
         self.noise = 0  # bytes outside of intact packets
 
     def clear(self) -> None:
-        """Clear the records."""
+        """Forget the recorded IDs and the noise."""
         self.ids.clear()
         self.noise = 0
 
     def packet(  # noqa: PLR0917  the contract of PacketSink
         self, bus: int, kind: int, servo_id: int, first_ns: int, last_ns: int, data: Payload
     ) -> None:
-        """Record a sent or received packet."""
+        """Forward a packet to the log, and record the ID of a reply or the bytes of noise."""
         if self._log is not None:
             self._log.packet(bus, PacketKind(kind), servo_id, first_ns, last_ns, data)
         if kind in (PacketKind.STATUS, PacketKind.LATE):
@@ -102,7 +109,7 @@ class Heard(PacketSink):
 
 
 class OnBus(PacketSink):
-    """Forwards packets as those of one bus of a log."""
+    """Packet sink that forwards packets to a log under a fixed bus index."""
 
     def __init__(self, log: PacketSink, index: int) -> None:
         self._log = log
@@ -111,12 +118,13 @@ class OnBus(PacketSink):
     def packet(  # noqa: PLR0917  the contract of PacketSink
         self, bus: int, kind: int, servo_id: int, first_ns: int, last_ns: int, data: Payload
     ) -> None:
-        """Forward a sent or received packet."""
+        """Forward a sent or received packet with the fixed bus index in place of `bus`."""
         self._log.packet(self._index, PacketKind(kind), servo_id, first_ns, last_ns, data)
 
 
 class ToolLine:
-    """Runs programs on one line; call `speak` first, and again for another protocol or rate.
+    """Runs programs on the port of a tool, in one protocol and at one rate; call `speak` first, and again to
+    change them.
 
     `log` receives every packet.
     """
@@ -127,14 +135,17 @@ class ToolLine:
         self.protocol = 0.0
         self.baud_rate = 0
         self.line: Line = Line(FIRST_RATE, port.most_latency_ns, LONGEST_RETURN_DELAY_NS)
-        """Makes transactions for the present protocol and rate."""
+        """Makes transactions for the protocol and rate that `speak` set."""
         self._lines: Lines | None = None
         self._spoken: dict[tuple[float, int], Lines] = {}
         """Lines by protocol and rate: they are kept, because a late reply may come after another rate was
-        used."""
+        used.
+        """
 
     def speak(self, protocol: float, baud_rate: int) -> bool:
-        """Change to a protocol and a rate; return False, unchanged, if the adapter does not support it."""
+        """Change to a protocol and a baud rate (bit/s); return False, unchanged, if the adapter does not
+        support the rate.
+        """
         if not self.port.tune(baud_rate):
             return False
         port, latency_ns = self.port, self.port.most_latency_ns
@@ -151,13 +162,13 @@ class ToolLine:
         return True
 
     def can_run_at(self, baud_rate: int) -> bool:
-        """Try a rate and return to the present one."""
+        """Return True if the adapter supports a baud rate (bit/s); the present rate is set again."""
         can = self.port.tune(baud_rate)
         self.port.tune(self.baud_rate)
         return can
 
     def run(self, program: Program[Result]) -> Result:
-        """Run a program to its end and return its result.
+        """Run a program on the line to its end and return its result.
 
         Raises:
             PortError: The line is gone or not suitable for servos.
@@ -170,12 +181,14 @@ class ToolLine:
         return result
 
     def wait(self, duration_ns: int) -> None:
-        """Wait, and record the packets that arrive."""
+        """Wait this long while packets that arrive are recorded."""
         self.run(_wait(duration_ns))
 
 
 def refuse_echo(name: str, reply: Reply) -> None:
-    """Raise PortError if the adapter echoes: an echo looks like a servo's answer."""
+    """Raise PortError if the reply shows that the adapter at `name` echoes: an echo looks like a servo's
+    answer.
+    """
     if reply.echoed:
         raise PortError(
             f"the adapter at {name} echoes what it sends; use one that switches its receiver off while it "
