@@ -1,4 +1,5 @@
-"""Bus plan: prepared transactions, reply layouts and units, made before a port is opened."""
+"""Bus plan: everything about one serial line that is computed before its port is opened: transactions,
+reply layouts and units."""
 
 from __future__ import annotations
 
@@ -13,12 +14,13 @@ from dxlwire.modes import Mode
 from dxlwire.transaction import Transaction
 
 SIGN = 0x400
-"""Sign bit of sign-magnitude items, bit 10: clockwise (e-Manual AX-12A, Moving Speed (32), Present Speed
-(38), Present Load (40))."""
+"""Direction bit of items with sign and magnitude, bit 10: clockwise (e-Manual AX-12A, Moving Speed (32),
+Present Speed (38), Present Load (40))."""
 
 
 class Field(msgspec.Struct, frozen=True):
-    """One item inside a block of bytes, little-endian."""
+    """Place and encoding of one control item inside a block of bytes that is read or written at once,
+    little-endian."""
 
     offset: int
     size: int  # 1, 2 or 4
@@ -27,12 +29,11 @@ class Field(msgspec.Struct, frozen=True):
     bit: int | None = None  # Index of the only bit that counts, for an item of a device; None: all bits
 
     def tick(self, block: bytes | memoryview) -> int:
-        """Return the item as a signed number of ticks from the bytes of its block.
+        """Return the value of this item from the bytes of its block, as a signed number of ticks.
 
         Velocity and effort are sign-magnitude in Protocol 1.0 and on the XL-320 (e-Manual AX-12A, Present
         Speed (38); XL-320, Present Speed (39)); bits above the sign are ignored. Other models use two's
-        complement (e-Manual XM430-W350, Present Velocity (128)).
-        """
+        complement (e-Manual XM430-W350, Present Velocity (128))."""
         raw = block[self.offset : self.offset + self.size]
         if self.encoding == "sign_magnitude":
             value = int.from_bytes(raw, "little")
@@ -41,7 +42,7 @@ class Field(msgspec.Struct, frozen=True):
 
 
 class StateLayout(msgspec.Struct, frozen=True):
-    """Block that is read from a servo in each cycle."""
+    """Block of bytes with position, velocity and effort that is read from a servo in each cycle."""
 
     address: int
     length: int
@@ -52,21 +53,24 @@ class StateLayout(msgspec.Struct, frozen=True):
 
 
 class GoalLayout(msgspec.Struct, frozen=True):
-    """Block that is written to a servo in each cycle, with the goals of a mode that it contains."""
+    """Block of bytes that is written to a servo in each cycle, with the goals of one mode that it
+    contains."""
 
     address: int
     length: int
     position: Field | None = None
     speed: Field | None = None
-    """In a block with a position: the speed toward it, None if it is not in the block. Otherwise the leading
-    goal."""
+    """In a block with a position: the speed toward that position, None if it is not in the block.
+    Otherwise the goal that the servo follows."""
     effort: Field | None = None
-    """With the block of a position: the maximum effort on the way to it. Otherwise the leading goal."""
+    """In a mode with a position goal: the maximum effort on the way to the position. Otherwise the goal
+    that the servo follows."""
     pwm: Field | None = None
 
     @property
     def leading(self) -> Field:
-        """Field of the goal that the servo follows: a position, else a speed, an effort or a PWM.
+        """Field of the goal in this block that the servo follows: a position, else a speed, an effort or a
+        PWM.
 
         Raises:
             LookupError: The block has no goal.
@@ -78,7 +82,8 @@ class GoalLayout(msgspec.Struct, frozen=True):
 
 
 class TorqueLimit(msgspec.Struct, frozen=True):
-    """Torque limit of a servo in RAM, and the item from which it is initialized at power-up."""
+    """Register in RAM that limits a servo's torque, and the register from which it is initialized at
+    power-up."""
 
     name: str  # Title in the e-Manual: `Torque Limit (34)`
     address: int
@@ -87,7 +92,7 @@ class TorqueLimit(msgspec.Struct, frozen=True):
 
 
 class RegisterValue(msgspec.Struct, frozen=True):
-    """One item of a servo's memory with its required value."""
+    """One register of a servo with the value that it should have."""
 
     address: int
     size: int  # 1, 2 or 4
@@ -97,19 +102,19 @@ class RegisterValue(msgspec.Struct, frozen=True):
 
     @property
     def data(self) -> bytes:
-        """Payload of the write, little-endian."""
+        """Value as bytes for a write, little-endian."""
         return self.value.to_bytes(self.size, "little", signed=self.value < 0)
 
 
 class Scale(msgspec.Struct, frozen=True):
-    """Unit and maximum of a goal."""
+    """Unit of one tick of a goal, and the highest number of ticks."""
 
     per_tick: float  # rad/s, the unit of the state's effort, or fraction of the full voltage
     most: int  # Highest tick without sign, according to the manual; the servo's own limit may be lower
 
 
 class OwnLimit(msgspec.Struct, frozen=True):
-    """Item with a servo's own limit. The servo refuses a goal beyond the limit."""
+    """Register with a limit that is stored in the servo. The servo refuses a goal beyond the limit."""
 
     of: Literal["speed", "effort", "pwm"]
     name: str
@@ -118,9 +123,8 @@ class OwnLimit(msgspec.Struct, frozen=True):
 
 
 class ModePlan(msgspec.Struct, frozen=True):
-    """One mode of one servo: the registers that select it and the goals that it follows. Sources: see
-    `mode_plan`.
-    """
+    """One mode of one servo: the registers that select it and the goals that the servo then follows.
+    Sources: see `mode_plan`."""
 
     mode: Mode
     operating: tuple[RegisterValue, ...]
@@ -143,16 +147,18 @@ SLOW_STATES: Mapping[str, SlowState] = MappingProxyType(
         "present_input_voltage": "voltage",
     }
 )
-"""Control table items that are states of a joint and are read between cycles."""
+"""Control table items that are read between cycles and shown in a joint's states, with the name of the
+state."""
 
 
 class ServoPlan(msgspec.Struct, frozen=True):
-    """One servo and its joint, whose position is s = direction * (theta - reference) * ratio."""
+    """One servo and its joint. The joint's position is s = direction * (theta - reference) * ratio, with
+    the servo's angle theta."""
 
     joint: str  # Name in messages: the joint, or in a transmission `wrist/left`
     row: int
-    """Row of the joint in the state and goal arrays of the whole robot. Where several servos move one joint
-    (`MechanicsPlan`), the servo's own row in the arrays of the servos."""
+    """Row of the joint in the state and goal arrays of the whole robot. Where several servos move one
+    joint (`MechanicsPlan`), the servo's own row in the arrays of the servos."""
     servo_id: int
     model: str
     model_number: int
@@ -163,8 +169,8 @@ class ServoPlan(msgspec.Struct, frozen=True):
     rad_s_per_tick: float
     max_speed_tick: int
     effort_per_tick: float
-    """Effort of the joint per tick of present load or current: Nm (N for a linear joint), or the servo's own
-    unit, A or the fraction of the maximum."""
+    """Effort of the joint per tick of present load or current: Nm (N for a linear joint), or the servo's
+    own unit, A or the fraction of the maximum."""
     lower_tick: int  # Lowest goal within the joint's limits, in ticks of the servo
     upper_tick: int  # Highest goal within the joint's limits, in ticks of the servo
     state: StateLayout
@@ -175,8 +181,8 @@ class ServoPlan(msgspec.Struct, frozen=True):
     reply reports them."""
     torque_limit: TorqueLimit | None = None  # None if the model has none that limits position control
     settings: tuple[RegisterValue, ...] = msgspec.field(default=(), name="registers")
-    """Required register values, in the order of writing: EEPROM first. In logs the field has the name of the
-    robot file's key `registers`, the source of most values."""
+    """Register values that the servo should have, in the order of writing: EEPROM first. In logs the field
+    has the name of the robot file's key `registers`, the source of most values."""
     modes: tuple[ModePlan, ...] = ()  # All modes that the servo can be in
     start_mode: Mode = Mode.POSITION  # Mode that the start-up selects; one of `modes`
     own_limits: tuple[OwnLimit, ...] = ()
@@ -185,7 +191,7 @@ class ServoPlan(msgspec.Struct, frozen=True):
     torque_on_return: bool = False
     continuous: bool = False  # The joint is a wheel or turns more than once
     torque_at_start: bool = True
-    """True if start-up enables torque. Otherwise the servo stays limp until a client requests torque."""
+    """True if start-up switches torque on. Otherwise the servo stays limp until a client requests torque."""
     ratio: float = 1.0
     """Movement of the joint per radian of the servo: rad (1 / gear ratio), or m for a linear joint."""
     name: str = ""
@@ -194,30 +200,31 @@ class ServoPlan(msgspec.Struct, frozen=True):
 
     @property
     def own_name(self) -> str:
-        """Unique name of the servo."""
+        """Name that only this servo has: `name`, or that of its joint if it is the joint's only servo."""
         return self.name or self.joint
 
     @property
     def declared(self) -> dict[str, int]:
-        """Register values from the robot file: integers on the wire by item name, in the order of writing."""
+        """Register values that the servo should have: integers on the wire by item name, in the order of
+        writing."""
         return {setting.name: setting.value for setting in self.settings}
 
     @property
     def position_per_tick(self) -> float:
-        """Movement of the joint per tick of the position, rad or m."""
+        """Movement of the joint per tick of the servo's position, rad or m."""
         return self.rad_per_tick * self.ratio
 
     @property
     def wraps(self) -> bool:
-        """True if the position wraps around once per revolution of a wheel."""
+        """True if the reported position jumps back after each revolution: a continuous joint whose
+        position has less than four bytes."""
         return self.continuous and self.state.position.size < 4
 
     def joint_position(self, raw: int) -> float:
-        """Return the joint's position, rad or m, for a present or goal position in ticks.
+        """Convert a present or goal position in ticks to the joint's position, rad or m.
 
-        theta = raw * rad_per_tick, counter-clockwise positive (thesis of M. Amarante Araujo, 2017, JointID;
-        e-Manual AX-12A, Goal Position (30): 300/1023 deg a tick).
-        """
+        theta = raw * rad_per_tick, counter-clockwise positive (thesis of M. Amarante Araujo, 2017,
+        JointID; e-Manual AX-12A, Goal Position (30): 300/1023 deg a tick)."""
         return self.direction * (raw * self.position_per_tick - self.reference * self.ratio)
 
     def position_text(self, position: float) -> str:
@@ -225,9 +232,8 @@ class ServoPlan(msgspec.Struct, frozen=True):
         return self.unit.text(position, digits=self.unit.digits)
 
     def outside_limits(self, raw: int, lower_tick: int, upper_tick: int) -> str:
-        """Return the problem and its fix for a position outside limits, all in ticks. The text follows the
-        joint's name.
-        """
+        """Return the error text for a servo at `raw`, outside of these limits, all in ticks: `is at 12.3
+        deg, outside its limits ...`, with the fix."""
         first, last = sorted(map(self.joint_position, (lower_tick, upper_tick)))
         lower = self.position_text(first).partition(" ")[0]  # the unit follows the upper limit
         return (
@@ -236,11 +242,11 @@ class ServoPlan(msgspec.Struct, frozen=True):
         )
 
     def step_text(self, step: float) -> str:
-        """Format a step of the joint, rad or m, for a message: `12 deg`, `5 mm`."""
+        """Format a change of the joint's position, rad or m, for a message: `12 deg`, `5 mm`."""
         return self.unit.text(step, digits=0)
 
     def mode_plan(self, mode: int) -> ModePlan:
-        """Return the plan of a mode.
+        """Return the plan of a mode of this servo.
 
         Raises:
             LookupError: The servo does not have the mode.
@@ -252,7 +258,7 @@ class ServoPlan(msgspec.Struct, frozen=True):
 
 
 class Member(msgspec.Struct, frozen=True):
-    """Block of a servo or a device that one read fetches in each cycle; devices may have several."""
+    """Block of a servo or a device that is read in each cycle; a servo has one, a device may have several."""
 
     servo_id: int
     address: int
@@ -263,7 +269,8 @@ class Member(msgspec.Struct, frozen=True):
 
 
 class DeviceField(msgspec.Struct, frozen=True):
-    """One state of a device: number on the wire * scale + offset."""
+    """One value that a device reports, and its conversion to SI units: number on the wire * scale +
+    offset."""
 
     state: str  # `angular_velocity.x`
     place: Field  # Position in its block
@@ -273,7 +280,7 @@ class DeviceField(msgspec.Struct, frozen=True):
 
 
 class DeviceBlock(msgspec.Struct, frozen=True):
-    """Bytes of a device that one read fetches."""
+    """Adjacent bytes of a device that are read at once, with the values in them."""
 
     address: int
     length: int
@@ -282,7 +289,8 @@ class DeviceBlock(msgspec.Struct, frozen=True):
 
 
 class DevicePlan(msgspec.Struct, frozen=True):
-    """Unit on a bus that is not a servo: read in each cycle, but without torque, goals or a mode."""
+    """Plan of a device: a unit on a bus that is not a servo. It is read in each cycle, but has no torque,
+    goals or mode."""
 
     name: str
     servo_id: int  # Its ID
@@ -293,7 +301,7 @@ class DevicePlan(msgspec.Struct, frozen=True):
 
 
 class Budget(msgspec.Struct, frozen=True):
-    """Cost of one cycle on one bus, ns (protocol.md, Time budget)."""
+    """Bytes and time (ns) that one cycle of reads and goals needs on one bus (protocol.md, Time budget)."""
 
     request_bytes: int
     reply_bytes: int
@@ -304,22 +312,22 @@ class Budget(msgspec.Struct, frozen=True):
 
     @property
     def goals_ns(self) -> int:
-        """Time of the goals on the wire, ns."""
+        """Time that the goals take on the wire, ns; part of `wire_ns`."""
         return self.wire_ns * self.goal_bytes // max(self.request_bytes + self.reply_bytes, 1)
 
     @property
     def total_ns(self) -> int:
-        """Time of one read-and-write exchange, ns."""
+        """Time of all reads and goals of one cycle, ns."""
         return self.wire_ns + self.return_delay_ns + self.latency_ns
 
     @property
     def highest_rate_hz(self) -> float:
-        """Rate at which the exchange would occupy the whole bus time, Hz."""
+        """Rate at which the reads and goals would occupy the whole time of the bus, Hz."""
         return 1e9 / self.total_ns
 
 
 class BusPlan(msgspec.Struct, frozen=True):
-    """One serial line: its servos, its prepared packets, its budget."""
+    """Plan of one serial line: its servos and devices, the packets of a cycle, and their time budget."""
 
     name: str
     port: str  # Device path, or `sim`
@@ -329,21 +337,22 @@ class BusPlan(msgspec.Struct, frozen=True):
     return_delay_ns: int
     servos: tuple[ServoPlan, ...]
     groups: tuple[tuple[int, ...], ...]
-    """Members that one instruction reads, as indices into `members` (servos first). A group of one is a plain
-    read."""
+    """Members that one instruction reads, as indices into `members` (servos first). A group of one is a
+    plain read."""
     reads: tuple[Transaction, ...]
-    """Read of each group without losses, in the form that every firmware supports."""
+    """Read transaction of each group, in the plain form that every firmware supports, without lost servos."""
     limp: tuple[Transaction, ...]
     """Broadcasts that switch off the torque of all servos; without reply, so they can be sent at any time."""
     budget: Budget  # Cost of a cycle with the chosen reads, including the fast forms of `fast`
     fast: tuple[bool, ...] = ()
-    """True for each group that is read by a fast form, provided that servos answer it at start-up."""
+    """True for each group that is read by a fast form (fast sync or bulk read), provided that its servos
+    answer one at start-up."""
     read_by: str = ""  # Instructions of the reads in the e-Manual's words: `fast sync read + read`
     watchdog_ticks: int = 0  # Value of each servo's Bus Watchdog, steps of 20 ms; 0: not armed
     slow_period_ns: int = 0  # Period in which each slow register is read once; 0: never
     devices: tuple[DevicePlan, ...] = ()  # Units on the bus that are not servos
     device_margin_ns: int = 1_000_000
-    """Time that the host waits for a device after the latest arrival that the wire allows."""
+    """Time that the host waits for a device after the latest arrival that the wire allows, ns."""
     rs485: bool = False  # The kernel switches the direction of the adapter's transceiver
     boot_ns: int = 0  # Boot time of the adapter after it was plugged in and opened
 
@@ -353,25 +362,25 @@ class BusPlan(msgspec.Struct, frozen=True):
         return members_of(self.servos, self.devices)
 
     def member_name(self, index: int) -> str:
-        """Return the name of a member's joint or device."""
+        """Return the name of the joint or device to which `members[index]` belongs."""
         device = self.members[index].device
         return self.servos[index].joint if device < 0 else self.devices[device].name
 
     @property
     def names(self) -> dict[int, str]:
-        """Names of joints and devices, by ID."""
+        """Name of the joint or device with each ID on this bus."""
         return {servo.servo_id: servo.joint for servo in self.servos} | {
             device.servo_id: device.name for device in self.devices
         }
 
     def label(self, servo: ServoPlan | DevicePlan) -> str:
-        """Return the name of a servo or a device in messages: `elbow (ID 4 on bus main)`."""
+        """Return the name of a servo or a device for messages: `elbow (ID 4 on bus main)`."""
         name = servo.joint if isinstance(servo, ServoPlan) else servo.name
         return f"{name} (ID {servo.servo_id} on bus {self.name})"
 
 
 def members_of(servos: Sequence[ServoPlan], devices: Sequence[DevicePlan]) -> tuple[Member, ...]:
-    """Return the blocks to read in each cycle from the servos and devices of one bus."""
+    """Return the blocks that each cycle reads from the servos and devices of one bus: servos first."""
     states = ((servo.servo_id, servo.state) for servo in servos)
     return (
         *(Member(servo_id, state.address, state.length, state.spare) for servo_id, state in states),

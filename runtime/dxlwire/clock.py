@@ -1,4 +1,4 @@
-"""Clock protocol: the same loop runs on the machine's monotonic time and on virtual time."""
+"""Clocks: the machine's monotonic time, and virtual time for simulated runs, with one interface."""
 
 from __future__ import annotations
 
@@ -10,23 +10,25 @@ from typing import Protocol
 
 
 class Clock(Protocol):
-    """Time source of the loop, the hardware, the recorder and the bus; integers of nanoseconds."""
+    """Time source of a run: loop, hardware, recorder and buses use it. All times are integers of
+    nanoseconds."""
 
     def now_ns(self) -> int:
-        """Return the current time, ns. The origin is arbitrary and never jumps."""
+        """Return the current time, ns. The origin is arbitrary; the time never jumps."""
         ...
 
     def wait_until(self, deadline_ns: int) -> int:
-        """Wait until `deadline_ns` and return the time after the wake-up, ns. Never returns early."""
+        """Wait until `deadline_ns` and return the time after the wake-up, ns, which is never earlier than
+        the deadline."""
         ...
 
 
 class MonotonicClock:
-    """CLOCK_MONOTONIC: sleeps until shortly before the deadline, then polls the clock.
+    """Clock of the machine, CLOCK_MONOTONIC. A wait sleeps until shortly before the deadline, then polls the
+    clock.
 
-    A sleep alone wakes some 50-100 us late on a stock Linux. Polling for the last `spin_ns` avoids that and
-    costs `spin_ns / period` of one core.
-    """
+    A sleep alone wakes some 50-100 us late on a stock Linux. Polling for the last `spin_ns` avoids that
+    and costs `spin_ns / period` of one core."""
 
     __slots__ = ("spin_ns",)
 
@@ -49,7 +51,7 @@ class MonotonicClock:
 
 
 class VirtualClock:
-    """Clock that advances only in waits; two runs from one seed have the same times."""
+    """Simulated clock that advances only in `wait_until`; two runs from one seed have the same times."""
 
     __slots__ = ("_calls", "_now_ns", "_order")
 
@@ -63,7 +65,8 @@ class VirtualClock:
         return self._now_ns
 
     def wait_until(self, deadline_ns: int) -> int:
-        """Advance to the deadline if it is in the future; return virtual time, ns."""
+        """Advance virtual time to the deadline if it is in the future, and make the scheduled calls that
+        are due; return the time, ns."""
         while self._calls and self._calls[0][0] <= deadline_ns:
             due_ns, _, action = heapq.heappop(self._calls)
             self._now_ns = max(self._now_ns, due_ns)
@@ -72,5 +75,6 @@ class VirtualClock:
         return self._now_ns
 
     def call_at(self, t_ns: int, action: Callable[[], None]) -> None:
-        """Schedule a call at a time, even in the middle of a wait. The action itself must not wait."""
+        """Schedule a call at a virtual time, ns, even in the middle of a wait. The action itself must not
+        wait."""
         heapq.heappush(self._calls, (t_ns, next(self._order), action))

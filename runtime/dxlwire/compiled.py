@@ -1,4 +1,4 @@
-"""Loading of compiled C sources: shared objects, their structs for ctypes, and memory for them."""
+"""Compiled C sources: loads their shared objects, and gives their structs and memory to ctypes."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ Library = TypeVar("Library", bound=ctypes.CDLL)
 
 
 def load_compiled(source: Path, kind: type[Library], path: Path | None = None) -> Library:
-    """Load the shared object that the build compiled from a C source.
+    """Load the shared object that was compiled from a C source when the package was built.
 
     Args:
         source: The C file. It defines `dxl_source`, which returns the checksum of the compiled source.
@@ -41,11 +41,11 @@ def load_compiled(source: Path, kind: type[Library], path: Path | None = None) -
 
 
 def parse_structs(source: str) -> Mapping[str, type[ctypes.Structure]]:
-    """Return the structs that a C source defines, by name. Pointers become addresses (`c_void_p`).
+    """Return the structs that the text of a C source defines, as ctypes classes by name. Pointers become
+    addresses (`c_void_p`).
 
-    Supported fields are numbers of fixed size, pointers, structs defined earlier in the source, and arrays of
-    these.
-    """
+    Supported fields are numbers of fixed size, pointers, structs defined earlier in the source, and arrays
+    of these."""
     # Comments may contain semicolons, which separate the fields below.
     text = re.sub(r"/\*.*?\*/", "", source, flags=re.DOTALL)
     # Array lengths may be macros, such as MOST_PIECES.
@@ -70,5 +70,6 @@ def parse_structs(source: str) -> Mapping[str, type[ctypes.Structure]]:
 
 
 def array_of(memory: memoryview) -> ctypes.Array[ctypes.c_char]:
-    """Return writable memory as an argument of compiled functions. The array keeps the memory alive."""
+    """Return writable memory as a ctypes array for arguments of compiled functions, without a copy. The
+    array keeps the memory alive."""
     return (ctypes.c_char * len(memory)).from_buffer(memory)

@@ -19,7 +19,8 @@ from typing import Literal
 
 @dataclass(frozen=True, slots=True, order=True)
 class Mark:
-    """Position in a file, in the form that editors can jump to; line and column count from 1."""
+    """Position in a file, printed as `file:line:column`, to which editors can jump; line and column count
+    from 1."""
 
     file: str
     line: int = 1
@@ -31,7 +32,7 @@ class Mark:
 
 @dataclass(frozen=True, slots=True)
 class Problem:
-    """One problem of an input, with its position and fix."""
+    """One problem in an input file, with its position and the fix."""
 
     mark: Mark
     what: str
@@ -46,19 +47,19 @@ class Problem:
 class DxlError(Exception):
     """Base class of every error that is raised on purpose, here and in the packages that build on dxlwire.
 
-    A command line exits with `exit_code`.
-    """
+    A command that fails with it exits with `exit_code`."""
 
     exit_code = 1
 
     @property
     def sentences(self) -> tuple[str, ...]:
-        """Lines of the message, followed by the notes that were added to the exception."""
+        """Lines of the error's message, followed by the notes that were added to the exception."""
         return (*str(self).splitlines(), *getattr(self, "__notes__", ()))
 
 
 class InputError(DxlError, ValueError):
-    """A file or an argument is wrong. `problems` contains all problems in file order."""
+    """A file or an argument of the user is wrong. `problems` contains all problems in file order; empty if
+    only a text was given."""
 
     exit_code = 2
 
@@ -69,27 +70,28 @@ class InputError(DxlError, ValueError):
 
 
 class NotCompiled(DxlError, RuntimeError):
-    """The shared object of a C source is missing, or was compiled from another source."""
+    """The shared object of a C source is missing, or was compiled from another source than the installed
+    one."""
 
 
 class PortError(DxlError, OSError):
-    """A serial line cannot be opened, is in use by another program, or is gone."""
+    """A serial line cannot be opened, is in use by another program, or was lost during use."""
 
 
 _WORD = re.compile(r"[A-Z]?[a-z]+|[A-Z]+(?![a-z])|[0-9]+")
 _SIDES = {"l": "left", "r": "right", "f": "front", "back": "rear", "hind": "rear", "top": "upper"}
 _SIDES |= {side: side for side in ("left", "right", "front", "rear", "upper", "lower", "inner", "outer")}
-"""Words that distinguish one limb from another, as numbers do."""
+"""Words in names that distinguish one limb from another, as numbers do, each with its standard form."""
 _MOST_NEAR = 3
-"""Limit of equally near names; a longer list does not help."""
+"""Number of equally similar names above which none is suggested; a longer list does not help."""
 
 
 def near(name: str, known: Iterable[str]) -> tuple[str, ...]:
-    """Return the known names that are probably meant: at most two letters differ, or the words are the same.
+    """Return the known names that are probably meant by a misspelled one: at most two letters differ, or the
+    words are the same.
 
-    The words may be in another order, and one name may have an extra word next to at least two equal ones. A
-    name of another side or with another number is never suggested, because it belongs to another limb.
-    """
+    The words may be in another order, and one name may have an extra word next to at least two equal ones.
+    A name of another side or with another number is never suggested, because it belongs to another limb."""
     wanted = _folded(name)
     most = 0 if len(wanted) < 3 else 1 if len(wanted) < 5 else 2
     found: dict[int, list[str]] = {}
@@ -112,7 +114,7 @@ def _words(name: str) -> list[str]:
 
 
 def _alike(words: list[str], others: list[str]) -> bool:
-    """Return True if two or more words agree, in any order, and at most one more is left over."""
+    """Return True if two or more words agree, in any order, and at most one other word remains."""
     few, many = sorted((sorted(words), sorted(others)), key=len)
     left = list(many)
     for word in few:
@@ -122,14 +124,15 @@ def _alike(words: list[str], others: list[str]) -> bool:
 
 
 def _other_limb(words: list[str], others: list[str]) -> bool:
-    """Return True if both have words of a side, or both have numbers, and these differ."""
+    """Return True if both names have words of a side, or both have numbers, and these differ."""
     sides = [sorted(_SIDES[word] for word in each if word in _SIDES) for each in (words, others)]
     numbers = [sorted("".join(filter(str.isdigit, each))) for each in (words, others)]
     return any(all(each) and each[0] != each[1] for each in (sides, numbers))
 
 
 def _edits(one: str, other: str, most: int) -> int:
-    """Return the edit distance (insert, delete, replace, swap neighbors), or a number above `most`."""
+    """Return the edit distance of two words (insert, delete, replace, swap neighbors), or a number above
+    `most`."""
     if abs(len(one) - len(other)) > most:
         return most + 1
     before: list[int] = []
@@ -145,7 +148,8 @@ def _edits(one: str, other: str, most: int) -> int:
 
 
 def suggestion(name: str, known: Iterable[str], otherwise: str = "") -> str:
-    """Return a fix for an unknown name: a near name, `otherwise`, or the list of known names."""
+    """Return a hint for an unknown name: `did you mean ...?` with similar names, else `otherwise`, else
+    the list of known names."""
     known = sorted(set(known))
     if meant := near(name, known):
         return f"did you mean {' or '.join(meant)}?"
@@ -153,5 +157,6 @@ def suggestion(name: str, known: Iterable[str], otherwise: str = "") -> str:
 
 
 def counted(number: int, one: str, many: str) -> str:
-    """Return `1 period`, `2 periods`: the singular for exactly one, the plural otherwise, including zero."""
+    """Return a number with its noun, such as `1 period` or `2 periods`: `one` for exactly one, `many`
+    otherwise, including zero."""
     return f"{number} {one if number == 1 else many}"

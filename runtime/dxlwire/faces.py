@@ -1,4 +1,4 @@
-"""Lazy modules: they offer names of other modules and import each one on first use."""
+"""Lazy modules: modules that offer names of other modules and import each of these on first use."""
 
 from __future__ import annotations
 
@@ -11,10 +11,10 @@ if TYPE_CHECKING:
 
 
 def lazy_face(module: str, source: str) -> tuple[Callable[[str], object], Callable[[], list[str]]]:
-    """Return `__getattr__` and `__dir__` of a lazy module; `__all__` is an attribute, too.
+    """Return the functions `__getattr__` and `__dir__` of a lazy module; it also has the attribute `__all__`.
 
-    Type checkers read the same stub file, so each name is listed only once. The file is read on first use of
-    a name, because most processes import the module only on the way to a submodule.
+    Type checkers read the same stub file, so each name is listed only once. The file is read on first use
+    of a name, because most processes import the module only on the way to a submodule.
 
     Args:
         module: Name of the lazy module.

@@ -1,4 +1,4 @@
-"""Joint units: SI and display units of the positions, speeds and efforts of a joint."""
+"""Joint units: SI and display units of the positions, speeds and efforts of rotary and linear joints."""
 
 from __future__ import annotations
 
@@ -12,15 +12,14 @@ _TEXTS: Mapping[str, _Texts] = {
     "rad": ("deg", math.degrees(1.0), 1, "", "Nm", "turns", "an angle"),
     "m": ("mm", 1e3, 2, " mm", "N", "is linear", "a length"),
 }
-"""Attributes of the units, in the order of their declarations in `JointUnit`."""
+"""Attributes of each unit, in the order of their declarations in `JointUnit`."""
 
 
 class JointUnit(Enum):
     """Unit of a joint's positions: an angle for a rotary joint, a length for a linear one.
 
     The value is the SI unit in plans, logs and answers: `JointUnit("m") is LINEAR`. A module that needs
-    another property of each kind of joint, such as a threshold, has a table with units as keys.
-    """
+    another property of each kind of joint, such as a threshold, has a table with units as keys."""
 
     ROTARY = "rad"
     LINEAR = "m"
@@ -41,16 +40,17 @@ class JointUnit(Enum):
 
     @property
     def speed(self) -> str:
-        """SI unit of speeds."""
+        """SI unit of the joint's speeds, such as `rad/s`."""
         return f"{self.si}/s"
 
     @property
     def acceleration(self) -> str:
-        """SI unit of accelerations."""
+        """SI unit of the joint's accelerations, such as `rad/s^2`."""
         return f"{self.si}/s^2"
 
     def effort_unit(self, measured: str) -> str:
-        """Return the unit of a joint's effort for the unit measured by its servo: N in place of Nm."""
+        """Return the unit of a joint's effort if its servo measures effort in `measured`: N in place of Nm
+        for a linear joint."""
         return self.torque if measured == "Nm" else measured
 
     def number(self, position: float, *, digits: int = 2, trim: bool = True, signed: bool = False) -> str:
@@ -69,7 +69,8 @@ class JointUnit(Enum):
         return f"+{text}" if signed and value > 0 else text
 
     def text(self, position: float, *, digits: int = 2, trim: bool = False) -> str:
-        """Format a position or a distance with its unit: `12.30 deg`, `4.56 mm`. Arguments as in `number`."""
+        """Format a position or a distance (rad or m) in display units with the unit: `12.30 deg`, `4.56
+        mm`. Arguments as in `number`."""
         return f"{self.number(position, digits=digits, trim=trim)} {self.shown}"
 
     def speed_text(self, speed: float) -> str:
@@ -77,12 +78,12 @@ class JointUnit(Enum):
         return f"{self.text(speed)}/s"
 
     def exact_text(self, position: float) -> str:
-        """Format a position with six significant digits: `12.3457 deg`."""
+        """Format a position (rad or m) in display units with six significant digits: `12.3457 deg`."""
         return f"{position * self.factor:.6g} {self.shown}"
 
     @classmethod
     def find_by_quantity(cls, si_unit: str) -> JointUnit:
-        """Return the unit of the joints that have a position, speed, acceleration or torque in an SI unit.
+        """Return the joint unit whose positions, speeds, accelerations or torques have this SI unit.
 
         Raises:
             LookupError: No joint has a quantity in this unit.

@@ -1,7 +1,7 @@
-"""Modes: the command interfaces of a joint, their valid combinations, and the servo modes for them.
+"""Modes: command interfaces of a joint (position, velocity, effort, PWM), their valid combinations, and the
+servo mode for each.
 
-No numpy here: the guardian reads the plan of a bus and must stay small.
-"""
+No numpy here: the guardian reads the plan of a bus and must stay small."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ COMMAND_INTERFACES: tuple[CommandName, ...] = ("position", "velocity", "effort",
 
 @unique
 class Mode(IntEnum):
-    """Control mode of a servo; the number is in the log."""
+    """Control mode of a servo: the quantity that its goals command. The number is stored in logs."""
 
     UNKNOWN = 0  # Unknown or changing: the joint gets no goals
     POSITION = 1  # Moves to a position, at full speed or at a given one; counts turns for a continuous joint
@@ -41,7 +41,7 @@ _MODES: dict[frozenset[str], Mode] = {
 
 
 def mode_of(names: Collection[str]) -> Mode:
-    """Return the mode for a combination of command interfaces.
+    """Return the servo mode for a combination of command interfaces, such as position and velocity.
 
     Raises:
         ValueError: No mode has this combination, or it is empty.

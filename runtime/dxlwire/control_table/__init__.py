@@ -1,8 +1,7 @@
-"""Control tables: addresses and units of the control items of each servo model.
+"""Control tables: addresses and units of the control items of each servo and device model.
 
-`find_table("AX-12A")` is the table of a model, `find_table("MX-28", 2.0)` that of one of its firmwares. Each
-model has a data file in `tables/`.
-"""
+`find_table("AX-12A")` is the table of a model, `find_table("MX-28", 2.0)` that of one of its firmwares.
+Each model has a data file in `tables/`."""
 
 from dxlwire.control_table.hardware_errors import Fault as Fault
 from dxlwire.control_table.hardware_errors import HardwareErrors as HardwareErrors

@@ -1,7 +1,6 @@
-"""Deviations: settings that another program left in a servo, judged by their effect.
+"""Deviations: rules for settings that another program changed in a servo, by their effect on a run.
 
-`tables/deviations.toml` has the judgement of every writable item. The data file of a model may override it.
-"""
+`tables/deviations.toml` has the rule of every writable item. The data file of a model may override it."""
 
 from __future__ import annotations
 
@@ -15,13 +14,14 @@ from typing import Literal
 import msgspec
 
 Judgement = Literal["refuse", "report", "harmless"]
-"""`refuse`: the servo gets no torque; `report`: an event at start-up; `harmless`: no action."""
+"""Consequence of a changed setting. `refuse`: the servo gets no torque; `report`: an event at start-up;
+`harmless`: no action."""
 
 _NUMBER = re.compile(r"_\d+$")
 
 
 class Deviation(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
-    """Judgement of values that differ from the factory's; see `deviations.toml`."""
+    """Rule for the values of one item that differ from the factory value; see `deviations.toml`."""
 
     judgement: Judgement
     effect: str
@@ -34,7 +34,8 @@ class Deviation(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     planned: bool = False
     """True if the value is compared with the plan of a run instead of the factory value."""
     limited_by: str = ""
-    """Item that bounds this one, and that supplies its value at power-up if it lacks an initial value."""
+    """Name of the item that limits this one, and that supplies its value at power-up if it lacks an
+    initial value."""
     remedy: str = "declare what the robot needs in `registers`, or write it by `dxlrun servo`"
 
     @property
@@ -43,29 +44,30 @@ class Deviation(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
         return self.judgement == "refuse" or bool(self.refused)
 
     def judge(self, value: int, factory: int) -> Judgement:
-        """Return the judgement of a value; both arguments are integers on the wire."""
+        """Return the consequence of a value; `value` and `factory` are integers on the wire."""
         if value in self.refused:
             return "refuse"
         return "harmless" if value == factory or value in self.equivalent else self.judgement
 
     def effect_of(self, value: int) -> str:
-        """Return the effect of a value: a verb with its object."""
+        """Return the effect of a value in words: a verb with its object."""
         effect = self.refused_effect if value in self.refused and self.refused_effect else self.effect
         bits = " and ".join(words for bit, words in self.bits if value & bit) or "has no known meaning"
         return effect.replace("{value}", str(value)).replace("{bits}", bits)
 
 
 UNDESCRIBED = Deviation("report", "has an effect that its control table does not describe")
-"""Judgement of an item of a plug-in's model that neither its own file nor `deviations.toml` judges."""
+"""Rule for an item of a plug-in's model that neither its own file nor `deviations.toml` judges: report it."""
 
 
 def deviation_of(name: str) -> Deviation:
-    """Return the judgement of an item name, the same for all models."""
+    """Return the rule in `deviations.toml` for an item name, the same for all models; the number at the
+    end of a name is ignored."""
     return deviations_by_name().get(_NUMBER.sub("", name), UNDESCRIBED)
 
 
 @functools.cache
 def deviations_by_name() -> Mapping[str, Deviation]:
-    """Return the judgements of `deviations.toml`, by item name without its number."""
+    """Return the rules of `deviations.toml`, by item name without its number."""
     text = (Path(__file__).parent / "tables" / "deviations.toml").read_text("utf-8")
     return msgspec.convert(tomllib.loads(text), dict[str, Deviation])

@@ -37,8 +37,8 @@ from dxlwire.control_table.table import CAPABILITIES as SERVO_CAPABILITIES
 from dxlwire.control_table.table import ControlItem, Table
 
 WAITS = "waits_in_chain"
-"""Capability of a board that must be read alone: in a chain after a missing servo it would never answer again
-(protocol.md)."""
+"""Capability of a board that must be read alone: in a chain of replies after a missing servo it would
+never answer again (protocol.md)."""
 CAPABILITIES: Mapping[str, str] = {
     **{
         name: SERVO_CAPABILITIES[name]
@@ -47,7 +47,8 @@ CAPABILITIES: Mapping[str, str] = {
     "broadcast_ping": "a reply to a ping to all IDs",
     WAITS: "in a sync or bulk read it waits for the status ahead of its own, and executes nothing until then",
 }
-"""Capabilities of devices in data files, in addition to ping, read and write."""
+"""Words that a device's data file may list under `capabilities`, with their meaning. Every device supports
+ping, read and write."""
 _SIZES = (1, 2, 4)
 _HIGHEST_ADDRESS = 0xFFFF - 4
 _MODEL_NUMBER = (0, 2)  # Address and size from which a model number is read before the model is known
@@ -67,31 +68,31 @@ _IDENTITY: Mapping[float, Mapping[str, Entry]] = {
     for protocol, firmware, servo_id, highest in ((1.0, 2, 3, 253), (2.0, 6, 7, 252))
 }
 STATE_NAME = re.compile(r"[A-Za-z][A-Za-z0-9_]*(\.[A-Za-z0-9_]+)*", re.ASCII)
-"""Pattern of state names, such as `angular_velocity.x`."""
+"""Pattern that the names of device states must match, such as `angular_velocity.x`."""
 
 
 _KEYS = {*ControlItem.__struct_fields__, "tick"} - {"name", "unit", "scale", "firmware", "deviation"}
 
 
 class DeviceTable(Table, frozen=True, kw_only=True):
-    """Control items of one device model."""
+    """Control table of one device model."""
 
     model_number: int | None
-    """Model number; None if the device reports any number or none. It is then not checked, and a scan cannot
-    identify it."""
+    """Model number; None if the device reports any number or none. It is then not checked, and a scan
+    cannot identify the device."""
     cyclic: tuple[str, ...]  # Items that are read in each cycle if the robot file names none
     fast_sync_read_firmware: int | None = None
-    """First firmware version with the fast forms; None if the model has none."""
+    """First firmware version that supports fast sync and bulk read; None if the model does not."""
     text: str = ""  # Text of the data file, for processes that do not read it; empty for a shipped file
 
 
 def is_device_table(text: str) -> bool:
-    """Return True if a data file describes a device."""
+    """Return True if the TOML text of a data file describes a device instead of a servo."""
     return tomllib.loads(text).get("kind") == "device"
 
 
 def read_device_table(text: str) -> DeviceTable:
-    """Return the table from the TOML text of a data file.
+    """Return the control table of a device from the TOML text of its data file.
 
     Raises:
         ValueError: The text is not a device table (also tomllib.TOMLDecodeError).
@@ -101,7 +102,7 @@ def read_device_table(text: str) -> DeviceTable:
 
 
 def build_device_table(data: Entry) -> DeviceTable:
-    """Return the table from the entry of a device; raises as `read_device_table`."""
+    """Return the control table of a device from its parsed data file; raises as `read_device_table`."""
     if data.get("kind") != "device":
         raise ValueError('the table of a device has kind = "device"')
     written = section(data["items"])
@@ -141,18 +142,17 @@ def build_device_table(data: Entry) -> DeviceTable:
 
 
 def _with_identity(entries: Entry, protocol: float) -> Entry:
-    """Add the items that every device has, at the addresses that servos of its protocol use.
+    """Add the items that every device has, unless the file has them, at the addresses that servos of its
+    protocol use.
 
-    e-Manual, Protocol 1.0 and 2.0 models, Control Table: Model Number, Firmware Version, ID.
-    """
+    e-Manual, Protocol 1.0 and 2.0 models, Control Table: Model Number, Firmware Version, ID."""
     places = _IDENTITY[protocol]
     return {**{name: entry for name, entry in places.items() if name not in entries}, **entries}
 
 
 def _check_places(items: Sequence[ControlItem]) -> None:
-    """Raise ValueError for overlapping items, except different bits of one place. Items are sorted by
-    address.
-    """
+    """Raise ValueError if items overlap, except different bits of the same bytes. Items are sorted by
+    address."""
     for before, item in pairwise(items):
         if item.address >= before.address + before.size:
             continue

@@ -1,4 +1,5 @@
-"""Device models: those of the shipped data files and those of plug-ins."""
+"""Device models: finds the control table of a device by name or number, among shipped data files and those
+of plug-ins."""
 
 from __future__ import annotations
 
@@ -19,7 +20,7 @@ _ADDED: list[DeviceTable] = []  # Tables of plug-ins
 
 
 def device_table(model: str, protocol: float | None = None) -> DeviceTable:
-    """Return the table of a device by its model's name or alias, in any case.
+    """Return the control table of a device model by its name or alias; case and punctuation are ignored.
 
     Raises:
         LookupError: No device has the name, or none of them speaks the protocol.
@@ -35,25 +36,25 @@ def device_table(model: str, protocol: float | None = None) -> DeviceTable:
 
 
 def device_tables() -> tuple[DeviceTable, ...]:
-    """Return the tables of all devices, shipped ones and those of plug-ins."""
+    """Return the control tables of all device models, shipped ones first, then those of plug-ins."""
     return (*_shipped(), *_ADDED)
 
 
 def devices_by_number(number: int, protocol: float) -> tuple[DeviceTable, ...]:
-    """Return the tables of a model number, or an empty tuple if it is unknown."""
+    """Return the control tables of devices with this model number; empty if the number is unknown."""
     return tuple(
         table for table in device_tables() if (table.model_number, table.protocol) == (number, protocol)
     )
 
 
 def perhaps_meant_device(name: str) -> str:
-    """Return a hint for an unknown device name."""
+    """Return a hint for an unknown device model name, such as `did you mean ...?`."""
     known = (each for table in device_tables() for each in (table.model, *table.aliases))
     return beginning_or_near(name, known)
 
 
 def add_device_table(text: str) -> DeviceTable:
-    """Add and return a plug-in's device table.
+    """Register a device model from a plug-in, and return its table.
 
     Args:
         text: TOML text of a data file.
@@ -79,7 +80,7 @@ def _key(name: str) -> str:
 
 
 def _refuse_twins(table: DeviceTable, known: Iterable[DeviceTable]) -> None:
-    """Raise ValueError if a servo or a device already has one of the names or the model number."""
+    """Raise ValueError if a known servo or device model has one of the table's names or its model number."""
     names = (table.model, *table.aliases)
     keys = set(map(_key, names))
     for each in known:

@@ -1,4 +1,4 @@
-"""Hardware errors of a model: the item that reports them, and the meaning of its bits or codes."""
+"""Hardware errors of a servo model: the item that reports them, and the meaning of its bits or codes."""
 
 from __future__ import annotations
 
@@ -9,21 +9,21 @@ from typing import Literal
 import msgspec
 
 Fault = Literal["voltage", "overheating", "overload"]
-"""Faults that the analysis distinguishes, independent of a model's own names and values."""
+"""Kinds of faults that the analysis of a log distinguishes, independent of a model's own names and values."""
 
 STATUS_BYTE: Mapping[str, int] = {"input_voltage": 0x01, "overheating": 0x04, "overload": 0x20}
-"""Errors in the error byte of Protocol 1.0, the same for every model; the other bits concern one instruction.
-
-Source: e-Manual, "DYNAMIXEL Protocol 1.0", Error."""
+"""Bits in the error byte of Protocol 1.0 that report a fault of the servo, the same for every model; the
+other bits concern one instruction. Source: e-Manual, "DYNAMIXEL Protocol 1.0", Error."""
 
 
 class HardwareErrors(msgspec.Struct, frozen=True):
-    """Error item of a model, with the meaning of its values."""
+    """Item that reports the hardware errors of a servo model, with the meaning of its values."""
 
     item: str = ""
-    """`hardware_error_status`, `error_code` (Y series), or empty for the error byte of each reply."""
+    """Name of the item: `hardware_error_status`, `error_code` (Y series), or empty for the error byte of
+    each reply."""
     values: Mapping[str, int] = MappingProxyType({})
-    """The e-Manual's name of an error in snake_case -> its bit, or its code where `has_codes`."""
+    """Bit of each error by the e-Manual's name in snake_case; the error's code instead if `has_codes`."""
 
     @property
     def has_codes(self) -> bool:
@@ -32,17 +32,18 @@ class HardwareErrors(msgspec.Struct, frozen=True):
 
     @property
     def mask(self) -> int:
-        """Mask of all error bits; only for an item of bits."""
+        """All error bits of the item together; only for an item of bits."""
         return sum(self.values.values())
 
     def names(self, value: int) -> tuple[str, ...]:
-        """Return the names of the errors in a value of the item."""
+        """Return the names of the errors that a value of the item reports."""
         if self.has_codes:
             return tuple(name for name, code in self.values.items() if code == value)
         return tuple(name for name, bit in self.values.items() if value & bit)
 
     def describe(self, value: int) -> str:
-        """Return the e-Manual's words for a value of the item; `no hardware error` for 0."""
+        """Return a value of the item in the e-Manual's words, such as `overload error`; `no hardware
+        error` for 0."""
         if not value:
             return "no hardware error"
         names = self.names(value)
@@ -54,12 +55,12 @@ class HardwareErrors(msgspec.Struct, frozen=True):
         return "; ".join(words)
 
     def is_warning(self, value: int) -> bool:
-        """Return True if a value is only a warning: the servo still accepts torque and goals."""
+        """Return True if a value reports only warnings: the servo still accepts torque and goals."""
         names = self.names(value)
         return bool(names) and all(map(is_warning, names))
 
     def faults(self, value: int) -> frozenset[Fault]:
-        """Return the faults that a value of the item reports."""
+        """Return the kinds of faults that a value of the item reports: voltage, overheating, overload."""
         kinds: tuple[Fault, ...] = ("voltage", "overheating", "overload")
         return frozenset(kind for kind in kinds for name in self.names(value) if name.endswith(kind))
 
@@ -69,10 +70,11 @@ class HardwareErrors(msgspec.Struct, frozen=True):
 
 
 def is_warning(name: str) -> bool:
-    """Return True for the name of a warning (e-Manual, Y series, Error Code (153))."""
+    """Return True if an error's name is that of a warning (e-Manual, Y series, Error Code (153))."""
     return name.endswith("_warning")
 
 
 def error_item(items: Mapping[str, object]) -> str:
-    """Return the name of a model's hardware error item; empty if it has none."""
+    """Return the name of the item among a model's items that reports hardware errors; empty if it has
+    none."""
     return next((name for name in ("hardware_error_status", "error_code") if name in items), "")

@@ -1,4 +1,5 @@
-"""Servo models: those of the shipped data files and those of plug-ins."""
+"""Servo models: finds the control table of a servo by name or number, among shipped data files and those
+of plug-ins."""
 
 from __future__ import annotations
 
@@ -13,14 +14,15 @@ from dxlwire.control_table.table import ControlTable
 from dxlwire.errors import suggestion
 
 _ADDED: dict[float, list[Listing]] = {1.0: [], 2.0: []}
-"""Tables of plug-ins; added during process start, before the first robot is compiled."""
+"""Models that plug-ins added, by protocol; added during process start, before the first robot file is
+read."""
 _MOST_MEANT = 4  # More suggestions than this do not help
 _SERIES = re.compile(r"[0-9]?[A-Z]+[0-9]{3}")
 _TEXTS: dict[str, str] = {}  # Name -> TOML text of the added tables
 
 
 def find_table(model: str, protocol: float | None = None) -> ControlTable:
-    """Return the control table of a model name; `understood` lists the accepted spellings.
+    """Return the control table of a servo model; `understood` lists the accepted spellings of its name.
 
     Args:
         model: Name or alias of the model.
@@ -47,17 +49,17 @@ def find_table(model: str, protocol: float | None = None) -> ControlTable:
 
 
 def protocols_of(model: str) -> tuple[float, ...]:
-    """Return the protocols of a model by any accepted name; empty if the model is unknown."""
+    """Return the protocols in which a servo model exists, by any accepted spelling of its name; empty if
+    the model is unknown."""
     return tuple(each for each in (1.0, 2.0) if understood(model, each) is not None)
 
 
 def understood(name: str, protocol: float) -> Listing | None:
-    """Return the model of a protocol that a name identifies, or None if there are none or several.
+    """Return the servo model that a name identifies in a protocol; None if no model fits, or several.
 
-    Accepted in addition to the names of models and their aliases: other case and punctuation (AX12, xl_320),
-    the product name with its connector (XL430-W250-T or -R), and the series of a model that is the only one
-    in it (XL430, XL-430).
-    """
+    Accepted in addition to the names of models and their aliases: other case and punctuation (AX12,
+    xl_320), the product name with its connector (XL430-W250-T or -R), and the series of a model that is
+    the only one in it (XL430, XL-430)."""
     known = _index(protocol)
     if name in known:
         return known[name]
@@ -79,17 +81,18 @@ def _key(name: str) -> str:
 
 
 def model_names(protocol: float | None = None) -> tuple[str, ...]:
-    """Return every exact model name and alias, sorted; with `protocol` only those of that protocol."""
+    """Return the exact names and aliases of all servo models, sorted; with `protocol` only those of that
+    protocol."""
     return tuple(sorted({name for each in (1.0, 2.0) if protocol in (None, each) for name in _index(each)}))
 
 
 def perhaps_meant(name: str, protocol: float | None = None) -> str:
-    """Return a hint for an unknown servo model name."""
+    """Return a hint for an unknown servo model name, such as `did you mean ...?`."""
     return beginning_or_near(name, model_names(protocol))
 
 
 def beginning_or_near(name: str, known: Iterable[str]) -> str:
-    """Return a hint for an unknown name: the names that start with it, else the nearest ones."""
+    """Return a hint for an unknown name: the known names that start with it, else the most similar ones."""
     keys = {_key(each): each for each in sorted(known, reverse=True)}
     key = _key(name)
     meant = sorted(each for each in keys if key and each.startswith(key))
@@ -99,24 +102,23 @@ def beginning_or_near(name: str, known: Iterable[str]) -> str:
 
 
 def all_tables() -> tuple[ControlTable, ...]:
-    """Return every control table once, sorted by protocol, model number and firmware."""
+    """Return the control table of every servo model once, sorted by protocol, model number and firmware."""
     tables = [listing.build() for listing in (*_listings(1.0), *_listings(2.0))]
     return tuple(sorted(tables, key=lambda each: (each.protocol, each.model_number, each.firmware)))
 
 
 def models_by_number(number: int, protocol: float, firmware: float = math.inf) -> tuple[ControlTable, ...]:
-    """Return the tables for a model number that a servo has reported, newest firmware first.
+    """Return the control tables of servos with this model number, newest firmware first.
 
-    The result is empty for an unknown number. It has several tables if the table depends on the firmware; the
-    first one then belongs to the given `firmware`.
-    """
+    The result is empty for an unknown number. It has several tables if the table depends on the firmware;
+    the first one then belongs to the given `firmware`."""
     found = [listing.build() for listing in _listings(protocol) if listing.model_number == number]
     fitting = [each for each in found if each.firmware <= firmware]
     return tuple(sorted(fitting, key=lambda each: -each.firmware))
 
 
 def add_control_table(text: str) -> ControlTable:
-    """Add and return a plug-in's control table.
+    """Register a servo model from a plug-in, and return its table.
 
     Args:
         text: TOML text of a data file.
@@ -143,10 +145,9 @@ def add_control_table(text: str) -> ControlTable:
 
 
 def added_control_tables(models: Iterable[str]) -> tuple[str, ...]:
-    """Return the texts of the added tables of some models; shipped models have none.
+    """Return the TOML texts of those of these models that plug-ins added; shipped models are omitted.
 
-    A process that does not load plug-ins can add them from these texts.
-    """
+    A process that does not load plug-ins can add them from these texts."""
     return tuple(dict.fromkeys(_TEXTS[model] for model in models if model in _TEXTS))
 
 
@@ -168,9 +169,8 @@ def _listings(protocol: float) -> tuple[Listing, ...]:
 
 @functools.cache
 def _shipped(protocol: float) -> Mapping[str, Listing]:
-    """Return the shipped models of one protocol, by name. The other protocol's files are not read until
-    needed.
-    """
+    """Return the shipped models of one protocol, by name and alias. The files of the other protocol are
+    not read until needed."""
     found: dict[str, Listing] = {}
     for listing in listings(protocol):
         for name in listing.names:

@@ -1,4 +1,4 @@
-"""Data files -> control tables: one TOML file per model, and the rules for all of them."""
+"""Sources: reads the TOML data files of servo models and builds control tables from them."""
 
 from __future__ import annotations
 
@@ -29,14 +29,14 @@ Entry: TypeAlias = Mapping[str, object]  # One table of a data file: an item, or
 
 
 class Listing(msgspec.Struct, frozen=True):
-    """Model whose table is built on demand."""
+    """One servo model whose control table is built on the first call of `build`."""
 
     names: tuple[str, ...]  # The model's own name first
     model_number: int
     firmware: int
     build: Callable[[], ControlTable]
-    """Return the table, the same object at each call. Raises ValueError or KeyError if its data file is
-    invalid."""
+    """Returns the control table, the same object at each call. Raises ValueError or KeyError if its data
+    file is invalid."""
 
 
 _SI = {
@@ -63,17 +63,17 @@ _SI = {
     "degC": ("degC", 1.0),
     "fraction": ("1", 1.0),
 }
-"""Unit of a data file -> SI unit and factor; `rpm2` is revolutions per minute per minute, `g` is
+"""SI unit and factor for each unit of a data file; `rpm2` is revolutions per minute per minute, `g` is
 standard gravity (3rd CGPM, 1901)."""
 
 
 _TABLES = Path(__file__).parent / "tables"
-"""Folder of the data files: one folder per protocol, with subfolders for large series; one TOML file per
-model."""
+"""Folder of the shipped data files: one folder per protocol, with subfolders for large series; one TOML
+file per model."""
 
 
 def listings(protocol: float) -> tuple[Listing, ...]:
-    """Return the models of all data files of a protocol; their tables are built on demand.
+    """Return the models of all shipped data files of a protocol; their control tables are built on demand.
 
     Raises:
         ValueError: A data file is invalid.
@@ -90,7 +90,8 @@ def listings(protocol: float) -> tuple[Listing, ...]:
 
 
 def _listing(name: str, heads: Mapping[str, Entry], texts: Mapping[str, str]) -> Listing:
-    """Return a model from the heads of the files. Whole files are parsed when the table is built."""
+    """Return one model from the keys at the start of its files. Whole files are parsed when the table is
+    built."""
     chain = _chain(name, heads)
     head = dict(ChainMap(*(dict(heads[each]) for each in chain)))
     return Listing(
@@ -104,7 +105,8 @@ def _listing(name: str, heads: Mapping[str, Entry], texts: Mapping[str, str]) ->
 
 
 def _chain(name: str, entries: Mapping[str, Entry]) -> list[str]:
-    """Return the names of a model and of its ancestors by `extends`, in that order."""
+    """Return the names of a model's file and of the files that it extends directly or indirectly, in that
+    order."""
     chain = [name]
     while (parent := entries[chain[-1]].get("extends")) is not None:
         if not isinstance(parent, str) or parent not in entries or parent in chain:
@@ -114,10 +116,10 @@ def _chain(name: str, entries: Mapping[str, Entry]) -> list[str]:
 
 
 def resolve(name: str, entries: Mapping[str, Entry]) -> Entry:
-    """Return a model's entry merged with the entries that it `extends`.
+    """Return the data of a model, merged with the data files that it `extends`.
 
-    Items are merged key by key. `left_out` names items that the model does not have. Baud rates are inherited
-    as a whole, aliases not at all.
+    Items are merged key by key. `left_out` names items that the model does not have. Baud rates are
+    inherited as a whole, aliases not at all.
 
     Raises:
         ValueError: The chain of `extends` ends at an unknown model or is circular.
@@ -137,7 +139,7 @@ def resolve(name: str, entries: Mapping[str, Entry]) -> Entry:
 
 
 def read_control_table(text: str) -> ControlTable:
-    """Return the control table from the TOML text of a data file.
+    """Return the control table of a servo model from the TOML text of its data file.
 
     Raises:
         ValueError: The text is not a control table (also tomllib.TOMLDecodeError).
@@ -147,7 +149,7 @@ def read_control_table(text: str) -> ControlTable:
 
 
 def build_table(data: Entry) -> ControlTable:
-    """Return the control table from a model's entry, with `extends` resolved.
+    """Return the control table of a servo model from its data, with `extends` resolved.
 
     Raises:
         ValueError: The entry is invalid.
@@ -197,7 +199,8 @@ def build_table(data: Entry) -> ControlTable:
 
 
 def _hardware_errors(data: Entry, items: Mapping[str, ControlItem]) -> HardwareErrors:
-    """Return the errors of a model. Raises ValueError for values that are not distinct bits or codes."""
+    """Return the hardware errors of a model from its data file. Raises ValueError for values that are not
+    distinct bits or codes."""
     item = error_item(items)
     entries = section(data.get("errors", STATUS_BYTE if not item else {}))
     values = {name: whole(entries, name) for name in entries}
@@ -212,7 +215,8 @@ def _hardware_errors(data: Entry, items: Mapping[str, ControlItem]) -> HardwareE
 
 
 def _figure(data: Entry, key: str, unit: str) -> float:
-    """Return a quantity of the motor. Raises ValueError if it is negative or has another unit."""
+    """Return a property of the motor, such as `stall_torque`, in an SI unit. Raises ValueError if it is
+    negative or has another unit."""
     found, value = quantity(str(data[key]))
     if found != unit or not value >= 0:
         raise ValueError(f"{key}: {data[key]!r} is not a quantity in {unit} from 0 on")
@@ -226,14 +230,15 @@ def _ratio(value: object) -> float:
 
 
 def section(value: object) -> Entry:
-    """Return a table of a data file. Raises ValueError if the value is not a table."""
+    """Return a value of a data file that must be a table. Raises ValueError otherwise."""
     if not isinstance(value, Mapping):
         raise ValueError(f"{value!r} is not a table")
     return value
 
 
 def whole(entry: Entry, key: str) -> int:
-    """Return an integer of a table. Raises ValueError if it is not an integer, KeyError if it is missing."""
+    """Return a value of a table that must be an integer. Raises ValueError if it is not an integer,
+    KeyError if it is missing."""
     value = entry[key]
     if type(value) is not int:
         raise ValueError(f"{key} is not a whole number")
@@ -241,14 +246,14 @@ def whole(entry: Entry, key: str) -> int:
 
 
 def words(value: object) -> list[str]:
-    """Return a list of words. Raises ValueError if the value is not one."""
+    """Return a value of a data file that must be a list of strings. Raises ValueError otherwise."""
     if not isinstance(value, list) or not all(isinstance(word, str) for word in value):
         raise ValueError(f"{value!r} is not a list of words")
     return value
 
 
 def quantity(text: str, own: Collection[str] = ()) -> tuple[str, float]:
-    """Return SI unit and value of `59 rpm` or `300/1023 deg`. The manual's ratio is rounded only once.
+    """Convert a text such as `59 rpm` or `300/1023 deg` to (SI unit, value in that unit).
 
     Args:
         text: Number, or ratio of two numbers, and unit.
@@ -271,7 +276,8 @@ def quantity(text: str, own: Collection[str] = ()) -> tuple[str, float]:
 
 
 def measure(name: str, entry: Entry, key: str, own: Collection[str] = ()) -> tuple[str, float]:
-    """Return SI unit and value of a quantity in an item's entry. Raises ValueError for other values."""
+    """Convert a quantity in an item's entry, such as `tick`, to (SI unit, value). Raises ValueError, with
+    the item's name, if it is not one."""
     try:
         return quantity(str(entry[key]), own)
     except ValueError as error:
@@ -279,7 +285,8 @@ def measure(name: str, entry: Entry, key: str, own: Collection[str] = ()) -> tup
 
 
 def _items(entries: Entry) -> Iterator[ControlItem]:
-    """Yield items. An item with `repeat` is the first of a series: `indirect_address_1` to 28."""
+    """Yield the control items of a data file. An item with `repeat` is the first of a series:
+    `indirect_address_1` to 28."""
     for name, value in entries.items():
         entry = section(value)
         if entry.get("access") == "RW":
@@ -296,7 +303,8 @@ def _items(entries: Entry) -> Iterator[ControlItem]:
 
 
 def read_item(name: str, entry: Entry, own: Collection[str] = ()) -> ControlItem:
-    """Return an item from its entry, where `tick` is a quantity. Raises ValueError for an invalid entry."""
+    """Return a control item from its entry in a data file, where `tick` is a quantity. Raises ValueError
+    for an invalid entry."""
     unit, scale = measure(name, entry, "tick", own) if "tick" in entry else ("", 1.0)
     try:
         entry = {"initial": None, **entry, "name": name, "unit": unit, "scale": scale}
@@ -327,7 +335,7 @@ def _effort_unit(item: ControlItem) -> EffortUnit:
 
 
 def protocol_in(value: object) -> float:
-    """Return the protocol of a data file. Raises ValueError if it is neither 1.0 nor 2.0."""
+    """Return the value of the key `protocol`. Raises ValueError if it is neither 1.0 nor 2.0."""
     if value not in (1.0, 2.0) or not isinstance(value, float):
         raise ValueError(f"protocol is 1.0 or 2.0, not {value!r}")
     return value

@@ -1,8 +1,8 @@
-"""Bus: one serial line as a transaction machine that never blocks; Lines: all of them, with one wait.
+"""Bus: exchanges packets on one serial line without blocking. Lines: all serial lines of a robot, with one
+wait.
 
 A bus writes an instruction and receives incoming bytes and the time from its caller. `Lines` executes the
-jobs of all buses concurrently: cyclic reads, idle work, set-up and tools.
-"""
+jobs of all buses concurrently: cyclic reads, idle work, set-up and tools."""
 
 from __future__ import annotations
 
@@ -42,8 +42,8 @@ PATIENT_DRAIN_LIMIT_NS = 200_000_000  # The same limit for a job that has no dea
 LOST_LINE_STEP_NS = 200_000  # Interval at which the other lines are checked while one is lost
 BEAT_NS = 1_000_000  # Longest interval between two calls of `beat`, not counting one wait
 MOST_LATE_NS = 1_000_000
-"""Cap for the measured lateness. A later reply is an accident, such as a stall of this process, and not a
-property of the line."""
+"""Cap for the measured lateness of replies, ns. A later reply is an accident, such as a stall of this
+process, and not a property of the line."""
 _FORGOTTEN = 6  # Each reply that is less late lowers a line's lateness by 2 ** -6
 
 FREE_NS, LATE_NS, LOST, ASKED_NS, SILENCE_NS = range(5)
@@ -66,20 +66,20 @@ _FAST: _Shape = (BROADCAST_ID, 0)  # Shape of the single status packet of a fast
 
 
 class Bus:
-    """Transaction engine for one line. Reports every byte on the line to the packet sink.
+    """Executes transactions on one serial line and matches replies to them. Reports every byte on the line to
+    the packet sink.
 
-    A reply counts only when ID and length match exactly and it comes no sooner than the wire allows. Each of
-    several replies to one instruction counts on its own, even when another one is lost. After a timeout the
-    line is drained until it is silent. A reply that may answer an older request does not count, see
-    `OwedReplies`.
-    """
+    A reply counts only when ID and length match exactly and it comes no sooner than the wire allows. Each
+    of several replies to one instruction counts on its own, even when another one is lost. After a timeout
+    the line is drained until it is silent. A reply that may answer an older request does not count, see
+    `OwedReplies`."""
 
     def __init__(self, index: int, plan: BusPlan, port: Port, clock: Clock, packets: PacketSink) -> None:
         self.index = index  # Its number in the log
         self.plan = plan
         self.now_ns = clock.now_ns
         self.failure: PortError | None = None
-        """Reason why the line is lost. A bus with a failure does nothing more."""
+        """Reason why the line is lost; None while it works. A bus with a failure sends and reads nothing."""
         self.noise_bytes = 0  # Bytes that belonged to no intact packet, since the start
         self.unrequested = 0
         """Packets since the start that no request of this host explains: instructions of another host, and
@@ -94,7 +94,8 @@ class Bus:
         self._sink = packets
         self._dialect: Dialect = dialect_of(plan.protocol)
         self.receiver = Receiver(self._take_packet, self._take_noise, self._dialect)
-        """Its `pending` bytes are the beginning of a packet; a new request discards them as noise."""
+        """Splits the received bytes into packets. Its `pending` bytes are the beginning of a packet; a new
+        request discards them as noise."""
         cyclic = {
             (one.servo_id, one.length + more)  # Lengths that distinguish late replies
             for one in plan.members
@@ -102,7 +103,7 @@ class Bus:
         }
         self._cyclic = frozenset(cyclic | {_FAST}) if any(plan.fast) else frozenset(cyclic)
         self.owed = OwedReplies(clock.now_ns)
-        """Replies that did not arrive in time and may arrive late."""
+        """Replies that did not arrive before their timeout and may still arrive."""
         self._written: bytes | bytearray | memoryview = b""  # The packet that was sent last
         self._job: Job | None = None
         self._cyclic_job = self._waits = False
@@ -124,7 +125,7 @@ class Bus:
 
     @property
     def busy(self) -> bool:
-        """True while a job is under way."""
+        """True while a job is loaded and not finished."""
         return self._job is not None
 
     @property
@@ -133,7 +134,7 @@ class Bus:
         return self.words[LATE_NS]
 
     def load(self, job: Job, *, cyclic: bool = False, waits: bool = False) -> None:
-        """Load a job; the next `step` begins it. Leftovers of an aborted job are dropped.
+        """Load a job; the next `step` starts it. An unfinished job is dropped.
 
         Args:
             job: The transactions to execute.
@@ -148,30 +149,30 @@ class Bus:
             self._reply.strays = 0
 
     def drop(self) -> None:
-        """Drop the loaded job. Replies that still arrive for it count as stray."""
+        """Remove the loaded job. Replies that still arrive for it count as stray."""
         self._note_owed()
         self._job = self._awaited = self._held = None
         self._state = _READY
 
     def fail(self, error: PortError) -> None:
-        """Mark the line as lost and drop its job."""
+        """Mark the line as lost because of `error`, and drop its job."""
         self.failure = error
         self.words[LOST] = 1
         self._job = None
 
     def retry(self) -> None:
-        """Use a failed line again."""
+        """Clear the failure, so that the line is used again."""
         self.failure = None
         self.words[LOST] = 0
 
     def renew(self, port: Port) -> None:
-        """Continue on a reopened port in place of the lost one, and drop the job."""
+        """Continue on a reopened port in place of the lost one: clear the failure and drop the job."""
         self._port = port
         self.retry()
         self.drop()
 
     def send(self, packet: bytes | bytearray | memoryview) -> None:
-        """Send a prepared packet without a reply, between two jobs, without blocking.
+        """Send a packet that no servo answers, between two jobs, without blocking.
 
         The next transaction starts when the packet is off the wire.
 
@@ -187,7 +188,8 @@ class Bus:
             raise self.failure
 
     def resume(self, received_ns: int, sent_ns: int, deadline_ns: int) -> None:
-        """Await the replies to the loaded job's next transaction, which the exchange kernel has sent.
+        """Take over from the exchange kernel: await the replies to the loaded job's next transaction,
+        which the kernel has sent.
 
         Args:
             received_ns: Arrival time of the replies to the transaction before.
@@ -205,7 +207,7 @@ class Bus:
         self._deadline_ns = deadline_ns
 
     def take(self, data: bytes, at_ns: int) -> None:
-        """Parse bytes that the exchange kernel received and could not use."""
+        """Parse bytes that the exchange kernel received and could not use; `at_ns` is their arrival time."""
         self._last_byte_ns = at_ns
         self.receiver.feed(data, at_ns)
         self._skip_headers()
@@ -213,16 +215,15 @@ class Bus:
     # Time
 
     def hear(self) -> int:
-        """Read the bytes that the line has, and continue. Return the latest time of the next call, as `step`
-        does.
+        """Read the bytes that have arrived, match them to the current transaction, and continue like `step`.
 
-        Called when the line is readable.
-        """
+        Called when the line is readable."""
         self._receive()
         return self.step(self.now_ns())
 
     def step(self, now_ns: int) -> int:
-        """Do everything that is due. Return the latest time of the next call, NEVER without a job."""
+        """Do what is due now: start the next transaction or handle a deadline. Return the latest time of
+        the next call, NEVER without a job."""
         try:
             while self._job is not None:
                 if self._state == _READY:
@@ -245,7 +246,7 @@ class Bus:
                 self.fail(error)
 
     def _begin(self, job: Job) -> int:
-        """Pass the reply to the job and start its next transaction; return the time after that."""
+        """Pass the last reply to the job and start its next transaction; return the time after that, ns."""
         reply, done = self._reply, self._awaited
         if done is not None and reply.outcome is _OK:
             self._note_lateness(reply.last_ns - self._sent_ns - done.due_ns - self._latency_ns)
@@ -268,9 +269,8 @@ class Bus:
         return self._send_awaited(transaction)
 
     def choose(self, transaction: Transaction) -> tuple[Transaction, int]:
-        """Return a transaction with a reply length that no owed reply has, and its earliest send time; 0:
-        now.
-        """
+        """Return the transaction with the reply length that no owed reply has, or is soonest free of them,
+        and its earliest send time; 0: now."""
         best, best_ns = transaction, self.owed.free_ns(transaction)
         for more in range(1, transaction.spare + 1):
             if not best_ns:
@@ -314,7 +314,7 @@ class Bus:
             self._send_awaited(self.choose(transaction)[0])
 
     def _send_awaited(self, transaction: Transaction) -> int:
-        """Send a transaction and await its replies; return the time after that."""
+        """Send a transaction and await its replies; return the time after the send, ns."""
         self._awaited = transaction
         if self.receiver.pending:
             self.receiver.flush()
@@ -328,7 +328,8 @@ class Bus:
         return now_ns
 
     def _write(self, packet: bytes | bytearray | memoryview, servo_id: int) -> int:
-        """Send a packet; return the time after that."""
+        """Write a packet to the port, log it, and note when it is off the wire; return the time after the
+        write, ns."""
         now_ns, words = self.now_ns, self.words
         before = now_ns()
         self._port.write(packet)
@@ -343,7 +344,7 @@ class Bus:
         return after
 
     def _await(self, transaction: Transaction, started_ns: int) -> None:
-        """Await the replies to a transaction whose instruction has been sent."""
+        """Start to await the replies to a transaction whose instruction was sent at `started_ns`."""
         reply = self._reply
         reply.parameters = b""
         reply.error = 0
@@ -367,7 +368,8 @@ class Bus:
             self._deadline_ns = started_ns + transaction.due_ns
 
     def _end(self, now_ns: int) -> None:
-        """Handle the deadline of the current transaction."""
+        """Handle the deadline of the current transaction: a timeout, the end of a drain, or the end of a
+        pause."""
         # Bytes may have arrived while this process was suspended: read them before the timeout counts.
         self._receive()
         if self._state == _AWAITING:
@@ -383,9 +385,8 @@ class Bus:
             self._release_held(now_ns)
 
     def _extend_deadline(self, now_ns: int) -> bool:
-        """Extend the deadline if the port has a reason to expect a late reply; return True if it was
-        extended.
-        """
+        """Ask the port for a later deadline, which it grants if the other side was stalled; return True if
+        the deadline was extended."""
         self._planned_deadline_ns = self._planned_deadline_ns or self._deadline_ns
         self._deadline_ns = self._port.extend_deadline(
             self._planned_deadline_ns, self.words[FREE_NS], self._last_byte_ns, now_ns
@@ -393,11 +394,12 @@ class Bus:
         return self._deadline_ns > now_ns
 
     def stalled_ns(self, since_ns: int, until_ns: int) -> int:
-        """Return how long the other side of the line had no processor between two times, ns."""
+        """Return how long the simulated servos at the other end of the line had no processor between two
+        times, ns."""
         return self._port.stalled_ns(since_ns, until_ns)
 
     def _give_up(self, now_ns: int) -> None:
-        """End a transaction that timed out with replies missing."""
+        """End a transaction that timed out with replies missing, and drain the line."""
         self.receiver.flush()  # A false header may hide the reply
         if self._state != _AWAITING:
             return
@@ -412,9 +414,8 @@ class Bus:
         return min(self._last_byte_ns + self._quiet_ns, self._drain_end_ns)
 
     def _note_lateness(self, late_ns: int) -> None:
-        """Update the lateness of the line. Idle time starts no transaction that could end that late. Same
-        rule in kernel.c.
-        """
+        """Update the line's worst lateness by that of one reply. Idle time starts no transaction that
+        could end that late. Same rule in kernel.c."""
         kept_ns = self.words[LATE_NS]
         kept_ns -= (kept_ns >> _FORGOTTEN) + 1
         self.words[LATE_NS] = max(min(late_ns, MOST_LATE_NS), kept_ns, 0)
@@ -471,17 +472,15 @@ class Bus:
         return True
 
     def _await_devices(self, awaited: Transaction, last_ns: int) -> None:
-        """Shorten the deadline for the open replies: all servos have answered by `last_ns`. Same rule in
-        kernel.c.
-        """
+        """Shorten the deadline for devices, because all servos in the same read have answered by
+        `last_ns`. Same rule in kernel.c."""
         self._planned_deadline_ns = 0
         brief_ns = max(self._sent_ns + awaited.tail_timeout_ns, last_ns + awaited.tail_margin_ns)
         self._deadline_ns = min(self._deadline_ns, brief_ns)
 
     def _place(self, status: Status, last_ns: int) -> tuple[int, bool] | None:
-        """Return the index of the awaited status that this one answers, and True for a refusal; None if it is
-        stray.
-        """
+        """Match a status packet to the open replies; return (index, True for a refusal), or None if no
+        open reply fits."""
         servo_id, error, parameters = status
         length = len(parameters)
         # An echo or a leftover of the request before comes sooner than the wire allows.
@@ -501,7 +500,8 @@ class Bus:
         return None
 
     def _is_fast(self, data: memoryview) -> bool:
-        """Return True if a fast form is awaited and the data begins like its single status."""
+        """Return True if a fast sync or bulk read is awaited and the data begins like its single status
+        packet."""
         awaited = self._awaited
         return (
             awaited is not None
@@ -511,7 +511,8 @@ class Bus:
         )
 
     def _take_fast(self, data: memoryview, last_ns: int) -> int:
-        """Use the valid entries of a fast form's single status; return the number of bytes used."""
+        """Pass the intact entries of a fast read's single status packet to the job; return the number of
+        bytes used."""
         awaited, job = self._awaited, self._job
         if awaited is None or job is None:
             return 0
@@ -529,7 +530,7 @@ class Bus:
         return used
 
     def _note_owed(self) -> None:
-        """Register the missing replies of an abandoned transaction as owed; they may still arrive."""
+        """Register the missing replies of an abandoned transaction as owed, because they may still arrive."""
         awaited = self._awaited
         if awaited is None:
             return
@@ -545,11 +546,11 @@ class Bus:
             self.owed.add(awaited, 0, self._sent_ns)
 
     def _stray(self, packet: memoryview) -> PacketKind:
-        """Classify and count an intact packet that is not awaited.
+        """Return the kind of an intact packet that is not awaited (echo, late reply, other host, status), and
+        count it.
 
         Replies are distinguished by ID and length. Replies to another host that reads the same items are
-        therefore taken for duplicates.
-        """
+        therefore taken for duplicates."""
         reply, awaited = self._reply, self._awaited
         if packet == self._written or (awaited is not None and packet == awaited.packet):
             reply.echoed = True
@@ -578,7 +579,8 @@ def _shapes(transaction: Transaction | None) -> list[_Shape]:
 
 
 def _good_parts(dialect: Dialect, transaction: Transaction, data: memoryview) -> tuple[list[Status], int]:
-    """Return the valid entries of a fast form's truncated or corrupted status, and their size in bytes."""
+    """Return the intact entries at the start of a truncated or corrupted status of a fast read, and their
+    size in bytes."""
     if dialect.size_at(data, 0, len(data)) != transaction.widest:
         return [], 0
     awaited = transaction.awaited
@@ -594,7 +596,7 @@ def _good_parts(dialect: Dialect, transaction: Transaction, data: memoryview) ->
 
 
 class Lines:
-    """The serial lines of a robot: their jobs are executed concurrently, with one wait for all lines."""
+    """The serial lines of a robot: the jobs of all are executed concurrently, with one wait for all lines."""
 
     def __init__(
         self,
@@ -604,7 +606,7 @@ class Lines:
         packets: PacketSink | Sequence[PacketSink],
         beat: Callable[[], None] = lambda: None,
     ) -> None:
-        """Open no port; `ports` are open already.
+        """Create a `Bus` for each line on ports that are open already.
 
         Args:
             plans: One plan for each line.
@@ -625,26 +627,25 @@ class Lines:
 
     @property
     def failure(self) -> PortError | None:
-        """Failure of the first line that is lost; None while all lines work."""
+        """Failure of the first lost line; None while all lines work."""
         return next((bus.failure for bus in self.buses if bus.failure is not None), None)
 
     def clear(self, buses: Iterable[Bus]) -> None:
-        """Discard the input of some lines before a request is sent on them.
+        """Read and discard what has arrived on these lines, before a request is sent on them.
 
-        A packet that arrived before a request must not be taken for its reply. Replies come in the order of
-        requests, so one extra reply would shift all later ones.
-        """
+        A packet that arrived before a request must not be taken for its reply. Replies come in the order
+        of requests, so one extra reply would shift all later ones."""
         here = {bus.index: bus for bus in buses if bus.failure is None}
         for index in self.ports.wait(0):
             if index in here:
                 here[index].hear()
 
     def pump(self) -> None:
-        """Execute the jobs of all lines with one wait over all ports, until every job is finished.
+        """Execute the loaded jobs of all lines with one wait over all ports; return when every job is
+        finished.
 
-        Everything that can be sent is sent before a reply is awaited. Nothing is raised: a lost line gets a
-        `failure`, and the other lines continue.
-        """
+        Everything that can be sent is sent before a reply is awaited. Nothing is raised: a lost line gets
+        a `failure`, and the other lines continue."""
         buses, clock_ns, wait = self.buses, self.clock.now_ns, self.ports.wait
         now_ns, beat_ns = clock_ns(), 0
         deadlines = [bus.step(now_ns) for bus in buses]

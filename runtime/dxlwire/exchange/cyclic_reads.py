@@ -1,4 +1,5 @@
-"""Cyclic reads: the prepared reads of one bus, planned again after each loss.
+"""Cyclic reads: the transactions that read all servos and devices of one bus in each cycle, planned again
+after each loss.
 
 Servos that can answer in turn are read by one instruction. A servo that misses its turn is read separately
 from the next cycle on, until it answers. In Protocol 1.0 a silent servo ends the chain, in 2.0 it may end it,
@@ -6,8 +7,7 @@ so it must not stay in the chain. A device that misses its turn leaves the chain
 servos their replies.
 
 A reply that arrives cycles late would look current. A group is therefore read in the length for which no
-reply is owed (`OwedReplies`), or whose owed replies are the oldest.
-"""
+reply is owed (`OwedReplies`), or whose owed replies are the oldest."""
 
 from __future__ import annotations
 
@@ -27,11 +27,11 @@ from dxlwire.plan.reads import state_read
 from dxlwire.transaction import Outcome, Reply, Transaction
 
 MOST_CHAINS = 64
-"""Size of the cache of chains that omit certain servos. On a line that loses a different servo every cycle
-the cache is cleared and rebuilt."""
+"""Size of the cache of requests, each for a chain that omits certain servos. On a line that loses a
+different servo every cycle the cache is cleared and rebuilt."""
 
 CALM_CYCLES = 2
-"""Cycles of the parser without a loss before the exchange kernel reads again."""
+"""Cycles without a loss that the parser reads before the exchange kernel reads again."""
 
 MOST_PROGRAMS = 8
 """Size of the cache of kernel programs: the length of replies changes after a loss, and once more after
@@ -43,7 +43,8 @@ plain form. Some servos answer a request of their own, but not in the shared sta
 
 
 class Request(msgspec.Struct, frozen=True):
-    """One read of servos of one group, in each length. `patient` waits for late replies, `short` does not."""
+    """One read of some servos or devices of one group, in each reply length. `patient` has the long
+    timeout, `short` the short one."""
 
     group: int
     indices: tuple[int, ...]
@@ -52,16 +53,17 @@ class Request(msgspec.Struct, frozen=True):
 
 
 class Cycle(msgspec.Struct, frozen=True):
-    """The reads of a cycle."""
+    """The reads of one cycle on one bus, in the order of sending."""
 
     silent: tuple[bool, ...]  # Servos that missed their newest read; each is read separately
     queue: tuple[Request, ...]
     program: Program | None
-    """The same reads for the kernel; None while a servo is silent or has just recovered."""
+    """The same reads laid out for the exchange kernel; None while a servo is silent or has just recovered."""
 
 
 class CyclicReads:
-    """Job that reads the state of every servo of one bus once."""
+    """Job of a bus that reads the state of every servo and device once a cycle, and records missed
+    replies. Members are indices in `BusPlan.members`."""
 
     def __init__(self, plan: BusPlan, samples: BusSamples, owed: OwedReplies) -> None:
         self._members = plan.members
@@ -69,14 +71,16 @@ class CyclicReads:
         self.missed = [0] * count  # Replies in a row that did not arrive
         self.errors = [0] * count  # Error byte of the newest reply
         self.garbled = [False] * count
-        """True when the newest loss had bytes and was the first one of its read."""
+        """True for each member whose newest loss came with garbled bytes and was the first loss of its
+        read."""
         self.away = [False] * count
         """True for a lost servo or device that is no longer read; see `leave`."""
         self.apart = [False] * count
         """True for a device that is read separately because it does not answer in a chain."""
         self.fast = list(plan.fast)  # True for each group that is read by a fast form; `plain` ends that
         self.given_up: list[int] = []
-        """Groups to report: their fast reads stayed incomplete, so they are read by the plain form now."""
+        """Groups whose fast reads stayed incomplete, so the plain form is used now; the caller reports and
+        removes them."""
         self.begun = False  # True from the parser's first read of a cycle until `end`
         self._plan = plan
         self.samples = samples
@@ -98,11 +102,12 @@ class CyclicReads:
 
     @property
     def stale(self) -> bool:
-        """True when the next cycle must be planned again."""
+        """True when the reads of the next cycle must be planned again."""
         return self._stale or self._planned_at != self._owed.version
 
     def plan(self) -> Cycle:
-        """Plan the next cycle before its first request. The plan is reused if nothing has changed."""
+        """Return the reads of the next cycle, planned again if something has changed; call it before the
+        first request."""
         if self.stale:
             self._stale, self._planned_at = False, self._owed.version
             silent = tuple(map(bool, self.missed))
@@ -121,9 +126,8 @@ class CyclicReads:
         return self.cycle
 
     def end(self) -> None:
-        """End a cycle that the parser read, or in which the line was lost. The next plan follows from its
-        losses.
-        """
+        """End a cycle that the parser read, or in which the line was lost; count calm cycles and
+        incomplete fast reads."""
         self.begun = False
         self._stale = True
         silent = self.cycle.silent
@@ -140,10 +144,9 @@ class CyclicReads:
         self._calm = 0 if silence or any(self._broken) else self._calm + 1
 
     def blamed(self, member: int) -> bool:
-        """Return True if a member missed its turn although every member before it in the same read answered.
+        """Return True if a member did not answer although every member before it in the same read did.
 
-        A silent member may silence the members after it, so only the first one is to blame.
-        """
+        A silent member may silence the members after it, so only the first one is to blame."""
         for request in self.cycle.queue:
             if member in request.indices:
                 before = request.indices[: request.indices.index(member)]
@@ -163,12 +166,13 @@ class CyclicReads:
         self._stale = True
 
     def learn(self, return_delays: Mapping[int, int]) -> None:
-        """Set the measured return delays of the servos, ns by ID. Deadlines of replies follow from them."""
+        """Use the measured return delays of the servos, ns by ID, for the deadlines of replies."""
         self._line = replace(self._line, return_delays=dict(return_delays))
         self._forget()
 
     def plain(self, group: int) -> None:
-        """Read a group by the plain form, which every firmware supports, from the next cycle on."""
+        """Read a group by the plain form instead of the fast one, from the next cycle on. Every firmware
+        supports the plain form."""
         self.fast[group] = False
         self._forget()
 
@@ -195,12 +199,11 @@ class CyclicReads:
         return request
 
     def _choose_length(self, group: int, requests: Sequence[Request]) -> None:
-        """Choose the length of a group's reads: one without owed replies, else the one whose owed replies are
-        the oldest.
+        """Choose the reply length of a group's reads: one without owed replies, else the one whose owed
+        replies are the oldest.
 
-        All reads of the group have the same length. Otherwise three silent servos of a group would choose the
-        same lengths forever.
-        """
+        All reads of the group have the same length. Otherwise three silent servos of a group would choose
+        the same lengths forever."""
         count = max((len(one.patient) for one in requests), default=1)
         first = self._shape[group]
         self._shape[group] = min(
@@ -209,11 +212,10 @@ class CyclicReads:
         )
 
     def _program(self, queue: Sequence[Request]) -> Program | None:
-        """Return the reads of a calm cycle for the kernel.
+        """Return the reads of a cycle without losses as a program for the kernel.
 
         Returns None, so that the parser reads, in two cases: a servo reports more than an alert, or a late
-        reply to a request of idle time may look like a state.
-        """
+        reply to a request of idle time may look like a state."""
         reads = [
             PlannedRead(
                 self._in_length(one.patient, one.group),
@@ -241,14 +243,14 @@ class CyclicReads:
     # Reading by the parser
 
     def begin(self, done: int = 0) -> None:
-        """Begin the parser's part of a cycle, after `done` reads that the kernel has completed."""
+        """Begin a cycle for the parser, after `done` reads that the kernel has completed."""
         if not done:
             self.samples.clear()
         self.begun = self._patient = True
         self._position = done
 
     def advance(self, reply: Reply | None) -> Transaction | None:
-        """Process the result of the current read and return the next read."""
+        """Count a loss if the current read failed, and return the next read of the cycle; None at the end."""
         queue = self.cycle.queue
         if reply is not None:
             if reply.outcome is not Outcome.OK:
@@ -263,7 +265,7 @@ class CyclicReads:
         return self._in_length(request.patient if patient else request.short, request.group)
 
     def status(self, index: int, reply: Reply) -> None:
-        """Store the state of one servo of the current read."""
+        """Store the state in the reply of one servo or device; `index` is its place in the current read."""
         servo = self.cycle.queue[self._position].indices[index]
         self.samples.take(servo, reply.parameters, reply.last_ns)
         self.errors[servo] = reply.error
@@ -285,7 +287,7 @@ class CyclicReads:
 
 
 def _reads(group: Sequence[int], silent: Sequence[bool]) -> list[tuple[int, ...]]:
-    """Group responsive servos into one read; read each unresponsive servo separately."""
+    """Return the reads of a group: one for all members that answer, and one for each silent member."""
     together = tuple(index for index in group if not silent[index])
     alone: list[tuple[int, ...]] = [(index,) for index in group if silent[index]]
     return [together, *alone] if together else alone

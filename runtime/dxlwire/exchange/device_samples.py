@@ -1,4 +1,4 @@
-"""Device samples: replies of devices -> their states in the cycle's record, in SI units."""
+"""Device samples: converts the replies of devices to their states in the cycle's record, in SI units."""
 
 from __future__ import annotations
 
@@ -16,11 +16,10 @@ REPORT_AGAIN_NS = 1_000_000_000  # Minimum interval between two events of one de
 
 
 class DeviceSamples:
-    """Newest replies of all devices; blocks are in the order of the plans.
+    """Newest values of all devices of a robot; blocks are in the order of the plans.
 
     A device's row is valid when all its blocks arrived in this cycle and all their values are finite.
-    Otherwise it keeps its values, is marked invalid, and its age grows.
-    """
+    Otherwise it keeps its values, is marked invalid, and its age grows."""
 
     def __init__(self, plans: Sequence[BusPlan], sources: SourceArrays, reports: ReportSink) -> None:
         self.sources = sources  # Source arrays of the cycle's record
@@ -28,15 +27,17 @@ class DeviceSamples:
         devices = [(plan, device) for plan in plans for device in plan.devices]
         blocks = [block for _, device in devices for block in device.blocks]
         self.values: Floats = np.full(len(sources.values), np.nan)
-        """Values of the newest intact replies, at the columns of `source_states`."""
+        """Values in the newest intact replies, SI units, at the columns of `source_states`; NaN before the
+        first reply."""
         self.fresh = np.zeros(len(blocks), dtype=np.bool_)
-        """True where an intact reply arrived in this cycle."""
+        """True for each block whose intact reply arrived in this cycle."""
         self.at_ns = np.full(len(blocks), -1, dtype=np.int64)
-        """Arrival time of the newest reply; -1 before the first reply."""
+        """Arrival time of each block's newest reply, ns; -1 before the first reply."""
         self.shown_ns = np.full(len(devices), -1, dtype=np.int64)
-        """Arrival time of the oldest reply that each device's states come from; -1 before the first."""
+        """Arrival time of the oldest reply among those that each device's states come from, ns; -1 before
+        the first."""
         self.doubted = np.zeros(len(devices), dtype=np.bool_)
-        """True where the replies of this cycle are rejected."""
+        """True for each device whose values of this cycle are rejected because one is not finite."""
         self._fields = [block.fields for block in blocks]
         self._devices: list[tuple[str, str, slice, list[int]]] = []
         first = 0

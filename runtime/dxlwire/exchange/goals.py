@@ -1,4 +1,4 @@
-"""Goals: arrays in SI units -> the sync writes of one bus, in the current mode of each servo."""
+"""Goals: converts goals in SI units to the sync writes of one bus, in the current mode of each servo."""
 
 from __future__ import annotations
 
@@ -21,20 +21,17 @@ from dxlwire.plan.planning import goal_parts
 from dxlwire.wire.dialect import dialect_of
 
 LEADS: Mapping[Mode, CommandName] = {Mode.VELOCITY: "velocity", Mode.EFFORT: "effort", Mode.PWM: "pwm"}
-"""Leading goal of each mode that does not follow the position. A servo without its leading goal gets no
-goals."""
+"""Goal that each mode follows if it is not the position. A servo for which this goal is NaN gets no goals."""
 
 _VELOCITY = COMMAND_INTERFACES.index("velocity")
 
 
 class GoalCell(msgspec.Struct, frozen=True):
-    """One goal item of one servo: conversion of a goal in SI units to the integer in the packet.
+    """One goal item of one servo, with the conversion of a goal in SI units to the integer in the packet.
 
     Signed: tick = (sign * goal + offset) / unit, rounded to the nearest and clamped to `low` and `high`.
-
     Magnitude: tick = |goal| / unit, clamped to `low` and `high`, and `free` where the goal is NaN. The
-    magnitude of a speed is rounded down, because it is a limit.
-    """
+    magnitude of a speed is rounded down, because it is a limit."""
 
     place: Field  # Position of the item in the servo's block
     interface: int  # Row of the goals, an index into COMMAND_INTERFACES
@@ -69,21 +66,23 @@ class GoalArrays:
         self._plan = plan
         self._modes: list[Mode] = [servo.start_mode for servo in plan.servos]
         self.own_limits: list[Mapping[OwnLimit, int]] = [{} for _ in plan.servos]
-        """Limits read from each servo, ticks; a servo refuses a goal beyond them."""
+        """Limits read from each servo, ticks, by servo index; a servo refuses a goal beyond them."""
         # True when limits have changed since the hardware passed them to the loop.
         self.limits_changed = False
         self.fraction = 1.0  # Fraction of a servo's effort or PWM limit that goals may use
         self.sync_writes: tuple[SyncWrite, ...] = ()
-        """One sync write per mode and block of goals, in the order of sending; replaced after a change."""
+        """One sync write per mode and block of goals, in the order of sending; replaced when a mode or
+        limit changes."""
         self.renew()
 
     @property
     def modes(self) -> Sequence[Mode]:
-        """Current modes of the servos; a servo in UNKNOWN gets no goals."""
+        """Current mode of each servo; a servo in UNKNOWN gets no goals."""
         return self._modes
 
     def set_mode(self, index: int, mode: Mode) -> None:
-        """Set the mode of a servo by its index in the plan; a servo in UNKNOWN gets no goals.
+        """Send goals in another mode from now on to the servo at this index in the plan; UNKNOWN: no
+        goals.
 
         Raises:
             LookupError: The servo does not have the mode.
@@ -95,10 +94,9 @@ class GoalArrays:
             self.renew()
 
     def set_limits(self, index: int, limits: Mapping[OwnLimit, int]) -> None:
-        """Clamp the goals of a servo to the limits that were read from it, ticks.
+        """Clamp the goals of a servo to the limits that were read from its registers, ticks.
 
-        A limit that is missing in `limits` keeps its value.
-        """
+        A limit that is missing in `limits` keeps its value."""
         found = {**self.own_limits[index], **limits}
         if found != self.own_limits[index]:
             self.own_limits[index] = found
@@ -109,7 +107,7 @@ class GoalArrays:
         return {limit.of: value for limit, value in self.own_limits[index].items()}
 
     def weaken(self, fraction: float) -> None:
-        """Limit effort and PWM goals to a fraction of the servo's limit.
+        """Limit the effort and PWM goals of all servos to a fraction of each servo's limit.
 
         Args:
             fraction: 0 to 1.
@@ -118,7 +116,8 @@ class GoalArrays:
         self.renew()
 
     def renew(self) -> None:
-        """Rebuild the sync writes; every goal is sent again. Used after a lost line, too."""
+        """Rebuild the sync writes, after which every goal is sent again. Also used when a lost line is
+        back."""
         # A sync write has one address and one length, so servos are grouped by their blocks of goals.
         groups: dict[tuple[Mode, tuple[GoalLayout, ...]], list[int]] = {}
         servos = self._plan.servos
@@ -145,7 +144,7 @@ class GoalArrays:
 
 
 class SyncWrite(msgspec.Struct, frozen=True):
-    """One block of goals, for the servos of one bus that are in one mode."""
+    """One block of goals that one packet writes to servos of one bus which are in the same mode."""
 
     layout: GoalLayout
     lead: int  # Row of the leading goal; a servo without it gets no goals
@@ -158,7 +157,7 @@ class SyncWrite(msgspec.Struct, frozen=True):
 def _cells(
     servo: ServoPlan, mode: Mode, layout: GoalLayout, limits: Mapping[str, int], fraction: float
 ) -> list[GoalCell]:
-    """Return the goals of a block, in the order of the wire.
+    """Return the conversions for the goals of one servo in a block, in the order of the wire.
 
     Args:
         limits: The servo's own limits, ticks, by limited quantity.
@@ -194,7 +193,7 @@ def _cells(
 
 
 def _position(place: Field, servo: ServoPlan, plan: ModePlan) -> GoalCell:
-    """Return the position goal, counted from the servo's raw 0."""
+    """Return the conversion of a position goal to ticks from the servo's raw 0."""
     return GoalCell(
         place,
         COMMAND_INTERFACES.index("position"),
@@ -210,9 +209,8 @@ def _position(place: Field, servo: ServoPlan, plan: ModePlan) -> GoalCell:
 def _reach(
     scale: Scale | None, of: str, limits: Mapping[str, int], fraction: float, ratio: float = 1.0
 ) -> tuple[float, int]:
-    """Return the unit in the joint's terms and the highest tick of a goal; 1 and 0 if the mode lacks the
-    goal.
-    """
+    """Return unit (in the joint's terms, per tick) and highest tick of a goal; 1 and 0 if the mode lacks
+    the goal."""
     if scale is None:
         return 1.0, 0
     used = 1.0 if of == "speed" else fraction

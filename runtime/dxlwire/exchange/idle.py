@@ -1,8 +1,7 @@
 """Idle scheduler: runs programs of transactions on one bus between two cycles, the most urgent first.
 
-A transaction begins only when its reply can arrive in time, so it does not delay the cycle. The exception is
-an urgent program that starves. A program that did not finish continues in the next idle time.
-"""
+A transaction begins only when its reply can arrive in time, so it does not delay the cycle. The exception
+is an urgent program that starves. A program that did not finish continues in the next idle time."""
 
 from __future__ import annotations
 
@@ -19,20 +18,20 @@ from dxlwire.plan.line import SHORT_TIMEOUT_MARGIN_NS
 from dxlwire.transaction import Outcome, Program, Reply, Transaction
 
 LEAST_MARGIN_NS = 100_000
-"""Minimum time for which a reply is awaited after it is due; servos answer with less delay than this."""
+"""Minimum time (ns) for which a reply is awaited after it is due; servos answer with less delay than this."""
 STARVED = 50
-"""Cycles after which an urgent program continues although the time is too short. A skipped period is better
-than a joint that gets no goals for the rest of the run."""
+"""Cycles after which an urgent program continues although the time is too short. A skipped period is
+better than a joint that gets no goals for the rest of the run."""
 STARVED_AGAIN = 5  # Cycles between the transactions of a starved program from then on
 WHOLE_BUS = -1  # Servo index of a program that concerns the whole bus
 
 
 @unique
 class Urgency(IntEnum):
-    """Priority of programs: a lower number goes first, even between two transactions of another program.
+    """Priority of a program in idle time: a lower number goes first, even between two transactions of another
+    program.
 
-    A program that never finds enough time is executed at the cost of the next cycle, unless it is SLOW.
-    """
+    A program that never finds enough time is executed at the cost of the next cycle, unless it is SLOW."""
 
     MODE = 0  # A joint has no goals until its mode is set
     REPAIR = 1  # Recovery of a servo: its torque, its alert, its return to the cycle
@@ -41,7 +40,7 @@ class Urgency(IntEnum):
 
 
 class _Task:
-    """A program in progress, with its next transaction."""
+    """One program that the idle scheduler has not finished, with its next transaction."""
 
     def __init__(self, program: Program[None], turn: tuple[Urgency, int], name: str, servo: int) -> None:
         self._program = program
@@ -58,9 +57,8 @@ class _Task:
         self.reported = False
 
     def resume(self, reply: Reply | None) -> bool:
-        """Pass the reply of the last transaction, None at the start; return True if another transaction
-        follows.
-        """
+        """Run the program to its next transaction, with the reply to the last one, None at the start;
+        return False if the program has ended."""
         self.begun = reply is not None
         self.held_ns = NEVER
         try:
@@ -71,12 +69,11 @@ class _Task:
 
 
 class IdleScheduler:
-    """Programs of one bus that wait for time between cycles; a bus executes them as one job per idle time.
+    """Queue of the programs that use one bus between cycles; the bus executes them as one job per idle time.
 
     Programs of one servo never overlap: a program that has begun ends before the next one begins. A
     transaction that sends nothing (`line.listen`) is a pause, and other programs use the line during it.
-    Every program runs to completion: on a lost line its transactions time out (`abandon`).
-    """
+    Every program runs to completion: on a lost line its transactions time out (`abandon`)."""
 
     def __init__(self, bus: Bus, reports: ReportSink) -> None:
         self.plan = bus.plan
@@ -110,15 +107,15 @@ class IdleScheduler:
 
     @property
     def waiting(self) -> int:
-        """Number of unfinished programs."""
+        """Number of programs that have not ended."""
         return len(self.tasks)
 
     @property
     def least_ns(self) -> int:
-        """Shortest useful idle time, ns, without the margin for late replies.
+        """Shortest idle time in which a waiting program can continue, ns, without the margin for late
+        replies.
 
-        NEVER: no program waits. 0: check the programs in every idle time.
-        """
+        NEVER: no program waits. 0: check the programs in every idle time."""
         least_ns = NEVER
         for task in self.tasks:
             if task.pressed is not Urgency.SLOW or task.begun or task.paused or task.next is None:
@@ -127,7 +124,8 @@ class IdleScheduler:
         return least_ns
 
     def begin(self, until_ns: int) -> bool:
-        """Prepare for the idle time that ends at `until_ns`; return False if no program waits."""
+        """Begin an idle time that ends at `until_ns`; return False if no program waits, so that the bus
+        need not load this job."""
         if not self.tasks:
             return False
         self._until_ns = until_ns
@@ -135,7 +133,8 @@ class IdleScheduler:
         return True
 
     def advance(self, reply: Reply | None) -> Transaction | None:
-        """Pass a reply to the program that awaits it, and return the next transaction that fits."""
+        """Pass the reply to the program that awaits it, and return the next transaction that fits into the
+        idle time; None: none does."""
         if reply is not None and self._current is not None:
             # The bus reuses the reply object and its buffer, so the program gets a copy.
             self._resume(self._current, replace(reply, parameters=bytes(reply.parameters)))
@@ -152,15 +151,14 @@ class IdleScheduler:
         return None
 
     def status(self, index: int, reply: Reply) -> None:
-        """Ignore a single status. The whole reply follows in `advance`: a program awaits one status at a
-        time.
-        """
+        """Ignore the status of one servo in a reply: `advance` receives the whole reply, and a program
+        awaits one status at a time."""
 
     def abandon(self) -> None:
-        """Run every program to completion without a line: every transaction times out.
+        """Run every program to its end while the line is lost: each transaction times out at once, and
+        nothing is sent.
 
-        Programs added during this call wait for the next idle time.
-        """
+        Programs added during this call wait for the next idle time."""
         tasks, self.tasks, self._current = self.tasks, [], None
         for task in tasks:
             more = task.next is not None or task.resume(None)
@@ -168,7 +166,8 @@ class IdleScheduler:
                 more = task.resume(_nothing())
 
     def _ready(self) -> _Task | None:
-        """Return the next program to run. A program that has begun precedes all others of the same servo."""
+        """Return the most urgent program that can continue now. A program that has begun precedes all
+        others of the same servo."""
         now = self.now_ns()
         for task in self.tasks:
             chosen = task
@@ -182,7 +181,8 @@ class IdleScheduler:
         return None
 
     def _held_back(self, task: _Task, now_ns: int) -> bool:
-        """Return True if a transaction must wait because a late reply could be taken for its own."""
+        """Return True if a program's next transaction must wait because a late reply could be taken for
+        its own."""
         wanted = task.next
         if wanted is None or not wanted.packet or not self.bus.choose(wanted)[1]:
             return False
@@ -201,7 +201,8 @@ class IdleScheduler:
             self._resume(task, _nothing(Outcome.SENT))
 
     def _timed(self, task: _Task, wanted: Transaction, first: bool) -> Transaction | None:
-        """Return the transaction with a timeout that fits the idle time, or None if it must wait."""
+        """Return the transaction with a timeout that fits the idle time, or None if it must wait for a
+        longer one."""
         left_ns = self._until_ns - self.now_ns()
         latest_ns = self._need_ns(self.bus.choose(wanted)[0], max(self.bus.late_ns, LEAST_MARGIN_NS))
         if latest_ns > left_ns:
@@ -215,14 +216,13 @@ class IdleScheduler:
     def _need_ns(self, wanted: Transaction, margin_ns: int) -> int:
         """Return the longest duration of a transaction whose replies are late by no more than the margin, ns.
 
-        A reply after the end of idle time would disturb the next cyclic read, which costs more than waiting.
-        """
+        A reply after the end of idle time would disturb the next cyclic read, which costs more than
+        waiting."""
         return wanted.due_ns + (self.plan.latency_ns + margin_ns if wanted.awaited else 0)
 
     def _forced(self, task: _Task, need_ns: int, left_ns: int) -> bool:
-        """Count the cycles that a program has waited; return True if it now runs at the cost of the next
-        cycle.
-        """
+        """Count a cycle in which a program found too little time; return True if it now runs at the cost
+        of the next cycle."""
         task.starved += 1
         if task.pressed is Urgency.SLOW or task.starved <= (STARVED_AGAIN if task.reported else STARVED):
             return False

@@ -1,9 +1,8 @@
-"""Exchange kernel: lays out the plan of a cycle for `kernel.c`, which executes it.
+"""Exchange kernel: prepares the reads and goals of a cycle for the compiled `kernel.c`, which executes them.
 
 The kernel is a shared object without Python code, called through ctypes and compiled by the build. After
-anything unexpected the packet-by-packet parser (`bus`) finishes the cycle. The structs that both sides share
-are parsed from `kernel.c`.
-"""
+anything unexpected the packet-by-packet parser (`bus`) finishes the cycle. The structs that both sides
+share are parsed from `kernel.c`."""
 
 from __future__ import annotations
 
@@ -38,7 +37,7 @@ _ENCODINGS = {"unsigned": 0, "twos_complement": 1, "sign_magnitude": 2, "float32
 
 @unique
 class Answer(IntEnum):
-    """Result of a kernel call."""
+    """Result of a call of the compiled kernel."""
 
     OK = 0
     WAITING = 1  # Replies are still awaited
@@ -67,7 +66,7 @@ _Part, _Packet, _Read, _Cell, _SyncWrite = (
 
 
 def library(path: Path | None = None) -> ctypes.CDLL:
-    """Return the functions of the compiled kernel.
+    """Load the compiled kernel and declare the types of its functions.
 
     Raises:
         NotCompiled: The kernel was not built, or was built from another source.
@@ -102,7 +101,8 @@ def polling_state(polling: ReplyPolling | None) -> ctypes.Structure:
 
 
 class PlannedRead(msgspec.Struct, frozen=True):
-    """One read of a cycle: its transaction, the members that answer, and the error bytes that they report."""
+    """One read of a cycle: its transaction, the members that answer, and the error bytes that they are
+    expected to report."""
 
     transaction: Transaction
     indices: tuple[int, ...]  # Indices of members of the bus, in the order of their replies
@@ -110,14 +110,14 @@ class PlannedRead(msgspec.Struct, frozen=True):
 
 
 class Program:
-    """The reads of one bus, laid out for the kernel."""
+    """The reads of one bus in a cycle, laid out as C structs for the kernel."""
 
     def __init__(self, plan: BusPlan, reads: Sequence[PlannedRead]) -> None:
         self._kept: list[object] = []  # Keeps buffers alive: the kernel has only their addresses
         self.count = len(reads)
         self.reads = _array(_Read, [self._read(plan, read) for read in reads])
         self.bytes = max((read.record_bytes for read in self.reads[: self.count]), default=0)
-        """Log space of the largest read with its replies, bytes."""
+        """Space in the log that the largest read needs with its replies, bytes."""
 
     def _keep(self, data: bytes) -> int:
         kept = ctypes.create_string_buffer(data, len(data))
@@ -158,7 +158,8 @@ _Replies = tuple[bytes, bytes, list[ctypes.Structure], list[ctypes.Structure]]
 
 
 def _replies(plan: BusPlan, read: PlannedRead) -> _Replies:
-    """Return the replies that follow one another: header, ID, length and error byte are known in advance."""
+    """Return the expected replies to a plain read, one packet per member, with the mask of the bytes that
+    are known in advance."""
     dialect = dialect_of(plan.protocol)
     data_at = dialect.OVERHEAD - dialect.CHECKSUM
     expected, known = b"", b""
@@ -176,7 +177,8 @@ def _replies(plan: BusPlan, read: PlannedRead) -> _Replies:
 
 
 def _fast_replies(plan: BusPlan, read: PlannedRead) -> _Replies:
-    """Return the single status of a fast form (e-Manual, Protocol 2.0, "Fast Sync Read (0x8A)")."""
+    """Return the expected single reply to a fast read, with the mask of known bytes (e-Manual, Protocol
+    2.0, "Fast Sync Read (0x8A)")."""
     dialect = dialect_of(plan.protocol)
     awaited = read.transaction.awaited
     size = dialect.fast_size(sum(one.length for one in awaited), len(awaited))
@@ -192,7 +194,7 @@ def _fast_replies(plan: BusPlan, read: PlannedRead) -> _Replies:
 
 
 class KernelGoals(msgspec.Struct, frozen=True):
-    """Goals of one bus, as arrays that are shared with the exchange kernel."""
+    """Goals of one bus, with arrays that the exchange kernel reads without a copy."""
 
     arrays: GoalArrays
     included: NDArray[np.bool_]  # True for each servo that may get goals
@@ -200,7 +202,7 @@ class KernelGoals(msgspec.Struct, frozen=True):
 
 
 class Kernel:
-    """All lines of a robot, laid out for the exchange kernel."""
+    """Interface to the compiled kernel, which reads and writes all lines of a robot in each cycle."""
 
     def __init__(
         self,
@@ -210,7 +212,7 @@ class Kernel:
         goals: Floats,
         packets: PacketLog,
     ) -> None:
-        """Lay out the plan of all lines.
+        """Pass plans, arrays and ports of all lines to the compiled kernel.
 
         Args:
             lines: The lines with their open ports.
@@ -319,7 +321,8 @@ class Kernel:
         return ctypes.addressof(array)
 
     def _lay_ports(self) -> None:
-        """Give the kernel file descriptors, or callbacks to the ports and the clock where there are none."""
+        """Pass the kernel file descriptors of the ports, or callbacks to ports and clock if there are
+        none, as in a simulation."""
         if (descriptors := self._ports.descriptors) is not None:
             for line, descriptor in zip(self._lines, descriptors, strict=False):
                 line.descriptor = descriptor
@@ -386,7 +389,7 @@ class Kernel:
         return bool(self._lines[index].planned) and self._buses[index].failure is None
 
     def _raise(self) -> None:
-        """Raise the exception that a callback stored, if any."""
+        """Raise the exception that a callback stored while the kernel ran, if any."""
         if (error := self._raised) is not None:
             self._raised, self._kernel.raised = None, 0
             self.abandon()
@@ -396,13 +399,12 @@ class Kernel:
         self._raised, self._kernel.raised = error, 1
 
     def poll_for_replies(self) -> None:
-        """Enable polling for replies if the ports are configured for it. Call before real-time scheduling
-        starts.
-        """
+        """Let the kernel poll for replies instead of sleeping, if the ports are configured for it. Call
+        before real-time scheduling starts."""
         self._kernel.polling = polling_state(self._ports.polling)
 
     def plan(self, index: int, program: Program) -> bool:
-        """Read a bus by a program from the next cycle on.
+        """Use a program for the reads of a bus from the next cycle on.
 
         Returns:
             False when the program is too large: the log's batch must hold the packets of all lines at
@@ -418,7 +420,8 @@ class Kernel:
         return True
 
     def finish_read(self, code: int) -> Answer:
-        """Continue an unfinished read; return its final result."""
+        """Continue a read that returned a code, until it is complete or the parser must take over; return
+        the final result."""
         while True:
             self._raise()
             if code == Answer.WAITING:
@@ -430,13 +433,15 @@ class Kernel:
             code = self.read()
 
     def plan_writes(self) -> None:
-        """Lay out new sync writes of the goals. They are replaced after a change of mode or limits."""
+        """Pass the kernel the sync writes of each bus whose goals were rebuilt, as after a change of mode
+        or limits."""
         for index, shared in enumerate(self._shared):
             if shared.arrays.sync_writes is not self._writes[index]:
                 self._take_writes(index, shared.arrays.sync_writes)
 
     def finish_write(self, code: int) -> dict[int, PortError]:
-        """Continue an unfinished write; return the failures of the lines since the last call, by index."""
+        """Continue a write that returned a code; return the failures of the lines since the last call, by
+        index."""
         while code == Answer.FULL:
             self._packets.commit()
             code = self.write()
@@ -455,29 +460,31 @@ class Kernel:
         line.writes, line.write_count = ctypes.addressof(array), len(laid)
 
     def _failure(self, index: int) -> PortError | None:
-        """Return the write failure of a line, once; None without a failure."""
+        """Return the write failure of a line and forget it; None without a failure."""
         line = self._lines[index]
         code, line.gone = line.gone, 0
         return self._ports.ports[index].failure(code) if code else None
 
     def line(self, index: int) -> tuple[ctypes.Structure, PortError | None]:
-        """Return the state of a line in an unfinished cycle, and its write failure."""
+        """Return the kernel's struct of a line in an unfinished cycle, and the line's write failure."""
         return self._lines[index], self._failure(index)
 
     def pieces(self, index: int) -> Iterator[tuple[bytes, int]]:
-        """Yield the unused bytes that were received on a line, with their arrival time, ns."""
+        """Yield the received bytes of a line that the kernel could not use, each piece with its arrival
+        time, ns."""
         line, start = self._lines[index], 0
         for piece in line.piece[: line.pieces]:
             yield ctypes.string_at(line.buffer + start, piece.end - start), piece.at_ns
             start = piece.end
 
     def abandon(self) -> None:
-        """End an unfinished cycle."""
+        """End a cycle that the kernel has not finished."""
         self._library.dxl_abandon(self._pointer)
 
 
 def _laid_write(write: SyncWrite) -> tuple[ctypes.Structure, list[object]]:
-    """Return a sync write for the kernel, and the objects that must stay alive while it is used."""
+    """Return a sync write as a struct for the kernel, and the objects that must stay alive while it is
+    used."""
     count, items = len(write.members), max(map(len, write.cells), default=0)
     arrays: dict[str, NDArray[np.generic]] = {
         "members": np.array(write.members, dtype=np.int32),
@@ -521,7 +528,7 @@ def _laid_write(write: SyncWrite) -> tuple[ctypes.Structure, list[object]]:
 
 
 def _array(kind: type[ctypes.Structure], items: Sequence[ctypes.Structure]) -> ctypes.Array[ctypes.Structure]:
-    """Return an array of structs, with at least one element: an empty array has no address."""
+    """Return a C array of structs, with at least one element: an empty array has no address."""
     return (kind * max(len(items), 1))(*items)
 
 
@@ -531,7 +538,7 @@ def _field(field: Field) -> ctypes.Structure:
 
 
 def _data(array: NDArray[np.generic]) -> int:
-    """Return the address of a contiguous array.
+    """Return the address of a numpy array's memory.
 
     Raises:
         ValueError: The array is not contiguous.

@@ -1,10 +1,9 @@
-"""Owed replies: the requests of one line that timed out and whose replies may still arrive.
+"""Owed replies: keeps record of requests on one line that timed out and whose replies may still arrive.
 
-A status packet carries neither an address nor a sequence number, so a late reply looks like the reply to the
-next request for the same number of bytes. One rule handles this for cycle, idle time, start-up and tools: a
-status counts only while no reply of its ID and length is owed to another request. A request therefore asks
-for a few extra bytes, or is held back, until no matching reply is owed.
-"""
+A status packet carries neither an address nor a sequence number, so a late reply looks like the reply to
+the next request for the same number of bytes. One rule handles this for cycle, idle time, start-up and
+tools: a status counts only while no reply of its ID and length is owed to another request. A request
+therefore asks for a few extra bytes, or is held back, until no matching reply is owed."""
 
 from __future__ import annotations
 
@@ -14,19 +13,19 @@ from typing import NamedTuple
 from dxlwire.transaction import BROADCAST_ID, Awaited, Transaction
 
 LEAST_WINDOW_NS = 750_000_000
-"""Minimum time for which a reply is owed after its request [i]: stalled machines, virtual machines and USB
-adapters delay replies by up to 600 ms."""
+"""Minimum time (ns) for which a reply is owed after its request [i]: stalled machines, virtual machines
+and USB adapters delay replies by up to 600 ms."""
 MOST_WINDOW_NS = 1_500_000_000  # Limits the wait on a line with even slower replies
 # Time after which a slow reply is forgotten, because a stall, such as that of a suspended machine, ends
 SLOW_MEMORY_NS = 60_000_000_000
 MOST_OWED = 8  # Maximum number of late replies recognized for one repeated request
 
 Question = int | bytes
-"""Key of a request: the address of a read, otherwise the instruction packet."""
+"""Key by which requests are compared: the address of a read, otherwise the instruction packet."""
 
 
 class _Entry:
-    """The unanswered repetitions of one request to one servo."""
+    """One request to one servo whose reply is owed, with the number of its unanswered repetitions."""
 
     __slots__ = ("count", "first_ns", "last_ns", "length", "question")
 
@@ -38,7 +37,7 @@ class _Entry:
 
 
 class _Change(NamedTuple):
-    """Latest instruction to one servo that may have changed registers."""
+    """Latest instruction to one servo that may have changed registers, with the times of its repetitions."""
 
     packet: bytes
     first_ns: int  # Time of the first of its repetitions
@@ -46,13 +45,13 @@ class _Change(NamedTuple):
 
 
 class OwedReplies:
-    """Replies that may still arrive on one line, by servo ID and number of parameter bytes.
+    """Replies that may still arrive on one line after their timeout, by servo ID and number of parameter
+    bytes.
 
-    Replies of a fast form are filed under the broadcast ID and the size of their single packet.
-    """
+    Replies of a fast form are filed under the broadcast ID and the size of their single packet."""
 
     def __init__(self, now_ns: Callable[[], int]) -> None:
-        """`now_ns` returns the time of the run's clock."""
+        """Start without owed replies; `now_ns` returns the time of the run's clock."""
         self._now_ns = now_ns
         self.version = 0  # Increases with each reply that becomes owed
         self._entries: dict[int, list[_Entry]] = {}
@@ -69,7 +68,8 @@ class OwedReplies:
         return min(max(LEAST_WINDOW_NS, self._slowest_ns * 5 // 4), MOST_WINDOW_NS)
 
     def add(self, transaction: Transaction, index: int, sent_ns: int) -> None:
-        """Note that the reply at `index` of a transaction did not arrive in time."""
+        """Record the reply at `index` of a transaction, which was sent at `sent_ns`, as owed: it did not
+        arrive in time."""
         servo_id, length, question = _shapes(transaction)[index]
         entries = self._entries.setdefault(servo_id, [])
         # Replies to expired requests are no longer expected.
@@ -83,7 +83,7 @@ class OwedReplies:
         self.version += 1
 
     def settle(self, servo_id: int, length: int, error: int) -> bool:
-        """Charge a received status to the oldest owed reply that it may be; return True if one was owed."""
+        """Remove the oldest owed reply that a received status may be; return True if there was one."""
         entries = self._entries.get(servo_id, [])
         found = next((one for one in entries if one.length == length), None)
         if found is None:
@@ -98,16 +98,16 @@ class OwedReplies:
         return True
 
     def note_answer(self, transaction: Transaction, awaited: Awaited, sent_ns: int) -> None:
-        """Note that a request was answered. A reply owed to an older, identical request is owed to this one
-        now.
-        """
+        """Note that a request was answered. If a reply is owed to an older, identical request, its time
+        now counts from this one."""
         servo_id, length, question = _shape(transaction, awaited)
         for one in self._entries.get(servo_id, ()):
             if (one.length, one.question) == (length, question) and one.last_ns + self.window_ns > sent_ns:
                 one.last_ns = sent_ns
 
     def note_change(self, transaction: Transaction, sent_ns: int) -> None:
-        """Note an instruction that may change registers: older reads are invalid from now on."""
+        """Note that an instruction which may change registers was sent: replies to older reads of this
+        servo are out of date."""
         before, first_ns = self._changes.get(transaction.servo_id), sent_ns
         if before is not None and before.packet == transaction.packet:
             # A retry changes nothing. After the window the servo may have changed the register itself, as by
@@ -116,7 +116,8 @@ class OwedReplies:
         self._changes[transaction.servo_id] = _Change(transaction.packet, first_ns, sent_ns)
 
     def free_ns(self, transaction: Transaction, *, any_age: bool = False) -> int:
-        """Return the time from which each reply to a transaction is unambiguous; 0: it is now."""
+        """Return the time from which no late reply can be taken for a reply to this transaction, ns; 0: it
+        is so now."""
         window_ns, free_ns = self.window_ns, 0
         for servo_id, length, question in _shapes(transaction):
             for one in self._entries.get(servo_id, ()):
@@ -125,10 +126,9 @@ class OwedReplies:
         return free_ns if free_ns and free_ns > self._now_ns() else 0
 
     def confuses(self, transaction: Transaction, awaited: Awaited, *, refusal: bool, any_age: bool) -> bool:
-        """Return True if a status that fits an awaited one may be the late reply to another request.
+        """Return True if a status that fits `awaited` may be the late reply to another request.
 
-        A refusal has no data, so it may belong to a request of any length.
-        """
+        A refusal has no data, so it may belong to a request of any length."""
         servo_id, length, question = _shape(transaction, awaited)
         if not (entries := self._entries.get(servo_id)):
             return False
@@ -141,10 +141,9 @@ class OwedReplies:
         )
 
     def asked_ns(self, transaction: Transaction, sent_ns: int) -> int:
-        """Return the send time of the oldest request that a reply to this transaction may answer.
+        """Return the send time of the oldest request that a reply to this transaction may answer, ns.
 
-        A late reply to an earlier repetition counts as the reply to this one.
-        """
+        A late reply to an earlier repetition counts as the reply to this one."""
         times = [
             one.first_ns
             for servo_id, length, question in _shapes(transaction)
@@ -154,7 +153,8 @@ class OwedReplies:
         return min([sent_ns, *times])
 
     def newest_ns(self, transactions: Iterable[Transaction]) -> int:
-        """Return the send time of the newest request whose late reply would fit; 0 without one."""
+        """Return the send time (ns) of the newest request whose late reply could be taken for one of these
+        transactions; 0 without one."""
         times = [
             one.last_ns
             for transaction in transactions
@@ -165,7 +165,8 @@ class OwedReplies:
         return max(times, default=0)
 
     def _same(self, servo_id: int, one: _Entry, question: Question, *, any_age: bool) -> bool:
-        """Return True if a late reply would answer the question as well as a new one.
+        """Return True if a late reply to an older request answers the new request as well as its own reply
+        would.
 
         Args:
             servo_id: The servo.

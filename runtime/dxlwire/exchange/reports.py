@@ -1,4 +1,4 @@
-"""Reports of the exchange to its caller: observations with a typed reason."""
+"""Reports: observations during the exchange that the caller should log, each with a typed reason."""
 
 from __future__ import annotations
 
@@ -9,10 +9,10 @@ from typing import Protocol
 
 @unique
 class Reason(Enum):
-    """Reason of a report."""
+    """Reason of a report, by which the caller chooses the event in its log."""
 
     IMPLAUSIBLE = "implausible"
-    """Implausible values of a servo or device, which were not used."""
+    """A servo or device sent values that are not plausible; they were not used."""
     NO_IDLE_TIME = "no_idle_time"
     """A program waits for more idle time than the cycle has; later cycles may be late."""
 
@@ -21,18 +21,18 @@ class Reason(Enum):
 
 
 def jumped(joint: str, jump: str, elapsed_ns: int) -> str:
-    """Return the text about a position that its servo cannot have."""
+    """Return the text for a position that its servo cannot have reached; `jump` is the distance with unit."""
     time = f"{elapsed_ns * 1e-6:.0f} ms"
     return f"{joint} jumped by {jump} in {time}, faster than it can turn: the value is not used"
 
 
 def not_finite(device: str, states: Sequence[str]) -> str:
-    """Return the text about values of a device that are NaN or infinite."""
+    """Return the text for values of a device that are NaN or infinite; `states` are their names."""
     return f"{device} sent values that are not finite ({', '.join(states)}): they are not used"
 
 
 def idle_time_short(program: str, needed_ns: int, left_ns: int) -> str:
-    """Return the text about a program that a cycle has too little idle time for."""
+    """Return the text for a program that needs more idle time than a cycle has."""
     return (
         f"{program} waits for idle time: it may take {needed_ns * 1e-6:.1f} ms, and a cycle leaves "
         f"{left_ns * 1e-6:.1f} ms; periods may be skipped"
@@ -40,7 +40,7 @@ def idle_time_short(program: str, needed_ns: int, left_ns: int) -> str:
 
 
 class ReportSink(Protocol):
-    """Receiver of reports; never blocks, never raises."""
+    """Receiver of reports, implemented by the caller; never blocks, never raises."""
 
     def report(self, reason: Reason, source: str, text: str) -> None:
         """Receive a report.

@@ -1,4 +1,5 @@
-"""Samples: replies of a cycle -> states of the whole robot in SI units, without implausible jumps."""
+"""Samples: converts the replies of a cycle to states of the whole robot in SI units, without implausible
+jumps."""
 
 from __future__ import annotations
 
@@ -19,18 +20,18 @@ _WHEEL_MODES = (Mode.VELOCITY, Mode.PWM)
 
 MARGIN_RAD = 0.035  # Two degrees: noise of a potentiometer, plus the movement by a hand [i]
 MARGIN_NS = 10_000_000
-"""Jitter of replies: the time between two replies may appear shorter by this much."""
+"""Jitter of replies, ns: the time between two replies may appear shorter by this much."""
 REPORT_AGAIN_NS = 1_000_000_000  # Minimum interval between two events of one servo
 
 
 class Samples:
-    """States of all servos, filled from replies; arrays have one column per servo, in the order of the plans.
+    """Newest values of all servos of a robot, and the conversion of replies to them; arrays have one column
+    per servo, in the order of the plans.
 
     Position: q = direction * (raw * rad_per_tick - reference) * ratio, rad or m. The sign of velocity and
-    effort follows the joint's direction, so positive effort is torque toward growing q. In wheel mode a model
-    without speed control reports a fraction of full output as its speed (AX-12A, Present Speed (38)), see
-    `mode_plan`.
-    """
+    effort follows the joint's direction, so positive effort is torque toward growing q. In wheel mode a
+    model without speed control reports a fraction of full output as its speed (AX-12A, Present Speed
+    (38)), see `mode_plan`."""
 
     def __init__(
         self,
@@ -44,36 +45,39 @@ class Samples:
         self.rows = np.array([servo.row for servo in servos], dtype=np.intp)
         """Row of each servo's joint in the states."""
         self.values: Floats = np.full((3, len(servos)), np.nan)
-        """Position, velocity and effort of each servo in its newest intact reply, SI units."""
+        """Position, velocity and effort in each servo's newest intact reply, SI units, shape (3, servos)."""
         self.scale: Floats = np.array([_units(servo) for servo in servos]).reshape(-1, 3).T.copy()
-        """Units per tick of each value; the unit of the velocity follows the servo's mode."""
+        """SI units per tick of position, velocity and effort, shape (3, servos); that of the velocity
+        follows the servo's mode."""
         self.reference: Floats = np.array(
             [servo.direction * servo.reference * servo.ratio for servo in servos]
         )
-        """Offset subtracted from each position, rad or m."""
+        """Offset subtracted from each servo's position, rad or m."""
         self.fresh = np.zeros(len(servos), dtype=np.bool_)
-        """True where an intact reply arrived in this cycle."""
+        """True for each servo whose intact reply arrived in this cycle."""
         self.at_ns = np.full(len(servos), -1, dtype=np.int64)
-        """Arrival time of the newest plausible reply; -1 before the first reply."""
+        """Arrival time of each servo's newest plausible reply, ns; -1 before the first reply."""
         self.shown_ns = self.at_ns.copy()
-        """`at_ns` at the end of the cycle before: arrival time of the sample that the states come from."""
+        """Arrival time of the reply from which each servo's states come, ns: `at_ns` at the end of the
+        cycle before."""
         self.recounted_ns = np.full(len(servos), -2, dtype=np.int64)
-        """Time of the last sample before a servo restarted its turn count; -2 if it never did."""
+        """Time of the last sample before a servo restarted its turn count, ns; -2 if it never did."""
         self.doubted = np.zeros(len(servos), dtype=np.bool_)
-        """True where the reply of this cycle is rejected."""
+        """True for each servo whose position of this cycle is rejected as an implausible jump."""
         self.jumps = Jumps(plans, reports)
         self.take: Callable[[int, int, bytes, int], object]
-        """Store a reply: index of the bus, index of the member, data, arrival time. Set by the kernel."""
+        """Store a reply; arguments: index of the bus, index of the member, data, arrival time in ns. Set
+        by the kernel."""
         self.settle_all: Callable[[int], int]
-        """Fill the states from the replies of this cycle. Returns 0, or another number if no state was filled
-        because a value is suspect. Set by the kernel."""
+        """Fill the states from the replies of this cycle; argument: time in ns. Returns 0, or another
+        number if no state was filled because a value is suspect. Set by the kernel."""
         self.show: Callable[[int], object]
-        """Fill the states from the replies that are not doubted. Set by the kernel."""
+        """Fill the states from the replies that are not doubted; argument: time in ns. Set by the kernel."""
         self._joint_speed = self.scale[1].copy()
         self._wheel_speed = np.array([servo.direction * _in_wheel_mode(servo) for servo in servos])
         self.modes = b""  # Modes of the robot at the last `follow_modes`
         self.devices = DeviceSamples(plans, sources, reports)
-        """Samples of all devices."""
+        """Samples of all devices, filled from the same replies."""
         first_servo = first_block = 0
         buses = []
         for number, plan in enumerate(plans):
@@ -83,22 +87,23 @@ class Samples:
         self.buses = tuple(buses)  # Samples of each bus
 
     def follow_modes(self) -> None:
-        """Set the unit of velocity that belongs to each servo's mode. Call before replies are processed."""
+        """Use the unit of velocity that belongs to each servo's present mode. Call before replies are
+        processed."""
         self.modes = self.states.mode.tobytes()
         turning = np.isin(self.states.mode[self.rows], _WHEEL_MODES)
         self.scale[1] = np.where(turning, self._wheel_speed, self._joint_speed)
 
     def settle(self, now_ns: int) -> None:
-        """Fill the states from the replies of this cycle.
+        """Fill the states of all joints and devices from the replies of this cycle.
 
-        The row of a servo without a reply, or with an implausible one, keeps its values, is marked invalid,
-        and its age grows.
-        """
+        The row of a servo without a reply, or with an implausible one, keeps its values, is marked
+        invalid, and its age grows."""
         if self.settle_all(now_ns):
             self.judge(now_ns)
 
     def judge(self, now_ns: int) -> None:
-        """Fill the states from the plausible replies of this cycle and report the others."""
+        """Check the positions and device values of this cycle, fill the states from the plausible ones,
+        and report the others."""
         steps = self.values[0] - self.states.position[self.rows]
         for index in self.jumps.suspects(steps, self.fresh):
             elapsed_ns = int(self.at_ns[index] - self.shown_ns[index])
@@ -112,9 +117,8 @@ class Samples:
 
 
 class BusSamples:
-    """Samples of one bus, as views of the arrays of `Samples`: first its servos, then the blocks of its
-    devices.
-    """
+    """Part of `Samples` for one bus, as views of its arrays: first the servos of the bus, then the blocks
+    of its devices."""
 
     def __init__(self, number: int, plan: BusPlan, samples: Samples, first: int, first_block: int) -> None:
         here = slice(first, first + len(plan.servos))
@@ -123,40 +127,40 @@ class BusSamples:
         self._number = number
         self._here = here
         self.fresh = samples.fresh[here]
-        """True where an intact reply arrived in this cycle; shape (servos of the bus,)."""
+        """True for each servo whose intact reply arrived in this cycle, shape (servos of the bus,)."""
         self.blocks_fresh = samples.devices.fresh[blocks]
-        """True for each block of a device that arrived in this cycle; shape (blocks of the bus,)."""
+        """True for each block of a device that arrived in this cycle, shape (blocks of the bus,)."""
         self.blocks_at_ns = samples.devices.at_ns[blocks]
-        """Arrival time of the newest reply of each block; -1 before the first reply."""
+        """Arrival time of the newest reply of each block, ns; -1 before the first reply."""
         self.at_ns = samples.at_ns[here]
-        """Arrival time of the newest plausible reply; -1 before the first reply."""
+        """Arrival time of each servo's newest plausible reply, ns; -1 before the first reply."""
 
     def clear(self) -> None:
-        """Begin a cycle: mark all states as not received."""
+        """Begin a cycle: mark the states of all servos and blocks as not received."""
         self.fresh[:] = False
         self.blocks_fresh[:] = False
 
     def restart_count(self, servo: int) -> None:
-        """Accept the next position of a servo at any distance: a reboot reset its turn count."""
+        """Accept the next position of a servo at any distance from the last: a reboot reset its turn
+        count."""
         self._samples.recounted_ns[self._here][servo] = self.at_ns[servo]
 
     def arrived(self, member: int) -> bool:
-        """Return True if an intact reply of a member of the plan arrived in this cycle."""
+        """Return True if an intact reply of this member of the plan arrived in this cycle."""
         servos = len(self.fresh)
         return bool(self.fresh[member] if member < servos else self.blocks_fresh[member - servos])
 
     def take(self, servo: int, data: bytes | memoryview, at_ns: int) -> None:
-        """Store the state that a member of the plan, by its index, has sent."""
+        """Store the reply of a member of the plan, which arrived at `at_ns`."""
         self._samples.take(self._number, servo, bytes(data), at_ns)
 
 
 class Jumps:
-    """Plausibility check of positions: a servo cannot move further than its speed allows.
+    """Check of positions for implausible jumps: a servo cannot move further than its speed allows.
 
     A step is possible up to the servo's highest speed limit times the time since its last good sample. A
-    servo that really is elsewhere is therefore accepted again after a moment. Steps are in the order of the
-    plans' servos.
-    """
+    servo that really is elsewhere is therefore accepted again after a moment. Steps are in the order of
+    the plans' servos."""
 
     def __init__(self, plans: Iterable[BusPlan], reports: ReportSink) -> None:
         self._reports = reports
@@ -166,17 +170,19 @@ class Jumps:
         ratios = np.array([servo.ratio for _, servo in both], dtype=np.float64)
         self._fastest = np.array(speeds, dtype=np.float64) * ratios
         self.always_possible: Floats = self._fastest * MARGIN_NS * 1e-9 + MARGIN_RAD * ratios
-        """Largest step that is possible at any time after a good sample, rad or m."""
+        """Step of each servo that is possible at any time after a good sample, rad or m."""
         self._mask = np.zeros(len(both), dtype=np.bool_)
         self._reported_ns = [-REPORT_AGAIN_NS] * len(both)
 
     def suspects(self, steps: Floats, fresh: NDArray[np.bool_]) -> list[int]:
-        """Return the indices of the `fresh` servos with a step that may be too large; steps in rad or m."""
+        """Return the indices of the `fresh` servos whose step (rad or m) needs the closer check of
+        `can_be`."""
         np.greater(np.abs(steps), self.always_possible, self._mask)
         return np.flatnonzero(self._mask & fresh).tolist()
 
     def can_be(self, index: int, step: float, elapsed_ns: int, now_ns: int) -> bool:
-        """Return True if a servo can have made a step within `elapsed_ns`; report it otherwise."""
+        """Return True if a servo can have made this step (rad or m) within `elapsed_ns`; otherwise report
+        an implausible value."""
         reach = self.always_possible[index] + self._fastest[index] * elapsed_ns * 1e-9
         if abs(step) <= reach:
             return True
@@ -195,16 +201,16 @@ def _units(servo: ServoPlan) -> tuple[float, float, float]:
 
 
 def _in_wheel_mode(servo: ServoPlan) -> float:
-    """Return the unit of the present speed in wheel mode, rad/s or m/s of the joint."""
+    """Return the unit of the present speed in wheel mode, rad/s or m/s of the joint per tick."""
     units = [mode.present_rad_s_per_tick for mode in servo.modes if mode.mode == Mode.VELOCITY]
     return (units[0] if units else servo.rad_s_per_tick) * servo.ratio
 
 
 def _most_speed(plan: BusPlan, servo: ServoPlan) -> float:
-    """Return the highest speed of a servo, rad/s. A profile may be faster than the velocity limit.
+    """Return the highest speed that a servo's registers allow, rad/s. A profile may be faster than the
+    velocity limit.
 
-    Velocity Limit (44) of an X servo ends at 1023, Profile Velocity (112) at 32767 (e-Manual XM430-W350).
-    """
+    Velocity Limit (44) of an X servo ends at 1023, Profile Velocity (112) at 32767 (e-Manual XM430-W350)."""
     limit = find_table(servo.model, plan.protocol).items.get("velocity_limit")
     ticks = servo.max_speed_tick if limit is None else min(servo.max_speed_tick, limit.maximum)
     return ticks * servo.rad_s_per_tick

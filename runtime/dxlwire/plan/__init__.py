@@ -1,4 +1,4 @@
-"""Bus plan: transactions of each cycle, their due times and cost, and the retries at set-up.
+"""Bus plan: computes the transactions of each cycle with due times and cost, and repeats lost requests at
+set-up.
 
-Execution of a plan belongs in `exchange`.
-"""
+Execution of a plan belongs in `exchange`."""

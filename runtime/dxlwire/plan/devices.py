@@ -1,4 +1,4 @@
-"""Devices: the bytes of a device to read in each cycle, grouped into reads."""
+"""Device reads: chooses the blocks of bytes that are read from a device in each cycle."""
 
 from __future__ import annotations
 
@@ -15,7 +15,8 @@ MOST_BYTES = 120  # Longest block of one read: devices have small buffers [i]
 def device_blocks(
     line: Line, table: DeviceTable, states: Mapping[str, ControlItem], first_column: int
 ) -> tuple[DeviceBlock, ...]:
-    """Return the reads that fetch the items of all states in the shortest time, in the order of addresses.
+    """Return the blocks by which the items of all these states are read in the shortest time, in the order of
+    addresses.
 
     A read includes the bytes between two items if they belong to items and one read is faster than two.
 
@@ -38,7 +39,7 @@ def device_blocks(
 
 
 def _together(line: Line, table: DeviceTable, run: Sequence[ControlItem], item: ControlItem) -> bool:
-    """Return True if one read of the run and another item is at least as fast as two reads."""
+    """Return True if one read of the items in `run` and another item is at least as fast as two reads."""
     start, end = run[0].address, max(one.address + one.size for one in run)
     upto = max(end, item.address + item.size)
     if upto - start > MOST_BYTES or not table.readable(end, item.address):

@@ -1,4 +1,5 @@
-"""Line: timing of one serial line, and the transactions that follow from it."""
+"""Line: builds transactions for one serial line, with due times and timeouts that follow from its speed
+and delays."""
 
 from __future__ import annotations
 
@@ -13,27 +14,29 @@ from dxlwire.wire.dialect import Dialect
 
 BITS_PER_BYTE = 10  # 8N1: start bit, eight bits, stop bit (protocol.md, Line)
 LONGEST_RETURN_DELAY_NS = 508_000
-"""254 steps of 2 us (e-Manual, Return Delay Time (5)), assumed until a servo reports its setting."""
+"""Return delay that is assumed until a servo reports its setting, ns: 254 steps of 2 us (e-Manual, Return
+Delay Time (5))."""
 TIMEOUT_MARGIN_NS = 10_000_000
-"""Time that the host waits for a servo with a recent reply, after the latest arrival that the wire allows.
+"""Time (ns) that the host waits for a servo with a recent reply, after the latest arrival that the wire
+allows.
 
-A real servo is late by microseconds at most. But the host may have to wait for its processor for a slice or
-two of the scheduler (3 ms each on a stock Linux). The same holds for a simulated servo in another process.
-Ten milliseconds keep this stall from being reported as a broken cable. Only the first timeout of a cycle
-takes that long (the later ones are short). It stays below the 15.6 ms after which a loop of 320 Hz would
-count as hanging. Servos that the run itself simulates have a longer timeout: `SimulatedPort`.
-"""
+A real servo is late by microseconds at most. But the host may have to wait for its processor for a slice
+or two of the scheduler (3 ms each on a stock Linux). The same holds for a simulated servo in another
+process. Ten milliseconds keep this stall from being reported as a broken cable. Only the first timeout of
+a cycle takes that long (the later ones are short). It stays below the 15.6 ms after which a loop of 320 Hz
+would count as hanging. Servos that the run itself simulates have a longer timeout: `SimulatedPort`."""
 SHORT_TIMEOUT_MARGIN_NS = 1_000_000
-"""The same for a servo that is already silent: it must not use up the time of the other servos."""
+"""Time (ns) like TIMEOUT_MARGIN_NS for a servo that is already silent: it must not use up the time of the
+other servos."""
 
 MOST_SPARE = 2
-"""Extra reply lengths per read; they distinguish late replies from the newest one (`exchange/owed.py`)."""
+"""Largest number of extra bytes in a read; the different lengths distinguish late replies from the newest
+one (`exchange/owed.py`)."""
 
 
 class Line(msgspec.Struct, frozen=True):
-    """Timing of one serial line according to the robot file; builds transactions with due times and timeouts,
-    ns.
-    """
+    """Timing of one serial line according to the robot file; its methods build transactions with due times
+    and timeouts, ns, and send nothing."""
 
     baud_rate: int
     latency_ns: int  # Latency of the adapter, once per request
@@ -42,30 +45,31 @@ class Line(msgspec.Struct, frozen=True):
     return_delays: Mapping[int, int] = {}
     """Known return delays by servo ID, ns; all other servos have `return_delay_ns`."""
     device_margin_ns: int = SHORT_TIMEOUT_MARGIN_NS
-    """Time that the host waits for a device after the latest arrival that the wire allows. It is as short as
-    for a silent servo, so that a lost device does not use up the time of the servos."""
+    """Time (ns) that the host waits for a device after the latest arrival that the wire allows. It is as
+    short as for a silent servo, so that a lost device does not use up the time of the servos."""
 
     def wire_ns(self, count: int) -> int:
         """Return the time that `count` bytes take on the wire, ns."""
         return count * BITS_PER_BYTE * 1_000_000_000 // self.baud_rate
 
     def delay_ns(self, servo_id: int) -> int:
-        """Return the return delay of a servo, ns."""
+        """Return the time that a servo waits before it answers, ns."""
         return self.return_delays.get(servo_id, self.return_delay_ns)
 
     def ping(self, servo_id: int) -> Transaction:
-        """Return a ping of one servo."""
+        """Return a transaction that pings one servo."""
         length = self.dialect.PING_LENGTH
         return self._answered(self.dialect.ping(servo_id), servo_id, Awaited(servo_id, length, PRESENCE))
 
     def read(self, servo_id: int, address: int, length: int, spare: int = 0) -> Transaction:
-        """Return a read of `length` bytes from `address`, after which `spare` more bytes are readable."""
+        """Return a transaction that reads `length` bytes from `address`, after which `spare` more bytes
+        are readable."""
         packet = self.dialect.read(servo_id, address, length)
         read = self._answered(packet, servo_id, Awaited(servo_id, length, address))
         return replace(read, spare=spare) if spare else read
 
     def read_many(self, requests: Sequence[tuple[int, int, int]], *, fast: bool = False) -> Transaction:
-        """Return one read of several servos, or a plain read of a single servo.
+        """Return a transaction that reads several servos at once, or a plain read of a single servo.
 
         Args:
             requests: ID, address and length for each servo.
@@ -88,22 +92,24 @@ class Line(msgspec.Struct, frozen=True):
         return Transaction(packet, BROADCAST_ID, awaited, due_ns, timeout_ns, size, fast=True)
 
     def write(self, servo_id: int, address: int, data: bytes) -> Transaction:
-        """Return a write with acknowledgement; a write to the broadcast ID has none."""
+        """Return a transaction that writes data and awaits the acknowledgement; a write to the broadcast
+        ID has none."""
         packet = self.dialect.write(servo_id, address, data)
         if servo_id == BROADCAST_ID:
             return self.unanswered(packet)
         return self._answered(packet, servo_id, Awaited(servo_id, 0))
 
     def instruct(self, servo_id: int, packet: bytes) -> Transaction:
-        """Return the transaction of an instruction that one servo acknowledges without data."""
+        """Return a transaction that sends an instruction packet to one servo, which acknowledges it
+        without data."""
         return self._answered(packet, servo_id, Awaited(servo_id, 0))
 
     def unanswered(self, packet: bytes) -> Transaction:
-        """Return a transaction without reply."""
+        """Return a transaction that sends a packet to which no servo replies."""
         return Transaction(packet, BROADCAST_ID, (), self.wire_ns(len(packet)), 0)
 
     def _answered(self, packet: bytes, servo_id: int, *awaited: Awaited) -> Transaction:
-        """Return a transaction whose replies follow one another, each after a return delay."""
+        """Return a transaction whose replies follow one another, each after the return delay of its servo."""
         replies = sum(self.dialect.OVERHEAD + one.length for one in awaited)
         due_ns = self.wire_ns(len(packet) + replies) + sum(self.delay_ns(one.servo_id) for one in awaited)
         widest = self.dialect.widest(max(one.length for one in awaited))
@@ -113,7 +119,7 @@ class Line(msgspec.Struct, frozen=True):
 
 
 def lengthen(read: Transaction, more: int, dialect: Dialect, byte_ns: int) -> Transaction:
-    """Return the read of one servo with `more` spare bytes."""
+    """Return the read of one servo with `more` additional bytes, so that its reply has another length."""
     (awaited,) = read.awaited
     length = awaited.length + more
     return replace(
@@ -127,5 +133,6 @@ def lengthen(read: Transaction, more: int, dialect: Dialect, byte_ns: int) -> Tr
 
 
 def listen(duration_ns: int) -> Transaction:
-    """Return a transaction that sends nothing and receives unrequested bytes for `duration_ns`."""
+    """Return a transaction that sends nothing for `duration_ns`, while bytes from the line are received
+    and logged."""
     return Transaction(b"", BROADCAST_ID, (), duration_ns, 0)

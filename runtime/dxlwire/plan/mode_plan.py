@@ -1,18 +1,16 @@
-"""Modes of a model: registers, goals and units of each mode, derived from the control table.
+"""Mode plans: registers, goals and units of each mode of a servo model, derived from its control table.
 
-Protocol 2.0: Operating Mode (11), or Control Mode (11) of the XL-320 (e-Manual XM430-W350, XL-320).
-
-Protocol 1.0: the angle limits, both 0 for wheel mode, both at the highest tick for multi-turn mode (e-Manual
-MX-28, CW/CCW Angle Limit (6, 8)), and Torque Control Mode Enable (70) of MX-64 and MX-106.
+Protocol 2.0: Operating Mode (11), or Control Mode (11) of the XL-320 (e-Manual XM430-W350, XL-320). Protocol
+1.0: the angle limits, both 0 for wheel mode, both at the highest tick for multi-turn mode (e-Manual MX-28,
+CW/CCW Angle Limit (6, 8)), and Torque Control Mode Enable (70) of MX-64 and MX-106.
 
 Effort limit of a position: Goal Current (102) in a mode of its own. In Protocol 1.0 it is Torque Limit (34)
 in joint mode (e-Manual AX-12A, Torque Limit (34)): the fraction of the maximum, and never 0, which indicates
 a shutdown.
 
-In wheel mode an AX, RX, DX, EX or XL-320 does not control its speed. Moving Speed (32) is then a fraction of
-full output (e-Manual AX-12A, Moving Speed (32)). That is `pwm`; as `velocity` it is the fraction of the
-no-load speed, which a loaded servo does not reach [i].
-"""
+In wheel mode an AX, RX, DX, EX or XL-320 does not control its speed. Moving Speed (32) is then a fraction
+of full output (e-Manual AX-12A, Moving Speed (32)). That is `pwm`; as `velocity` it is the fraction of the
+no-load speed, which a loaded servo does not reach [i]."""
 
 from __future__ import annotations
 
@@ -36,7 +34,7 @@ from dxlwire.control_table import ControlItem, ControlTable
 from dxlwire.modes import Mode
 
 _CURRENT, _VELOCITY, _POSITION, _EXTENDED, _CURRENT_BASED, _PWM = 0, 1, 3, 4, 5, 16
-"""Values of Operating Mode (11)."""
+"""Values of Operating Mode (11) that select the modes of these names."""
 _WHEEL, _JOINT = 1, 2  # Control Mode (11) of the XL-320
 _EXTENDED_TURNS = 256
 """Range of extended position control in either direction, revolutions (e-Manual XM430-W350, Goal Position
@@ -46,7 +44,8 @@ _MULTI_TURN_TICKS = 28_672
 _FULL = 1023
 """Moving Speed (32) at full output in wheel mode, and maximum of Goal Torque (71), without direction bit."""
 _ADDRESS_OF_P = 512
-"""Address of Torque Enable on P and PRO(A), which have no current-based position control."""
+"""Address of Torque Enable on P and PRO(A) servos, which identifies them: they have no current-based
+position control."""
 
 
 LACKS: Mapping[Mode, str] = MappingProxyType(
@@ -58,11 +57,12 @@ LACKS: Mapping[Mode, str] = MappingProxyType(
         Mode.EFFORT_POSITION: "has no position control with a limit of the effort",
     }
 )
-"""Reason why a model lacks a mode."""
+"""Text for a model that does not have a mode; it follows the model's name."""
 
 
 def position_reach(table: ControlTable, continuous: bool) -> tuple[int, int]:
-    """Return the lowest and highest goal position, ticks. `continuous`: over many turns, if the model can."""
+    """Return the lowest and highest goal position of a model, ticks. `continuous`: over many turns, if the
+    model can."""
     if continuous and _EXTENDED in operating_modes(table):
         turns = round(_EXTENDED_TURNS * math.tau / table.rad_per_tick) - 1
         return -turns, turns
@@ -74,7 +74,7 @@ def position_reach(table: ControlTable, continuous: bool) -> tuple[int, int]:
 def mode_plans(
     table: ControlTable, lower_tick: int, upper_tick: int, continuous: bool
 ) -> tuple[ModePlan, ...]:
-    """Return the modes of a model.
+    """Return the plans of all modes that a model has.
 
     A model that cannot count turns has no position control for a `continuous` joint.
 
@@ -91,10 +91,10 @@ def mode_plans(
 
 
 def mode_in(servo: ServoPlan, found: Mapping[str, int]) -> Mode:
-    """Return the mode that a servo's registers select, UNKNOWN if the plan has none for them.
+    """Return the mode that the register values in `found`, by name, select; UNKNOWN if the plan has none for
+    them.
 
-    If two modes have the same registers, as velocity and PWM in wheel mode, the start mode wins.
-    """
+    If two modes have the same registers, as velocity and PWM in wheel mode, the start mode wins."""
     for plan in sorted(servo.modes, key=lambda plan: plan.mode != servo.start_mode):
         if in_mode(plan, found):
             return plan.mode
@@ -102,21 +102,21 @@ def mode_in(servo: ServoPlan, found: Mapping[str, int]) -> Mode:
 
 
 def model_modes(table: ControlTable, continuous: bool) -> tuple[Mode, ...]:
-    """Return the modes that a model has."""
+    """Return the modes that a model has, for a joint that is continuous or not."""
     return tuple(plan.mode for plan in mode_plans(table, table.min_tick, table.max_tick, continuous))
 
 
 def controls_speed(table: ControlTable) -> bool:
-    """Return True if a model controls its speed; in wheel mode of Protocol 1.0 only MX models do."""
+    """Return True if a model controls its speed in velocity mode; in wheel mode of Protocol 1.0 only MX
+    models do."""
     return "operating_mode" in table.items or "resolution_divider" in table.items
 
 
 def in_mode(wanted: ModePlan, found: Mapping[str, int]) -> bool:
-    """Return True if register values, by name, select a mode.
+    """Return True if the register values in `found`, by name, select this mode.
 
     Any pair of angle limits in ascending order selects joint mode. A pair in descending order selects no
-    mode: it belongs to a servo whose mode change was interrupted after one of the two writes.
-    """
+    mode: it belongs to a servo whose mode change was interrupted after one of the two writes."""
     values = {register.name: register.value for register in wanted.operating}
     low, high = values.pop("cw_angle_limit", None), values.pop("ccw_angle_limit", None)
     if any(found.get(name) != value for name, value in values.items()):
@@ -127,9 +127,8 @@ def in_mode(wanted: ModePlan, found: Mapping[str, int]) -> bool:
 
 
 def own_limits(table: ControlTable) -> tuple[OwnLimit, ...]:
-    """Return the items with the servo's own limits, in ticks of the goal. The servo refuses a goal beyond
-    them.
-    """
+    """Return the registers of a model that hold its own limits, in ticks of the goal. The servo refuses a
+    goal beyond them."""
     places: list[tuple[Literal["speed", "effort", "pwm"], str]] = [
         ("speed", "velocity_limit"),
         ("effort", "current_limit"),
@@ -145,12 +144,13 @@ def own_limits(table: ControlTable) -> tuple[OwnLimit, ...]:
 
 
 def limits_torque(table: ControlTable) -> bool:
-    """Return True if Torque Limit (34) limits the effort of positions: Protocol 1.0."""
+    """Return True if Torque Limit (34) can limit the effort of a position goal, as in Protocol 1.0."""
     return table.protocol == 1.0 and "torque_limit" in table.items
 
 
 def position_layout(table: ControlTable) -> GoalLayout:
-    """Return the block of the goal position, with the speed toward it if the two items are adjacent."""
+    """Return the block of the goal position, which includes the speed toward it if the two items are
+    adjacent."""
     position, speed = table.items["goal_position"], table.items[table.goal_speed_item]
     start = min(position.address, speed.address)
     if abs(position.address - speed.address) != (speed.size if start == speed.address else position.size):
@@ -160,7 +160,7 @@ def position_layout(table: ControlTable) -> GoalLayout:
 
 
 def _by_operating_mode(table: ControlTable, ends: tuple[int, int], continuous: bool) -> list[ModePlan]:
-    """Return the modes of a model with Operating Mode (e-Manual, section of that name, by model)."""
+    """Return the mode plans of a model with Operating Mode (e-Manual, section of that name, by model)."""
     items, listed = table.items, operating_modes(table)
     # PRO; its Goal Torque counts current as well
     effort = "goal_current" if "goal_current" in items else "goal_torque"
@@ -199,9 +199,8 @@ def _by_operating_mode(table: ControlTable, ends: tuple[int, int], continuous: b
 
 
 def operating_modes(table: ControlTable) -> tuple[int, ...]:
-    """Return the supported values of Operating Mode, or an empty tuple without that item (e-Manual, by
-    model).
-    """
+    """Return the values of Operating Mode that a model supports, or an empty tuple without that item
+    (e-Manual, by model)."""
     item = table.items.get("operating_mode")
     if item is None:
         return ()
@@ -221,7 +220,8 @@ def operating_modes(table: ControlTable) -> tuple[int, ...]:
 
 
 def _by_angle_limits(table: ControlTable, ends: tuple[int, int], continuous: bool) -> list[ModePlan]:
-    """Return the modes of a model that chooses between joint and wheel by angle limits or Control Mode."""
+    """Return the mode plans of a model that chooses between joint and wheel by angle limits or Control
+    Mode."""
     items = table.items
     many = continuous and "multi_turn_offset" in items
     controlled = controls_speed(table)
@@ -256,7 +256,8 @@ def _by_angle_limits(table: ControlTable, ends: tuple[int, int], continuous: boo
 
 
 def _selected(table: ControlTable, limits: tuple[int, int]) -> tuple[RegisterValue, ...]:
-    """Return the registers that select joint mode within limits, or wheel mode: both limits 0."""
+    """Return the register values that select joint mode with these limits, ticks, or wheel mode: both
+    limits 0."""
     if "control_mode" in table.items:
         return (_value(table, "control_mode", _JOINT if any(limits) else _WHEEL),)
     chosen = [
@@ -295,5 +296,5 @@ def _value(table: ControlTable, name: str, value: int) -> RegisterValue:
 
 
 def field(item: ControlItem, start: int) -> Field:
-    """Return the field of an item in a block that begins at an address."""
+    """Return place and encoding of an item in a block of bytes that begins at address `start`."""
     return Field(item.address - start, item.size, item.encoding)

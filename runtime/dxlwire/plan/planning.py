@@ -1,6 +1,5 @@
 """Planning: builds the plan of one bus, with packets, times and cost of a cycle, from joints and control
-tables.
-"""
+tables."""
 
 from __future__ import annotations
 
@@ -44,7 +43,7 @@ Item = TypeVar("Item")
 
 
 class Wiring(msgspec.Struct, frozen=True):
-    """One joint and its servo, as input of `bus_plan`."""
+    """One joint and its servo as described in the robot file; input of `bus_plan`."""
 
     joint: str
     row: int  # Row of the joint in the state and goal arrays of the whole robot
@@ -55,12 +54,12 @@ class Wiring(msgspec.Struct, frozen=True):
     lower: float  # rad or m, in the joint's terms
     upper: float  # rad or m, in the joint's terms
     settings: tuple[RegisterValue, ...] = ()
-    """Required register values, in the order of writing."""
+    """Register values that the servo should have, in the order of writing."""
     continuous: bool = False
     """True for a wheel, or for a joint that counts several turns; without limits `lower` and `upper` are
     infinite."""
     start_mode: Mode | None = None
-    """Mode that the start-up selects; None: VELOCITY for a wheel, else POSITION."""
+    """Mode that start-up selects; None: VELOCITY for a wheel, else POSITION."""
     ratio: float = 1.0  # Movement of the joint per radian of the servo, rad or m
     unit: JointUnit = ROTARY  # Unit of the joint's positions
     name: str = ""  # Unique name of the servo if several servos move one joint
@@ -77,7 +76,7 @@ def bus_plan(
     devices: Sequence[tuple[DevicePlan, DeviceTable]] = (),
     protocol: float = 1.0,
 ) -> BusPlan:
-    """Return the plan of one serial line.
+    """Return the plan of one serial line with its servos and devices.
 
     Args:
         name: Name of the bus.
@@ -123,7 +122,7 @@ def bus_plan(
 
 
 def plan_line(plan: BusPlan) -> Line:
-    """Return the line of a plan, with the timing of the robot file."""
+    """Return the timing of a bus as planned, which builds transactions."""
     return Line(
         plan.baud_rate,
         plan.latency_ns,
@@ -134,7 +133,8 @@ def plan_line(plan: BusPlan) -> Line:
 
 
 def torque_off_ns(plan: BusPlan) -> int:
-    """Return the time to switch torque off on a bus, ns: a broadcast, then each servo with read-back."""
+    """Return the time to switch torque off on a bus, ns: a broadcast, then a write and a read of each
+    servo."""
     line, total_ns = plan_line(plan), sum(each.due_ns for each in plan.limp)
     for servo in plan.servos:
         write = line.write(servo.servo_id, servo.torque_address, b"\0")
@@ -149,7 +149,7 @@ def goal_layouts(servos: Sequence[ServoPlan]) -> tuple[GoalLayout, ...]:
 
 
 def goal_parts(dialect: Dialect, layout: GoalLayout, servos: Sequence[Item]) -> list[Sequence[Item]]:
-    """Split the servos of one goal block into parts that fit one sync write each."""
+    """Split servos that share one goal block into parts that fit one sync write each."""
     most = dialect.MOST_GOAL_BYTES // (layout.length + 1)
     return [servos[start : start + most] for start in range(0, len(servos), most)]
 
@@ -166,10 +166,9 @@ def _empty_goals(line: Line, layout: GoalLayout, servos: Sequence[ServoPlan]) ->
 
 
 def _torque_off(line: Line, servos: Sequence[ServoPlan]) -> list[Transaction]:
-    """Return broadcasts that switch torque off, without a reply.
+    """Return transactions that switch torque off on all these servos, without a reply.
 
-    Each address of Torque Enable gets its own sync write if models differ in it.
-    """
+    Each address of Torque Enable gets its own sync write if models differ in it."""
     addresses = dict.fromkeys(servo.torque_address for servo in servos)
     if len(addresses) == 1:
         return [line.write(BROADCAST_ID, address, b"\0") for address in addresses]
@@ -230,7 +229,7 @@ def _scaled(scale: Scale, factor: float) -> Scale:
 
 
 def _start_mode(joint: Wiring, modes: Sequence[ModePlan]) -> Mode:
-    """Return the start mode. Raises ValueError if the model does not have it."""
+    """Return the mode in which a servo starts. Raises ValueError if the model does not have it."""
     wanted = joint.start_mode or (Mode.VELOCITY if joint.continuous else Mode.POSITION)
     if any(plan.mode == wanted for plan in modes):
         return wanted
@@ -238,7 +237,8 @@ def _start_mode(joint: Wiring, modes: Sequence[ModePlan]) -> Mode:
 
 
 def _torque_limit(table: ControlTable) -> TorqueLimit | None:
-    """Return the torque limit of a model; see `dynamixel.torque_limit` for the pages of the manual."""
+    """Return the register that limits the torque of a model; None if it has none. `torque_limits.py` names
+    the pages of the manual."""
     for name, full in (("torque_limit", "max_torque"), ("goal_pwm", "pwm_limit")):
         item, own = table.items.get(name), table.items.get(full)
         if item is not None and own is not None and item.size == own.size:
@@ -250,8 +250,7 @@ def _torque_limit(table: ControlTable) -> TorqueLimit | None:
 def _state_layout(table: ControlTable, *, counts_turns: bool) -> StateLayout:
     """Return the single block that holds position, speed and load or current.
 
-    Raises ValueError if other addresses between them are not items: these cannot be read.
-    """
+    Raises ValueError if other addresses between them are not items: these cannot be read."""
     names = ("present_position", table.present_speed_item, table.effort_item)
     items = [table.items[name] for name in names]
     start = min(item.address for item in items)
