@@ -1,4 +1,5 @@
-"""`python -m dxlsim`: simulated servos on a pseudo-terminal, for any program that speaks Dynamixel."""
+"""Command `python -m dxlsim`: serves simulated servos on a pseudo-terminal, for any program that speaks
+Dynamixel."""
 
 from __future__ import annotations
 
@@ -96,7 +97,7 @@ def _parser() -> argparse.ArgumentParser:
 
 
 def main(words: Sequence[str] | None = None) -> int:
-    """Serve until SIGINT or SIGTERM.
+    """Serve simulated servos as the command line describes until SIGINT or SIGTERM; return the exit code.
 
     Returns:
         0; 1 if the ledger is incomplete after a write error; 2 if the arguments are wrong.

@@ -8,7 +8,7 @@ from dxlsim.simulation_plan import SimulationConfig
 
 
 class SimulationJob(msgspec.Struct, frozen=True):
-    """Task of the process of the simulated buses, sent as JSON through a descriptor."""
+    """First message to the process of the simulated buses: what it simulates, and how it runs."""
 
     config: SimulationConfig
     ledger: str | None = None  # JSON-lines file for every byte on the buses
@@ -19,14 +19,14 @@ class SimulationJob(msgspec.Struct, frozen=True):
 
 
 class Request(msgspec.Struct):
-    """Message to the simulation."""
+    """Request to a running simulation."""
 
     look: bool = False  # Request the current state of every servo
     fault: str | None = None  # Line of a fault to plan, as typed by a person
 
 
 class ServoLook(msgspec.Struct, frozen=True):
-    """Current state of one servo."""
+    """Present state of one simulated servo, in answer to a `look` request."""
 
     bus: str
     id: int
@@ -42,16 +42,15 @@ class ServoLook(msgspec.Struct, frozen=True):
 
 
 class SimulationMessage(msgspec.Struct, frozen=True, omit_defaults=True):
-    """Message from the simulation: one of these fields, `real_time` with the first ports, `lateness_us` with
-    servos.
-    """
+    """Message from the simulation to its starter: one of these fields, `real_time` with the first ports,
+    `lateness_us` with servos."""
 
     ports: dict[str, str] | None = None  # Device of each bus; empty while an adapter is unplugged
     real_time: str = ""  # Real-time properties that the system granted
     servos: tuple[ServoLook, ...] | None = None
     lateness_us: dict[str, float] = {}
     """Lateness of the deliveries to the host, us, by statistic, such as median and p99; empty before the
-    first."""
+    first delivery."""
     happened: str | None = None  # Fault that was just injected
     fault: str | None = None  # Accepted fault line in canonical form
     error: str | None = None  # Reason why the configuration or a fault line is invalid

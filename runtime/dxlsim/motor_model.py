@@ -17,11 +17,10 @@ import msgspec
 
 
 class Stribeck(msgspec.Struct, frozen=True):
-    """Additional friction near standstill: friction * exp(-(|speed| / velocity)**exponent).
+    """Additional friction of a motor near standstill: friction * exp(-(|speed| / velocity)**exponent).
 
-    B. Armstrong-Helouvry, P. Dupont, C. Canudas de Wit, "A survey of models, analysis tools and compensation
-    methods for the control of machines with friction", Automatica 30 (1994), section 2.
-    """
+    B. Armstrong-Helouvry, P. Dupont, C. Canudas de Wit, "A survey of models, analysis tools and
+    compensation methods for the control of machines with friction", Automatica 30 (1994), section 2."""
 
     friction: float  # Nm
     velocity: float  # rad/s
@@ -29,7 +28,7 @@ class Stribeck(msgspec.Struct, frozen=True):
 
 
 class MotorLoad(msgspec.Struct, frozen=True):
-    """Load during the identification, in addition to the motor's own rotor and gear."""
+    """Load on the servo during the identification, in addition to the motor's own rotor and gear."""
 
     inertia: float = 0.0  # kg m^2
     gravity: float = 0.0  # Torque of the weight in the horizontal position, Nm
@@ -37,7 +36,7 @@ class MotorLoad(msgspec.Struct, frozen=True):
 
 
 class MotorModel(msgspec.Struct, frozen=True):
-    """Motor of a servo: the parameters of a motor file, which a joint of the robot file references."""
+    """Content of a motor file: the parameters of a servo's motor. A joint of the robot file references it."""
 
     model: str  # Model of the servo: MX-64
     voltage: float  # V of the supply, unless it is measured
@@ -49,21 +48,21 @@ class MotorModel(msgspec.Struct, frozen=True):
     viscous_friction: float = 0.0  # Nm s/rad
     stribeck: Stribeck | None = None
     position_gain: float | None = None
-    """Duty per rad of error and unit of the P gain; None: not identified."""
+    """Duty per rad of error and unit of the P gain's register; None: not identified."""
     p_gain: int | None = None
     """Value of the P gain's register: from the robot file's `registers`, else the one at which
-    `position_gain` was identified. None: the servo has no such register, and `position_gain` is the whole
-    gain."""
+    `position_gain` was identified. None: the servo has no such register, and `position_gain` is the
+    whole gain."""
     delay_ns: int = 0  # Delay between a goal's arrival at the servo and at the motor
     load: MotorLoad = MotorLoad()
     source: str = ""  # Data of the identification
     torque_per_effort: float | None = None
-    """Nm per unit of the effort that the servo measures and accepts, A or Nm. None: the effort has another
-    unit, or no joint was compared with the file yet."""
+    """Joint torque, Nm, per unit of the effort that the servo measures and accepts, A or Nm. None: the
+    effort has another unit, or no joint was compared with the file yet."""
 
     @property
     def stiffness(self) -> float | None:
-        """Duty per rad between goal and angle; None: not identified."""
+        """Duty per rad between goal and angle at the P gain `p_gain`; None: not identified."""
         if self.position_gain is None:
             return None
         return self.position_gain * (1 if self.p_gain is None else self.p_gain)

@@ -17,11 +17,11 @@ import pytest
 from dxlsim.serving.served_bus import ServedBus, serve_bus
 
 SERVOS = "XL430-W250:1,2"
-"""Servos of a test without the mark."""
+"""Servos of the fixture `dynamixel_bus` in a test without the mark of this name."""
 
 
 def pytest_configure(config: pytest.Config) -> None:
-    """Register the mark."""
+    """Register the mark `dynamixel_bus` with pytest."""
     config.addinivalue_line(
         "markers",
         "dynamixel_bus(*servos, baud_rate, protocol, faults, seed, link): the servos of the fixture "

@@ -1,8 +1,8 @@
-"""Simulated USB adapter between line and host: timing and splitting of the bytes that it delivers.
+"""Simulated USB adapter between line and host: when it delivers received bytes to the host, and in which
+pieces.
 
-Not modelled: the frames of USB itself (125 us or 1 ms), delays by hubs and other devices, the transfer of the
-host's bytes to the line, and modem lines.
-"""
+Not modelled: the frames of USB itself (125 us or 1 ms), delays by hubs and other devices, the transfer of
+the host's bytes to the line, and modem lines."""
 
 from __future__ import annotations
 
@@ -14,43 +14,47 @@ from dxlsim.bus.line import Transmission
 from dxlsim.simulation_plan import AdapterConfig
 
 BURST = 62
-"""Bytes that an FTDI chip delivers without waiting for its timer: a USB packet of 64 bytes minus two status
-bytes (FTDI, AN232B-04, "Data Throughput, Latency and Handshaking")."""
+"""Bytes that an FTDI chip delivers without waiting for its latency timer: a USB packet of 64 bytes minus
+two status bytes (FTDI, AN232B-04, "Data Throughput, Latency and Handshaking")."""
 
 UNREAD_LIMIT = 4096
-"""Size of the receive buffer for a host that does not read; further bytes are lost, as in the kernel's
-terminal buffer."""
+"""Size (bytes) of the receive buffer for a host that does not read; further bytes are lost, as in the
+kernel's terminal buffer."""
 
 _LONGEST_PIECE = 8  # Longest piece with the split `random`, bytes
 
 
 HandOver = tuple[int, bytes, Sequence[Transmission]]
-"""Planned time of a delivery to the host, its bytes, and the transmissions that it completes."""
+"""One delivery to the host: its planned time (ns), its bytes, and the transmissions that are complete with
+it."""
 
 
 class SimulatedAdapter:
-    """Buffer for bytes that have passed the wire, until the host receives them."""
+    """Adapter of one simulated line: keeps bytes that have passed the wire until the host receives them."""
 
     def __init__(self, config: AdapterConfig, start_ns: int) -> None:
         self.timer_ns = config.latency_timer_ns
         self._split = config.split
         self.immediate = config.latency_timer_ns == 0 and config.split == "whole"
-        """True if the host receives a transmission at the moment at which it ends on the wire."""
+        """True if the host receives a transmission at the moment at which it ends on the wire: no latency
+        timer, no splitting."""
         self._arrived: deque[Transmission] = deque()
-        """Transmissions that have ended on the wire and are not fully delivered."""
+        """Transmissions that have ended on the wire and are not fully delivered to the host."""
         self._chance = random.Random(config.seed)
         self._piece = self._next_piece()  # Size of the next piece, bytes
         self._timed_ns = start_ns
-        """Time at which the latency timer last expired, or at which a full burst was sent before that."""
+        """Time (ns) at which the latency timer last expired, or at which a full burst was sent before
+        that."""
         self._burst: deque[HandOver] = deque()  # Pieces of the burst that is being delivered
 
     def set_timer(self, timer_ns: int, now_ns: int) -> None:
-        """Change and restart the latency timer."""
+        """Set the latency timer to `timer_ns` (0: none) and restart it at `now_ns`."""
         self.timer_ns, self._timed_ns = timer_ns, now_ns
         self.immediate = timer_ns == 0 and self._split == "whole"
 
     def accept(self, new: Transmission) -> bool:
-        """Accept a transmission that has ended on the wire; return False if the buffer is full."""
+        """Store a transmission that has ended on the wire; return False if the buffer is full and the
+        bytes are lost."""
         if self._arrived and sum([len(each.data) for each in self._arrived]) + len(new.data) > UNREAD_LIMIT:
             return False
         self._arrived.append(new)
@@ -62,7 +66,8 @@ class SimulatedAdapter:
         self._burst.clear()
 
     def next_ns(self, passing: Sequence[Transmission]) -> int | None:
-        """Return the time of the next delivery if nothing else happens; None without bytes."""
+        """Return the time (ns) of the next delivery to the host if nothing else happens; None without
+        bytes. `passing` is still on the wire."""
         if self._burst:
             return self._burst[0][0]
         if not (self._arrived or passing):
@@ -73,7 +78,7 @@ class SimulatedAdapter:
         return first.passed_ns(min(len(first.data), first.given + self._piece) - 1)
 
     def hand_over(self, now_ns: int, passing: Sequence[Transmission]) -> list[HandOver]:
-        """Return the deliveries to the host up to a time."""
+        """Return the deliveries to the host that are due by `now_ns`, each once."""
         given: list[HandOver] = []
         while (due_ns := self.next_ns(passing)) is not None and due_ns <= now_ns:
             if self._burst:
@@ -89,10 +94,10 @@ class SimulatedAdapter:
         return given
 
     def _timer_end_ns(self, queue: Sequence[Transmission]) -> int:
-        """Return the time at which the timer expires with a byte waiting, or a full burst is complete.
+        """Return the time (ns) at which the latency timer expires with a byte waiting, or a full burst is
+        complete.
 
-        The timer restarts with each delivery. It also expires with an empty buffer (AN232B-04).
-        """
+        The timer restarts with each delivery. It also expires with an empty buffer (AN232B-04)."""
         timer_ns = self.timer_ns
         oldest_ns = max(queue[0].passed_ns(queue[0].given), self._timed_ns + 1)
         # The timer is periodic: round up to its next expiry (-(-a // b) is a ceiling division).
@@ -106,7 +111,7 @@ class SimulatedAdapter:
         return runs_out_ns
 
     def _gather(self, now_ns: int, most: int, passing: Sequence[Transmission]) -> HandOver:
-        """Collect up to `most` bytes that have passed the wire."""
+        """Take up to `most` bytes that have passed the wire, and return them as one delivery."""
         data, ended = b"", []
         for each in (*self._arrived, *passing):
             if each.first_ns >= now_ns:
@@ -124,7 +129,8 @@ class SimulatedAdapter:
         return now_ns, data, ended
 
     def _pieces(self, due_ns: int, burst: HandOver) -> list[HandOver]:
-        """Split a burst into pieces with pauses that are long enough for a host to distinguish them [i]."""
+        """Split a delivery into pieces with pauses of 10 us, long enough for a host to distinguish them
+        [i]."""
         if self._split == "whole":
             return [burst]
         _, data, ended = burst

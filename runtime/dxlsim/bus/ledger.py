@@ -1,4 +1,5 @@
-"""Ledger of a simulated bus: every byte in and out with its time. The runtime cannot edit it."""
+"""Ledger of simulated buses: every byte between host and servos with its time, and every fault. The
+runtime cannot edit it."""
 
 from __future__ import annotations
 
@@ -20,7 +21,7 @@ FAULT = "fault: "  # Prefix of the note of a fault; the fault's text follows
 
 
 class LedgerEntry(NamedTuple):
-    """Bytes that passed the wire together, or a note about an action on the bus."""
+    """One entry of the ledger: bytes that passed the wire together, or a note about an action on the bus."""
 
     # `in`: time at which the host wrote them; `out`: time at which the last byte had passed the wire
     t_ns: int
@@ -36,7 +37,7 @@ _Time = Annotated[int, msgspec.Meta(ge=-(1 << 62), le=1 << 62)]
 
 
 class _Line(msgspec.Struct, omit_defaults=True):
-    """One entry as a line of the file; a busy bus has thousands of them per second."""
+    """One ledger entry as a line of the JSON-lines file; a busy bus has thousands of them per second."""
 
     t_ns: _Time
     bus: str
@@ -50,7 +51,8 @@ _encoder, _decoder = msgspec.json.Encoder(), msgspec.json.Decoder(_Line)
 
 
 class Ledger:
-    """Record of a bus in memory, in a JSON-lines file, or both; `keep=False` bounds the memory of long runs.
+    """Writes the entries of simulated buses to memory, a JSON-lines file, or both; `keep=False` bounds the
+    memory of long runs.
 
     Args:
         file: File open for buffered writing: a busy bus has thousands of entries per second. `close`
@@ -76,7 +78,7 @@ class Ledger:
         *,
         late_ns: int = 0,
     ) -> None:
-        """Add bytes or a note. `flush_if_due` or `close` writes it to the file."""
+        """Add an entry with bytes or a note. `flush_if_due` or `close` makes sure that it is in the file."""
         if self._keep:
             self.entries.append(LedgerEntry(t_ns, bus, direction, data, note, late_ns))
         if self._file is not None:
@@ -91,19 +93,18 @@ class Ledger:
             self.on_note(note)
 
     def flush_due_ns(self) -> int | None:
-        """Return the time by which the file must be flushed, ns on the clock of the entries; None without
-        need.
-        """
+        """Return the time by which the file must be flushed, ns on the clock of the entries; None if
+        nothing is unwritten."""
         return None if self._unflushed_ns is None else self._unflushed_ns + FLUSH_NS
 
     def flush_if_due(self, now_ns: int) -> None:
-        """Flush the file if its oldest unwritten entry is half a second old."""
+        """Flush the file if its oldest unwritten entry is at least half a second old at `now_ns`."""
         due = self.flush_due_ns()
         if due is not None and now_ns >= due:
             self.flush()
 
     def flush(self) -> None:
-        """Flush the file."""
+        """Write all entries that are buffered to the file."""
         self._unflushed_ns = None
         if self._file is not None:
             try:

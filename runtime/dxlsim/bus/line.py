@@ -1,9 +1,8 @@
-"""Half-duplex line: transmissions toward the host, and their collisions.
+"""Half-duplex line of a simulated bus: packets and noise on their way to the host, and their collisions.
 
 Not modelled: reception of noise and of other servos' replies by servos (except for the end of the previous
-reply in a group read), framing errors and breaks, garbage between rates that differ by less than 3 %, levels
-and reflections on the cable.
-"""
+reply in a group read), framing errors and breaks, garbage between rates that differ by less than 3 %,
+levels and reflections on the cable."""
 
 from __future__ import annotations
 
@@ -23,16 +22,16 @@ ECHO = "echo"  # Note of the host's own bytes, echoed by its adapter
 
 
 class Turn(NamedTuple):
-    """Turn of one servo in a group read."""
+    """Turn of one servo in a group read (sync or bulk read), with its replies."""
 
     servo_id: int
     replies: tuple[tuple[ServoReply, bytes], ...]
-    """Replies with their bytes: several if servos share an ID, none if the servo is absent."""
+    """Replies with their bytes on the wire: several if servos share an ID, none if the servo is absent."""
     slot_bytes: int  # Size of a whole reply: the turn ends after that time on the wire
 
 
 class GroupReply(msgspec.Struct):
-    """Replies to a group read; each one is sent after the end of the previous reply."""
+    """Replies to one group read (sync or bulk read); each one is sent after the end of the previous reply."""
 
     turns: Sequence[Turn]
     has_slots: bool
@@ -42,7 +41,7 @@ class GroupReply(msgspec.Struct):
 
 
 class Transmission(msgspec.Struct):
-    """Contiguous bytes on their way to the host."""
+    """Contiguous bytes on their way to the host: a reply, noise, or an echo."""
 
     first_ns: int  # Time at which the first byte begins to pass the wire
     due_ns: int  # Time at which the last byte has passed the wire
@@ -55,16 +54,16 @@ class Transmission(msgspec.Struct):
     given: int = 0  # Number of bytes that the adapter has already delivered
 
     def passed_ns(self, index: int) -> int:
-        """Return the time at which the byte at `index` has passed the wire."""
+        """Return the time (ns) at which the byte at `index` has passed the wire."""
         return self.first_ns + (self.due_ns - self.first_ns) * (index + 1) // len(self.data)
 
     def overlaps(self, begin_ns: int, end_ns: int) -> bool:
-        """Return True if the bytes are on the wire within an interval. An adapter's echo never is."""
+        """Return True if the bytes are on the wire within this interval, ns. An adapter's echo never is."""
         return self.note != ECHO and self.first_ns < end_ns and begin_ns < self.due_ns
 
 
 class SimulatedLine:
-    """Transmissions of servos and noise on one line, ordered by their end."""
+    """Bytes of servos and noise that are on one simulated line, ordered by their end."""
 
     def __init__(self, baud_rate: int, note: Callable[[str], None]) -> None:
         self.passing: list[Transmission] = []
@@ -72,11 +71,12 @@ class SimulatedLine:
         self._note = note
 
     def duration_ns(self, size: int) -> int:
-        """Return the duration of `size` bytes: 10 bits each (e-Manual, 8N1)."""
+        """Return how long `size` bytes take on the wire, ns: 10 bits each (e-Manual, 8N1)."""
         return size * 10_000_000_000 // self.baud_rate
 
     def send(self, new: Transmission) -> None:
-        """Add a transmission to the host. It is mixed with those that are on the wire at the same time."""
+        """Add a transmission to the host. It is mixed with those that are on the wire at the same time: a
+        collision."""
         passing = self.passing
         if len(passing) >= MOST_PASSING:
             self._note(f"{len(new.data)} bytes to the host are lost: too many are on their way")
@@ -91,11 +91,12 @@ class SimulatedLine:
         insort(passing, new, key=_due)
 
     def echo(self, own: Transmission) -> None:
-        """Add the adapter's echo of the host's own bytes."""
+        """Add the adapter's echo of the host's own bytes, which collides with nothing."""
         insort(self.passing, own, key=_due)
 
     def withdraw(self, group: GroupReply) -> None:
-        """Remove the replies of a group read that wait for the end of another reply."""
+        """Remove those replies of a group read that have not begun because they wait for the end of
+        another reply."""
         under_way = [each for each in self.passing if each.group is group]
         if not under_way:
             return
@@ -103,10 +104,10 @@ class SimulatedLine:
         self.passing[:] = [each for each in self.passing if each.group is not group or each.turn < group.sent]
 
     def talk_over(self, sent: bytearray, position: int, start_ns: int) -> None:
-        """Corrupt the host's bytes from `position` while a servo sends, and truncate that servo's reply.
+        """Apply a collision of the host's bytes from `position` with replies: set the host's bytes to 0, and
+        truncate the replies.
 
-        A servo does not receive while it sends: it sees the host's bytes as 0 [i].
-        """
+        A servo does not receive while it sends: it sees the host's bytes as 0 [i]."""
         byte_ns = self.duration_ns(1)
         begin_ns, end_ns = start_ns + self.duration_ns(position), start_ns + self.duration_ns(len(sent))
         for each in [each for each in self.passing if each.overlaps(begin_ns, end_ns)]:
@@ -122,9 +123,8 @@ class SimulatedLine:
                 insort(self.passing, cut, key=_due)
 
     def _mixed(self, one: Transmission, other: Transmission) -> Transmission:
-        """Return the result of two simultaneous senders: the AND of their bytes, as two drivers pulling low
-        [i].
-        """
+        """Return the transmission that results from two simultaneous senders: the AND of their bytes, as
+        two drivers pulling low [i]."""
         early, late = sorted((one, other), key=_first)
         offset = round((late.first_ns - early.first_ns) / self.duration_ns(1))
         # An idle line reads as FF, the neutral element of AND.
@@ -144,7 +144,8 @@ class SimulatedLine:
 
 
 def flipped(packet: bytes, index: int, flip: int) -> bytes:
-    """Return a packet with flipped bits in one byte. Raises IndexError if the packet is shorter."""
+    """Return a packet with the bits of `flip` inverted in the byte at `index`. Raises IndexError if the
+    packet is shorter."""
     broken = bytearray(packet)
     broken[index] ^= flip
     return bytes(broken)

@@ -34,7 +34,7 @@ _ANSWER_NS = 500_000  # Delay of a constructed answer: Return Delay Time at its 
 
 
 class RecordedBus(SimulatedBus):
-    """Line of a recording, without servos.
+    """Simulated bus that replays a recording to the host, without servos.
 
     Raises:
         InputError: The recording has no instruction.
@@ -65,7 +65,8 @@ class RecordedBus(SimulatedBus):
         self._count_packet()
 
     def _transmissions(self, heard: tuple[Heard, ...], end_ns: int) -> Iterator[Transmission]:
-        """Yield the recorded bytes as transmissions; bytes that overlap in time are joined."""
+        """Yield recorded bytes as transmissions after an instruction that ended at `end_ns`; bytes that
+        overlap in time are joined."""
         waiting: Transmission | None = None
         for delay_ns, data in heard:
             wire_ns = self._line.duration_ns(len(data))
@@ -96,14 +97,16 @@ class RecordedBus(SimulatedBus):
                 yield instruction, (entry,)
 
     def _read(self, packet: InstructionPacket) -> ReadEntry | None:
-        """Return the target of a read of one servo, or None for another instruction."""
+        """Return ID, address and length that a read of one servo asks for, or None for another
+        instruction."""
         if packet.instruction != Instruction.READ or packet.servo_id == BROADCAST:
             return None
         place = self._codec.read(packet.parameters)
         return None if place is None else ReadEntry(packet.servo_id, *place)
 
     def _known(self, packet: InstructionPacket) -> tuple[Heard, ...] | None:
-        """Return the answer to a ping or a read from other recorded reads, or None if a byte is unknown."""
+        """Return the answer to a ping or a read, composed of other recorded reads, or None if a byte is
+        unknown."""
         if not packet.intact or packet.servo_id == BROADCAST:
             return None
         entry = self._read(packet)
@@ -121,7 +124,7 @@ class RecordedBus(SimulatedBus):
         return (Heard(_ANSWER_NS + self._line.duration_ns(len(data)), data),)
 
     def _registers(self, servo_id: int) -> dict[int, int]:
-        """Return the known bytes of a servo's control table, by address."""
+        """Return the bytes of a servo's control table that recorded reads show, by address."""
         known: dict[int, int] = {}
         for instruction, entries in self._reads:
             asked = {entry.servo_id: entry for entry in entries}

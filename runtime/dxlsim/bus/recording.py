@@ -1,4 +1,4 @@
-"""Recording of a bus: the instructions of a host, and the answers that it received."""
+"""Recording of a bus: the instructions that a host sent, and the answers that it received."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ from dxlwire.errors import InputError
 
 
 class RecordedPackets(msgspec.Struct, frozen=True):
-    """Packets that passed one bus, one row each, in any order. Times are ns of one clock."""
+    """Packets that passed one recorded bus, one row each, in any order. Times are ns of one clock."""
 
     is_instruction: NDArray[np.bool_]  # True: sent by the host; False: received by the host
     first_ns: NDArray[np.int64]  # Before the write() of the packet, or after the read() of its first byte
@@ -32,10 +32,10 @@ class Heard(NamedTuple):
 
 
 class Recording:
-    """Instructions of a bus with the bytes received after each one.
+    """Instructions of a recorded bus, with the bytes that the host received after each.
 
-    `take` returns the recorded answers of an instruction one after the other, and then repeats the last one.
-    Bytes belong to the instruction before them.
+    `take` returns the recorded answers of an instruction one after the other, and then repeats the last
+    one. Bytes belong to the instruction before them.
 
     Raises:
         InputError: The packets contain no instruction.
@@ -64,15 +64,17 @@ class Recording:
 
     @property
     def instructions(self) -> Sequence[bytes]:
-        """The distinct instructions."""
+        """The instructions in the recording, each once."""
         return tuple(self._exchanges)
 
     def newest(self, instruction: bytes) -> tuple[Heard, ...]:
-        """Return the last answer that was given to an instruction, or its first one if none was given."""
+        """Return the answer to an instruction that `take` returned last, or the first recorded one if
+        there was none."""
         return self._heard(self._exchanges[instruction][max(0, self._next[instruction] - 1)])
 
     def take(self, instruction: bytes) -> tuple[Heard, ...] | None:
-        """Return the next recorded answer to an instruction, or None if it is not in the recording."""
+        """Return the next recorded answer to an instruction, or None if the instruction is not in the
+        recording."""
         exchanges = self._exchanges.get(instruction)
         if exchanges is None:
             return None

@@ -54,7 +54,7 @@ Action = Callable[[], None]
 
 
 class PacketFault(NamedTuple):
-    """Fault of the next packet of a servo, or of the host."""
+    """Fault that is applied to the next packet of a servo, or of the host."""
 
     text: str
     alter: Alteration
@@ -63,7 +63,8 @@ class PacketFault(NamedTuple):
 
 
 class SimulatedBus:
-    """One simulated line; time comes from the caller and never goes back."""
+    """One simulated half-duplex line with its servos and devices; time comes from the caller and never
+    goes back."""
 
     def __init__(
         self, config: BusConfig, ledger: Ledger, start_ns: int, mechanics: Mechanics | None = None
@@ -80,12 +81,13 @@ class SimulatedBus:
         self.nodes: tuple[SimulatedNode, ...] = ()
         """All units on the line: servos, then devices."""
         self.mechanics = mechanics or Mechanics(start_ns)
-        """Mechanics of the servos; several buses of one robot share them."""
+        """Mechanics that the servos move; several buses of one robot share them."""
         self.now_ns = start_ns  # Current time of the bus
         self.host_free_ns = start_ns
-        """Time at which the host's last byte has passed the wire."""
+        """Time (ns) at which the host's last byte has passed the wire."""
         self.lateness_ns: deque[int] = deque(maxlen=1000)
-        """Delay of the recent deliveries to the host in real time, ns."""
+        """Delays (ns) of the recent deliveries to the host, compared with their planned times; in real
+        time only."""
         self._codec = protocol2.CODEC if config.protocol == 2.0 else protocol1.CODEC
         self._receiver = InstructionReceiver(self._codec)
         self._line = SimulatedLine(config.baud_rate, self.note)
@@ -96,9 +98,10 @@ class SimulatedBus:
         self._reply_faults: dict[int, deque[PacketFault]] = {}
         self._instruction_faults: deque[PacketFault] = deque()
         self._planned: list[tuple[int, int, Action]] = []
-        """Actions ordered by their time; actions of the same time in the order of planning."""
+        """Actions with their times (ns), ordered by time; actions of the same time in the order of
+        planning."""
         self._planned_after: list[tuple[int, int, Action]] = []
-        """Actions ordered by the number of packets after which they run."""
+        """Actions with the number of instruction packets after which they run, ordered by that number."""
         self._packets = 0
         self._order = itertools.count()
         for servo in config.servos:
@@ -109,7 +112,8 @@ class SimulatedBus:
     # The line
 
     def receive(self, data: bytes | bytearray | memoryview, at_ns: int) -> None:
-        """Receive bytes that the host writes to its adapter at `at_ns`. They are sent after earlier bytes."""
+        """Receive bytes that the host writes to its adapter at `at_ns`. They go on the wire after bytes
+        written earlier."""
         sent = bytes(data)
         self._pass_time(at_ns)
         self.ledger.add(at_ns, self.name, "in", sent)
@@ -127,7 +131,7 @@ class SimulatedBus:
 
     @property
     def baud_rate(self) -> int:
-        """The host's baud rate, bit/s."""
+        """Baud rate of the host's adapter, bit/s."""
         return self._line.baud_rate
 
     @baud_rate.setter
@@ -137,12 +141,13 @@ class SimulatedBus:
         self._nodes_by_id.clear()
 
     def change_rate(self, baud_rate: int) -> None:
-        """Change the host's baud rate, bit/s."""
+        """Change the baud rate of the host's adapter, bit/s, and note it in the ledger."""
         self.note(f"the host's rate is {baud_rate} bit/s")
         self.baud_rate = baud_rate
 
     def next_due_ns(self) -> int | None:
-        """Return the time of the next event without input: bytes to deliver, or a fault; None without any."""
+        """Return the time (ns) of the next event without input: bytes to deliver to the host, or a fault;
+        None without any."""
         passing = self._line.passing
         due_ns = None if self._wedged else self._adapter.next_ns(passing)
         if passing and (due_ns is None or passing[0].due_ns < due_ns):
@@ -152,7 +157,8 @@ class SimulatedBus:
         return due_ns
 
     def next_delivery_ns(self, gather_ns: int) -> int | None:
-        """Return `next_due_ns`, or the end of the last reply that follows it within `gather_ns`."""
+        """Return `next_due_ns`, or the end of the last reply that ends at most `gather_ns` later, to
+        deliver several at once."""
         due_ns = self.next_due_ns()
         passing = self._line.passing
         if due_ns is None or not passing or due_ns != passing[0].due_ns or not self._adapter.immediate:
@@ -163,7 +169,7 @@ class SimulatedBus:
         return passing[bisect_right(passing, last_ns, key=_due) - 1].due_ns
 
     def take(self, now_ns: int, *, handed_ns: int | None = None) -> bytes:
-        """Return the bytes that have reached the host by `now_ns`, each once.
+        """Return the bytes that the host receives by `now_ns`, each once, and write them to the ledger.
 
         Args:
             now_ns: Time of the bus.
@@ -186,11 +192,11 @@ class SimulatedBus:
     # Interface for tests and faults
 
     def servo(self, servo_id: int) -> SimulatedServo:
-        """Return the first servo with this ID. Raises LookupError without one."""
+        """Return the first servo on the line with this ID. Raises LookupError without one."""
         return self._first(self.servos, servo_id, "servo")
 
     def add_servo(self, config: ServoConfig) -> SimulatedServo:
-        """Connect another servo to the line."""
+        """Connect another servo to the line and return it."""
         servo = make_servo(
             config, self.baud_rate, self.now_ns, self.note, self.protocol, mechanics=self.mechanics
         )
@@ -200,7 +206,7 @@ class SimulatedBus:
         return servo
 
     def add_device(self, config: DeviceConfig) -> SimulatedDevice:
-        """Connect another device to the line; it has the supply of the first servo."""
+        """Connect another device to the line and return it; it has the supply voltage of the first servo."""
         world = Measured(self.servos[0].voltage if self.servos else SUPPLY_VOLTS)
         device = make_device(
             config, self.protocol, world, baud_rate=self.baud_rate, note=self.note, now_ns=self.now_ns
@@ -212,7 +218,7 @@ class SimulatedBus:
         return device
 
     def device(self, servo_id: int) -> SimulatedDevice:
-        """Return the first device with this ID. Raises LookupError without one."""
+        """Return the first device on the line with this ID. Raises LookupError without one."""
         return self._first(self.devices, servo_id, "device")
 
     def _first(self, nodes: Sequence[Node], servo_id: int, called: str) -> Node:
@@ -222,38 +228,40 @@ class SimulatedBus:
         raise LookupError(f"bus {self.name} has no {called} with ID {servo_id}")
 
     def advance(self, now_ns: int) -> None:
-        """Advance every servo and device to a time, so that a test can inspect them."""
+        """Advance the line and every servo and device to a time, ns, so that a test can inspect them."""
         self._pass_time(now_ns)
         for node in self.nodes:
             node.advance(now_ns)
 
     def excuse(self, duration_ns: int) -> None:
-        """Exclude a stall of this process, ns, from the time of the servos' Bus Watchdogs."""
+        """Do not count a stall of this process, of `duration_ns`, toward the timeout of the servos' Bus
+        Watchdogs."""
         for servo in self.servos:
             servo.excuse(duration_ns)
 
     def at(self, t_ns: int, action: Action) -> None:
-        """Plan a fault: call `action` when the bus reaches `t_ns`."""
+        """Call `action`, such as a fault, when the time of the bus reaches `t_ns`."""
         heapq.heappush(self._planned, (t_ns, next(self._order), action))
 
     def after(self, packets: int, action: Action) -> None:
-        """Plan a fault: call `action` after that many more instruction packets; 0: now."""
+        """Call `action`, such as a fault, after that many more instruction packets; 0: now."""
         heapq.heappush(self._planned_after, (self._packets + packets, next(self._order), action))
         self._act_after_packets()
 
     def note(self, text: str) -> None:
-        """Add a note to the ledger, at the time of the bus."""
+        """Add a note to the ledger, at the present time of the bus."""
         self.ledger.add(self.now_ns, self.name, "note", note=text)
 
     def alter_next(
         self, servo_id: int, text: str, alter: Alteration, *, delay_ns: int = 0, copies: int = 1
     ) -> None:
-        """Alter, delay or repeat a servo's next reply; `text` describes it in the ledger."""
+        """Alter, delay or repeat a servo's next reply; `text` describes the fault in the ledger."""
         self._withdraw_waiting()
         self._reply_faults.setdefault(servo_id, deque()).append(PacketFault(text, alter, delay_ns, copies))
 
     def alter_next_instruction(self, text: str, alter: Alteration) -> None:
-        """Alter the next whole instruction as received by the servos; b"" loses it."""
+        """Alter the next whole instruction as received by the servos; an `alter` that returns b"" loses
+        it."""
         self._instruction_faults.append(PacketFault(text, alter))
 
     def inject_noise(self, data: bytes, at_ns: int) -> None:
@@ -263,7 +271,7 @@ class SimulatedBus:
         self._line.send(Transmission(at_ns, at_ns + self._line.duration_ns(len(data)), data, "noise"))
 
     def unplug(self) -> None:
-        """Unplug the adapter: its buffer is lost, and the host's port disappears."""
+        """Unplug the adapter: bytes in its buffer are lost, and the host's port disappears."""
         if self.plugged:
             self.note("adapter unplugged")
             self.plugged = False
@@ -272,7 +280,7 @@ class SimulatedBus:
             self._receiver.forget()
 
     def plug_in(self) -> None:
-        """Plug the adapter in again: a host must open its port again."""
+        """Plug the adapter in again; the host must then open its port again."""
         if not self.plugged:
             self.note("adapter plugged in")
             self.plugged = True
@@ -288,7 +296,8 @@ class SimulatedBus:
         self._adapter.set_timer(timer_ns, self.now_ns)
 
     def wedge(self, on: bool = True) -> None:
-        """Make the adapter accept bytes without passing them on, in both directions; False ends it."""
+        """Make the adapter discard all bytes in both directions, although the host can write; False ends
+        this."""
         self.note("adapter wedged" if on else "adapter works again")
         self._wedged = on
         self._adapter.forget()
@@ -296,7 +305,8 @@ class SimulatedBus:
     # Inside: time
 
     def _pass_time(self, now_ns: int) -> None:
-        """Process all events up to `now_ns`, in the order of their times."""
+        """Process all events up to `now_ns`: ends of transmissions and planned actions, in the order of
+        their times."""
         passing, planned = self._line.passing, self._planned
         while True:
             due_ns = passing[0].due_ns if passing else now_ns + 1
@@ -310,7 +320,8 @@ class SimulatedBus:
         self.now_ns = max(self.now_ns, now_ns)
 
     def _arrive(self, each: Transmission) -> None:
-        """Pass a finished transmission to the adapter, and continue a group read that waited for it."""
+        """Pass a transmission that has ended on the wire to the adapter, and send the next reply of a
+        group read that waited for its end."""
         self.now_ns = max(self.now_ns, each.due_ns)
         if not self.plugged or self._wedged:
             self.note(f"{len(each.data)} bytes to the host are lost: {each.data.hex(' ')}")
@@ -331,14 +342,15 @@ class SimulatedBus:
             self._group = None
 
     def _withdraw_waiting(self) -> None:
-        """Remove the replies of a group read that have not begun: an event may precede them."""
+        """Remove the replies of a group read that have not begun, because another event may come before
+        them."""
         if self._group is not None:
             self._line.withdraw(self._group)
 
     # Inside: instructions
 
     def _transmit(self, sent: bytes | bytearray, start_ns: int) -> None:
-        """Send the host's bytes to the servos, which execute each complete instruction."""
+        """Send the host's bytes, from `start_ns`, to the servos, which execute each complete instruction."""
         position = 0
         while position < len(sent):
             self._withdraw_waiting()
@@ -388,7 +400,8 @@ class SimulatedBus:
         self._count_packet()
 
     def _nodes_of(self, servo_id: int) -> tuple[SimulatedNode, ...]:
-        """Return the nodes that receive an ID at the host's rate; cached until an ID or a rate changes."""
+        """Return the servos and devices that receive an ID at the host's baud rate; cached until an ID or
+        a rate changes."""
         found = self._nodes_by_id.get(servo_id)
         if found is None:
             rate, tolerance = self.baud_rate, RATE_TOLERANCE * self.baud_rate
@@ -398,7 +411,7 @@ class SimulatedBus:
         return found
 
     def _turns(self, read: GroupRead, slots: bool, end_ns: int) -> Sequence[Turn]:
-        """Return the replies of each servo to a group read, with their state at a time."""
+        """Return the turns of a group read with each servo's replies, which show the states at `end_ns`."""
         self.mechanics.advance(end_ns)
         turns: list[Turn] = []
         shared = protocol2.FastStatusPacket(read.lengths) if read.fast else None
@@ -418,11 +431,10 @@ class SimulatedBus:
         return turns
 
     def _send_turns(self, group: GroupReply, free_ns: int) -> None:
-        """Send the next replies of a group read, starting when the line is free.
+        """Send the next replies of a group read, starting when the line is free at `free_ns`.
 
-        If nothing else is on the line, a reply is sent before the previous one has ended. Any event between
-        them removes it again.
-        """
+        If nothing else is on the line, a reply is sent before the previous one has ended. Any event
+        between them removes it again."""
         alone, sent_any = not self._line.passing, False
         while group.sent < len(group.turns):
             turn = group.turns[group.sent]
@@ -449,7 +461,7 @@ class SimulatedBus:
             self._group = None
 
     def _send_reply(self, servo_id: int, reply: Transmission) -> bool:
-        """Send a servo's reply with its faults; return True if anything was sent."""
+        """Send a servo's reply with the faults planned for it; return True if anything was sent."""
         faults = self._reply_faults.get(servo_id)
         if not faults:
             self._line.send(reply)

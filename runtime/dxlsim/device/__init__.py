@@ -1,4 +1,3 @@
-"""Simulated devices: units on a simulated line that are not servos.
+"""Simulated devices: units on a simulated line that are not servos, such as IMUs.
 
-They use the memory of servos (`registers`).
-"""
+They use the memory of servos (`registers`)."""

@@ -1,4 +1,4 @@
-"""Measurements of a simulated device: each item shows a quantity, chosen by the name of its state."""
+"""Measurements of a simulated device: chooses the quantity that each item shows by the name of its state."""
 
 from __future__ import annotations
 
@@ -30,18 +30,19 @@ _TURNS = ("roll", "pitch", "yaw")
 
 
 class Measured(msgspec.Struct):
-    """Physical quantities at one device, in SI units."""
+    """Physical quantities that one simulated device can measure, SI units."""
 
     volts: float
     angular_velocity: Vector = (0.0, 0.0, 0.0)  # rad/s, in the device's own axes
     linear_acceleration: Vector = (0.0, 0.0, STANDARD_GRAVITY)
-    """m/s^2, in the device's own axes. Gravity counts as upward, as in every accelerometer at rest."""
+    """Acceleration in the device's own axes, m/s^2. Gravity counts as upward, as in every accelerometer at
+    rest."""
     orientation: Quaternion = NO_TURN  # Quaternion x, y, z, w of the device in the world
     celsius: float = ROOM_CELSIUS
     update: Callable[[], None] = lambda: None  # Updates the motion to the time of the device
 
     def tip(self, axis: str, angle: Callable[[], tuple[float, float]]) -> None:
-        """Rotate the device about an axis of its own, in addition to its other motion.
+        """Rotate the device from now on about an axis of its own, in addition to its other motion.
 
         Args:
             axis: x, y or z.
@@ -71,11 +72,10 @@ class Measured(msgspec.Struct):
 def shown(
     items: Mapping[str, ControlItem], config: Shown, world: Measured, random: Random
 ) -> dict[str, Callable[[], int]]:
-    """Return a function for each measuring item that returns its current integer on the wire.
+    """Return, by item name, functions that return the integer on the wire which a measuring item shows now.
 
     The configured value or state of an item comes first, then the name of its own state. A writable item
-    without a configured state keeps its written value. An unknown quantity is 0.
-    """
+    without a configured state keeps its written value. An unknown quantity is 0."""
     live: dict[str, Callable[[], int]] = {}
     for name, item in items.items():
         value = _value(config.states.get(name, item.state), world)
@@ -96,7 +96,8 @@ def _constant(value: float) -> Callable[[], float]:
 
 
 def _value(state: str, world: Measured) -> Callable[[], float] | None:
-    """Return a function for the quantity of a state name, or None if the simulation does not model it."""
+    """Return a function that returns the quantity of a state name, or None if the simulation does not
+    model it."""
     what, _, axis = state.partition(".")
     index = _AXES.find(axis) if axis else -1
     if 0 <= index < _VECTORS.get(what, 0):

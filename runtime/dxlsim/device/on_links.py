@@ -1,4 +1,5 @@
-"""Simulated devices on links of the robot's URDF: an IMU measures the motion of its link."""
+"""Devices on links: lets a simulated device, such as an IMU, measure the motion of a link of the robot's
+URDF."""
 
 from __future__ import annotations
 
@@ -16,7 +17,7 @@ from dxlsim.simulation_plan import UrdfBodies
 
 
 def fix_to_links(devices: Iterable[SimulatedDevice], mechanics: Mechanics, sensed: UrdfBodies) -> None:
-    """Connect each device with a link to that link's motion, at the time of each reading.
+    """Connect each device that names a link to the motion of that link; every reading measures it.
 
     Raises:
         KeyError: The URDF does not have the link.
@@ -32,7 +33,7 @@ def fix_to_links(devices: Iterable[SimulatedDevice], mechanics: Mechanics, sense
 def _feeling(
     device: SimulatedDevice, body: SimulatedBody, shafts: Callable[[int], Shafts]
 ) -> Callable[[], None]:
-    """Return a function that updates a device's measurements once for all items of a reading."""
+    """Return a function that updates a device's measurements to its time, once for all items of a reading."""
     at_ns = -1
 
     def update() -> None:
@@ -46,7 +47,7 @@ def _feeling(
 
 
 def feel(world: Measured, motion: LinkMotion) -> None:
-    """Set a device's measurements to the motion of its link, with gravity upward for a link at rest."""
+    """Set a device's measurements to the motion of its link; a link at rest measures gravity upward."""
     x, y, z, w = motion.orientation.tolist()
     pull = np.array(rotated((-x, -y, -z, w), (0.0, 0.0, STANDARD_GRAVITY)))
     ax, ay, az = (motion.linear_acceleration + pull).tolist()

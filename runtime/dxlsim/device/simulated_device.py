@@ -1,9 +1,8 @@
-"""Simulated device: registers that show measurements and keep written values; no torque, no motion.
+"""Simulated device: a unit whose registers show measurements and keep written values; no torque, no motion.
 
-It supports ping, read and write, and the other instructions of its control table. It does not answer unknown
-instructions, like boards with ROBOTIS' Dynamixel2Arduino (utility/slave.cpp, processInst). Its EEPROM is
-never locked.
-"""
+It supports ping, read and write, and the other instructions of its control table. It does not answer
+unknown instructions, like boards with ROBOTIS' Dynamixel2Arduino (utility/slave.cpp, processInst). Its
+EEPROM is never locked."""
 
 from __future__ import annotations
 
@@ -25,13 +24,14 @@ from dxlwire.control_table.device_table import WAITS, DeviceTable, read_device_t
 from dxlwire.control_table.devices import device_table
 
 CHAIN_WAIT_NS = 50_000_000
-"""Time for which a board with `waits_in_chain` waits for the status before its own (ROBOTIS' OpenCR firmware,
-built natively); each other status restarts it."""
+"""Time (ns) for which a board with `waits_in_chain` waits for the status before its own (ROBOTIS' OpenCR
+firmware, built natively); each other status restarts it."""
 BOOT_NS = 100_000_000  # Time without reception after a reboot [i]
 
 
 class SimulatedDevice(SimulatedNode):
-    """One device. The bus calls `execute` and `reply_to_group_read`; faults and tests call the rest."""
+    """One simulated device. The bus calls `execute` and `reply_to_group_read`; faults and tests call the
+    rest."""
 
     kind = "device"
 
@@ -78,11 +78,12 @@ class SimulatedDevice(SimulatedNode):
         return super().baud_rate if "baud_rate" in self.registers else self._line_rate
 
     def advance(self, now_ns: int) -> None:
-        """Advance the measurements to a time; an earlier time is ignored."""
+        """Set the device's time for its measurements; an earlier time is ignored."""
         self.now_ns = max(self.now_ns, now_ns)
 
     def receives(self, now_ns: int) -> bool:
-        """Return True if the device receives an instruction at a time."""
+        """Return True if the device receives an instruction that ends at `now_ns`: it is not silent,
+        booting, waiting or disconnected."""
         if self._silent or now_ns < self._deaf_until_ns:
             return False
         if self._awaited_id is not None and now_ns < self._waits_until_ns:
@@ -93,21 +94,22 @@ class SimulatedDevice(SimulatedNode):
         return all(contact() for contact in self._contacts)
 
     def chain(self, read: GroupRead, now_ns: int) -> None:
-        """Wait for the status before its own in a group read, if the board has this behaviour."""
+        """Start to wait for the status before the device's own in a group read, if its board has this
+        behaviour."""
         listed = [entry.servo_id for entry in read.entries]
         place = listed.index(self.servo_id) if self.can(WAITS) and self.servo_id in listed else 0
         if place and self.receives(now_ns):
             self._awaited_id, self._waits_until_ns = listed[place - 1], now_ns + CHAIN_WAIT_NS
 
     def overhear(self, servo_id: int, now_ns: int) -> None:
-        """Process a status packet of another unit on the line."""
+        """Note a status packet of another unit on the line, for which the device may wait."""
         if self._awaited_id == servo_id:
             self._awaited_id = None
         elif self._awaited_id is not None and now_ns < self._waits_until_ns:
             self._waits_until_ns = now_ns + CHAIN_WAIT_NS
 
     def can(self, capability: str) -> bool:
-        """Return True if the device has a capability, in the words of control tables."""
+        """Return True if the device's control table lists a capability."""
         return capability in self.table.capabilities
 
     # Instructions
@@ -122,7 +124,8 @@ class SimulatedDevice(SimulatedNode):
         return instruction in known or (instruction in needs and self.can(needs[Instruction(instruction)]))
 
     def _replies_to(self, packet: InstructionPacket, own: bool) -> bool:
-        """Return True if a status packet follows. Of the broadcasts only a ping is answered, if supported."""
+        """Return True if the device answers an instruction. Of the broadcasts only a ping is answered, if
+        supported."""
         known = self._knows(packet.instruction) and (own or self.can("broadcast_ping"))
         return known and super()._replies_to(packet, own)
 
@@ -138,7 +141,7 @@ class SimulatedDevice(SimulatedNode):
         return 0
 
     def _written(self, names: frozenset[str]) -> None:
-        """Do nothing: writes only change bytes."""
+        """Do nothing: writes to a device only change its registers."""
 
     def _takes_part(self, read: GroupRead) -> bool:
         bulk = read.instruction in (Instruction.BULK_READ, Instruction.FAST_BULK_READ)
@@ -164,7 +167,7 @@ class SimulatedDevice(SimulatedNode):
         return live
 
     def _set(self, name: str, wire: int) -> None:
-        """Set an item without a write instruction; it no longer shows a measurement."""
+        """Set an item to an integer without a write instruction; the item no longer shows a measurement."""
         address, size, bit = self._bits[name]
         place = self._place_names[address, size]
         if bit is not None:
@@ -175,10 +178,10 @@ class SimulatedDevice(SimulatedNode):
     # Interface for faults
 
     def protect(self, refused: int = 0) -> None:
-        """Do nothing: a device has no torque to switch off."""
+        """Do nothing: a device has no torque that a shutdown could cut."""
 
     def reset(self) -> None:
-        """Power-cycle the device: RAM is lost."""
+        """Power-cycle the device: its RAM registers return to their initial values."""
         self.note(f"{self.called}: power cycle")
         self.registers.restore_ram()
 
@@ -201,20 +204,19 @@ class SimulatedDevice(SimulatedNode):
         self.note(f"{self.called}: tips by {math.degrees(by):g} deg about {axis}")
 
     def set_voltage(self, volts: float) -> None:
-        """Change the supply voltage, V."""
+        """Change the device's supply voltage, V."""
         self.world.volts = volts
         self.note(f"{self.called}: voltage {volts} V")
 
     @property
     def voltage(self) -> float:
-        """Supply voltage, V."""
+        """Supply voltage of the device, V."""
         return self.world.volts
 
 
 def _registers(table: DeviceTable) -> ControlTable:
-    """Return a device's items as a control table. Bits of one place become one item with the first bit's
-    name.
-    """
+    """Return a device's items as the control table that `Memory` needs. Bits of one place become one item
+    with the first bit's name."""
     items: dict[str, ControlItem] = {}
     places: set[tuple[int, int]] = set()
     for name, item in table.items.items():
@@ -255,7 +257,7 @@ def make_device(
     note: Callable[[str], None],
     now_ns: int,
 ) -> SimulatedDevice:
-    """Return a device that was just switched on at a baud rate, bit/s.
+    """Return a simulated device of a model that was just switched on at a baud rate, bit/s.
 
     Raises:
         LookupError: The model has no table of the protocol.

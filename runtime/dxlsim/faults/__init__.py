@@ -1,4 +1,3 @@
-"""Faults: disturbances of a simulated bus, by script or at random.
+"""Faults: disturbances of a simulated bus, injected by script or at random.
 
-A fault changes bytes, times or registers. The reaction of the runtime is out of scope.
-"""
+A fault changes bytes, times or registers. The reaction of the runtime is out of scope."""

@@ -1,4 +1,5 @@
-"""Fault as one line of text, `lose servo=3 at=2s`: parsing, validation and formatting."""
+"""Fault: one disturbance as one line of text, such as `lose servo=3 at=2s`: parsing, validation and
+formatting."""
 
 from __future__ import annotations
 
@@ -12,7 +13,7 @@ from dxlwire.errors import InputError, suggestion
 
 
 class Fault(msgspec.Struct, frozen=True):
-    """One fault of simulated buses; `str()` returns the line that `parse_fault` parses."""
+    """One fault to inject into simulated buses; `str()` returns the line that `parse_fault` parses."""
 
     kind: str  # Key of KINDS
     given: Mapping[str, Value]
@@ -20,19 +21,20 @@ class Fault(msgspec.Struct, frozen=True):
     simulation, or after `packet` more instruction packets on the bus. Without both it happens at once."""
 
     def number(self, key: str) -> int | None:
-        """Return an integer value, such as an ID or a time; None if the key is missing."""
+        """Return the integer given for a key, such as an ID or a time in ns; None if the key is missing."""
         value = self.given.get(key)
         return value if isinstance(value, int) else None
 
     @property
     def bus(self) -> str | None:
-        """Name of the bus; None: the only bus."""
+        """Name of the simulated bus; None: the only bus."""
         value = self.given.get("bus")
         return value if isinstance(value, str) else None
 
     @property
     def servo(self) -> int | None:
-        """ID of the servo; for a fault of a packet, the servo that sends the reply."""
+        """ID of the affected servo; for a fault of a packet, the servo that sends the reply. None: not
+        given."""
         return self.number("servo")
 
     @property
@@ -82,14 +84,15 @@ def parse_fault(text: str) -> Fault:
 
 
 def usage(name: str) -> str:
-    """Return the syntax of a kind: `lose [servo=ID] [from=host] ...`. Raises KeyError for an unknown kind."""
+    """Return the syntax of a kind of fault: `lose [servo=ID] [from=host] ...`. Raises KeyError for an
+    unknown kind."""
     kind = KINDS[name]
     keys = [(key, f"{key}={reader.example}") for key, reader in kind.readers.items()]
     return " ".join((name, *(text if key in kind.needs else f"[{text}]" for key, text in keys)))
 
 
 def fault_help() -> tuple[str, ...]:
-    """Return the syntax and the effect of each kind, one line per kind."""
+    """Return the syntax and the effect of each kind of fault, one line per kind."""
     return tuple(f"{usage(name)}: {kind.does}" for name, kind in KINDS.items())
 
 

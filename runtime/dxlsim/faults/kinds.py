@@ -1,9 +1,9 @@
-"""Kinds of faults: the keys of each kind's line, its random values in a storm, and its effect on a bus.
+"""Kinds of faults: for each kind the keys of its line, its effect on a simulated bus, and its random values
+in a storm.
 
 Simplifications: noise and a babbling servo reach the host and corrupt simultaneous replies of servos, but
-servos never parse their bytes as instructions. A supply voltage changes instantly. A servo without power is
-limp at once. A second servo with an ID has the angle of the first one and carries no load [i].
-"""
+servos never parse their bytes as instructions. A supply voltage changes instantly. A servo without power
+is limp at once. A second servo with an ID has the angle of the first one and carries no load [i]."""
 
 from __future__ import annotations
 
@@ -27,7 +27,8 @@ from dxlsim.simulation_plan import ServoConfig
 NOISE_BYTES = 8
 TIMER_NS = 16_000_000  # Factory setting of an FTDI adapter's latency timer (AN232B-04)
 HOT_CELSIUS = 90.0
-"""Above the factory setting of Temperature Limit (31) in every model: 85 degrees C at most."""
+"""Temperature of the fault `overheat` by default, degrees C: above the factory setting of Temperature
+Limit (31) in every model, which is 85 at most."""
 BOOT_NS = 100_000_000  # Time without reception after a restart; the manuals give no value [i]
 BROWNOUT_NS = 200_000_000
 BABBLE_NS = 200_000_000
@@ -39,19 +40,21 @@ _SUPPLY_NS = 10_000_000  # Update interval of a supply with a resistance
 _MS, _S = 1_000_000, 1_000_000_000
 
 LINE, PACKET, NODE, SERVO, DEVICE = "line", "packet", "node", "servo", "device"
-"""Targets of a fault: the line or its adapter; a packet of a servo or of the host; any unit on the line; a
-servo (with a shaft, or of a model); another device."""
+"""Targets of a kind of fault: the line or its adapter; a packet of a servo or of the host; any unit on the
+line; a servo (with a shaft, or of a model); another device."""
 
 
 class Hold(msgspec.Struct):
-    """State that persists as long as any fault of its kind lasts, on one servo or one adapter."""
+    """Lasting effect of a kind of fault on one servo or adapter, which ends with the last overlapping
+    fault of that kind."""
 
     restore: Callable[[], None]  # Restores the state from before the first fault
     faults: int = 0
 
 
 Holds = dict[tuple[str, int], Hold]
-"""Hold by kind and target; shared by all faults of a script, because they may overlap."""
+"""The lasting effects by kind and `id()` of the target; shared by all faults of a script, because they may
+overlap."""
 
 
 _Act = TypeVar("_Act", bound=Callable[..., None])
@@ -60,7 +63,8 @@ Draw = Callable[[Random], Mapping[str, Value]]  # Draws random values of a kind 
 
 
 class Kind(NamedTuple):
-    """One kind of fault: its effect in words, its target, and its keys, required ones first."""
+    """One kind of fault: its effect in words, its target, the function that does it, and its keys,
+    required ones first."""
 
     does: str
     of: str
@@ -76,7 +80,8 @@ WHEN = ("bus", "at", "packet")  # Keys of every kind for place and time; a storm
 
 
 def _kind(of: str, draw: Draw = lambda random: {}) -> Callable[[_Act], _Act]:
-    """Register a function as the kind of its name; its parameters are the keys of the kind's line."""
+    """Return a decorator that registers a function as the kind of fault of its name; its parameters are
+    the keys of the kind's line."""
 
     def take_up(act: _Act) -> _Act:
         name, does = act.__name__.removeprefix("_"), inspect.cleandoc(act.__doc__ or "")
@@ -112,10 +117,10 @@ def _stretch(random: Random) -> dict[str, Value]:
 
 
 class Happening:
-    """One planned fault of one bus; it adds a note to the ledger when it happens."""
+    """One planned fault on one bus; it adds a note to the ledger when it happens."""
 
     def __init__(self, kind: str, text: str, bus: SimulatedBus, random: Random, holds: Holds) -> None:
-        """Prepare a fault.
+        """Prepare a fault; calling the function of its kind with this object makes it happen.
 
         Args:
             kind: Key of KINDS.
@@ -134,10 +139,10 @@ class Happening:
             self.bus.note(f"{FAULT}{self._text}")
 
     def _named(self, nodes: Sequence[Node], servo: int | None) -> list[Node]:
-        """Return the unit with an ID, or all units of the bus, and note that the fault happens.
+        """Return the unit with this ID, or all units if `servo` is None, advanced to now; note in the ledger
+        that the fault happens.
 
-        The result is empty if the host has changed the ID since planning. The fault then does not happen.
-        """
+        The result is empty if the host has changed the ID since planning. The fault then does not happen."""
         named = [node for node in nodes if servo in (None, node.servo_id)]
         if servo is not None:
             named = named[:1]  # If two units share the ID, the fault concerns the first
@@ -158,7 +163,8 @@ class Happening:
             self.bus.at(self.bus.now_ns + for_ns, action)
 
     def _hold(self, target: object, restore: Callable[[], None], for_ns: int | None) -> None:
-        """Call `restore` after a time, or after the end of the last overlapping fault of the same kind."""
+        """Call `restore` after `for_ns`, or after the end of the last overlapping fault of the same kind;
+        None: never."""
         hold = self._holds.setdefault((self._kind, id(target)), Hold(restore))
         hold.faults += 1
 
@@ -180,7 +186,7 @@ class Happening:
         delay_ns: int = 0,
         copies: int = 1,
     ) -> None:
-        """Alter the next packets of a servo; None: those of the host."""
+        """Alter the next `count` packets of a servo by `change`; None: those of the host."""
 
         def altered(packet: bytes) -> bytes:
             self._enter()
@@ -427,12 +433,12 @@ class Happening:
 
 
 PASSING = ("lose", "corrupt", "truncate", "delay", "duplicate", "noise", "silence", "babble")
-"""Kinds without lasting effects: the default of a storm."""
+"""Kinds of faults that end without a lasting effect: the default of a storm."""
 _HOST_SHARE = 0.25  # Fraction of lost or corrupted packets in a storm that are the host's
 
 
 Strike = Callable[[SimulatedBus, str, dict[str, Value]], None]
-"""Receives the choices of a storm: bus, kind, and values by key."""
+"""Plans one fault that a storm has drawn, from its bus, its kind, and its values by key."""
 
 
 @_kind(LINE)

@@ -1,4 +1,4 @@
-"""Fault script: plans faults from lines of text and enters them in the ledger when they happen."""
+"""Fault script: plans faults on simulated buses and enters them in the ledger when they happen."""
 
 from __future__ import annotations
 
@@ -15,11 +15,11 @@ from dxlwire.errors import InputError
 
 
 class FaultScript:
-    """Faults of buses, at their times; open values are drawn from `seed`.
+    """Faults to inject into simulated buses at their times; values that a fault leaves open are drawn from
+    `seed`.
 
-    A fault that happens adds exactly one note to the ledger, `fault: ` and its text: a fault of a packet when
-    that packet passes, any other fault at its time. Each fault of a storm has a note of its own.
-    """
+    A fault that happens adds exactly one note to the ledger, `fault: ` and its text: a fault of a packet
+    when that packet passes, any other fault at its time. Each fault of a storm has a note of its own."""
 
     def __init__(self, faults: Sequence[Fault], seed: int = 0) -> None:
         self._faults = tuple(faults)
@@ -31,7 +31,7 @@ class FaultScript:
         self._holds: Holds = {}
 
     def attach(self, buses: Sequence[SimulatedBus], *, start_ns: int = 0, now_ns: int | None = None) -> None:
-        """Plan every fault on its bus.
+        """Plan every fault of the script on its bus.
 
         Args:
             buses: The buses.
@@ -46,7 +46,7 @@ class FaultScript:
         self._plan(self._faults, start_ns if now_ns is None else now_ns)
 
     def add(self, fault: Fault, now_ns: int) -> None:
-        """Plan one more fault on the attached buses.
+        """Plan one more fault on the attached buses, during the simulation.
 
         Args:
             fault: The fault.
@@ -79,15 +79,16 @@ class FaultScript:
 
     @property
     def waiting(self) -> tuple[Fault, ...]:
-        """Faults that have not happened, possibly never: a servo that is not read loses no reply."""
+        """Faults that have not happened yet, and possibly never will: a servo that is not read loses no
+        reply."""
         return tuple(fault for fault, happening in self._planned if not happening.happened)
 
     def _placed(self, fault: Fault, index: int, since_ns: int) -> list[tuple[Fault, Happening]]:
-        """Return a fault with its bus, or all faults of a storm in the order of their times.
+        """Return a fault with the object that does it on its bus, or all faults of a storm in the order of
+        their times.
 
-        Each fault of a storm names its bus (if there are several), its servo and its time, so that its text
-        alone reproduces it. Without `at=` a storm starts at `since_ns`.
-        """
+        Each fault of a storm names its bus (if there are several), its servo and its time, so that its
+        text alone reproduces it. Without `at=` a storm starts at `since_ns`."""
         buses = _chosen(fault, self._buses)
         if fault.at_ns is not None and fault.at_ns < since_ns:
             raise InputError(f"it is {since_ns / 1e9:.3f} s after the start already; omit at= for now")
@@ -114,7 +115,7 @@ class FaultScript:
 
 
 def _action(fault: Fault, first: object, **others: object) -> Callable[[], None]:
-    """Return a call of a kind's function with the values of a fault's line."""
+    """Return a function that does a fault: it calls the function of the kind with the values of the line."""
     named = {f"{key}_" if iskeyword(key) else key: value for key, value in fault.given.items()}
     return partial(
         KINDS[fault.kind].act, first, **{key: named[key] for key in named if key not in WHEN}, **others
@@ -122,7 +123,7 @@ def _action(fault: Fault, first: object, **others: object) -> Callable[[], None]
 
 
 def _chosen(fault: Fault, buses: Sequence[SimulatedBus]) -> Sequence[SimulatedBus]:
-    """Return the bus of a fault, or all buses for a storm that names none.
+    """Return the bus on which a fault happens, or all buses for a storm that names none.
 
     Raises:
         InputError: The bus or the servo does not exist, the fault cannot happen to that device, or it names

@@ -1,4 +1,4 @@
-"""Values of a fault's line: parsing and formatting of `3`, `500ms`, `-30deg`, `ff00fd`."""
+"""Values: parsing and formatting of a fault's values, such as `3`, `500ms`, `-30deg`, `ff00fd`."""
 
 from __future__ import annotations
 
@@ -17,7 +17,8 @@ _MOST_DEGREES = 36_000.0
 
 
 class Reader(NamedTuple):
-    """Parser and formatter of a value; `example` represents the value in the help."""
+    """Parser and formatter of one key's value in a fault's line; `example` represents the value in the
+    help."""
 
     example: str
     read: Callable[[str], Value]  # Raises ValueError with the expected form
@@ -25,9 +26,8 @@ class Reader(NamedTuple):
 
 
 def _read(read: Callable[[str], Value], may_be: Callable[..., bool], asked: str) -> Callable[[str], Value]:
-    """Return a parser that accepts the values of `read` for which `may_be` holds. It raises ValueError with
-    `asked`.
-    """
+    """Return a parser that accepts the values of `read` for which `may_be` holds; otherwise it raises
+    ValueError with `asked`, the expected form."""
 
     def checked(text: str) -> Value:
         with suppress(ValueError):
@@ -119,4 +119,4 @@ READERS: Mapping[str, Reader] = {
     "packet": Reader("NUMBER", _whole(1, 10**9)),
     "for": _time_of,
 }
-"""Readers by key, in the order of the keys in a formatted fault."""
+"""Parser and formatter of each key, in the order of the keys in a formatted fault."""

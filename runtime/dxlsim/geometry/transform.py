@@ -1,8 +1,7 @@
-"""Transforms: pose of one frame in another one, as a translation and a unit quaternion.
+"""Transforms: pose of one frame (coordinate system) in another one, as a translation and a unit quaternion.
 
 Plain Python, so that the client of a running robot needs no library; a robot has some twenty frames.
-Quaternions are (x, y, z, w), as in ROS 2 messages; rotations are active and right-handed.
-"""
+Quaternions are (x, y, z, w), as in ROS 2 messages; rotations are active and right-handed."""
 
 from __future__ import annotations
 
@@ -18,18 +17,18 @@ NO_TURN: Quaternion = (0.0, 0.0, 0.0, 1.0)
 
 
 class Transform(msgspec.Struct, frozen=True):
-    """Pose of a frame in another one: p_there = rotation * p_here + translation."""
+    """Pose of an inner frame in an outer one: p_outer = rotation * p_inner + translation."""
 
     translation: Vector = (0.0, 0.0, 0.0)  # m
     rotation: Quaternion = NO_TURN  # Unit quaternion
 
     def __matmul__(self, inner: Transform) -> Transform:
-        """Return the pose of an inner frame in the outer frame."""
+        """Return the pose of a frame, given in this frame as `inner`, in the outer frame."""
         moved = self.apply(inner.translation)
         return Transform(moved, product(self.rotation, inner.rotation))
 
     def apply(self, point: Vector) -> Vector:
-        """Transform a point of this frame, m, into the outer frame."""
+        """Convert a point from this frame to the outer frame, m."""
         x, y, z = rotated(self.rotation, point)
         a, b, c = self.translation
         return x + a, y + b, z + c
@@ -43,7 +42,7 @@ class Transform(msgspec.Struct, frozen=True):
 
     @property
     def matrix(self) -> Matrix:
-        """Homogeneous matrix, 4 x 4, in row order."""
+        """Pose as a homogeneous matrix, 4 x 4, in row order."""
         columns = [
             rotated(self.rotation, axis) for axis in ((1.0, 0.0, 0.0), (0.0, 1.0, 0.0), (0.0, 0.0, 1.0))
         ]
@@ -52,7 +51,8 @@ class Transform(msgspec.Struct, frozen=True):
 
     @property
     def rpy(self) -> Vector:
-        """Roll, pitch and yaw, rad, as in a URDF: about the fixed x, y and z axes, in this order."""
+        """Rotation as roll, pitch and yaw, rad, as in a URDF: about the fixed x, y and z axes, in this
+        order."""
         (a, _, _, _), (b, _, _, _), (c, d, e, _), _ = self.matrix
         level = math.hypot(a, b)
         if level < 1e-12:  # Gimbal lock: roll and yaw rotate about the same axis
@@ -62,7 +62,7 @@ class Transform(msgspec.Struct, frozen=True):
 
 
 def product(left: Quaternion, right: Quaternion) -> Quaternion:
-    """Return the rotation by `right` followed by `left`."""
+    """Return the rotation that rotates by `right` first, and then by `left`."""
     x1, y1, z1, w1 = left
     x2, y2, z2, w2 = right
     return (
@@ -74,13 +74,13 @@ def product(left: Quaternion, right: Quaternion) -> Quaternion:
 
 
 def conjugate(rotation: Quaternion) -> Quaternion:
-    """Return the inverse rotation."""
+    """Return the inverse of a rotation, a unit quaternion."""
     x, y, z, w = rotation
     return -x, -y, -z, w
 
 
 def rotated(rotation: Quaternion, vector: Vector) -> Vector:
-    """Return the rotated vector: v + 2 w (u x v) + 2 u x (u x v), with the quaternion (u, w)."""
+    """Return a vector rotated by a unit quaternion (u, w): v + 2 w (u x v) + 2 u x (u x v)."""
     x, y, z, w = rotation
     a, b, c = vector
     d, e, f = 2 * (y * c - z * b), 2 * (z * a - x * c), 2 * (x * b - y * a)
@@ -102,7 +102,7 @@ def from_rpy(rpy: Vector) -> Quaternion:
 
 
 def unit(rotation: Quaternion) -> Quaternion | None:
-    """Return the normalized quaternion, or None for an invalid one: NaN, infinite or of length 0."""
+    """Return a quaternion scaled to length 1, or None for an invalid one: NaN, infinite or of length 0."""
     length = math.sqrt(sum(value * value for value in rotation))
     if not math.isfinite(length) or length < 1e-9:
         return None
@@ -111,11 +111,11 @@ def unit(rotation: Quaternion) -> Quaternion | None:
 
 
 def near(rotation: Quaternion, last: Quaternion) -> Quaternion:
-    """Return the one of a rotation's two quaternions that is nearer to the last one.
+    """Return `rotation` or its negative, which is the same rotation: the one that is nearer to the quaternion
+    `last`.
 
-    Values between two messages are interpolated; with the other quaternion the interpolation would take the
-    long way.
-    """
+    Values between two messages are interpolated; with the other quaternion the interpolation would take
+    the long way."""
     x, y, z, w = rotation
     together = x * last[0] + y * last[1] + z * last[2] + w * last[3]
     return (-x, -y, -z, -w) if together < 0 else rotation

@@ -1,9 +1,8 @@
-"""URDF of a robot: links, joints, origins, axes, limits and mimic joints; each error has its position.
+"""URDF of a robot: reads links, joints, origins, axes, limits and mimic joints; each error has its position.
 
 Source: the pages "urdf/XML" of ROS (robot, link, joint) for elements, defaults and units: rad, and m for
 prismatic joints. `rpy` rotates about the parent's fixed x, then y, then z axis. Shapes and masses are not
-read here.
-"""
+read here."""
 
 from __future__ import annotations
 
@@ -26,7 +25,8 @@ _NOWHERE: Vector = (0.0, 0.0, 0.0)
 
 
 class UrdfLimits(msgspec.Struct, frozen=True):
-    """Limits of a joint: rad, rad/s and Nm; for a prismatic joint m, m/s and N. None: not given."""
+    """Limits of a joint in the URDF: rad, rad/s and Nm; for a prismatic joint m, m/s and N. None: not
+    given."""
 
     lower: float | None = None
     upper: float | None = None
@@ -35,7 +35,7 @@ class UrdfLimits(msgspec.Struct, frozen=True):
 
 
 class Mimic(msgspec.Struct, frozen=True):
-    """Coupling of a joint to another one: q = multiplier * q_of_that + offset."""
+    """`mimic` of a joint: it follows the joint `joint` with q = multiplier * q_of_that + offset."""
 
     joint: str
     multiplier: float = 1.0
@@ -43,7 +43,7 @@ class Mimic(msgspec.Struct, frozen=True):
 
 
 class UrdfJoint(msgspec.Struct, frozen=True):
-    """Joint, with the pose of its child link in its parent link."""
+    """Joint of a URDF, with the pose of its child link in its parent link."""
 
     name: str
     type: JointType
@@ -58,12 +58,12 @@ class UrdfJoint(msgspec.Struct, frozen=True):
 
     @property
     def moves(self) -> bool:
-        """True unless the joint is fixed."""
+        """True unless the joint's type is `fixed`."""
         return self.type != "fixed"
 
 
 class Urdf(msgspec.Struct, frozen=True):
-    """Tree of a robot's links."""
+    """Links and joints of a URDF, which form one tree."""
 
     name: str
     root: str  # Link without a parent
@@ -72,18 +72,17 @@ class Urdf(msgspec.Struct, frozen=True):
     joints: tuple[UrdfJoint, ...]  # In the order of `links`: the joint above each link except the root
 
     def joint(self, name: str) -> UrdfJoint | None:
-        """Return a joint by its name, or None."""
+        """Return the joint with this name, or None."""
         return next((joint for joint in self.joints if joint.name == name), None)
 
 
 def leader(
     joints: Mapping[str, UrdfJoint], joint: UrdfJoint, known: Container[str]
 ) -> tuple[UrdfJoint, float, float]:
-    """Return the joint that a joint follows, with q = scale * q_of_that + offset.
+    """Return the joint that `joint` follows through its `mimic` chain, with scale and offset: q = scale *
+    q_of_that + offset.
 
-    The search along `mimic` ends at the first joint that is in `known` or mimics no joint, possibly the joint
-    itself.
-    """
+    The search ends at the first joint that is in `known` or mimics no joint, possibly the joint itself."""
     scale, offset = 1.0, 0.0
     while joint.name not in known and joint.mimic is not None:
         offset += scale * joint.mimic.offset
@@ -93,10 +92,10 @@ def leader(
 
 
 def read_urdf(text: str, file: str = "the URDF") -> Urdf:
-    """Return the tree of a URDF.
+    """Parse the text of a URDF and return its links and joints; `file` is its name in error messages.
 
-    DTDs are rejected: entities can refer to files of this machine or expand without limit, and a URDF needs
-    none.
+    DTDs are rejected: entities can refer to files of this machine or expand without limit, and a URDF
+    needs none.
 
     Raises:
         InputError: The URDF is invalid; `problems` has all errors that can be detected at once.
@@ -118,7 +117,7 @@ class _Element(msgspec.Struct):
 
 
 def _parsed(text: str, file: str) -> _Element:
-    """Return the top element, `robot`. Raises InputError."""
+    """Parse the XML and return the top element, `robot`. Raises InputError."""
     top = _Element("", {}, Mark(file))
     inside = [top]
     parser = expat.ParserCreate()
@@ -155,7 +154,7 @@ def _parsed(text: str, file: str) -> _Element:
 
 
 class _Reading:
-    """Reader of a URDF's elements; collects their errors."""
+    """Reads the elements of a URDF and collects all errors in them."""
 
     def __init__(self, robot: _Element) -> None:
         self._robot = robot
@@ -164,7 +163,7 @@ class _Reading:
         self._joints: dict[str, UrdfJoint] = {}
 
     def result(self) -> Urdf:
-        """Return the tree. Raises InputError."""
+        """Return the tree of links. Raises InputError with all errors."""
         for element in self._robot.all("link"):
             self._link(element)
         if not self._links:
@@ -223,7 +222,7 @@ class _Reading:
         return "fixed"
 
     def _end(self, element: _Element, name: str, tag: str) -> str:
-        """Return the parent or child link of a joint."""
+        """Return the name of a joint's parent or child link; report it if it is missing or unknown."""
         found = element.first(tag)
         link = "" if found is None else found.attributes.get("link", "")
         mark = element.mark if found is None else found.mark
@@ -247,7 +246,7 @@ class _Reading:
         return default
 
     def _axis(self, element: _Element, name: str) -> Vector:
-        """Return the normalized axis."""
+        """Return a joint's axis as a unit vector."""
         x, y, z = self._vector(element, name, "axis", "xyz", (1.0, 0.0, 0.0))
         length = math.hypot(x, y, z)
         if not length:
@@ -318,7 +317,7 @@ class _Reading:
                 self._add(following.mark, what, "remove the mimic of one of them")
 
     def _root(self) -> str:
-        """Return the link without a parent; add a problem unless the links form one tree."""
+        """Return the link without a parent; report an error unless the links form one tree."""
         above: dict[str, UrdfJoint] = {}
         for joint in self._joints.values():
             other = above.setdefault(joint.child, joint)
@@ -347,7 +346,7 @@ class _Reading:
 
 
 def _downwards(root: str, joints: Sequence[UrdfJoint]) -> tuple[UrdfJoint, ...]:
-    """Return the joints below a link, each after the joint above it."""
+    """Return all joints below the link `root`, each after the joint above it."""
     below: dict[str, list[UrdfJoint]] = {}
     for joint in joints:
         below.setdefault(joint.parent, []).append(joint)

@@ -1,4 +1,3 @@
-"""Motion: motors, gains, loads and bodies of simulated servos.
+"""Motion: motors, control loops, loads and bodies of simulated servos.
 
-Instructions and registers do not belong here.
-"""
+Instructions and registers do not belong here."""

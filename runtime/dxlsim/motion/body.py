@@ -1,10 +1,9 @@
-"""Body: motion of the links of a URDF, computed from the shafts of simulated servos.
+"""Body: computes the motion of a URDF's links from the shafts of simulated servos, for simulated sensors.
 
-Pose, velocity and acceleration are propagated from link to link along the tree (R. Featherstone, "Rigid Body
-Dynamics Algorithms", 2008, chapter 5: the outward half of the recursive Newton-Euler algorithm). The input is
-only the shafts' motion, so the result is the same with independent joints and with MuJoCo; a test compares it
-with MuJoCo's own sensors. The URDF's first link is fixed at the world's origin, z up.
-"""
+Pose, velocity and acceleration are propagated from link to link along the tree (R. Featherstone, "Rigid
+Body Dynamics Algorithms", 2008, chapter 5: the outward half of the recursive Newton-Euler algorithm). The
+input is only the shafts' motion, so the result is the same with independent joints and with MuJoCo; a test
+compares it with MuJoCo's own sensors. The URDF's first link is fixed at the world's origin, z up."""
 
 from __future__ import annotations
 
@@ -43,7 +42,7 @@ class _Step(msgspec.Struct, frozen=True):
 
 
 class SimulatedBody:
-    """Links of a URDF at the time of the last `move`.
+    """Links of a URDF, moved by simulated shafts; `motion` shows them at the last `move`.
 
     Raises:
         InputError: The URDF is invalid.
@@ -60,13 +59,14 @@ class SimulatedBody:
         self.move(Shafts(0, *(np.zeros(bodies.servos) for _ in range(3))))
 
     def move(self, shafts: Shafts) -> None:
-        """Set the state of the shafts, in the order in which the servos were added."""
+        """Set angles, velocities and accelerations of all shafts, in the order in which the servos were
+        added."""
         self._place = self._matrix @ shafts.angle + self._offset
         self._speed = self._matrix @ shafts.velocity
         self._gain = self._matrix @ shafts.acceleration
 
     def motion(self, link: str) -> LinkMotion:
-        """Return the motion of a link.
+        """Return pose, velocity and acceleration of a link at the last `move`.
 
         Raises:
             KeyError: The URDF does not have the link.
@@ -130,7 +130,8 @@ class SimulatedBody:
 
 
 def _moved(bodies: UrdfBodies) -> tuple[tuple[str, ...], Floats, Floats]:
-    """Return the joints that shafts move, and their coordinates: q = matrix @ shafts + offset."""
+    """Return the joints that shafts move, and matrix and offset for their coordinates: q = matrix @ shafts
+    + offset."""
     names: list[str] = []
     rows: list[Floats] = []
     offsets: list[float] = []
@@ -147,17 +148,18 @@ def _moved(bodies: UrdfBodies) -> tuple[tuple[str, ...], Floats, Floats]:
 
 
 class ShaftSink(Protocol):
-    """Receiver of the newest state of all shafts."""
+    """Receiver of the newest angles, velocities and accelerations of all shafts."""
 
     values: int
-    """Length of the arrays: angle, velocity and acceleration of each shaft."""
+    """Length of the array that `write` receives: angle, velocity and acceleration of each shaft."""
 
     def write(self, t_ns: int, values: Floats) -> None:
-        """Write the angles, rad, then the velocities, rad/s, then the accelerations, rad/s^2; never waits."""
+        """Write an array with the angles, rad, then the velocities, rad/s, then the accelerations,
+        rad/s^2; never waits."""
 
 
 class ShaftsShown:
-    """Publishes the motion of the shafts after each step of the mechanics, for processes of sensors."""
+    """Publishes the motion of all shafts after each step of the mechanics, for sensors in other processes."""
 
     def __init__(self, mechanics: Mechanics, sink: ShaftSink) -> None:
         self._mechanics, self._sink = mechanics, sink
@@ -166,7 +168,7 @@ class ShaftsShown:
         mechanics.sense()
 
     def show(self) -> None:
-        """Write to the sink if the mechanics have advanced since the last call."""
+        """Write the shafts' motion to the sink if the mechanics have advanced since the last call."""
         mechanics, values = self._mechanics, self._values
         if mechanics.grid_ns == self._shown_ns:
             return
@@ -178,16 +180,17 @@ class ShaftsShown:
 
 
 class SensedBody:
-    """Current body of a simulation in this process."""
+    """Source of link motions for sensors in the process of the simulation; each query moves the body to
+    the present time."""
 
     def __init__(self, bodies: UrdfBodies, mechanics: Mechanics, now_ns: Callable[[], int]) -> None:
-        """Load the URDF. Raises InputError for an invalid one."""
+        """Read the URDF of `bodies`. Raises InputError for an invalid one."""
         self._body, self._mechanics, self._now_ns = SimulatedBody(bodies), mechanics, now_ns
         self._count = bodies.servos
         mechanics.sense()
 
     def motion(self, link: str) -> LinkMotion:
-        """Return the current motion of a link.
+        """Return the motion of a link at the present time of the simulation.
 
         Raises:
             KeyError: The URDF does not have the link.

@@ -25,14 +25,13 @@ _UNWOUND = 1e-6  # duty/s; an integral that changes the duty more slowly counts 
 
 
 class ServoCommand(NamedTuple):
-    """Parameters of one servo's controller until the next command; every default switches its term off.
+    """Parameters of one servo's controller, computed from its registers; every default switches its term off.
 
-    `duty` is a fraction of the supply voltage at the motor, -1 to 1. Angles are those of the shaft.
-    """
+    `duty` is a fraction of the supply voltage at the motor, -1 to 1. Angles are those of the shaft."""
 
     goal: float = 0.0  # rad; end of the trajectory
     speed: float = FREE
-    """rad/s, speed limit of the trajectory; with `turning` its signed speed"""
+    """Speed limit of the trajectory, rad/s; with `turning` the signed speed."""
     acceleration: float = FREE  # rad/s^2 of the trajectory
     turning: float = 0.0  # 1: the trajectory continues indefinitely at `speed`
     p_ccw: float = 0.0  # duty per rad of error, if the goal is counter-clockwise of the shaft
@@ -50,19 +49,19 @@ class ServoCommand(NamedTuple):
 
 
 LIMP = ServoCommand()
-"""No torque: the shaft moves freely, and the motor brakes it as with shorted terminals [i]."""
+"""Command without torque: the shaft moves freely, and the motor brakes it as with shorted terminals [i]."""
 
 ROWS = {name: row for row, name in enumerate(ServoCommand._fields)}
-"""Row of each number in an array of all servos."""
+"""Row of each field of `ServoCommand` in the array of all servos' commands."""
 
 
 class Profiles:
-    """Position and velocity setpoints of the servos' controllers.
+    """Trajectories of the servos to their goals: position and velocity setpoints of their controllers in each
+    step.
 
     The speed is limited by the profile's speed, and changes with the profile's acceleration (e-Manual, X
     series, Profile Velocity (112)). The manual's jerk control is not modelled. A new goal starts with the
-    current velocity of the trajectory ("Velocity Override").
-    """
+    current velocity of the trajectory ("Velocity Override")."""
 
     def __init__(self, commands: Floats, angle: Floats, dt_s: float) -> None:
         self._goal, self._speed, self._acceleration, self._turn = (
@@ -71,19 +70,20 @@ class Profiles:
         self.position: Floats = angle.copy()  # rad
         self.velocity: Floats = np.zeros(len(angle))  # rad/s
         self.change: Floats = np.zeros(len(angle))
-        """Change of the velocity in the last step, rad/s."""
+        """Change of each trajectory's velocity in the last step, rad/s."""
         self.arrived = False  # True while no trajectory moves
         self._dt_s = dt_s
         self.commanded()
 
     def commanded(self) -> None:
-        """Update cached values after a change of commands."""
+        """Recompute values that depend on the array of commands; call it after a change of commands."""
         self._turning = self._turn != 0.0
         self._accelerate()
         self.arrived = False
 
     def aim(self, index: int, goal: float, speed: float, acceleration: float) -> None:
-        """Change one servo's goal, rad, the profile's speed, rad/s, and acceleration, rad/s^2."""
+        """Change one servo's goal, rad, and the speed, rad/s, and acceleration, rad/s^2, of its
+        trajectory."""
         self._goal[index], self._speed[index] = goal, speed
         if self._acceleration[index] != acceleration:
             self._acceleration[index] = acceleration
@@ -91,13 +91,13 @@ class Profiles:
         self.arrived = False
 
     def at_goal(self, index: int) -> bool:
-        """Return True if a servo's trajectory has ended."""
+        """Return True if a servo's trajectory has ended; with a speed command, if that speed is reached."""
         if self._turning[index]:
             return bool(self.velocity[index] == self._speed[index])
         return bool(abs(self._goal[index] - self.position[index]) < _ARRIVED)
 
     def step(self) -> None:
-        """Continue the trajectories by one step."""
+        """Advance all trajectories by one step of `dt_s`."""
         if self.arrived:
             return
         error = self._goal - self.position
@@ -113,7 +113,8 @@ class Profiles:
         self.position += self.velocity * self._dt_s
 
     def look(self) -> None:
-        """Check whether all trajectories have ended, and then set them exactly to their goals."""
+        """Check whether all trajectories have ended; if so, set them exactly to their goals and stop
+        stepping them."""
         if self.arrived or self._turning.any():
             return
         left = np.abs(self._goal - self.position).max(initial=0.0)
@@ -129,14 +130,16 @@ class Profiles:
 
 
 class ControlLaw:
-    """Controllers and motors of all servos; `step` computes `drive` and `damping` for the plant."""
+    """Controllers and motors of all servos; `step` computes their torques, as `drive` and `damping`, for
+    the plant."""
 
     def __init__(self, commands: Floats, motor_damping: Floats, dt_s: float) -> None:
         size = len(motor_damping)
         self._rows = {name: commands[row] for name, row in ROWS.items()}
         self._dt_s = dt_s
         self.stall: Floats = np.zeros(size)
-        """Torque at standstill and full duty, at the supply voltage, Nm. Call `commanded` after a change."""
+        """Torque of each servo at standstill and full duty, at its supply voltage, Nm. Call `commanded`
+        after a change."""
         self._motor_damping = motor_damping
         self.drive: Floats = np.zeros(size)  # Nm at standstill
         self.damping: Floats = motor_damping  # Nm s/rad
@@ -149,13 +152,13 @@ class ControlLaw:
 
     @property
     def winding(self) -> bool:
-        """True while an integral changes, which may still move a shaft that friction holds."""
+        """True while a controller's integral changes, which may still move a shaft that friction holds."""
         if not self._integrates:
             return False
         return bool((np.abs(self._rows["i"] * self._error) * self._within > _UNWOUND).any())
 
     def commanded(self) -> None:
-        """Update cached values after a change of commands."""
+        """Recompute values that depend on the array of commands; call it after a change of commands."""
         rows = self._rows
         self._feed = rows["d"] + rows["feed_velocity"]
         self._integrates = bool(rows["i"].any())
@@ -165,7 +168,8 @@ class ControlLaw:
         self._longest = np.where(held, rows["limit"] / np.maximum(rows["p_ccw"], 1e-9), FREE)
 
     def step(self, profiles: Profiles, angle: Floats, velocity: Floats) -> None:
-        """Compute drive and damping for shafts at some angles, rad, and velocities, rad/s."""
+        """Compute `drive` and `damping` of all servos for their setpoints and the shafts' angles, rad, and
+        velocities, rad/s."""
         rows = self._rows
         error = np.maximum(np.minimum(profiles.position - angle, self._longest), -self._longest)
         np.copyto(profiles.position, angle + error, where=self._turning)

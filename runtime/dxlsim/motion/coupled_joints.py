@@ -36,13 +36,12 @@ _SETTLED = 1e-10  # rad/s or m/s; the iteration ends when a round of friction ch
 
 
 class CoupledJoints:
-    """Mechanism of several servos.
+    """Plant of one mechanism in which several servos move joints together.
 
     Damping and the elasticity of brackets are implicit (backward Euler), so a step is stable at any
-    stiffness. As in `IndependentJoints`, half a step of the motors' damping is subtracted from their inertia,
-    and friction is that of `Motor` and of `Load`. The holding frictions are found by iteration (projected
-    Gauss-Seidel).
-    """
+    stiffness. As in `IndependentJoints`, half a step of the motors' damping is subtracted from their
+    inertia, and friction is that of `Motor` and of `Load`. The holding frictions are found by iteration
+    (projected Gauss-Seidel)."""
 
     def __init__(self, mechanism: Mechanism, joints: Sequence[PlantJoint]) -> None:
         self.angle: Floats = np.array([joint.angle for joint in joints], dtype=np.float64)
@@ -94,7 +93,7 @@ class CoupledJoints:
         self.angle += self.velocity * dt_s
 
     def jam(self, index: int, on: bool) -> None:
-        """Block a servo's shaft at its angle, or release it."""
+        """Block a servo's shaft at its present angle, or release it."""
         self._jammed[index] = JAMMED_NM if on else 0.0
 
     def place(self, index: int, angle: float) -> None:
@@ -105,7 +104,7 @@ class CoupledJoints:
         self.velocity[moved != 0.0] = 0.0
 
     def recount(self, index: int, by: float) -> None:
-        """Shift the angle count of a resting shaft by an angle, rad."""
+        """Add `by`, rad, to the angle count of a resting shaft, which does not move."""
         self.angle[index] += by
         self._reference[index] += by
 
@@ -123,7 +122,7 @@ class CoupledJoints:
         self._gains: list[list[float]] = compliance.tolist()
 
     def _rubbed(self, free: Floats, most: Sequence[float], dt_s: float) -> Floats:
-        """Return the speeds after friction.
+        """Return the servos' speeds after friction.
 
         Args:
             free: Speeds without friction.
@@ -150,29 +149,30 @@ class CoupledJoints:
 
 
 def coupled_projection(matrix: Floats) -> Floats:
-    """Return the projection of servo coordinates onto motions that no other servo resists: pinv(M) M."""
+    """Return the projection of servo coordinates onto motions in which the servos do not work against each
+    other: pinv(M) M."""
     found = np.linalg.pinv(matrix) @ matrix
     return np.where(np.abs(found) < _ROUNDED, 0.0, found)
 
 
 def coupled_motion(projection: Floats, index: int) -> Floats:
-    """Return the movement of each servo of a mechanism per unit of one servo's movement."""
+    """Return how far each servo of a mechanism moves per unit of movement of the servo at `index`."""
     moved: Floats = projection[:, index] / projection[index, index]
     return moved
 
 
 def joints_without_bodies(mechanisms: Sequence[Mechanism], joints: Sequence[PlantJoint]) -> Plant:
-    """Return the plant of servos without bodies, grouped by their mechanisms."""
+    """Return the plant of all servos of a simulation without bodies, grouped by their mechanisms."""
     return combine_plants(joints, parts_without_bodies(mechanisms, joints, range(len(joints))))
 
 
 def parts_without_bodies(
     mechanisms: Sequence[Mechanism], joints: Sequence[PlantJoint], rows: Sequence[int]
 ) -> list[Part]:
-    """Return the plants of some servos: one per coupled mechanism, and one for all independent servos.
+    """Return the plants of the servos in `rows`: one per coupled mechanism, and one for all independent
+    servos.
 
-    A mechanism is omitted until all its servos have been added.
-    """
+    A mechanism is omitted until all its servos have been added."""
     whole = [
         one for one in mechanisms if not one.is_single and all(servo.index in rows for servo in one.servos)
     ]

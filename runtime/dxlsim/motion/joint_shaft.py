@@ -1,4 +1,4 @@
-"""Shaft of servos with angle limits and a moving speed: Protocol 1.0, and the XL-320."""
+"""Joint shaft: shaft of servos with angle limits and a moving speed: Protocol 1.0, and the XL-320."""
 
 from __future__ import annotations
 
@@ -17,41 +17,43 @@ SLOPE_TICK = math.radians(300) / 1023
 """Unit of Compliance Slope (28), rad: 0x40 is about 18.8 degrees (manual of the RX-28, example 17)."""
 
 SLOPE_TIMES_P = 1024
-"""P gain 32 is as stiff as slope 32, 8 as slope 128 (e-Manual, MX-28, PID Gains (26, 27, 28)); an identified
-P gain (`Motor.p_gain_duty`) has priority."""
+"""Product of compliance slope and P gain of equal stiffness: P gain 32 is as stiff as slope 32, 8 as slope
+128 (e-Manual, MX-28, PID Gains (26, 27, 28)); an identified P gain (`Motor.p_gain_duty`) has priority."""
 
 _MID_OF_CURRENT = {"current": 2048, "sensed_current": 512}
-"""Tick of zero current: MX-64, Current (68), 4.5 mA a tick; EX-106+, Sensed Current (56), 10 mA a tick."""
+"""Value of an item at zero current: MX-64, Current (68), 4.5 mA a tick; EX-106+, Sensed Current (56), 10
+mA a tick."""
 
 _WHEEL_P, _WHEEL_I = 4.0, 40.0
-"""Duty per speed error, as a fraction of the no-load speed, and per its integral, 1/s. A speed is reached in
-0.12 s [i]."""
+"""Gains of speed control in wheel mode: duty per speed error, as a fraction of the no-load speed, and per
+its integral, 1/s. A speed is reached in 0.12 s [i]."""
 
 
 class JointShaft(Shaft):
-    """Joint, wheel and multi-turn mode; torque control mode on models with Goal Torque.
+    """Shaft of a servo with angle limits: joint, wheel and multi-turn mode; torque control mode on models
+    with Goal Torque.
 
     In joint mode the trajectory has Moving Speed, and Goal Acceleration on models with this item; 0 means
-    no limit. AX and RX models convert the error into torque by compliance margin, slope and punch, MX models
-    and the XL-320 by PID gains. In wheel mode Moving Speed is an open-loop duty on AX and RX models (unit
-    0.1 %), and a controlled speed on MX models.
-    """
+    no limit. AX and RX models convert the error into torque by compliance margin, slope and punch, MX
+    models and the XL-320 by PID gains. In wheel mode Moving Speed is an open-loop duty on AX and RX models
+    (unit 0.1 %), and a controlled speed on MX models."""
 
     items = ACCESS.joint_shaft
 
     def __init__(self, memory: Memory, mechanics: Mechanics, motor: Motor, load: Load, angle: float) -> None:
         super().__init__(memory, mechanics, motor, load, angle)
         self._turns_apart = 0.0
-        """Whole turns between the shaft and the turn in which joint mode counts, rad."""
+        """Whole turns between the shaft's angle and the turn in which joint mode counts, rad."""
         self._aimed: tuple[int, int, int] = (0, 0, 0)
         self._reach = memory.table.max_tick * memory.table.rad_per_tick
 
     def within_a_turn(self, angle: float) -> float:
-        """Return the angle unchanged: these servos count no turns."""
+        """Return the angle unchanged: at power-up these servos show the same angle as before."""
         return angle
 
     def position_tick(self, angle: float) -> int:
-        """Return Present Position; beyond the range the nearest end [i]."""
+        """Return the value of Present Position for an angle of the shaft, rad; beyond the range the
+        nearest end [i]."""
         table = self.memory.table
         if multi_turn_mode(self.memory):
             tick = round(angle / table.rad_per_tick / self.memory["resolution_divider"])
@@ -67,7 +69,8 @@ class JointShaft(Shaft):
         return max(0, min(table.max_tick, tick))
 
     def live(self) -> Mapping[str, Callable[[], int]]:
-        """Return the items of the motion, each with a function for its current value in ticks."""
+        """Return the items that show the motion, each with a function for its present value, the integer
+        on the wire."""
         return {
             # Negative turns, as in goals
             "present_position": lambda: self.position_tick(self.angle) & 0xFFFF,
@@ -106,7 +109,8 @@ class JointShaft(Shaft):
         return self.memory.table.rad_s_per_tick / 2
 
     def _whole_turns(self, angle: float) -> float:
-        """Return the whole turns of an angle, rad; an angle slightly outside the range counts as inside."""
+        """Return the whole turns in an angle, rad; an angle slightly outside the range of joint mode
+        counts as inside."""
         outside = max(math.tau - self._reach, 0.1) / 2
         return math.tau * math.floor((angle + outside) / math.tau)
 
@@ -164,12 +168,11 @@ class JointShaft(Shaft):
         )
 
     def _pid(self, limit: float) -> ServoCommand:
-        """Return the PID gains: Kp = P / 8, Ki = I * 1000 / 2048, Kd = D * 4 / 1000 (e-Manual, MX-28, PID
-        Gains).
+        """Return the command of position control with the gains of MX servos: Kp = P / 8, Ki = I * 1000 /
+        2048, Kd = D * 4 / 1000 (e-Manual, MX-28, PID Gains).
 
         All are in one unit. No manual describes an effect of Punch together with PID gains, so it has none
-        here [?].
-        """
+        here [?]."""
         memory = self.memory
         unit = 8 * (self.motor.p_gain_duty or 1 / (SLOPE_TIMES_P * SLOPE_TICK))
         p = memory["p_gain"] / 8 * unit
@@ -183,10 +186,10 @@ class JointShaft(Shaft):
 
 
 def _slope(value: int) -> int:
-    """Return the effective slope: the largest power of two up to the value, 2 to 128.
+    """Return the compliance slope that is in effect for a register value: the largest power of two up to the
+    value, 2 to 128.
 
-    e-Manual, AX-12A, Compliance Slope (28): "7 steps".
-    """
+    e-Manual, AX-12A, Compliance Slope (28): "7 steps"."""
     return min(128, 1 << max(1, value.bit_length() - 1))
 
 

@@ -1,4 +1,4 @@
-"""Simulated body for sensors: messages about shafts between processes, and the motion of a link."""
+"""Link motion: types by which sensors learn the motion of simulated shafts and of a robot's links."""
 
 from __future__ import annotations
 
@@ -12,37 +12,36 @@ Floats = NDArray[np.float64]
 
 
 class LinkMotion(msgspec.Struct, frozen=True):
-    """Pose and motion of a link of the robot's URDF.
+    """Pose, velocity and acceleration of a link of the robot's URDF.
 
-    The world's z axis points up; the URDF's first link is fixed at its origin.
-    """
+    The world's z axis points up; the URDF's first link is fixed at its origin."""
 
     position: Floats
-    """m, of the link's origin in the world, shape (3,)."""
+    """Position of the link's origin in the world, m, shape (3,)."""
     orientation: Floats
-    """Unit quaternion x, y, z, w: rotates from the link's frame into the world's; w is not negative."""
+    """Unit quaternion x, y, z, w that rotates from the link's frame into the world's; w is not negative."""
     linear_velocity: Floats
-    """m/s, of the link's origin in the world."""
+    """Velocity of the link's origin in the world, m/s, shape (3,)."""
     angular_velocity: Floats
-    """rad/s, in the link's own frame, as a gyroscope on it measures."""
+    """Angular velocity in the link's own frame, rad/s, as a gyroscope on the link measures."""
     linear_acceleration: Floats
-    """m/s^2, of the link's origin in the link's own frame, without gravity."""
+    """Acceleration of the link's origin in the link's own frame, m/s^2, without gravity."""
 
 
 class Body(Protocol):
-    """Simulated body at the time of a sample."""
+    """Simulated body of a robot, which a sensor asks for the motion of a link."""
 
     def motion(self, link: str) -> LinkMotion:
-        """Return the current motion of a link. Raises KeyError if the URDF does not have the link."""
+        """Return the present motion of a link. Raises KeyError if the URDF does not have the link."""
 
 
 class Shafts(msgspec.Struct, frozen=True):
-    """Shafts of the simulated servos at a time, in the order of the simulation's servos."""
+    """Motion of all shafts of the simulated servos at a time, in the order of the simulation's servos."""
 
     t_ns: int
     angle: Floats
-    """rad from the servo's raw 0."""
+    """Angle of each shaft from the servo's raw 0, rad."""
     velocity: Floats
-    """rad/s."""
+    """Velocity of each shaft, rad/s."""
     acceleration: Floats
-    """rad/s^2."""
+    """Acceleration of each shaft, rad/s^2."""

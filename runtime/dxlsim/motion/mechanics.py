@@ -1,9 +1,8 @@
-"""Mechanics: all servos of one simulation, stepped together on one time grid.
+"""Mechanics: motion of all servos of one simulation, stepped together on one time grid.
 
-In each step the profiles give the setpoints of the servos' controllers, the control law gives the torque of
-the motors, and the plant gives the motion. Commands take effect at the next point of the grid; between grid
-points angles are extrapolated with their velocity. Nothing is computed while all servos rest.
-"""
+In each step the profiles give the setpoints of the servos' controllers, the control law gives the torque
+of the motors, and the plant gives the motion. Commands take effect at the next point of the grid; between
+grid points angles are extrapolated with their velocity. Nothing is computed while all servos rest."""
 
 from __future__ import annotations
 
@@ -25,11 +24,11 @@ from dxlsim.motion.plant import Floats, IndependentJoints, Plant, PlantJoint, Pl
 from dxlsim.simulation_plan import Load, SimulationConfig
 
 STEP_NS = 2_000_000
-"""Step of the grid. The shortest time constant in a servo is that of its motor: 13.6 ms or more."""
+"""Step of the time grid, ns. The shortest time constant in a servo is that of its motor: 13.6 ms or more."""
 
 EAGER_NS, EASY_NS = 4_000_000, 1_000_000_000
-"""Intervals of `advance` in real time, while servos move and while they only cool. Catching up after a long
-pause of the host would delay the next reply."""
+"""Intervals (ns) at which `advance` is due in real time, while servos move and while they only cool.
+Catching up after a long pause of the host would delay the next reply."""
 
 STRAIN_NS = 100_000_000  # Interval at which heat and load are updated; a whole number of steps
 
@@ -41,8 +40,8 @@ _STILL, _UNDRIVEN = 1e-6, 1e-8  # rad/s, and its change in a step: a servo rests
 AMBIENT_C = 30.0  # Temperature of a servo at rest, degrees C [i]
 
 STALLED_RISE_C = 300.0
-"""Steady-state temperature rise of a stalled servo, degrees C: with 400 s the servo reaches 80 after a minute
-[i]."""
+"""Steady-state temperature rise of a stalled servo, degrees C: with a time constant of 400 s the servo
+reaches 80 after a minute [i]."""
 
 COOLING_S = 400.0  # Time constant of housing and winding, modelled as one body [i]
 
@@ -64,7 +63,8 @@ class _Hand(msgspec.Struct):
 
 
 class Mechanics:
-    """Servos that are stepped together; time comes from the callers, and an earlier time is ignored."""
+    """Shafts, controllers and temperatures of all servos of one simulation, stepped together; time comes
+    from the callers, and an earlier time is ignored."""
 
     def __init__(self, start_ns: int, plant: PlantMaker | None = None) -> None:
         self._make_plant: PlantMaker = plant or IndependentJoints
@@ -82,13 +82,14 @@ class Mechanics:
         self._commanded = False
         self.still = False  # True while all servos rest without new commands
         self._before: Floats | None = None
-        """Velocities before the last step; None unless accelerations are sensed."""
+        """Velocities of the shafts before the last step, rad/s; None unless `sense` was called."""
         self._build(np.zeros(0), np.zeros(0))
 
     # Servos
 
     def add(self, motor: Motor, load: Load, angle: float) -> int:
-        """Add a servo at rest and limp, with its shaft at an angle, rad from its raw 0; return its index."""
+        """Add a servo at rest and limp, with its shaft at `angle`, rad from its raw 0; return the index by
+        which other methods address it."""
         plant, profiles, law, strain = self.plant, self.profiles, self.law, self.strain
         commands, count = self._commands, len(self._motors)
         self._motors.append(motor)
@@ -106,26 +107,28 @@ class Mechanics:
         return count
 
     def jam(self, index: int, on: bool) -> None:
-        """Block a shaft at its angle, or release it."""
+        """Block a servo's shaft at its present angle, or release it."""
         self.plant.jam(index, on)
         self._wake()
 
     def motor(self, index: int) -> Motor:
-        """Return a servo's motor."""
+        """Return the motor of a servo."""
         return self._motors[index]
 
     def watch(self, index: int, act: Callable[[], None]) -> None:
-        """Call `act` when a servo's temperature changes by a degree, or when it is overloaded."""
+        """Call `act` whenever a servo's temperature changes by a degree, and when it has been overloaded
+        for too long."""
         self._watchers[index] = act
 
     def supply(self, index: int, volts: float) -> None:
-        """Change a servo's supply voltage; its stall torque and no-load speed change in proportion."""
+        """Set a servo's supply voltage, V; its stall torque and no-load speed change in proportion."""
         motor = self._motors[index]
         self.law.stall[index] = motor.stall_torque * (volts / motor.voltage if motor.voltage else 1.0)
         self._wake()
 
     def command(self, index: int, command: ServoCommand) -> None:
-        """Command a servo. Its trajectory continues from its setpoint, or from the shaft if it was limp."""
+        """Give a servo's controller new parameters. Its trajectory continues from its setpoint, or from
+        the shaft if it was limp."""
         was_limp = self._commands[ROWS["limit"], index] == 0.0
         was_turning = self._commands[ROWS["turning"], index] != 0.0
         self._commands[:, index] = command
@@ -138,13 +141,14 @@ class Mechanics:
         self._wake()
 
     def aim(self, index: int, goal: float, speed: float, acceleration: float) -> None:
-        """Change only the goal of a servo and its profile; units as in `ServoCommand`."""
+        """Change only a servo's goal, rad, and the speed, rad/s, and acceleration, rad/s^2, of its
+        trajectory."""
         self.profiles.aim(index, goal, speed, acceleration)
         self.strain.calm = False
         self.still = False
 
     def place(self, index: int, angle: float) -> None:
-        """Move a resting shaft to an angle, rad; its trajectory begins there."""
+        """Move a resting shaft to an angle, rad, at once; its trajectory begins there."""
         self.plant.place(index, angle)
         self.profiles.position[index], self.profiles.velocity[index] = angle, 0.0
         if self._commands[ROWS["limit"], index] == 0.0:
@@ -153,7 +157,8 @@ class Mechanics:
         self.still = False
 
     def recount(self, index: int, angle: float) -> None:
-        """Stop a shaft and count its angle, rad, in another turn; its trajectory begins there."""
+        """Stop a shaft, and change its count of turns so that its angle becomes `angle`, rad; its
+        trajectory begins there."""
         turns = math.tau * round((angle - self.plant.angle.item(index)) / math.tau)
         if turns:
             self._recounted[index] += turns
@@ -161,7 +166,7 @@ class Mechanics:
         self.place(index, angle)
 
     def turn(self, index: int, by: float, duration_ns: int, gives_way: Callable[[float], None]) -> None:
-        """Turn a shaft by hand, evenly by an angle, starting now.
+        """Turn a servo's shaft as by hand, evenly by an angle, starting now.
 
         The hand lets go of a servo that drives or holds its shaft.
 
@@ -176,29 +181,30 @@ class Mechanics:
         self.still = False
 
     def heat(self, index: int, celsius: float) -> None:
-        """Set a servo's temperature, degrees C; it then approaches that of its load."""
+        """Set a servo's temperature, degrees C; it then approaches the temperature that its load causes."""
         self.strain.temperature[index] = celsius
         self.strain.calm = False
 
     def overloaded(self, index: int) -> bool:
-        """Return True if a servo has been overloaded for too long."""
+        """Return True if a servo has been overloaded for OVERLOAD_TICKS or longer."""
         return bool(self.strain.overloaded[index] >= OVERLOAD_TICKS)
 
     # For sensors on the bodies
 
     def sense(self) -> None:
-        """Record the data for `acceleration` from the next step on."""
+        """Record velocities from the next step on, so that `acceleration` is available."""
         self._before = self.plant.velocity.copy()
 
     @property
     def acceleration(self) -> Floats:
-        """Accelerations of the shafts in the last step, rad/s^2; requires an earlier call of `sense`."""
+        """Accelerations of the shafts in the last step, rad/s^2; zeros unless `sense` was called before."""
         if self.still or self._before is None or len(self._before) != len(self._motors):
             return np.zeros(len(self._motors))
         return (self.plant.velocity - self._before) / (STEP_NS * 1e-9)
 
     def shafts(self, now_ns: int, count: int) -> Shafts:
-        """Return the first `count` shafts at a time, extrapolated with their velocity between grid points."""
+        """Return the motion of the first `count` shafts at a time, extrapolated with their velocity
+        between grid points."""
         self.advance(now_ns)
         velocity = self.plant.velocity[:count].copy()
         angle = self.plant.angle[:count] + velocity * (max(0, now_ns - self.grid_ns) * 1e-9)
@@ -207,13 +213,12 @@ class Mechanics:
     # Time
 
     def call_at(self, t_ns: int, action: Callable[[], None]) -> None:
-        """Call `action` at the first grid point at or after a time."""
+        """Call `action` at the first grid point at or after `t_ns`."""
         heapq.heappush(self._agenda, (t_ns, next(self._order), action))
 
     def due_ns(self) -> int | None:
-        """Return the time of the next `advance` in real time, even without requests of hosts; None without
-        need.
-        """
+        """Return the time at which `advance` must be called in real time, even without requests of hosts;
+        None if nothing moves or cools."""
         if not self._motors:
             return None
         if not self.still:
@@ -225,7 +230,7 @@ class Mechanics:
         return easy_ns if agenda_ns is None else min(easy_ns, agenda_ns)
 
     def advance(self, now_ns: int) -> None:
-        """Step up to the last grid point at or before a time."""
+        """Step all servos up to the last grid point at or before `now_ns`."""
         if self._busy or self.grid_ns + STEP_NS > now_ns:
             return
         self._busy = True  # Callbacks may read the time, but must not advance it
@@ -236,7 +241,8 @@ class Mechanics:
             self._busy = False
 
     def _advance_once(self, now_ns: int) -> None:
-        """Take one step, or skip the steps in which nothing happens."""
+        """Do the actions that are due, then take one step or skip the steps in which nothing happens;
+        update temperatures if due."""
         while self._agenda and self._agenda[0][0] <= self.grid_ns:
             heapq.heappop(self._agenda)[2]()
         if self.still or not self._motors:
@@ -252,7 +258,7 @@ class Mechanics:
             self._feel()
 
     def _skip(self, now_ns: int) -> None:
-        """Skip steps without motion, due actions or changes of temperature."""
+        """Skip steps at once while all servos rest, up to the next action or change of temperature."""
         until_ns = now_ns if self.strain.calm else min(now_ns, self._next_strain_ns)
         if self._agenda:
             until_ns = min(until_ns, self._agenda[0][0])
@@ -284,7 +290,8 @@ class Mechanics:
             self.still = True
 
     def _step_with_hands(self) -> None:
-        """Take one step; a shaft that is turned by hand follows the hand."""
+        """Take one step in which shafts that are turned by hand follow the hand, unless the servo drives
+        them."""
         angles = {index: self.plant.angle.item(index) for index in self._hands}
         self._step()
         for index, angle in angles.items():
@@ -340,7 +347,8 @@ class Mechanics:
 
 
 class Strain:
-    """Temperature from the copper loss (current squared, [i]: one body), and duration of overload."""
+    """Temperature of each servo from the copper loss (current squared, [i]: one body), and duration of its
+    overload."""
 
     def __init__(self, nominal_stall: Floats, dt_s: float) -> None:
         size = len(nominal_stall)
@@ -351,7 +359,8 @@ class Strain:
         self.calm = False  # True if the same load would change nothing any more
 
     def tick(self, torque: Floats, most: Floats) -> list[int]:
-        """Update for one tick under torques, Nm; return the servos with a new temperature or overload.
+        """Update temperatures and overloads for one tick of STRAIN_NS; return the servos with a new
+        temperature or overload.
 
         Args:
             torque: Torque of each motor, Nm.
@@ -369,7 +378,8 @@ class Strain:
 
 
 def plant_of(config: SimulationConfig) -> PlantMaker:
-    """Return the maker of a simulation's plant: of its bodies, or of joints without bodies.
+    """Return the function that makes a simulation's plant: of its bodies in MuJoCo, or of joints without
+    bodies.
 
     Raises:
         InputError: MuJoCo is not installed, cannot load the URDF, or would move nothing.

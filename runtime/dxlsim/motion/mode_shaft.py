@@ -1,4 +1,4 @@
-"""Shaft of servos with an operating mode: Protocol 2.0 except the XL-320."""
+"""Mode shaft: shaft of servos with an operating mode: Protocol 2.0 except the XL-320."""
 
 from __future__ import annotations
 
@@ -31,29 +31,28 @@ _IN_POSITION_TICKS = 10
 
 
 SAMPLING_S = 1e-3
-"""Sampling period in the e-Manual's conversions of gains, which mention it without a value (X series,
-Velocity PI Gain (76, 78) and Position PID Gain (80 to 84)). Gains refer to PWM units, ticks and velocity
-units [i]."""
+"""Sampling period (s) in the e-Manual's conversions of gains, which mention it without a value (X series,
+Velocity PI Gain (76, 78) and Position PID Gain (80 to 84)). Gains refer to PWM units, ticks and
+velocity units [i]."""
 
 UNKNOWN_P = 150.0
-"""Duty per rad if the manual gives no initial gain: the PRO, P and Y lines, and the grippers [i].
+"""P gain, duty per rad, if the manual gives no initial gain: the PRO, P and Y lines, and the grippers [i].
 
 ROBOTIS' own examples for the PRO line wait until at most 20 ticks are left (DynamixelSDK,
-c++/example/protocol2.0, DXL_MOVING_STATUS_THRESHOLD); friction takes 1.3 % of the duty, and 20 ticks of the
-finest model are 0.000125 rad.
-"""
+c++/example/protocol2.0, DXL_MOVING_STATUS_THRESHOLD); friction takes 1.3 % of the duty, and 20 ticks of
+the finest model are 0.000125 rad."""
 
 UNKNOWN_VELOCITY_P, UNKNOWN_VELOCITY_I = 4.0, 40.0
-"""The same for velocity control: duty per speed error, as a fraction of the no-load speed, and per its
-integral, 1/s [i]."""
+"""Gains of velocity control for the same models: duty per speed error, as a fraction of the no-load speed,
+and per its integral, 1/s [i]."""
 
 
 class ModeShaft(Shaft):
-    """Follows the goal of its mode, with the profile for the way to it.
+    """Shaft of a servo with an operating mode: follows the goal of its mode, with the profile for the way to
+    the goal.
 
-    Profile Velocity 0 disables the profile (a step); Profile Acceleration 0 makes it rectangular (e-Manual, X
-    series, Profile Velocity (112)). Velocity control uses only the acceleration.
-    """
+    Profile Velocity 0 disables the profile (a step); Profile Acceleration 0 makes it rectangular
+    (e-Manual, X series, Profile Velocity (112)). Velocity control uses only the acceleration."""
 
     items = ACCESS.mode_shaft
 
@@ -63,7 +62,8 @@ class ModeShaft(Shaft):
         self._profile_kind = 0
         items = memory.table.items
         self._speed_item = memory.table.goal_speed_item
-        """Item of the profile's speed: on PRO Goal Velocity (600), with Goal Acceleration (606)."""
+        """Name of the item with the profile's speed: on PRO Goal Velocity (600), with Goal Acceleration
+        (606)."""
         of_pro = self._speed_item == "goal_velocity"
         self._ramp_item = "goal_acceleration" if of_pro else "profile_acceleration"
         item = items.get(self._ramp_item)
@@ -77,7 +77,8 @@ class ModeShaft(Shaft):
         memory.watch(("drive_mode", "homing_offset"), self._orient)
 
     def within_a_turn(self, angle: float) -> float:
-        """Return the angle within the encoder's turn: 0 to 4095 ticks, or centered at 0."""
+        """Return the angle, rad, that the servo shows after power-up: within one turn of its encoder, 0 to
+        4095 ticks, or centered at 0."""
         shown = self._sign * angle
         if self.memory.table.items["min_position_limit"].minimum < 0:
             return self._sign * (shown - math.tau * round(shown / math.tau))
@@ -86,12 +87,12 @@ class ModeShaft(Shaft):
         return self._sign * (shown - math.tau * math.floor((shown + half) / math.tau))
 
     def position_tick(self, angle: float) -> int:
-        """Return Present Position."""
+        """Return the value of Present Position, ticks, for an angle of the shaft, rad."""
         tick = round(self._sign * angle / self._rad_per_tick)
         return tick + self._offset
 
     def live(self) -> Mapping[str, Callable[[], int]]:
-        """Return the items of the motion, each with a function for its current value in ticks."""
+        """Return the items that show the motion, each with a function for its present value in ticks."""
         return {
             "present_position": lambda: self.position_tick(self.angle),
             "present_velocity": lambda: self._velocity_tick("present_velocity", self.velocity),
@@ -165,11 +166,10 @@ class ModeShaft(Shaft):
         return _position_gains(memory, self.motor)._replace(limit=limit, torque_limit=most)
 
     def _most_torque(self, torque: float) -> float:
-        """Return the torque limit of position or velocity control, Nm.
+        """Return the torque limit of position or velocity control, Nm; FREE on models without Goal Torque.
 
-        On PRO it is Goal Torque (604), or Torque Limit (30) if that is 0 (e-Manual, Goal Torque (604)). For
-        the RH-P12-RN the use of Torque Limit is inferred [i].
-        """
+        On PRO it is Goal Torque (604), or Torque Limit (30) if that is 0 (e-Manual, Goal Torque (604)).
+        For the RH-P12-RN the use of Torque Limit is inferred [i]."""
         if self._torque_item is None or self._torque_item.name != "goal_torque":
             return FREE
         return abs(torque) or self.memory["torque_limit"] * self._torque_unit
@@ -193,7 +193,8 @@ class ModeShaft(Shaft):
 
     @property
     def _torque_unit(self) -> float:
-        """Nm per tick of the goal, which counts current, or fractions of the stall torque (L42-10-S300-R)."""
+        """Torque per tick of the goal, Nm; the goal counts current, or fractions of the stall torque
+        (L42-10-S300-R)."""
         if self._torque_item is None:
             return 0.0
         parts = self._torque_item.unit == "1"
@@ -220,7 +221,8 @@ class ModeShaft(Shaft):
         return goal, speed, acceleration
 
     def _timed(self, goal: float, distance: float, duration: float, ramp: float) -> Trajectory:
-        """Return a move with a duration and an acceleration time, s; the latter is at most half as long."""
+        """Return the trajectory of a move with a duration and an acceleration time, s; the latter is at
+        most half as long."""
         if distance == 0.0:
             return goal, FREE, FREE
         ramp = min(ramp, duration / 2)
@@ -240,10 +242,10 @@ def _kind(ramp: float, distance: float, speed: float, acceleration: float) -> in
 
 
 def _position_gains(memory: Memory, motor: Motor) -> ServoCommand:
-    """Return the gains of position control: KP / 128, KI / 65536, KD / 16, KFF1 / 4 and KFF2 / 4.
+    """Return a command with the gains of position control: KP / 128, KI / 65536, KD / 16, KFF1 / 4 and KFF2 /
+    4.
 
-    If the P gain was identified with another value, the others are scaled with it [i].
-    """
+    If the P gain was identified with another value, the others are scaled with it [i]."""
     table = memory.table
     if table.items["position_p_gain"].initial is None or "goal_pwm" not in table.items:
         d = critical_d(UNKNOWN_P, motor)
@@ -261,7 +263,8 @@ def _position_gains(memory: Memory, motor: Motor) -> ServoCommand:
 
 
 def _velocity_gains(memory: Memory) -> ServoCommand:
-    """Return the gains of velocity control, KVP / 128 and KVI / 65536, on the integrated speed."""
+    """Return a command with the gains of velocity control, KVP / 128 and KVI / 65536, applied to the
+    integrated speed."""
     table = memory.table
     if "goal_pwm" not in table.items or table.items["velocity_p_gain"].initial is None:
         p, i = UNKNOWN_VELOCITY_P / table.max_speed, UNKNOWN_VELOCITY_I / table.max_speed

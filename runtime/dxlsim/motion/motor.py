@@ -1,4 +1,4 @@
-"""Motor of a simulated servo with its gear, from the manual's data and published identifications."""
+"""Motor: model of a servo's motor and gear, from the manual's data and published identifications."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ from dxlsim.motor_model import MotorModel, Stribeck
 from dxlwire.control_table import ControlTable
 
 STALL_POWER_W = 20.0
-"""Stall torque times no-load speed if the manual gives no stall torque: as an XM430-W350 [i]."""
+"""Stall torque times no-load speed, W, if the manual gives no stall torque: as an XM430-W350 [i]."""
 
 STALL_CURRENT_A = 1.5  # Used if the manual gives none and the model measures none: as an AX-12A [i]
 
@@ -22,12 +22,12 @@ _FILE = Path(__file__).parent / "motors.toml"
 
 
 class Motor(msgspec.Struct, frozen=True):
-    """Direct-current motor with its gear, as seen at the horn: torque decreases linearly with speed.
+    """Direct-current motor of a servo with its gear, as seen at the horn: torque decreases linearly with
+    speed.
 
     Friction is at most `friction + load_friction * |motor's torque - load's torque|`. In motion
     `viscous_friction` times the speed is added: model M3 of M. Duclusaud et al., "Extended Friction Models
-    for the Physics Simulation of Servo Actuators" (arXiv 2410.08650).
-    """
+    for the Physics Simulation of Servo Actuators" (arXiv 2410.08650)."""
 
     stall_torque: float  # Nm of the motor at `voltage` and standstill, without subtracting friction
     damping: float
@@ -39,7 +39,8 @@ class Motor(msgspec.Struct, frozen=True):
     load_friction: float = 0.0  # Nm of friction per Nm between the motor's torque and the load's
     viscous_friction: float = 0.0  # Nm s/rad
     p_gain_duty: float = 0.0
-    """Duty per rad of error and unit of the P gain; 0: not identified, the manual's value holds."""
+    """Duty per rad of error and unit of the P gain's register; 0: not identified, the manual's value
+    holds."""
     source: str = ""  # Source of the data that no manual gives
     gain_source: str = ""  # Source of `p_gain_duty`
     stribeck: Stribeck | None = None  # Additional friction near standstill
@@ -51,7 +52,7 @@ class Motor(msgspec.Struct, frozen=True):
 
     @property
     def no_load_speed(self) -> float:
-        """Speed at `voltage` and full duty, rad/s, at which motor and friction are in balance."""
+        """Speed at `voltage` and full duty, rad/s, at which the motor's torque only balances friction."""
         driving = 1.0 - self.load_friction
         return (driving * self.stall_torque - self.friction) / (
             driving * self.damping + self.viscous_friction
@@ -78,10 +79,9 @@ class _Motors(msgspec.Struct, frozen=True):
 
 
 def motor_of(table: ControlTable, model: MotorModel | None = None) -> Motor:
-    """Return a model's motor: that of a motor file, or an identified one.
+    """Return the motor of a servo model: that of the motor file `model` if given, or an identified one.
 
-    Without either, its data are the manual's, with inertia and friction of a similar motor.
-    """
+    Without either, its data are the manual's, with inertia and friction of a similar motor."""
     known = _known(table)
     if model is None:
         return known
@@ -106,7 +106,7 @@ def _known(table: ControlTable) -> Motor:
 
 
 def identified_motor(model: MotorModel) -> Motor:
-    """Return the motor of a motor file, or of motors.toml."""
+    """Convert the parameters of a motor file, or of an entry of motors.toml, to a motor."""
     return Motor(
         stall_torque=model.torque_constant * model.voltage / model.resistance,
         damping=model.torque_constant**2 / model.resistance,
@@ -124,11 +124,11 @@ def identified_motor(model: MotorModel) -> Motor:
 
 
 def _scaled(table: ControlTable, like: MotorModel) -> Motor:
-    """Return a motor with the manual's stall torque and no-load speed, otherwise scaled from another motor.
+    """Return a motor with the manual's stall torque and no-load speed, and the rest scaled from the motor of
+    `like`.
 
     The damping gives exactly that speed with friction f, load friction l and viscous friction v: (1 - l) *
-    (stall torque - damping * speed) = f + v * speed.
-    """
+    (stall torque - damping * speed) = f + v * speed."""
     model = identified_motor(like)
     torque = table.stall_torque or STALL_POWER_W / table.max_speed
     friction = model.friction / model.stall_torque

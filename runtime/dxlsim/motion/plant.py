@@ -1,8 +1,8 @@
-"""Plant: joints that simulated servos move, with inertia, friction and gravity, all in one step.
+"""Plant: motion of the joints that simulated servos move, with inertia, friction and gravity, all in one
+step.
 
-Each servo provides its torque at standstill and the reduction of this torque per rad/s; a plant converts that
-into motion. `IndependentJoints` is the plant of joints without coupling.
-"""
+Each servo provides its torque at standstill and the reduction of this torque per rad/s; a plant converts
+that into motion. `IndependentJoints` is the plant of joints without coupling."""
 
 from __future__ import annotations
 
@@ -25,7 +25,7 @@ JAMMED_NM = 1e6  # Friction of a blocked joint: more than the torque of any moto
 
 
 class PlantJoint(msgspec.Struct, frozen=True):
-    """Shaft of one servo, as the input of a plant."""
+    """Shaft of one servo with its motor and load, as the input of a plant."""
 
     motor: Motor  # The plant applies its inertia and friction
     load: Load
@@ -34,42 +34,44 @@ class PlantJoint(msgspec.Struct, frozen=True):
 
 
 class Plant(Protocol):
-    """All joints of a simulation, in the order in which the servos were added."""
+    """Mechanics of all shafts of a simulation, in the order in which the servos were added."""
 
     @property
     def angle(self) -> Floats:
-        """Angles, rad; always the same array."""
+        """Angle of each shaft, rad from the servo's raw 0; always the same array."""
 
     @property
     def velocity(self) -> Floats:
-        """Speeds, rad/s, counter-clockwise positive; always the same array."""
+        """Speed of each shaft, rad/s, counter-clockwise positive; always the same array."""
 
     def step(self, drive: Floats, damping: Floats, dt_s: float) -> None:
         """Advance by `dt_s` with servo torque `drive - damping * velocity` (Nm, Nm s/rad)."""
 
     def place(self, index: int, angle: float) -> None:
-        """Move a resting shaft to an angle, rad."""
+        """Move a resting shaft to an angle, rad, at once."""
 
     def recount(self, index: int, by: float) -> None:
-        """Shift the angle count of a resting shaft by an angle, rad, as after a power cycle."""
+        """Add `by`, rad, to the angle count of a resting shaft, as after a power cycle; the shaft does not
+        move."""
 
     def jam(self, index: int, on: bool) -> None:
-        """Block a shaft at its angle, or release it."""
+        """Block a shaft at its present angle, or release it."""
 
 
 Part = tuple[Sequence[int], Plant]  # Indices of some servos, and their plant
 
 PlantMaker = Callable[[Sequence[PlantJoint]], Plant]
-"""Makes the plant of some joints. It is called again with the current joints when a servo is added later."""
+"""Makes the plant of some shafts. It is called again with all shafts, at their present angles, when a
+servo is added later."""
 
 
 class IndependentJoints:
-    """Joints without coupling.
+    """Plant of shafts that do not affect each other.
 
-    The velocity is updated first, with implicit damping: stable at any damping and any step. That alone would
-    brake less than the motor does, as if dt / 2 of its damping were inertia (7 % for an MX-64). Subtracting
-    this from the inertia turns the step into Crank-Nicolson's. Friction is that of `Motor` and of `Load`.
-    """
+    The velocity is updated first, with implicit damping: stable at any damping and any step. That alone
+    would brake less than the motor does, as if dt / 2 of its damping were inertia (7 % for an MX-64).
+    Subtracting this from the inertia turns the step into Crank-Nicolson's. Friction is that of `Motor` and
+    of `Load`."""
 
     def __init__(self, joints: Sequence[PlantJoint]) -> None:
         self.angle: Floats = np.array([joint.angle for joint in joints], dtype=np.float64)
@@ -105,16 +107,16 @@ class IndependentJoints:
         self.angle += velocity * dt_s
 
     def jam(self, index: int, on: bool) -> None:
-        """Block a joint at its angle, or release it."""
+        """Block a shaft at its present angle, or release it."""
         self._friction[index] = JAMMED_NM if on else self._free_friction[index]
 
     def place(self, index: int, angle: float) -> None:
-        """Move a resting joint to an angle, rad."""
+        """Move a resting shaft to an angle, rad, at once."""
         self.angle[index] = angle
         self.velocity[index] = 0.0
 
     def recount(self, index: int, by: float) -> None:
-        """Shift the angle count of a resting shaft by an angle, rad."""
+        """Add `by`, rad, to the angle count of a resting shaft, which does not move."""
         self.angle[index] += by
         self._down[index] += by
 
@@ -127,7 +129,7 @@ class IndependentJoints:
 
 
 class SeveralPlants:
-    """Plants without coupling, each with some of the servos."""
+    """Plant composed of plants that do not affect each other, each with some of the servos."""
 
     def __init__(self, joints: Sequence[PlantJoint], parts: Sequence[Part]) -> None:
         self.angle: Floats = np.array([joint.angle for joint in joints], dtype=np.float64)
@@ -147,26 +149,27 @@ class SeveralPlants:
             self._take(rows, plant)
 
     def place(self, index: int, angle: float) -> None:
-        """Move a resting shaft to an angle, rad."""
+        """Move a resting shaft to an angle, rad, at once."""
         rows, plant, place = self._place_of[index]
         self._hand(rows, plant)
         plant.place(place, angle)
         self._take(rows, plant)
 
     def recount(self, index: int, by: float) -> None:
-        """Shift the angle count of a resting shaft by an angle, rad."""
+        """Add `by`, rad, to the angle count of a resting shaft, which does not move."""
         rows, plant, place = self._place_of[index]
         self._hand(rows, plant)
         plant.recount(place, by)
         self._take(rows, plant)
 
     def jam(self, index: int, on: bool) -> None:
-        """Block a shaft at its angle, or release it."""
+        """Block a shaft at its present angle, or release it."""
         _, plant, place = self._place_of[index]
         plant.jam(place, on)
 
     def _hand(self, rows: Rows, plant: Plant) -> None:
-        """Copy the shafts to a plant, because they may have been changed in the common arrays."""
+        """Copy the shafts' state to a plant before its step, because the common arrays may have been
+        changed."""
         plant.angle[:] = self.angle[rows]
         plant.velocity[:] = self.velocity[rows]
 
@@ -176,13 +179,13 @@ class SeveralPlants:
 
 
 def combine_plants(joints: Sequence[PlantJoint], parts: Sequence[Part]) -> Plant:
-    """Return the common plant of these parts; rows are in the order of the joints."""
+    """Return one plant that consists of these parts, with the shafts in the order of the joints."""
     rows, plant = parts[0]
     return plant if [*rows] == [*range(len(joints))] else SeveralPlants(joints, parts)
 
 
 class Stribecks:
-    """Additional friction of joints near standstill."""
+    """Additional friction near standstill (Stribeck effect) of several joints at once."""
 
     def __init__(self, joints: Sequence[PlantJoint]) -> None:
         parts = [joint.motor.stribeck or Stribeck(0.0, 1.0) for joint in joints]
@@ -191,6 +194,6 @@ class Stribecks:
         self._exponent = np.array([part.exponent for part in parts])
 
     def friction(self, velocity: Floats) -> Floats:
-        """Return the additional friction at some velocities, rad/s, in Nm."""
+        """Return the additional friction of each joint, Nm, at its velocity, rad/s."""
         friction: Floats = self._most * np.exp(-((np.abs(velocity) / self._speed) ** self._exponent))
         return friction

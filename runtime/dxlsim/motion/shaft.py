@@ -1,4 +1,5 @@
-"""Shaft of a simulated servo: commands from its registers, and its motion in registers."""
+"""Shaft of a simulated servo: turns written registers into commands of the mechanics, and motion into
+registers."""
 
 from __future__ import annotations
 
@@ -16,11 +17,12 @@ from dxlsim.registers.memory import Memory
 from dxlsim.simulation_plan import Load
 
 Trajectory = tuple[float, float, float]
-"""Goal, rad of the shaft, and the profile's speed, rad/s, and acceleration, rad/s^2."""
+"""Goal of a move, rad of the shaft, and the profile's speed, rad/s, and acceleration, rad/s^2."""
 
 
 class Shaft(ABC):
-    """Follows written registers and reports the motion; a subclass for each family of registers."""
+    """Shaft of one simulated servo: follows written registers and reports the motion; a subclass for each
+    family of registers."""
 
     items: ClassVar[ShaftItems]
 
@@ -38,14 +40,15 @@ class Shaft(ABC):
 
     @property
     def angle(self) -> float:
-        """Angle of the shaft itself, rad from raw 0, including turns, without Homing Offset and reversal."""
+        """Angle of the shaft at the servo's time, rad from raw 0, including turns, without Homing Offset
+        and reversal."""
         plant, ahead_ns = self.mechanics.plant, self.now_ns - self.mechanics.grid_ns
         angle: float = plant.angle.item(self.index)
         return angle + plant.velocity.item(self.index) * ahead_ns * 1e-9 if ahead_ns > 0 else angle
 
     @property
     def velocity(self) -> float:
-        """Speed, rad/s, counter-clockwise positive."""
+        """Speed of the shaft, rad/s, counter-clockwise positive."""
         return self.mechanics.plant.velocity.item(self.index)
 
     @property
@@ -60,16 +63,17 @@ class Shaft(ABC):
 
     @property
     def moving(self) -> bool:
-        """True while its trajectory moves, or while its speed exceeds the threshold."""
+        """True while the shaft's trajectory moves, or while its speed exceeds the threshold."""
         return self._under_way or abs(self.velocity) > self._noticed_speed
 
     @property
     def torque_on(self) -> bool:
-        """True if the motor holds or moves the shaft: torque is enabled and its limit is not 0."""
+        """True if the motor holds or moves the shaft: torque is enabled and Torque Limit is not 0."""
         return self.memory.get("torque_enable") == 1 and self.memory.get("torque_limit", 1) > 0
 
     def recount(self, angle: float) -> None:
-        """Stop the shaft at its position, and count its angle in another turn."""
+        """Stop the shaft where it is, and change its count of turns so that its angle becomes `angle`,
+        rad."""
         self.mechanics.recount(self.index, angle)
         self._forget()
 
@@ -79,14 +83,15 @@ class Shaft(ABC):
         self._goes_to_goal = False
 
     def advance(self, now_ns: int) -> None:
-        """Advance to a time; an earlier time is ignored."""
+        """Advance the shaft's time and the mechanics to `now_ns`; an earlier time is ignored."""
         if now_ns > self.now_ns:
             self.now_ns = now_ns
             if now_ns - self.mechanics.grid_ns >= STEP_NS:
                 self.mechanics.advance(now_ns)
 
     def plan(self, written: Iterable[str]) -> None:
-        """Command the written registers, if they differ from the last command."""
+        """Command the motion that the registers ask for after these were written, unless it is the last
+        command."""
         if self.items.aims.isdisjoint(written) and self.items.others.isdisjoint(written):
             return
         if self._goes_to_goal and self.items.aims.issuperset(written):
@@ -109,9 +114,8 @@ class Shaft(ABC):
     def _act(self, action: Callable[[], None]) -> None:
         """Schedule an action on the mechanics after the response delay, at the next grid point.
 
-        It is up to a step late, half a step on average. That compensates the lead of a plant, which updates
-        its velocity first.
-        """
+        It is up to a step late, half a step on average. That compensates the lead of a plant, which
+        updates its velocity first."""
         withdrawn = self._withdrawn
 
         def act() -> None:
@@ -121,25 +125,27 @@ class Shaft(ABC):
         self.mechanics.call_at(self.now_ns + self.response_delay_ns, act)
 
     def power_up(self) -> None:
-        """Come to rest within one turn, with the angle as the goal [i]."""
+        """Stop the shaft and count its angle within one turn, as a servo does at power-up; the goal
+        becomes that angle [i]."""
         self.recount(self.within_a_turn(self.angle))
         self.memory["goal_position"] = self.position_tick(self.angle)
 
     @abstractmethod
     def within_a_turn(self, angle: float) -> float:
-        """Return the angle that the servo detects at power-up."""
+        """Return the angle, rad, that the servo shows after power-up, when it has lost its count of turns."""
 
     @abstractmethod
     def position_tick(self, angle: float) -> int:
-        """Return Present Position."""
+        """Return the value of Present Position for an angle of the shaft, rad."""
 
     @abstractmethod
     def live(self) -> Mapping[str, Callable[[], int]]:
-        """Return the items of the motion, each with a function for its current value in ticks."""
+        """Return the items that show the motion, each with a function for its present value."""
 
     @abstractmethod
     def _command(self) -> ServoCommand:
-        """Return the command of the registers while torque is on, without the trajectory to a goal."""
+        """Return the controller's command from the registers while torque is on, without the trajectory to
+        a goal."""
 
     @property
     @abstractmethod
@@ -151,7 +157,8 @@ class Shaft(ABC):
 
     @abstractmethod
     def _new_trajectory(self, *, afresh: bool = False) -> Trajectory | None:
-        """Return the trajectory of the registers, or None if it has not changed."""
+        """Return the trajectory that the registers ask for, or None if it has not changed; `afresh`:
+        return it in any case."""
 
     @property
     def _under_way(self) -> bool:
@@ -159,15 +166,14 @@ class Shaft(ABC):
 
 
 def in_turn(angle: float) -> float:
-    """Return the same direction between 0 and a whole turn."""
+    """Return the angle, rad, plus or minus whole turns, between 0 and a whole turn."""
     return angle if 0 <= angle < math.tau else angle % math.tau
 
 
 def critical_d(p: float, motor: Motor) -> float:
     """Return the D gain, duty per rad/s, with which a P gain, duty per rad, does not overshoot.
 
-    With the motor's time constant T, and w its stall torque over damping, the loop is T x'' + (1 + D w) x' +
-    P w x = 0.
-    """
+    With the motor's time constant T, and w its stall torque over damping, the loop is T x'' + (1 + D w) x'
+    + P w x = 0."""
     speed = motor.stall_torque / motor.damping
     return max(0.0, 2 * math.sqrt(p * speed * motor.time_constant) - 1.0) / speed

@@ -1,4 +1,3 @@
-"""Registers: memory of a simulated servo or device, and the rules for rejected writes.
+"""Registers: memory of a simulated servo or device, and the rules by which it rejects writes.
 
-Names, addresses and units come from the control tables.
-"""
+Names, addresses and units come from the control tables."""

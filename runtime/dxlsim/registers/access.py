@@ -1,8 +1,7 @@
-"""Access rules: writes that a simulated servo or device rejects, and their errors; `[i]` marks inferred
+"""Access rules: which writes a simulated servo or device rejects, and with which error; `[i]` marks inferred
 rules.
 
-A write is rejected as a whole [i]. The table `access.toml` has the special items of servos.
-"""
+A write is rejected as a whole [i]. The table `access.toml` has the special items of servos."""
 
 from __future__ import annotations
 
@@ -20,7 +19,8 @@ from dxlsim.wire.protocol2 import ErrorNumber
 from dxlwire.control_table import SIGN_BIT, ControlItem, ControlTable
 
 ErrorOf = Callable[[Memory, ControlItem, int], int]
-"""Returns the error for a value of an item (signed if the item is); 0: the value is accepted."""
+"""Returns the error with which a value of an item (signed if the item is) is rejected; 0: the value is
+accepted."""
 
 _TURNS = 256
 """Range of extended position control in either direction, revolutions (e-Manual, X series, Goal Position
@@ -33,7 +33,7 @@ TORQUE_ENABLE_OF_P = 512  # Address of Torque Enable on P, PRO(A), RH-P12-RN(A) 
 
 
 class ShaftItems(msgspec.Struct, frozen=True):
-    """Items whose writes may change the motion of one kind of shaft."""
+    """Items whose writes may change the motion of one kind of shaft: `aims` only the goal, `others` more."""
 
     aims: frozenset[str]
     others: frozenset[str]
@@ -72,7 +72,7 @@ ACCESS = msgspec.convert(tomllib.loads(Path(__file__).with_suffix(".toml").read_
 
 @unique
 class OperatingMode(IntEnum):
-    """Operating Mode (11); the position limits apply in POSITION."""
+    """Values of Operating Mode (11); the position limits apply in POSITION."""
 
     CURRENT = 0
     VELOCITY = 1
@@ -83,12 +83,11 @@ class OperatingMode(IntEnum):
 
 
 def refusal(memory: Memory, run: Run, error_of: ErrorOf) -> int:
-    """Return the error for a write, or 0 if it is accepted.
+    """Return the error with which a servo or device rejects a write, or 0 if it accepts the write.
 
-    Protocol 1.0: the error bits of all its items; a cell without an item is a range error [i]. Protocol 2.0:
-    the first error; the EEPROM is locked while torque is on, and a write of an incomplete item is a length
-    error (e-Manual, Protocol 2.0, "Error": Data Length Error).
-    """
+    Protocol 1.0: the error bits of all its items; a cell without an item is a range error [i]. Protocol
+    2.0: the first error; the EEPROM is locked while torque is on, and a write of an incomplete item is a
+    length error (e-Manual, Protocol 2.0, "Error": Data Length Error)."""
     cells = run.cells
     errors = (error_of(memory, item, signed(item, run.after[item.name])) for item in cells.items)
     if memory.table.protocol == 1.0:
@@ -102,20 +101,21 @@ def refusal(memory: Memory, run: Run, error_of: ErrorOf) -> int:
 
 
 def device_error(memory: Memory, item: ControlItem, value: int) -> int:
-    """Return the error for a value of a device's item: a range error outside its range."""
+    """Return the error with which a device rejects a value: a range error outside the item's range; 0:
+    accepted."""
     taken = item.access == "RW" and item.minimum <= value <= item.maximum
     return 0 if taken else ErrorBit.RANGE if memory.table.protocol == 1.0 else ErrorNumber.DATA_RANGE
 
 
 def lock_error(memory: Memory, item: ControlItem, value: int) -> int:
-    """Return the error for a value in Protocol 1.0, where Lock (47) locks the EEPROM until a power cycle.
+    """Return the error with which a servo of Protocol 1.0 rejects a value; 0: accepted. Lock (47) locks the
+    EEPROM until a power cycle.
 
     A read-only item, a locked item and a value out of range are range errors [i]; a goal outside the angle
     limits is an angle limit error (e-Manual, Goal Position (30)).
 
-    A Moving Speed with a direction bit is accepted in joint mode too [i]. The manual only has "0 ~ 1,023 can
-    be used", but pypot writes the bit to every motor with `orientation: indirect`, and Poppy moves.
-    """
+    A Moving Speed with a direction bit is accepted in joint mode too [i]. The manual only has "0 ~ 1,023
+    can be used", but pypot writes the bit to every motor with `orientation: indirect`, and Poppy moves."""
     if item.name == "goal_position" and multi_turn_mode(memory):  # Counts turns, in two's complement
         return ErrorBit.RANGE if abs(value - (value >> 15 << 16)) > _MULTI_TURN_GOAL else 0
     locked = memory.get("lock") == 1 and (not value if item.name == "lock" else item.area == "EEPROM")
@@ -128,7 +128,8 @@ def lock_error(memory: Memory, item: ControlItem, value: int) -> int:
 
 
 def torque_error(memory: Memory, item: ControlItem, value: int) -> int:
-    """Return the error for a value in Protocol 2.0."""
+    """Return the error with which a servo of Protocol 2.0 rejects a value for its range or the servo's
+    limits; 0: accepted."""
     name, table = item.name, memory.table
     one_turn = name == "goal_position" and _one_turn(memory)
     lowest, highest = item.minimum, item.maximum
@@ -162,14 +163,16 @@ def _outside_angle_limits(memory: Memory, item: ControlItem, value: int) -> bool
 
 
 def _one_turn(memory: Memory) -> bool:
-    """Return True if the goal stays within a turn, because of the operating mode or of a gripper's travel."""
+    """Return True if goal positions are within one turn, because of the operating mode or of a gripper's
+    travel."""
     goal = memory.table.items["goal_position"]
     has_one = (goal.maximum - goal.minimum + 1) * memory.table.rad_per_tick < 0.99 * math.tau
     return has_one or memory.get("operating_mode", OperatingMode.POSITION) == OperatingMode.POSITION
 
 
 def watchdog_expired(memory: Memory) -> bool:
-    """Return True if Bus Watchdog (98) has expired: its value is then -1, which a host cannot write."""
+    """Return True if the Bus Watchdog (98) has stopped the servo: its value is then -1, which a host
+    cannot write."""
     item = memory.table.items.get("bus_watchdog")
     return item is not None and memory["bus_watchdog"] > item.maximum
 
@@ -177,8 +180,7 @@ def watchdog_expired(memory: Memory) -> bool:
 def wheel_mode(memory: Memory) -> bool:
     """Return True if a servo with angle limits is in wheel mode (e-Manual, CW/CCW Angle Limit (6, 8)).
 
-    Both limits are 0; on the XL-320, Control Mode (11) is 1.
-    """
+    Both limits are 0; on the XL-320, Control Mode (11) is 1."""
     if "control_mode" in memory:
         return memory["control_mode"] == 1
     return memory.get("cw_angle_limit") == 0 and memory.get("ccw_angle_limit") == 0

@@ -1,4 +1,5 @@
-"""Memory of a simulated servo: the control items of its table as bytes and as integers on the wire."""
+"""Memory of a simulated servo or device: the registers of its control table as bytes and as integers on
+the wire."""
 
 from __future__ import annotations
 
@@ -16,7 +17,7 @@ range."""
 
 
 class Cells(NamedTuple):
-    """Properties of a range of cells."""
+    """Properties of a range of cells, the bytes of a memory."""
 
     items: tuple[ControlItem, ...]  # Their items; empty if a cell belongs to no item
     names: frozenset[str]
@@ -26,11 +27,11 @@ class Cells(NamedTuple):
     read_only: bool  # True if at least one item is read-only
     eeprom: bool  # True if at least one item is in the EEPROM area
     live: tuple[tuple[str, Callable[[], int]], ...]
-    """Names of the live items, with the functions that return their current values."""
+    """Names of the live items in the range, with the functions that return their present values."""
 
 
 class Run(NamedTuple):
-    """Bytes for a range of cells."""
+    """Part of a write: bytes for a range of cells, with the values of the items after the write."""
 
     address: int
     data: bytes
@@ -39,16 +40,16 @@ class Run(NamedTuple):
 
 
 class Memory:
-    """Bytes of a control table; `memory[name]` is the integer on the wire, never negative.
+    """Registers of a simulated unit as bytes; `memory[name]` is the integer on the wire, never negative.
 
-    Cells of Indirect Data are aliases of the cells at the addresses in the Indirect Addresses.
-    """
+    Cells of Indirect Data are aliases of the cells at the addresses in the Indirect Addresses."""
 
     def __init__(self, table: ControlTable, firmware: int) -> None:
         self.table = table = table.with_firmware(firmware)
         self.firmware = firmware
         self.has_gaps = True
-        """False if cells without any item are unreadable."""
+        """True if addresses between items can be read, as 0; False if cells without any item are
+        unreadable."""
         self.size = table.size  # Bytes from address 0 to the end of the last item
         self._memory = bytearray(self.size)
         # Same content as the bytes, for speed: reads are far more frequent than writes
@@ -66,7 +67,7 @@ class Memory:
         self.restore_factory_values()
 
     def restore_factory_values(self, keep: tuple[str, ...] = ()) -> None:
-        """Reset every item except `keep` to its initial value, or to 0 without one."""
+        """Reset every item except `keep` to its initial value, or to 0 without one, as by a factory reset."""
         self.reset(name for name in self.table.items if name not in keep)
         self["model_number"] = self.table.model_number
         self["firmware_version"] = self.firmware
@@ -76,7 +77,7 @@ class Memory:
         self.reset(name for name, item in self.table.items.items() if item.area == "RAM")
 
     def reset(self, names: Iterable[str]) -> None:
-        """Reset items to their initial values; names that the model lacks are ignored."""
+        """Reset these items to their initial values; names that the model lacks are ignored."""
         for name in names:
             if (item := self.table.items.get(name)) is not None:
                 initial = max(0, item.minimum) if item.access == "RW" else 0
@@ -99,7 +100,7 @@ class Memory:
             self._notify((name,))
 
     def watch(self, names: Iterable[str], act: Callable[[], None]) -> None:
-        """Call `act` now, and after each change of one of the items, possibly also without a change."""
+        """Call `act` now, and whenever one of these items is changed, possibly also without a change."""
         for name in names:
             self._watchers.setdefault(name, []).append(act)
         act()
@@ -109,45 +110,45 @@ class Memory:
             act()
 
     def get(self, name: str, otherwise: int = 0) -> int:
-        """Return the integer of an item, or `otherwise` if the model lacks the item."""
+        """Return the integer of an item on the wire, or `otherwise` if the model lacks the item."""
         return self._values.get(name, otherwise)
 
     def show(self, name: str, wire: int) -> None:
-        """Set an item if the model has it; the value is clamped to the range of its bytes."""
+        """Set an item from inside the unit, if the model has it; the value is clamped to the range of its
+        bytes."""
         if name in self._places:
             *_, lowest, highest = self._places[name]
             self[name] = lowest if wire < lowest else min(wire, highest)
 
     def show_live(self, live: Mapping[str, Callable[[], int]]) -> None:
-        """Let functions provide the values of items; they are called only when the items are read."""
+        """Make items live: functions provide their values, and are called only when the items are read."""
         self._live = {name: show for name, show in live.items() if name in self}
         self._cells_at.clear()
 
     def show_no_more(self, name: str) -> None:
-        """Make a live item keep its current value."""
+        """End the function of a live item, which keeps its present value."""
         self._live.pop(name, None)
         self._cells_at.clear()
 
     def refresh(self) -> None:
-        """Update all live items."""
+        """Set all live items to their present values."""
         for name, show in self._live.items():
             self.show(name, show())
 
     def ticks(self, name: str) -> int:
-        """Return the signed number of ticks of an item."""
+        """Return the value of an item as a signed number of ticks."""
         item = self.table.items[name]
         return item.decode(self.data(name)) if item.encoding == "sign_magnitude" else signed(item, self[name])
 
     def data(self, name: str) -> bytes:
-        """Return the bytes of an item."""
+        """Return the bytes of an item as they are stored."""
         item = self.table.items[name]
         return bytes(self._memory[item.address : item.address + item.size])
 
     def read(self, address: int, length: int) -> bytes | None:
-        """Return the current bytes of a range, or None if it is unreadable.
+        """Return the present bytes of a range as a host reads them, or None if the range is unreadable.
 
-        Cells between items are 0, and so are targets of Indirect Addresses beyond the table [i].
-        """
+        Cells between items are 0, and so are targets of Indirect Addresses beyond the table [i]."""
         if length < 1 or address + length > self.size:
             return None
         cells = self.cells(address, length)
@@ -168,7 +169,8 @@ class Memory:
         return bytes(self._memory[address : address + length]).ljust(length, b"\0")
 
     def runs(self, address: int, data: bytes) -> tuple[Run, ...]:
-        """Return the actual targets of a write: the given cells, or the targets of Indirect Data."""
+        """Return the parts of a write at their actual addresses: the given cells, or the targets of
+        Indirect Data."""
         cells = self.cells(address, len(data))
         if cells.direct:
             return (self._run(address, data, cells),)
@@ -178,7 +180,8 @@ class Memory:
         )
 
     def places(self, address: int, length: int) -> list[tuple[int, int, int]]:
-        """Return the actual location of cells as runs: target address, first index, end index."""
+        """Return the actual locations of a range, resolved through Indirect Data: (target address, first
+        index, end index) of each part."""
         places: list[tuple[int, int, int]] = []
         for index in range(length):
             name = self._indirect.get(address + index)
@@ -234,7 +237,7 @@ class Memory:
         return Run(address, data, cells, after)
 
     def write(self, run: Run) -> None:
-        """Write bytes that have been accepted."""
+        """Store one part of a write that has been accepted, and call the watchers of its items."""
         start, end = run.address, run.address + len(run.data)
         if self._memory[start:end] != run.data:
             self._memory[start:end] = run.data
@@ -244,12 +247,13 @@ class Memory:
 
 
 def signed(item: ControlItem, wire: int) -> int:
-    """Return the integer of an item with its sign, if it is in two's complement."""
+    """Return an integer on the wire with its sign, if the item is in two's complement."""
     return wire - (wire >> 8 * item.size - 1 << 8 * item.size) if item.signed else wire
 
 
 def _place(item: ControlItem) -> tuple[int, int, int, int, int]:
-    """Return start and end of an item, its bit mask, and the range of its bytes."""
+    """Return (start, end, bit mask, lowest, highest) of an item: its addresses, and the range of its
+    bytes."""
     bits = 8 * item.size - item.signed
     lowest = -1 << bits if item.signed else 0
     return item.address, item.address + item.size, (1 << 8 * item.size) - 1, lowest, (1 << bits) - 1

@@ -1,4 +1,5 @@
-"""Host protocols: objects that send requests to a server, and that receive its progress."""
+"""Host protocols: interfaces of the program that sends requests to a server of simulated buses, and that
+receives its progress."""
 
 from __future__ import annotations
 
@@ -12,39 +13,39 @@ ENDLESS_NS = 1 << 62
 
 
 class Starter(Protocol):
-    """Program that started a server, possibly in another thread or process."""
+    """Program that started a server of simulated buses, possibly in another thread or process."""
 
     closed: bool
-    """True after its last request: the server ends."""
+    """True after the program's last request: the server then ends."""
 
     def fileno(self) -> int:
         """Return a descriptor that is readable after a request, and writable while messages are accepted."""
 
     def receive(self) -> Sequence[Request]:
-        """Return the new requests; called when the descriptor is readable."""
+        """Return the new requests of the program; called when the descriptor is readable."""
 
     def send(self, message: SimulationMessage) -> None:
         """Send a message to the program; never raises."""
 
 
 class LineProgress(Protocol):
-    """Receiver of the progress on one line. Times are CLOCK_MONOTONIC, ns."""
+    """Receiver of the server's progress on one line. Times are CLOCK_MONOTONIC, ns."""
 
     def serve(self, until_ns: int) -> None:
         """Publish that all bytes due to the host before `until_ns` have been delivered."""
 
     def take(self, off_wire_ns: int) -> None:
-        """Publish the time at which the newest byte received from the host is off the wire."""
+        """Publish the time at which the newest byte received from the host is off the simulated wire."""
 
     def give(self, due_ns: int, now_ns: int) -> None:
-        """Publish that bytes are delivered at `now_ns` that were due at `due_ns`."""
+        """Publish that bytes which were due at `due_ns` are delivered to the host at `now_ns`."""
 
 
 class Progress(Protocol):
-    """Receiver of the server's progress, for hosts that distinguish a late server from a silent servo."""
+    """Receiver of the server's progress, so that a host can distinguish a late server from a silent servo."""
 
     def note_stall(self, begin_ns: int, end_ns: int) -> None:
-        """Publish an interval in which the server was runnable but had no core."""
+        """Publish an interval in which the server was ready to run but had no processor core."""
 
     def line(self, index: int) -> LineProgress:
-        """Return the progress on one line."""
+        """Return the receiver of the progress on one line, by its index."""

@@ -1,4 +1,4 @@
-"""Pseudo-terminal of a simulated bus: a host opens it like the port of an adapter."""
+"""Pseudo-terminal: terminal of a simulated bus, which a host opens like the port of an adapter."""
 
 from __future__ import annotations
 
@@ -14,9 +14,11 @@ from pathlib import Path
 from dxlsim.bus.simulated_bus import SimulatedBus
 
 _TCGETS2, _TCSETS2 = 0x802C542A, 0x402C542B
-"""Terminal settings with a numeric rate (Linux, asm-generic/ioctls.h): they support every rate."""
+"""Requests for terminal settings with a numeric rate (Linux, asm-generic/ioctls.h): they support every
+rate."""
 _SETTINGS = struct.Struct("4I20s2I")
-"""struct termios2 (asm-generic/termbits.h): flags of input, output, control, local; line; both rates."""
+"""Layout of struct termios2 (asm-generic/termbits.h): flags of input, output, control, local; line; both
+rates."""
 _ROOM = bytes(_SETTINGS.size)
 _CBAUD, _BOTHER = 0o010017, 0o010000
 _CHUNK = 4096
@@ -24,16 +26,15 @@ _CHUNK = 4096
 
 
 class PseudoTerminal:
-    """Master's end of a terminal that hosts open and close. No slave is open here, because programs check for
-    other users of a port.
+    """Simulation's end (master) of a terminal whose other end (slave) hosts open and close. No slave is open
+    here, because programs check for other users of a port.
 
     A terminal starts with the rate of the bus. A host that sets another rate sends at that rate, and servos
     at the old rate receive nothing.
 
     Difference from a USB adapter [i]: a host that flushes its output right after writing
-    (`tcflush(TCOFLUSH)`, pyserial's `reset_output_buffer`) loses the bytes that the kernel has not delivered
-    yet. pypot 5.0 does so before each packet.
-    """
+    (`tcflush(TCOFLUSH)`, pyserial's `reset_output_buffer`) loses the bytes that the kernel has not
+    delivered yet. pypot 5.0 does so before each packet."""
 
     def __init__(self, bus: SimulatedBus, link: DeviceLink | None = None) -> None:
         self.bus = bus
@@ -48,7 +49,7 @@ class PseudoTerminal:
 
     @property
     def path(self) -> str:
-        """Path of the device for hosts; empty while the adapter is unplugged."""
+        """Path of the device that hosts open; empty while the adapter is unplugged."""
         return self._name if self.plugged else ""
 
     def fileno(self) -> int:
@@ -56,11 +57,10 @@ class PseudoTerminal:
         return self._master
 
     def follow_adapter(self) -> bool:
-        """Close and reopen the terminal with the adapter of the bus; return True if the device has changed.
+        """Unplug or plug in the terminal like the adapter of the bus; return True if the device has changed.
 
-        The new device has another name, as with udev, because a host may still hold the old one; the link is
-        updated. Bytes that the host wrote in between are lost.
-        """
+        The new device has another name, as with udev, because a host may still hold the old one; the link
+        is updated. Bytes that the host wrote in between are lost."""
         if self._times_unplugged == self.bus.times_unplugged and self.plugged == self.bus.plugged:
             return False
         self._taken = b""
@@ -80,7 +80,7 @@ class PseudoTerminal:
         return True
 
     def read(self) -> None:
-        """Read one chunk of the host's bytes."""
+        """Read one chunk of bytes that the host has written, and keep it for `receive`."""
         data = b""
         with suppress(OSError):  # No data, or no host
             data = os.read(self._master, _CHUNK)
@@ -88,7 +88,7 @@ class PseudoTerminal:
         self.may_have_more = len(data) == _CHUNK
 
     def receive(self, now_ns: int) -> int:
-        """Pass the bytes that were read to the bus, with the write time `now_ns`.
+        """Pass the bytes that were read to the bus, as written at `now_ns`, with the host's baud rate.
 
         Returns:
             The number of bytes.
@@ -106,7 +106,8 @@ class PseudoTerminal:
         return len(data)
 
     def deliver(self, now_ns: int, announce: Callable[[int], None] | None = None) -> None:
-        """Write the due bytes to the host; bytes that do not fit into the terminal are lost.
+        """Write the bytes of the bus that are due to the host; bytes that do not fit into the terminal are
+        lost.
 
         Args:
             now_ns: Time up to which bytes are due.
@@ -131,7 +132,8 @@ class PseudoTerminal:
         self._unpublish()
 
     def _new_pair(self) -> tuple[int, str]:
-        """Return the descriptor of the master and the path of the slave, which keeps its settings."""
+        """Return the descriptor of a new terminal's master and the path of its slave, which is raw and has
+        the rate of the bus."""
         master, slave = os.openpty()
         tty.setraw(slave)
         _set_rate(slave, self.bus.baud_rate)
@@ -151,14 +153,14 @@ class PseudoTerminal:
 
 
 class DeviceLink:
-    """Symbolic link with a changing target; never replaces anything but a link."""
+    """Symbolic link that follows a device whose name changes; it never replaces anything but a link."""
 
     def __init__(self, path: Path) -> None:
         self._path = path
         self._target: str | None = None
 
     def point(self, target: str) -> None:
-        """Point the link at `target` atomically.
+        """Point the link at the path `target`, atomically.
 
         Raises:
             FileExistsError: The path is not a link.

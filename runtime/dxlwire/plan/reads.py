@@ -1,4 +1,5 @@
-"""Reads: grouping of a bus's servos and devices into read instructions, by the lowest cost.
+"""Reads: decides which servos and devices of a bus are read by one instruction, by the lowest cost of a
+cycle.
 
 One instruction for several servos saves its own bytes and the adapter's latency for each servo after the
 first. A fast form saves seven bytes of each reply, and the return delays of all servos but the first
@@ -6,8 +7,7 @@ first. A fast form saves seven bytes of each reply, and the return delays of all
 without gaps.
 
 Devices answer after the servos of their read, so that a silent device does not affect the servos' replies.
-The blocks of one device are in different reads, because an instruction must not contain an ID twice.
-"""
+The blocks of one device are in different reads, because an instruction must not contain an ID twice."""
 
 from __future__ import annotations
 
@@ -23,13 +23,14 @@ from dxlwire.plan.line import TIMEOUT_MARGIN_NS, Line
 from dxlwire.transaction import Transaction
 
 CHAIN = MappingProxyType({1.0: "bulk_read", 2.0: "sync_read"})
-"""Protocol -> capability of servos with one layout to answer a single instruction in turn."""
+"""Capability that servos with the same layout need to answer a single instruction in turn, by protocol."""
 TOGETHER = "bulk_read"  # The same capability for servos with different layouts
 FAST = "fast_sync_read"  # Capability to answer with one shared status packet
 
 
 class Reads(NamedTuple):
-    """Grouping of a bus's servos and devices into reads."""
+    """The read instructions of one bus in a cycle: groups of servos and devices, each with its
+    transaction."""
 
     groups: tuple[tuple[int, ...], ...]  # Indices of members; a group of one is a plain read
     fast: tuple[bool, ...]  # True for each group that is read by a fast form
@@ -38,7 +39,7 @@ class Reads(NamedTuple):
 
 
 def state_read(line: Line, members: Sequence[Member], more: int = 0, *, fast: bool = False) -> Transaction:
-    """Return one read of several members, servos first.
+    """Return a transaction that reads the state of several members at once, servos first.
 
     Devices get only a short timeout once the servos have answered.
 
@@ -66,20 +67,22 @@ def state_read(line: Line, members: Sequence[Member], more: int = 0, *, fast: bo
 
 
 def servo_read(line: Line, servo: ServoPlan) -> Transaction:
-    """Return the read of one servo's state."""
+    """Return a transaction that reads position, velocity and effort of one servo."""
     state = servo.state
     return line.read(servo.servo_id, state.address, state.length, state.spare)
 
 
 def slow_items(table: ControlTable) -> tuple[str, ...]:
-    """Return the items that are read between cycles if the robot file names none."""
+    """Return the items of a model, such as temperature and voltage, that are read between cycles if the
+    robot file names none."""
     return tuple(name for name in table.items if name in SLOW_STATES)
 
 
 def choose_reads(
     line: Line, members: Sequence[Member], able: Sequence[Set[str]], goals: Sequence[bytes]
 ) -> Reads:
-    """Return the cheapest grouping of the servos and devices of a bus; among equal ones the simplest.
+    """Return the read instructions of a bus that cost the least time per cycle; among equal ones the
+    simplest.
 
     Args:
         line: Timing of the line.
@@ -106,7 +109,8 @@ def choose_reads(
 
 
 def read_budget(line: Line, reads: Sequence[Transaction], goals: Sequence[bytes]) -> Budget:
-    """Return the cost of one cycle. A sync write has no reply, so it adds no latency (protocol.md)."""
+    """Return bytes and time of one cycle with these reads and goal packets. A sync write has no reply, so
+    it adds no latency (protocol.md)."""
     request_bytes = sum(len(read.packet) for read in reads) + sum(map(len, goals))
     reply_bytes = delays = 0
     for read in reads:
@@ -126,7 +130,8 @@ def read_budget(line: Line, reads: Sequence[Transaction], goals: Sequence[bytes]
 def _partitions(
     line: Line, members: Sequence[Member], able: Sequence[Set[str]]
 ) -> list[tuple[tuple[tuple[int, ...], ...], tuple[bool, ...]]]:
-    """Return the possible groupings, with the groups that use a fast form; the simplest first."""
+    """Return each possible grouping of the members with True for the groups that use a fast form; the
+    simplest first."""
     chain = CHAIN[line.dialect.PROTOCOL]
     alone: list[Hashable] = list(range(len(members)))
     alike: list[Hashable] = [
@@ -156,7 +161,7 @@ def _grouped(keys: Sequence[Hashable]) -> tuple[tuple[int, ...], ...]:
 
 
 def read_by(protocol: float, members: Sequence[Member], reads: Reads) -> str:
-    """Return the e-Manual's names of the instructions of reads: `fast sync read + read`."""
+    """Return the e-Manual's names of the instructions that these reads use: `fast sync read + read`."""
     names: dict[str, None] = {}
     for group, fast in zip(reads.groups, reads.fast, strict=True):
         blocks = {(members[index].address, members[index].length) for index in group}

@@ -1,4 +1,5 @@
-"""Retries and longer timeouts for programs without a deadline: start-up, recovery, tools."""
+"""Retries: repeats transactions and extends timeouts for programs that no cycle waits for: start-up,
+recovery, tools."""
 
 from __future__ import annotations
 
@@ -12,22 +13,25 @@ from dxlwire.wire.dialect import dialect_of
 
 ATTEMPTS = 3
 LONGER_NS = 240_000_000
-"""Extension of the ordinary timeout [i]: hosts, virtual machines and USB adapters stall for tens of ms."""
+"""Longest extension of an ordinary timeout, ns [i]: hosts, virtual machines and USB adapters stall for
+tens of ms."""
 MOST_SILENCE_NS = 960_000_000
-"""Total extension of timeouts for all lost replies: after four losses a servo is not merely late."""
+"""Total extension of timeouts for all lost replies of a program, ns: after four losses a servo is not
+merely late."""
 
 
 class ReplyTimes(msgspec.Struct):
-    """Lateness of the replies on one bus, as `extend_timeouts` observes it."""
+    """Lateness of the replies on one bus, collected by `extend_timeouts`."""
 
     late_ns: list[int] = []
     """Delay of each unambiguous reply after its due time, ns, without the stalls of simulated servos."""
     missing: int = 0
-    """Number of requests without a reply before their extended timeout."""
+    """Number of requests that got no reply before their extended timeout."""
 
 
 def setup_line(plan: BusPlan) -> Line:
-    """Return the line for use before the servos' return delays are known; it assumes the longest delay."""
+    """Return the timing of a bus for use before the servos' return delays are known: it assumes the
+    longest delay."""
     delay_ns = max(plan.return_delay_ns, LONGEST_RETURN_DELAY_NS)
     return Line(plan.baud_rate, plan.latency_ns, delay_ns, dialect_of(plan.protocol))
 
@@ -43,7 +47,7 @@ def retry(transaction: Transaction) -> Program[Reply]:
 
 
 def pause(duration_ns: int) -> Program[None]:
-    """Wait, and receive bytes that still arrive."""
+    """Send nothing for `duration_ns`; bytes that still arrive are received and logged."""
     yield listen(duration_ns)
 
 
@@ -79,7 +83,7 @@ def limit_patience(
 def extend_timeouts(
     program: Program[Result], most_ns: int = LONGER_NS, times: ReplyTimes | None = None
 ) -> Program[Result]:
-    """Run a program of one bus with longer timeouts while few replies are lost.
+    """Run a program of one bus with longer timeouts, until MOST_SILENCE_NS has been spent on lost replies.
 
     A late servo costs only its own delay. A bus without any servo is reported within about two seconds.
 

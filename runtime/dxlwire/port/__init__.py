@@ -1,4 +1,3 @@
-"""Serial ports: opening, locking and reopening, with the latency timer of the adapter.
+"""Serial ports: opening, locking and reopening of lines, and the latency timer of the adapter.
 
-Packets do not belong here: a port carries bytes.
-"""
+Packets do not belong here: a port carries bytes."""

@@ -1,4 +1,4 @@
-"""Adapters: the serial ports of this machine, and programs and settings that may disturb them."""
+"""Adapters: finds the serial ports of this machine, and programs and settings that may disturb them."""
 
 from __future__ import annotations
 
@@ -11,31 +11,34 @@ import msgspec
 ROOT = Path("/")
 USB_PORTS = ("ttyUSB*", "ttyACM*")
 ONBOARD_PORTS = ("ttyAMA*", "ttyTHS*", "ttySC*", "serial0")
-"""UARTs of a Raspberry Pi, a Jetson, an SC16IS7xx on SPI or I2C; serial0 is the Pi's own alias."""
+"""Name patterns of UARTs of a Raspberry Pi, a Jetson, an SC16IS7xx on SPI or I2C; serial0 is the Pi's own
+alias."""
 _BRAILLE = re.compile(r'^ENV\{PRODUCT\}=="(1a86/7523|10c4/ea60)/', re.MULTILINE)
-"""Pattern of a rule that starts brltty for each CH340 or CP210x."""
+"""Pattern of the udev rules that start brltty for each CH340 or CP210x adapter."""
 _RULES = ("etc/udev/rules.d", "usr/lib/udev/rules.d", "lib/udev/rules.d")
 
 
 class Disturbance(msgspec.Struct, frozen=True):
-    """Program or setting on this machine that may take a port, send to it, or suspend it."""
+    """Program or setting on this machine that may open a port, send to it, or suspend it, as texts for a
+    message."""
 
     what: str
     found: str
     why: str
     fix: str
-    """Command that removes the disturbance."""
+    """Shell command that removes the disturbance."""
 
 
 def serial_devices(root: Path = ROOT) -> tuple[str, ...]:
-    """Return the paths of the serial ports of this machine, persistent names first."""
+    """Return the device paths of the serial ports of this machine, persistent names first."""
     folders = [("serial/by-id", "*"), *(("", pattern) for pattern in (*USB_PORTS, *ONBOARD_PORTS))]
     found = (sorted((root / "dev" / folder).glob(pattern)) for folder, pattern in folders)
     return tuple(f"/{path.relative_to(root)}" for paths in found for path in paths)
 
 
 def disturbances(root: Path = ROOT) -> Iterator[Disturbance]:
-    """Yield programs and settings that may disturb the USB adapters of a machine."""
+    """Yield the programs and settings found on this machine that may disturb its USB adapters; `root` is
+    for tests."""
     ports = [path.name for pattern in USB_PORTS for path in sorted((root / "dev").glob(pattern))]
     programs = {_text(path) for path in root.glob("proc/[0-9]*/comm")}
     if ports and "ModemManager" in programs:
@@ -65,7 +68,7 @@ def disturbances(root: Path = ROOT) -> Iterator[Disturbance]:
 
 
 def warnings_for(port: str, root: Path = ROOT) -> Iterator[str]:
-    """Yield a sentence for each disturbance that concerns a port."""
+    """Yield a sentence with the fix for each disturbance that concerns a port."""
     name = (root / port.lstrip("/")).resolve().name
     if any(Path(name).match(pattern) for pattern in USB_PORTS):
         for one in disturbances(root):
@@ -74,7 +77,7 @@ def warnings_for(port: str, root: Path = ROOT) -> Iterator[str]:
 
 
 def _power_control(device: Path) -> Path | None:
-    """Return the file that controls USB autosuspend of a port, or None if it is not on USB."""
+    """Return the file in sysfs that controls USB autosuspend of a port, or None if it is not on USB."""
     place = device.resolve()
     found = (folder for folder in (place, *place.parents) if (folder / "idVendor").is_file())
     usb = next(found, None)

@@ -1,10 +1,9 @@
-"""Latency timer: the delay with which an FTDI adapter holds back the last bytes of a reply, and ways to
-shorten it.
+"""Latency timer: the time for which an FTDI adapter holds back the last bytes of a reply, and ways to shorten
+it.
 
 Sources: FTDI AN232B-04; Linux, drivers/usb/serial/ftdi_sio.c. The driver shows the timer in sysfs and
 shortens it to 1 ms for a program that sets ASYNC_LOW_LATENCY on the open line. Other adapters have no such
-timer.
-"""
+timer."""
 
 from __future__ import annotations
 
@@ -20,40 +19,42 @@ _TIOCGSERIAL, _TIOCSSERIAL, _FLAGS, _ASYNC_LOW_LATENCY = 0x541E, 0x541F, 4, 1 <<
 """Index of `flags` in struct serial_struct (linux/serial.h): the fifth integer."""
 SHIPPED_NS = 16_000_000  # Factory setting of an FTDI adapter's timer (AN232B-04)
 _SEEN_LESS_NS = 4_000_000
-"""Tolerance below the timer [i]: it starts with the reply's first byte or with earlier bytes, so the host may
-observe only the rest of its period."""
+"""Tolerance (ns) below the timer [i]: it starts with the reply's first byte or with earlier bytes, so the
+host may observe only the rest of its period."""
 _SEEN_MORE_NS = 2_000_000  # Tolerance above the timer [i], for a host that reads the bytes late
 
 
 class LatencyTimer(msgspec.Struct, frozen=True):
-    """Latency timer of one adapter."""
+    """Latency timer of one adapter, as found in sysfs."""
 
     found_ms: int
     place: Path  # File of the timer in sysfs
 
     @property
     def fix(self) -> str:
-        """Command that shortens the timer until the adapter is unplugged."""
+        """Shell command that sets the timer to 1 ms until the adapter is unplugged."""
         return fix(str(self.place))
 
 
 def fix(place: str) -> str:
-    """Return the command that sets a timer to its minimum, 1 ms, until the adapter is unplugged."""
+    """Return the shell command that sets the timer in this file to its minimum, 1 ms, until the adapter is
+    unplugged."""
     return f"echo 1 | sudo tee {place}"
 
 
 def is_simulated(port: str) -> bool:
-    """Return True if a port has no real servos: `dxlrun sim` serves its own on a pseudo-terminal."""
+    """Return True if a port has simulated servos: it is `sim`, or a pseudo-terminal, as served by `dxlrun
+    sim`."""
     return port == "sim" or os.path.realpath(port).startswith("/dev/pts/")
 
 
 def is_timer(extra_ns: float) -> bool:
-    """Return True if the lateness of replies suggests an FTDI timer at its factory setting."""
+    """Return True if replies that come this much late suggest an FTDI timer at its factory setting, 16 ms."""
     return SHIPPED_NS - _SEEN_LESS_NS <= extra_ns <= SHIPPED_NS + _SEEN_MORE_NS
 
 
 def timer_ms(place: Path) -> int | None:
-    """Return the value of a timer file, ms, or None if it is unreadable or not a number."""
+    """Return the latency in a timer file, ms, or None if the file is unreadable or contains no number."""
     try:
         return int(place.read_text())
     except (OSError, ValueError):
@@ -61,14 +62,16 @@ def timer_ms(place: Path) -> int | None:
 
 
 def latency_timer(path: str, system: Path = SYSTEM) -> LatencyTimer | None:
-    """Return the timer of the adapter with the device `path`, or None if it has none or may not be read."""
+    """Return the latency timer of the adapter at the device `path`, or None if it has none or the file may
+    not be read."""
     place = system / "bus/usb-serial/devices" / Path(os.path.realpath(path)).name / "latency_timer"
     found = timer_ms(place)
     return None if found is None else LatencyTimer(found, place)
 
 
 def shorten(descriptor: int, path: str, most_ns: int, system: Path = SYSTEM) -> tuple[str, str]:
-    """Shorten the latency timer of an open line if it is longer than `most_ns` and this user may change it.
+    """Shorten the latency timer of an open line's adapter if it is longer than `most_ns` and this user may
+    change it.
 
     Args:
         descriptor: The open line.

@@ -1,4 +1,5 @@
-"""Ports: handles of serial lines, for writes and for reads with a deadline."""
+"""Ports: write to and read from open serial lines without blocking, and wait for bytes on all lines at
+once."""
 
 from __future__ import annotations
 
@@ -18,55 +19,55 @@ from dxlwire.errors import PortError
 _write, _now_ns = os.write, time.monotonic_ns
 
 _WRITE_TIMEOUT_NS = 20_000_000
-"""A goal packet for 50 servos takes 2.6 ms at 1 Mbit/s; a line that blocks for 20 ms is stuck."""
+"""Time after which a line that accepts no bytes counts as stuck, ns: a goal packet for 50 servos takes 2.6
+ms at 1 Mbit/s."""
 
 LONGEST_STALL_NS = 500_000_000
-"""Longest wait for a stalled simulated servo, after which it counts as lost. The shutdown of a run has two
-seconds, and a person notices a robot that stops for half a second."""
+"""Longest wait for a stalled simulated servo, ns, after which it counts as lost. The shutdown of a run has
+two seconds, and a person notices a robot that stops for half a second."""
 _STALL_STEP_NS = 1_000_000  # Interval at which the progress of a stalled process is checked
 _SAME_STALL_NS = 10_000_000  # Waits with a shorter gap than this count as one
 
 Reopened = Callable[[int], int | None]
-"""Requests a new descriptor of a line from the process that opens lines; returns it, or None until it is
-available. Never waits."""
+"""Requests a new descriptor of a lost line, by its index, from the process that opens lines; returns the
+descriptor, or None until it is available. Never waits."""
 
 
 AUTO_SHARE = 0.1
-"""Highest share of a core for reply polling, unless the file sets the polling time."""
+"""Highest share of a processor core for reply polling, unless the robot file sets the polling time."""
 MOST_SHARE = 0.5  # The same if the file sets it
 
 
 class ReplyPolling(msgspec.Struct):
     """Settings of reply polling: the kernel sleeps until shortly before a reply is due, then polls for it.
 
-    On a stock Linux the wake-up of a blocked process costs some 50 us per reply. Polling draws on a credit: a
-    share of the elapsed time, so that it never uses more than that share of a core. Only the exchange kernel
-    polls.
-    """
+    On a stock Linux the wake-up of a blocked process costs some 50 us per reply. Polling draws on a
+    credit: a share of the elapsed time, so that it never uses more than that share of a core. Only the
+    exchange kernel polls."""
 
     longest_ns: int = 1_000_000
-    """Longest polling for one reply; a later reply is late or lost."""
+    """Longest polling for one reply, ns; a reply that comes later is late or lost."""
     share: float = AUTO_SHARE
     margin_ns: int = 60_000
-    """Time before the expected reply at which sleep ends, because sleeps were measured to overshoot."""
+    """Time before the expected reply at which the sleep ends, ns, because sleeps were measured to
+    overshoot."""
 
 
 class Port(Protocol):
-    """One serial line; no method waits.
+    """One serial line, real or simulated, as bytes; no method waits.
 
-    Raises PortError when the adapter is gone.
-    """
+    Raises PortError when the adapter is gone."""
 
     def write(self, data: bytes | bytearray | memoryview) -> None:
         """Write one whole packet to the line."""
         ...
 
     def read_into(self, buffer: memoryview) -> int:
-        """Copy received bytes into `buffer`; return their number, 0 without any."""
+        """Copy received bytes into `buffer`; return their number, 0 if there are none."""
         ...
 
     def failure(self, code: int) -> PortError:
-        """Return the error for a failed write.
+        """Return the exception for a failed write.
 
         Args:
             code: errno of the write, or -1 if the line accepts no more bytes.
@@ -74,7 +75,7 @@ class Port(Protocol):
         ...
 
     def extend_deadline(self, deadline_ns: int, off_wire_ns: int, heard_ns: int, now_ns: int) -> int:
-        """Return the extended deadline of a reply that is incomplete at its deadline.
+        """Return a later deadline for a reply that is incomplete at its deadline.
 
         It is later than `now_ns` only if the device at the other end had no processor, as the process of
         simulated servos may have none. For real servos it is always `deadline_ns`.
@@ -88,11 +89,12 @@ class Port(Protocol):
         ...
 
     def stalled_ns(self, since_ns: int, until_ns: int) -> int:
-        """Return how long the device had no processor between two times, ns; 0 for real servos."""
+        """Return how long the simulated servos had no processor between two times, ns; 0 for real servos."""
         ...
 
     def late_ns(self, off_wire_ns: int, heard_ns: int) -> int:
-        """Return the part of the newest reply's lateness for which the device had no processor.
+        """Return for how long (ns) the newest reply was late because the simulated servos had no
+        processor; 0 for real servos.
 
         Args:
             off_wire_ns: Time at which its request was off the wire.
@@ -102,28 +104,28 @@ class Port(Protocol):
 
 
 class Ports(Protocol):
-    """All lines of a robot, with a common wait."""
+    """All open lines of a robot, with one wait for bytes on any line."""
 
     @property
     def polling(self) -> ReplyPolling | None:
-        """Settings of reply polling; None: no polling."""
+        """Settings of reply polling in the exchange kernel; None: no polling."""
         ...
 
     @property
     def descriptors(self) -> Sequence[int] | None:
-        """File descriptors of the lines; None on virtual time."""
+        """File descriptors of the lines; None for a simulation on virtual time."""
         ...
 
     @property
     def ports(self) -> Sequence[Port]:
-        """The lines, in the order of the plan's buses."""
+        """The open ports, in the order of the plan's buses."""
         ...
 
     def wait(self, deadline_ns: int) -> Sequence[int]:
         """Wait for bytes on any line until `deadline_ns`; return the indices of the readable lines.
 
-        The result is empty after the deadline. On virtual time the wait advances the clock. A deadline in the
-        past only checks the lines.
+        The result is empty after the deadline. On virtual time the wait advances the clock. A deadline in
+        the past only checks the lines.
 
         Args:
             deadline_ns: Time on the run's Clock.
@@ -131,32 +133,33 @@ class Ports(Protocol):
         ...
 
     def reopen(self, index: int) -> bool:
-        """Request a lost line again; return True if its port is replaced in `ports`. Never waits.
+        """Request that a lost line is opened again; return True if it is open, with a new port in `ports`.
+        Never waits.
 
-        From the first call on, the lost line is no longer part of `wait`. The devices on a reopened line were
-        without a host, and possibly without power, so all its servos are treated as rebooted.
-        """
+        From the first call on, the lost line is no longer part of `wait`. The devices on a reopened line
+        were without a host, and possibly without power, so all its servos are treated as rebooted."""
         ...
 
 
 class OwnProcessors:
-    """Mix-in for ports of devices with their own processors, which the host cannot delay."""
+    """Base class for ports of real servos, which have their own processors: the host cannot stall them."""
 
     def extend_deadline(self, deadline_ns: int, off_wire_ns: int, heard_ns: int, now_ns: int) -> int:
-        """Return `deadline_ns`."""
+        """Return `deadline_ns`: a real servo is never waited for any longer."""
         return deadline_ns
 
     def stalled_ns(self, since_ns: int, until_ns: int) -> int:
-        """Return 0."""
+        """Return 0: a real servo is never stalled."""
         return 0
 
     def late_ns(self, off_wire_ns: int, heard_ns: int) -> int:
-        """Return 0."""
+        """Return 0: a real servo is never stalled."""
         return 0
 
 
 class SerialPort(OwnProcessors):
-    """Serial line with a non-blocking descriptor, which another process opened, locked and configured."""
+    """Port on a non-blocking descriptor of a serial line, which another process opened, locked and
+    configured."""
 
     def __init__(self, descriptor: int, name: str) -> None:
         os.set_blocking(descriptor, False)
@@ -165,10 +168,12 @@ class SerialPort(OwnProcessors):
         self._read_into = io.FileIO(descriptor, closefd=False).readinto
         self.name = name  # Device path, for messages
         self.announced = False
-        """True after a wait reported bytes. An empty read then means that the line is lost."""
+        """True after a wait reported this line as readable. An empty read then means that the line is
+        lost."""
 
     def write(self, data: bytes | bytearray | memoryview) -> None:
-        """Write one whole packet to the line. Raises PortError when the adapter is gone."""
+        """Write one whole packet to the line. Raises PortError when the adapter is gone or accepts no
+        bytes."""
         try:
             count = _write(self.descriptor, data)
         except BlockingIOError:
@@ -179,9 +184,8 @@ class SerialPort(OwnProcessors):
             self._write_rest(memoryview(data)[count:])
 
     def _write_rest(self, data: memoryview) -> None:
-        """Wait for room in the output queue. Packets are short, so a queue that stays full belongs to a stuck
-        line.
-        """
+        """Write the rest of a packet when the output queue has room; raise PortError after 20 ms, because
+        only a stuck line stays full."""
         deadline = time.monotonic_ns() + _WRITE_TIMEOUT_NS
         while data:
             left = deadline - time.monotonic_ns()
@@ -196,7 +200,8 @@ class SerialPort(OwnProcessors):
                 raise self._gone(error) from error
 
     def read_into(self, buffer: memoryview) -> int:
-        """Copy received bytes into `buffer`. Raises PortError when the adapter is gone."""
+        """Copy received bytes into `buffer`; return their number. Raises PortError when the adapter is
+        gone."""
         try:
             count = self._read_into(buffer)
         except OSError as error:
@@ -211,7 +216,8 @@ class SerialPort(OwnProcessors):
         return SerialPort(self.descriptor, self.name)
 
     def failure(self, code: int) -> PortError:
-        """Return the error for a failed write, given its errno, or -1 if the line accepts no more bytes."""
+        """Return the exception for a failed write, given its errno, or -1 if the line accepts no more
+        bytes."""
         if code < 0:
             return PortError(f"{self.name} takes no more bytes: is the adapter stuck, or the line held?")
         return self._gone(OSError(code, os.strerror(code)))
@@ -223,7 +229,8 @@ class SerialPort(OwnProcessors):
 
 
 class StallCounter:
-    """Time that replies of simulated servos were awaited after their deadlines, over all lines."""
+    """Counts the time for which stalled simulated servos were awaited after the deadlines of their
+    replies, over all lines."""
 
     __slots__ = ("_until_ns", "times", "waited_ns")
 
@@ -233,7 +240,8 @@ class StallCounter:
         self._until_ns = 0
 
     def count(self, begin_ns: int, end_ns: int) -> None:
-        """Count a wait, without the time already counted for another line; it may extend the previous one."""
+        """Count a wait from `begin_ns` to `end_ns`, without the time already counted for another line; it
+        may extend the previous one."""
         if begin_ns - self._until_ns > _SAME_STALL_NS:
             self.times += 1
             self._until_ns = begin_ns
@@ -242,7 +250,7 @@ class StallCounter:
 
 
 class SimulatingProcess(Protocol):
-    """Process that simulates servos, as seen by their ports."""
+    """Process that simulates servos, as seen by the ports of a run."""
 
     def stalled_ns(self, since_ns: int, until_ns: int) -> int:
         """Return how long the process did not run between two times of CLOCK_MONOTONIC, ns."""
@@ -250,42 +258,43 @@ class SimulatingProcess(Protocol):
 
 
 class LineProgress(Protocol):
-    """Progress of a simulating process on one line; times are CLOCK_MONOTONIC, ns."""
+    """Progress of the simulating process on one line, from memory that it shares; times are
+    CLOCK_MONOTONIC, ns."""
 
     @property
     def process(self) -> SimulatingProcess:
-        """Process that serves the line."""
+        """Process that simulates the servos of the line."""
         ...
 
     @property
     def taken_ns(self) -> int:
-        """Time at which the newest byte received by the process is off the wire. Read this property first."""
+        """Time at which the newest byte that the process has received is off the simulated wire. Read this
+        property first."""
         ...
 
     @property
     def served_ns(self) -> int:
-        """Time up to which all due bytes were sent to the host."""
+        """Time up to which the process has sent the host all bytes that were due."""
         ...
 
     @property
     def given_ns(self) -> int:
-        """Time at which the newest bytes were sent to the host; 0 before the first."""
+        """Time at which the process sent the newest bytes to the host; 0 before the first."""
         ...
 
     @property
     def due_ns(self) -> int:
-        """Time at which the newest bytes were due."""
+        """Time at which the newest bytes that were sent to the host were due."""
         ...
 
 
 class SimulatedPort(SerialPort):
-    """Pseudo-terminal of simulated servos, whose process may have to wait for a core.
+    """Port on a pseudo-terminal of simulated servos, whose process may have to wait for a processor core.
 
-    A reply is awaited beyond its deadline while `progress` shows one of these: the process has not read the
-    request, has not served the line up to the deadline, or has sent bytes that are still in the kernel's
-    buffer. The limit is LONGEST_STALL_NS after the request. The deadline is counted from the time at which
-    the process read the request.
-    """
+    A reply is awaited beyond its deadline while `progress` shows one of these: the process has not read
+    the request, has not served the line up to the deadline, or has sent bytes that are still in the
+    kernel's buffer. The limit is LONGEST_STALL_NS after the request. The deadline is counted from the time
+    at which the process read the request."""
 
     def __init__(self, descriptor: int, name: str, progress: LineProgress, stalls: StallCounter) -> None:
         super().__init__(descriptor, name)
@@ -299,7 +308,8 @@ class SimulatedPort(SerialPort):
         return SimulatedPort(self.descriptor, self.name, self._progress, self._stalls)
 
     def extend_deadline(self, deadline_ns: int, off_wire_ns: int, heard_ns: int, now_ns: int) -> int:
-        """Return the extended deadline of an overdue reply; see `Port.extend_deadline`."""
+        """Return a later deadline for an overdue reply if the simulating process was stalled; see
+        `Port.extend_deadline`."""
         progress = self._progress
         taken_ns, served_ns, given_ns = progress.taken_ns, progress.served_ns, progress.given_ns
         if (taken_ns, served_ns) == self._given_up:
@@ -323,13 +333,14 @@ class SimulatedPort(SerialPort):
         return self._progress.process.stalled_ns(since_ns, until_ns)
 
     def late_ns(self, off_wire_ns: int, heard_ns: int) -> int:
-        """Return the part of the newest reply's lateness for which its process read or sent bytes late."""
+        """Return for how long (ns) the newest reply was late because the simulating process read or sent
+        bytes late."""
         taken_late_ns = max(0, self._progress.taken_ns - off_wire_ns)
         return taken_late_ns + max(0, heard_ns - self._progress.due_ns)
 
 
 class SerialPorts:
-    """The serial lines of a robot on the machine's monotonic time.
+    """The open serial lines of a robot, for a run on the machine's monotonic time; implements `Ports`.
 
     Args:
         ports: The open lines.
@@ -354,18 +365,17 @@ class SerialPorts:
 
     @property
     def ports(self) -> Sequence[SerialPort]:
-        """The lines, in the order of the plan's buses."""
+        """The open ports, in the order of the plan's buses."""
         return self._ports
 
     @property
     def descriptors(self) -> Sequence[int]:
-        """Descriptors of the lines; a reopened line keeps its number."""
+        """File descriptors of the lines; a reopened line keeps its number."""
         return [port.descriptor for port in self._ports]
 
     def wait(self, deadline_ns: int) -> Sequence[int]:
-        """Wait for bytes on any line until `deadline_ns` of CLOCK_MONOTONIC; a past deadline only checks
-        them.
-        """
+        """Wait for bytes on any line until `deadline_ns` of CLOCK_MONOTONIC; return the indices of the
+        readable lines. A past deadline only checks them."""
         left_ns = deadline_ns - _now_ns()
         found: list[tuple[int, int]] = []
         # poll has a resolution of milliseconds, so select waits for the remaining microseconds.
@@ -386,10 +396,9 @@ class SerialPorts:
         return indices
 
     def reopen(self, index: int) -> bool:
-        """Request a lost line again.
+        """Request that a lost line is opened again; return True if it is open.
 
-        Until it is back, its descriptor refers to the null device and keeps its number.
-        """
+        Until then its descriptor refers to the null device and keeps its number."""
         gone = self._ports[index]
         if gone.descriptor in self._waited:
             self._waited.remove(gone.descriptor)
@@ -406,12 +415,14 @@ class SerialPorts:
 
 
 def set_aside(descriptor: int) -> None:
-    """Release a lost line. Its device gets the same name again only if no process has it open."""
+    """Replace a lost line's descriptor by the null device. The device of a replugged adapter gets the same
+    name again only if no process has the old one open."""
     # Opened read-only so that writes fail
     put_in_place(os.open(os.devnull, os.O_RDONLY | os.O_CLOEXEC), descriptor)
 
 
 def put_in_place(new: int, descriptor: int) -> None:
-    """Make `descriptor` refer to the file of `new`, and close `new`. Owners of the number need no update."""
+    """Make `descriptor` refer to the file of `new`, and close `new`. Objects that use the number need no
+    update."""
     os.dup2(new, descriptor, inheritable=False)
     os.close(new)

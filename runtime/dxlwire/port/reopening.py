@@ -1,4 +1,5 @@
-"""Reopening: the process that holds the lines opens a lost line again."""
+"""Reopening: opens the lines of a robot, and opens a lost line again in a thread; used by the process that
+holds the lines."""
 
 from __future__ import annotations
 
@@ -26,12 +27,12 @@ _LASTING = Path("/dev/serial")
 
 
 def lasting_name(path: str, lasting: Path = _LASTING) -> str:
-    """Return the persistent name of the adapter at `path`; empty if a later adapter could get the same name.
+    """Return a path that leads only to the adapter at `path`, also after it was replugged; empty for a
+    pseudo-terminal.
 
-    A link always leads to its adapter. A device such as /dev/ttyUSB0 may belong to another adapter next time,
-    so udev's link by serial number or by position is used if it exists. A pseudo-terminal is gone for good,
-    and the next program may get its name.
-    """
+    A link always leads to its adapter. A device such as /dev/ttyUSB0 may belong to another adapter next
+    time, so udev's link by serial number or by position is used if it exists. A pseudo-terminal is gone
+    for good, and the next program may get its name."""
     if os.path.islink(path):
         return path
     if path.startswith("/dev/pts/"):
@@ -42,7 +43,7 @@ def lasting_name(path: str, lasting: Path = _LASTING) -> str:
 
 
 class Wanted(msgspec.Struct, frozen=True):
-    """Requested properties of a line, from the robot file."""
+    """Device and settings with which a line is opened, from the robot file."""
 
     path: str
     baud_rate: int
@@ -52,7 +53,7 @@ class Wanted(msgspec.Struct, frozen=True):
 
 
 class Opened(msgspec.Struct, frozen=True):
-    """A line that was opened."""
+    """Result of opening one line."""
 
     index: int
     descriptor: int
@@ -63,11 +64,10 @@ class Opened(msgspec.Struct, frozen=True):
 
 
 class KeptLines:
-    """The open lines of a robot. A lost line is reopened, however long that takes.
+    """The open lines of a robot. A lost line is reopened when its adapter is back, however long that takes.
 
-    A descriptor keeps its number while its line is lost and reopened. Each lost line is opened in a thread of
-    its own: a driver may need seconds for it, and the process also has to supervise the loop.
-    """
+    A descriptor keeps its number while its line is lost and reopened. Each lost line is opened in a thread
+    of its own: a driver may need seconds for it, and the process also has to supervise the loop."""
 
     def __init__(
         self,
@@ -75,7 +75,7 @@ class KeptLines:
         system: Path = SYSTEM,
         describe_holder: DescribeProcess = describe_no_process,
     ) -> None:
-        """Open the lines.
+        """Open all lines.
 
         Args:
             lines: The lines.
@@ -110,11 +110,11 @@ class KeptLines:
         self._bell = os.eventfd(0, os.EFD_NONBLOCK | os.EFD_CLOEXEC)
 
     def fileno(self) -> int:
-        """Return a descriptor for select that becomes readable when a line is back."""
+        """Return a descriptor for select that becomes readable when a lost line has been reopened."""
         return self._bell
 
     def lost(self, index: int) -> bool:
-        """Release a lost line and start to reopen it; return False if that is not possible."""
+        """Release a lost line and start a thread that reopens it; return False if that is not possible."""
         set_aside(self.descriptors[index])
         if not self._names[index]:
             return False
@@ -126,7 +126,7 @@ class KeptLines:
         return True
 
     def returned(self) -> list[Opened]:
-        """Return the lines that are back since the last call. They have their old descriptors."""
+        """Return the lines that were reopened since the last call. They have their old descriptors."""
         found: list[Opened] = []
         if select.select([self._bell], [], [], 0)[0]:
             os.eventfd_read(self._bell)
@@ -137,7 +137,7 @@ class KeptLines:
         return found
 
     def close(self) -> None:
-        """Close all lines."""
+        """Unlock and close all lines."""
         let_go(self.descriptors)
         self.descriptors.clear()
 

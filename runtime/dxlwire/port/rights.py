@@ -1,15 +1,17 @@
-"""Rights: commands that give a user access to a port."""
+"""Rights: finds the shell command that gives a user access to a port."""
 
 from __future__ import annotations
 
 from pathlib import Path
 
 _SERIAL_GROUPS = frozenset({"dialout", "uucp", "plugdev"})
-"""Groups that exist for ports. Membership in another group, such as root, grants far more than a port."""
+"""Groups that exist for access to ports. Membership in another group, such as root, grants far more than a
+port."""
 
 
 def serial_group(port: Path) -> str | None:
-    """Return the group of a port if it is one for ports and its members may read and write the port."""
+    """Return the group that owns a port if it is one for serial ports and may read and write the port;
+    otherwise None."""
     try:
         group = port.group()
         return group if group in _SERIAL_GROUPS and port.stat().st_mode & 0o060 == 0o060 else None
@@ -18,7 +20,8 @@ def serial_group(port: Path) -> str | None:
 
 
 def command_for_access(port: Path, shown: str, user: str) -> str:
-    """Return the command that gives a user access to a port; `shown` is the port's path for the user."""
+    """Return the shell command that gives a user access to a port; `shown` is the port's path for the
+    user."""
     group = serial_group(port)
     if group is not None:
         return f"sudo usermod -aG {group} {user}  # then log in again"

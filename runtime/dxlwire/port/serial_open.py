@@ -1,4 +1,5 @@
-"""Opening of a serial line for exclusive use. The guardian opens it, and the loop inherits the descriptor."""
+"""Opening of a serial line for exclusive use, with errors that name cause and fix. The guardian opens it,
+and the loop inherits the descriptor."""
 
 from __future__ import annotations
 
@@ -22,37 +23,38 @@ except ImportError:  # Windows checks only the parameters of sensors and opens n
     fcntl = termios = None  # type: ignore[assignment]  # modules, or none
 
 _RATE_TOLERANCE = 0.02
-"""Tolerance of the baud rate: an 8N1 receiver samples the tenth bit correctly up to 5 %, both ends together
-[i]."""
+"""Tolerated relative difference of a baud rate from the requested one: an 8N1 receiver samples the tenth
+bit correctly up to 5 %, both ends together [i]."""
 _TCGETS2, _TCSETS2, _BOTHER = 0x802C542A, 0x402C542B, 0o010000
-"""Terminal settings with a numeric rate (Linux, asm-generic/ioctls.h): they support every rate."""
+"""Requests and flag for terminal settings with a numeric rate (Linux, asm-generic/ioctls.h): they support
+every rate."""
 _SETTINGS = struct.Struct("4I20s2I")
-"""struct termios2 (asm-generic/termbits.h): flags of input, output, control, local; line; both rates."""
+"""Layout of struct termios2 (asm-generic/termbits.h): flags of input, output, control, local; line; both
+rates."""
 _TIOCSRS485 = 0x542F
 _RS485 = struct.pack("8I", 0b11, *(0,) * 7)
-"""struct serial_rs485 (linux/serial.h): enabled, RTS high during transmission, no delays."""
+"""Content of struct serial_rs485 (linux/serial.h): enabled, RTS high during transmission, no delays."""
 
 DescribeProcess = Callable[[Path], str]
-"""Describes the process of a folder in /proc, and how to stop it; returns an empty text if it is unknown."""
+"""Returns a text about the process with this folder in /proc, and how to stop it; empty if it is unknown."""
 
 
 class SerialLine:
-    """Serial device for exclusive use: raw, 8N1, no flow control.
+    """Serial device that this process has opened and locked for exclusive use: raw, 8N1, no flow control.
 
     The lock belongs to the terminal, and the Linux kernel releases it when the last process closes the
     device. Simulated servos keep their device open for the next program, so `close` releases the lock
     explicitly.
 
-    Linux sets DTR when a port is opened, which resets boards such as an Arduino or an OpenCM. By default it
-    also clears DTR when the port is closed. That is switched off here, so a board resets only once, at the
-    first opening after it was plugged in.
-    """
+    Linux sets DTR when a port is opened, which resets boards such as an Arduino or an OpenCM. By default
+    it also clears DTR when the port is closed. That is switched off here, so a board resets only once, at
+    the first opening after it was plugged in."""
 
     def __init__(self, path: str, baud_rate: int) -> None:
-        """Open and lock the device. Raises OSError."""
+        """Open and lock the device, and set its rate. Raises OSError."""
         self.path = path
         self.baud_rate = 0
-        """Rate that the driver actually set, bit/s."""
+        """Baud rate that the driver actually set, bit/s."""
         # O_NONBLOCK: opening does not wait for a carrier. O_NOCTTY: the line does not become the controlling
         # terminal.
         self._descriptor = os.open(path, os.O_RDWR | os.O_NOCTTY | os.O_NONBLOCK)
@@ -60,7 +62,8 @@ class SerialLine:
             # An advisory lock, which pyserial programs respect
             fcntl.flock(self._descriptor, fcntl.LOCK_EX | fcntl.LOCK_NB)
             self.set_dtr = bool(self._settings()[2] & termios.HUPCL)
-            """True if opening the port has set DTR: the first opening here since it was plugged in."""
+            """True if opening the port has set DTR: the first opening on this machine since it was plugged
+            in."""
             self.set_rate(baud_rate)
             termios.tcflush(self._descriptor, termios.TCIFLUSH)
             # Blocks every other program, except those of root
@@ -76,13 +79,12 @@ class SerialLine:
         self.close()
 
     def fileno(self) -> int:
-        """Return the file descriptor."""
+        """Return the file descriptor of the open device."""
         return self._descriptor
 
     def set_rate(self, baud_rate: int) -> bool:
-        """Set the baud rate, bit/s; return False if the driver's rate differs by more than 2 %. Raises
-        OSError.
-        """
+        """Set the baud rate, bit/s; return False if the rate that the driver set differs by more than 2 %.
+        Raises OSError."""
         # CLOCAL ignores modem lines. Without HUPCL the kernel leaves DTR unchanged on close.
         control = termios.CS8 | termios.CREAD | termios.CLOCAL | _BOTHER
         settings = _SETTINGS.pack(0, 0, control, 0, bytes(20), baud_rate, baud_rate)
@@ -91,12 +93,12 @@ class SerialLine:
         return is_rate(self.baud_rate, baud_rate)
 
     def detach(self) -> int:
-        """Return the descriptor, which the caller then owns; `let_go` closes it."""
+        """Return the descriptor and give up its ownership; the caller closes it with `let_go`."""
         descriptor, self._descriptor = self._descriptor, -1
         return descriptor
 
     def close(self) -> None:
-        """Close the line unless it is closed or detached."""
+        """Unlock and close the device unless it is closed or detached."""
         if self._descriptor >= 0:
             let_go([self.detach()])
 
@@ -106,7 +108,7 @@ class SerialLine:
 
 
 def let_go(descriptors: Iterable[int]) -> None:
-    """Unlock and close detached lines, of this process or of one that has exited."""
+    """Unlock and close descriptors of lines that were detached, by this process or by one that has exited."""
     for descriptor in descriptors:
         with suppress(OSError):  # The adapter is gone, and the lock with it
             fcntl.ioctl(descriptor, termios.TIOCNXCL)
@@ -114,7 +116,7 @@ def let_go(descriptors: Iterable[int]) -> None:
 
 
 def describe_no_process(process: Path) -> str:
-    """Return an empty description; the default of `DescribeProcess`."""
+    """Default of `DescribeProcess`: return an empty text."""
     return ""
 
 
@@ -126,7 +128,7 @@ def open_serial(
     boot_ns: int = 0,
     describe_holder: DescribeProcess = describe_no_process,
 ) -> SerialLine:
-    """Open a serial device for exclusive use: raw, 8N1. A pseudo-terminal works as well.
+    """Open and lock a serial device for exclusive use: raw, 8N1. A pseudo-terminal works as well.
 
     Args:
         path: The device.
@@ -159,12 +161,12 @@ def open_serial(
 
 
 def is_rate(found: int, asked: int) -> bool:
-    """Return True if two baud rates agree within 2 %."""
+    """Return True if the baud rate `found` is within 2 % of `asked`."""
     return abs(found - asked) <= _RATE_TOLERANCE * asked
 
 
 def rate_remark(line: SerialLine, baud_rate: int) -> str:
-    """Return a sentence about a baud rate that the driver did not set as requested; empty otherwise."""
+    """Return a sentence about a baud rate that the driver did not set as requested; empty if it did."""
     if is_rate(line.baud_rate, baud_rate):
         return ""
     error = line.baud_rate / baud_rate - 1.0
@@ -200,11 +202,10 @@ def _what_exists() -> str:
 
 
 def _holder(path: str, describe: DescribeProcess) -> str:
-    """Return the processes that have the device open, and how to stop them.
+    """Return a text that names the processes which have the device open, and how to stop them.
 
-    The first non-empty description is used. Without one, each process is named by its command. Processes of
-    other users may be invisible.
-    """
+    The first non-empty description is used. Without one, each process is named by its command. Processes
+    of other users may be invisible."""
     device = os.path.realpath(path)
     found = [
         process for process in _processes() if process.name != str(os.getpid()) and _has_open(process, device)

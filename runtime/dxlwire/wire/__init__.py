@@ -1,4 +1,3 @@
-"""Packets of both protocols as bytes, and the receiver that finds packets in noise.
+"""Wire: packets of both protocols as bytes, and the receiver that finds packets among noise.
 
-No I/O and no control tables here.
-"""
+No I/O and no control tables here."""

@@ -1,7 +1,5 @@
-"""Dialect: common interface of the two protocols, so that bus, plan and start-up are independent of them.
-
-The modules `protocol1` and `protocol2` are the two dialects.
-"""
+"""Dialect: the functions and constants that the modules `protocol1` and `protocol2` share, so that bus,
+plan and start-up are independent of the protocol."""
 
 from __future__ import annotations
 
@@ -15,7 +13,8 @@ from dxlwire.wire import protocol1, protocol2
 
 
 class Dialect(Protocol):
-    """Packets of one protocol <-> bytes. Pure functions; the modules document their exceptions."""
+    """Functions of a protocol that build and parse packets. They are pure; the modules `protocol1` and
+    `protocol2` document their exceptions."""
 
     PROTOCOL: float
     HEADER: bytes
@@ -29,7 +28,8 @@ class Dialect(Protocol):
     ALERT: int
 
     def size_at(self, buffer: Bytes, start: int, end: int) -> int:
-        """Return the size of the packet with its header at `start`; 0: not known yet, -1: false header."""
+        """Return the size of the packet whose header is at `start`; 0: not known yet, -1: not a real
+        header."""
         ...
 
     def intact(self, packet: memoryview) -> bool:
@@ -37,21 +37,21 @@ class Dialect(Protocol):
         ...
 
     def opened(self, packet: memoryview) -> Status | None:
-        """Parse an intact packet; return None if it cannot be a status."""
+        """Parse an intact packet as a status, the reply of a servo; return None if it cannot be one."""
         ...
 
     def instructs(self, packet: memoryview) -> bool:
-        """Return True if an intact packet parses as an instruction of a host. In Protocol 1.0 a status may,
-        too.
-        """
+        """Return True if an intact packet parses as an instruction of a host. In Protocol 1.0 a status
+        may, too."""
         ...
 
     def refused(self, error: int, length: int, awaited: int) -> bool:
-        """Return True if a status reports that the instruction was not executed."""
+        """Return True if a status with this error and `length` parameters, where `awaited` were expected,
+        reports that the instruction was not executed."""
         ...
 
     def describe_error(self, error: int) -> str:
-        """Return the e-Manual's words for an error byte."""
+        """Return an error byte of a status in the e-Manual's words."""
         ...
 
     def widest(self, length: int) -> int:
@@ -63,31 +63,33 @@ class Dialect(Protocol):
         ...
 
     def ping(self, servo_id: int) -> bytes:
-        """Return the packet that checks the presence of a servo."""
+        """Return the packet that asks a servo for a reply, to check its presence."""
         ...
 
     def read(self, servo_id: int, address: int, length: int) -> bytes:
-        """Return the packet that reads a range of the control table."""
+        """Return the packet that reads `length` bytes of the control table from `address`."""
         ...
 
     def write(self, servo_id: int, address: int, data: bytes) -> bytes:
-        """Return the packet that writes a range of the control table."""
+        """Return the packet that writes `data` into the control table from `address`."""
         ...
 
     def read_many(self, requests: Sequence[tuple[int, int, int]], *, fast: bool = False) -> bytes:
-        """Return a single packet that reads several servos, given ID, address and length for each."""
+        """Return a single packet that reads several servos, given (ID, address, length) for each."""
         ...
 
     def fast_size(self, length: int, count: int) -> int:
-        """Return the size of a fast form's shared status for `count` servos and `length` bytes of data."""
+        """Return the size (bytes) of the status that `count` servos share in a fast read of `length` bytes
+        in total."""
         ...
 
     def fast_answers(self, packet: Bytes, lengths: Sequence[int]) -> list[Status]:
-        """Return the servos' entries in the status of a fast form, up to the first corrupted entry."""
+        """Return the servos' parts of a shared status of a fast read, up to the first corrupted part;
+        `lengths` are the requested bytes."""
         ...
 
     def sync_write(self, address: int, length: int, data: Mapping[int, bytes]) -> bytes:
-        """Return the packet that writes `length` bytes to several servos, by ID."""
+        """Return the packet that writes `length` bytes from `address` to several servos; `data` by ID."""
         ...
 
 
@@ -95,12 +97,13 @@ _DIALECTS: Mapping[float, Dialect] = MappingProxyType({1.0: protocol1, 2.0: prot
 
 
 def dialect_of(protocol: float) -> Dialect:
-    """Return the dialect of Protocol 1.0 or 2.0. Raises LookupError for another one."""
+    """Return the dialect module of Protocol 1.0 or 2.0. Raises LookupError for another one."""
     return _DIALECTS[protocol]
 
 
 def sync_writes(dialect: Dialect, writes: Iterable[tuple[int, int, bytes]]) -> list[bytes]:
-    """Return packets for writes, given ID, address and data for each: one packet per address and length."""
+    """Return sync write packets for writes, given (ID, address, data) for each: one packet per address and
+    length."""
     places: dict[tuple[int, int], dict[int, bytes]] = {}
     for servo_id, address, data in writes:
         places.setdefault((address, len(data)), {})[servo_id] = data

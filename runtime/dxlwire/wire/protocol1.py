@@ -1,9 +1,9 @@
-"""Protocol 1.0 packets as bytes: instructions of a host, replies of a servo; pure functions.
+"""Protocol 1.0: builds and parses packets, instructions of a host and replies of a servo, as bytes; pure
+functions.
 
-Source: ROBOTIS e-Manual, "DYNAMIXEL Protocol 1.0". Instruction `FF FF ID LEN INST P.. CHK`, status `FF FF ID
-LEN ERR P.. CHK`; LEN = parameters + 2; CHK = ~(ID + LEN + INST or ERR + parameters) & FF. A status has no
-mark that distinguishes it from an instruction: an echoed instruction parses as a status.
-"""
+Source: ROBOTIS e-Manual, "DYNAMIXEL Protocol 1.0". Instruction `FF FF ID LEN INST P.. CHK`, status `FF FF
+ID LEN ERR P.. CHK`; LEN = parameters + 2; CHK = ~(ID + LEN + INST or ERR + parameters) & FF. A status has
+no mark that distinguishes it from an instruction: an echoed instruction parses as a status."""
 
 from __future__ import annotations
 
@@ -30,7 +30,7 @@ _MOST_PARAMETERS = 0xFF - 2
 
 @unique
 class Instruction(IntEnum):
-    """Instruction codes of a host (e-Manual, "Instruction Details")."""
+    """Codes of the instructions that a host sends (e-Manual, "Instruction Details")."""
 
     PING = 0x01
     READ = 0x02
@@ -56,7 +56,7 @@ class StatusError(IntFlag):
 
 
 REFUSALS = StatusError.RANGE | StatusError.CHECKSUM | StatusError.INSTRUCTION
-"""Bits of a servo that did not execute the instruction."""
+"""Error bits that mean the servo did not execute the instruction."""
 
 _LENGTHS: Mapping[int, tuple[int, int]] = {
     Instruction.PING: (2, 2),
@@ -87,11 +87,11 @@ def describe_error(error: int) -> str:
 
 
 def refused(error: int, length: int, awaited: int) -> bool:
-    """Return True if a status of `length` parameters, where `awaited` were expected, is a refusal.
+    """Return True if a status of `length` parameters, where `awaited` were expected, reports that the
+    instruction was not executed.
 
-    The error bits describe the state of the servo if data is present. Without data they are the reason of the
-    refusal.
-    """
+    The error bits describe the state of the servo if data is present. Without data they are the reason of
+    the refusal."""
     return length == 0 != awaited and error & REFUSALS != 0
 
 
@@ -101,7 +101,7 @@ def widest(length: int) -> int:
 
 
 def size_at(buffer: Bytes, start: int, end: int) -> int:
-    """Return the size of the packet with its header at `start`; 0: not known yet, -1: false header."""
+    """Return the size of the packet whose header is at `start`; 0: not known yet, -1: not a real header."""
     known = end - start
     if known > 2 and buffer[start + 2] == 0xFF:
         return -1
@@ -117,18 +117,16 @@ def intact(packet: memoryview) -> bool:
 
 
 def opened(packet: memoryview) -> Status | None:
-    """Parse an intact packet; return None for the broadcast ID, which is never in a status.
+    """Parse an intact packet as a status; return None for the broadcast ID, which is never in a status.
 
-    An instruction to one servo parses as a status, too.
-    """
+    An instruction to one servo parses as a status, too."""
     return None if packet[2] == BROADCAST_ID else Status(packet[2], packet[4], packet[5:-1])
 
 
 def instructs(packet: memoryview) -> bool:
     """Return True if an intact packet parses as an instruction of a host, by its code and length.
 
-    A status can have the same bytes: its error byte would then equal the code.
-    """
+    A status can have the same bytes: its error byte would then equal the code."""
     if packet[2] == BROADCAST_ID:
         return True
     least, most = _LENGTHS.get(packet[4], (1, 0))
@@ -148,7 +146,7 @@ def _packet(servo_id: int, kind: int, parameters: bytes) -> bytes:
 
 
 def instruction_packet(servo_id: int, instruction: int, parameters: bytes = b"") -> bytes:
-    """Return an instruction packet.
+    """Return an instruction packet with a code of `Instruction`.
 
     Raises:
         ValueError: `servo_id` is neither 0..253 nor broadcast, or the parameters do not fit.
@@ -164,7 +162,7 @@ def status_packet(servo_id: int, error: int = 0, parameters: bytes = b"") -> byt
 
 
 def ping(servo_id: int) -> bytes:
-    """Return the packet that asks for an empty status."""
+    """Return the packet that asks a servo for an empty status, to check its presence."""
     return instruction_packet(servo_id, Instruction.PING)
 
 
@@ -179,12 +177,12 @@ def write(servo_id: int, address: int, data: bytes) -> bytes:
 
 
 def factory_reset(servo_id: int) -> bytes:
-    """Return the packet that resets the control table to factory values, including ID and baud rate."""
+    """Return the packet that resets a servo's control table to factory values, including ID and baud rate."""
     return instruction_packet(servo_id, Instruction.FACTORY_RESET)
 
 
 def bulk_read(requests: Sequence[tuple[int, int, int]], *, fast: bool = False) -> bytes:
-    """Return the packet that reads two or more MX servos in turn, given ID, address and length for each.
+    """Return the packet that reads two or more MX servos in turn, given (ID, address, length) for each.
 
     Each servo waits for the status of the servo before it, so an absent servo ends the chain.
 
@@ -201,17 +199,18 @@ read_many = bulk_read  # Common name in both dialects
 
 
 def fast_size(length: int, count: int) -> int:
-    """Raise ValueError: only Protocol 2.0 has fast forms."""
+    """Raise ValueError: only Protocol 2.0 has fast reads."""
     raise ValueError(NO_FAST_FORM)
 
 
 def fast_answers(packet: Bytes, lengths: Sequence[int]) -> list[Status]:
-    """Raise ValueError: only Protocol 2.0 has fast forms."""
+    """Raise ValueError: only Protocol 2.0 has fast reads."""
     raise ValueError(NO_FAST_FORM)
 
 
 def sync_write(address: int, length: int, data: Mapping[int, bytes]) -> bytes:
-    """Return the broadcast packet that writes `length` bytes from `address`, by servo ID; it has no reply.
+    """Return the broadcast packet that writes `length` bytes from `address` to several servos, `data` by
+    ID; it has no reply.
 
     Raises:
         ValueError: The data of a servo does not have `length` bytes, or the packet would be too long.

@@ -1,10 +1,10 @@
-"""Protocol 2.0 packets as bytes: instructions of a host, replies of a servo; pure functions.
+"""Protocol 2.0: builds and parses packets, instructions of a host and replies of a servo, as bytes; pure
+functions.
 
-Source: ROBOTIS e-Manual, "DYNAMIXEL Protocol 2.0". Instruction `FF FF FD 00 ID LENL LENH INST P.. CRCL CRCH`;
-a status has INST 55 and an error byte before its parameters. LEN counts everything after itself. From INST to
-the last parameter `FF FF FD` is sent as `FF FF FD FD` (byte stuffing). The CRC covers everything before it,
-including stuffing: CRC-16 of polynomial 8005, not reflected, from 0.
-"""
+Source: ROBOTIS e-Manual, "DYNAMIXEL Protocol 2.0". Instruction `FF FF FD 00 ID LENL LENH INST P.. CRCL
+CRCH`; a status has INST 55 and an error byte before its parameters. LEN counts everything after itself.
+From INST to the last parameter `FF FF FD` is sent as `FF FF FD FD` (byte stuffing). The CRC covers
+everything before it, including stuffing: CRC-16 of polynomial 8005, not reflected, from 0."""
 
 from __future__ import annotations
 
@@ -30,8 +30,8 @@ ID_AT = 4  # Offset of the ID, which is that of the addressed or the answering s
 HIGHEST_ID = 0xFC
 PING_LENGTH = 3  # Parameters of the answer to a ping: model number (2), firmware version (1)
 MOST_GOAL_BYTES = 1024
-"""Limit of a sync write's parameters after address and length: even with stuffing they fit a batch of the
-log."""
+"""Limit of a sync write's parameters after address and length, bytes: even with stuffing they fit a batch
+of the log."""
 STATUS = 0x55
 ALERT = 0x80  # Bit of the error byte: a hardware error, see `ControlTable.errors`; the data is valid
 _MOST_PARAMETERS = 0xFFFF - 3
@@ -42,7 +42,7 @@ _BACKUP = b"\x43\x54\x52\x4c"
 
 @unique
 class Instruction(IntEnum):
-    """Instruction codes of a host (e-Manual, "Instruction")."""
+    """Codes of the instructions that a host sends (e-Manual, "Instruction")."""
 
     PING = 0x01
     READ = 0x02
@@ -63,7 +63,7 @@ class Instruction(IntEnum):
 
 @unique
 class ErrorNumber(IntEnum):
-    """Bits 0..6 of the error byte: reason why the servo did not execute the instruction."""
+    """Bits 0..6 of a status packet's error byte: the reason why the servo did not execute the instruction."""
 
     RESULT_FAIL = 1
     INSTRUCTION = 2
@@ -76,7 +76,7 @@ class ErrorNumber(IntEnum):
 
 @unique
 class Reset(IntEnum):
-    """Scope of a factory reset: the settings that it keeps."""
+    """Scope of a factory reset: the settings of a servo that it keeps."""
 
     ALL = 0xFF
     KEEP_ID = 0x01
@@ -95,7 +95,7 @@ _NUMBERS: Mapping[int, str] = {
 
 
 def describe_error(error: int) -> str:
-    """Return the e-Manual's words for an error byte; `no error` for 0."""
+    """Return an error byte in the e-Manual's words; `no error` for 0."""
     words = []
     if error & ALERT:
         words.append("alert: the servo has a hardware error")
@@ -105,21 +105,22 @@ def describe_error(error: int) -> str:
 
 
 def refused(error: int, length: int, awaited: int) -> bool:
-    """Return True if a status of `length` parameters, where `awaited` were expected, is a refusal.
+    """Return True if a status of `length` parameters, where `awaited` were expected, reports that the
+    instruction was not executed.
 
     An error number is a refusal, and an error reply to a read has no data. The alert bit alone is not a
-    refusal.
-    """
+    refusal."""
     return error & ~ALERT != 0 and length in (0, awaited)
 
 
 def crc(data: Bytes) -> int:
-    """Return the CRC of a packet without its last two bytes (e-Manual, "CRC Calculation")."""
+    """Return the CRC that belongs at the end of a packet, given without its last two bytes (e-Manual, "CRC
+    Calculation")."""
     return crc16.umts(data)
 
 
 def stuffed(body: bytes) -> bytes:
-    """Return the bytes from INST to the last parameter with byte stuffing."""
+    """Return the bytes from INST to the last parameter with byte stuffing, as they are sent."""
     return body.replace(_PATTERN, _STUFFED)
 
 
@@ -129,12 +130,13 @@ def unstuffed(body: bytes) -> bytes:
 
 
 def widest(length: int) -> int:
-    """Return the largest size on the line of a status: one stuffing byte per three of `length` parameters."""
+    """Return the largest size on the line of a status, bytes: one stuffing byte per three of `length`
+    parameters."""
     return OVERHEAD + length + (length + 2) // 3
 
 
 def size_at(buffer: Bytes, start: int, end: int) -> int:
-    """Return the size of the packet with its header at `start`; 0: not known yet, -1: false header."""
+    """Return the size of the packet whose header is at `start`; 0: not known yet, -1: not a real header."""
     known = end - start
     if known > 4 and buffer[start + 4] in (0xFD, 0xFF):
         return -1
@@ -150,10 +152,10 @@ def intact(packet: memoryview) -> bool:
 
 
 def opened(packet: memoryview) -> Status | None:
-    """Parse an intact packet; return None if it is not a status, such as an echoed instruction.
+    """Parse an intact packet as a status; return None if it is not a status, such as an echoed instruction.
 
-    The status of a fast form (from the broadcast ID) has no stuffing: `fast_answers` reads its parameters.
-    """
+    The shared status of a fast read (from the broadcast ID) has no stuffing: `fast_answers` reads its
+    parameters."""
     if packet[7] != STATUS or len(packet) < OVERHEAD:
         return None
     body = bytes(packet[7:-2])
@@ -168,18 +170,18 @@ def instructs(packet: memoryview) -> bool:
 
 
 def fast_size(length: int, count: int) -> int:
-    """Return the size of the shared status of a fast form: `length` bytes of data of `count` servos.
+    """Return the size (bytes) of the status that `count` servos share in a fast read of `length` bytes in
+    total.
 
-    Each entry adds an error byte, an ID and a CRC to its data (e-Manual, "Fast Sync Read (0x8A)").
-    """
+    Each part adds an error byte, an ID and a CRC to its data (e-Manual, "Fast Sync Read (0x8A)")."""
     return 8 + length + 4 * count
 
 
 def fast_answers(packet: Bytes, lengths: Sequence[int]) -> list[Status]:
-    """Return the servos' entries in the status of a fast form, in their order.
+    """Return the servos' parts of the shared status of a fast read, in their order.
 
-    Each entry's CRC covers everything since the first FF. The list ends before the first entry that is
-    truncated or has a wrong CRC, so the entries before an absent servo stay usable.
+    Each part's CRC covers everything since the first FF. The list ends before the first part that is
+    truncated or has a wrong CRC, so the parts before an absent servo stay usable.
 
     Args:
         packet: The status packet, possibly truncated.
@@ -214,7 +216,7 @@ def _packet(address: int, body: bytes) -> bytes:
 
 
 def instruction_packet(servo_id: int, instruction: int, parameters: bytes = b"") -> bytes:
-    """Return an instruction packet.
+    """Return an instruction packet with a code of `Instruction`.
 
     Raises:
         ValueError: `servo_id` is neither 0..252 nor broadcast, or the parameters do not fit.
@@ -230,7 +232,7 @@ def status_packet(servo_id: int, error: int = 0, parameters: bytes = b"") -> byt
 
 
 def ping(servo_id: int = BROADCAST_ID) -> bytes:
-    """Return the packet that asks for model number and firmware version."""
+    """Return the packet that asks one servo, or all, for model number and firmware version."""
     return instruction_packet(servo_id, Instruction.PING)
 
 
@@ -245,34 +247,38 @@ def write(servo_id: int, address: int, data: bytes) -> bytes:
 
 
 def factory_reset(servo_id: int, what: Reset) -> bytes:
-    """Return the packet that resets the control table to factory values."""
+    """Return the packet that resets a servo's control table to factory values; `what` decides about ID and
+    baud rate."""
     return instruction_packet(servo_id, Instruction.FACTORY_RESET, bytes((what,)))
 
 
 def reboot(servo_id: int) -> bytes:
-    """Return the packet that restarts the servo; RAM returns to its defaults."""
+    """Return the packet that restarts a servo; its RAM registers return to their defaults."""
     return instruction_packet(servo_id, Instruction.REBOOT)
 
 
 def back_up(servo_id: int) -> bytes:
-    """Return the packet that stores the control table in the servo's backup; refused while torque is on."""
+    """Return the packet that stores the control table in the backup inside the servo; refused while torque
+    is on."""
     return instruction_packet(servo_id, Instruction.CONTROL_TABLE_BACKUP, b"\x01" + _BACKUP)
 
 
 def restore(servo_id: int) -> bytes:
-    """Return the packet that restores the EEPROM from the backup; the servo then reboots."""
+    """Return the packet that restores the EEPROM from the backup inside the servo; the servo then reboots."""
     return instruction_packet(servo_id, Instruction.CONTROL_TABLE_BACKUP, b"\x02" + _BACKUP)
 
 
 def sync_read(address: int, length: int, servo_ids: Iterable[int], *, fast: bool = False) -> bytes:
-    """Return the packet that reads the same bytes from servos; `fast`: they share one status."""
+    """Return the packet that reads `length` bytes from `address` of several servos; `fast`: they share one
+    status."""
     instruction = Instruction.FAST_SYNC_READ if fast else Instruction.SYNC_READ
     parameters = _word(address) + _word(length) + bytes(servo_ids)
     return instruction_packet(BROADCAST_ID, instruction, parameters)
 
 
 def bulk_read(requests: Iterable[tuple[int, int, int]], *, fast: bool = False) -> bytes:
-    """Return the packet that reads different bytes from servos, given ID, address and length for each."""
+    """Return the packet that reads different bytes from servos, given (ID, address, length) for each;
+    `fast`: they share one status."""
     instruction = Instruction.FAST_BULK_READ if fast else Instruction.BULK_READ
     parameters = b"".join(
         bytes((servo_id,)) + _word(address) + _word(length) for servo_id, address, length in requests
@@ -281,7 +287,8 @@ def bulk_read(requests: Iterable[tuple[int, int, int]], *, fast: bool = False) -
 
 
 def read_many(requests: Sequence[tuple[int, int, int]], *, fast: bool = False) -> bytes:
-    """Return a packet that reads several servos in turn, given ID, address and length for each."""
+    """Return a packet that reads several servos in turn, given (ID, address, length) for each: sync read
+    if all have the same bytes, else bulk read."""
     _, address, length = requests[0]
     if all(request[1:] == (address, length) for request in requests):
         return sync_read(address, length, (servo_id for servo_id, _, _ in requests), fast=fast)
@@ -289,7 +296,8 @@ def read_many(requests: Sequence[tuple[int, int, int]], *, fast: bool = False) -
 
 
 def sync_write(address: int, length: int, data: Mapping[int, bytes]) -> bytes:
-    """Return the broadcast packet that writes `length` bytes from `address`, by servo ID; it has no reply.
+    """Return the broadcast packet that writes `length` bytes from `address` to several servos, `data` by
+    ID; it has no reply.
 
     Raises:
         ValueError: The data of a servo does not have `length` bytes.

@@ -1,7 +1,7 @@
 """Receiver: extracts intact packets of a protocol from the byte stream of one serial line, despite noise.
 
-One preallocated buffer, no growth. Each byte is delivered exactly once: inside an intact packet, or as noise.
-"""
+One preallocated buffer, no growth. Each byte is delivered exactly once: inside an intact packet, or as
+noise."""
 
 from __future__ import annotations
 
@@ -11,20 +11,18 @@ from dxlwire.port.ports import Port
 from dxlwire.wire.dialect import Dialect
 
 Taker = Callable[[memoryview, int, int], None]
-"""Receives bytes with the times (ns) of the read() calls that returned the first and the last of them.
-
-The view is valid only during the call.
-"""
+"""Callback for a packet or noise: bytes, and the times (ns) of the read() calls that returned the first
+and the last of them. The view is valid only during the call."""
 
 _GOOD_READ = 765  # Bytes that one read may return in addition to an unfinished packet
 
 
 class Receiver:
-    """Extracts packets from a stream; decides on a header only when its whole packet has arrived.
+    """Extracts packets from the bytes of one line and passes packets and noise to two callbacks; it decides
+    on a header only when its whole packet has arrived.
 
-    A false header in noise can announce up to the protocol's longest packet and so hold back the bytes after
-    it; `flush` ends that after a deadline.
-    """
+    A false header in noise can announce up to the protocol's longest packet and so hold back the bytes
+    after it; `flush` ends that after a deadline."""
 
     def __init__(self, packet: Taker, noise: Taker, dialect: Dialect) -> None:
         header = dialect.HEADER
@@ -41,7 +39,8 @@ class Receiver:
         self._noise = noise
 
     def read_from(self, port: Port, now_ns: Callable[[], int]) -> int:
-        """Read from the port and deliver complete packets; return the number of bytes read.
+        """Read bytes from the port and deliver the packets that are complete; return the number of bytes
+        read.
 
         Raises:
             PortError: The adapter is gone.
@@ -52,7 +51,8 @@ class Receiver:
         return count
 
     def feed(self, data: bytes, now_ns: int) -> None:
-        """Deliver the complete packets of bytes that arrived at `now_ns`; keep an unfinished packet."""
+        """Add bytes that arrived at `now_ns`, and deliver the packets that are complete; keep an
+        unfinished packet."""
         start = 0
         while start < len(data):
             chunk = data[start : start + min(_GOOD_READ, len(self._view) - self.pending)]
@@ -61,12 +61,14 @@ class Receiver:
             self._accept(len(chunk), now_ns)
 
     def skip_header(self) -> None:
-        """Discard the pending header as false, and scan the bytes after it."""
+        """Treat the header of the unfinished packet as noise, and search for packets in the bytes after
+        it."""
         if self.pending:
             self._forget(self._scan(1))
 
     def flush(self) -> None:
-        """Stop waiting for the rest of an unfinished packet: scan again after its header."""
+        """Stop waiting for the rest of an unfinished packet: deliver all pending bytes, as later packets
+        or as noise."""
         while self.pending:
             if self._buffer.startswith(self._header, 0, self.pending):
                 self._forget(self._scan(1))
@@ -91,7 +93,8 @@ class Receiver:
         taker(self._view[start:stop], times[first], times[last])
 
     def _scan(self, search: int) -> int:
-        """Deliver complete packets with headers from `search` on; return the start of the remaining bytes."""
+        """Deliver complete packets with headers from `search` on, and noise between them; return the start
+        of the remaining bytes."""
         buffer, end = self._buffer, self.pending
         done = 0  # Everything before this index was delivered
         while True:
@@ -119,7 +122,8 @@ class Receiver:
         return start
 
     def _beginning(self, search: int) -> int:
-        """Return the index at which the last bytes may begin a header, or the end of the bytes."""
+        """Return the index at which the last bytes may be the start of a header; without such bytes, the
+        end of all bytes."""
         for beginning in self._beginnings:
             if self._buffer.endswith(beginning, search, self.pending):
                 return self.pending - len(beginning)
