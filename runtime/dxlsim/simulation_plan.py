@@ -1,8 +1,8 @@
-"""Simulation plan: servos with their loads on buses with their adapters; plain data, convertible to JSON.
+"""Simulation plan: describes simulated buses, adapters, servos and their loads; plain data, convertible to
+JSON.
 
-This module imports nothing of the simulation itself, so that the rest of the runtime can describe one
-cheaply.
-"""
+This module imports nothing of the simulation itself, so that the rest of the runtime can describe a
+simulation cheaply."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ from dxlsim.motor_model import MotorModel
 
 
 class Load(msgspec.Struct, frozen=True):
-    """Load on the shaft of a servo, or on a joint (N and kg for a linear one); none by default."""
+    """Load on the shaft of a simulated servo, or on a joint (N and kg for a linear one); none by default."""
 
     inertia: float = 0.0  # kg m^2, in addition to the servo's own rotor and gear
     friction: float = 0.0
@@ -22,7 +22,7 @@ class Load(msgspec.Struct, frozen=True):
     gravity: float = 0.0  # Torque by gravity with the link in horizontal position, Nm
     gravity_angle: float = 0.0  # rad from the servo's raw 0, with the link straight down
     turns: float = 1.0
-    """rad of the link per rad of the shaft, with a gear between them; torques are at the shaft."""
+    """Radians of the link per radian of the shaft, with a gear between them; torques are at the shaft."""
     steady: float = 0.0  # Constant torque that turns the shaft back, Nm: of a weight on a slide
 
 
@@ -30,24 +30,22 @@ NO_LOAD = Load()
 
 
 class ServoTimes(msgspec.Struct, frozen=True):
-    """Delays of a servo, in addition to its return delay."""
+    """Delays of a simulated servo, in addition to its return delay."""
 
     response_delay_ns: int = 0
-    """Delay between the end of an instruction and its effect on the motor; torque off has none.
+    """Delay between the end of an instruction and its effect on the motor, ns; torque off has none.
 
-    An AX-12+ was measured to need 17 to 50 ms from a goal to its first motion, including its inertia (J. A.
-    Smith, J. Jivraj, "Analysis of Robotis Dynamixel AX-12+ Actuator Latencies").
-    """
+    An AX-12+ was measured to need 17 to 50 ms from a goal to its first motion, including its inertia (J.
+    A. Smith, J. Jivraj, "Analysis of Robotis Dynamixel AX-12+ Actuator Latencies")."""
     write_time_ns: int = 0
-    """Time without reception after the end of an instruction that writes.
+    """Time without reception after the end of an instruction that writes, ns.
 
     An AX-12 needs 24 us plus 6 us per byte, and several ms for a write to its EEPROM (Xevel, "Dynamixel
-    protocol notes").
-    """
+    protocol notes")."""
 
 
 class ServoConfig(msgspec.Struct, frozen=True):
-    """Servo that is connected to a bus at the start of the simulation."""
+    """Simulated servo that is connected to a bus at the start of the simulation."""
 
     servo_id: int
     model: str
@@ -57,15 +55,15 @@ class ServoConfig(msgspec.Struct, frozen=True):
     firmware: int | None = None
     """Firmware Version: selects the control table if a model has two, and the support of fast reads.
 
-    None: a version with all items of the model's table.
-    """
+    None: a version with all items of the model's table."""
     times: ServoTimes = ServoTimes()
     motor: MotorModel | None = None
-    """Model of its motor from a motor file; None: the simulation's default for the servo model."""
+    """Parameters of the servo's motor from a motor file; None: the simulation's default for the servo
+    model."""
 
 
 class Shown(msgspec.Struct, frozen=True):
-    """Measurements and location of a device."""
+    """Quantities that a simulated device measures, and its location on the robot."""
 
     states: dict[str, str] = {}
     """State name by item, which selects the measured quantity; default: the state in the control table."""
@@ -76,7 +74,7 @@ class Shown(msgspec.Struct, frozen=True):
 
 
 class DeviceConfig(msgspec.Struct, frozen=True):
-    """Device that is connected to a bus at the start of the simulation."""
+    """Simulated device that is connected to a bus at the start of the simulation."""
 
     servo_id: int  # Its ID
     model: str
@@ -85,12 +83,14 @@ class DeviceConfig(msgspec.Struct, frozen=True):
 
 
 class AdapterConfig(msgspec.Struct, frozen=True):
-    """Behaviour of a line's adapter; by default each reply is delivered as a whole with its last byte."""
+    """Behaviour of a simulated line's adapter; by default each reply is delivered as a whole with its last
+    byte."""
 
     latency_timer_ns: int = 0
-    """FTDI latency timer: bytes are delivered when it expires or when 62 bytes are waiting; 0: at once."""
+    """FTDI latency timer, ns: bytes are delivered when it expires or when 62 bytes are waiting; 0: at
+    once."""
     split: Literal["whole", "byte", "random"] = "whole"
-    """Size of the delivered pieces; `random`: 1 to 8 bytes."""
+    """Size of the pieces that are delivered to the host; `random`: 1 to 8 bytes."""
     seed: int = 0  # Seed of `random`
     echo: bool = False  # True: the host receives its own bytes
     absent: Literal["silent", "slot"] = "silent"
@@ -102,7 +102,7 @@ WHOLE_REPLIES = AdapterConfig()
 
 
 class BusConfig(msgspec.Struct, frozen=True):
-    """One serial line and its servos."""
+    """One simulated serial line with its servos, devices and adapter."""
 
     name: str
     baud_rate: int  # bit/s, of the host and, at the start, of every servo
@@ -117,7 +117,8 @@ class BusConfig(msgspec.Struct, frozen=True):
 
 
 class MechanismServo(msgspec.Struct, frozen=True):
-    """Servo of a mechanism, with its coordinate s = per_rad * (theta - reference)."""
+    """Servo of a mechanism, with its coordinate s = per_rad * (theta - reference) for the angle theta of
+    its shaft."""
 
     index: int  # Index in the order in which the servos are added
     reference: float  # rad from the servo's raw 0
@@ -128,11 +129,10 @@ HINGES = ("revolute", "continuous")  # Rotary joint types of a URDF
 
 
 class Mechanism(msgspec.Struct, frozen=True):
-    """Servos and the joints that they move: q = matrix @ s.
+    """Servos and the joints that they move together: joint coordinates q = matrix @ servo coordinates s.
 
     One servo with its own joint, several servos on one joint (q is the mean of theirs), a differential, or
-    any other matrix of full rank.
-    """
+    any other matrix of full rank."""
 
     servos: tuple[MechanismServo, ...]
     joints: tuple[str, ...]
@@ -144,12 +144,12 @@ class Mechanism(msgspec.Struct, frozen=True):
 
     @property
     def is_single(self) -> bool:
-        """True for one servo that moves independently of all other joints."""
+        """True for one servo that moves its own joint, independently of all other joints."""
         return not self.loads
 
 
 class UrdfBodies(msgspec.Struct, frozen=True):
-    """URDF with the mechanisms that move its joints, for any plant."""
+    """URDF of a robot with the mechanisms that move its joints."""
 
     urdf: str
     mechanisms: tuple[Mechanism, ...]  # Servos without a mechanism are added after all others
@@ -161,13 +161,14 @@ class UrdfBodies(msgspec.Struct, frozen=True):
 
 
 class SimulationConfig(msgspec.Struct, frozen=True):
-    """Configuration of the process of the simulated buses."""
+    """Configuration of a simulation: all that the process of the simulated buses needs."""
 
     buses: tuple[BusConfig, ...]
     faults: tuple[str, ...] = ()  # Lines of faults; their times count from the start
     seed: int = 0  # Seed of the random values of faults
     links: dict[str, str] = {}
-    """Path of a symbolic link to each bus's terminal, by bus; it is updated like links by udev."""
+    """Path of a symbolic link to each bus's terminal, by name of the bus; it is updated like links by
+    udev."""
     # Bodies that the servos move together; None: each joint moves independently
     bodies: UrdfBodies | None = None
     mechanisms: tuple[Mechanism, ...] = ()  # Servos without a mechanism move independently

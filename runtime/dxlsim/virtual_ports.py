@@ -1,4 +1,5 @@
-"""Virtual ports: ports of simulated buses on virtual time, without process, terminal or real waiting."""
+"""Virtual ports: connect the exchange to simulated buses on virtual time, without process, terminal or
+real waiting."""
 
 from __future__ import annotations
 
@@ -10,7 +11,7 @@ from dxlwire.errors import PortError
 
 
 class VirtualPort:
-    """Host's end of one simulated bus; implements `dxlwire`'s Port."""
+    """Host's end of one simulated bus on virtual time; implements `dxlwire`'s Port."""
 
     def __init__(self, clock: VirtualClock, bus: SimulatedBus) -> None:
         self._clock = clock
@@ -19,14 +20,14 @@ class VirtualPort:
         self._unplugged = bus.times_unplugged
 
     def write(self, data: bytes | bytearray | memoryview) -> None:
-        """Write bytes to the line now. Raises PortError if the adapter was unplugged."""
+        """Write bytes to the line at the present virtual time. Raises PortError if the adapter was
+        unplugged."""
         self._check()
         self._bus.receive(data, self._clock.now_ns())
 
     def read_into(self, buffer: memoryview) -> int:
         """Copy the bytes that have arrived; return their number. Raises PortError if the adapter was
-        unplugged.
-        """
+        unplugged."""
         self._check()
         self.collect()
         size = min(len(buffer), len(self._arrived))
@@ -35,30 +36,29 @@ class VirtualPort:
         return size
 
     def failure(self, code: int) -> PortError:
-        """Return the error for a failed write; the only cause is an unplugged adapter."""
+        """Return the exception for a failed write; the only cause is an unplugged adapter."""
         return PortError(f"the adapter of bus {self._bus.name} is gone")
 
     def extend_deadline(self, deadline_ns: int, off_wire_ns: int, heard_ns: int, now_ns: int) -> int:
-        """Return `deadline_ns`: virtual time waits for the servos."""
+        """Return `deadline_ns`: virtual time waits for the servos, so none is stalled."""
         return deadline_ns
 
     def stalled_ns(self, since_ns: int, until_ns: int) -> int:
-        """Return 0: virtual time waits for the servos."""
+        """Return 0: virtual time waits for the servos, so none is stalled."""
         return 0
 
     def late_ns(self, off_wire_ns: int, heard_ns: int) -> int:
-        """Return 0: virtual time waits for the servos."""
+        """Return 0: virtual time waits for the servos, so none is stalled."""
         return 0
 
     def collect(self) -> bool:
-        """Receive the bytes that have passed the wire; return True if bytes are waiting or the adapter is
-        gone.
-        """
+        """Take the bytes that have passed the wire from the bus; return True if bytes are waiting or the
+        adapter is gone."""
         self._arrived += self._bus.take(self._clock.now_ns())
         return bool(self._arrived) or self._gone
 
     def unplug(self) -> None:
-        """Unplug the adapter: every later use raises PortError."""
+        """Unplug the adapter: every later use of this port raises PortError."""
         self._bus.unplug()
 
     @property
@@ -72,11 +72,11 @@ class VirtualPort:
 
 
 class VirtualPorts:
-    """All simulated lines of a robot with a common wait; implements `dxlwire`'s Ports."""
+    """All simulated lines of a robot on virtual time, with a common wait; implements `dxlwire`'s Ports."""
 
     def __init__(self, clock: VirtualClock, buses: Sequence[SimulatedBus]) -> None:
         self.polling = self.descriptors = None
-        """Properties as in SerialPorts. Virtual time needs neither polling nor descriptors."""
+        """None, because virtual time needs neither polling nor file descriptors."""
         self._clock = clock
         self._buses = tuple(buses)
         self._ports = [VirtualPort(clock, bus) for bus in buses]
@@ -84,7 +84,7 @@ class VirtualPorts:
 
     @property
     def ports(self) -> Sequence[VirtualPort]:
-        """The lines, in the order of the buses."""
+        """The ports of the lines, in the order of the buses."""
         return self._ports
 
     def wait(self, deadline_ns: int) -> Sequence[int]:
@@ -100,7 +100,8 @@ class VirtualPorts:
             self._clock.wait_until(min([deadline_ns, *due]))
 
     def reopen(self, index: int) -> bool:
-        """Request a lost line again; return True once its adapter is plugged in."""
+        """Request a lost line again; return True, with a new port in `ports`, once its adapter is plugged
+        in."""
         self._lost.add(index)
         bus = self._buses[index]
         bus.advance(self._clock.now_ns())

@@ -138,7 +138,8 @@ class ProgramJob(Generic[Result]):
         status at a time."""
 
     def advance(self, reply: Reply | None) -> Transaction | None:
-        """Resume the program with a copy of the reply; return its next transaction, or None at its end."""
+        """Resume the program with a copy of the reply; return its next transaction, None after the last
+        one."""
         try:
             if reply is None:
                 return next(self._program)

@@ -120,7 +120,7 @@ class LayerStage(msgspec.Struct, frozen=True):
 
     prepare: Callable[[Plan, States, Commands, EventSink], PreparedLayer | None]
     to_servos: bool = False
-    """True if the arrays below have a row per servo and those above a row per joint. Such a layer is placed
+    """True if the arrays below have a row per servo and those above a row per joint. This one is placed
     below all others.
     """
 

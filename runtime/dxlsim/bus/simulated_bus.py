@@ -112,7 +112,7 @@ class SimulatedBus:
     # The line
 
     def receive(self, data: bytes | bytearray | memoryview, at_ns: int) -> None:
-        """Receive bytes that the host writes to its adapter at `at_ns`. They go on the wire after bytes
+        """Receive bytes that the host writes to its adapter at `at_ns`. They are sent after bytes
         written earlier."""
         sent = bytes(data)
         self._pass_time(at_ns)

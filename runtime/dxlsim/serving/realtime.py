@@ -1,4 +1,5 @@
-"""Real time for the process of the simulated buses: priority, a dedicated core, and punctual wake-ups."""
+"""Real time: requests priority and core for the process of the simulated buses, and decides between
+sleeping and polling for punctual wake-ups."""
 
 from __future__ import annotations
 
@@ -9,16 +10,17 @@ import os
 _PR_SET_TIMERSLACK = 29  # linux/prctl.h
 
 LONGEST_POLL_NS = 50_000
-"""Polling time before a reply is due: a sleep wakes some 30 us late on a stock kernel."""
+"""Longest polling of the clock before a reply is due, ns: a sleep wakes some 30 us late on a stock kernel."""
 _POLL_SHARE = 6
 """Polling is limited to one part in this many of the time by which the process waits longer than it works."""
 _BUDGET_NS = 20_000_000
 _PAUSE_NS = 100_000
-"""Shortest sleep while polling is not allowed; everything that becomes due during it is sent together."""
+"""Shortest sleep while polling is not allowed, ns; everything that becomes due during the sleep is sent
+together."""
 
 
 def prepare(priority: int, core: int) -> str:
-    """Request a real-time priority and a core; return a description of the result.
+    """Request a real-time priority and a core for this process; return a text about what was granted.
 
     Never raises: a simulation without real time still works, and its ledger shows the lateness.
 
@@ -61,12 +63,11 @@ def _take_priority(priority: int) -> str:
 
 
 class PollBudget:
-    """Decides how long to sleep before an event, and when to poll the clock instead.
+    """Decides how long a server sleeps before an event, and when it polls the clock instead.
 
-    Polling is punctual but uses the processor. It is limited to a sixth of the time, and a process that works
-    half of the time does not poll at all. Without polling, replies are delivered slightly late, several at
-    once.
-    """
+    Polling is punctual but uses the processor. It is limited to a sixth of the time, and a process that
+    works half of the time does not poll at all. Without polling, replies are delivered slightly late,
+    several at once."""
 
     def __init__(self, now_ns: int) -> None:
         self._budget_ns = _BUDGET_NS
@@ -74,7 +75,8 @@ class PollBudget:
         self._polls = False
 
     def sleep_s(self, due_ns: int | None, now_ns: int, easy_ns: int | None = None) -> float | None:
-        """Return the time to sleep, s; 0: poll; None: indefinitely.
+        """Return the time to sleep before the next event, s; 0: poll the clock; None: sleep until a host
+        writes.
 
         Args:
             due_ns: Time of the next punctual event; None: no event.
@@ -96,7 +98,7 @@ class PollBudget:
         return 0.0 if self._polls or left_ns <= 0 else _PAUSE_NS * 1e-9
 
     def woke(self, now_ns: int) -> None:
-        """Account for the actual waiting time."""
+        """Charge the time since the last `sleep_s` to the budget; call it after each sleep or polling."""
         self._woken_ns = now_ns
         waited_ns = now_ns - self._asked_ns
         spent_ns = waited_ns if self._polls else 0

@@ -1,4 +1,5 @@
-"""Simulated bus that a thread of this process serves on a pseudo-terminal, for tests and scripts."""
+"""Served bus: a simulated bus that a thread of this process serves on a pseudo-terminal, for tests and
+scripts."""
 
 from __future__ import annotations
 
@@ -18,11 +19,12 @@ from dxlsim.texts.servo_words import bus_of_servos
 from dxlwire.errors import InputError
 
 ANSWER_TIMEOUT_S = 10.0
-"""Timeout for the server thread, which has to wait for the interpreter lock."""
+"""Timeout for an answer of the server thread, s, which has to wait for the interpreter lock."""
 
 
 class LocalStarter:
-    """Starter of a server in this process: requests come from any thread, messages go to a function."""
+    """Starter of a server in this process: requests come from any thread, messages of the server go to a
+    function."""
 
     def __init__(self, take: Callable[[SimulationMessage], None]) -> None:
         self.closed = False
@@ -36,28 +38,28 @@ class LocalStarter:
         return self._wake
 
     def ask(self, request: Request) -> None:
-        """Send a request to the server."""
+        """Send a request to the server; any thread may call this."""
         self._requests.append(request)
         os.eventfd_write(self._wake, 1)
 
     def end(self) -> None:
-        """End the server after its pending requests."""
+        """End the server after it has answered its pending requests."""
         self._ending = True
         os.eventfd_write(self._wake, 1)
 
     def send(self, message: SimulationMessage) -> None:
-        """Pass a message to the function."""
+        """Pass a message of the server to the function."""
         self._take(message)
 
     def receive(self) -> Sequence[Request]:
-        """Return the new requests."""
+        """Return the new requests; called by the server."""
         with suppress(BlockingIOError):
             os.eventfd_read(self._wake)
         self.closed = self._ending
         return [self._requests.popleft() for _ in range(len(self._requests))]
 
     def close(self) -> None:
-        """Close the descriptor after the server has ended."""
+        """Close the descriptor; call it after the server has ended."""
         os.close(self._wake)
 
 
@@ -136,7 +138,7 @@ class ServedBus:
             raise InputError(message.error)
 
     def look(self) -> tuple[ServoLook, ...]:
-        """Return the current state of each servo: position, torque, temperature, error, counts of packets."""
+        """Return the present state of each servo: position, torque, temperature, error, counts of packets."""
         return self._ask(Request(look=True)).servos or ()
 
     def close(self) -> None:

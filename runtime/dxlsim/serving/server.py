@@ -1,4 +1,4 @@
-"""Server: serves simulated buses in real time, in one thread that waits for all lines together."""
+"""Server: serves simulated buses to hosts in real time, in one thread that waits for all lines together."""
 
 from __future__ import annotations
 
@@ -29,34 +29,38 @@ from dxlsim.simulation_plan import SimulationConfig
 from dxlwire.errors import InputError
 
 MOST_BACKLOG_NS = 20_000_000
-"""Limit of the host's bytes that wait for the wire; beyond it the host is not read.
+"""Limit of the host's bytes that wait for the simulated wire, as wire time in ns; beyond it the host is not
+read.
 
-The host is thus slowed down to the rate of its line, as with an adapter.
-"""
+The host is thus slowed down to the rate of its line, as with an adapter."""
 
 GATHER_NS = 250_000
-"""Replies within this time are delivered together, as in two microframes of USB. Each delivery costs more
-processor time here and in the host than a reply."""
+"""Replies that end within this time, ns, are delivered together, as in two microframes of USB. Each
+delivery costs more processor time here and in the host than a reply."""
 
 _WRITTEN = select.EPOLLIN | select.EPOLLET
-"""Edge-triggered, to report each write of a host once. A terminal without a host is at end of file all the
-time."""
+"""Events of epoll for a terminal. Edge-triggered, to report each write of a host once: a terminal without
+a host is at end of file all the time."""
 
 LONGEST_SLEEP_NS = 10_000_000
-"""Longest sleep while the host watches the progress, so that a longer pause is recognized as a stall."""
+"""Longest sleep (ns) while a host watches the server's progress, so that a longer pause is recognized as a
+stall."""
 STALL_NS = 20_000_000
-"""A longer pause between two readings of the clock counts as a stall, in which the process had no core."""
+"""Pause between two readings of the clock, ns, from which it counts as a stall, in which the process had
+no core."""
 
 IDLE_NS = 300_000  # Time reserved for a few steps of the mechanics
 
 _BITS_PER_BYTE = 10  # 8N1
 
 _GOAL_MODES = (3, 4, 5)
-"""Values of Operating Mode (11): position, extended position, current-based position (e-Manual, X series)."""
+"""Values of Operating Mode (11) with a goal position: position, extended position, current-based position
+(e-Manual, X series)."""
 
 
 class Server:
-    """Serves pseudo-terminals and buses until its starter closes, or until the `stop` of `run` is readable.
+    """Serves simulated buses on pseudo-terminals until its starter closes, or until the `stop` of `run` is
+    readable.
 
     Raises:
         InputError: A fault of the configuration can never happen, or its bodies cannot be moved.
@@ -113,10 +117,10 @@ class Server:
         self._waiting = select.epoll()
         self._by_descriptor: dict[int, PseudoTerminal] = {}
         self._held: dict[int, int] = {}
-        """Terminals that are not read until a time, by descriptor."""
+        """Times (ns) until which terminals are not read because their hosts are too fast, by descriptor."""
 
     def run(self, granted: str = "", stop: int = -1) -> None:
-        """Report the ports and the granted real-time properties, then serve.
+        """Report the ports and the granted real-time properties to the starter, then serve until the end.
 
         Args:
             granted: Description of the granted real-time properties.
@@ -137,7 +141,8 @@ class Server:
             terminal.close()
 
     def _look_at_clock(self) -> int:
-        """Return the time, ns. Publish a preceding stall and exclude it from the servos' watchdogs."""
+        """Return the time, ns. If the process was stalled before, publish the stall and exclude it from
+        the servos' watchdogs."""
         now_ns = time.monotonic_ns()
         if self._progress is not None:
             since_ns, self._looked_ns = self._looked_ns, now_ns
@@ -183,7 +188,8 @@ class Server:
         self._ledger.flush_if_due(now_ns)
 
     def _find_next_delivery(self) -> int | None:
-        """Return the time of the next delivery to any host; publish it for each line."""
+        """Return the time (ns) of the next delivery to any host, None without one; publish it for each
+        line."""
         soonest_ns = None
         for terminal in self._terminals:
             due_ns = terminal.bus.next_delivery_ns(GATHER_NS)
@@ -194,7 +200,8 @@ class Server:
         return soonest_ns
 
     def _work_in_idle_time(self, now_ns: int) -> int | None:
-        """Do the work that is not urgent; return the time at which more is due."""
+        """Step the mechanics and resume reading slowed hosts; return the time (ns) at which more such work
+        is due, None: nothing is."""
         self._mechanics.advance(now_ns)
         times = [self._ledger.flush_due_ns(), self._mechanics.due_ns()]
         if self._held:
@@ -253,7 +260,7 @@ class Server:
             self._waiting.modify(number, _WRITTEN)  # Makes epoll report the waiting bytes once more
 
     def _plug(self) -> None:
-        """Register the terminals that exist now."""
+        """Wait for the terminals that exist now, after an adapter was unplugged or plugged in."""
         for number in self._by_descriptor:
             # Terminals that were unplugged or are on hold are not registered
             with contextlib.suppress(OSError):
@@ -271,12 +278,12 @@ class Server:
             self._tell(SimulationMessage(happened=note.removeprefix(FAULT)))
 
     def _tell(self, message: SimulationMessage) -> None:
-        """Send a message; drop it if the starter does not read. Never blocks."""
+        """Send a message to the starter; drop it if the starter does not read. Never blocks."""
         if select.select((), (self._starter,), (), 0)[1]:  # Writable means room for 100 KB or more
             self._starter.send(message)
 
     def _answer_requests(self, now_ns: int) -> None:
-        """Answer the requests of the starter."""
+        """Answer the new requests of the starter: states of servos, and faults to plan."""
         for request in self._starter.receive():
             if request.look:
                 looks = tuple(look for bus in self._buses for look in servo_looks(bus, now_ns))
@@ -295,7 +302,8 @@ class Server:
 
 
 class _ServedLine:
-    """Publisher of the progress on one line."""
+    """Publishes the server's progress on one line, for hosts that distinguish a late server from a silent
+    servo."""
 
     __slots__ = ("_bus", "_progress", "_served_ns", "_taken_ns")
 
@@ -306,23 +314,24 @@ class _ServedLine:
         self._served_ns = -1
 
     def serve(self, due_ns: int | None) -> None:
-        """Publish the time of the next delivery to the host; None: nothing is due."""
+        """Publish that the line is served up to its next delivery to the host, at `due_ns`; None: nothing
+        is due."""
         until_ns = ENDLESS_NS if due_ns is None else due_ns
         if until_ns != self._served_ns:
             self._progress.serve(until_ns)
             self._served_ns = until_ns
 
     def take(self, count: int, now_ns: int) -> None:
-        """Publish that bytes of the host were received, even if a fault keeps them from the servos.
+        """Publish that `count` bytes of the host were received, even if a fault keeps them from the servos.
 
-        Call this after `serve`: a host that sees the bytes as received relies on the due time of the reply.
-        """
+        Call this after `serve`: a host that sees the bytes as received relies on the due time of the
+        reply."""
         duration_ns = count * _BITS_PER_BYTE * 1_000_000_000 // self._bus.baud_rate
         self._taken_ns = max(self._taken_ns, now_ns) + duration_ns
         self._progress.take(self._taken_ns)
 
     def give(self, now_ns: int) -> None:
-        """Publish a delivery to the host."""
+        """Publish that bytes are delivered to the host now, with the time at which they were due."""
         self._progress.give(now_ns - self._bus.lateness_ns[-1], now_ns)
 
 
@@ -337,7 +346,7 @@ def wake_on_signals(*numbers: signal.Signals) -> socket.socket:
 
 
 def servo_looks(bus: SimulatedBus, now_ns: int) -> list[ServoLook]:
-    """Return the current state of each servo of a bus."""
+    """Return the present state of each servo of a bus, for a `look` request."""
     bus.advance(now_ns)
     return [
         ServoLook(
@@ -366,10 +375,10 @@ def _goal(registers: Memory) -> float | None:
 
 
 def lateness_us(buses: Sequence[SimulatedBus]) -> dict[str, float]:
-    """Return the lateness of deliveries to hosts, us: median, p99, maximum; empty before the first delivery.
+    """Return statistics of the lateness of recent deliveries to hosts, us: median, p99, maximum; empty before
+    the first delivery.
 
-    Quantiles by nearest rank: the smallest value that at least this share does not exceed.
-    """
+    Quantiles by nearest rank: the smallest value that at least this share does not exceed."""
     ordered = sorted(late_ns for bus in buses for late_ns in bus.lateness_ns)
     if not ordered:
         return {}

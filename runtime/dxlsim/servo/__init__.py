@@ -1,4 +1,3 @@
-"""Servo: instructions and protection of a simulated servo.
+"""Servo: instructions, registers and protection of a simulated servo.
 
-The motion of its shaft belongs in `motion`.
-"""
+The motion of its shaft belongs in `motion`."""

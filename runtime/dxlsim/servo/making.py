@@ -1,4 +1,4 @@
-"""Construction of a model's simulated servo, with its table, shaft and protocol."""
+"""Making: builds the simulated servo of a model, with its table, motor, shaft and protocol."""
 
 from __future__ import annotations
 
@@ -16,7 +16,8 @@ from dxlsim.simulation_plan import ServoConfig
 from dxlwire.control_table import ControlTable, find_table, models_by_number
 
 FIRMWARE = {1.0: 24, 2.0: 45}
-"""Firmware version of a simulated servo, unless its table requires a newer one; the manual gives none."""
+"""Firmware version of a simulated servo by protocol, unless its table requires a newer one; the manual
+gives none."""
 
 
 def make_servo(
@@ -28,7 +29,7 @@ def make_servo(
     *,
     mechanics: Mechanics | None = None,
 ) -> SimulatedServo:
-    """Return a servo that was just switched on at a baud rate, bit/s.
+    """Return a simulated servo that was just switched on, with a baud rate in bit/s.
 
     Raises:
         LookupError: The model has no control table.

@@ -1,8 +1,8 @@
-"""Node of a simulated line, a servo or another device: its interface to the bus, and its disconnection.
+"""Node: base class of the units on a simulated line, servos and other devices: instructions, replies, and
+disturbances.
 
-Subclasses implement the meaning of the registers: `simulated_servo` has a shaft, `simulated_device` shows the
-measurements of a board.
-"""
+Subclasses implement the meaning of the registers: `simulated_servo` has a shaft, `simulated_device` shows
+the measurements of a board."""
 
 from __future__ import annotations
 
@@ -30,23 +30,23 @@ Answer = tuple[int, bytes]  # Error and parameters of a reply
 
 
 class ServoCounts(msgspec.Struct):
-    """Packet counters of a servo since the start."""
+    """Counters of the packets of one servo or device since the start of the simulation."""
 
     received: int = 0  # Intact instructions to it, including broadcasts
     replied: int = 0
     last_error: int = 0  # Error of its last reply, as in the packet
 
     def reply(self, error: int) -> None:
-        """Count a reply."""
+        """Count a reply with this error."""
         self.replied += 1
         self.last_error = error
 
 
 class SimulatedNode(ABC):
-    """One node. The bus calls `execute` and `reply_to_group_read`; faults and tests call the rest.
+    """One servo or device on a simulated line. The bus calls `execute` and `reply_to_group_read`; faults and
+    tests call the rest.
 
-    `note` is called with each refusal and each fault.
-    """
+    `note` is called with a text about each refusal and each fault."""
 
     kind: ClassVar[str]  # Word for the node in notes
     answers_damaged = False
@@ -61,23 +61,23 @@ class SimulatedNode(ABC):
         self.counts = ServoCounts()
         self.servo_id = 0  # ID (3 or 7)
         self.secondary_id: int | None = None
-        """Secondary ID (12), to which it never replies; None: it has none, or the feature is off.
+        """Secondary ID (12), to which the node listens but never replies; None: it has none, or the feature
+        is off.
 
-        253 to 255 switch it off, and the ID has priority (e-Manual, X series).
-        """
+        253 to 255 switch it off, and the ID has priority (e-Manual, X series)."""
         self._silent = False
         self._contacts: list[Callable[[], bool]] = []
-        """Callbacks that return True if the cable has contact when an instruction arrives."""
+        """Functions that return True if the cable has contact when an instruction arrives; all must."""
         self._later_ns = 0  # Additional delay of its replies
         self._deaf_until_ns = now_ns
-        """Time until which it boots or processes a write, and receives nothing."""
+        """Time (ns) until which the node boots or processes a write, and receives nothing."""
         self._delay_ns = 0  # Return Delay Time (5, 9)
         memory.show_live(self._live_items())
         memory.watch(("return_delay_time",), self._set_delay)
 
     @property
     def called(self) -> str:
-        """Name in notes: `servo 3`."""
+        """Name of the node in notes of the ledger: `servo 3`."""
         return f"{self.kind} {self.servo_id}"
 
     def _set_delay(self) -> None:
@@ -86,18 +86,20 @@ class SimulatedNode(ABC):
     # Interface to the bus
 
     def listens_to(self, servo_id: int) -> bool:
-        """Return True if an instruction to an ID, or a broadcast, is for this node."""
+        """Return True if an instruction to `servo_id`, or a broadcast, is for this node."""
         return servo_id == BROADCAST or servo_id in (self.servo_id, self.secondary_id)
 
     @property
     def baud_rate(self) -> int:
-        """Baud rate of the node, bit/s; in Protocol 1.0 also by the formula 2e6 / (value + 1)."""
+        """Baud rate of the node according to its registers, bit/s; in Protocol 1.0 also by the formula 2e6
+        / (value + 1)."""
         registers = self.registers
         value, rates = registers[baud_item(registers)], registers.table.baud_rates
         return rates.get(value, 2_000_000 // (value + 1) if registers.table.protocol == 1.0 else 0)
 
     def execute(self, packet: InstructionPacket, now_ns: int) -> ServoReply | None:
-        """Execute an instruction whose last byte arrived at `now_ns`; return the reply, if any."""
+        """Execute an instruction whose last byte arrived at `now_ns`; return the reply, or None if the
+        node sends none."""
         servo_id = self.servo_id  # A write of ID is still answered with the old ID [i]
         own = packet.servo_id == servo_id
         if not (own or self.listens_to(packet.servo_id)) or not self.receives(now_ns):
@@ -112,7 +114,7 @@ class SimulatedNode(ABC):
         return ServoReply(servo_id, error | self._state(), parameters, delay_ns) if replies else None
 
     def reply_to_group_read(self, read: GroupRead, entry: ReadEntry, now_ns: int) -> ServoReply | None:
-        """Return the node's reply to a group read that ended at `now_ns`, or None for no reply."""
+        """Return the node's reply to a group read that ended at `now_ns`, or None if it sends none."""
         if not self.receives(now_ns) or not self._takes_part(read):
             return None
         if self.registers.get("status_return_level", 2) < 1:
@@ -129,54 +131,58 @@ class SimulatedNode(ABC):
 
     @abstractmethod
     def advance(self, now_ns: int) -> None:
-        """Advance the live values to a time; an earlier time is ignored."""
+        """Advance the node to `now_ns`; an earlier time is ignored."""
 
     @abstractmethod
     def receives(self, now_ns: int) -> bool:
-        """Return True if the node receives an instruction at a time."""
+        """Return True if the node receives an instruction that ends at `now_ns`: it is connected, has
+        booted, and is not silenced."""
 
     @abstractmethod
     def _live_items(self) -> Mapping[str, Callable[[], int]]:
-        """Return the items with live values, and the functions that return them."""
+        """Return the items that show present values, each with the function that returns the integer on
+        the wire."""
 
     @abstractmethod
     def _state(self) -> int: ...
 
     @abstractmethod
     def protect(self, refused: int = 0) -> None:
-        """Apply the node's protection against harmful conditions."""
+        """Apply the node's protection, such as a shutdown; `refused` is the error of a refused
+        instruction."""
 
     @abstractmethod
     def reset(self) -> None:
-        """Power-cycle the node: RAM is lost."""
+        """Power-cycle the node: its RAM registers return to their initial values."""
 
     @property
     @abstractmethod
     def voltage(self) -> float:
-        """Supply voltage, V."""
+        """Supply voltage of the node, V."""
 
     @abstractmethod
     def set_voltage(self, volts: float) -> None:
-        """Change the supply voltage, V."""
+        """Change the node's supply voltage, V."""
 
     @abstractmethod
     def _set(self, name: str, wire: int) -> None: ...
 
     @abstractmethod
     def _takes_part(self, read: GroupRead) -> bool:
-        """Return True if the node supports a group read."""
+        """Return True if the node supports a group read (sync or bulk read), so that it replies."""
 
     @abstractmethod
     def _written(self, names: frozenset[str]) -> None:
-        """Apply the side effects of a write to some items."""
+        """Apply the side effects of a write to these items."""
 
     # Instructions
 
     def _replies_to(self, packet: InstructionPacket, own: bool) -> bool:
-        """Return True if a status packet follows (Status Return Level). Of the broadcasts only a ping is
-        answered.
+        """Return True if a status packet follows an instruction (Status Return Level). Of the broadcasts only
+        a ping is answered.
 
-        A packet with a wrong checksum is not answered, unless `answers_damaged` asks for the manual's error.
+        A packet with a wrong checksum is not answered, unless `answers_damaged` asks for the manual's
+        error.
 
         Args:
             packet: The instruction.
@@ -195,7 +201,8 @@ class SimulatedNode(ABC):
         return self._delay_ns + self.servo_id * self._codec.ping_slot_ns(self.baud_rate)
 
     def _obey(self, packet: InstructionPacket) -> Answer:
-        """Return the answer to an instruction; a packet with a wrong checksum is not executed."""
+        """Execute an instruction and return error and data of its reply; a packet with a wrong checksum is
+        not executed."""
         codec, parameters = self._codec, packet.parameters
         if not packet.intact:
             return codec.damaged, b""
@@ -213,14 +220,15 @@ class SimulatedNode(ABC):
         return (self._manage(packet), b"") if answer is None else answer
 
     def _manage(self, packet: InstructionPacket) -> int:
-        """Execute an instruction other than reads and writes; return the error, also for an unknown one."""
+        """Execute an instruction other than reads and writes; return the error, which for an unknown one
+        is not 0."""
         return self._codec.unknown
 
     def _stays_out(self, read: GroupRead) -> None:
         self.note(f"{self.called} does not reply to the fast read {read.instruction:#04x}")
 
     def _answer_read(self, address: int, length: int) -> Answer:
-        """Return data; cells between items are 0 [i]."""
+        """Return error and bytes for a read; cells between items are 0 [i]."""
         data = self.registers.read(address, length)
         return (self._codec.no_cells, b"") if data is None else (0, data)
 
@@ -233,7 +241,8 @@ class SimulatedNode(ABC):
         return protocol2.ErrorNumber.ACCESS if shadow else 0
 
     def _write_listed(self, writes: ListedWrites | None) -> int:
-        """Execute the writes of a list for this node, in list order; its Secondary ID counts as well [i].
+        """Execute those writes of a sync or bulk write that are for this node, in list order; its
+        Secondary ID counts as well [i].
 
         Returns:
             The last error; in Protocol 1.0 all error bits.
@@ -250,7 +259,7 @@ class SimulatedNode(ABC):
         return error
 
     def _write(self, address: int, data: bytes) -> int:
-        """Execute a write; return 0, or its error if it is rejected."""
+        """Execute a write; return 0, or the error if the write is rejected."""
         runs = self.registers.runs(address, data)
         if error := self._refused(runs):
             return error
@@ -268,28 +277,29 @@ class SimulatedNode(ABC):
     # Interface for faults
 
     def silence(self, on: bool = True) -> None:
-        """Cut its data line, or restore it. A cut node receives and sends nothing, but keeps moving."""
+        """Cut the node's data line, or restore it. A cut node receives and sends nothing, but keeps
+        moving."""
         self._silent = on
         self.note(f"{self.called}: data line {'cut' if on else 'restored'}")
 
     def interrupt(self, contact: Callable[[], bool]) -> None:
-        """Pass instructions and replies of this node only while `contact` returns True."""
+        """From now on pass instructions and replies of this node only while `contact` returns True."""
         self._contacts.append(contact)
         self.note(f"{self.called}: cable loose")
 
     def connect(self, contact: Callable[[], bool]) -> None:
-        """Undo `interrupt`."""
+        """Undo `interrupt` with the same function."""
         self._contacts.remove(contact)
         self.note(f"{self.called}: cable has contact")
 
     def reply_later(self, by_ns: int) -> None:
-        """Delay each reply by an additional time, ns; 0: no longer."""
+        """Delay each reply by an additional time, ns; 0 ends this."""
         self._later_ns = by_ns
         self._set_delay()
         self.note(f"{self.called}: replies {by_ns} ns later")
 
     def cut_power(self, until_ns: int) -> None:
-        """Cut its power until a time: RAM is lost, and the node does nothing before."""
+        """Cut the node's power until `until_ns`: RAM is lost, and the node receives nothing before."""
         self.reset()
         self._receive_nothing_until(max(self._deaf_until_ns, until_ns))
 
@@ -297,7 +307,7 @@ class SimulatedNode(ABC):
         self._deaf_until_ns = t_ns
 
     def poke(self, name: str, wire: int) -> None:
-        """Set a control item to an integer on the wire, without checks, as if it had been set before."""
+        """Set a register to an integer on the wire, without checks, as if it had been set before."""
         self.note(f"{self.called}: {name} set to {wire}")
         self._set(name, wire)
 
@@ -306,7 +316,7 @@ Node = TypeVar("Node", bound=SimulatedNode)
 
 
 def baud_value(table: ControlTable, baud_rate: int) -> int:
-    """Return the value of the baud rate item for a rate, bit/s.
+    """Return the value of a model's baud rate item for a rate, bit/s.
 
     Raises:
         ValueError: The model does not support the rate.
@@ -321,5 +331,5 @@ def baud_value(table: ControlTable, baud_rate: int) -> int:
 
 
 def baud_item(memory: Memory) -> str:
-    """Return the name of the baud rate item; the Y series has two rates."""
+    """Return the name of the item with the baud rate of the bus; the Y series has two rates."""
     return "baud_rate" if "baud_rate" in memory else "baud_rate_bus"

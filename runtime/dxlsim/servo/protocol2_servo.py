@@ -1,8 +1,7 @@
 """Simulated servo of Protocol 2.0: its instructions, Hardware Error Status with its latch, Bus Watchdog.
 
-The Y series reports errors in Error Code instead, and each of them switches torque off. Not modelled for the
-Y series: the time to switch torque, the brake, and Controller State except off, running and fault.
-"""
+The Y series reports errors in Error Code instead, and each of them switches torque off. Not modelled for
+the Y series: the time to switch torque, the brake, and Controller State except off, running and fault."""
 
 from __future__ import annotations
 
@@ -24,8 +23,8 @@ TORQUE_ON_BY_GOAL = 0x08  # Bit of Drive Mode (10): a goal enables torque
 
 _LIMITS = frozenset(("pwm_limit", "current_limit"))
 _SPEAKS = (2, 20, 21, 22)
-"""Values of Protocol Type (13) with which a servo executes Protocol 2.0. Without a remote control on the line
-the servo falls back from S.BUS, iBUS and RC-PWM (e-Manual, X330, Protocol Type (13))."""
+"""Values of Protocol Type (13) with which a servo executes Protocol 2.0. Without a remote control on the
+line the servo falls back from S.BUS, iBUS and RC-PWM (e-Manual, X330, Protocol Type (13))."""
 
 _HISTORY = 16
 _INVERTER_OFF, _RUNNING, _FAULT = 2, 5, 8  # Values of Controller State (152) of the Y series
@@ -39,12 +38,14 @@ _KEPT_BY_RESET = {0xFF: (), 0x01: ("id",), 0x02: ("id", "baud_rate", "baud_rate_
 
 
 class Protocol2Servo(SimulatedServo):
-    """Servo of Protocol 2.0: X, P, PRO and Y, the XL-320, grippers, and MX with firmware for Protocol 2.0."""
+    """Simulated servo of Protocol 2.0: X, P, PRO and Y, the XL-320, grippers, and MX with firmware for
+    Protocol 2.0."""
 
     def __init__(self, memory: Memory, shaft: Shaft, note: Callable[[str], None]) -> None:
         self._errors = memory.table.errors
         self._has_error_code = self._errors.has_codes
-        """True for the Y series, which also keeps its turn count without power."""
+        """True for the Y series, which reports errors in Error Code and keeps its turn count without
+        power."""
         self._backup: dict[str, int] = {}
         self._shut_down = False
         self._check_ns: int | None = None  # Time of the next Bus Watchdog check; None: no check
@@ -68,8 +69,7 @@ class Protocol2Servo(SimulatedServo):
     def _manage(self, packet: InstructionPacket) -> int:
         """Execute an instruction other than reads and writes; return an instruction error for an unknown one.
 
-        An instruction to the Secondary ID must not change the EEPROM [i].
-        """
+        An instruction to the Secondary ID must not change the EEPROM [i]."""
         error: int | None = None
         match packet.instruction, packet.parameters:
             case Instruction.REBOOT, b"":
@@ -118,13 +118,14 @@ class Protocol2Servo(SimulatedServo):
             self.shaft.mechanics.call_at(end_ns, lambda: self._check_watchdog(end_ns))
 
     def _watchdog_units(self) -> int:
-        """Return the timeout of the Bus Watchdog, in its unit; 0 while it is not running."""
+        """Return the timeout of the Bus Watchdog in units of WATCHDOG_UNIT_NS; 0 while the watchdog is not
+        running."""
         registers = self.registers
         units = registers.get("bus_watchdog")
         return units if units and registers.get("torque_enable") and not watchdog_expired(registers) else 0
 
     def _check_watchdog(self, at_ns: int) -> None:
-        """Stop the servo if the Bus Watchdog has expired; otherwise schedule the next check."""
+        """Stop the servo if its Bus Watchdog has expired; otherwise schedule the next check."""
         if at_ns != self._check_ns:
             return  # A shorter timeout was set in the meantime
         self._check_ns = None
@@ -141,19 +142,20 @@ class Protocol2Servo(SimulatedServo):
     # Protection
 
     def _refusal(self, run: Run) -> int:
-        """Return the error number of a write, 0 if it is accepted.
+        """Return the error number with which the servo rejects a write, 0 if it accepts the write.
 
-        After a shutdown torque stays off until a reboot: a result fail [i].
-        """
+        After a shutdown torque stays off until a reboot: a result fail [i]."""
         torque = self._shut_down and run.after.get("torque_enable")
         return super()._refusal(run) or (ErrorNumber.RESULT_FAIL if torque else 0)
 
     def _state(self) -> int:
-        """Return the alert bit while Hardware Error Status or Error Code reports an error."""
+        """Return the error bits of every reply: the alert bit while Hardware Error Status or Error Code
+        reports an error."""
         return ALERT if self.registers.get(self._errors.item) else 0
 
     def protect(self, refused: int = 0) -> None:
-        """Report active errors, and switch torque off until a reboot if Shutdown lists one of them."""
+        """Show active errors in the registers, and switch torque off until a reboot if Shutdown lists one
+        of them."""
         registers = self.registers
         wrong = self._wrong()
         if self._has_error_code:
@@ -171,23 +173,24 @@ class Protocol2Servo(SimulatedServo):
         self._show_controller_state()
 
     def reboot(self) -> None:
-        """Restart; the servo receives nothing until the restart is complete."""
+        """Restart the servo, which receives nothing until the restart is complete."""
         self.note(f"servo {self.servo_id}: reboot")
         self.power_up()
         self._receive_nothing_until(self.shaft.now_ns + self.boot_ns)
 
     def power_up(self) -> None:
-        """Start with RAM and angle as at power-up; only the Y series keeps its turn count."""
+        """Set RAM and angle as at power-up; only the Y series keeps its turn count."""
         angle = self.shaft.angle
         super().power_up()
         if self._has_error_code:
             self._recount(angle)
 
     def clear_turns(self) -> int:
-        """Reset Present Position into one turn; return an error while the servo moves.
+        """Count Present Position within one turn (instruction Clear); return an error while the servo moves,
+        0 on success.
 
-        On the Y series torque must be off as well, and the servo reboots. The position becomes the goal [i].
-        """
+        On the Y series torque must be off as well, and the servo reboots. The position becomes the goal
+        [i]."""
         if self.shaft.moving or (self._has_error_code and self.registers.get("torque_enable")):
             return ErrorNumber.RESULT_FAIL
         self._recount(self.shaft.within_a_turn(self.shaft.angle))
@@ -196,7 +199,8 @@ class Protocol2Servo(SimulatedServo):
         return 0
 
     def clear_error(self) -> int:
-        """Clear Error Code; return an error while a cause is active (e-Manual, Y series)."""
+        """Clear Error Code (instruction Clear); return an error while a cause is active (e-Manual, Y
+        series), 0 on success."""
         if self._wrong():
             return ErrorNumber.RESULT_FAIL
         self.registers["error_code"] = 0
@@ -209,15 +213,14 @@ class Protocol2Servo(SimulatedServo):
     def keeps_backup(self) -> bool:
         """True if the servo supports Control Table Backup; it then has the item Backup Ready.
 
-        e-Manual, Protocol 2.0, Control Table Backup (0x20), and the models' pages, Backup Ready.
-        """
+        e-Manual, Protocol 2.0, Control Table Backup (0x20), and the models' pages, Backup Ready."""
         return "backup_ready" in self.registers
 
     def back_up(self) -> int:
-        """Store EEPROM, gains, profile and indirect addresses; return an error while torque is on.
+        """Store EEPROM, gains, profile and indirect addresses in the servo's backup; return an error while
+        torque is on, 0 on success.
 
-        P does not store indirect addresses; neither does Y [i].
-        """
+        P does not store indirect addresses; neither does Y [i]."""
         registers = self.registers
         if registers.get("torque_enable"):
             return ErrorNumber.RESULT_FAIL
@@ -228,9 +231,8 @@ class Protocol2Servo(SimulatedServo):
         return 0
 
     def restore_backup(self) -> int:
-        """Restore the EEPROM from the backup, and reboot; return an error while torque is on, or without a
-        backup.
-        """
+        """Restore the EEPROM from the servo's backup, and reboot; return an error while torque is on, or
+        without a backup."""
         registers = self.registers
         if registers.get("torque_enable") or not self._backup:
             return ErrorNumber.RESULT_FAIL
@@ -246,7 +248,7 @@ class Protocol2Servo(SimulatedServo):
         self.shaft.plan(("goal_position",))
 
     def _wrong(self) -> tuple[int, ...]:
-        """Return the bits or codes of the errors with an active cause."""
+        """Return the bits or codes of the hardware errors whose cause is active now."""
         registers, errors = self.registers, self._errors
         wrong = [errors.value_of("overload")] if self.overload else []
         if "max_voltage_limit" in registers:
@@ -261,7 +263,8 @@ class Protocol2Servo(SimulatedServo):
         return tuple(wrong)
 
     def _show_error_code(self, codes: tuple[int, ...]) -> None:
-        """Report the newest error. The same error does not count twice, and the history holds the last 16."""
+        """Show active errors in Error Code and its history. The same error does not count twice, and the
+        history holds the last 16."""
         registers = self.registers
         names = [f"error_code_history_{number}" for number in range(1, _HISTORY + 1)]
         history = [registers[name] for name in names if registers[name]]
@@ -319,8 +322,7 @@ class Protocol2Servo(SimulatedServo):
     def _change_mode(self) -> None:
         """Apply the effects of a new operating mode (e-Manual, X series, Operating Mode (11)).
 
-        Gains, profile and the limiting goals are reset; position control has only one turn.
-        """
+        Gains, profile and the limiting goals are reset; position control has only one turn."""
         registers = self.registers
         registers.reset((*ACCESS.gains, *ACCESS.profile))
         self._find_turn()
@@ -329,10 +331,9 @@ class Protocol2Servo(SimulatedServo):
         self._reset_goals()
 
     def _find_turn(self) -> None:
-        """Reset Present Position into the turn of position control.
+        """Count Present Position within the one turn of position control, if the servo is in that mode.
 
-        e-Manual, X series, Torque Enable (64): it is reset after a change of mode or torque.
-        """
+        e-Manual, X series, Torque Enable (64): it is reset after a change of mode or torque."""
         shaft = self.shaft
         if self.registers.get("operating_mode") != OperatingMode.POSITION or self._has_error_code:
             return
@@ -353,7 +354,8 @@ class Protocol2Servo(SimulatedServo):
 
 
 def _is_kept(name: str, item: ControlItem) -> bool:
-    """Return True if a backup includes an item (e-Manual, Protocol 2.0, Control Table Backup (0x20))."""
+    """Return True if the servo's backup includes an item (e-Manual, Protocol 2.0, Control Table Backup
+    (0x20))."""
     if name.startswith("indirect_address_"):
         return item.area == "RAM"
     return item.access == "RW" and (item.area == "EEPROM" or name in (*ACCESS.gains, *ACCESS.profile))

@@ -5,9 +5,8 @@ instructions and the protection of the other servos. `[i]` marks behaviour that 
 e-Manual has no answer; nothing was compared with a real servo yet.
 
 Not modelled: other protocols than 1.0 and 2.0 on one line (a servo set to another protocol is silent), the
-shared properties of the two shafts of a 2XL or 2XC, servos that are coupled by Drive Mode, and effects of the
-firmware version beyond the control table, the fast reads, Clear and Control Table Backup.
-"""
+shared properties of the two shafts of a 2XL or 2XC, servos that are coupled by Drive Mode, and effects of
+the firmware version beyond the control table, the fast reads, Clear and Control Table Backup."""
 
 from __future__ import annotations
 
@@ -29,7 +28,7 @@ _SECONDARY_IDS = ("secondary_shadow_id", "secondary_id")
 
 
 class SimulatedServo(SimulatedNode):
-    """One servo: its registers command a shaft and report the motion."""
+    """One simulated servo of either protocol: its registers command a shaft and report the motion."""
 
     kind = "servo"
 
@@ -37,9 +36,10 @@ class SimulatedServo(SimulatedNode):
         self.shaft = shaft
         self.overload = False  # True while the load exceeds the torque of the shaft
         self.wakes_on_goal = True
-        """Protocol 1.0: writing Goal Position (30) while Torque Enable (24) is 0 sets it to 1 [i]."""
+        """True: in Protocol 1.0 a write of Goal Position (30) while Torque Enable (24) is 0 sets Torque
+        Enable to 1 [i]."""
         self.boot_ns = BOOT_NS
-        """Duration of a reboot or a factory reset by an instruction: Protocol 2.0."""
+        """Duration of a reboot or a factory reset by an instruction of Protocol 2.0, ns."""
         self.write_time_ns = 0  # Time without reception after an instruction that writes
         self._speaks = True  # False if another protocol is set
         self._started_ns = self._received_ns = shaft.now_ns
@@ -61,12 +61,13 @@ class SimulatedServo(SimulatedNode):
     # Interface to the bus
 
     def advance(self, now_ns: int) -> None:
-        """Advance the shaft and the live registers to a time; an earlier time is ignored."""
+        """Advance the shaft and the registers that show it to `now_ns`; an earlier time is ignored."""
         self.shaft.advance(now_ns)
         self.registers.refresh()
 
     def receives(self, now_ns: int) -> bool:
-        """Return True if the servo receives an instruction at a time."""
+        """Return True if the servo receives an instruction that ends at `now_ns`; if so, the shaft is
+        advanced and the Bus Watchdog's time restarts."""
         if self._silent or now_ns < self._deaf_until_ns or not self._speaks:
             return False
         self.shaft.advance(now_ns)
@@ -76,14 +77,15 @@ class SimulatedServo(SimulatedNode):
         return True
 
     def excuse(self, duration_ns: int) -> None:
-        """Exclude a stall of this process, ns, from the time of the Bus Watchdog."""
+        """Do not count a stall of this process, of `duration_ns`, toward the timeout of the Bus Watchdog."""
         self._received_ns += duration_ns
 
     # Differences between the protocols
 
     @abstractmethod
     def protect(self, refused: int = 0) -> None:
-        """Switch torque off if an error is active that Shutdown lists."""
+        """Switch torque off if an error is active that the register Shutdown lists; `refused` has the
+        error of a refused instruction."""
 
     @abstractmethod
     def _start_up(self) -> None: ...
@@ -147,14 +149,14 @@ class SimulatedServo(SimulatedNode):
         return round((self._voltage - SUPPLY_OHM * drawn) / self.registers.table.items[name].scale)
 
     def _strained(self) -> None:
-        """Handle a new temperature, in whole degrees, or an overload."""
+        """React to a new temperature, in whole degrees, or to an overload, which the mechanics report."""
         if not self.overload and self.shaft.mechanics.overloaded(self.shaft.index):
             self.overload = True
             self.note(f"servo {self.servo_id}: overload, it does not hold its load")
         self.protect()
 
     def power_up(self) -> None:
-        """Start with RAM at its values for power-up; the shaft stays at its angle."""
+        """Start with RAM registers at their values for power-up; the shaft stays at its angle."""
         self._registered = None
         self.overload = False
         self.registers.restore_ram()
@@ -177,12 +179,12 @@ class SimulatedServo(SimulatedNode):
 
     @property
     def torque_on(self) -> bool:
-        """True if the motor holds or moves the shaft: torque is enabled and its limit is not 0."""
+        """True if the motor holds or moves the shaft: torque is enabled and Torque Limit is not 0."""
         return self.shaft.torque_on
 
     @property
     def voltage(self) -> float:
-        """Supply voltage, V; the servo measures less while it draws current."""
+        """Supply voltage of the servo, V; the servo measures less while it draws current."""
         return self._voltage
 
     @voltage.setter
@@ -192,7 +194,7 @@ class SimulatedServo(SimulatedNode):
 
     @property
     def temperature(self) -> float:
-        """Temperature, degrees C."""
+        """Temperature of the servo, degrees C."""
         return float(self.shaft.mechanics.strain.temperature[self.shaft.index])
 
     @temperature.setter
@@ -200,7 +202,7 @@ class SimulatedServo(SimulatedNode):
         self.shaft.mechanics.heat(self.shaft.index, celsius)
 
     def jam(self, on: bool) -> None:
-        """Block the shaft, or release it."""
+        """Block the shaft at its present angle, or release it."""
         self.shaft.mechanics.jam(self.shaft.index, on)
         self.note(f"servo {self.servo_id}: shaft {'blocked' if on else 'free'}")
 
@@ -210,31 +212,29 @@ class SimulatedServo(SimulatedNode):
         self.power_up()
 
     def trigger_overload(self) -> None:
-        """Load the shaft beyond its torque.
+        """Overload the shaft beyond its torque, as a fault.
 
         The overload ends with a power cycle, a reboot (Protocol 2.0), or a write of Torque Limit (34,
-        Protocol 1.0).
-        """
+        Protocol 1.0)."""
         self.overload = True
         self.note(f"servo {self.servo_id}: overload")
         self.protect()
 
     def set_voltage(self, volts: float) -> None:
-        """Change the supply voltage, V."""
+        """Change the servo's supply voltage, V, as a fault."""
         self.voltage = volts
         self.note(f"servo {self.servo_id}: voltage {volts} V")
         self.protect()
 
     def set_temperature(self, celsius: float) -> None:
-        """Set the temperature, degrees C."""
+        """Set the servo's temperature, degrees C, as a fault."""
         self.temperature = celsius
         self.note(f"servo {self.servo_id}: temperature {celsius} degC")
         self.protect()
 
     def turn(self, by: float, duration_ns: int) -> None:
-        """Turn the shaft by hand by an angle, rad, within a time. The hand lets go of a servo that has
-        torque.
-        """
+        """Turn the shaft as by hand by an angle, rad, within a time. The hand lets go of a servo that has
+        torque."""
 
         def gives_way(turned: float) -> None:
             came = f"yields after {math.degrees(turned):.1f} of {math.degrees(by):g} deg"
@@ -244,10 +244,9 @@ class SimulatedServo(SimulatedNode):
 
 
 class Protocol1Servo(SimulatedServo):
-    """Servo of Protocol 1.0: AX, DX, EX, RX, and MX with their first firmware.
+    """Simulated servo of Protocol 1.0: AX, DX, EX, RX, and MX with their first firmware.
 
-    It has error bits, Torque Limit 0 after a shutdown, and the lock of the EEPROM.
-    """
+    It has error bits, Torque Limit 0 after a shutdown, and the lock of the EEPROM."""
 
     def __init__(self, memory: Memory, shaft: Shaft, note: Callable[[str], None]) -> None:
         super().__init__(memory, lock_error, shaft, note)
@@ -261,7 +260,8 @@ class Protocol1Servo(SimulatedServo):
         return 0
 
     def _takes_part(self, read: GroupRead) -> bool:
-        """Return True for a supported bulk read: MX models only, with two servos or more."""
+        """Return True if the servo replies to a group read: a bulk read of two servos or more, on MX
+        models only."""
         known = "bulk_read" in self.registers.table.capabilities and len(read.entries) >= 2
         if not known:
             self.note(f"servo {self.servo_id} refuses a bulk read of {len(read.entries)}")
@@ -270,7 +270,7 @@ class Protocol1Servo(SimulatedServo):
     # Protection
 
     def _state(self) -> int:
-        """Return the error bits, which persist as long as their cause."""
+        """Return the error bits of every reply; each persists as long as its cause."""
         registers, errors = self.registers, self.registers.table.errors
         error = errors.value_of("overload") if self.overload else 0
         if not registers["min_voltage_limit"] <= round(self.voltage * 10) <= registers["max_voltage_limit"]:
@@ -300,10 +300,9 @@ class Protocol1Servo(SimulatedServo):
 
 
 def _supply(memory: Memory) -> float:
-    """Return the supply voltage of a servo, V.
+    """Return the voltage with which a simulated servo is supplied, V.
 
-    It is the voltage of the manual's data; otherwise 12 V, or the middle of the servo's limits.
-    """
+    It is the voltage of the manual's data; otherwise 12 V, or the middle of the servo's limits."""
     if memory.table.nominal_voltage:
         return memory.table.nominal_voltage
     lowest, highest = memory.get("min_voltage_limit", 0), memory.get("max_voltage_limit", 999)

@@ -1,4 +1,4 @@
-"""Durations in text form, `500 us` or `2 s`, and quantities with any unit."""
+"""Durations in text form, such as `500 us` or `2 s`; splits quantities with any unit."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ _QUANTITY = re.compile(
 
 
 def split_quantity(text: str) -> tuple[str, str] | None:
-    """Return the number and the unit of a quantity, such as `("1.5", "ms")`, or None for another text."""
+    """Split a quantity into number and unit, such as `("1.5", "ms")`; return None for another text."""
     match = _QUANTITY.fullmatch(text.strip()) if len(text) <= LONGEST_QUANTITY else None
     number = match[1].replace("_", "") if match else ""
     if match is None or not any(character.isdigit() for character in number.split("e")[0].split("E")[0]):
@@ -29,7 +29,8 @@ def split_quantity(text: str) -> tuple[str, str] | None:
 
 
 def nanoseconds(number: str, unit: str) -> int | None:
-    """Return a duration in a unit of `DURATION_NS`, ns, or None if it is not from 0 s to 31 years."""
+    """Return a duration, given as number and unit of `DURATION_NS`, in ns, or None if it is not from 0 s
+    to 31 years."""
     duration_ns = round(Fraction(number) * DURATION_NS[unit])  # Exact: 0.1 ms is 100000 ns
     return duration_ns if 0 <= duration_ns <= LONGEST_NS else None
 

@@ -1,4 +1,4 @@
-"""Servos of one bus in the syntax of a command line: `XL430-W250:1-3`."""
+"""Servo words: parses the servos of one bus in the syntax of a command line: `XL430-W250:1-3`."""
 
 from __future__ import annotations
 
@@ -18,14 +18,16 @@ from dxlwire.errors import InputError
 BUS = "main"  # Name of the bus
 _SERVO = re.compile(r"(.+?):(\d+(?:-\d+)?(?:,\d+(?:-\d+)?)*)", re.ASCII)
 _HIGHEST_ID = {1.0: 253, 2.0: 252}
-"""254 is the broadcast ID; 253 is part of the header of Protocol 2.0 (e-Manual, Packet ID)."""
+"""Highest ID of a servo by protocol: 254 is the broadcast ID; 253 is part of the header of Protocol 2.0
+(e-Manual, Packet ID)."""
 _MOST_DIGITS = 9
 
 
 def bus_of_servos(
     words: Sequence[str], baud_rate: int | None = None, protocol: float | None = None
 ) -> BusConfig:
-    """Return the bus of servos in the form `MODEL:IDS`, each in the middle of its travel.
+    """Return the configuration of a simulated bus with servos written as `MODEL:IDS`, each in the middle
+    of its travel.
 
     Args:
         words: Models with their IDs, such as `XL430-W250:1-3` or `AX-12A:1,4`.
@@ -103,7 +105,7 @@ def _unknown(models: Sequence[str]) -> list[str]:
 
 
 def _protocol(models: Sequence[str], chosen: float | None) -> float:
-    """Return the chosen protocol, or the common protocol of all models."""
+    """Return the chosen protocol, or the common protocol of all models. Raises InputError if none fits."""
     if chosen not in (None, 1.0, 2.0):
         raise InputError(f"there is no Protocol {chosen:g}; --protocol is 1.0 or 2.0")
     spoken = {model: protocols_of(model) for model in models}

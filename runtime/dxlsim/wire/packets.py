@@ -1,8 +1,8 @@
-"""Common packet code of both protocols for servos: instruction packets, replies, group reads, framing.
+"""Packets: common code of both protocols for simulated servos: instruction packets, replies, group reads,
+framing.
 
-Written from the protocols alone (ROBOTIS e-Manual, "Protocol 1.0", "Protocol 2.0"), without the host's packet
-code: a common codec would hide its own errors.
-"""
+Written from the protocols alone (ROBOTIS e-Manual, "Protocol 1.0", "Protocol 2.0"), without the host's
+packet code: a common codec would hide its own errors."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ BROADCAST = 0xFE
 
 @unique
 class Instruction(IntEnum):
-    """Instruction byte (e-Manual, "Instruction"); Protocol 1.0 has only some of them."""
+    """Codes of instructions (e-Manual, "Instruction"); Protocol 1.0 has only some of them."""
 
     PING = 0x01
     READ = 0x02
@@ -37,7 +37,7 @@ class Instruction(IntEnum):
 
 
 class InstructionPacket(NamedTuple):
-    """One packet on the line."""
+    """One packet that a servo has received from the line."""
 
     servo_id: int
     instruction: int
@@ -48,7 +48,7 @@ class InstructionPacket(NamedTuple):
 
 
 class ServoReply(NamedTuple):
-    """Reply of a servo, with its delay after the instruction's last byte."""
+    """Reply of a servo to an instruction, with its delay after the instruction's last byte."""
 
     servo_id: int
     error: int
@@ -57,7 +57,7 @@ class ServoReply(NamedTuple):
 
 
 class ReadEntry(NamedTuple):
-    """Address range to read from one servo of a list."""
+    """Address range that a group read asks of one servo."""
 
     servo_id: int
     address: int
@@ -65,7 +65,8 @@ class ReadEntry(NamedTuple):
 
 
 class GroupRead(msgspec.Struct, frozen=True):
-    """Instruction that several servos answer one after the other, in the order of its list."""
+    """Instruction (sync or bulk read) that several servos answer one after the other, in the order of its
+    list."""
 
     instruction: int
     entries: tuple[ReadEntry, ...]
@@ -76,16 +77,17 @@ class GroupRead(msgspec.Struct, frozen=True):
 
     @property
     def lengths(self) -> tuple[int, ...]:
-        """Number of bytes of each entry."""
+        """Number of bytes that each entry asks for."""
         return tuple(each.length for each in self.entries)
 
 
 ListedWrites = Mapping[int, Sequence[tuple[int, int, int, bytes]]]
-"""Writes of a list by ID: place in the list, ID, address, data."""
+"""Writes of a sync or bulk write by ID: place in the list, ID, address, data."""
 
 
 def sync_writes(listed: bytes, address: int, length: int) -> ListedWrites | None:
-    """Return the writes of a sync write's list of IDs and data, or None if its length is wrong."""
+    """Return the writes in a sync write's list of IDs and data, by ID, or None if the length of the list
+    is wrong."""
     if length == 0 or len(listed) % (length + 1):
         return None
     writes: dict[int, list[tuple[int, int, int, bytes]]] = {}
@@ -96,9 +98,8 @@ def sync_writes(listed: bytes, address: int, length: int) -> ListedWrites | None
 
 
 class Codec(NamedTuple):
-    """Codec of a protocol: `protocol1.CODEC` and `protocol2.CODEC`. Functions return None for malformed
-    input.
-    """
+    """Functions and constants with which simulated servos parse and build packets of a protocol:
+    `protocol1.CODEC` and `protocol2.CODEC`. Functions return None for malformed input."""
 
     header: bytes  # The ID follows the header
     no_id: frozenset[int]  # Bytes that cannot be an ID
@@ -112,7 +113,7 @@ class Codec(NamedTuple):
     listed_writes: Callable[[InstructionPacket], ListedWrites | None]  # From a sync write or bulk write
     group_read: Callable[[InstructionPacket], GroupRead | None]  # None also for other instructions
     ping_slot_ns: Callable[[int], int]
-    """Delay between the answers of two successive IDs to a broadcast ping, at a baud rate."""
+    """Delay (ns) between the answers of two successive IDs to a broadcast ping, at a baud rate."""
     error: Callable[[int], IntEnum | IntFlag]  # Enum member of an error
     damaged: int  # Error for a wrong checksum
     unknown: int  # Error for an unknown instruction, or wrong parameters
@@ -120,7 +121,8 @@ class Codec(NamedTuple):
 
 
 class InstructionReceiver:
-    """Extracts instruction packets from the bytes of a line, despite noise; holds at most one packet."""
+    """Extracts instruction packets from the bytes that a host sends on a line, despite noise; holds at
+    most one packet."""
 
     def __init__(self, codec: Codec) -> None:
         self._codec = codec
@@ -128,19 +130,18 @@ class InstructionReceiver:
 
     @property
     def pending(self) -> int:
-        """Number of bytes of an incomplete packet."""
+        """Number of received bytes of an incomplete packet."""
         return len(self._held)
 
     def forget(self) -> None:
-        """Discard a packet that was not completed in time."""
+        """Discard the bytes of a packet that was not completed in time."""
         self._held = b""
 
     def feed(self, data: bytes | bytearray, start: int = 0) -> InstructionPacket | None:
         """Process `data` from `start` until a packet is complete, and return the packet.
 
-        None means that all bytes were processed without completing a packet. A packet with a wrong checksum
-        is returned, too. Continue at `packet.end`.
-        """
+        None means that all bytes were processed without completing a packet. A packet with a wrong
+        checksum is returned, too. Continue at `packet.end`."""
         held = len(self._held)
         seen = self._held + data[start:]
         at = 0
@@ -155,7 +156,7 @@ class InstructionReceiver:
         return self._codec.packet(bytes(seen[at:end]), start + end - held)
 
     def _size(self, head: bytes) -> int | None:
-        """Return the size of a packet with this beginning, or None if the beginning is too short."""
+        """Return the size of a packet with this beginning, bytes, or None if the beginning is too short."""
         codec = self._codec
         begin = len(codec.header) + 1
         end = begin + codec.length_bytes

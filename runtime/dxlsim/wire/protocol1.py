@@ -1,4 +1,4 @@
-"""Protocol 1.0 from the servo's perspective: bytes of the line -> instructions, replies -> bytes."""
+"""Protocol 1.0 for simulated servos: parses instructions and builds replies as bytes."""
 
 from __future__ import annotations
 
@@ -22,7 +22,7 @@ LONGEST = 4 + 255
 
 @unique
 class ErrorBit(IntFlag):
-    """Error byte of a status packet (e-Manual, Protocol 1.0, "Error")."""
+    """Bits of the error byte in a status packet (e-Manual, Protocol 1.0, "Error")."""
 
     VOLTAGE = 0x01
     ANGLE_LIMIT = 0x02
@@ -34,18 +34,18 @@ class ErrorBit(IntFlag):
 
 
 def checksum(body: bytes | bytearray) -> int:
-    """Return the checksum of everything between header and checksum."""
+    """Return the checksum of a packet, given the bytes between header and checksum."""
     return ~sum(body) & 0xFF
 
 
 def status_packet(servo_id: int, error: int, parameters: bytes = b"") -> bytes:
-    """Return the bytes of a status packet."""
+    """Return the bytes of a status packet, the reply of a servo."""
     body = bytes((servo_id, len(parameters) + 2, error)) + parameters
     return HEADER + body + bytes((checksum(body),))
 
 
 def group_read(packet: InstructionPacket) -> GroupRead | None:
-    """Return the group read of a packet, or None for another or a malformed instruction."""
+    """Parse a bulk read; return None for another or a malformed instruction."""
     if not packet.intact or packet.servo_id != BROADCAST or packet.instruction != Instruction.BULK_READ:
         return None
     listed = packet.parameters[1:]

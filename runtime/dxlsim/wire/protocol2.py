@@ -1,7 +1,6 @@
-"""Protocol 2.0 from the servo's perspective: bytes of the line -> instructions, replies -> bytes.
+"""Protocol 2.0 for simulated servos: parses instructions and builds replies as bytes.
 
-Only the CRC comes from a library; the tests use another implementation.
-"""
+Only the CRC comes from a library; the tests use another implementation."""
 
 from __future__ import annotations
 
@@ -46,7 +45,7 @@ _GROUP_READS = _FAST_READS | {Instruction.SYNC_READ, Instruction.BULK_READ}
 
 @unique
 class ErrorNumber(IntEnum):
-    """Number in bits 0..6 of a status packet's error (e-Manual, Protocol 2.0, "Error")."""
+    """Numbers in bits 0..6 of a status packet's error (e-Manual, Protocol 2.0, "Error")."""
 
     NONE = 0
     RESULT_FAIL = 1
@@ -64,7 +63,8 @@ def crc16(data: bytes | bytearray, crc: int = 0) -> int:
 
 
 def ping_slot_ns(baud_rate: int) -> int:
-    """Return the delay between the answers of two successive IDs to a broadcast ping."""
+    """Return the delay (ns) between the answers of two successive IDs to a broadcast ping, at a rate in
+    bit/s."""
     return _PING_REPLY * (10_000_000_000 // baud_rate) + SLOT_NS
 
 
@@ -79,7 +79,7 @@ def unstuffed(body: bytes) -> bytes:
 
 
 def status_packet(servo_id: int, error: int, parameters: bytes = b"") -> bytes:
-    """Return the bytes of a status packet."""
+    """Return the bytes of a status packet, the reply of a servo."""
     body = bytes((STATUS, error)) + parameters
     if HEADER in body:
         body = stuffed(body)
@@ -90,8 +90,7 @@ def status_packet(servo_id: int, error: int, parameters: bytes = b"") -> bytes:
 class FastStatusPacket:
     """Shared status packet of a fast sync or bulk read: each servo adds error, ID, data and CRC.
 
-    It has no byte stuffing. Each CRC covers everything before it, including earlier CRCs.
-    """
+    It has no byte stuffing. Each CRC covers everything before it, including earlier CRCs."""
 
     def __init__(self, lengths: tuple[int, ...]) -> None:
         self._head = _head(BROADCAST, _fast_length(lengths)) + bytes((STATUS,))
@@ -99,7 +98,7 @@ class FastStatusPacket:
         self._sent_crc = b""  # Previous CRC as sent; the next CRC covers it
 
     def part(self, reply: ServoReply) -> bytes:
-        """Return the bytes that the next servo adds; the first servo also sends the header."""
+        """Return the bytes that the next servo adds for its reply; the first servo also sends the header."""
         servo_id, error, parameters, _ = reply
         data = b"%b%c%c%b" % (self._head, error, servo_id, parameters)
         self._head = b""
@@ -109,7 +108,7 @@ class FastStatusPacket:
 
 
 def group_read(packet: InstructionPacket) -> GroupRead | None:
-    """Return the group read of a packet, or None for another or a malformed instruction."""
+    """Parse a sync, bulk or fast read; return None for another or a malformed instruction."""
     if packet.instruction not in _GROUP_READS or not packet.intact or packet.servo_id != BROADCAST:
         return None
     known = _group_read if len(packet.parameters) <= _LONGEST_KNOWN else _group_read.__wrapped__
