@@ -190,9 +190,11 @@ def inputs_of_pictures(reader: Reader) -> dict[str, Inputs]:
         "setup_hands": {"drawing": by_hand.draw_setup},
         "calibrate_hands": {"drawing": by_hand.draw_calibrate},
         "teach_hands": {"drawing": by_hand.draw_teach},
-        "setup": said_by("dxlrun_hand.servo_setup"),
+        "setup": said_by(
+            "dxlrun_hand.servo_setup", "dxlrun.dynamixel.tools.one_servo", "dxlrun.dynamixel.texts"
+        ),
         "calibrate": said_by("dxlrun_hand.calibration", "dxlrun_hand.commands.calibrate"),
-        "teach": said_by("dxlrun_hand.teaching", "dxlrun_hand.commands.teach"),
+        "teach": said_by("dxlrun_hand.teaching", "dxlrun_hand.commands.teach", "dxlrun_hand.lines"),
         "characterize": {
             "robots/single_joint.yaml": partial(file, "robots/single_joint.yaml"),
             **said_by(f"{lab}.characterize.page", f"{lab}.characterize.tables"),
