@@ -37,7 +37,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
-    from dxlrun.channels.events import EventText
+    from dxlrun.channels.event_records import EventText
 
 DOCS = Path(__file__).resolve().parent
 ROOT = DOCS.parent
@@ -218,7 +218,7 @@ def tooling_page(name: str) -> str:
 def requests(_: str = "") -> str:
     """Return the table of HTTP requests: their fields, and the first line about their handlers."""
     from dxlrun.remote.gateway import _HANDLERS
-    from dxlrun.remote.requests.table import REQUESTS
+    from dxlrun.remote.requests.request_table import REQUESTS
 
     rows = ["| request | fields of the body | about |", "|---|---|---|"]
     for each in REQUESTS:
@@ -260,7 +260,7 @@ class Field(str):
 def event_rows() -> list[tuple[str, str, EventText[...]]]:
     """Return all rows of the tables of texts: file below `runtime/`, name, row."""
     import dxlrun.log.log_writer
-    from dxlrun.channels.events import EventText
+    from dxlrun.channels.event_records import EventText
 
     names = [".".join(path.relative_to(ROOT / "runtime").with_suffix("").parts) for path in text_tables()]
     modules = [*map(importlib.import_module, names), dxlrun.log.log_writer]

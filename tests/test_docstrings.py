@@ -17,7 +17,7 @@ import pytest
 import dxlrun
 import dxlrun.tooling
 from dxlrun import Controller, Interfaces, ParametersModel, RemoteRobot, Sensor
-from dxlrun.control.controllers.plugins import controller_breach
+from dxlrun.control.controllers.plugin_loading import controller_breach
 from dxlrun.features.sensors.offer import sensor_breach
 from dxlrun.testing import simulated_robot
 

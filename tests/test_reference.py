@@ -15,7 +15,7 @@ from tests.kit.pages import PATHS, page_text
 
 import dxlrun
 import dxlrun.tooling
-from dxlrun.cli import verbs
+from dxlrun.cli import verb_registry
 
 ROOT = Path(__file__).parents[1]
 GENERATE = ROOT / "docs/generate.py"
@@ -84,7 +84,7 @@ def test_reference_has_every_name_and_command() -> None:
     assert methods == set(re.findall(r"^#### `(\w+)`", client, re.MULTILINE))
     listed = page_text("commands.md")
     sections = dict(re.findall(r"^### ([a-z -]+)\n(.*?)(?=^### |\Z)", listed, re.MULTILINE | re.DOTALL))
-    assert {name.split()[0] for name in sections} == {*verbs.names(), "view"}
+    assert {name.split()[0] for name in sections} == {*verb_registry.names(), "view"}
     assert {"bench rate", "experiment tracking"} <= set(sections)
     assert all(f"| `{option}" in sections["send"] for option in ("--wait", "--in STR", "--json", "TARGET"))
 

@@ -11,7 +11,7 @@ import pytest
 from tests.kit.loaded import loaded
 
 from dxlrun.channels.answers import Code
-from dxlrun.channels.events import EventCode, Severity, event_names, event_text
+from dxlrun.channels.event_records import EventCode, Severity, event_names, event_text
 
 ROOT = Path(__file__).parents[1]
 generate = loaded(ROOT / "docs/generate.py")
@@ -67,7 +67,7 @@ def test_only_rows_make_events() -> None:
     """No other place chooses a code or a severity."""
     bodies = [call for path in PRODUCT for call in calls(path, "EventBody")]
     assert len(bodies) == 1, bodies
-    assert bodies[0].startswith("runtime/dxlrun/channels/events.py:")
+    assert bodies[0].startswith("runtime/dxlrun/channels/event_records.py:")
 
 
 def test_every_code_has_a_row() -> None:

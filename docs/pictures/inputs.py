@@ -171,9 +171,15 @@ def inputs_of_pictures(reader: Reader) -> dict[str, Inputs]:
     torso = robot_and_motion("bioloid_torso_imu", "three_parts")
     view: Inputs = {"page of dxlrun view": page_of_view}
     analysis, lab = "dxlrun_analysis", "dxlrun_lab"
-    page = said_by(*(f"{analysis}.page.{part}" for part in ("page", "loop", "joints", "wake_ups")))
+    page = said_by(
+        *(f"{analysis}.page.{part}" for part in ("report_page", "loop_plots", "joint_plots", "wake_up_plots"))
+    )
     analyzed = {**command(FIRST), "dxlrun analyze": reader.analysis}
-    latency = (f"{lab}.commands.latency", f"{lab}.latency.measurement", f"{analysis}.page.wake_ups")
+    latency = (
+        f"{lab}.commands.latency",
+        f"{lab}.latency.latency_measurement",
+        f"{analysis}.page.wake_up_plots",
+    )
     return {
         "terminal": analyzed,
         "report": {**analyzed, **page},
@@ -197,11 +203,13 @@ def inputs_of_pictures(reader: Reader) -> dict[str, Inputs]:
         "teach": said_by("dxlrun_hand.teaching", "dxlrun_hand.commands.teach", "dxlrun_hand.lines"),
         "characterize": {
             "robots/single_joint.yaml": partial(file, "robots/single_joint.yaml"),
-            **said_by(f"{lab}.characterize.page", f"{lab}.characterize.tables"),
+            **said_by(
+                f"{lab}.characterize.characterization_page", f"{lab}.characterize.characterization_tables"
+            ),
         },
         "arm_report": {**arm, **page},
         "watch": {**arm, **said_by("dxlrun.cli.steering.watch")},
-        "doctor": said_by("dxlrun.cli.doctor", "dxlrun.run.doctor"),
+        "doctor": said_by("dxlrun.cli.doctor", "dxlrun.run.machine_checks"),
         "latency": said_by(*latency),
         "view": {**torso, **view},
         "view_phone": {**torso, **view},

@@ -245,8 +245,8 @@ class Maker:
         from tests.kit.browser import Browser
         from tests.view.served import Served
 
-        from dxlrun_view.live import LiveRobot
-        from dxlrun_view.recorded import RecordedRobot
+        from dxlrun_view.live_robot import LiveRobot
+        from dxlrun_view.recorded_robot import RecordedRobot
 
         with ExitStack() as stack:
             drawing = ("--use-angle=swiftshader", "--enable-unsafe-swiftshader", "--no-first-run")
@@ -280,9 +280,9 @@ class Maker:
                     browser.until("window.looked > 5")
                     if name == "view":
                         printed(("play", "three_parts", "--no-wait"), self.place)
-                        end_s = live.at(None).time + 9.0
+                        end_s = live.moment_at(None).time + 9.0
                         # Looks between those of the page, so that its curves have no gap on a busy machine.
-                        while live.at(None).time < end_s:
+                        while live.moment_at(None).time < end_s:
                             time.sleep(0.04)
                     self._kept(name, browser.picture())
                 served.close()

@@ -26,7 +26,7 @@ class Counts:
         self._pending: list[Numbers] = []
         self._waiting = 0
 
-    def take(self, group: Numbers, value: Numbers) -> None:
+    def count_values(self, group: Numbers, value: Numbers) -> None:
         """Count values in their groups.
 
         Args:
@@ -38,7 +38,7 @@ class Counts:
         if self._waiting > _MOST_PENDING:
             self._merge()
 
-    def of(self, group: int) -> tuple[Numbers, Numbers]:
+    def counts_of(self, group: int) -> tuple[Numbers, Numbers]:
         """Return the distinct values that were counted in a group, ascending, and the count of each value."""
         self._merge()
         begin, end = np.searchsorted(self._keys, [group << _GROUP, (group + 1) << _GROUP])

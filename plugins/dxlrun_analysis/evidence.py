@@ -53,8 +53,8 @@ def busy_machine(totals: RunTotals) -> list[str]:
     deadline and are not used.
     """
     load, causes = totals.causes.load, totals.causes.causes
-    parts = [load.text] if load.share else []
-    parts += [totals.wait.text] if totals.wait.times >= _LEAST_CYCLES else []
+    parts = [load.clause] if load.share else []
+    parts += [totals.wait.clause] if totals.wait.times >= _LEAST_CYCLES else []
     if totals.plan.loop.schedule == "sequential":
         return parts
     late = totals.latency.share_over_1_ms if totals.latency else 0.0

@@ -21,6 +21,6 @@ def dxlrun_commands() -> Sequence[Command]:
     return (
         Command("analyze", f"{_PLACE}.analyze:analyze", group="Every day"),
         Command("export", f"{_PLACE}.export:export", group="Logs"),
-        Command("logs", f"{_PLACE}.logs:logs", group="Logs"),
-        Command("upload", f"{_PLACE}.logs:upload", group="Logs"),
+        Command("logs", f"{_PLACE}.season_logs:logs", group="Logs"),
+        Command("upload", f"{_PLACE}.season_logs:upload", group="Logs"),
     )

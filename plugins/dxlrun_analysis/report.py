@@ -11,16 +11,16 @@ from dxlrun import Log, LogReader, open_log
 from dxlrun.tooling.output import Cell, Part, Sentence, Table, Tone, Value, counted
 from dxlrun.tooling.plans import ScheduleName
 from dxlrun.tooling.records import EventCode
-from dxlrun_analysis.cycles.latency import on_virtual_time
+from dxlrun_analysis.cycles.punctuality import on_virtual_time
 from dxlrun_analysis.parts.cycles import CAUSES, CONTROLLERS, LATENCY, PERIODS, STEPS
 from dxlrun_analysis.parts.history import EVENTS, PAUSES, STEERING, TOPICS, tone_of
 from dxlrun_analysis.parts.part import Report, ReportPart
-from dxlrun_analysis.parts.servos import BUSES, EXTREMES, JOINTS, SERVOS
+from dxlrun_analysis.parts.servo_parts import BUSES, EXTREMES, JOINTS, SERVOS
 from dxlrun_analysis.parts.source_values import SOURCES
-from dxlrun_analysis.plan import LoggedBus, plan_of
+from dxlrun_analysis.plan_excerpt import LoggedBus, plan_of
 from dxlrun_analysis.servos.exchanges import Exchanges
 from dxlrun_analysis.tally import Tally
-from dxlrun_analysis.verdict import judge
+from dxlrun_analysis.verdict import judge_run
 
 PARTS: tuple[ReportPart[Any], ...] = (
     ReportPart("log", lambda report: str(report.about.path)),
@@ -78,10 +78,10 @@ def analyze(
     """
     tally = Tally(exchanges, (part.collector for part in PARTS if part.collector is not None))
     for log in reader.slices():
-        for take in (tally.take, *watching):
+        for take in (tally.add_slice, *watching):
             take(log)
     totals = tally.totals(reader.about)
-    report = Report(reader.about, tally, totals, judge(totals), {})
+    report = Report(reader.about, tally, totals, judge_run(totals), {})
     report.numbers.update((part.name, part.numbers(report)) for part in PARTS)
     return report
 

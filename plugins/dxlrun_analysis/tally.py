@@ -16,20 +16,20 @@ from dxlrun.tooling.records import (
     EventCode,
     EventCounts,
     EventGroup,
-    Granted,
     LostRecords,
+    SchedulerGrant,
+    SimulationStall,
     SimulationWait,
-    Waited,
 )
 from dxlrun_analysis.causes.causes import NO_CAUSES, Causes, CycleCauses
 from dxlrun_analysis.conduct.conduct import NO_CONDUCT, Conduct, ConductHistory
 from dxlrun_analysis.conduct.frozen_sources import FrozenSources
-from dxlrun_analysis.conduct.steering import Act, Pause, SteeringHistory
-from dxlrun_analysis.cycles.latency import Latency, Periods, Punctuality, Slowest, on_virtual_time
+from dxlrun_analysis.conduct.steering_history import Act, Pause, SteeringHistory
+from dxlrun_analysis.cycles.punctuality import Latency, LongCycle, Periods, Punctuality, on_virtual_time
 from dxlrun_analysis.finding import Finding
+from dxlrun_analysis.joints.goal_tracking import JointTracking, TrackingCollector
 from dxlrun_analysis.joints.health import ServoHealth
-from dxlrun_analysis.joints.tracking import JointTracking, Tracking
-from dxlrun_analysis.plan import LoggedPlan, plan_of
+from dxlrun_analysis.plan_excerpt import LoggedPlan, plan_of
 from dxlrun_analysis.servos.exchanges import Exchanges
 from dxlrun_analysis.servos.traffic import BusTraffic, ServoTraffic, Traffic
 
@@ -54,7 +54,7 @@ class RunTotals:
 
     periods: Periods
     latency: Latency | None = None  # None if the loop never ran a cycle, and without a log
-    slowest: Slowest | None = None
+    slowest: LongCycle | None = None
     causes: Causes = NO_CAUSES  # Causes of late and long cycles
     virtual: bool = False
     plan: LoggedPlan = field(default_factory=LoggedPlan)
@@ -109,7 +109,7 @@ class RunTotals:
 class Collector(Protocol):
     """Interface of an accumulator that collects one subject of a log, slice by slice."""
 
-    def take(self, log: Log) -> None:
+    def add_slice(self, log: Log) -> None:
         """Add the next slice of the log."""
 
 
@@ -130,7 +130,7 @@ class Tally:
         """
         own = (
             *(Punctuality(), CycleCauses(), Traffic(watch), ServoHealth()),
-            *(Tracking(), SteeringHistory(), ConductHistory(), FrozenSources()),
+            *(TrackingCollector(), SteeringHistory(), ConductHistory(), FrozenSources()),
         )
         self._collectors: dict[type[Collector], Collector] = {type(each): each for each in own}
         self._collectors |= {kind: kind() for kind in others}
@@ -140,23 +140,23 @@ class Tally:
         self._unread = 0
         self._wait = SimulationWait()
 
-    def of(self, kind: type[C]) -> C:
+    def find_collector(self, kind: type[C]) -> C:
         """Return the accumulator of a class."""
         return cast("C", self._collectors[kind])
 
-    def take(self, log: Log) -> None:
+    def add_slice(self, log: Log) -> None:
         """Give the next slice of the log to all accumulators.
 
         Raises:
             LogError: A packet in the slice cannot be read.
         """
         for collector in self._collectors.values():
-            collector.take(log)
+            collector.add_slice(log)
         for event in log.events:
-            self._events.add(event)
+            self._events.count_event(event)
             with suppress(*UNREADABLE):
                 if event.code == EventCode.SCHEDULER and event.source == "loop":
-                    granted = msgspec.json.decode(event.data, type=Granted)
+                    granted = msgspec.json.decode(event.data, type=SchedulerGrant)
                     if granted.request == "scheduler":
                         self._granted = granted.granted
                 elif event.code == EventCode.SERVO_LOST and (why := event.text.partition(_ANSWERS)[2]):
@@ -164,7 +164,7 @@ class Tally:
                 elif event.code == EventCode.RECORDER_GAP:
                     self._unread += msgspec.json.decode(event.data, type=LostRecords).lost
                 elif event.code == EventCode.SIMULATION_STALLED:
-                    data, wait = msgspec.json.decode(event.data, type=Waited), self._wait
+                    data, wait = msgspec.json.decode(event.data, type=SimulationStall), self._wait
                     self._wait = SimulationWait(wait.waited_ns + data.waited_ns, wait.times + data.times)
 
     def totals(self, log: Log) -> RunTotals:
@@ -173,13 +173,13 @@ class Tally:
         Args:
             log: Metadata of the file, which the last slice completes.
         """
-        punctuality, traffic = self.of(Punctuality), self.of(Traffic)
-        account, late = punctuality.finish()
-        servos, buses = traffic.finish()
-        acts, pauses = self.of(SteeringHistory).finish()
-        tracking = self.of(Tracking).finish(log)
-        conduct = self.of(ConductHistory).finish()
-        movement = tuple(self.of(Tracking).movement.findings(conduct.goals.allowed))
+        punctuality, traffic = self.find_collector(Punctuality), self.find_collector(Traffic)
+        account, late = punctuality.compute_latency()
+        servos, buses = traffic.summarize_traffic()
+        acts, pauses = self.find_collector(SteeringHistory).collect_acts()
+        tracking = self.find_collector(TrackingCollector).evaluate_joints(log)
+        conduct = self.find_collector(ConductHistory).summarize_conduct()
+        movement = tuple(self.find_collector(TrackingCollector).movement.findings(conduct.goals.allowed))
         gaps = self._unread
         with suppress(KeyError, ValueError):
             gaps = int(log.metadata[SUMMARY_NAME]["gaps"])
@@ -187,7 +187,7 @@ class Tally:
             periods=account,
             latency=late,
             slowest=punctuality.slowest,
-            causes=self.of(CycleCauses).finish(),
+            causes=self.find_collector(CycleCauses).find_causes(),
             virtual=on_virtual_time(log),
             plan=plan_of(log),
             real_time=_real_time(log, granted=self._granted),
@@ -206,8 +206,8 @@ class Tally:
             findings=(
                 *traffic.findings,
                 *movement,
-                *self.of(ServoHealth).findings(movement),
-                *self.of(FrozenSources).findings(),
+                *self.find_collector(ServoHealth).findings(movement),
+                *self.find_collector(FrozenSources).findings(),
             ),
             tracking=tracking,
             conduct=conduct,

@@ -28,8 +28,8 @@ import msgspec
 
 from dxlrun.tooling.output import counted, microseconds
 from dxlrun.tooling.records import EventCode, Severity
-from dxlrun_analysis.causes.rules import own_work
-from dxlrun_analysis.conduct.steering import Act, Pause
+from dxlrun_analysis.causes.loop_rules import own_work
+from dxlrun_analysis.conduct.steering_history import Act, Pause
 from dxlrun_analysis.evidence import accused, busy_machine
 from dxlrun_analysis.finding import HURTS, Finding, Rank
 from dxlrun_analysis.lost import (
@@ -78,7 +78,7 @@ class Verdict(msgspec.Struct, frozen=True):
     findings: tuple[Finding, ...]
 
 
-def judge(totals: RunTotals) -> Verdict:
+def judge_run(totals: RunTotals) -> Verdict:
     """Judge a run: combine the findings of all rules, sort them and decide whether the run was good."""
     judged = accused(
         totals,
@@ -175,7 +175,7 @@ def _longest(totals: RunTotals) -> str:
     steps = ((slowest.read_ns, "read"), (slowest.update_ns, "update"), (slowest.write_ns, "write"))
     longest_ns, name = max(steps)
     worst = max(totals.causes.worst, key=lambda one: one.written_us - one.woken_us, default=None)
-    why = f": {worst.causes[0].name}" if worst is not None and worst.causes else ""
+    why = f": {worst.causes[0].label}" if worst is not None and worst.causes else ""
     took = f"a cycle took up to {microseconds(slowest.lasted_ns / 1e3)}, its {name}"
     return f"; {took} {microseconds(longest_ns / 1e3)}{why}"
 

@@ -32,8 +32,8 @@ from dxlrun import (
     ParametersModel,
 )
 from dxlrun.messages import Header, Odometry
-from dxlrun_controllers.joints import JointNames, or_number
-from dxlrun_controllers.laws.odometry import Pose, WheelAngles
+from dxlrun_controllers.joint_parameters import JointNames, or_number
+from dxlrun_controllers.laws.odometry import BasePose, WheelAngles
 
 
 class LinearLimits(ParametersModel):
@@ -155,12 +155,12 @@ class Ramp:
         most = (self._sink if falling else self._rise) * dt
         return target if abs(gap) <= most else self.velocity + math.copysign(most, gap)
 
-    def set(self, velocity: float, dt: float) -> None:
+    def set_velocity(self, velocity: float, dt: float) -> None:
         """Set the present velocity, reached in the last `dt` s, and the acceleration that follows from it."""
         self.acceleration = (velocity - self.velocity) / dt
         self.velocity = velocity
 
-    def stop(self) -> None:
+    def stand_still(self) -> None:
         """Set velocity and acceleration to 0 at once."""
         self.velocity = self.acceleration = 0.0
 
@@ -192,7 +192,7 @@ class DiffDriveController(Controller[DiffDriveParameters]):
         self._angles = WheelAngles(len(context.joints), self._wheel_limit, context.period_ns)
         self._sides = slice(None, left), slice(left, None)
         self._linear, self._angular = Ramp(parameters.linear), Ramp(parameters.angular)
-        self._pose = Pose()
+        self._pose = BasePose()
         self._message = Odometry(
             header=Header(frame_id=parameters.frame), child_frame_id=parameters.child_frame
         )
@@ -216,10 +216,10 @@ class DiffDriveController(Controller[DiffDriveParameters]):
 
     def on_activate(self, time_ns: int) -> None:
         """Command a standstill until the first twist is received."""
-        self._linear.stop()
-        self._angular.stop()
+        self._linear.stand_still()
+        self._angular.stand_still()
         self._command = self._target = (0.0, 0.0)
-        self._angles.begin()
+        self._angles.restart_odometry()
         self._holding = False
         self.context.commands.velocity.fill(0.0)
 
@@ -255,8 +255,8 @@ class DiffDriveController(Controller[DiffDriveParameters]):
         forward, turn = self._within_wheels(
             linear.next(self._target[0], dt), angular.next(self._target[1], dt)
         )
-        linear.set(forward, dt)
-        angular.set(turn, dt)
+        linear.set_velocity(forward, dt)
+        angular.set_velocity(turn, dt)
         velocity, (left, right), across = self.context.commands.velocity, self._sides, turn * self._half
         velocity[left] = (forward - across) / self._radii[0]
         velocity[right] = (forward + across) / self._radii[1]
@@ -267,8 +267,8 @@ class DiffDriveController(Controller[DiffDriveParameters]):
         """
         forward, turn = self._rims(self.context.goals.velocity)
         if abs(forward - self._linear.velocity) > _SAME or abs(turn - self._angular.velocity) > _SAME:
-            self._linear.stop()
-            self._angular.stop()
+            self._linear.stand_still()
+            self._angular.stand_still()
             self._linear.velocity, self._angular.velocity = forward, turn
 
     def _within_wheels(self, forward: float, turn: float) -> tuple[float, float]:
@@ -300,7 +300,7 @@ class DiffDriveController(Controller[DiffDriveParameters]):
         states = self.context.states
         if self.parameters.odometry == "command":
             self._twist = self._linear.velocity, self._angular.velocity
-            self._pose.move(self._twist[0] * dt, self._twist[1] * dt)
+            self._pose.move_along_arc(self._twist[0] * dt, self._twist[1] * dt)
         elif np.count_nonzero(states.valid) == states.valid.size:
             self._measure(time_ns)
         else:
@@ -319,12 +319,12 @@ class DiffDriveController(Controller[DiffDriveParameters]):
         """
         states = self.context.states
         age_ns = self._angles.age_ns(time_ns)
-        elapsed_ns = self._angles.take(states, time_ns)
+        elapsed_ns = self._angles.add_sample(states, time_ns)
         self._twist = linear, angular = self._rims(states.velocity)
         if elapsed_ns is not None:
             by_position = self.parameters.odometry == "position"
             moved = linear * elapsed_ns * 1e-9, angular * elapsed_ns * 1e-9
-            self._pose.move(*(self._rims(self._angles.turned) if by_position else moved))
+            self._pose.move_along_arc(*(self._rims(self._angles.turned) if by_position else moved))
         elif age_ns >= 0:
             self.context.say(
                 f"odometry continues without the distance of {age_ns * 1e-9:.2f} s with missing replies"

@@ -20,7 +20,7 @@ from dxlrun import (
     Mistake,
 )
 from dxlrun.messages import Header
-from dxlrun_controllers.joints import (
+from dxlrun_controllers.joint_parameters import (
     JointsParameters,
     PerJoint,
     Positive,
@@ -29,7 +29,7 @@ from dxlrun_controllers.joints import (
     refer,
     row_of,
 )
-from dxlrun_controllers.laws.feed_forward import NEEDED_FIGURES, InverseServo, MotionAhead, output_per_need
+from dxlrun_controllers.laws.inverse_model import NEEDED_FIGURES, InverseServo, MotionAhead, output_per_need
 
 STATE_NS: Final = 20_000_000
 """Time between two messages of the topic `state`, ns."""
@@ -163,7 +163,7 @@ class FeedForward(Controller[FeedForwardParameters]):
         """Discard the past motion, so that the joints rest where they are until a reference is commanded."""
         self._reference.fill(np.nan)
         self._ahead.reset()
-        self._inverse.supply.take(self.context.states.voltage, 1.0)
+        self._inverse.supply.filter_voltage(self.context.states.voltage, 1.0)
         self._state_ns = time_ns
 
     def update(self, time_ns: int, period_ns: int) -> None:
@@ -172,7 +172,7 @@ class FeedForward(Controller[FeedForwardParameters]):
         period_s = period_ns * 1e-9
         refer(self._reference, context)
         velocity = np.where(np.isfinite(context.references.position), context.references.velocity, 0.0)
-        inverse.supply.take(context.states.voltage, period_s / (self._filter_s + period_s))
+        inverse.supply.filter_voltage(context.states.voltage, period_s / (self._filter_s + period_s))
         ahead.update(self._reference, velocity, period_s)
         inverse.update(ahead.position, ahead.velocity, ahead.acceleration)
         np.copyto(inverse.duty, clamped(inverse.duty, -1.0, 1.0))

@@ -27,7 +27,7 @@ from dxlrun import (
     RobotModel,
 )
 from dxlrun.messages import Header
-from dxlrun_controllers.joints import (
+from dxlrun_controllers.joint_parameters import (
     JointsParameters,
     PerJoint,
     Positive,
@@ -37,8 +37,8 @@ from dxlrun_controllers.joints import (
     refer,
     row_of,
 )
-from dxlrun_controllers.laws.feed_forward import NEEDED_FIGURES, Supply, output_per_need
 from dxlrun_controllers.laws.gravity import MOVABLE, TYPES, Bodies, bodies_of, gravity_law, up_of
+from dxlrun_controllers.laws.inverse_model import NEEDED_FIGURES, Supply, output_per_need
 
 STATE_NS: Final = 20_000_000
 """Time between two messages of the topic `state`, ns."""
@@ -184,7 +184,7 @@ class GravityCompensation(Controller[GravityParameters]):
     def on_activate(self, time_ns: int) -> None:
         """Discard the past references, so that the joints are held where they are."""
         self._reference.fill(np.nan)
-        self._supply.take(self.context.states.voltage, 1.0)
+        self._supply.filter_voltage(self.context.states.voltage, 1.0)
         self._up[:] = (0.0, 0.0, 1.0)
         self._state_ns = time_ns
 
@@ -192,7 +192,7 @@ class GravityCompensation(Controller[GravityParameters]):
         """Command the references plus the value that compensates the weight."""
         context, parameters, count = self.context, self.parameters, len(self._output)
         period_s = period_ns * 1e-9
-        self._supply.take(context.states.voltage, period_s / (self._filter_s + period_s))
+        self._supply.filter_voltage(context.states.voltage, period_s / (self._filter_s + period_s))
         self._at[count:] = context.reads[: self._others]
         if parameters.orientation is not None:
             up_of(context.reads[self._others :], self._up)

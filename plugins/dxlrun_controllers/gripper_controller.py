@@ -45,7 +45,7 @@ from dxlrun import (
     RobotModel,
 )
 from dxlrun_controllers.group import PositionsCommand
-from dxlrun_controllers.joints import hold, or_number, take_shorter_way_from_goals
+from dxlrun_controllers.joint_parameters import hold_joints, or_number, take_shorter_way_from_goals
 
 STATE_NS = 50_000_000
 """Time between two messages of the topic `state`, ns."""
@@ -273,7 +273,7 @@ class GripperController(Controller[GripperParameters]):
 
     def on_activate(self, time_ns: int) -> None:
         """Hold where the gripper is."""
-        hold(self.context)
+        hold_joints(self.context)
         commands = self.context.commands
         self.on_parameters(time_ns)
         if self.parameters.effort is not None:
@@ -303,7 +303,7 @@ class GripperController(Controller[GripperParameters]):
 
     def on_command(self, kind: str, data: NDArray[np.float64], time_ns: int) -> None:
         """Set another goal position without a result; an active goal ends as preempted."""
-        self._end(Outcome.PREEMPTED, "positions came")
+        self._end_goal(Outcome.PREEMPTED, "positions came")
         self._cancelled, self._stalled = False, False
         self.on_parameters(time_ns)
         np.copyto(self.context.commands.position, take_shorter_way_from_goals(data, self.context))
@@ -324,7 +324,7 @@ class GripperController(Controller[GripperParameters]):
             if self._cancelled:
                 still = bool(states.valid[0]) and abs(states.velocity[0]) <= self.parameters.stall_speed
                 if still or time_ns - self._began_ns >= REST_NS:
-                    self._end(Outcome.CANCELLED, "stopped")
+                    self._end_goal(Outcome.CANCELLED, "stopped")
             else:
                 self._watch(self._goal, time_ns)
         if time_ns - self._published_ns >= STATE_NS:
@@ -338,7 +338,7 @@ class GripperController(Controller[GripperParameters]):
         """End or report an active goal by the measured position; without a reply, only by the timeout."""
         if not self.context.states.valid[0]:
             if time_ns - self._began_ns >= self.parameters.timeout:
-                self._end(Outcome.MISSED, "no reply of its servo")
+                self._end_goal(Outcome.MISSED, "no reply of its servo")
             return
         position = float(self.context.states.position[0])
         error = abs(self._target - position)
@@ -353,7 +353,7 @@ class GripperController(Controller[GripperParameters]):
             self._hand_over(f"stalled, holds something at {self._place(position)}", np.inf, np.inf, 0)
             return
         if time_ns - self._began_ns >= self.parameters.timeout:
-            self._end(Outcome.MISSED, f"not there after {self.parameters.timeout * 1e-9:g} s")
+            self._end_goal(Outcome.MISSED, f"not there after {self.parameters.timeout * 1e-9:g} s")
             return
         goal.feedback(max(0.0, 1.0 - error / self._way) if self._way else 0.0, error)
 
@@ -377,7 +377,7 @@ class GripperController(Controller[GripperParameters]):
         if not np.isnan(position):
             self.context.commands.position.fill(min(max(position, self._lower), self._upper))
 
-    def _end(self, outcome: Outcome, text: str) -> None:
+    def _end_goal(self, outcome: Outcome, text: str) -> None:
         goal, self._goal = self._goal, None
         if goal is None:
             return

@@ -9,7 +9,7 @@ from numpy.typing import NDArray
 from pydantic import Field
 
 from dxlrun import CommandModel, Controller, Interfaces
-from dxlrun_controllers.joints import JointsParameters, hold, take_shorter_way_from_goals
+from dxlrun_controllers.joint_parameters import JointsParameters, hold_joints, take_shorter_way_from_goals
 
 
 class GroupParameters(JointsParameters):
@@ -77,7 +77,7 @@ class _GroupController(Controller[GroupParameters]):
     def on_activate(self, time_ns: int) -> None:
         """Hold the joints at their last goals; velocities, efforts and PWM start at 0."""
         if "position" in self.claimed:
-            hold(self.context)
+            hold_joints(self.context)
         else:
             getattr(self.context.commands, self.claimed[0]).fill(0.0)
 

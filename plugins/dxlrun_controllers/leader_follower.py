@@ -23,14 +23,14 @@ from dxlrun import (
     ParametersModel,
 )
 from dxlrun_controllers.group import PositionsCommand
-from dxlrun_controllers.joints import (
+from dxlrun_controllers.joint_parameters import (
     clamped,
     commanded_by,
-    hold,
+    hold_joints,
     take_shorter_way,
     take_where_heard,
 )
-from dxlrun_controllers.laws.tracking import CLOSING_SPEED
+from dxlrun_controllers.laws.tracking_law import CLOSING_SPEED
 
 
 class Pair(ParametersModel):
@@ -132,7 +132,7 @@ class LeaderFollower(Controller[LeaderFollowerParameters]):
 
     def on_activate(self, time_ns: int) -> None:
         """Hold the joints at their last goals until a leader or a command is fresh."""
-        hold(self.context)
+        hold_joints(self.context)
         self._in_step.fill(False)
         self._unknown = True
         self._commanded_ns = -1
@@ -148,7 +148,7 @@ class LeaderFollower(Controller[LeaderFollowerParameters]):
         hold.
         """
         if self.context.states.has_lost:
-            hold(self.context)
+            hold_joints(self.context)
             self._in_step.fill(False)
         if self._unknown:
             self._unknown = take_where_heard(self.context.commands.position, self.context.states)

@@ -21,7 +21,7 @@ from dxlrun import (
 )
 from dxlrun.messages import Header
 from dxlrun_controllers.group import PositionsCommand, VelocitiesCommand
-from dxlrun_controllers.joints import (
+from dxlrun_controllers.joint_parameters import (
     JointsParameters,
     NotNegative,
     PerJoint,
@@ -184,7 +184,7 @@ class PidController(Controller[PidParameters]):
     def on_parameters(self, time_ns: int) -> None:
         """Set the gains of the law, which may have changed in the run."""
         gains, joints = self.parameters.gains, self.context.joints
-        self._pid.take(gains, joints)
+        self._pid.set_gains(gains, joints)
         self._feed_forward = row_of(gains.feed_forward, joints, 0.0)
 
     def on_activate(self, time_ns: int) -> None:

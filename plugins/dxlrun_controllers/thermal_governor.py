@@ -22,7 +22,7 @@ from dxlrun import (
     ServoModel,
 )
 from dxlrun.messages import Header
-from dxlrun_controllers.joints import (
+from dxlrun_controllers.joint_parameters import (
     JointsParameters,
     PerJoint,
     Positive,
@@ -155,8 +155,8 @@ class ThermalGovernor(Controller[ThermalParameters]):
         self._smooth(context.states.temperature, period_ns * 1e-9)
         np.copyto(self._scale, torque_scale(self._temperature, self._warn, self._limit))
         context.provided[:] = self._scale
-        self._report(self._is_hot, self._warn, "it gets less torque")
-        self._report(self._is_spent, self._limit, "it gets no torque")
+        self._report_crossings(self._is_hot, self._warn, "it gets less torque")
+        self._report_crossings(self._is_spent, self._limit, "it gets no torque")
         commands, references, most = context.commands, context.references, self._most * self._scale
         if self._by_position:
             refer(self._reference, context)
@@ -193,7 +193,7 @@ class ThermalGovernor(Controller[ThermalParameters]):
         was_read = np.isfinite(position)
         np.copyto(goal, held, where=(self._scale < 1.0) & was_read)
 
-    def _report(self, beyond: NDArray[np.bool_], threshold: Floats, what: str) -> None:
+    def _report_crossings(self, beyond: NDArray[np.bool_], threshold: Floats, what: str) -> None:
         temperature = self._temperature
         now = temperature >= threshold - self.parameters.hysteresis * beyond
         for row in np.flatnonzero(now != beyond):

@@ -28,7 +28,7 @@ _MOST_TOLD, _LINES_TOLD = 4096, 6  # Bytes and lines of a run's output in an ans
 _MAIN = "from dxlrun.cli import main; raise SystemExit(main())"
 
 
-class Starter:
+class AgentApp:
     """ASGI application of the agent: starts a robot on POST, and reports on GET whether its run lives.
 
     `directory` is that of the fleet file; runs are started in it, and their output files are in it.
@@ -40,10 +40,10 @@ class Starter:
 
     async def __call__(self, scope: Scope, receive: Receive, send: Send) -> None:
         """Answer one HTTP request with the status and text of `answer`, for the role of the client."""
-        status, text = self.answer(scope["method"], unquote(scope["path"]), scope["client"].role)
+        status, text = self.answer_request(scope["method"], unquote(scope["path"]), scope["client"].role)
         await PlainTextResponse(text, status)(scope, receive, send)
 
-    def answer(self, method: str, path: str, role: Role) -> tuple[int, str]:
+    def answer_request(self, method: str, path: str, role: Role) -> tuple[int, str]:
         """Execute a request; return HTTP status and text.
 
         200: the robot was started (POST) or runs (GET); 403: the client is not an admin; 404: the agent does
@@ -83,12 +83,12 @@ class Starter:
         return 200, "it was started"
 
 
-async def serve(agent: Agent, directory: Path) -> None:
+async def serve_agent(agent: Agent, directory: Path) -> None:
     """Run the agent of a fleet file, whose directory is given, until the process ends.
 
     Raises:
         InputError: The certificates are refused.
         OSError: The address cannot be used.
     """
-    await serve_clients(Listener.secured(agent.address), Starter(agent, directory))
+    await serve_clients(Listener.secured(agent.address), AgentApp(agent, directory))
     await asyncio.Event().wait()

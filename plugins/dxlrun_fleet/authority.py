@@ -33,7 +33,7 @@ _EARLIER = timedelta(minutes=5)
 """Certificates are valid from this long before their creation, because clocks of computers differ."""
 
 
-class Issued(NamedTuple):
+class IssuedCertificates(NamedTuple):
     """All certificates that the authority has signed for one robot or client, by its name."""
 
     name: str
@@ -55,26 +55,26 @@ class Issued(NamedTuple):
         return [digits.zfill(len(digits) + len(digits) % 2) for digits in found]
 
 
-def place() -> Path:
+def authority_directory() -> Path:
     """Return the directory with the authority's private key and all certificates that it signed."""
     return keys_place() / "authority"
 
 
-def issued() -> Iterator[Issued]:
+def issued() -> Iterator[IssuedCertificates]:
     """Yield the certificates of each robot and client, in alphabetical order of their names."""
-    for path in sorted(place().glob("issued/*.crt")):
+    for path in sorted(authority_directory().glob("issued/*.crt")):
         *earlier, newest = x509.load_pem_x509_certificates(path.read_bytes())
-        yield Issued(path.stem, newest, (*earlier,))
+        yield IssuedCertificates(path.stem, newest, (*earlier,))
 
 
-def revoke(one: Issued) -> None:
+def revoke(one: IssuedCertificates) -> None:
     """Add all certificates of a robot or client to the file `revoked`, so that this computer's robots refuse
     them."""
     lines = "".join(f"{serial}\n" for serial in sorted(revoked().union(one.serials)))
     _write(keys_place() / "revoked", lines.encode())
 
 
-def issue(name: str, role: Role | None, days: int, to: Path) -> Issued:
+def issue(name: str, role: Role | None, days: int, to: Path) -> IssuedCertificates:
     """Sign a certificate for a new key, and write both with the authority's certificate to a directory.
 
     Args:
@@ -92,7 +92,7 @@ def issue(name: str, role: Role | None, days: int, to: Path) -> Issued:
     except OSError as error:
         raise unwritable(to, error) from error
     issuer, signer = _authority()
-    kept = place() / "issued" / f"{name}.crt"
+    kept = authority_directory() / "issued" / f"{name}.crt"
     there = to / f"{file}.crt"
     root = issuer.public_bytes(Encoding.PEM)
     held = there.exists() and _is_named(there, name)
@@ -113,7 +113,7 @@ def issue(name: str, role: Role | None, days: int, to: Path) -> Issued:
     )
     if role is None:
         builder = builder.add_extension(x509.SubjectAlternativeName([x509.DNSName(name)]), critical=False)
-    one = Issued(name, builder.sign(signer, hashes.SHA256()))
+    one = IssuedCertificates(name, builder.sign(signer, hashes.SHA256()))
     signed = one.certificate.public_bytes(Encoding.PEM)
     _write(kept, (kept.read_bytes() if kept.exists() else b"") + signed)
     _write_key(to / f"{file}.key", key)
@@ -129,11 +129,11 @@ def _is_named(path: Path, name: str) -> bool:
 
 def _authority() -> tuple[x509.Certificate, ec.EllipticCurvePrivateKey]:
     """Return the authority's certificate and private key. The first call on a computer creates both files."""
-    certificate, path = keys_place() / "ca.crt", place() / "ca.key"
+    certificate, path = keys_place() / "ca.crt", authority_directory() / "ca.key"
     if not path.exists():
         if certificate.exists():
             raise InputError(f"{certificate} is of another computer's authority: make certificates there")
-        (place() / "issued").mkdir(parents=True, mode=0o700)
+        (authority_directory() / "issued").mkdir(parents=True, mode=0o700)
         key = ec.generate_private_key(ec.SECP256R1())
         name = x509.Name([_attribute(NameOID.COMMON_NAME, "dxlrun")])
         usage = x509.KeyUsage(
@@ -157,7 +157,9 @@ def _authority() -> tuple[x509.Certificate, ec.EllipticCurvePrivateKey]:
         _write(certificate, signed.public_bytes(Encoding.PEM))
     signer = load_pem_private_key(path.read_bytes(), None)
     if not isinstance(signer, ec.EllipticCurvePrivateKey):
-        raise InputError(f"{path} is not a key of this version; move {place()} away to start over")
+        raise InputError(
+            f"{path} is not a key of this version; move {authority_directory()} away to start over"
+        )
     return x509.load_pem_x509_certificate(certificate.read_bytes()), signer
 
 

@@ -15,7 +15,7 @@ from urllib.parse import quote
 from cyclopts import Parameter
 
 from dxlrun import DxlrunError, InputError
-from dxlrun.tooling.output import print_error, show, show_json
+from dxlrun.tooling.output import print_error, show_json, show_parts
 from dxlrun.tooling.verbs import DebugFlag, JsonFlag
 
 if TYPE_CHECKING:
@@ -62,7 +62,7 @@ def fleet(
     if serve is not None:
         return _serve(found, serve)
     client_context()  # A problem with the certificates affects all robots, so report it once
-    found.require((*start, *stop))
+    found.require_robots((*start, *stop))
     if start or stop:
         return _change(found, start, stop, as_json=as_json)
     return _view(found, as_json=as_json)
@@ -73,15 +73,15 @@ def _serve(fleet: Fleet, name: str) -> int:
         raise InputError(f"the file has no agent {name}; it has {', '.join(fleet.agents) or 'none'}")
     import asyncio
 
-    from dxlrun_fleet.agent import serve
+    from dxlrun_fleet.agent import serve_agent
 
     agent = fleet.agents[name]
     for robot, words in agent.starts.items():
         if not (fleet.directory / words[0]).is_file():
             raise InputError(f"there is no {fleet.directory / words[0]}, by which {robot} is started")
-    show(f"{agent.address} starts {', '.join(agent.starts)}; Ctrl-C ends it, and no robot")
+    show_parts(f"{agent.address} starts {', '.join(agent.starts)}; Ctrl-C ends it, and no robot")
     try:
-        asyncio.run(serve(agent, fleet.directory))
+        asyncio.run(serve_agent(agent, fleet.directory))
     except KeyboardInterrupt:
         return 0
     except OSError as error:
@@ -109,7 +109,7 @@ def _change(fleet: Fleet, start: tuple[str, ...], stop: tuple[str, ...], *, as_j
     if as_json:
         show_json(rows, code=code, errors=failures)
     for row in () if as_json else rows:
-        (show if row["done"] else print_error)(str(row["text"]))
+        (show_parts if row["done"] else print_error)(str(row["text"]))
     return code
 
 
@@ -166,5 +166,5 @@ def _view(fleet: Fleet, *, as_json: bool) -> int:
     if as_json:
         show_json(rows, code=code, errors=failures)
     else:
-        show(fleet_table(rows))
+        show_parts(fleet_table(rows))
     return code

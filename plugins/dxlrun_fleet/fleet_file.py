@@ -12,7 +12,7 @@ from typing import Annotated, NamedTuple
 from pydantic import AfterValidator
 
 from dxlrun import InputError
-from dxlrun.tooling.files import Form, key, read_yaml, refuse, suggestion
+from dxlrun.tooling.files import Form, key, read_yaml, suggestion, validation_error
 from dxlrun.tooling.live import Address, ListedAddress
 
 
@@ -20,11 +20,11 @@ def _line(text: str) -> str:
     try:
         words = shlex.split(text)
     except ValueError as error:
-        raise refuse(
+        raise validation_error(
             f"{text!r} is not a command line: {error}", "write it like the words after `dxlrun`"
         ) from error
     if not words or not words[0].endswith((".yaml", ".yml")):
-        raise refuse(f"{text!r} begins with no robot file", "write ROBOT.yaml and what follows it")
+        raise validation_error(f"{text!r} begins with no robot file", "write ROBOT.yaml and what follows it")
     return text
 
 
@@ -72,7 +72,7 @@ class Fleet(NamedTuple):
                 return agent
         raise InputError(f"no agent of the file starts {robot}; name it under agents: NAME: starts")
 
-    def require(self, names: tuple[str, ...]) -> None:
+    def require_robots(self, names: tuple[str, ...]) -> None:
         """Raise InputError for the first name that is not a robot of the fleet file."""
         for name in names:
             if name not in self.robots:

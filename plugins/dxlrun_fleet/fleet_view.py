@@ -20,7 +20,7 @@ _ERROR = 40
 """Lowest severity of an event that the table shows as an error (warnings are below)."""
 
 
-class Seen(msgspec.Struct, frozen=True):
+class RobotStatus(msgspec.Struct, frozen=True):
     """Row of the fleet table: one robot at its last reply."""
 
     robot: str
@@ -47,7 +47,7 @@ class RobotView:
 
     def __init__(self, name: str, address: Address) -> None:
         self._address = address
-        self._seen = Seen(name)
+        self._seen = RobotStatus(name)
         self._replied = time.monotonic()
         self.tried = threading.Event()
         """Set once the first poll has succeeded or failed."""
@@ -58,7 +58,7 @@ class RobotView:
         """Stop polling, without waiting for a robot that hangs."""
         self._ended.set()
 
-    def seen(self) -> Seen:
+    def seen(self) -> RobotStatus:
         """Return the robot's row at its last reply; unreachable and without measurements after SILENT_S."""
         seen, silent = self._seen, time.monotonic() - self._replied
         if seen.state != "unreachable" and silent <= SILENT_S:
@@ -75,14 +75,14 @@ class RobotView:
                 with RemoteRobot(self._seen.robot, NetworkLink(self._address, "dxlrun fleet")) as robot:
                     last = 0
                     while not self._ended.wait(LOOK_S if last else 0.0):
-                        last = self._look(robot, last)
+                        last = self._poll_robot(robot, last)
                         self._replied = time.monotonic()
                         self.tried.set()
             except (DxlrunError, OSError, ValueError) as error:
                 self._seen = msgspec.structs.replace(self._seen, state="unreachable", reason=str(error))
             self.tried.set()
 
-    def _look(self, robot: RemoteRobot, last: int) -> int:
+    def _poll_robot(self, robot: RemoteRobot, last: int) -> int:
         """Poll the robot's state and its events after number `last`; return the number of its last event."""
         info = msgspec.convert(robot.info(), RobotInfo)
         events = msgspec.convert(robot.events(last), Events)
@@ -117,9 +117,9 @@ def _at_most(values: np.ndarray[tuple[int, ...], np.dtype[np.float64]]) -> int |
     return int(np.nanargmax(values)) if np.isfinite(values).any() else None
 
 
-def fleet_table(robots: list[Seen]) -> Table:
+def fleet_table(robots: list[RobotStatus]) -> Table:
     """Return the table of `dxlrun fleet`: state, battery, hottest servo, last error and log of each robot."""
-    columns: Columns[Seen] = [
+    columns: Columns[RobotStatus] = [
         (Column("robot", "name"), lambda one: one.robot),
         (Column("state", "name"), _state),
         (Column("battery", form="{:.1f} V", missing="-"), lambda one: one.voltage),
@@ -131,7 +131,7 @@ def fleet_table(robots: list[Seen]) -> Table:
     return Table.listing("", columns, robots)
 
 
-def _state(one: Seen) -> Cell:
+def _state(one: RobotStatus) -> Cell:
     if one.state == "unreachable":
         return Cell(f"unreachable since {one.since[11:19]}", "error")
     return Cell(one.state, "good" if one.state == "running" else "warning")

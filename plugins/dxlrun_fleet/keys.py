@@ -10,11 +10,11 @@ from typing import TYPE_CHECKING, Literal
 
 from dxlrun import InputError
 from dxlrun.tooling.live import Role
-from dxlrun.tooling.output import Column, Table, show, show_json
+from dxlrun.tooling.output import Column, Table, show_json, show_parts
 from dxlrun.tooling.verbs import DebugFlag, JsonFlag
 
 if TYPE_CHECKING:
-    from dxlrun_fleet.authority import Issued
+    from dxlrun_fleet.authority import IssuedCertificates
 
 _NAME = re.compile(r"[A-Za-z0-9][A-Za-z0-9_.-]{0,62}", re.ASCII)
 MOST_DAYS = 3650
@@ -88,7 +88,7 @@ def keys(
             where = "" if output is None else f"; copy it to ~/.config/dxlrun/keys of {name}'s computer"
             sentence = f"{directory} has the certificate of {name} ({one.role}, {days} days){where}"
         if not as_json:
-            show(sentence)
+            show_parts(sentence)
             return 0
     rows = [
         {
@@ -104,8 +104,8 @@ def keys(
         show_json(rows)
         return 0
     columns = [Column(name, "name") for name in ("name", "role", "until", "state")]
-    show(
-        Table.of("Certificates", columns, ([*row.values()][:4] for row in rows))
+    show_parts(
+        Table.from_rows("Certificates", columns, ([*row.values()][:4] for row in rows))
         if rows
         else "no certificate yet; `dxlrun keys robot NAME` and `dxlrun keys client NAME` make some"
     )
@@ -128,7 +128,7 @@ def _refuse_unused(action: str, given: Mapping[str, object]) -> None:
             raise InputError(f"`dxlrun keys {action}` does not use {option}, only {actions}; omit it")
 
 
-def _state(one: Issued, refused: frozenset[str]) -> str:
+def _state(one: IssuedCertificates, refused: frozenset[str]) -> str:
     if one.serials[0] in refused:
         return "revoked"
     return "valid" if one.certificate.not_valid_after_utc > datetime.now(UTC) else "expired"

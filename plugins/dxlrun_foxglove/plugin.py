@@ -16,4 +16,4 @@ def dxlrun_contract() -> int:
 @hookimpl
 def dxlrun_commands() -> Sequence[Command]:
     """Return the command `foxglove`, with the function that is imported on use."""
-    return (Command("foxglove", "dxlrun_foxglove.command:foxglove", group="Robots that run"),)
+    return (Command("foxglove", "dxlrun_foxglove.foxglove:foxglove", group="Robots that run"),)

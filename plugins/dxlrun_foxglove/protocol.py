@@ -41,7 +41,7 @@ class Subscription(msgspec.Struct, frozen=True, rename="camel"):
     channel_id: Number
 
 
-class Parameter(msgspec.Struct, frozen=True):
+class ViewerParameter(msgspec.Struct, frozen=True):
     """Value of a controller's parameter."""
 
     name: str
@@ -49,13 +49,13 @@ class Parameter(msgspec.Struct, frozen=True):
     value: bool | int | float | str
 
 
-class Words(msgspec.Struct, frozen=True, rename="camel"):
+class ViewerFrame(msgspec.Struct, frozen=True, rename="camel"):
     """Text frame (JSON) from a viewer. Each operation `op` uses some of the fields."""
 
     op: Operation
     subscriptions: list[Subscription] = []
     subscription_ids: list[Number] = []
-    parameters: list[Parameter] = []
+    parameters: list[ViewerParameter] = []
     parameter_names: list[str] = []
     id: str | None = None
     """Viewer's name for the request, which the answer repeats."""
@@ -73,10 +73,10 @@ class Call(msgspec.Struct, frozen=True):
     """Arguments in this encoding."""
 
 
-_decode = msgspec.json.Decoder(Words).decode
+_decode = msgspec.json.Decoder(ViewerFrame).decode
 
 
-def received(frame: str | bytes) -> Words | Call:
+def received(frame: str | bytes) -> ViewerFrame | Call:
     """Parse a frame from a viewer.
 
     Raises:
@@ -100,14 +100,14 @@ def response(call: Call, body: bytes) -> bytes:
     return _CALL_HEAD.pack(RESPONSE, call.service, call.number, len(name)) + name + body
 
 
-def failure(request: Words | Call, why: str) -> str:
+def failure(request: ViewerFrame | Call, why: str) -> str:
     """Return the text frame that refuses a request or a call with the reason."""
     if isinstance(request, Call):
         return text("serviceCallFailure", serviceId=request.service, callId=request.number, message=why)
     return status(ERROR, why)
 
 
-def values(parameters: Sequence[Parameter], number: str | None) -> str:
+def values(parameters: Sequence[ViewerParameter], number: str | None) -> str:
     """Return the text frame with the values of parameters; `number` repeats the `id` of the request."""
     return text("parameterValues", parameters=parameters, **({"id": number} if number else {}))
 

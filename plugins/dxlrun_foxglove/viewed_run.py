@@ -11,7 +11,7 @@ import msgspec
 from dxlrun import DxlrunError, InputError, RemoteRobot, TopicMessage, connect
 from dxlrun.tooling.live import LiveMessages, RobotInfo
 from dxlrun.tooling.topics import MessageType
-from dxlrun_foxglove.protocol import WARNING, Call, Parameter, status, text
+from dxlrun_foxglove.protocol import WARNING, Call, ViewerParameter, status, text
 from dxlrun_foxglove.viewer import Channel, Viewer
 
 ENCODING = "json"
@@ -74,9 +74,9 @@ class ViewedRun(LiveMessages):
                 viewer.reply(advertised((put,)))
             if first and viewer.graph:
                 viewer.reply(self.graph)
-            viewer.show(put, wall_ns, data)
+            viewer.queue_message(put, wall_ns, data)
 
-    async def follow(self) -> str:
+    async def forward_messages(self) -> str:
         """Forward the messages of the robot until its run has ended; return the reason of the end."""
         known: set[str] = set()
         why = ""
@@ -101,16 +101,16 @@ class ViewedRun(LiveMessages):
         with _robot(self._name) as robot:
             listen = partial(robot.listen, *topics, rate=RATE, newest=False)
             async for message in await asyncio.to_thread(listen):
-                self.take(message)
+                self.handle_message(message)
         raise DxlrunError(f"the run of {self._name} has ended")
 
-    def take(self, message: TopicMessage) -> None:
+    def handle_message(self, message: TopicMessage) -> None:
         """Forward a message to the viewers; warn them if messages of its topic were lost before it."""
         if message.lost:
             lost = f"{message.lost} messages of {message.topic} were lost before they came here"
             for viewer in self.viewers:
                 viewer.reply(status(WARNING, lost))
-        super().take(message)
+        super().handle_message(message)
 
     # Requests of viewers
 
@@ -133,21 +133,21 @@ class ViewedRun(LiveMessages):
         others = ("subscribedTopics", "advertisedServices", "removedTopics", "removedServices")
         return text("connectionGraphUpdate", publishedTopics=rows, **dict.fromkeys(others, ()))
 
-    def parameters(self, names: Collection[str]) -> list[Parameter]:
+    def parameters(self, names: Collection[str]) -> list[ViewerParameter]:
         """Return the values of these parameters of controllers, or of all without names.
 
         Parameters that are neither numbers nor texts are omitted. Raises DxlrunError.
         """
         with _robot(self._name) as robot:
             return [
-                Parameter(f"{controller}.{one.name}", one.value)
+                ViewerParameter(f"{controller}.{one.name}", one.value)
                 for controller in _controllers(robot, names)
                 for one in robot.parameter_table(controller)
                 if isinstance(one.value, bool | int | float | str)
                 and (not names or f"{controller}.{one.name}" in names)
             ]
 
-    def set_parameters(self, parameters: Sequence[Parameter]) -> None:
+    def set_parameters(self, parameters: Sequence[ViewerParameter]) -> None:
         """Change parameters of controllers, those of one controller in one cycle. Raises DxlrunError."""
         with _robot(self._name) as robot:
             for controller in _controllers(robot, [one.name for one in parameters]):

@@ -61,7 +61,7 @@ class Viewer:
         self._replies.append(frame)
         self._more.set()
 
-    def show(self, channel: Channel, wall_ns: int, data: bytes) -> None:
+    def queue_message(self, channel: Channel, wall_ns: int, data: bytes) -> None:
         """Queue a message (CDR; time in ns since 1970) if the viewer has subscribed to its channel.
 
         A slow viewer loses the oldest messages and gets one warning.
@@ -78,7 +78,7 @@ class Viewer:
                 self.reply(status(WARNING, SLOW))
         self._more.set()
 
-    async def send(self) -> None:
+    async def send_queued(self) -> None:
         """Send queued frames, replies before messages, as fast as the viewer receives them.
 
         Returns never; raises ConnectionClosed when the viewer has disconnected.

@@ -38,7 +38,7 @@ _SHIFTING = {
 with which a joint is calibrated."""
 
 
-class Measured(msgspec.Struct, frozen=True):
+class JointCalibration(msgspec.Struct, frozen=True):
     """Measured calibration of a joint, for its keys reference, direction and limits in the robot file."""
 
     joint: str
@@ -55,7 +55,7 @@ class Measured(msgspec.Struct, frozen=True):
     """Travel of the joint per rad of its servo, rad or m."""
 
 
-class BeyondTurn(ServoFault):
+class TurnRangeFault(ServoFault):
     """Error of a servo that was turned by hand beyond the range of its positions."""
 
 
@@ -90,7 +90,7 @@ class HandJoint:
                 "file, or set the servos up with `dxlrun setup`"
             )
         names = [name for name in _SHIFTING if name in self.table.items]
-        for name, value in self._one.read(names).items():
+        for name, value in self._one.read_items(names).items():
             bits, only = _SHIFTING[name]
             if value & bits != only:
                 title = self.table.items[name].title
@@ -108,21 +108,21 @@ class HandJoint:
         self.limp = True
         self._one.torque(False)
 
-    def begin(self) -> float:
+    def start_counting(self) -> float:
         """Start counting the servo's turns; return its angle, rad, within the turn that its goals reach."""
-        readings = sorted(self._read() for _ in range(_READINGS))
+        readings = sorted(self._read_raw() for _ in range(_READINGS))
         self._raw = readings[_READINGS // 2]
         # A servo that counted turns, such as in wheel mode, is in its first turn after power-up.
         self._travelled = self.table.min_tick + (self._raw - self.table.min_tick) % self._turn
         return self._angle
 
-    def follow(self) -> float:
+    def read_angle(self) -> float:
         """Read the servo; return its angle, rad, counted across turns since `begin`.
 
         Raises:
             ServoFault: The servo does not answer.
         """
-        raw = self._read()
+        raw = self._read_raw()
         step = raw - self._raw
         if 2 * abs(step) > self._turn:  # The position wraps around at the end of a turn
             step -= round(step / self._turn) * self._turn
@@ -143,7 +143,7 @@ class HandJoint:
         tick = self.table.rad_per_tick
         least, most = self.table.min_tick * tick, self.table.max_tick * tick
         if not self.servo.continuous and (lowest < least - tick or highest > most + tick):
-            raise BeyondTurn(
+            raise TurnRangeFault(
                 f"{self.name} went beyond the turn of its {self.table.model}, whose goals are from "
                 f"{_degrees(least)} to {_degrees(most)} deg: its servo was at {_degrees(lowest)} "
                 f"to {_degrees(highest)} deg. If the joint must go there, turn the servo's horn "
@@ -154,15 +154,15 @@ class HandJoint:
     def _angle(self) -> float:
         return self._travelled * self.table.rad_per_tick
 
-    def _read(self) -> int:
+    def _read_raw(self) -> int:
         try:
-            return self._one.read(["present_position"])["present_position"]
+            return self._one.read_items(["present_position"])["present_position"]
         except ServoFault:
             remedy = choose_remedy(self._port)
             raise ServoFault(f"{self._label} does not answer any more: {remedy}") from None
 
 
-def measure(joints: Sequence[HandJoint], dialogue: Dialogue) -> list[Measured]:
+def measure_joints(joints: Sequence[HandJoint], dialogue: Dialogue) -> list[JointCalibration]:
     """Guide the user through zero pose and ends of joints; return their calibrations.
 
     The torque of all joints is off afterwards.
@@ -170,34 +170,36 @@ def measure(joints: Sequence[HandJoint], dialogue: Dialogue) -> list[Measured]:
     Raises:
         ServoFault: A servo does not answer any more.
     """
-    dialogue.ask("The torque goes off now: hold what could fall, and press Enter ")
+    dialogue.ask_question("The torque goes off now: hold what could fall, and press Enter ")
     for joint in joints:
         joint.let_go()
     names = ", ".join(joint.name for joint in joints)
-    dialogue.ask(f"Move to the zero pose: {names}. Then press Enter ")
-    zeros = [joint.begin() for joint in joints]
+    dialogue.ask_question(f"Move to the zero pose: {names}. Then press Enter ")
+    zeros = [joint.start_counting() for joint in joints]
     return [_measure(joint, zero, dialogue) for joint, zero in zip(joints, zeros, strict=True)]
 
 
-def _measure(joint: HandJoint, zero: float, dialogue: Dialogue) -> Measured:
+def _measure(joint: HandJoint, zero: float, dialogue: Dialogue) -> JointCalibration:
     servo = joint.servo
     while True:
         try:
             found = _ends(joint, dialogue)
-        except BeyondTurn as error:
-            dialogue.ask(f"{error} Then press Enter ")
+        except TurnRangeFault as error:
+            dialogue.ask_question(f"{error} Then press Enter ")
             continue
         positive, negative, lowest, highest = found
         way = positive - (zero if servo.continuous else negative)
         if abs(way) >= LEAST_WAY:
             break
-        dialogue.say(f"{joint.name} moved by {_degrees(abs(way))} deg only: move it further.")
+        dialogue.print_lines(f"{joint.name} moved by {_degrees(abs(way))} deg only: move it further.")
     direction = 1 if way > 0 else -1
     limits = None
     if not servo.continuous:
         ends = [direction * (angle - zero) * servo.ratio for angle in (min(lowest, zero), max(highest, zero))]
         limits = _inside(min(ends), max(ends), servo.unit)
-    return Measured(joint.name, zero, direction, limits, servo.unit, joint.table.rad_per_tick, servo.ratio)
+    return JointCalibration(
+        joint.name, zero, direction, limits, servo.unit, joint.table.rad_per_tick, servo.ratio
+    )
 
 
 def _ends(joint: HandJoint, dialogue: Dialogue) -> tuple[float, float, float, float]:
@@ -206,24 +208,24 @@ def _ends(joint: HandJoint, dialogue: Dialogue) -> tuple[float, float, float, fl
     They are the angles at the positive and at the other end, and the lowest and highest on the way. Raises
     BeyondTurn.
     """
-    begin = joint.begin()
+    begin = joint.start_counting()
     seen = [begin, begin]
     now = begin
 
-    def look() -> str:
+    def show_angle() -> str:
         nonlocal now
-        now = joint.follow()
+        now = joint.read_angle()
         seen[:] = min(seen[0], now), max(seen[1], now)
         return f"  its servo is at {_degrees(now)} deg, was at {_degrees(seen[0])} to {_degrees(seen[1])} deg"
 
     way = "on in its positive direction" if joint.servo.continuous else "in its positive direction to the end"
-    dialogue.ask_while(f"Move {joint.name} {way}, and press Enter", look)
-    look()
+    dialogue.ask_while(f"Move {joint.name} {way}, and press Enter", show_angle)
+    show_angle()
     joint.check_turn(*seen)
     positive = now
     if not joint.servo.continuous:
-        dialogue.ask_while(f"Move {joint.name} to its other end, and press Enter", look)
-        look()
+        dialogue.ask_while(f"Move {joint.name} to its other end, and press Enter", show_angle)
+        show_angle()
         joint.check_turn(*seen)
     return positive, now, seen[0], seen[1]
 
@@ -247,7 +249,7 @@ def keys_of(joint: str, *, continuous: bool) -> list[KeyPath]:
 
 
 def replacements(
-    text: RobotText, servo: ServoPlan, limits: tuple[float, float] | None, found: Measured
+    text: RobotText, servo: ServoPlan, limits: tuple[float, float] | None, found: JointCalibration
 ) -> list[Replacement]:
     """Return new values for the keys of a joint that differ from the robot file by more than a tick.
 

@@ -19,7 +19,7 @@ LOOK_S = 0.02
 
 def yes(dialogue: Dialogue, question: str) -> bool:
     """Ask the user a yes/no question; return True only for y or yes."""
-    return dialogue.ask(f"{question} [y/N] ").lower() in ("y", "yes")
+    return dialogue.ask_question(f"{question} [y/N] ").lower() in ("y", "yes")
 
 
 @contextmanager
@@ -53,26 +53,26 @@ class Dialogue:
             )
         self._typed = b""
 
-    def say(self, *lines: str) -> None:
+    def print_lines(self, *lines: str) -> None:
         """Print lines to the terminal."""
         sys.stdout.write("".join(f"{line}\n" for line in lines))
         sys.stdout.flush()
 
-    def ask(self, question: str) -> str:
+    def ask_question(self, question: str) -> str:
         """Ask, and return the line that the user types. Input from before the question is discarded."""
-        return self._answer(question, None)
+        return self._read_answer(question, None)
 
     def ask_while(self, question: str, look: Callable[[], str]) -> str:
         """Ask, and call `look` every LOOK_S until the user has typed a line, which is returned.
 
         The text that `look` returns is shown in a line that is updated in place.
         """
-        return self._answer(f"{question}\n", look)
+        return self._read_answer(f"{question}\n", look)
 
-    def _answer(self, question: str, look: Callable[[], str] | None) -> str:
+    def _read_answer(self, question: str, look: Callable[[], str] | None) -> str:
         self._typed = b""
         termios.tcflush(self._input, termios.TCIFLUSH)
-        self._write(question)
+        self._write_text(question)
         try:
             while (line := self._line(LOOK_S if look else None)) is None:
                 if not look:
@@ -80,13 +80,13 @@ class Dialogue:
                 text = look()[: shutil.get_terminal_size().columns - 1]
                 # The terminal has echoed an Enter that is waiting, so the cursor is on the next line.
                 if not select.select([self._input], [], [], 0)[0]:
-                    self._write(f"\r\x1b[K{text}")
+                    self._write_text(f"\r\x1b[K{text}")
         except BaseException:  # The next output must begin a new line
-            self._write("\n")
+            self._write_text("\n")
             raise
         return line
 
-    def _write(self, text: str) -> None:
+    def _write_text(self, text: str) -> None:
         sys.stdout.write(text)
         sys.stdout.flush()
 

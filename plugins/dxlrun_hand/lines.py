@@ -27,7 +27,7 @@ def find_port(bus: str, dialogue: Dialogue, devices: Devices) -> str:
         PortError: Not exactly one port appeared in each of three attempts.
     """
     for _ in range(TRIES):
-        dialogue.ask(f"Unplug the adapter of bus {bus}, and press Enter ")
+        dialogue.ask_question(f"Unplug the adapter of bus {bus}, and press Enter ")
         others = {os.path.realpath(path) for path in devices()}
 
         def added(others: Collection[str] = others) -> list[str]:
@@ -40,9 +40,9 @@ def find_port(bus: str, dialogue: Dialogue, devices: Devices) -> str:
         names = added()
         adapters = {os.path.realpath(name) for name in names}
         if len(adapters) == 1:
-            dialogue.say(f"Bus {bus} is at {names[0]}.")
+            dialogue.print_lines(f"Bus {bus} is at {names[0]}.")
             return names[0]
-        dialogue.say(
+        dialogue.print_lines(
             f"{len(adapters)} adapters appeared ({', '.join(names)}): plug in the one of bus {bus} alone."
             if adapters
             else "No adapter appeared: was it unplugged before the first Enter, and is it plugged in now?"
@@ -79,11 +79,11 @@ class BusLines:
         self._opened = opened
         self._names = {bus: lasting_name(port) or port for bus, port in ports.items()}
         for bus in ports:
-            with self.open(bus):
+            with self.open_line(bus):
                 pass
 
     @contextmanager
-    def open(self, bus: str) -> Iterator[ToolLine]:
+    def open_line(self, bus: str) -> Iterator[ToolLine]:
         """Open the port of a bus, yield its line, and close it. Raises PortError."""
         with self._opened(self._names[bus]) as port:
             yield ToolLine(port)

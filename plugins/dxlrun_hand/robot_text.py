@@ -49,7 +49,7 @@ class RobotText:
         self._edits: dict[Path, list[_Edit]] = {source.path: [] for source in self._sources}
         self._uses = [Counter(map(id, _nodes(source.tree.root))) for source in self._sources]
 
-    def check(self, path: KeyPath) -> None:
+    def check_path(self, path: KeyPath) -> None:
         """Check that the value at a key path can be replaced or added.
 
         Raises:
@@ -69,12 +69,12 @@ class RobotText:
         if at != path and not isinstance(node, yaml.MappingNode):
             raise _refuse_node(source, node, f"{_words(at)} is not a mapping", "write its keys below it")
 
-    def put(self, path: KeyPath, value: str | Sequence[str]) -> None:
+    def plan_value(self, path: KeyPath, value: str | Sequence[str]) -> None:
         """Plan a new value, or new items of a list, for a key path; a missing key is added.
 
         Raises InputError as `check`.
         """
-        self.check(path)
+        self.check_path(path)
         source, at, node = self._own(path)
         edits = self._edits[source.path]
         if at != path and isinstance(node, yaml.MappingNode):
@@ -100,7 +100,7 @@ class RobotText:
             lines += difflib.unified_diff(old, new, *names, lineterm="", n=1)
         return lines
 
-    def write(self) -> None:
+    def write_files(self) -> None:
         """Write the planned changes. Each file is replaced atomically.
 
         Raises:

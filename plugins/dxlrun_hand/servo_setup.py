@@ -23,7 +23,7 @@ from dxlwire import BusPlan, ControlTable, ServoPlan, find_table
 SKIP = ("s", "skip")
 
 
-class SetUp:
+class ServoSetup:
     """Dialogue that configures the servos of a robot file; `done` lists the names of the finished ones."""
 
     def __init__(self, description: Description, dialogue: Dialogue) -> None:
@@ -51,15 +51,19 @@ class SetUp:
         for plan in self.plans:
             servos = tuple(servo for servo in plan.servos if servo.own_name in chosen)
             while servos:
-                self.dialogue.ask(f"Connect all servos of bus {plan.name} with their power, and press Enter ")
-                with lines.open(plan.name) as tool:
+                self.dialogue.ask_question(
+                    f"Connect all servos of bus {plan.name} with their power, and press Enter "
+                )
+                with lines.open_line(plan.name) as tool:
                     found = compare_servos(tool, plan, servos)
-                self.dialogue.say(*(f"{joint}: {text}" for joint, text in found.describe_deviations()))
+                self.dialogue.print_lines(
+                    *(f"{joint}: {text}" for joint, text in found.describe_deviations())
+                )
                 if not found.problems:
                     count = "1 servo is" if len(servos) == 1 else f"{len(servos)} servos are"
-                    self.dialogue.say(f"Bus {plan.name}: {count} as in the robot file.")
+                    self.dialogue.print_lines(f"Bus {plan.name}: {count} as in the robot file.")
                     break
-                self.dialogue.say(*found.problems)
+                self.dialogue.print_lines(*found.problems)
                 if not yes(self.dialogue, "Look again?"):
                     return False
         return True
@@ -70,14 +74,14 @@ class SetUp:
             plan = self.plans[index]
             servo = _named(plan, name)
             model = "any model" if name in self._unknown else servo.model
-            typed = self.dialogue.ask(
+            typed = self.dialogue.ask_question(
                 f"Connect the servo for {name} ({model}) alone to bus {plan.name}, and press Enter "
                 "(s: skip it) "
             )
             if typed.lower() in SKIP:
                 return False
             try:
-                with lines.open(plan.name) as tool:
+                with lines.open_line(plan.name) as tool:
                     found = self._alone(tool, plan, servo)
                     if name in self._unknown:
                         self._models[name] = found.model
@@ -85,9 +89,9 @@ class SetUp:
                         plan = self.plans[index]
                     self.changing = name
                     for sentence in bring(OneServo(tool, found), plan, _named(plan, name)):
-                        self.dialogue.say(f"  {name}: {sentence}")
+                        self.dialogue.print_lines(f"  {name}: {sentence}")
             except (PortError, ServoFault) as error:
-                self.dialogue.say(*error.sentences)
+                self.dialogue.print_lines(*error.sentences)
                 continue
             self.changing = ""
             return True
@@ -102,7 +106,9 @@ class SetUp:
         rates = dict.fromkeys((plan.baud_rate, factory_rate(table)))
         found = scan(tool, Search((plan.protocol,), tuple(rates))).servos
         if not found:
-            self.dialogue.say("  not at its usual rates; every other one is tried, which takes half a minute")
+            self.dialogue.print_lines(
+                "  not at its usual rates; every other one is tried, which takes half a minute"
+            )
             found = scan(tool).servos
         if not found:
             remedy = choose_remedy(tool.port.name, "check its power and its cable")
@@ -162,10 +168,10 @@ def bring(one: OneServo, plan: BusPlan, servo: ServoPlan) -> list[str]:
     declared = {register.name for register in desired}
     refusing = (item for item in one.table.items.values() if item.deviation and item.deviation.may_refuse)
     names = [item.name for item in refusing if item.area == "EEPROM"]
-    for each in one.deviations(one.read(names, refused=True)):
+    for each in one.deviations(one.read_items(names, refused=True)):
         if each.refused and each.item.name not in declared:
             desired = (*desired, one.register(each.item.name, each.factory))
-    done += one.write(desired)
+    done += one.write_registers(desired)
     return done or ["was as the robot file has it"]
 
 

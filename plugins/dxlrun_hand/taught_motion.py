@@ -28,7 +28,7 @@ _SPARE = 0.9
 """Fraction of a joint's speed limit that a taught motion uses at most."""
 
 
-class Shown(msgspec.Struct, frozen=True, eq=False):
+class TaughtMotion(msgspec.Struct, frozen=True, eq=False):
     """Recorded positions of one pose or motion that the user showed by hand."""
 
     time_s: Floats
@@ -37,7 +37,7 @@ class Shown(msgspec.Struct, frozen=True, eq=False):
     """Positions of the taught joints, rad or m, shape (moments, joints)."""
 
 
-class Taught(msgspec.Struct, frozen=True):
+class TaughtJoints(msgspec.Struct, frozen=True):
     """Joints of a taught motion with their limits, and the processing of what the user showed."""
 
     joints: tuple[str, ...]
@@ -54,22 +54,22 @@ class Taught(msgspec.Struct, frozen=True):
         """Movement of each joint that counts as much as 1 rad of a rotary joint, rad or m."""
         return np.array([TURN_SIZES[unit] for unit in self.units])
 
-    def trimmed(self, shown: Shown) -> Shown:
+    def trimmed(self, shown: TaughtMotion) -> TaughtMotion:
         """Return a motion without the standstill at both ends. A motion that never moves becomes a pose."""
         time, position = shown.time_s, shown.position
         still = MOVED_RAD * self.size
         begun = np.flatnonzero((np.abs(position - position[0]) > still).any(axis=1))
         if not len(begun):
-            return Shown(np.zeros(1), position[-1:])
+            return TaughtMotion(np.zeros(1), position[-1:])
         left = np.flatnonzero((np.abs(position - position[-1]) > still).any(axis=1))
         kept = (time >= time[begun[0]] - REST_S) & (time <= time[left[-1]] + REST_S)
-        return Shown(time[kept] - time[kept][0], position[kept])
+        return TaughtMotion(time[kept] - time[kept][0], position[kept])
 
-    def smoothed(self, shown: Shown) -> Shown:
+    def smoothed(self, shown: TaughtMotion) -> TaughtMotion:
         """Return a motion at equal steps, smoothed with a Hann window."""
         count = round(float(shown.time_s[-1]) / _STEP_S) + 1
         if count < 3:
-            return Shown(np.zeros(1), shown.position[-1:])
+            return TaughtMotion(np.zeros(1), shown.position[-1:])
         time = np.arange(count, dtype=np.float64) * _STEP_S
         half = round(WINDOW_S / _STEP_S / 2)
         weights = np.hanning(2 * half + 3)[1:-1]
@@ -80,9 +80,9 @@ class Taught(msgspec.Struct, frozen=True):
             )
             for column in shown.position.T
         ]
-        return Shown(time, np.array(columns, np.float64).T)
+        return TaughtMotion(time, np.array(columns, np.float64).T)
 
-    def joined(self, parts: Sequence[Shown], path: Path) -> RecordedMotion:
+    def joined(self, parts: Sequence[TaughtMotion], path: Path) -> RecordedMotion:
         """Join poses and motions to one motion, clipped to the limits, with transitions between them.
 
         `path` is the motion file that it will have.
@@ -106,7 +106,7 @@ class Taught(msgspec.Struct, frozen=True):
         longer = max(1.0, float((fastest / (_SPARE * self.speed)).max()))
         return replace(motion, time_s=motion.time_s * longer), longer
 
-    def beyond(self, parts: Sequence[Shown]) -> list[str]:
+    def beyond(self, parts: Sequence[TaughtMotion]) -> list[str]:
         """Return the joints that the user moved beyond their position limits."""
         positions, slack = np.concatenate([part.position for part in parts]), MOVED_RAD * self.size
         out = ((positions < self.lower - slack) | (positions > self.upper + slack)).any(axis=0)

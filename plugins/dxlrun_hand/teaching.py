@@ -17,7 +17,7 @@ from dxlrun.tooling.verbs import cancel_goals
 from dxlrun_analysis.playback.motion_file import player_of
 from dxlrun_analysis.playback.recorded_motion import Floats
 from dxlrun_hand.dialogue import Dialogue, ending_with, yes
-from dxlrun_hand.taught_motion import Shown, Taught
+from dxlrun_hand.taught_motion import TaughtJoints, TaughtMotion
 
 LONGEST_AGE_NS = 1_000_000_000
 """Age of a joint's newest position above which its servo counts as lost, ns."""
@@ -64,7 +64,7 @@ class Teaching:
         joints = tuple(joint for joint in info["joints"] if joint in moved)
         ends = [info["limits"].get(joint, (-math.inf, math.inf)) for joint in joints]
         self._asked = [joint for joint in joints if joint in asked]
-        self._taught = Taught(
+        self._taught = TaughtJoints(
             joints,
             tuple(JointUnit(info["units"][joint]) for joint in joints),
             np.array([lower for lower, _ in ends]),
@@ -77,11 +77,13 @@ class Teaching:
         self.released: list[str] = []
         """Controllers that the dialogue deactivated and that are still inactive."""
 
-    def teach(self) -> list[Shown]:
+    def teach(self) -> list[TaughtMotion]:
         """Run the teaching dialogue; return the poses and motions, or an empty list if the user quits."""
-        self._dialogue.ask(f"These joints become limp: {', '.join(self._asked)}. Hold them, and press Enter ")
+        self._dialogue.ask_question(
+            f"These joints become limp: {', '.join(self._asked)}. Hold them, and press Enter "
+        )
         self._let_go(self._asked)
-        shown: list[Shown] = []
+        shown: list[TaughtMotion] = []
         while True:
             typed = self._dialogue.ask_while(f"{len(shown)} shown. {HELP}", self._positions)
             verb, *names = typed.split() or [""]
@@ -90,7 +92,7 @@ class Teaching:
             elif verb == "u" and shown:
                 shown.pop()
             elif verb == "":
-                shown.append(Shown(np.zeros(1), self._now()[1][None, :]))
+                shown.append(TaughtMotion(np.zeros(1), self._now()[1][None, :]))
             elif verb == "r":
                 shown.append(self._recorded())
             elif verb == "s" and shown:
@@ -98,9 +100,11 @@ class Teaching:
             elif verb == "q":
                 return []
             else:
-                self._dialogue.say(f"  {typed!r} does nothing here" if shown else "  nothing was shown yet")
+                self._dialogue.print_lines(
+                    f"  {typed!r} does nothing here" if shown else "  nothing was shown yet"
+                )
 
-    def save(self, shown: Sequence[Shown], target: Path) -> None:
+    def save(self, shown: Sequence[TaughtMotion], target: Path) -> None:
         """Join the poses and motions to one within the joints' limits, and write it to a new motion file.
 
         Raises:
@@ -108,29 +112,31 @@ class Teaching:
         """
         taught = self._taught
         for joint in taught.beyond(shown):
-            self._dialogue.say(f"  {joint} was shown beyond its limits: the motion keeps it at them.")
+            self._dialogue.print_lines(f"  {joint} was shown beyond its limits: the motion keeps it at them.")
         motion, longer = taught.slowed(taught.joined(shown, target))
         if longer > 1.0:
-            self._dialogue.say(
+            self._dialogue.print_lines(
                 f"  It was shown faster than the joints may move, and takes {longer:.2g} times as long."
             )
         origin = f"Shown by hand to {self._robot.name}.\nWritten by `dxlrun teach`."
         text = taught.text_of(motion, self._plans, origin)
         write_target(target, text)
-        self._dialogue.say(f"{target}: {motion.duration_s:.1f} s of {len(taught.joints)} joints")
+        self._dialogue.print_lines(f"{target}: {motion.duration_s:.1f} s of {len(taught.joints)} joints")
 
-    def hold(self) -> None:
+    def hold_joints(self) -> None:
         """Enable the torque of all limp joints where they are, and activate their controllers again.
 
         The user is asked to hold the joints, again after each refusal by the robot.
         """
         while self.limp:
-            self._dialogue.ask("The torque comes back where the joints are: hold them, and press Enter ")
+            self._dialogue.ask_question(
+                "The torque comes back where the joints are: hold them, and press Enter "
+            )
             self._try(self._hold, list(self.limp))
         self._robot.switch(activate=self.released)
         self.released = []
 
-    def play(self, motion: Path) -> bool:
+    def play_motion(self, motion: Path) -> bool:
         """Play a motion file with a slow start from the current positions, and wait for its end.
 
         Returns True if all goals were reached. Ctrl-C cancels the motion.
@@ -142,7 +148,7 @@ class Teaching:
         except KeyboardInterrupt:
             cancel_goals(self._robot, numbers)
             raise
-        self._dialogue.say(*(f"  {state.describe()}" for state in states))
+        self._dialogue.print_lines(*(f"  {state.describe_outcome()}" for state in states))
         return all(state.reached for state in states)
 
     def left(self) -> str:
@@ -182,7 +188,7 @@ class Teaching:
         wrong = [name for name in names if name not in self._groups]
         if wrong or not names:
             what = f"no joint {', '.join(wrong)}" if wrong else "name joints or groups"
-            self._dialogue.say(f"  {what}: {', '.join(self._groups)}")
+            self._dialogue.print_lines(f"  {what}: {', '.join(self._groups)}")
             return
         self._try(self._let_go if verb == "limp" else self._hold, names)
 
@@ -192,7 +198,7 @@ class Teaching:
         try:
             switch(names)
         except Refused as error:
-            self._dialogue.say(*(f"  {line}" for line in error.sentences))
+            self._dialogue.print_lines(*(f"  {line}" for line in error.sentences))
 
     # Positions
 
@@ -217,24 +223,24 @@ class Teaching:
         )
         return "  " + "  ".join(written)
 
-    def _recorded(self) -> Shown:
+    def _recorded(self) -> TaughtMotion:
         """Record the joints' positions until Enter; return the motion without standstill, smoothed."""
         times: list[float] = []
         positions: list[Floats] = []
 
-        def look() -> str:
+        def show_time() -> str:
             time, position = self._now()
             if not times or time > times[-1]:
                 times.append(time)
                 positions.append(position)
             return f"  {times[-1] - times[0]:.1f} s"
 
-        look()
-        self._dialogue.ask_while("Recording: show the motion, then press Enter", look)
-        look()
-        shown = Shown(np.array(times) - times[0], np.array(positions))
+        show_time()
+        self._dialogue.ask_while("Recording: show the motion, then press Enter", show_time)
+        show_time()
+        shown = TaughtMotion(np.array(times) - times[0], np.array(positions))
         shown = self._taught.smoothed(self._taught.trimmed(shown))
-        self._dialogue.say(f"  {shown.time_s[-1]:.1f} s without the standstill at both ends")
+        self._dialogue.print_lines(f"  {shown.time_s[-1]:.1f} s without the standstill at both ends")
         return shown
 
 
@@ -258,13 +264,13 @@ def taught(
         shown = task.teach()
         if shown:
             task.save(shown, target)
-        task.hold()
+        task.hold_joints()
         if not shown:
-            dialogue.say("Nothing was saved.")
+            dialogue.print_lines("Nothing was saved.")
             return 1
         if not yes(dialogue, f"Play it on {robot.name}? It begins slowly."):
             return 0
-        return 0 if task.play(target) else 1
+        return 0 if task.play_motion(target) else 1
 
 
 def _groups(info: Mapping[str, Any]) -> dict[str, tuple[str, ...]]:

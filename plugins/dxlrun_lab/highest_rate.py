@@ -41,7 +41,7 @@ Run = Callable[[Plan], Path]
 the same directory."""
 
 
-class Tried(msgspec.Struct, frozen=True):
+class RateTrial(msgspec.Struct, frozen=True):
     """Result of a run at one loop rate"""
 
     rate_hz: float
@@ -66,7 +66,7 @@ class HighestRate(msgspec.Struct, frozen=True):
     """Highest rate that the buses allow by computation, Hz"""
     kept_hz: float | None
     """Highest rate that was kept, Hz; None if there is none"""
-    tries: tuple[Tried, ...]
+    tries: tuple[RateTrial, ...]
 
 
 def highest_rate(
@@ -89,7 +89,7 @@ def highest_rate(
     """
     plan = compile_robot(description, [], round(seconds * 1e9)).plan
     computed = 1e9 / plan.loop.least_period_ns
-    rate, tries = _round(min(_COMFORT * computed, HIGHEST_HZ)), list[Tried]()
+    rate, tries = _round(min(_COMFORT * computed, HIGHEST_HZ)), list[RateTrial]()
     while len(tries) < MOST_TRIES and rate > 0:
         progress(rate)
         tries.append(_try(plan, rate, run))
@@ -123,7 +123,7 @@ def _round(rate: float) -> float:
     return float(math.floor(rate)) if rate >= 10 else math.floor(rate * 10) / 10
 
 
-def _try(plan: Plan, rate: float, run: Run) -> Tried:
+def _try(plan: Plan, rate: float, run: Run) -> RateTrial:
     path = run(replace(plan, loop=replace(plan.loop, period_ns=round(1e9 / rate))))
     log = read_log(path)
     if not len(log.cycles):
@@ -135,7 +135,7 @@ def _try(plan: Plan, rate: float, run: Run) -> Tried:
     ledger, simulated = path.with_name(_LEDGER), 0
     if overruns and ledger.is_file():
         simulated = min(overruns, overruns_by_servos(log, read_ledger(ledger)))
-    return Tried(
+    return RateTrial(
         rate_hz=rate,
         cycles=len(log.cycles),
         overruns=overruns,

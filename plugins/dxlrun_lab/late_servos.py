@@ -21,7 +21,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from dxlrun import Log
-from dxlrun_analysis.plan import LoggedBus, plan_of
+from dxlrun_analysis.plan_excerpt import LoggedBus, plan_of
 from dxlsim import LedgerEntry
 from dxlwire import BITS_PER_BYTE, PacketKind
 

@@ -9,9 +9,9 @@ import msgspec
 import numpy as np
 
 from dxlrun.tooling.output import counted
-from dxlrun_analysis.playback.rows import Rows
+from dxlrun_analysis.playback.rows import PlaybackRows
 from dxlrun_lab.guided.experiment import APPROACH_RAD_S, Procedure, Situation
-from dxlrun_lab.guided.segment import Guard, Recorded, Segment
+from dxlrun_lab.guided.segment import Guard, Segment, SegmentRecording
 
 _SETTLE_S = 0.5
 """Time for which the last pose is still commanded, s"""
@@ -29,7 +29,7 @@ class PlayedJoint(msgspec.Struct, frozen=True):
     """Largest difference, rad"""
 
 
-class PlayedBack(msgspec.Struct, frozen=True):
+class PlaybackResult(msgspec.Struct, frozen=True):
     """Result of the playback of a recorded motion"""
 
     seconds: float
@@ -42,7 +42,7 @@ class PlayedBack(msgspec.Struct, frozen=True):
 class Playback(msgspec.Struct, frozen=True):
     """Experiment that plays a recorded motion as one segment. The joints remain at the last pose."""
 
-    rows: Rows
+    rows: PlaybackRows
     """The motion as poses of the robot's joints, one per period"""
 
     @property
@@ -59,7 +59,7 @@ class Playback(msgspec.Struct, frozen=True):
             f"{rows.joints[fastest]} at up to {math.degrees(speed[fastest]):.0f} deg/s",
         )
 
-    def moves(self, situation: Situation) -> Sequence[str]:
+    def describe_motions(self, situation: Situation) -> Sequence[str]:
         """Describe the way to the first pose, and the motion."""
         rows = self.rows
         ways = {
@@ -92,7 +92,9 @@ class Playback(msgspec.Struct, frozen=True):
             guard=Guard(age_s=max(_OLDEST_S, _OLDEST_CYCLES / situation.rate)),
         )
 
-    def finish(self, situation: Situation, recorded: Sequence[Recorded], why: str) -> PlayedBack:
+    def evaluate_recordings(
+        self, situation: Situation, recorded: Sequence[SegmentRecording], why: str
+    ) -> PlaybackResult:
         """Return the played duration and the tracking error of each joint."""
         played = recorded[-1]
         off = np.abs(np.where(played.valid, played.position - played.goal, np.nan))
@@ -102,4 +104,4 @@ class Playback(msgspec.Struct, frozen=True):
             rms = float(np.sqrt(np.mean(known**2))) if len(known) else math.nan
             joints.append(PlayedJoint(name, rms, float(known.max(initial=0.0))))
         seconds = float(played.time[-1]) if len(played) else 0.0
-        return PlayedBack(seconds, played.whole, tuple(joints))
+        return PlaybackResult(seconds, played.whole, tuple(joints))

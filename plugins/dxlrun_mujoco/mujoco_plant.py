@@ -72,40 +72,40 @@ def mujoco_plant(bodies: UrdfBodies) -> PlantMaker:
         root = ElementTree.fromstring(bodies.urdf)  # noqa: S314  it was checked when the robot was compiled
         kinds = {each.get("name", ""): each.get("type", "") for each in root.findall("joint")}
         here = [one for one in bodies.mechanisms if all(kinds.get(name) in one.types for name in one.joints)]
-        moved = _Moved(
+        moved = _MovedMechanisms(
             tuple(one for one in here if one.is_single), tuple(one for one in here if not one.is_single)
         )
-        _make_movable(root, moved.names)
+        _make_movable(root, moved.joint_names)
         text = ElementTree.tostring(root, encoding="unicode")
         _compiled(text, _NOTHING_MOVED, ())
     except (ValueError, SyntaxError) as error:  # A ParseError of XML is a SyntaxError
         reason = " ".join(str(error).split())
         raise InputError(f"MuJoCo cannot take the URDF: {reason}; correct it") from error
-    if not moved.names:
+    if not moved.joint_names:
         raise InputError(
             "physics: mujoco turns no joint: no hinge of the URDF has the name of a joint of the robot file; "
             "give them the same names, or take physics: independent"
         )
 
-    def make(joints: Sequence[PlantJoint]) -> Plant:
-        here = moved.of(len(joints))
+    def make_plant(joints: Sequence[PlantJoint]) -> Plant:
+        here = moved.restricted_to(len(joints))
         others = [row for row in range(len(joints)) if row not in here.rows]
         parts: list[Part] = [(here.rows, MujocoBodies(text, here, joints))] if here.rows else []
         if others or not parts:
             parts += parts_without_bodies(bodies.mechanisms, joints, others)
         return combine_plants(joints, parts)
 
-    return make
+    return make_plant
 
 
-class _Moved(msgspec.Struct, frozen=True):
+class _MovedMechanisms(msgspec.Struct, frozen=True):
     """Mechanisms whose joints MuJoCo moves."""
 
     single: tuple[Mechanism, ...]  # One servo each, which is the rotor of its joint
     shared: tuple[Mechanism, ...]  # Several servos that share joints, each with its own rotor
 
     @property
-    def names(self) -> set[str]:
+    def joint_names(self) -> set[str]:
         """Names of the URDF's joints that servos move."""
         return {name for one in (*self.single, *self.shared) for name in one.joints}
 
@@ -119,25 +119,26 @@ class _Moved(msgspec.Struct, frozen=True):
         """Index of each of `servos` among all servos of the simulation."""
         return [servo.index for servo in self.servos]
 
-    def of(self, count: int) -> _Moved:
+    def restricted_to(self, count: int) -> _MovedMechanisms:
         """Return the mechanisms whose servos are all among the first `count` servos of the simulation."""
         parts = (
             tuple(one for one in part if all(servo.index < count for servo in one.servos))
             for part in (self.single, self.shared)
         )
-        return _Moved(*parts)
+        return _MovedMechanisms(*parts)
 
 
-_NOTHING_MOVED = _Moved((), ())
+_NOTHING_MOVED = _MovedMechanisms((), ())
 
 
 class MujocoBodies:
     """MuJoCo simulation of the bodies, as the plant of the servos that move them.
 
-    `angle` (rad) and `velocity` (rad/s) have an item for each servo's shaft, in the order of `_Moved.servos`.
+    `angle` (rad) and `velocity` (rad/s) have an item for each servo's shaft, in the order of
+    `_MovedMechanisms.servos`.
     """
 
-    def __init__(self, urdf: str, moved: _Moved, servos: Sequence[PlantJoint]) -> None:
+    def __init__(self, urdf: str, moved: _MovedMechanisms, servos: Sequence[PlantJoint]) -> None:
         import mujoco
 
         mine = [servos[row] for row in moved.rows]
@@ -176,7 +177,7 @@ class MujocoBodies:
         self._put_bodies()
         self._dt_s = 0.0
 
-    def step(self, drive: Floats, damping: Floats, dt_s: float) -> None:
+    def step_shafts(self, drive: Floats, damping: Floats, dt_s: float) -> None:
         """Advance by `dt_s` with servo torque `drive - damping * velocity` (Nm, Nm s/rad)."""
         numbers, scale = self._numbers, self._per_rad
         if dt_s != self._dt_s:
@@ -196,7 +197,7 @@ class MujocoBodies:
         self.angle[:] = self._reference + self._turn[numbers] / scale
         self.velocity[:] = self._speed[numbers] / scale
 
-    def place(self, index: int, angle: float) -> None:
+    def place_shaft(self, index: int, angle: float) -> None:
         """Put a servo's shaft at an angle, rad, at rest, together with the joints that it moves."""
         by = self._per_rad[index] * (angle - self.angle[index])
         self.angle[index] = angle
@@ -208,7 +209,7 @@ class MujocoBodies:
                 self.velocity[one.rows[moved != 0.0]] = 0.0
         self._put_bodies()
 
-    def recount(self, index: int, by: float) -> None:
+    def shift_angle(self, index: int, by: float) -> None:
         """Add `by`, rad, to the counted angle of a servo's shaft. The shaft and the bodies do not move."""
         self.angle[index] += by
         self._reference[index] += by
@@ -270,7 +271,7 @@ def _make_movable(root: Element, moved: Set[str]) -> None:
                 link.remove(shape)
 
 
-def _compiled(urdf: str, moved: _Moved, servos: Sequence[PlantJoint]) -> MjModel:
+def _compiled(urdf: str, moved: _MovedMechanisms, servos: Sequence[PlantJoint]) -> MjModel:
     """Compile the URDF to a MuJoCo model, with the rotors and frictions of servos.
 
     Joint limits and contacts are disabled.

@@ -22,7 +22,7 @@ SUPPORTS = ("rosidl_typesupport_fastrtps_c", "rosidl_typesupport_introspection_c
 NEEDED = "the compilers gcc and g++ and Python's headers (sudo apt install build-essential python3-dev)"
 
 
-class Interfaces(BuildHookInterface[Any]):
+class InterfacePackages(BuildHookInterface[Any]):
     """Build hook of the wheel: adds a compiled message package for each directory of interfaces/, and the
     index in which ROS 2 tools find them."""
 
@@ -44,7 +44,7 @@ class Interfaces(BuildHookInterface[Any]):
             )
             if not library.exists() or library.stat().st_mtime < newest:
                 shutil.rmtree(package, ignore_errors=True)
-                make(source, made / "sources" / source.name, library, made / "lib")
+                make_package(source, made / "sources" / source.name, library, made / "lib")
                 _describe(source, share)
             included[str(package)] = source.name
         build_data["shared_data"][str(made / "share")] = "share"
@@ -53,7 +53,7 @@ class Interfaces(BuildHookInterface[Any]):
             build_data["shared_data"][str(path)] = f"lib/{path.name}"
 
 
-class TreeVersion(MetadataHookInterface):
+class BridgeTreeVersion(MetadataHookInterface):
     """Metadata hook that sets the version to that of the source tree, and pins dxlrun to the same version.
 
     The version is only defined in the pyproject.toml of dxlrun. An sdist has version and pin in its PKG-INFO.
@@ -70,7 +70,7 @@ class TreeVersion(MetadataHookInterface):
         metadata["dependencies"] = [f"dxlrun=={metadata['version']}", *self.config.get("dependencies", ())]
 
 
-def make(source: Path, place: Path, library: Path, libraries: Path) -> None:
+def make_package(source: Path, place: Path, library: Path, libraries: Path) -> None:
     """Generate C and Python sources from a package's message definitions, and compile them.
 
     Args:

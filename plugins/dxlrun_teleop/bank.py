@@ -33,7 +33,7 @@ _LEADING = 1.25
 
 
 @unique
-class Form(Enum):
+class CommandForm(Enum):
     """Form of a controller's command: its field names, and True if axes are integrated to positions."""
 
     POSITIONS = frozenset({"positions"}), True
@@ -47,7 +47,7 @@ class Form(Enum):
 
     def fits(self, fields: Collection[str]) -> bool:
         """Return True if a command with these fields has this form. A trajectory may have more fields."""
-        return self.fields <= set(fields) if self is Form.TRAJECTORY else self.fields == set(fields)
+        return self.fields <= set(fields) if self is CommandForm.TRAJECTORY else self.fields == set(fields)
 
 
 class Slot(msgspec.Struct, frozen=True):
@@ -72,7 +72,7 @@ class Bank(msgspec.Struct, frozen=True):
     controller: str
     kind: str
     """Kind of the command, such as `posvel`"""
-    form: Form
+    form: CommandForm
     slots: tuple[Slot, ...]
     """All numbers of the command, in its order"""
     driven: tuple[int, ...]
@@ -80,19 +80,19 @@ class Bank(msgspec.Struct, frozen=True):
     into: tuple[str, ...] = ()
     """Controllers whose references the controller commands; empty if it commands servos"""
 
-    def command(self, values: Sequence[float], factor: float) -> dict[str, object]:
+    def build_command(self, values: Sequence[float], factor: float) -> dict[str, object]:
         """Return the fields of the controller's command with these values, one per slot (SI units)."""
         match self.form:
-            case Form.TWIST:
+            case CommandForm.TWIST:
                 return {slot.name: value for slot, value in zip(self.slots, values, strict=True)}
-            case Form.VELOCITIES:
+            case CommandForm.VELOCITIES:
                 return {"velocities": values}
-            case Form.POSITIONS:
+            case CommandForm.POSITIONS:
                 return {"positions": values}
-            case Form.POSVEL:
+            case CommandForm.POSVEL:
                 speeds = [_LEADING * min(slot.most, slot.speed * factor) for slot in self.slots]
                 return {"positions": values, "velocities": speeds}
-            case Form.TRAJECTORY:
+            case CommandForm.TRAJECTORY:
                 ends = [values[index] for index in self.driven]
                 point = {"time": HORIZON_S, "positions": ends, "velocities": [0.0] * len(ends)}
                 return {"points": [point], "joints": [self.slots[index].name for index in self.driven]}
@@ -147,15 +147,15 @@ def _follows(one: Row, info: Row) -> bool:
 def _bank(robot: RemoteRobot, one: Row, info: Row) -> Bank | None:
     """Return a bank that drives all numbers of a controller's command; None if no Form fits it."""
     for kind, schema in one["takes"].items():
-        for form in (form for form in Form if form.fits(schema.get("properties", ()))):
-            twist = form is Form.TWIST
+        for form in (form for form in CommandForm if form.fits(schema.get("properties", ()))):
+            twist = form is CommandForm.TWIST
             slots = _twist(robot, one) if twist else [_joint(joint, info, form) for joint in one["joints"]]
             places = tuple(range(len(slots)))
             return Bank(one["name"], kind, form, tuple(slots), places, tuple(one["into"]))
     return None
 
 
-def _joint(name: str, info: Row, form: Form) -> Slot:
+def _joint(name: str, info: Row, form: CommandForm) -> Slot:
     unit, limit = info["units"][name], info["speeds"][name]
     most = math.inf if limit is None else limit / _ROOM if form.integrates else limit
     return Slot(name, unit, min(USUAL_SPEED[unit], most), most, *info["limits"].get(name, ()))

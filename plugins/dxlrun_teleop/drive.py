@@ -11,11 +11,11 @@ from collections.abc import Sequence
 from contextlib import suppress
 
 from dxlrun import Refused, RemoteRobot, Stream
-from dxlrun_teleop.bank import HORIZON_S, Bank, Form
-from dxlrun_teleop.source import Given, Press
+from dxlrun_teleop.bank import HORIZON_S, Bank, CommandForm
+from dxlrun_teleop.source import InputState, Press
 
 PERIOD_S = 0.02
-"""Period of `Drive.step`, in which the device is read and a command is sent, s"""
+"""Period of `Drive.apply_input`, in which the device is read and a command is sent, s"""
 LEASE_S = 0.15
 """Time for which a command of the stream is valid, s: seven periods. Including some periods of the loop,
 joints hold within 250 ms after the last one."""
@@ -34,7 +34,7 @@ class Drive:
         self._robot, self._banks, self.factor = robot, banks, factor
         self._place = 0
         self._armed = False
-        self._moving: _Moving | None = None
+        self._moving: _BankMotion | None = None
 
     @property
     def bank(self) -> Bank:
@@ -46,7 +46,7 @@ class Drive:
         """Last commanded value of each slot of the bank (SI units); empty while the robot holds"""
         return () if self._moving is None else self._moving.values
 
-    def step(self, given: Given, now: float) -> None:
+    def apply_input(self, given: InputState, now: float) -> None:
         """Apply the input of the device: change speed factor or bank, and send the next command.
 
         Args:
@@ -66,17 +66,17 @@ class Drive:
         self._armed = not turned and (self._armed or not given.enabled)
         self._place = (self._place + turned) % len(self._banks)
         if given.enabled and self._armed:
-            self._moving = self._moving or _Moving(self._robot, self.bank, now)
-            self._moving.move(given.axes, self.factor, now)
+            self._moving = self._moving or _BankMotion(self._robot, self.bank, now)
+            self._moving.integrate_axes(given.axes, self.factor, now)
 
     def close(self) -> None:
         """Stop: end a stream with a command to stand still. A short trajectory ends without one."""
         moving, self._moving = self._moving, None
         if moving is not None:
-            moving.settle(self.factor)
+            moving.end_stream(self.factor)
 
 
-class _Moving:
+class _BankMotion:
     """Motion of a bank while the dead-man's switch is held, which starts at the joints' present goals"""
 
     def __init__(self, robot: RemoteRobot, bank: Bank, now: float) -> None:
@@ -84,10 +84,10 @@ class _Moving:
         self.values = _present(robot, bank) if bank.form.integrates else [0.0] * len(bank.slots)
         self.moved = now
         self._sent = -math.inf
-        as_stream = bank.form is not Form.TRAJECTORY
+        as_stream = bank.form is not CommandForm.TRAJECTORY
         self._stream: Stream | None = robot.stream(bank.controller, bank.kind, LEASE_S) if as_stream else None
 
-    def move(self, axes: Sequence[float], factor: float, now: float) -> None:
+    def integrate_axes(self, axes: Sequence[float], factor: float, now: float) -> None:
         """Integrate the axes' deflections since the last call to positions, and send the command. Speeds are
         sent as they are. A trajectory is sent every HORIZON_S / 2 at most."""
         bank, elapsed, self.moved = self._bank, now - self.moved, now
@@ -99,19 +99,19 @@ class _Moving:
             elif speed:  # a joint beyond its limits is only clamped once it is driven
                 self.values[index] = min(max(self.values[index] + speed * elapsed, slot.lower), slot.upper)
         if self._stream is not None:
-            self._stream.send(bank.command(self.values, factor))
+            self._stream.send(bank.build_command(self.values, factor))
         elif elapsed and any(axes) and now - self._sent >= HORIZON_S / 2:
             self._sent = now
-            self._robot.send(bank.controller, bank.kind, bank.command(self.values, factor))
+            self._robot.send(bank.controller, bank.kind, bank.build_command(self.values, factor))
 
-    def settle(self, factor: float) -> None:
+    def end_stream(self, factor: float) -> None:
         """End the stream with one command to stand still, which does not expire."""
         bank = self._bank
         if self._stream is not None:
             values = self.values if bank.form.integrates else [0.0] * len(self.values)
             # The command is refused for a joint beyond its limits. The stream then ends with its lease.
             with suppress(Refused):
-                self._robot.send(bank.controller, bank.kind, bank.command(values, factor))
+                self._robot.send(bank.controller, bank.kind, bank.build_command(values, factor))
 
 
 def _present(robot: RemoteRobot, bank: Bank) -> list[float]:

@@ -10,7 +10,7 @@ import termios
 import tty
 
 from dxlrun import InputError
-from dxlrun_teleop.source import Given, Press
+from dxlrun_teleop.source import InputState, Press
 
 HELD_S = 0.13
 """Time for which a key counts as held after a press or repeat, s. It must exceed the repeat period, which is
@@ -54,12 +54,12 @@ class TerminalKeyboard:
         """Restore the terminal. Input that was not read is discarded."""
         termios.tcsetattr(self._input, termios.TCSAFLUSH, self._before)
 
-    def read(self, now: float) -> Given:
+    def read_input(self, now: float) -> InputState:
         """Return the input at `now`, s: axes whose keys count as held, and presses since the last call."""
         presses: set[Press] = set()
         while select.select([self._input], [], [], 0.0)[0]:
             if not (data := os.read(self._input, 4096)):
-                return Given((0.0,) * len(self.axes), False, frozenset({Press.QUIT}))
+                return InputState((0.0,) * len(self.axes), False, frozenset({Press.QUIT}))
             text = self._rest + data.decode(errors="replace")
             part = _PART.search(text)
             self._rest = part[0] if part else ""
@@ -73,4 +73,4 @@ class TerminalKeyboard:
                     presses.add(_PRESSES[key])
         held = {axis: side for axis, (side, typed) in self._typed.items() if now - typed <= HELD_S}
         axes = tuple(held.get(axis, 0.0) for axis in range(len(self.axes)))
-        return Given(axes, bool(held), frozenset(presses))
+        return InputState(axes, bool(held), frozenset(presses))

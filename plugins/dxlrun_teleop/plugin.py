@@ -16,4 +16,4 @@ def dxlrun_contract() -> int:
 @hookimpl
 def dxlrun_commands() -> Sequence[Command]:
     """Return the command `teleop`, with the function that is imported on use."""
-    return (Command("teleop", "dxlrun_teleop.command:teleop", group="Robots that run"),)
+    return (Command("teleop", "dxlrun_teleop.teleop:teleop", group="Robots that run"),)

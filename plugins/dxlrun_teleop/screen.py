@@ -9,14 +9,14 @@ from contextlib import contextmanager
 from dxlrun import RemoteRobot
 from dxlrun.tooling.output import Column, Table, fitted, out
 from dxlrun_teleop.drive import Drive
-from dxlrun_teleop.source import Source
+from dxlrun_teleop.source import InputSource
 
 REFRESH_S = 0.1
 """Shortest time between two updates of the screen, s"""
 _SHOWN = {"rad": (180 / math.pi, "deg"), "m": (1e3, "mm")}
 
 
-def view(robot: RemoteRobot, drive: Drive, source: Source) -> tuple[str, Table]:
+def view(robot: RemoteRobot, drive: Drive, source: InputSource) -> tuple[str, Table]:
     """Return a headline (robot, controller, speed factor), and a table with joint, command and position of
     each axis."""
     bank, values, states = drive.bank, drive.values, robot.states()
@@ -31,11 +31,11 @@ def view(robot: RemoteRobot, drive: Drive, source: Source) -> tuple[str, Table]:
         rows.append((label, slot.name, commanded, at))
     head = f"{robot.name}: {bank.controller} {'moves' if values else 'holds'}, speed x{drive.factor:.2g}"
     columns = (Column("axis", "name"), Column("moves", "name"), Column("commanded"), Column("position"))
-    return head, Table.of("", columns, rows)
+    return head, Table.from_rows("", columns, rows)
 
 
 @contextmanager
-def screen(robot: RemoteRobot, drive: Drive, source: Source) -> Iterator[Callable[[float], None]]:
+def screen(robot: RemoteRobot, drive: Drive, source: InputSource) -> Iterator[Callable[[float], None]]:
     """Yield a function that draws the view, at most every REFRESH_S of the time (s) it is called with.
 
     Without a terminal, it does nothing.
@@ -51,7 +51,7 @@ def screen(robot: RemoteRobot, drive: Drive, source: Source) -> Iterator[Callabl
     drawn_s = -math.inf
     with Live(console=console, auto_refresh=False, transient=True) as live:
 
-        def draw(now: float) -> None:
+        def draw_screen(now: float) -> None:
             nonlocal drawn_s
             if now - drawn_s >= REFRESH_S:
                 drawn_s = now
@@ -61,4 +61,4 @@ def screen(robot: RemoteRobot, drive: Drive, source: Source) -> Iterator[Callabl
                 texts = (Text.assemble(*line, no_wrap=True, overflow="ellipsis") for line in lines)
                 live.update(Group(*texts), refresh=True)
 
-        yield draw
+        yield draw_screen

@@ -16,7 +16,7 @@ class Press(Enum):
     QUIT = auto()
 
 
-class Given(NamedTuple):
+class InputState(NamedTuple):
     """Input of a device at one time"""
 
     axes: tuple[float, ...]
@@ -27,7 +27,7 @@ class Given(NamedTuple):
     """Actions triggered since the previous input"""
 
 
-class Source(Protocol):
+class InputSource(Protocol):
     """Input device: a keyboard, a gamepad, or a script"""
 
     axes: tuple[str, ...]
@@ -35,7 +35,7 @@ class Source(Protocol):
     help: str
     """Description of the dead-man's switch and of the other keys, for the screen"""
 
-    def read(self, now: float) -> Given:
+    def read_input(self, now: float) -> InputState:
         """Return the device's input at `now`, s of a monotonic clock, without waiting for a press.
 
         Raises:

@@ -35,7 +35,7 @@ class Bundle(BuildHookInterface[Any]):
             bundle(root / "page", Path(place), root / BUNDLE)
 
 
-class TreeVersion(MetadataHookInterface):
+class ViewTreeVersion(MetadataHookInterface):
     """Metadata hook that sets the version to that of the source tree, and pins dxlrun to the same version.
 
     The version is only defined in the pyproject.toml of dxlrun. An sdist has version and pin in its PKG-INFO.

@@ -21,9 +21,9 @@ from dxlrun.contract.hookspecs import hookimpl as hookimpl
 from dxlrun.contract.joint_controller import JointController as JointController
 from dxlrun.contract.joint_controller import reading as reading
 from dxlrun.contract.serial_line import open_serial as open_serial
-from dxlrun.description.form import Mistake as Mistake
-from dxlrun.description.form import ParametersModel as ParametersModel
-from dxlrun.description.joints.servo import ServoModel as ServoModel
+from dxlrun.description.base_form import Mistake as Mistake
+from dxlrun.description.base_form import ParametersModel as ParametersModel
+from dxlrun.description.joints.servo_model import ServoModel as ServoModel
 from dxlrun.description.joints.turns import nearest_turn as nearest_turn
 from dxlrun.description.units import Angle as Angle
 from dxlrun.description.units import AngularAcceleration as AngularAcceleration
@@ -54,10 +54,10 @@ from dxlrun.errors import ServoFault as ServoFault
 from dxlrun.errors import StartUpError as StartUpError
 from dxlrun.features.sensors.driver import Sensor as Sensor
 from dxlrun.features.sensors.driver import SensorContext as SensorContext
-from dxlrun.log.reader import Log as Log
-from dxlrun.log.reader import LogReader as LogReader
-from dxlrun.log.reader import Topic as Topic
-from dxlrun.log.reader import open_log as open_log
+from dxlrun.log.log_reader import Log as Log
+from dxlrun.log.log_reader import LogReader as LogReader
+from dxlrun.log.log_reader import Topic as Topic
+from dxlrun.log.log_reader import open_log as open_log
 from dxlrun.remote.client import RemoteGoal as RemoteGoal
 from dxlrun.remote.client import RemoteRobot as RemoteRobot
 from dxlrun.remote.client import Stream as Stream

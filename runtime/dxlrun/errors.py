@@ -7,7 +7,7 @@ Exception
     ├── InputError (ValueError)    a file, an argument or a plug-in is wrong; exit code 2
     │   └── PlugInError (ImportError)   a plug-in is missing, broken on import, or of another contract
     ├── PortError (OSError)        a serial line cannot be opened, or is gone
-    ├── NotCompiled                a compiled C source is missing; see dxlwire/errors.py
+    ├── NotCompiled                a compiled C source is missing; see dxlwire/exceptions.py
     ├── StartUpError               a servo differs from the robot file; torque stayed off
     ├── ServoFault                 a servo refused a tool's request, or did not answer
     ├── ControllerFault            a controller raised, or broke its contract
@@ -27,8 +27,8 @@ from dataclasses import replace
 from importlib.util import find_spec
 from types import MappingProxyType
 
-from dxlwire.errors import DxlError as DxlrunError
-from dxlwire.errors import InputError, Mark, PortError, Problem, counted, near, suggestion
+from dxlwire.exceptions import DxlError as DxlrunError
+from dxlwire.exceptions import InputError, Mark, PortError, Problem, counted, near, suggestion
 
 __all__ = [
     "ControllerFault",

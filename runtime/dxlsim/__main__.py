@@ -18,11 +18,11 @@ from dxlsim.bus.ledger import Ledger
 from dxlsim.faults.fault import fault_help
 from dxlsim.messages import SimulationMessage
 from dxlsim.serving.served_bus import LocalStarter
-from dxlsim.serving.server import Server, wake_on_signals
+from dxlsim.serving.simulation_server import Server, wake_on_signals
 from dxlsim.simulation_plan import BusConfig, SimulationConfig
 from dxlsim.texts.duration import parse_duration
 from dxlsim.texts.servo_words import bus_of_servos
-from dxlwire.errors import InputError
+from dxlwire.exceptions import InputError
 
 _EXAMPLES = """\
 examples:
@@ -145,7 +145,7 @@ def _serve(config: SimulationConfig, ledger: Ledger) -> None:
     (bus,) = config.buses
     link = config.links.get(bus.name)
 
-    def show(message: SimulationMessage) -> None:
+    def show_ports(message: SimulationMessage) -> None:
         if message.ports is not None:
             path = message.ports[bus.name]
             where = f"{link} -> {path}" if link and path else path or "the adapter is unplugged"
@@ -153,9 +153,9 @@ def _serve(config: SimulationConfig, ledger: Ledger) -> None:
         if message.happened is not None:
             print(f"fault: {message.happened}", flush=True)
 
-    starter = LocalStarter(show)
+    starter = LocalStarter(show_ports)
     with wake_on_signals(signal.SIGINT, signal.SIGTERM) as wake:
-        Server(config, ledger, starter).run(stop=wake.fileno())
+        Server(config, ledger, starter).serve_ports(stop=wake.fileno())
 
 
 def _text_of(bus: BusConfig) -> str:

@@ -18,7 +18,7 @@ class SimulationJob(msgspec.Struct, frozen=True):
     progress: int = -1  # Descriptor of the memory for the progress of the process; -1: none
 
 
-class Request(msgspec.Struct):
+class SimulationRequest(msgspec.Struct):
     """Request to a running simulation."""
 
     look: bool = False  # Request the current state of every servo

@@ -62,7 +62,7 @@ class ServoConfig(msgspec.Struct, frozen=True):
     model."""
 
 
-class Shown(msgspec.Struct, frozen=True):
+class DeviceReadings(msgspec.Struct, frozen=True):
     """Quantities that a simulated device measures, and its location on the robot."""
 
     states: dict[str, str] = {}
@@ -79,7 +79,7 @@ class DeviceConfig(msgspec.Struct, frozen=True):
     servo_id: int  # Its ID
     model: str
     return_delay_ns: int = 0  # Initial value of its return delay time, if it has this item
-    shown: Shown = Shown()
+    shown: DeviceReadings = DeviceReadings()
 
 
 class AdapterConfig(msgspec.Struct, frozen=True):

@@ -7,7 +7,7 @@ from collections.abc import Sequence
 
 from dxlsim.bus.simulated_bus import SimulatedBus
 from dxlwire.clock import VirtualClock
-from dxlwire.errors import PortError
+from dxlwire.exceptions import PortError
 
 
 class VirtualPort:
@@ -19,17 +19,17 @@ class VirtualPort:
         self._arrived = bytearray()
         self._unplugged = bus.times_unplugged
 
-    def write(self, data: bytes | bytearray | memoryview) -> None:
+    def write_packet(self, data: bytes | bytearray | memoryview) -> None:
         """Write bytes to the line at the present virtual time. Raises PortError if the adapter was
         unplugged."""
         self._check()
-        self._bus.receive(data, self._clock.now_ns())
+        self._bus.receive_bytes(data, self._clock.now_ns())
 
     def read_into(self, buffer: memoryview) -> int:
         """Copy the bytes that have arrived; return their number. Raises PortError if the adapter was
         unplugged."""
         self._check()
-        self.collect()
+        self.collect_bytes()
         size = min(len(buffer), len(self._arrived))
         buffer[:size] = self._arrived[:size]
         del self._arrived[:size]
@@ -51,10 +51,10 @@ class VirtualPort:
         """Return 0: virtual time waits for the servos, so none is stalled."""
         return 0
 
-    def collect(self) -> bool:
+    def collect_bytes(self) -> bool:
         """Take the bytes that have passed the wire from the bus; return True if bytes are waiting or the
         adapter is gone."""
-        self._arrived += self._bus.take(self._clock.now_ns())
+        self._arrived += self._bus.drain_bytes(self._clock.now_ns())
         return bool(self._arrived) or self._gone
 
     def unplug(self) -> None:
@@ -87,11 +87,11 @@ class VirtualPorts:
         """The ports of the lines, in the order of the buses."""
         return self._ports
 
-    def wait(self, deadline_ns: int) -> Sequence[int]:
+    def wait_for_bytes(self, deadline_ns: int) -> Sequence[int]:
         """Advance virtual time until bytes arrive or `deadline_ns`; return the indices of readable lines."""
         while True:
             # Time passes for the servos of a lost line, too.
-            received = [index for index, port in enumerate(self._ports) if port.collect()]
+            received = [index for index, port in enumerate(self._ports) if port.collect_bytes()]
             ready = [index for index in received if index not in self._lost]
             now_ns = self._clock.now_ns()
             if ready or now_ns >= deadline_ns:
@@ -104,7 +104,7 @@ class VirtualPorts:
         in."""
         self._lost.add(index)
         bus = self._buses[index]
-        bus.advance(self._clock.now_ns())
+        bus.advance_to(self._clock.now_ns())
         if not bus.plugged:
             return False
         self._lost.remove(index)

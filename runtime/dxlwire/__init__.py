@@ -15,7 +15,7 @@ A dialect builds and parses the packets of a protocol:
 
     >>> from dxlwire import dialect_of
     >>> packets = dialect_of(2.0)
-    >>> packets.write(1, item.address, item.encode(2048)).hex(" ")
+    >>> packets.write_range(1, item.address, item.encode(2048)).hex(" ")
     'ff ff fd 00 01 09 00 03 74 00 00 08 00 00 42 89'
 """
 

@@ -10,7 +10,7 @@ from types import MappingProxyType
 from typing import TypeVar
 from zlib import crc32
 
-from dxlwire.errors import NotCompiled
+from dxlwire.exceptions import NotCompiled
 
 _HINT = "install dxlrun again"  # The distribution that contains dxlwire
 Library = TypeVar("Library", bound=ctypes.CDLL)

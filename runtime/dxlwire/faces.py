@@ -31,7 +31,7 @@ def lazy_face(module: str, source: str) -> tuple[Callable[[str], object], Callab
             homes.update({line[-1]: line[1] for line in words if "as" in line})
         return homes
 
-    def get(name: str) -> object:
+    def get_attribute(name: str) -> object:
         if name == "__all__":
             return list(read_homes())
         if name not in read_homes():
@@ -42,4 +42,4 @@ def lazy_face(module: str, source: str) -> tuple[Callable[[str], object], Callab
         setattr(sys.modules[module], name, value)
         return value
 
-    return get, lambda: sorted({*vars(sys.modules[module]), *read_homes()})
+    return get_attribute, lambda: sorted({*vars(sys.modules[module]), *read_homes()})

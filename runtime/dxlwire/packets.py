@@ -69,6 +69,6 @@ class PacketLog(PacketSink):
     def wake(self, cycle: int) -> None:
         """Begin a cycle, by its number: later packets belong to its period."""
 
-    def commit(self) -> object:
+    def commit_packets(self) -> object:
         """Add the packets that were recorded in `desk` to the log, and empty the memory."""
         return None

@@ -25,7 +25,7 @@ class Status(NamedTuple):
     parameters: bytes | memoryview
 
 
-class Awaited(msgspec.Struct, frozen=True):
+class ExpectedReply(msgspec.Struct, frozen=True):
     """One status packet that is expected as a reply to an instruction."""
 
     servo_id: int
@@ -38,7 +38,7 @@ class Transaction(msgspec.Struct, frozen=True):
 
     packet: bytes
     servo_id: int  # The servo that the instruction addresses
-    awaited: tuple[Awaited, ...]  # Expected replies, in the order of their arrival; may be empty
+    awaited: tuple[ExpectedReply, ...]  # Expected replies, in the order of their arrival; may be empty
     due_ns: int
     """Time from the start of the write to the last byte of all replies on the wire; without replies the
     time of the instruction on the wire."""
@@ -64,7 +64,7 @@ class Transaction(msgspec.Struct, frozen=True):
 
 
 @unique
-class Outcome(IntEnum):
+class TransactionOutcome(IntEnum):
     """Outcome of a transaction. A lost packet is not an exception."""
 
     SENT = 0  # No reply was expected
@@ -83,7 +83,7 @@ class Reply(msgspec.Struct):
     A bus reuses one object for all its transactions, so a job must copy the values before it continues.
     Programs get their own objects."""
 
-    outcome: Outcome
+    outcome: TransactionOutcome
     error: int  # Error byte of the status packet
     parameters: bytes | memoryview
     last_ns: int  # Time of the read() that returned the last byte of the status packet
@@ -96,7 +96,7 @@ class Reply(msgspec.Struct):
     @property
     def answered(self) -> bool:
         """True if all expected status packets arrived, without a refusal."""
-        return self.outcome is Outcome.OK
+        return self.outcome is TransactionOutcome.OK
 
     def word(self, size: int = 2, offset: int = 0) -> int:
         """Return the unsigned little-endian integer of `size` bytes at `offset` in the parameters."""
@@ -111,7 +111,7 @@ later transactions may depend. It returns a result."""
 class Job(Protocol):
     """Sequence of transactions that a `Bus` executes one after the other."""
 
-    def advance(self, reply: Reply | None) -> Transaction | None:
+    def next_transaction(self, reply: Reply | None) -> Transaction | None:
         """Process the reply to the last transaction (None at the start), and return the next transaction;
         None at the end."""
         ...
@@ -137,7 +137,7 @@ class ProgramJob(Generic[Result]):
         """Ignore the single status packet: `advance` receives the whole reply, and a program awaits one
         status at a time."""
 
-    def advance(self, reply: Reply | None) -> Transaction | None:
+    def next_transaction(self, reply: Reply | None) -> Transaction | None:
         """Resume the program with a copy of the reply; return its next transaction, None after the last
         one."""
         try:

@@ -7,13 +7,13 @@ from typing import Any
 
 from msgspec import structs
 
-from dxlrun.channels.events import EventCode, EventGroup, Severity
+from dxlrun.channels.event_records import EventCode, EventGroup, Severity
 from dxlrun.plan.loop_plan import ControllerPlan
 from dxlrun.plan.machine_load import MachineLoad
 from dxlrun_analysis.causes.causes import Causes
-from dxlrun_analysis.cycles.latency import Latency, Periods
+from dxlrun_analysis.cycles.punctuality import Latency, Periods
 from dxlrun_analysis.finding import Finding, Rank
-from dxlrun_analysis.plan import NO_LOOP, LoggedBus, LoggedPlan, LoggedServo
+from dxlrun_analysis.plan_excerpt import NO_LOOP, LoggedBus, LoggedPlan, LoggedServo
 from dxlrun_analysis.servos.traffic import ServoTraffic
 from dxlrun_analysis.tally import RunTotals
 

@@ -14,13 +14,13 @@ import pytest
 from rich.console import Console
 from tests.kit.made_logs import Cycle, Said, Wire
 
-from dxlrun.channels.events import EventCode, Severity
+from dxlrun.channels.event_records import EventCode, Severity
 from dxlrun.errors import LogError
-from dxlrun.log.reader import read_log
+from dxlrun.log.log_reader import read_log
 from dxlrun.output.json import json_text
-from dxlrun.output.table import microseconds
-from dxlrun.output.terminal import show
-from dxlrun_analysis.cycles.latency import Durations, Punctuality
+from dxlrun.output.terminal import show_parts
+from dxlrun.output.text_table import microseconds
+from dxlrun_analysis.cycles.punctuality import Durations, Punctuality
 from dxlrun_analysis.parts.cycles import CONTROLLERS, STEPS
 from dxlrun_analysis.parts.history import EVENTS
 from dxlrun_analysis.parts.part import Report
@@ -36,7 +36,7 @@ GOALS = bytes.fromhex("fffffe0483")
 
 def shown(report: Report) -> str:
     console = Console(file=io.StringIO(), width=160)
-    show(*parts(report), console=console)
+    show_parts(*parts(report), console=console)
     text: str = console.file.getvalue()  # type: ignore[attr-defined]  # a StringIO, given above
     return text
 
@@ -96,12 +96,12 @@ def test_the_steps_take_the_times_of_the_records(write: Make) -> None:
         Cycle(number, late=50, read=5000 + number, update=100, write=300 - number) for number in range(101)
     ]
     report = analyze_log(write(cycles))
-    steps = {step.name: (step.median_us, step.p99_us, step.max_us) for step in STEPS.of(report)}
+    steps = {step.name: (step.median_us, step.p99_us, step.max_us) for step in STEPS.numbers_of(report)}
     assert steps["read"] == pytest.approx((5050, 5099, 5100))
     assert steps["update"] == pytest.approx((100, 100, 100))
     assert steps["write"] == pytest.approx((250, 299, 300))
     assert steps["cycle"] == pytest.approx((5400, 5400, 5400))
-    head, idle = CONTROLLERS.of(report)
+    head, idle = CONTROLLERS.numbers_of(report)
     assert (head.name, head.cycles, head.max_us) == ("head", 101, 50)
     assert (idle.name, idle.cycles) == ("idle", 0)
 
@@ -223,7 +223,7 @@ def test_errors_gaps_and_a_log_without_end_are_reported(write: Make) -> None:
     assert "no end" in report.verdict.sentences[2]
     assert "17 records were lost" in report.verdict.sentences[2]
     assert "ValueError: no" in shown(report)
-    assert [(event.name, event.count) for event in EVENTS.of(report)] == [
+    assert [(event.name, event.count) for event in EVENTS.numbers_of(report)] == [
         ("controller_fault", 1),
         ("recorder_gap", 1),
         ("loop_started", 1),
@@ -242,7 +242,7 @@ def test_a_run_without_a_cycle_is_reported(write: Make) -> None:
         "Not good: the loop never ran a cycle.",
         "The loop never ran a cycle.",
     )
-    assert (report.totals.latency, STEPS.of(report)) == (None, ())
+    assert (report.totals.latency, STEPS.numbers_of(report)) == (None, ())
     assert "torso" in shown(report)
 
 
@@ -295,9 +295,10 @@ def test_slices_give_what_the_whole_log_gives(write: Make) -> None:
     whole = Punctuality(), Durations()
     sliced = Punctuality(), Durations()
     for one in whole:
-        one.take(log)
+        one.add_slice(log)
     for begin in range(0, len(log.cycles), 7):
         for one in sliced:
-            one.take(replace(log, cycles=log.cycles[begin : begin + 7], activation=None))
-    assert [one.finish() for one in sliced] == [one.finish() for one in whole]
+            one.add_slice(replace(log, cycles=log.cycles[begin : begin + 7], activation=None))
+    assert sliced[0].compute_latency() == whole[0].compute_latency()
+    assert sliced[1].compute_durations() == whole[1].compute_durations()
     assert sliced[0].slowest == whole[0].slowest

@@ -9,19 +9,19 @@ import pytest
 from msgspec import structs
 from tests.analysis.judged import BUSY, REAL, SIMULATED, accusing, lost, on_bus, plan, totals
 
-from dxlrun.channels.events import EventCode
+from dxlrun.channels.event_records import EventCode
 from dxlrun.dynamixel.remedies import INJECTED
 from dxlrun.plan.loop_plan import JointPlan
 from dxlrun.plan.machine_load import MachineLoad, SimulationWait
 from dxlrun.plan.mechanics_plan import CouplingPlan, MechanicsPlan
 from dxlrun_analysis.causes.causes import Causes
-from dxlrun_analysis.cycles.latency import Latency, Periods
+from dxlrun_analysis.cycles.punctuality import Latency, Periods
 from dxlrun_analysis.evidence import accused
 from dxlrun_analysis.finding import Finding, Rank
-from dxlrun_analysis.plan import LoggedPlan, LoggedServo
+from dxlrun_analysis.plan_excerpt import LoggedPlan, LoggedServo
 from dxlrun_analysis.rules import RULES, Needs
 from dxlrun_analysis.tally import RealTime
-from dxlrun_analysis.verdict import judge
+from dxlrun_analysis.verdict import judge_run
 
 LACKING: dict[str, tuple[Needs, dict[str, Any]]] = {
     "nothing": (Needs.NOTHING, {}),
@@ -98,12 +98,12 @@ def test_joint_is_not_accused_where_replies_of_all_buses_are_missing() -> None:
 def test_busy_machine_is_named_with_its_numbers_and_a_remedy(port: str, lack: str) -> None:
     """A gate that closes without a word would leave a bad run without a cause."""
     run = totals(plan=plan(port), findings=(accusing("late_replies"),), **LACKING[lack][1])
-    (machine,) = (one for one in judge(run).findings if one.code == "busy_machine")
+    (machine,) = (one for one in judge_run(run).findings if one.code == "busy_machine")
     assert machine.subject == "machine"
     assert ("no core was idle in 9 of 10 s" in machine.sentence) is (lack == "a busy machine")
     assert machine.remedy.startswith("End other programs")
     assert ("--virtual" in machine.remedy) is (port == SIMULATED)
-    (machine,) = (one for one in judge(replace(run, virtual=True)).findings if one.code == "busy_machine")
+    (machine,) = (one for one in judge_run(replace(run, virtual=True)).findings if one.code == "busy_machine")
     assert "--virtual" not in machine.remedy
 
 
@@ -199,7 +199,7 @@ def test_controller_with_the_name_of_a_simulated_bus_keeps_its_remedy() -> None:
     ],
 )
 def test_scheduler_is_recommended_only_where_it_was_not_granted(real_time: RealTime, helps: str) -> None:
-    (_, machine, *_) = judge(totals(causes=BUSY, real_time=real_time, plan=plan(REAL))).findings
+    (_, machine, *_) = judge_run(totals(causes=BUSY, real_time=real_time, plan=plan(REAL))).findings
     assert helps in machine.remedy
     assert ("scheduler" in machine.remedy) is not real_time.granted
 

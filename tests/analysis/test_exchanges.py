@@ -6,9 +6,9 @@ from collections.abc import Sequence
 
 import pytest
 
-from dxlrun.channels.packets import LoggedPacket
+from dxlrun.channels.logged_packets import LoggedPacket
 from dxlrun.log.columns import PacketColumns
-from dxlrun_analysis.plan import LoggedBus
+from dxlrun_analysis.plan_excerpt import LoggedBus
 from dxlrun_analysis.servos.broken_replies import BrokenReplies
 from dxlrun_analysis.servos.exchanges import Exchanges, Loss, Pairing
 from dxlrun_analysis.servos.losses import ServoLosses
@@ -34,7 +34,7 @@ def status(servo_id: int) -> bytes:
 
 def columns(wires: Wires) -> PacketColumns:
     """Packets of one bus: kind, ID, bytes, ms."""
-    return PacketColumns.of(
+    return PacketColumns.from_packets(
         LoggedPacket(0, kind, one, at * MS, at * MS, data) for kind, one, data, at in wires
     )
 
@@ -109,7 +109,9 @@ def test_only_of_a_shared_packet_the_end_may_be_cut(read: bytes, shared: bool) -
     came = [(STATUS, 254, CUT + both)] if shared else [(STATUS, 3, status(3)), (STATUS, 7, status(7))]
     broken = BrokenReplies(1)
     for _ in range(5):
-        broken.take(paired([(ASK, 254, read, 0), *((*one, 1) for one in came), (NOISE, 254, bytes(5), 2)]))
+        broken.add_exchanges(
+            paired([(ASK, 254, read, 0), *((*one, 1) for one in came), (NOISE, 254, bytes(5), 2)])
+        )
     (finding,) = broken.findings(0, BUS, dict.fromkeys((3, 7, 4), ServoLosses(5, 5, 5)))
     assert "servo 4" in finding.sentence
     assert ("which all share" in finding.sentence or "that all share" in finding.sentence) == shared
@@ -154,7 +156,7 @@ def test_a_host_that_uses_the_same_adapter_is_told_by_the_replies_to_it(
         wires += [(ASK, 7, PING_7, 10 * number), (STATUS, 7, status(7), 10 * number + 1)]
         wires += [(STATUS, servo_id, status(servo_id), 10 * number + 2)]
     others = OtherHosts(1)
-    others.take(paired(wires))
+    others.add_exchanges(paired(wires))
     found = others.findings(0, BUS)
     assert others.explains(0) is bool(told)
     assert [(one.code, one.subject) for one in found] == [("another_host", "main")] * bool(told)

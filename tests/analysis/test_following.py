@@ -132,7 +132,7 @@ def test_a_long_run_keeps_its_begin_and_its_end() -> None:
     column = np.arange(cycles, dtype=np.float64)[:, None]
     for begin in range(0, cycles, 999):
         part = slice(begin, begin + 999)
-        trail.take(at_ns[part], column[part], column[part], column[part])
+        trail.add_cycles(at_ns[part], column[part], column[part], column[part])
     kept = trail.samples()
     assert len(kept.at_s) == 8_192
     assert kept.way[:4096, 0].tolist() == list(range(4096))
@@ -145,7 +145,7 @@ def test_of_many_cycles_one_is_kept_each_20_ms() -> None:
     at_ns = 10**9 + np.arange(1000) * 1_000_000
     values = np.zeros((1000, 1))
     for part in (slice(0, 333), slice(333, 1000)):
-        trail.take(at_ns[part], values[part], values[part], values[part])
+        trail.add_cycles(at_ns[part], values[part], values[part], values[part])
     assert np.diff(trail.samples().at_s) == pytest.approx(STEP_S)
 
 
@@ -153,7 +153,7 @@ def test_a_joint_is_compared_with_the_lag_of_its_kind() -> None:
     trail = Trail(3, 0)
     way = np.tile(SWING[:, None], 3)
     position = np.column_stack([behind(SWING, 2), behind(SWING, 2), behind(SWING, 5)])
-    trail.take((TIME * 1e9).astype(np.int64), way, position, np.zeros_like(way))
+    trail.add_cycles((TIME * 1e9).astype(np.int64), way, position, np.zeros_like(way))
     planned = [PlannedJoint(f"j{row}", tick=TICK, top_effort=1.0) for row in range(3)]
     assert [one.lag_s for one in followed(planned, trail.samples())] == pytest.approx([0.04] * 3)
     other = [*planned[:2], PlannedJoint("j2", tick=TICK, top_effort=1.0, alike="MX")]

@@ -6,9 +6,9 @@ from typing import Any
 
 import pytest
 
-from dxlrun.channels.events import Event, EventCode, Severity
-from dxlrun.channels.packets import LoggedPacket
-from dxlrun_analysis.plan import LoggedBus, LoggedServo
+from dxlrun.channels.event_records import Event, EventCode, Severity
+from dxlrun.channels.logged_packets import LoggedPacket
+from dxlrun_analysis.plan_excerpt import LoggedBus, LoggedServo
 from dxlrun_analysis.servos.foreign_writes import ForeignWrites
 from dxlwire.control_table import find_table
 from dxlwire.packets import PacketKind
@@ -28,11 +28,11 @@ def told(
     servos = [LoggedServo(joint=name, servo_id=at, model=model) for at, name in enumerate(NAMES, 3)]
     bus, writes = LoggedBus("main", protocol=protocol, servos=servos), ForeignWrites()
     for data in sent:
-        writes.take(0, bus, LoggedPacket(0, PacketKind.OTHER_HOST, 254, S, S, data))
+        writes.add_write(0, bus, LoggedPacket(0, PacketKind.OTHER_HOST, 254, S, S, data))
     for name, code, at_s in failures:
-        writes.failed(Event(round(at_s * S), code, Severity.ERROR, name, ""))
-    assert writes.of(1) == ("", False)
-    return writes.of(0)
+        writes.add_failure(Event(round(at_s * S), code, Severity.ERROR, name, ""))
+    assert writes.describe_writes(1) == ("", False)
+    return writes.describe_writes(0)
 
 
 def item(protocol: float, name: str) -> tuple[int, int]:
@@ -42,7 +42,7 @@ def item(protocol: float, name: str) -> tuple[int, int]:
 
 def write(protocol: float, servo_id: int, name: str, value: int, more: bytes = b"") -> bytes:
     address, size = item(protocol, name)
-    packet: bytes = WIRES[protocol].write(servo_id, address, value.to_bytes(size, "little") + more)
+    packet: bytes = WIRES[protocol].write_range(servo_id, address, value.to_bytes(size, "little") + more)
     return packet
 
 
@@ -91,7 +91,9 @@ def test_all_servos_that_an_instruction_means_are_told(protocol: float) -> None:
 def test_of_a_bulk_write_each_part_is_told() -> None:
     address, _ = item(2.0, "torque_enable")
     part = bytes((4, address, 0, 1, 0, 0))
-    data = protocol2.instruction_packet(254, protocol2.Instruction.BULK_WRITE, part + b"\5" + part[1:])
+    data = protocol2.instruction_packet(
+        254, protocol2.Protocol2Instruction.BULK_WRITE, part + b"\5" + part[1:]
+    )
     assert told(2.0, data) == ("torque_enable = 0 to IDs 4, 5", False)
 
 
@@ -99,9 +101,9 @@ def test_of_a_bulk_write_each_part_is_told() -> None:
     "sent",
     [
         protocol1.ping(4),
-        protocol1.read(4, 36, 2),
+        protocol1.read_range(4, 36, 2),
         write(1.0, 9, "id", 1),
-        protocol1.write(4, 31, b"\1"),
+        protocol1.write_range(4, 31, b"\1"),
         write(1.0, 4, "goal_position", 1, b"\1"),
         b"\xff\xff\x04",
     ],

@@ -47,7 +47,7 @@ def findings(
             attachments={"plan.json": json.dumps(plan).encode()},
             metadata={},
         )
-        sensors.take(part)
+        sensors.add_slice(part)
     return list(sensors.findings())
 
 

@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 from tests.analysis.stranger.kit import JOINTS, ROBOTS, Story
 
-from dxlrun.log.reader import read_log
+from dxlrun.log.log_reader import read_log
 from dxlrun_analysis.report import analyze_log
 from dxlrun_analysis.servos.joint_states import BINS
 from dxlrun_analysis.servos.losses import narrowest
@@ -124,8 +124,8 @@ def found(tmp_path: Path) -> Callable[[str, Inject], list[tuple[str, str]]]:
         story.duration_s = 5.0
         inject(story)
         traffic, log = Traffic(), read_log(story.run())
-        traffic.take(log)
-        traffic.finish()
+        traffic.add_slice(log)
+        traffic.summarize_traffic()
         return sorted((one.code, one.subject) for one in traffic.findings)
 
     return found
@@ -204,8 +204,8 @@ def test_a_plug_that_is_loose_at_some_angles_is_told_with_them(tmp_path: Path) -
     story.fault("loose servo={id} low=195deg high=205deg share=0.2 at=1s", "left_knee")
     story.motion = story.swing(left_knee="0.7 * sin(3 * t)")
     traffic, log = Traffic(), read_log(story.run())
-    traffic.take(log)
-    traffic.finish()
+    traffic.add_slice(log)
+    traffic.summarize_traffic()
     (finding,) = traffic.findings
     assert (finding.code, finding.subject) == ("lossy_servo", "left_knee")
     told = r"(\d+) episodes, (\d+) of them between 1\d and 2\d deg, where it was for 1?\d% of the time"

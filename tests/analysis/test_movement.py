@@ -11,7 +11,7 @@ from tests.kit.moved_joints import FAULT, SWING, TICK, TIME, Floats, Joint, behi
 from tests.kit.stories import send, tell
 
 from dxlrun.channels.cycle import Torque
-from dxlrun.log.reader import read_log
+from dxlrun.log.log_reader import read_log
 from dxlrun.plan.loop_plan import JointPlan
 from dxlrun_analysis.finding import Rank
 from dxlrun_analysis.report import analyze

@@ -11,11 +11,11 @@ import pytest
 from msgspec import structs
 from tests.kit.made_logs import JOINTS, Cycle, loop_of
 
-from dxlrun.log.reader import read_log
+from dxlrun.log.log_reader import read_log
 from dxlrun.plan.loop_plan import JointPlan
 from dxlrun.plan.mechanics_plan import CouplingPlan
-from dxlrun_analysis.joints.tracking import tracking
-from dxlrun_analysis.plan import LoggedPlan, plan_of
+from dxlrun_analysis.joints.goal_tracking import tracking
+from dxlrun_analysis.plan_excerpt import LoggedPlan, plan_of
 from dxlrun_analysis.report import analyze, tables
 from dxlwire.joint_unit import LINEAR, ROTARY, JointUnit
 

@@ -9,10 +9,10 @@ import numpy as np
 import pytest
 from msgspec import structs
 
-from dxlrun.channels.packets import LoggedPacket
+from dxlrun.channels.logged_packets import LoggedPacket
 from dxlrun.log.columns import PacketColumns
 from dxlrun_analysis.finding import Finding
-from dxlrun_analysis.plan import LoggedBus, LoggedServo
+from dxlrun_analysis.plan_excerpt import LoggedBus, LoggedServo
 from dxlrun_analysis.servos.exchanges import Pairing
 from dxlrun_analysis.servos.joint_states import JointStates
 from dxlrun_analysis.servos.losses import Losses
@@ -66,9 +66,9 @@ class Line:
 
 def findings(packets: Line, *, line: bool = False) -> list[Finding]:
     """Return those about the servos; `line`: and about their bus."""
-    columns = replace(PacketColumns.of(packets.packets), cycle=np.array(packets.cycles, np.int64))
+    columns = replace(PacketColumns.from_packets(packets.packets), cycle=np.array(packets.cycles, np.int64))
     times = ReplyTimes(1)
-    times.take(Pairing((BUS,)).alone(columns), Losses(JointStates([BUS.name])))
+    times.add_exchanges(Pairing((BUS,)).alone(columns), Losses(JointStates([BUS.name])))
     slow = list(times.servos(0, BUS, now_and_then=True))
     return [*slow, *times.line(0, BUS, [one.subject for one in slow])] if line else slow
 

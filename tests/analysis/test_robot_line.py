@@ -14,18 +14,18 @@ from msgspec import structs
 from tests.kit.totals import totals_of
 
 from dxlrun import LINEAR, ROTARY, JointUnit
-from dxlrun.channels.events import RUN_ENDED, EventCode, EventGroup, GoalReport, GoalTotals, Severity
-from dxlrun.log.reader import Log, read_log
+from dxlrun.channels.event_records import RUN_ENDED, EventCode, EventGroup, GoalReport, GoalTotals, Severity
+from dxlrun.log.log_reader import Log, read_log
 from dxlrun.plan.loop_plan import ScheduledCommand, ScheduledGoal
 from dxlrun.testing import simulated_robot
 from dxlrun_analysis.conduct.conduct import Conduct, ConductHistory, Takeover
-from dxlrun_analysis.conduct.steering import Act
-from dxlrun_analysis.cycles.latency import Periods
+from dxlrun_analysis.conduct.steering_history import Act
+from dxlrun_analysis.cycles.punctuality import Periods
 from dxlrun_analysis.finding import Finding, Rank
-from dxlrun_analysis.joints.tracking import JointTracking
-from dxlrun_analysis.plan import NO_LOOP, LoggedPlan
+from dxlrun_analysis.joints.goal_tracking import JointTracking
+from dxlrun_analysis.plan_excerpt import NO_LOOP, LoggedPlan
 from dxlrun_analysis.tally import RunTotals
-from dxlrun_analysis.verdict import judge
+from dxlrun_analysis.verdict import judge_run
 
 S = 10**9
 ROBOTS = Path(__file__).parents[2] / "robots"
@@ -64,7 +64,7 @@ def goals(reached: int, *failed: GoalReport) -> GoalTotals:
 
 
 def line(**changed: Any) -> str:
-    return judge(totals(**changed)).sentences[0]
+    return judge_run(totals(**changed)).sentences[0]
 
 
 def happened(code: EventCode, source: str, at_s: float) -> EventGroup:
@@ -119,17 +119,17 @@ def test_what_happened_to_the_same_joints_is_told_together_as_it_came() -> None:
 
 def test_a_goal_of_a_played_motion_that_was_missed_is_not_good() -> None:
     missed = GoalReport(1, "arm", "trajectory", f"{WAVE}:4:5", "missed", "elbow is 0.2 off", "elbow", 0.2)
-    verdict = judge(totals(conduct=conduct(goals=goals(1, missed))))
+    verdict = judge_run(totals(conduct=conduct(goals=goals(1, missed))))
     assert not verdict.good
     assert verdict.findings[1].code == "goal_missed"
     assert "Not good: wave of arm missed its goal (elbow 11.5 deg off);" in verdict.sentences[0]
     a_client_s = conduct(goals=goals(2, structs.replace(missed, origin="anna")))
-    assert judge(totals(conduct=a_client_s)).good
+    assert judge_run(totals(conduct=a_client_s)).good
 
 
 def test_played_goal_that_the_end_of_the_run_cut_is_not_good() -> None:
     cut = GoalReport(1, "arm", "trajectory", f"{WAVE}:4:5", "aborted", RUN_ENDED)
-    verdict = judge(totals(conduct=conduct(goals=goals(1, cut))))
+    verdict = judge_run(totals(conduct=conduct(goals=goals(1, cut))))
     assert not verdict.good
     assert verdict.sentences[0].startswith("Not good: the run ended before wave of arm did; played wave ")
     assert verdict.sentences[1] == "The run ended at 20 s, before wave of arm ended at 25 s."
@@ -139,9 +139,9 @@ def test_played_goal_that_the_end_of_the_run_cut_is_not_good() -> None:
 
 def test_played_goal_that_never_began_is_not_good() -> None:
     begun = structs.replace(goals(1), begun={f"{WAVE}:9:9": 1})
-    verdict = judge(totals(conduct=conduct(goals=begun)))
+    verdict = judge_run(totals(conduct=conduct(goals=begun)))
     assert verdict.sentences[0].startswith("Not good: wave of arm never began; ")
-    part = judge(totals(conduct=conduct(goals=begun, whole=False)))
+    part = judge_run(totals(conduct=conduct(goals=begun, whole=False)))
     assert part.good, "the motion may have begun in another part of the log"
 
 
@@ -198,19 +198,19 @@ def test_goals_that_a_client_cancelled_are_said() -> None:
 def test_a_fault_that_a_fallback_took_over_is_good_with_fallbacks() -> None:
     fault = happened(EventCode.CONTROLLER_FAULT, "arm", 7.0)
     fallback = Takeover(2.0, "arm", "hold", "a gain of 0")
-    verdict = judge(totals(events=(fault,), conduct=conduct(takeovers=(fallback,))))
+    verdict = judge_run(totals(events=(fault,), conduct=conduct(takeovers=(fallback,))))
     assert (verdict.good, verdict.word) == (True, "good, with fallbacks")
     assert verdict.sentences[0].startswith(
         "Good, with fallbacks: arm failed (a gain of 0) and fell back to hold at 2.0 s; "
     )
     assert not [one for one in verdict.findings if one.code == "errors_logged"]
-    again = judge(totals(events=(fault,), conduct=conduct(takeovers=(fallback,), unanswered=("arm",))))
+    again = judge_run(totals(events=(fault,), conduct=conduct(takeovers=(fallback,), unanswered=("arm",))))
     assert (again.good, again.word) == (False, "not good")
 
 
 def test_the_line_is_first_and_accuses_nothing() -> None:
     hot = Finding("servo_error", "elbow", "It is hot.", rank=Rank.LINE)
-    robot, first, *_ = judge(totals(findings=(hot,))).findings
+    robot, first, *_ = judge_run(totals(findings=(hot,))).findings
     assert (robot.code, robot.subject, robot.rank, first) == ("robot", "", Rank.REMARK, hot)
 
 
@@ -221,7 +221,7 @@ def test_a_robot_that_its_fall_reflex_could_not_keep_up_fell(tmp_path: Path) -> 
     log = tmp_path / "run.mcap"
     motion = ROBOTS / "motions/fall_reflex_tip.yaml"
     simulated_robot(ROBOTS / "fall_reflex.yaml", play=[motion], log=log).run()
-    verdict = judge(totals_of(log))
+    verdict = judge_run(totals_of(log))
     assert not verdict.good
     assert verdict.sentences[0].startswith("Not good: it fell at 1.6 s and lies; played fall_reflex_tip ")
     assert verdict.findings[1].code == "fell"
@@ -265,8 +265,8 @@ def test_a_robot_lies_whose_gravity_has_turned(
     cycles["source_state"][::3] = math.nan
     history = ConductHistory()
     for part in np.split(cycles, 4):
-        history.take(replace(short, header=header, cycles=part))
-    found = history.finish()
+        history.add_slice(replace(short, header=header, cycles=part))
+    found = history.summarize_conduct()
     assert found.turned_rad == pytest.approx(math.radians(abs(end - begin)), abs=1e-6)
     assert found.lies is lies
 
@@ -281,8 +281,8 @@ def short(tmp_path_factory: pytest.TempPathFactory) -> Log:
 
 def test_a_robot_without_an_imu_does_not_fall(short: Log) -> None:
     history = ConductHistory()
-    history.take(short)
-    assert (history.finish().turned_rad, history.finish().lies) == (None, False)
+    history.add_slice(short)
+    assert (history.summarize_conduct().turned_rad, history.summarize_conduct().lies) == (None, False)
 
 
 # Controllers that fail

@@ -15,7 +15,7 @@ from dxlrun_analysis.rules import RULES, Needs
 
 ROOM = Path(next(iter(dxlrun_analysis.__path__)))
 FILES = [file for file in ROOM.rglob("*.py") if file != ROOM / "rules.py"]
-MADE_BY = ("Finding", "Failing", "cause", "joint_finding")
+MADE_BY = ("Finding", "FollowingFailure", "cause", "joint_finding")
 """Calls whose first argument is a code, or a name that holds one."""
 NAMES = {"port", "servo_id", "name", "bus"}
 

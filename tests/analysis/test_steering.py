@@ -12,11 +12,11 @@ import pytest
 from rich.console import Console
 from tests.kit.stories import Asked, Clients
 
-from dxlrun.channels.commands import Command
-from dxlrun.log.reader import Log, read_log
-from dxlrun.output.terminal import show
+from dxlrun.channels.commands import CommandMessage
+from dxlrun.log.log_reader import Log, read_log
+from dxlrun.output.terminal import show_parts
 from dxlrun.testing import simulated_robot
-from dxlrun_analysis.cycles.latency import cycle_periods_ns
+from dxlrun_analysis.cycles.punctuality import cycle_periods_ns
 from dxlrun_analysis.parts.part import Report
 from dxlrun_analysis.report import analyze, parts, tables
 
@@ -36,12 +36,12 @@ controllers:
 """
 
 
-def ask(kind: str, **data: object) -> Command:
-    return Command(0, "", kind, msgspec.json.encode(data) if data else b"", "anna")
+def ask(kind: str, **data: object) -> CommandMessage:
+    return CommandMessage(0, "", kind, msgspec.json.encode(data) if data else b"", "anna")
 
 
-def send(*numbers: float, lease_ns: int = 0, controller: str = "head") -> Command:
-    return Command(0, controller, "positions", np.array(numbers).tobytes(), "bob", lease_ns)
+def send(*numbers: float, lease_ns: int = 0, controller: str = "head") -> CommandMessage:
+    return CommandMessage(0, controller, "positions", np.array(numbers).tobytes(), "bob", lease_ns)
 
 
 ASKED: Asked = {
@@ -52,7 +52,7 @@ ASKED: Asked = {
     **{cycle: [send(0.1, 0.1, lease_ns=50 * MS)] for cycle in range(31, 39)},
     50: [ask("switch", activate=["tail"], deactivate=["head"]), send(0.2, 0.2, lease_ns=50 * MS)],
     51: [send(0.2, 0.2, lease_ns=50 * MS), send(0.1, controller="tail")],
-    55: [Command(0, "", "load", b'{"name":', "mallory"), ask("stop")],
+    55: [CommandMessage(0, "", "load", b'{"name":', "mallory"), ask("stop")],
 }
 
 
@@ -130,7 +130,7 @@ def test_a_pause_is_counted_in_periods_and_in_seconds(report: Report) -> None:
     assert (pause.begin_s, pause.end_s) == pytest.approx((0.2, 0.4))
     assert pause.periods == 15
     console = Console(file=io.StringIO(), width=160)
-    show(*parts(report), console=console)
+    show_parts(*parts(report), console=console)
     shown = console.file.getvalue()  # type: ignore[attr-defined]  # a StringIO, given above
     assert "periods paused" in shown
     assert "pair, 50 Hz and 100 Hz, 0.9 s" in shown
@@ -180,7 +180,7 @@ def test_a_pause_that_the_run_ends_in_lasts_to_the_end(tmp_path: Path) -> None:
 
 
 def test_the_page_shows_it(log: Log, report: Report) -> None:
-    from dxlrun_analysis.page.page import analyzed_page
+    from dxlrun_analysis.page.report_page import analyzed_page
 
     _, text = analyzed_page(log)
     assert 'id="steering"' in text

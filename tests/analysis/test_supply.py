@@ -56,7 +56,7 @@ def health_of(
             joints=names,
             attachments={"plan.json": json.dumps(PLAN).replace("XM430-W350", model).encode()},
         )
-        health.take(part)
+        health.add_slice(part)
     return health
 
 

@@ -10,9 +10,9 @@ import pytest
 from rich.console import Console
 from tests.kit.made_logs import Cycle, Said, Wire
 
-from dxlrun.channels.events import EventCode, Severity
-from dxlrun.output.table import Table
-from dxlrun.output.terminal import show
+from dxlrun.channels.event_records import EventCode, Severity
+from dxlrun.output.terminal import show_parts
+from dxlrun.output.text_table import Table
 from dxlrun_analysis.parts.part import Report
 from dxlrun_analysis.report import analyze_log, parts
 from dxlwire.packets import PacketKind
@@ -23,7 +23,7 @@ Make = Callable[..., Any]
 def lines(report: Report, width: int) -> list[str]:
     file = io.StringIO()
     console = Console(file=file, width=width, force_terminal=True, color_system=None)
-    show(*(part for part in parts(report) if isinstance(part, Table)), console=console)
+    show_parts(*(part for part in parts(report) if isinstance(part, Table)), console=console)
     return file.getvalue().splitlines()
 
 

@@ -16,10 +16,10 @@ from msgspec import structs
 from tests.kit.made_logs import loop_of, made_log
 
 from dxlrun.channels.cycle import CycleLayout, Torque
-from dxlrun.log.reader import Log, read_log
+from dxlrun.log.log_reader import Log, read_log
 from dxlrun.output.json import json_text
 from dxlrun.plan.loop_plan import JointPlan
-from dxlrun_analysis.joints.tracking import JointTracking, reachable, tracking
+from dxlrun_analysis.joints.goal_tracking import JointTracking, reachable, tracking
 from dxlrun_analysis.report import analyze, tables
 
 DT = 0.02
@@ -204,7 +204,7 @@ def test_a_first_goal_is_approached_from_where_the_joint_stands(make: Make) -> N
 
 
 def test_terminal_report_and_json_have_the_same_numbers(make: Make) -> None:
-    from dxlrun_analysis.page.page import analyzed_page
+    from dxlrun_analysis.page.report_page import analyzed_page
 
     log = make(stepped(200, 10, 1.0), ramp(200, 10, 1.0, 0.5, delay=3), speed=0.5)
     report = analyze(log)

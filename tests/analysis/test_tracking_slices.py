@@ -9,11 +9,11 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from dxlrun.log.reader import Log, read_log
+from dxlrun.log.log_reader import Log, read_log
 from dxlrun.testing import simulated_robot
-from dxlrun_analysis.joints import tracking as module
+from dxlrun_analysis.joints import goal_tracking as module
 from dxlrun_analysis.joints.delay import DelayFit
-from dxlrun_analysis.joints.tracking import JointTracking, Tracking, tracking
+from dxlrun_analysis.joints.goal_tracking import JointTracking, TrackingCollector, tracking
 
 ROBOTS = Path(__file__).parents[2] / "robots"
 NAMES = (
@@ -23,10 +23,10 @@ NAMES = (
 
 
 def in_slices(log: Log, size: int) -> tuple[JointTracking, ...]:
-    collected = Tracking()
+    collected = TrackingCollector()
     for start in range(0, len(log.cycles), size):
-        collected.take(replace(log, cycles=log.cycles[start : start + size]))
-    return collected.finish(log)
+        collected.add_slice(replace(log, cycles=log.cycles[start : start + size]))
+    return collected.evaluate_joints(log)
 
 
 @pytest.fixture(scope="module")
@@ -79,7 +79,7 @@ def test_what_rests_for_very_long_is_kept_in_bounded_memory(
     rested = []
     for start in range(0, len(times), 50):
         piece = times[start : start + 50]
-        rested += list(found.take(piece, np.zeros(50), np.full(50, 0.01), 1e-3, final=False))
+        rested += list(found.find_rests(piece, np.zeros(50), np.full(50, 0.01), 1e-3, final=False))
         assert len(found.times) <= 76
     assert len(rested) > 100
     assert {rest.error_rad for rest in rested} == {0.01}
@@ -96,7 +96,7 @@ def fitted(delay_cycles: float, noise: float = 0.0, period_s: float = 0.02, size
     for start in range(0, len(number), size):
         first = max(0, start - 2)
         part = slice(first, start + size)
-        fit.take(times[part], goal[part], position[part], start - first)
+        fit.add_cycles(times[part], goal[part], position[part], start - first)
     return fit.best_s(0.01)
 
 
@@ -111,10 +111,10 @@ def test_the_delay_is_refused_where_none_explains_the_difference() -> None:
     assert fitted(60.0) is None  # beyond the longest
     fit = DelayFit()
     number = np.arange(2000)
-    fit.take(number * 0.02, np.sin(number * 0.05), np.full(2000, 0.3), 0)  # a joint that is blocked
+    fit.add_cycles(number * 0.02, np.sin(number * 0.05), np.full(2000, 0.3), 0)  # a joint that is blocked
     assert fit.best_s(0.01) is None
     still = DelayFit()
-    still.take(number * 0.02, np.full(2000, 0.5), np.full(2000, 0.5), 0)
+    still.add_cycles(number * 0.02, np.full(2000, 0.5), np.full(2000, 0.5), 0)
     assert still.best_s(0.01) is None
     assert DelayFit().best_s(0.01) is None
 

@@ -10,9 +10,9 @@ from typing import Any
 import pytest
 from tests.analysis import traffic_oracle as oracle
 
-from dxlrun.channels.packets import LoggedPacket
+from dxlrun.channels.logged_packets import LoggedPacket
 from dxlrun.log.columns import PacketColumns
-from dxlrun.log.reader import read_log
+from dxlrun.log.log_reader import read_log
 from dxlrun.testing import simulated_robot
 from dxlrun_analysis.servos import exchanges as pairing
 from dxlrun_analysis.servos.traffic import Traffic
@@ -72,7 +72,7 @@ def packets(chance: random.Random, count: int) -> list[LoggedPacket]:
 def log_of(found: list[LoggedPacket]) -> Any:
     return SimpleNamespace(
         buses=("a", "b", "c"),
-        packets=PacketColumns.of(found),
+        packets=PacketColumns.from_packets(found),
         attachments={"plan.json": PLAN},
         cycles=(),
         events=(),
@@ -83,7 +83,7 @@ def log_of(found: list[LoggedPacket]) -> Any:
 
 def same(traffic: Traffic, log: Any) -> None:
     """Compare what was counted with the count of the whole log packet by packet."""
-    for found, expected in zip(traffic.finish(), oracle.traffic(log), strict=True):
+    for found, expected in zip(traffic.summarize_traffic(), oracle.traffic(log), strict=True):
         assert [
             {name: getattr(one, name) for name in row} for one, row in zip(found, expected, strict=True)
         ] == expected
@@ -98,7 +98,7 @@ def test_columns_give_what_packet_by_packet_gives(window_ms: int, monkeypatch: p
         for size in (chance.choice((1, 7)), 1000):
             traffic = Traffic()
             for start in range(0, max(len(found), 1), size):
-                traffic.take(log_of(found[start : start + size]))
+                traffic.add_slice(log_of(found[start : start + size]))
             same(traffic, log_of(found))
 
 
@@ -109,5 +109,5 @@ def test_columns_give_what_packet_by_packet_gives_of_a_run(name: str, tmp_path: 
     FaultScript([parse_fault("storm seed=5 faults=12 within=400ms at=1000ms")]).attach(simulated.buses)
     simulated.run()
     log, traffic = read_log(path), Traffic()
-    traffic.take(log)
+    traffic.add_slice(log)
     same(traffic, log)

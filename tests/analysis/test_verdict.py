@@ -15,26 +15,26 @@ from tests.analysis.judged import MS, REAL, accusing, lost, on_bus, plan, totals
 from tests.kit.made_logs import loop_of
 from tests.kit.totals import totals_of
 
-from dxlrun.channels.commands import Command
-from dxlrun.channels.events import EventCode, EventGroup, Severity
-from dxlrun.log import log_writer, reader
-from dxlrun.log.reader import Log, open_log, read_log
+from dxlrun.channels.commands import CommandMessage
+from dxlrun.channels.event_records import EventCode, EventGroup, Severity
+from dxlrun.log import log_reader, log_writer
+from dxlrun.log.log_reader import Log, open_log, read_log
 from dxlrun.output.json import json_text
 from dxlrun.run.run_log import log_header
 from dxlrun.testing import plan_of, simulated_robot
-from dxlrun_analysis.conduct import steering
-from dxlrun_analysis.cycles import latency
-from dxlrun_analysis.cycles.latency import Periods
+from dxlrun_analysis.conduct import steering_history
+from dxlrun_analysis.cycles import punctuality
+from dxlrun_analysis.cycles.punctuality import Periods
 from dxlrun_analysis.finding import Finding, Rank
-from dxlrun_analysis.joints.tracking import JointTracking
-from dxlrun_analysis.plan import NO_LOOP, LoggedBus, LoggedPlan, LoggedServo
-from dxlrun_analysis.plan import plan_of as plan_in
+from dxlrun_analysis.joints.goal_tracking import JointTracking
+from dxlrun_analysis.plan_excerpt import NO_LOOP, LoggedBus, LoggedPlan, LoggedServo
+from dxlrun_analysis.plan_excerpt import plan_of as plan_in
 from dxlrun_analysis.report import analyze, analyze_log
 from dxlrun_analysis.servos import exchanges as pairing
 from dxlrun_analysis.servos.losses import ServoLosses
 from dxlrun_analysis.servos.traffic import ServoTraffic
 from dxlrun_analysis.tally import RealTime, RunTotals, Tally
-from dxlrun_analysis.verdict import judge
+from dxlrun_analysis.verdict import judge_run
 from dxlsim.faults.fault import parse_fault
 from dxlsim.faults.script import FaultScript
 from dxlwire.packets import PacketKind
@@ -51,7 +51,7 @@ def tolerating(share: float) -> LoggedPlan:
 
 
 def test_a_good_run_is_good() -> None:
-    verdict = judge(totals())
+    verdict = judge_run(totals())
     assert verdict.good
     assert verdict.sentences == (
         "Good: ran for 20.0 s without a motion.",
@@ -101,11 +101,11 @@ def test_a_failure_beside_the_loop_is_the_runs(write: Make, cycle: Make) -> None
 @pytest.mark.parametrize(("skipped", "good"), [(0, True), (100, True), (101, False)])
 def test_as_many_periods_may_be_skipped_as_the_file_tolerates(skipped: int, good: bool) -> None:
     account = Periods(1000, 1000 - skipped, skipped, 0, True, 50.0, 20.0, (50.0,))
-    verdict = judge(totals(periods=account))
+    verdict = judge_run(totals(periods=account))
     assert verdict.good is good
     assert verdict.sentences[1].startswith("The loop kept" if good else "The loop did not keep 50 Hz: 101 of")
-    assert judge(totals(periods=account, plan=tolerating(0.5))).good
-    assert judge(totals(periods=account, plan=tolerating(0.0))).good is (skipped == 0)
+    assert judge_run(totals(periods=account, plan=tolerating(0.5))).good
+    assert judge_run(totals(periods=account, plan=tolerating(0.0))).good is (skipped == 0)
 
 
 def test_the_tolerance_is_that_of_the_robot_file_in_the_log(tmp_path: Path, write: Make, cycle: Make) -> None:
@@ -126,18 +126,18 @@ def test_the_tolerance_is_that_of_the_robot_file_in_the_log(tmp_path: Path, writ
 @pytest.mark.parametrize(("skipped", "good"), [(10, True), (11, False)])
 def test_a_short_run_may_skip_what_one_of_two_seconds_may(skipped: int, good: bool) -> None:
     short = Periods(20, 20 - skipped, skipped, 0, True, 50.0, 0.4, (50.0,))
-    assert judge(totals(periods=short)).good is good
+    assert judge_run(totals(periods=short)).good is good
 
 
 @pytest.mark.parametrize(("invalid", "good"), [(2, True), (3, False)])
 def test_two_replies_of_a_short_run_may_be_missing(invalid: int, good: bool) -> None:
     short = Periods(20, 20, 0, 0, True, 50.0, 0.4, (50.0,))
-    assert judge(totals(periods=short, invalid=(invalid, 0))).good is good
+    assert judge_run(totals(periods=short, invalid=(invalid, 0))).good is good
 
 
 @pytest.mark.parametrize(("invalid", "good"), [(0, True), (10, True), (11, False), (500, False)])
 def test_a_joint_may_be_unknown_in_one_cycle_of_a_hundred(invalid: int, good: bool) -> None:
-    verdict = judge(totals(invalid=(0, invalid)))
+    verdict = judge_run(totals(invalid=(0, invalid)))
     assert verdict.good is good
     if not good:
         assert verdict.sentences[1] == (
@@ -158,7 +158,7 @@ def test_invalid_states_are_those_of_the_first_servo_without_a_reply(
     servos = [LoggedServo(joint, at, row=at) for at, joint in enumerate(("elbow", "wrist"))]
     plan = LoggedPlan(buses=[LoggedBus(name="main", servos=servos)])
     replies = (answered("elbow", 0, 1000, 50, own), answered("wrist", 1, 1000, 50, 0))
-    findings = judge(totals(plan=plan, invalid=(50, 50), servos=replies)).findings
+    findings = judge_run(totals(plan=plan, invalid=(50, 50), servos=replies)).findings
     (found,) = (one for one in findings if one.code == "invalid_states")
     assert found.subject == subject
     assert found.sentence.startswith("States were invalid: elbow in 5.0%, wrist in 5.0% of the cycles, ")
@@ -172,7 +172,7 @@ def test_positions_that_the_loop_did_not_believe_are_named_where_replies_are_int
     events = (EventGroup(EventCode.IMPLAUSIBLE, Severity.WARNING, "elbow", 3, 5 * 10**9, text),)
     other = (accusing(spoilt, "main", share=9.0),) * bool(spoilt)
     run = totals(plan=plan, events=events, servos=on_bus("elbow", bus="main"), findings=other)
-    jumped = [one for one in judge(run).findings if one.code == "position_jumped"]
+    jumped = [one for one in judge_run(run).findings if one.code == "position_jumped"]
     assert [one.sentence for one in jumped] == [f"{text}."] * (not spoilt)
 
 
@@ -209,7 +209,7 @@ def test_findings_are_sorted_and_decide_whether_a_run_was_good() -> None:
             ("silent", "foot", "", Rank.SERVO),
         )
     )
-    verdict, bad = (judge(totals(findings=found)) for found in ((remark, cause), (remark, cause, loss)))
+    verdict, bad = (judge_run(totals(findings=found)) for found in ((remark, cause), (remark, cause, loss)))
     assert (verdict.good, bad.good) == (True, False)
     assert verdict.sentences[1] == "supply. Mend it."
     assert any(one.startswith("oscillates.") for one in verdict.sentences[2:])
@@ -230,14 +230,14 @@ LOST, REBOOTED = lost("elbow"), lost("elbow", code=EventCode.SERVO_REBOOTED)
 def test_a_servo_that_is_lost_alone_is_told_with_its_angle() -> None:
     joint = JointTracking("elbow", 0, 0.0, 0, None, None, None, None, None, None, lost_at=0.5)
     for events, told in (((LOST,), "elbow was lost, at 29 deg."), ((LOST, lost("wrist")), "wrist was lost.")):
-        sentences = [one.sentence for one in judge(totals(events=events, tracking=(joint,))).findings]
+        sentences = [one.sentence for one in judge_run(totals(events=events, tracking=(joint,))).findings]
         assert any(sentence.endswith(told) for sentence in sentences)
 
 
 def test_why_the_start_was_refused_is_said_first() -> None:
     text = "knee is at 70.0 deg\nelbow has angle limits 1850..2246"
     refused = EventGroup(EventCode.SETUP, Severity.ERROR, "loop", 1, MS, text)
-    found = judge(
+    found = judge_run(
         replace(totals(events=(refused,)), periods=Periods(0, 0, 0, 0, True, 50.0, 0.0, ()))
     ).findings
     why = "knee is at 70.0 deg; elbow has angle limits 1850..2246"
@@ -248,7 +248,7 @@ def test_a_servo_that_answers_again_and_is_not_taken_back_is_told_with_why() -> 
     again, buses = lost("elbow", count=3), plan(REAL, REAL)
     why = "answers again, but cannot take part: elbow is model number 1030, not a XM430-W350 (1020)"
     returns = {"elbow": ["sends garbled or double replies", why]}
-    verdict = judge(totals(events=(lost("wrist"), again), returns=returns, plan=buses))
+    verdict = judge_run(totals(events=(lost("wrist"), again), returns=returns, plan=buses))
     (servo,) = (one for one in verdict.findings if one.code == "servo_lost")
     told = f"Servos failed: elbow was lost; wrist was lost. elbow {why}."
     assert (servo.subject, servo.sentence) == ("elbow", told)
@@ -260,7 +260,7 @@ def test_what_to_do_about_a_servo_that_answers_twice_is_told_of_a_real_one(port:
     returns = {
         "elbow": ["sends garbled or double replies: do two servos have its ID? If not, check its cable"]
     }
-    verdict = judge(totals(events=(lost("elbow"),), returns=returns, plan=plan(port, port)))
+    verdict = judge_run(totals(events=(lost("elbow"),), returns=returns, plan=plan(port, port)))
     told = " ".join(verdict.sentences)
     assert "elbow sends garbled or double replies" in told
     assert ("check its cable" in told.lower()) is (port != "sim")
@@ -282,7 +282,7 @@ def test_buses_that_fall_silent_at_once_are_not_accused_one_by_one(
     joints = ("elbow", "wrist", "hip", "knee")
     servos = on_bus(*joints[:2]) + on_bus(*joints[2:], bus="bus1")
     events = tuple(lost(joint, at) for joint, at in zip(joints, at_ms, strict=True) if at is not None)
-    verdict = judge(totals(events=events, servos=servos, plan=plan(REAL, REAL)))
+    verdict = judge_run(totals(events=events, servos=servos, plan=plan(REAL, REAL)))
     found = {one.subject: one for one in verdict.findings if one.sentence.startswith("All ")}
     assert found.keys() == told.keys()
     assert all(told[subject] in one.sentence for subject, one in found.items())
@@ -294,7 +294,7 @@ def test_buses_that_fall_silent_at_once_are_not_accused_one_by_one(
 def test_servos_of_a_lost_bus_are_not_accused() -> None:
     gone = EventGroup(EventCode.PORT_LOST, Severity.ERROR, "bus0", 1, 4 * MS, "gone")
     for events, accused in (((gone, lost("elbow")), False), ((lost("elbow"),), True)):
-        verdict = judge(totals(events=events, servos=on_bus("elbow", "wrist"), plan=plan(REAL)))
+        verdict = judge_run(totals(events=events, servos=on_bus("elbow", "wrist"), plan=plan(REAL)))
         (servo,) = (one for one in verdict.findings if one.code == "servo_lost")
         assert bool(servo.remedy) is accused
         assert ("bus bus0 was lost" in verdict.sentences[0]) is not accused
@@ -318,7 +318,7 @@ def test_servos_of_a_lost_bus_are_not_accused() -> None:
 )
 def test_servos_that_are_lost_at_once_share_a_cable(events: tuple[EventGroup, ...], shared: bool) -> None:
     servos = (*on_bus("elbow", "wrist", "hand"), *on_bus("far", "other", "third", bus="bus1"))
-    verdict = judge(totals(events=events, servos=servos, plan=plan(REAL)))
+    verdict = judge_run(totals(events=events, servos=servos, plan=plan(REAL)))
     assert any("they share a supply or a cable" in one.sentence for one in verdict.findings) is shared
 
 
@@ -327,7 +327,7 @@ def test_why_a_servo_did_not_come_back_is_told_where_few_were_lost() -> None:
         returns = {"elbow": ["sends garbled or double replies", "answers too late"]}
         servos = on_bus("elbow", "wrist", "hand", "head")
         events = tuple(lost(joint, 400 * at) for at, joint in enumerate(joints))
-        verdict = judge(totals(events=events, returns=returns, servos=servos, plan=plan(REAL)))
+        verdict = judge_run(totals(events=events, returns=returns, servos=servos, plan=plan(REAL)))
         assert any("elbow answers too late." in one.sentence for one in verdict.findings) is (
             len(joints) == 2
         )
@@ -416,7 +416,7 @@ def storm(tmp_path_factory: pytest.TempPathFactory) -> Path:
         *((at, "resume", b"") for at in (900, 2500)),
     )
     for number, (at_ms, kind, data) in enumerate(asked, start=1):
-        command = Command(number, "", kind, data, "anna")
+        command = CommandMessage(number, "", kind, data, "anna")
         robot.buses[0].at(at_ms * MS, lambda command=command: robot.inbox.waiting.append(command))
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(log_writer, "CHUNK_BYTES", 4096)
@@ -427,15 +427,15 @@ def storm(tmp_path_factory: pytest.TempPathFactory) -> Path:
 def test_a_log_counted_in_slices_is_the_log_counted_as_a_whole(
     storm: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    for module in (pairing, latency, steering):
+    for module in (pairing, punctuality, steering_history):
         monkeypatch.setattr(module, "DISORDER_NS", 200 * MS)
-    monkeypatch.setattr(reader, "SLICE_BYTES", 1)
+    monkeypatch.setattr(log_reader, "SLICE_BYTES", 1)
     slices: list[Log] = []
     slices.extend(open_log(storm).slices())
     assert len(slices) > 20
     assert max(len(one.cycles) for one in slices) < 20
     tally = Tally()
-    tally.take(read_log(storm))
+    tally.add_slice(read_log(storm))
     whole = tally.totals(read_log(storm))
     assert totals_of(storm) == whole
     assert whole.servos[0].lost
@@ -460,16 +460,16 @@ def test_an_event_is_not_cut_where_a_slice_ends(
 def analyze_totals(path: Path) -> RunTotals:
     log = read_log(path)
     tally = Tally()
-    tally.take(log)
+    tally.add_slice(log)
     return tally.totals(log)
 
 
 def test_page_and_json_and_run_have_the_same_verdict(storm: Path) -> None:
-    from dxlrun_analysis.page.page import analyzed_page
+    from dxlrun_analysis.page.report_page import analyzed_page
 
     log = read_log(storm)
     report = analyze(log)
-    said = judge(totals_of(storm))
+    said = judge_run(totals_of(storm))
     assert not said.good
     assert report.verdict == said
     shown = json.loads(json_text(report.numbers))["verdict"]
@@ -483,8 +483,8 @@ def test_damage_is_reported_of_a_scanned_log_too(storm: Path, tmp_path: Path) ->
     cut = tmp_path / "cut.mcap"
     data = storm.read_bytes()
     cut.write_bytes(data[: len(data) * 2 // 3])
-    assert judge(totals_of(cut)) == analyze_log(cut).verdict
-    assert any("log is not whole" in sentence for sentence in judge(totals_of(cut)).sentences)
+    assert judge_run(totals_of(cut)) == analyze_log(cut).verdict
+    assert any("log is not whole" in sentence for sentence in judge_run(totals_of(cut)).sentences)
 
 
 @pytest.mark.parametrize("virtual", [False, True])
@@ -512,7 +512,7 @@ def test_a_simulated_bus_is_known_when_the_link_to_its_port_is_gone(
 def test_servos_that_were_lost_did_not_answer_every_time(code: EventCode) -> None:
     servo = ServoTraffic("bus0", 1, "elbow", 9, 9, 0, 9, 0, (), 0.0, 0.0)
     lost = EventGroup(code, Severity.ERROR, "elbow", 1, 5 * MS, "gone: was it unplugged?")
-    said = " ".join(judge(totals(events=(lost,), servos=(servo,))).sentences)
+    said = " ".join(judge_run(totals(events=(lost,), servos=(servo,))).sentences)
     assert "answered every time" not in said
     assert "?." not in said
-    assert "answered every time" in " ".join(judge(totals(servos=(servo,))).sentences)
+    assert "answered every time" in " ".join(judge_run(totals(servos=(servo,))).sentences)

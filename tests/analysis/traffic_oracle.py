@@ -12,8 +12,8 @@ from dataclasses import dataclass, field
 from statistics import median
 from typing import Any, NamedTuple
 
-from dxlrun.channels.packets import LoggedPacket
-from dxlrun_analysis.plan import LoggedBus, plan_of
+from dxlrun.channels.logged_packets import LoggedPacket
+from dxlrun_analysis.plan_excerpt import LoggedBus, plan_of
 from dxlrun_analysis.servos.traffic import error_names
 from dxlwire.packets import PacketKind
 

@@ -39,7 +39,7 @@ from websockets.sync.client import ClientConnection, connect
 from websockets.typing import Subprotocol
 
 import dxlrun
-from dxlrun.log.reader import read_log
+from dxlrun.log.log_reader import read_log
 
 DXLRUN = Path(sys.executable).with_name("dxlrun")
 ROBOT = Path(__file__).parents[2] / "robots" / "humanoid_20.yaml"

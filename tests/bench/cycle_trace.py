@@ -27,14 +27,14 @@ from types import CodeType, FrameType
 import dxlrun
 import dxlrun_controllers
 from dxlrun.channels import mailbox
-from dxlrun.channels.commands import Command, CommandRing, Inbox, NoInbox
-from dxlrun.channels.events import EventRing
+from dxlrun.channels.commands import CommandMessage, CommandRing, Inbox, NoInbox
+from dxlrun.channels.event_records import EventRing
+from dxlrun.channels.logged_packets import LONGEST_BATCH, PacketBatch
 from dxlrun.channels.mailbox import Mailbox, MailboxWriter
-from dxlrun.channels.packets import LONGEST_BATCH, PacketBatch
 from dxlrun.channels.ring import RingWriter, create
 from dxlrun.compile.simulation import simulation_of
 from dxlrun.control.context import Unsupervised
-from dxlrun.control.controllers.plugins import load_plugins
+from dxlrun.control.controllers.plugin_loading import load_plugins
 from dxlrun.plan.robot_plan import Plan
 from dxlrun.run.assembly import LoopHost, Sinks, assemble
 from dxlrun.testing import plan_of
@@ -71,7 +71,7 @@ class Trace:
             self._calls = Counter()
             if self._box is not None and count % COMMAND_CYCLES == 0:
                 data = struct.pack("<4d", 0.3 + count * 1e-3, -0.5, 1.0, 1.0)
-                self._box.post(Command(count, "head", "posvel", data, "bench"))
+                self._box.post_command(CommandMessage(count, "head", "posvel", data, "bench"))
             sys.setprofile(self._note)
 
     def _note(self, frame: FrameType, event: str, _: object) -> None:

@@ -26,7 +26,7 @@ from pathlib import Path
 
 from dxlrun.remote.network.certificates import keys_place
 from dxlrun.remote.network.network_link import NetworkLink
-from dxlrun.remote.requests.table import Role
+from dxlrun.remote.requests.request_table import Role
 from dxlrun_fleet import authority
 from dxlrun_fleet.fleet_file import read_fleet
 

@@ -40,9 +40,9 @@ from msgspec.structs import replace
 from tests.kit.decoded import decode_packets
 
 from dxlrun.channels.cycle import Commands, SourceStates, States
-from dxlrun.channels.packets import PacketBatch
+from dxlrun.channels.logged_packets import PacketBatch
 from dxlrun.channels.ring import Handover
-from dxlrun.dynamixel.hardware import DynamixelHardware, ServoArrays
+from dxlrun.dynamixel.dynamixel_hardware import DynamixelHardware, ServoArrays
 from dxlrun.dynamixel.servo.life import ServoEvent
 from dxlrun.errors import PortError
 from dxlwire.bus_plan import BusPlan, DevicePlan
@@ -50,9 +50,9 @@ from dxlwire.clock import VirtualClock
 from dxlwire.control_table import find_table
 from dxlwire.control_table.device_table import read_device_table
 from dxlwire.exchange import kernel
-from dxlwire.exchange.bus import NEVER, Lines
+from dxlwire.exchange.bus_engine import NEVER, Lines
 from dxlwire.modes import Mode
-from dxlwire.plan.devices import device_blocks
+from dxlwire.plan.device_reads import device_blocks
 from dxlwire.plan.line import Line as LineTimes
 from dxlwire.plan.planning import Wiring, bus_plan
 from dxlwire.port.ports import OwnProcessors
@@ -119,7 +119,7 @@ class Line(OwnProcessors):
         self.lost = False
         """True where the line takes no bytes: its adapter is gone."""
 
-    def write(self, data):
+    def write_packet(self, data):
         self.sent.append(bytes(data))
         if self.lost:
             raise PortError("it is gone")
@@ -159,7 +159,7 @@ class LinePorts:
         self.back = False
         """True when lines that are lost can be opened again."""
 
-    def wait(self, deadline_ns):
+    def wait_for_bytes(self, deadline_ns):
         self.clock.wait_until(min([deadline_ns, *(at for line in self.ports for at, _ in line.arriving)]))
         return [index for index, line in enumerate(self.ports) if line.ready]
 
@@ -175,7 +175,7 @@ class Events:
     def __init__(self):
         self.list = []
 
-    def emit(self, source, event, data=b""):
+    def emit_event(self, source, event, data=b""):
         self.list.append((source, *event))
 
 
@@ -295,7 +295,7 @@ class Side:
         for line in self.lines.ports:
             line.sent = []
         self.goals.values[:] = goals
-        hardware.write()
+        hardware.write_goals()
         if idle_ns:
             hardware.idle(self.lines.clock.now_ns() + idle_ns)
 
@@ -304,10 +304,10 @@ class Side:
         hardware, clock = self.hardware, self.lines.clock
         self._plan_reads()
         began, self.parsed = bool(hardware._by_kernel), False
-        hardware.read()
+        hardware.read_states()
         self.began += began
         self.ended += began and not self.parsed
-        self.packets.commit()
+        self.packets.commit_packets()
         found = self.found(), clock.now_ns()
         clock.wait_until(clock.now_ns() + PERIOD_NS)
         return found

@@ -149,7 +149,7 @@ def campaign(dialect: Dialect, count: int, seed: int) -> Tally:
         while start < len(stream):
             now += 1
             piece = stream[start : start + rng.choice((1, 5, 16, 64, 64, 512, 2048))]
-            ear.receiver.feed(piece, now)
+            ear.receiver.feed_bytes(piece, now)
             tally.most_pending = max(tally.most_pending, ear.receiver.pending)
             start += len(piece)
         ear.receiver.flush()

@@ -140,12 +140,12 @@ class Host:
 
     def send(self, data: bytes) -> bytes:
         """Send bytes; return all that is answered."""
-        self.bus.receive(data, self.now_ns)
+        self.bus.receive_bytes(data, self.now_ns)
         self.now_ns += len(data) * 10_000_000_000 // self.rate
         reply = b""
         while (due := self.bus.next_due_ns()) is not None:
             self.now_ns = max(self.now_ns, due)
-            reply += self.bus.take(self.now_ns)
+            reply += self.bus.drain_bytes(self.now_ns)
         return reply
 
     def run(self) -> None:

@@ -199,7 +199,7 @@ def packets(log: Path) -> Iterator[tuple[str, int, bytes]]:
     """Yield topic, time and message of each cycle's packets."""
     import numpy as np
 
-    from dxlrun.log.reader import read_log
+    from dxlrun.log.log_reader import read_log
     from dxlrun.messages.cdr import Codec
     from dxlrun.messages.definition import MessageType
 
@@ -207,11 +207,11 @@ def packets(log: Path) -> Iterator[tuple[str, int, bytes]]:
     codec = Codec(MessageType("dxlrun_msgs/msg/BusPackets", f"int64 cycle\n{arrays}uint8[] data\n"))
     read = read_log(log)
     for index, bus in enumerate(read.buses):
-        of_bus = read.packets.take(read.packets.bus == index)
+        of_bus = read.packets.select_rows(read.packets.bus == index)
         begins = [0, *(np.flatnonzero(np.diff(of_bus.cycle)) + 1).tolist(), len(of_bus)]
         pieces = [at for begin, end in pairwise(begins) for at in range(begin, end, 1000)]
         for rows in np.split(np.arange(len(of_bus)), pieces[1:]):
-            one = of_bus.take(rows).compact()
+            one = of_bus.select_rows(rows).compact()
             if len(one):
                 took = one.last_ns - one.first_ns
                 bodies = one.kind.tobytes(), one.servo_id.tobytes(), one.length.astype(np.uint16)
@@ -235,7 +235,8 @@ def run(number: int, tree: Path, directory: Path, show: Path | None) -> dict[str
     script.attach(robot.buses)
     loop = robot.plan.loop
     joints, controllers = [one.name for one in loop.joints], [one.name for one in loop.controllers]
-    made_of = vars(sys.modules[type(robot.inbox).__module__])["Command"]
+    module = vars(sys.modules[type(robot.inbox).__module__])
+    made_of = module.get("CommandMessage") or module["Command"]  # its name in older trees
     for index, (at_ns, kind, data) in enumerate(commands(random, joints, controllers), 1):
         command = made_of(index, "", kind, data, "same")
         robot.clock.call_at(at_ns, lambda command=command: robot.inbox.waiting.append(command))

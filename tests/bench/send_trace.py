@@ -99,7 +99,7 @@ def gateway() -> Calls:
         asked = asyncio.ensure_future(awaited(Counted(calls, request)))
         while not asked.done():
             desk.take()
-            desk.link.collect()
+            desk.link.collect_messages()
             await asyncio.sleep(0)
 
     async def awaited(steps: Counted) -> None:

@@ -21,7 +21,7 @@ from pathlib import Path
 import numpy as np
 
 import dxlrun
-from dxlrun.log.reader import read_log
+from dxlrun.log.log_reader import read_log
 
 ROBOT = Path(__file__).parents[2] / "robots" / "humanoid_20.yaml"
 BEFORE_S = 3.0

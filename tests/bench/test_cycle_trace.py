@@ -14,8 +14,8 @@ def test_a_steady_cycle_goes_through_few_functions_and_files():
     calls = cycle_trace.steady_cycle()
     files = cycle_trace.by_file(calls)
     names = {name for functions in files.values() for name in functions}
-    assert {f"DynamixelHardware.{name}" for name in ("idle", "read", "write")} <= names
-    assert not any("Bus." in name or "Receiver" in name for name in names)  # the kernel reads
+    assert {f"DynamixelHardware.{name}" for name in ("idle", "read_states", "write_goals")} <= names
+    assert not any("BusEngine." in name or "Receiver" in name for name in names)  # the kernel reads
     assert len(calls) <= MOST_FUNCTIONS
     assert len(files) <= MOST_FILES
 
@@ -24,7 +24,7 @@ def test_a_cycle_that_takes_a_command_goes_through_few_functions():
     calls = cycle_trace.command_cycle()
     names = {code.co_qualname for code in calls}
     assert {
-        "Mailbox.take",
+        "Mailbox.drain_commands",
         "Steering.execute_commands",
         "Manager.dispatch_command",
         "_GroupController.on_command",

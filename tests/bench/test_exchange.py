@@ -112,7 +112,7 @@ def learned() -> tuple[Terminal, Callable[..., bytes]]:
     assert say(protocol1.ping(1), 6)[2] == 1
     terminal.do("learn")
     assert say(protocol1.ping(1), 6)
-    assert say(protocol1.write(0xFE, 30, b"\0\2")) == b""
+    assert say(protocol1.write_range(0xFE, 30, b"\0\2")) == b""
     (first, last) = terminal.do("play")
     assert (first.count, len(first.reply)) == (6, 6)
     assert (last.count, last.reply) == (9, b"")

@@ -16,14 +16,14 @@ from dxlrun import Log, log
 from dxlrun.tooling import html
 from dxlrun.tooling.html import section
 def late():
-    from dxlrun.log.reader import LogReader
+    from dxlrun.log.log_reader import LogReader
     import dxlwire.wire.crc, numpy
 from dxlwire import Bus
 """,
     }
     inside = {name for _, name, of_face in house.imported_names(texts) if not of_face}
     faces = {name for _, name, of_face in house.imported_names(texts) if of_face}
-    assert inside == {"dxlrun.log", "dxlrun.log.reader.LogReader", "dxlwire.wire.crc"}
+    assert inside == {"dxlrun.log", "dxlrun.log.log_reader.LogReader", "dxlwire.wire.crc"}
     assert faces == {
         "dxlrun",
         "dxlrun.Log",
@@ -60,7 +60,7 @@ def test_a_room_is_a_library_a_package_or_a_feature() -> None:
         "runtime/dxlrun/clock.py": "dxlrun/clock",
         "runtime/dxlrun/features/devices/form.py": "dxlrun/features/devices",
         "runtime/dxlrun/features/feature.py": "dxlrun/features/feature",
-        "plugins/dxlrun_view/src/dxlrun_view/live.py": "dxlrun_view",
+        "plugins/dxlrun_view/src/dxlrun_view/live_robot.py": "dxlrun_view",
     }
     assert {path: house.room_of(path) for path in rooms} == rooms
 

@@ -7,7 +7,7 @@ from importlib import metadata
 import pytest
 from tests.kit.answers import read_answer
 
-from dxlrun.channels import compiled
+from dxlrun.channels import c_sources
 from dxlrun.cli import inputs
 from dxlrun.errors import DxlrunError, InputError, Mark, PortError, Problem
 
@@ -40,9 +40,9 @@ def test_a_command_is_imported_alone():
 
     assert {name for name in modules if name.startswith("dxlrun.")} == {
         *("dxlrun.cli", "dxlrun.cli.app", "dxlrun.cli.inputs", "dxlrun.cli.run", "dxlrun.cli.check"),
-        *("dxlrun.cli.verbs", "dxlrun.installed_plugins"),
+        *("dxlrun.cli.verb_registry", "dxlrun.installed_plugins"),
         *("dxlrun.cli.tools", "dxlrun.cli.tools.tool_log"),
-        *("dxlrun.output", "dxlrun.output.json", "dxlrun.output.table", "dxlrun.output.terminal"),
+        *("dxlrun.output", "dxlrun.output.json", "dxlrun.output.text_table", "dxlrun.output.terminal"),
         *("dxlrun.output.escaping", "dxlrun.output.target"),
         "dxlrun.output.unblocked",
         "dxlrun.errors",
@@ -59,7 +59,7 @@ def test_the_version_is_that_of_the_package(dxlrun):
 
 
 def test_the_version_shows_that_the_kernel_is_missing(dxlrun, monkeypatch, tmp_path):
-    monkeypatch.setattr(compiled, "SOURCES", [tmp_path / "kernel.c"])
+    monkeypatch.setattr(c_sources, "SOURCES", [tmp_path / "kernel.c"])
     said = dxlrun("--version")
     assert said.code == 0
     assert said.out.endswith(", but the compiled kernel is missing: install dxlrun again\n")

@@ -89,7 +89,7 @@ def test_client_moves_the_arm_that_a_scan_has_drafted(
     monkeypatch.setattr(face, "connect", lambda name: nullcontext(RemoteRobot(name, link)))
     exec(blocks(LIBRARIES, "python")[2], {})  # noqa: S102  of this repository
     for _ in range(200):
-        link.turn()
+        link.run_cycle()
     cycles, _ = link.new()
     assert np.degrees(cycles["position"][-1]) == pytest.approx([10.0, 10.0], abs=1.0)
     assert dxlrun(*koch).code == 0

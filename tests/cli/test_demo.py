@@ -12,7 +12,7 @@ import pytest
 
 import dxlrun.cli
 from dxlrun.cli import run as run_room
-from dxlrun.cli import verbs
+from dxlrun.cli import verb_registry
 from dxlrun.cli.inputs import examples_directory
 from dxlrun.remote import sockets
 
@@ -64,7 +64,7 @@ def test_page_is_served_during_the_run_where_it_is_installed(
 
     monkeypatch.setattr(subprocess, "Popen", start)
     monkeypatch.setattr(run_room, "run", run)
-    monkeypatch.setattr(verbs, "packaged", lambda: {"view": object()})
+    monkeypatch.setattr(verb_registry, "packaged", lambda: {"view": object()})
     monkeypatch.setattr(sockets, "running", lambda: ("other",))
     assert run_room.demo(**options) == 7
     assert [served.command[-1] for served in started] == ["other"] * (not options)
@@ -75,7 +75,7 @@ def test_demo_without_the_page_names_the_package(
     dxlrun: Dxlrun, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
     monkeypatch.setattr(run_room, "run", lambda *_, **__: 0)
-    monkeypatch.setattr(verbs, "packaged", dict)
+    monkeypatch.setattr(verb_registry, "packaged", dict)
     assert run_room.demo() == 0
     assert "install dxlrun-view" in capsys.readouterr().out
 

@@ -9,7 +9,7 @@ from pathlib import Path
 from tests.kit.answers import result_of
 from tests.kit.pages import page_text
 
-from dxlrun.compile.robot import compile_files
+from dxlrun.compile.robot_compiler import compile_files
 from dxlrun.testing import simulated_robot
 from dxlsim.faults.fault import parse_fault
 from dxlsim.faults.script import FaultScript

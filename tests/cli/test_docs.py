@@ -19,20 +19,20 @@ import numpy as np
 import pytest
 from tests.kit.examples import as_parameters
 
-from dxlrun.channels.answers import Done
-from dxlrun.channels.commands import Command
-from dxlrun.channels.events import event_names
-from dxlrun.cli import verbs
+from dxlrun.channels.answers import Completion
+from dxlrun.channels.commands import CommandMessage
+from dxlrun.channels.event_records import event_names
+from dxlrun.cli import verb_registry
 from dxlrun.cli.examples import schema_text
 from dxlrun.cli.sim import sim
-from dxlrun.cli.steering.written import Written
-from dxlrun.compile.robot import compile_files
-from dxlrun.control.controllers.plugins import load_plugins
-from dxlrun.description.joints.joints import Joint
+from dxlrun.cli.steering.written import WrittenEntry
+from dxlrun.compile.robot_compiler import compile_files
+from dxlrun.control.controllers.plugin_loading import load_plugins
+from dxlrun.description.joints.joint_forms import Joint
 from dxlrun.description.reading import read_robot
 from dxlrun.remote.preparation import Preparation
 from dxlrun.run.run_summary import RunOptions, RunSummary
-from dxlrun.run.simulation_front import Served
+from dxlrun.run.simulation_front import SimulationResult
 from dxlrun.testing import plan_of, read_log, simulated_robot
 from dxlrun_view import dxlrun_commands
 from dxlsim.faults.fault import parse_fault
@@ -128,9 +128,9 @@ def served(monkeypatch: pytest.MonkeyPatch) -> list[SimulationConfig]:
     """What `dxlrun sim` was about to serve."""
     configs: list[SimulationConfig] = []
 
-    def serve(job: SimulationJob, *_: object, **__: object) -> Served:
+    def serve(job: SimulationJob, *_: object, **__: object) -> SimulationResult:
         configs.append(job.config)
-        return Served(1.0, SimulationMessage(), ())
+        return SimulationResult(1.0, SimulationMessage(), ())
 
     monkeypatch.setattr(sim, "_serve", serve)
     return configs
@@ -148,10 +148,10 @@ def test_commands_inside_sentences_exist_with_their_options(
     dxlrun: Dxlrun, monkeypatch: pytest.MonkeyPatch, page: str
 ) -> None:
     # the page's package is installed by itself
-    found = dict(verbs.packaged()) | {command.name: command for command in dxlrun_commands()}
-    monkeypatch.setattr(verbs, "packaged", lambda: found)
+    found = dict(verb_registry.packaged()) | {command.name: command for command in dxlrun_commands()}
+    monkeypatch.setattr(verb_registry, "packaged", lambda: found)
     general = dxlrun("--help").out
-    known = set(verbs.names())
+    known = set(verb_registry.names())
     for span in spans(PAGES[page]):
         verb, *rest = span.split()
         if verb.startswith("--") or verb.endswith((".yaml", "FILE", "ROBOT", "VERB")):
@@ -398,15 +398,15 @@ def test_architecture_md_its_motion_has_these_bytes_and_this_row(dxlrun: Dxlrun,
     plan = plan_of(ROOT / "robots/bioloid_torso.yaml")
     preparation = Preparation({joint.name: joint for joint in plan.loop.joints}, load_plugins())
     (head,) = (one for one in plan.loop.controllers if one.name == controller)
-    body = json.dumps(Written.read(words, None).data).encode()
+    body = json.dumps(WrittenEntry.from_words(words, None).data).encode()
     prepared = preparation.command(head, kind, body, units=True)
     assert (len(prepared.data), prepared.beyond) == (32, ())
     log = tmp_path / "torso.mcap"
     robot = simulated_robot(ROOT / "robots/bioloid_torso.yaml", duration_s=4.0, log=log)
-    sent = Command(1, controller, kind, prepared.data, "a reader")
+    sent = CommandMessage(1, controller, kind, prepared.data, "a reader")
     robot.buses[0].at(2_000_000_000, lambda: robot.inbox.waiting.append(sent))
     robot.run()
-    assert isinstance(robot.inbox.answers[1], Done)
+    assert isinstance(robot.inbox.answers[1], Completion)
     entries = robot.ledger.entries
     moves = [one for one in entries if one.direction == "in" and one.t_ns > 2e9 and one.data[4] == 0x83]
     assert moves[3].data == command  # in the fourth cycle; what changed in it once more

@@ -11,9 +11,9 @@ from typing import Any
 import pytest
 from tests.kit.answers import read_answer
 
-from dxlrun.channels import compiled
-from dxlrun.control.realtime import UNLIMITED
-from dxlrun.run.doctor import RATES, Finding, Machine, diagnose, may_schedule, set_rates
+from dxlrun.channels import c_sources
+from dxlrun.control.realtime_grants import UNLIMITED
+from dxlrun.run.machine_checks import RATES, CheckResult, Machine, diagnose, may_schedule, set_rates
 from dxlwire.port.adapters import serial_devices, warnings_for
 
 GOOD = {
@@ -29,14 +29,14 @@ GOOD = {
     "dev/ttyUSB0": "",
     "etc/os-release": 'NAME="Some Linux"\nID=some\n',
 }
-Look = Callable[..., dict[str, Finding]]
+Look = Callable[..., dict[str, CheckResult]]
 
 
 @pytest.fixture
 def look(tmp_path: Path) -> Look:
     """Return what the doctor finds on a machine that is good but for what is given, by what was looked at."""
 
-    def look(files: dict[str, str | None] | None = None, **other: Any) -> dict[str, Finding]:
+    def look(files: dict[str, str | None] | None = None, **other: Any) -> dict[str, CheckResult]:
         for name, text in (GOOD | (files or {})).items():
             if text is not None:
                 path = tmp_path / name
@@ -450,6 +450,6 @@ def test_an_exchange_that_is_not_compiled_is_missing(look: Look) -> None:
 
 @pytest.mark.parametrize("what", ["kernel", "gate", "shared_memory"])
 def test_each_compiled_part_is_looked_for(what: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    sources = [tmp_path / path.name if path.stem == what else path for path in compiled.SOURCES]
-    monkeypatch.setattr(compiled, "SOURCES", sources)
+    sources = [tmp_path / path.name if path.stem == what else path for path in c_sources.SOURCES]
+    monkeypatch.setattr(c_sources, "SOURCES", sources)
     assert Machine.this().compiled == f"the compiled {what} is missing: install dxlrun again"

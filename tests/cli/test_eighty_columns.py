@@ -12,10 +12,10 @@ import pytest
 
 from dxlrun.channels.cycle import CycleRecord
 from dxlrun.cli.steering import steer, watch
-from dxlrun.control.controllers.plugins import load_plugins
+from dxlrun.control.controllers.plugin_loading import load_plugins
 from dxlrun.output import terminal
-from dxlrun.output.table import Column, Table
-from dxlrun.remote.named.joints import states_of
+from dxlrun.output.text_table import Column, Table
+from dxlrun.remote.named.named_joints import states_of
 from dxlrun.remote.preparation import Preparation
 from dxlrun.run import run_summary
 from dxlrun.testing import plan_of, simulated_robot
@@ -117,9 +117,9 @@ def test_a_robot_that_runs(seen: Seen, robot: Path) -> None:
         info={"controllers": listed},
         states=states_of(plan, record, places),
     )
-    terminal.show(steer.controllers({"controllers": listed}), steer.sources({"sources": sources}))
-    terminal.show(steer.groups({"groups": plan.groups}))
-    terminal.show(watch.joints(watched), watch.sources(watched), watch.controllers(watched))
+    terminal.show_parts(steer.controllers({"controllers": listed}), steer.sources({"sources": sources}))
+    terminal.show_parts(steer.groups({"groups": plan.groups}))
+    terminal.show_parts(watch.joints(watched), watch.sources(watched), watch.controllers(watched))
 
 
 @pytest.mark.needs("logs")
@@ -140,7 +140,7 @@ def test_a_line_that_changes_fits_beside_its_spinner(monkeypatch: pytest.MonkeyP
         plan: Any = SimpleNamespace(robot=robot, loop=loop)
         status: Any = SimpleNamespace(console=console, update=lines.append)
         for virtual in (False, True):
-            run_summary.Progress(plan, status, virtual=virtual).ran(36_000_000, 1_234)
+            run_summary.RunStatusLine(plan, status, virtual=virtual).ran(36_000_000, 1_234)
     assert len(lines) == 6
     assert max(map(len, lines)) <= 77
     assert lines[0].startswith("torso: 36001.2 of 86400.0 s, 1234 periods skipped")
@@ -148,12 +148,14 @@ def test_a_line_that_changes_fits_beside_its_spinner(monkeypatch: pytest.MonkeyP
 
 def test_what_is_equal_in_all_rows_is_said_once_and_what_is_too_wide_is_cut() -> None:
     columns = [Column("name", "name"), Column("bus", "name"), Column("remark", "text"), Column("number")]
-    table = Table.of("", columns, [("a", "main_bus", "word " * 5, 1), ("c", "main_bus", "other", 2)])
+    table = Table.from_rows("", columns, [("a", "main_bus", "word " * 5, 1), ("c", "main_bus", "other", 2)])
     caption, *lines = texts(terminal.fitted(table, 44))
     assert caption == "in all rows: bus main_bus"
     assert "main_bus" not in "".join(lines)
     names = [Column(name, "name") for name in "abc"]
-    wide = Table.of("", [*names, Column("d")], [("left_shoulder_" * 3, "b" * 30, "c", 1), ("a", "b", "d", 2)])
+    wide = Table.from_rows(
+        "", [*names, Column("d")], [("left_shoulder_" * 3, "b" * 30, "c", 1), ("a", "b", "d", 2)]
+    )
     lines = texts(terminal.fitted(wide, 60))
     assert "left_shoulder_left_shoulde… " in "".join(lines)
     assert max(map(len, lines)) <= 60

@@ -11,7 +11,7 @@ from tests.kit.answers import result_of
 from tests.kit.examples import as_parameters
 
 from dxlrun.cli import inputs
-from dxlrun.compile.robot import compile_files
+from dxlrun.compile.robot_compiler import compile_files
 from dxlrun.errors import DxlrunError
 
 ROBOTS = Path(__file__).parents[2] / "robots"

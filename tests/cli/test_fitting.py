@@ -9,11 +9,11 @@ import pytest
 from rich.console import Console
 
 from dxlrun.output.graph import Graph, Node
-from dxlrun.output.html import table_element
-from dxlrun.output.table import Cell, Column, Sentence, Table
-from dxlrun.output.terminal import print_error, print_warning, show, show_json
+from dxlrun.output.html_tree import table_element
+from dxlrun.output.terminal import print_error, print_warning, show_json, show_parts
+from dxlrun.output.text_table import Cell, Column, Sentence, Table
 
-SERVOS = Table.of(
+SERVOS = Table.from_rows(
     "",
     [
         Column("ID"),
@@ -36,7 +36,7 @@ def shown(*parts: Table | Sentence | str, width: int, terminal: bool = False) ->
         force_terminal=terminal,
         color_system="standard" if terminal else None,
     )
-    show(*parts, console=console)
+    show_parts(*parts, console=console)
     text: str = console.file.getvalue()  # type: ignore[attr-defined]  # a StringIO, given above
     return "\n".join(line.rstrip() for line in text.splitlines())
 
@@ -88,7 +88,9 @@ def test_a_table_that_does_not_fit_becomes_paragraphs_in_which_nothing_is_cut(
 
 
 def test_a_long_text_is_folded_between_words() -> None:
-    table = Table.of("Events", [Column("event", "name"), Column("text", "text")], [("SETUP", "word " * 20)])
+    table = Table.from_rows(
+        "Events", [Column("event", "name"), Column("text", "text")], [("SETUP", "word " * 20)]
+    )
     lines = shown(table, width=50).splitlines()
     assert lines[:2] == ["", "Events"]
     assert max(map(len, lines)) <= 50
@@ -97,7 +99,7 @@ def test_a_long_text_is_folded_between_words() -> None:
 
 def test_a_row_needs_a_value_for_each_column() -> None:
     with pytest.raises(ValueError, match="zip"):
-        Table.of("", [Column("ID"), Column("model")], [(1,)])
+        Table.from_rows("", [Column("ID"), Column("model")], [(1,)])
 
 
 def test_only_a_terminal_gets_colours() -> None:
@@ -109,7 +111,7 @@ HOSTILE = "\x1b]0;owned\x07\x1b[2J \x9b31m \u202egood\u202c \r\b \x7f \ud800"
 
 
 def test_texts_of_plug_ins_have_no_effect_on_a_terminal(capsys: pytest.CaptureFixture[str]) -> None:
-    table = Table.of(
+    table = Table.from_rows(
         HOSTILE, [Column(HOSTILE, "name"), Column("b", "text")], [(HOSTILE, HOSTILE), ("a", "b")]
     )
     graph = Graph(HOSTILE, (Node("a", "controller", (HOSTILE,)),), ())

@@ -94,7 +94,7 @@ def test_python_gets_the_same_pose(pair: Path) -> None:
     pose = kinematics(pair).pose("jaw", "base", {"pan": 1.0, "jaw": 0.02})
 
     assert pose.rpy == pytest.approx((0, 0, 1))
-    assert pose.apply((0.0, 0.0, 1.0))[2] == 1
+    assert pose.transform_point((0.0, 0.0, 1.0))[2] == 1
 
 
 @pytest.mark.parametrize(

@@ -20,7 +20,7 @@ from dxlrun.cli.steering.steer import drawing
 from dxlrun.output.graph import Edge, Graph, Node, placed
 from dxlrun.output.graph_picture import graph_svg
 from dxlrun.output.graph_text import graph_text
-from dxlrun.output.terminal import show
+from dxlrun.output.terminal import show_parts
 
 Dxlrun = Callable[..., Any]
 ROBOTS = Path(__file__).parents[2] / "robots"
@@ -178,7 +178,7 @@ def test_a_terminal_without_these_characters_gets_others() -> None:
     for width in (60, 120):
         assert graph_text(GRAPH, width, ascii_only=True).isascii()
     stream = io.TextIOWrapper(io.BytesIO(), encoding="ascii")
-    show(GRAPH, console=Console(file=stream, width=120))
+    show_parts(GRAPH, console=Console(file=stream, width=120))
     assert b"position + velocity" in stream.buffer.getvalue()  # type: ignore[attr-defined]  # a BytesIO, given above
 
 

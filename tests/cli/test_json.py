@@ -10,7 +10,7 @@ import pytest
 from tests.kit.answers import read_answer
 
 from dxlrun.cli.app import build
-from dxlrun.cli.verbs import GROUPS
+from dxlrun.cli.verb_registry import GROUPS
 from dxlrun.testing import simulated_robot
 
 ROOT = Path(__file__).parents[2]

@@ -23,12 +23,12 @@ from msgspec.structs import replace
 from tests.kit.answers import read_answer, result_of
 from tests.kit.pages import page_text
 
-from dxlrun.log.reader import read_log
+from dxlrun.log.log_reader import read_log
 from dxlrun_analysis.latency import latency_log
 from dxlrun_analysis.latency.conditions import Settings
 from dxlrun_analysis.latency.statistics import Block
 from dxlrun_lab import stress
-from dxlrun_lab.latency import measurement
+from dxlrun_lab.latency import latency_measurement
 
 Dxlrun = Callable[..., Any]
 needs_cc = pytest.mark.skipif(shutil.which("cc") is None, reason="no C compiler")
@@ -74,9 +74,9 @@ def test_a_comparison_from_the_command_line_to_the_log(dxlrun: Dxlrun, tmp_path:
 def test_a_log_that_the_disk_has_no_room_for_fails_and_the_table_is_shown(
     dxlrun: Dxlrun, monkeypatch: pytest.MonkeyPatch, more: tuple[str, ...]
 ) -> None:
-    wrote = latency_log.write
+    wrote = latency_log.write_log
     full = "writing the log stopped: No space left on device"
-    monkeypatch.setattr(latency_log, "write", lambda *words: replace(wrote(*words), error=full))
+    monkeypatch.setattr(latency_log, "write_log", lambda *words: replace(wrote(*words), error=full))
     found = dxlrun("latency", "--count", 20, "--blocks", 1, "--log", "here.mcap", *more)
     assert found.code == 1
     told = f"the log here.mcap is incomplete: {full}"
@@ -164,10 +164,10 @@ def test_the_commands_of_a_page_are_understood(
             times = np.array([[0, 1_000 + number]])
             measured.blocks += [Block(one.name, number, times, 1, 9) for one in settings.conditions]
 
-    monkeypatch.setattr(measurement, "measure", measure)
-    monkeypatch.setattr(measurement, "require_grants", lambda *_: ())
-    monkeypatch.setattr(measurement, "compiled_yardstick", lambda *_: nullcontext(""))
-    monkeypatch.setattr(measurement, "keep_cores_awake", lambda *_: None)
+    monkeypatch.setattr(latency_measurement, "measure_blocks", measure)
+    monkeypatch.setattr(latency_measurement, "require_grants", lambda *_: ())
+    monkeypatch.setattr(latency_measurement, "compiled_yardstick", lambda *_: nullcontext(""))
+    monkeypatch.setattr(latency_measurement, "keep_cores_awake", lambda *_: None)
     text = page_text(page)
     lines = re.findall(r"^    dxlrun (latency .+)$", text, re.MULTILINE)
     assert lines
@@ -210,7 +210,7 @@ def test_an_interrupted_measurement_says_so_below_its_table(
         monkeypatch.undo()
         raise KeyboardInterrupt
 
-    monkeypatch.setattr(measurement._Process, "_ended", interrupted)
+    monkeypatch.setattr(latency_measurement._Process, "_ended", interrupted)
     found = dxlrun("latency", "--count", 600_000, "--no-record")
     assert found.code == 130
     assert found.errors[-1].startswith("interrupted")

@@ -8,7 +8,7 @@ from pathlib import Path
 import pytest
 from tests.kit.judges import log_has_every_byte
 
-from dxlrun.log.reader import read_log
+from dxlrun.log.log_reader import read_log
 from dxlsim.bus.ledger import read_ledger
 
 

@@ -11,7 +11,7 @@ import dxlwire
 from dxlrun.cli.tools.models import runs, unit_of
 from dxlrun.contract.hookspecs import HookSpecs
 from dxlwire.control_table import all_tables, find_table
-from dxlwire.control_table.devices import device_tables
+from dxlwire.control_table.device_models import device_tables
 
 
 def test_without_a_name_all_models_are_listed(dxlrun):

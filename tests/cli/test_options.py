@@ -11,7 +11,7 @@ from typing import Any, NamedTuple, get_args
 import pytest
 from cyclopts import App
 
-from dxlrun.cli import verbs
+from dxlrun.cli import verb_registry
 from dxlrun.cli.app import build
 
 ROOT = Path(__file__).parents[2]
@@ -99,7 +99,7 @@ def test_option_that_can_be_switched_off_has_both_names(every_option: list[Optio
 def test_renamed_option_names_the_new_one(every_option: list[Option], dxlrun: Callable[..., Any]) -> None:
     known = {(option.verb, name) for option in every_option for name in option.names}
     places = {"servo": ["/dev/none", "1", "get"], "teach": ["new.yaml"], "frames": ["robot.yaml"]}
-    for verb, words in verbs.RENAMED.items():
+    for verb, words in verb_registry.RENAMED.items():
         for old, new in words.items():
             assert (verb, old) not in known
             assert (verb, new.split()[0]) in known

@@ -23,7 +23,7 @@ from tests.kit.pages import page_text
 
 import dxlrun as face
 from dxlrun import RemoteRobot, connect
-from dxlrun.remote.live.listening import Listening
+from dxlrun.remote.live.listening import MessageIterator
 from dxlrun.testing import plan_of
 from dxlrun.tooling.runs import VirtualLink
 from dxlsim.faults.fault import parse_fault
@@ -83,7 +83,7 @@ class Virtual:
             fault = parse_fault(f"turn servo={name[2:]} by={by}deg for=200ms")
             self.faults.add(fault, self.link.simulated.clock.now_ns())
         for _ in range(15):
-            self.link.turn()
+            self.link.run_cycle()
 
 
 def test_teach_and_play(
@@ -171,7 +171,7 @@ def test_react_to_an_event(
     """The last one: it halts the torso."""
     listen = RemoteRobot.listen
 
-    def silenced(robot: RemoteRobot, *topics: str) -> Listening:
+    def silenced(robot: RemoteRobot, *topics: str) -> MessageIterator:
         heard = listen(robot, *topics)
         live.inject("silence servo=21 for=1s")
         return heard

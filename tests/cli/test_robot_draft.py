@@ -6,10 +6,10 @@ from itertools import pairwise
 
 import pytest
 
-from dxlrun.channels.answers import Done
-from dxlrun.channels.commands import Command
+from dxlrun.channels.answers import Completion
+from dxlrun.channels.commands import CommandMessage
 from dxlrun.cli.tools.scan import draft, draft_file
-from dxlrun.compile.robot import compile_files
+from dxlrun.compile.robot_compiler import compile_files
 from dxlrun.dynamixel.tools.scanning import FoundServo
 from dxlrun.errors import InputError, ServoFault
 from dxlrun.testing import simulated_robot
@@ -117,11 +117,11 @@ def test_the_first_send_to_a_drafted_robot_moves_it_slowly(tmp_path, protocol, m
     assert "raise its limits.velocity" in text
     robot = simulated_robot(path, arguments={"port": "sim"}, duration_s=5.0)
     robot.inbox.waiting.append(
-        Command(1, "all_joints", "positions", array("d", (1.0, -1.0)).tobytes(), "anna")
+        CommandMessage(1, "all_joints", "positions", array("d", (1.0, -1.0)).tobytes(), "anna")
     )
     result = robot.run()
     assert (result.reason, result.detail) == ("ended", "")
-    assert isinstance(robot.inbox.answers[1], Done)
+    assert isinstance(robot.inbox.answers[1], Completion)
     written = list(goals(robot.ledger.entries, protocol))
     unit, middle = GOALS[protocol][1], math.radians(150 if protocol == 1.0 else 180)
     for servo_id, end in ((1, 1.0), (2, -1.0)):

@@ -16,7 +16,7 @@ from rich.console import Console
 from tests.kit.answers import result_of
 from tests.kit.commands import Said
 
-from dxlrun.channels.events import (
+from dxlrun.channels.event_records import (
     RUN_ENDED,
     EventBody,
     EventCode,
@@ -29,10 +29,10 @@ from dxlrun.channels.events import (
     Severity,
 )
 from dxlrun.errors import PortError
-from dxlrun.log.reader import read_log
+from dxlrun.log.log_reader import read_log
 from dxlrun.plan.machine_load import MachineLoad, SimulationWait
 from dxlrun.plan.robot_plan import Plan
-from dxlrun.run.run_summary import Progress, RunOptions, RunSummary, run_verdict
+from dxlrun.run.run_summary import RunOptions, RunStatusLine, RunSummary, run_verdict
 from dxlrun.run.virtual_run import VirtualRobot, run_virtual
 from dxlrun.testing import plan_of
 
@@ -310,8 +310,10 @@ def test_a_played_motion_that_missed_its_goal_fails_the_run(
         history.planned = plan.loop.origins
         for command in plan.loop.commands:
             if command.goal is not None:
-                history.add(GoalReport(1, command.controller, command.kind, command.origin, "accepted"))
-        history.add(GoalReport(1, "left_arm", "trajectory", origin, status, text, "elbow", 0.157))
+                history.count_report(
+                    GoalReport(1, command.controller, command.kind, command.origin, "accepted")
+                )
+        history.count_report(GoalReport(1, "left_arm", "trajectory", origin, status, text, "elbow", 0.157))
         runs.answer = structs.replace(GOOD, events=EventTotals(goals=history.totals), **ran)
         return dxlrun(torso, "--play", three_parts)
 
@@ -369,7 +371,7 @@ def test_a_traceback_with_any_bytes_reaches_the_end_of_the_run():
     ring = EventRing(
         SimpleNamespace(append=lambda _, data: written.append(data)), SimpleNamespace(now_ns=int)
     )
-    ring.emit("arm", EventBody(EventCode.CONTROLLER_FAULT, Severity.ERROR, "no file \udcff"))
+    ring.emit_event("arm", EventBody(EventCode.CONTROLLER_FAULT, Severity.ERROR, "no file \udcff"))
     outcome = msgspec.json.encode(ring.totals)
     assert msgspec.json.decode(outcome, type=EventTotals).errors[0].text == "no file ?"
     assert len(written) == 1
@@ -504,7 +506,7 @@ def test_progress_counts_skipped_periods(
     now = iter((100.0, 100.05, 102.0))
     monkeypatch.setattr("dxlrun.run.run_summary.time.monotonic", lambda: next(now))
     line = Line()
-    progress = Progress(plan_of(torso, duration_s=9.0), line, virtual=virtual)
+    progress = RunStatusLine(plan_of(torso, duration_s=9.0), line, virtual=virtual)
     progress.ran(1, 0)
     progress.ran(100, 50)
 
@@ -518,7 +520,7 @@ def test_without_a_terminal_a_line_every_five_seconds_shows_progress(
     now = iter([100.0, *(100 + 0.02 * cycle for cycle in range(1, 601))])
     monkeypatch.setattr("dxlrun.run.run_summary.time.monotonic", lambda: next(now))
     line = Line(terminal=False)
-    progress = Progress(plan_of(torso, duration_s=12.0), line)
+    progress = RunStatusLine(plan_of(torso, duration_s=12.0), line)
     for cycle in range(1, 601):
         progress.ran(cycle, 0)
 

@@ -6,7 +6,7 @@ import sys
 import yaml
 from tests.kit.answers import result_of
 
-from dxlrun.log.reader import read_log
+from dxlrun.log.log_reader import read_log
 from dxlsim.simulation_plan import BusConfig, ServoConfig
 from dxlwire.packets import PacketKind
 

@@ -14,8 +14,8 @@ from pydantic import BaseModel
 
 from dxlrun.cli.app import run_tokens
 from dxlrun.cli.examples import schema_text
-from dxlrun.control.controllers import plugins
-from dxlrun.control.controllers.plugins import Offer, Offers
+from dxlrun.control.controllers import plugin_loading
+from dxlrun.control.controllers.plugin_loading import Offer, Offers
 from dxlrun.description.document import grow, literal, parse
 from dxlrun.description.json_schema import robot_schema
 from dxlrun.errors import PlugInError
@@ -67,11 +67,11 @@ def test_a_type_that_cannot_be_imported_is_left_out(monkeypatch: pytest.MonkeyPa
     def fails() -> Offer:
         raise PlugInError("cannot be imported: no module named nothing")
 
-    found = plugins.load_plugins()
+    found = plugin_loading.load_plugins()
     makes = {name: functools.partial(found.controllers.__getitem__, name) for name in found.controllers}
     broken = structs.replace(found, controllers=Offers({"nothing": fails, **makes}, {}))
     usual = schema_text("robot")
-    monkeypatch.setattr(plugins, "load_plugins", lambda: broken)
+    monkeypatch.setattr(plugin_loading, "load_plugins", lambda: broken)
     assert schema_text("robot") == usual
 
 

@@ -13,7 +13,7 @@ from dxlrun.dynamixel.tools import scanning
 from dxlrun.dynamixel.tools.scanning import FoundServo
 from dxlrun.dynamixel.tools.servo_backup import read_backup
 from dxlrun.errors import InputError
-from dxlrun.log.reader import read_log
+from dxlrun.log.log_reader import read_log
 from dxlsim.simulation_plan import BusConfig, ServoConfig
 from dxlwire.packets import PacketKind
 

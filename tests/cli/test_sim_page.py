@@ -10,7 +10,7 @@ import pytest
 from tests.kit.pages import page_text
 
 from dxlrun.cli.sim import sim
-from dxlrun.run.simulation_front import Served
+from dxlrun.run.simulation_front import SimulationResult
 from dxlsim.faults.kinds import KINDS
 from dxlsim.messages import SimulationJob, SimulationMessage
 from dxlsim.simulation_plan import SimulationConfig
@@ -24,9 +24,9 @@ COMMANDS = re.findall(r"^    (dxlrun sim .+)$", PAGE, re.MULTILINE)
 def test_each_command_of_the_page_is_understood(dxlrun, line, monkeypatch, tmp_path):
     asked: list[SimulationConfig] = []
 
-    def serve(job: SimulationJob, *_: object, **__: object) -> Served:
+    def serve(job: SimulationJob, *_: object, **__: object) -> SimulationResult:
         asked.append(job.config)
-        return Served(1.0, SimulationMessage(), ())
+        return SimulationResult(1.0, SimulationMessage(), ())
 
     monkeypatch.setattr(sim, "_serve", serve)
     (tmp_path / "robots").symlink_to(ROOT / "robots")

@@ -11,7 +11,7 @@ import pytest
 from msgspec.structs import replace
 from rich.console import Console
 
-from dxlrun.cli.sim.sim_views import Shown, TableView, page
+from dxlrun.cli.sim.sim_views import SimulationView, TableView, page
 from dxlrun.run.simulation_front import TypedLines
 from dxlsim.messages import ServoLook, SimulationMessage
 
@@ -83,14 +83,14 @@ def test_a_low_window_keeps_the_prompt():
 def test_the_table_is_drawn_again_below_each_printed_line():
     file = StringIO()
     console = Console(file=file, force_terminal=True, width=80, height=20)
-    view = TableView(Shown("torso", (), {}), console)
+    view = TableView(SimulationView("torso", (), {}), console)
     with view.showing():
         line = "a line that is much wider than the window of eighty columns, so that it must be folded"
         for told in ({"happened": line}, {"fault": line}, {"error": line}, {"ports": {line: ""}}):
-            view.look(look(2), "lose")
+            view.show_snapshot(look(2), "lose")
             file.seek(0)
             file.truncate()
-            view.take(SimulationMessage(**told))
+            view.show_message(SimulationMessage(**told))
             said = file.getvalue()
             assert said.index("folded") < said.index("XL430-W250") < said.index("lose")
         view.help()
@@ -121,7 +121,7 @@ def test_letters_become_lines(keyboard, letters, lines, pending):
     writer, typed = keyboard
     os.write(writer, letters)
 
-    assert typed.receive() == lines
+    assert typed.read_lines() == lines
     assert (typed.pending, typed.ended) == (pending, False)
     os.close(writer)
 
@@ -141,6 +141,6 @@ def test_an_end_gives_what_was_not_finished(keyboard):
     os.write(writer, b"help")
     os.close(writer)
 
-    assert typed.receive() == []
-    assert typed.receive() == ["help"]
+    assert typed.read_lines() == []
+    assert typed.read_lines() == ["help"]
     assert typed.ended

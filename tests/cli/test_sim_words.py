@@ -9,7 +9,7 @@ import pytest
 
 from dxlrun.cli.sim.sim import link_of_each
 from dxlrun.cli.sim.sim_inputs import read_faults, servo_bus, with_adapter
-from dxlrun.cli.sim.sim_views import PlainView, Shown, ending
+from dxlrun.cli.sim.sim_views import PlainView, SimulationView, ending
 from dxlrun.errors import InputError
 from dxlsim.messages import ServoLook, SimulationMessage
 from dxlsim.simulation_plan import BusConfig, ServoConfig
@@ -104,12 +104,12 @@ def test_what_is_no_link_is_never_replaced(tmp_path):
 def test_the_ports_are_printed_once(capsys):
     servos = tuple(ServoConfig(each, "AX-12A", 0.0) for each in (1, 2, 3, 7))
     bus = BusConfig("main", 1_000_000, servos)
-    view = PlainView(Shown("torso", (bus,), {"main": Path("/tmp/robot")}, "dxlrun torso.yaml"))  # noqa: S108
+    view = PlainView(SimulationView("torso", (bus,), {"main": Path("/tmp/robot")}, "dxlrun torso.yaml"))  # noqa: S108
 
     view.opened({"main": "/dev/pts/7"}, "core 1")
-    view.take(SimulationMessage({"main": ""}))
-    view.take(SimulationMessage({"main": "/dev/pts/9"}))
-    view.take(SimulationMessage(happened="lose servo=1"))
+    view.show_message(SimulationMessage({"main": ""}))
+    view.show_message(SimulationMessage({"main": "/dev/pts/9"}))
+    view.show_message(SimulationMessage(happened="lose servo=1"))
 
     assert capsys.readouterr().out.splitlines() == [
         "torso: 4 servos simulated on 1 bus; Ctrl-C ends it, `help` lists faults to type",

@@ -31,15 +31,15 @@ VALIDATORS = """
 import json
 import dxlrun.features.devices.form, dxlrun.features.mechanics.form, dxlrun.features.recording.form
 import dxlrun.description.robot
-from dxlrun.description.form import Form
+from dxlrun.description.base_form import Form
 def forms(form):
     return [form, *(each for below in form.__subclasses__() for each in forms(below))]
 print(json.dumps([len(forms(Form)), [each.__name__ for each in forms(Form) if each.__pydantic_complete__]]))
 """
 RUN_TIME = {
-    "dxlrun.control": ("gate", "loop", "realtime", "safe_motion", "steering"),
-    "dxlrun.dynamixel": ("hardware", "servo/life", "servo/servos", "tools"),
-    "dxlrun.log": ("identity", "recorder", "log_writer", "reader"),
+    "dxlrun.control": ("gate", "loop", "realtime_grants", "safe_motion", "steering"),
+    "dxlrun.dynamixel": ("dynamixel_hardware", "servo/life", "servo/servo_supervision", "tools"),
+    "dxlrun.log": ("identity", "recorder", "log_writer", "log_reader"),
     "dxlsim": ("bus", "serving"),
     "dxlwire": ("exchange", "port"),
 }
@@ -100,7 +100,7 @@ def test_forms_build_no_validators_on_import() -> None:
 
 def test_check_imports_what_it_uses(checked: set[str]) -> None:
     """The other side: the names above are those of modules that exist."""
-    assert checked >= {"dxlrun.compile.robot", "dxlrun.description.robot", "pydantic", "yaml"}
+    assert checked >= {"dxlrun.compile.robot_compiler", "dxlrun.description.robot", "pydantic", "yaml"}
     for room, parts in RUN_TIME.items():
         folder = ROOT / "runtime" / room.replace(".", "/")
         assert {part for part in parts if not any(folder.glob(f"{part}*"))} == set()
@@ -108,6 +108,6 @@ def test_check_imports_what_it_uses(checked: set[str]) -> None:
 
 def test_a_virtual_run_imports_neither_gateway_nor_physics() -> None:
     ran = loaded("robots/bioloid_torso.yaml", "--virtual", "--duration", "0.1", "--no-record")
-    assert "dxlsim.serving.server" not in ran
+    assert "dxlsim.serving.simulation_server" not in ran
     assert beneath(ran, "mujoco", "starlette", "uvicorn", "matplotlib", "rich", "dxlrun.remote") == set()
     assert "dxlrun.run.virtual_run" in ran

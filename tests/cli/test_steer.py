@@ -20,7 +20,7 @@ from tests.kit.answers import read_answer, result_of
 from tests.kit.pages import page_text
 
 from dxlrun import DxlrunError, GoalState, GoalTimeout, RemoteRobot, connect, running
-from dxlrun.cli.verbs import GROUPS
+from dxlrun.cli.verb_registry import GROUPS
 from dxlrun.remote.sockets import SocketLink
 
 ROOT = Path(__file__).parents[2]

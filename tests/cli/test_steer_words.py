@@ -10,9 +10,9 @@ from rich.console import Console
 from tests.kit.answers import result_of
 
 from dxlrun.cli.steering.steer import command, controllers, headline, state
-from dxlrun.cli.steering.written import Written
+from dxlrun.cli.steering.written import WrittenEntry
 from dxlrun.errors import InputError, Refused
-from dxlrun.output.terminal import show
+from dxlrun.output.terminal import show_parts
 
 NO_ROBOT = "dxlrun: no robot runs that can be steered; `dxlrun ROBOT.yaml` starts one"
 
@@ -58,7 +58,7 @@ def test_a_wrong_quantity_is_reported_at_its_place_in_the_file(tmp_path: Path) -
     file = tmp_path / "step.yaml"
     file.write_text("positions:\n  - 30\nvelocities: [true]\n")
     refused = Refused("...", code="wrong_quantity", fields=WRONG, wrong_input=True)
-    located = Written.read((), file).located(refused)
+    located = WrittenEntry.from_words((), file).located(refused)
     assert isinstance(located, InputError)
     assert str(located).splitlines() == [
         f"{file}:2:5: positions[0]: no unit; add it",
@@ -68,13 +68,13 @@ def test_a_wrong_quantity_is_reported_at_its_place_in_the_file(tmp_path: Path) -
 
 def test_wrong_quantities_of_the_command_line_are_a_line_each_and_keep_their_code() -> None:
     refused = Refused("...", code="wrong_quantity", fields=WRONG, wrong_input=True)
-    located = Written.read(["positions=[30]", "velocities=[true]"], None).located(refused)
+    located = WrittenEntry.from_words(["positions=[30]", "velocities=[true]"], None).located(refused)
     assert isinstance(located, Refused)
     assert (str(located).splitlines(), located.code, located.exit_code) == (
         WRONG["problems"], "wrong_quantity", 2,
     )  # fmt: skip
     other = Refused("no", code="not_active")
-    assert Written.read((), None).located(other) is other
+    assert WrittenEntry.from_words((), None).located(other) is other
 
 
 # What is listed
@@ -98,7 +98,7 @@ def test_no_name_is_broken_on_a_narrow_terminal(width: int) -> None:
     arm = {"name": "arm", "active": True, "held": False, "rate": 50.0, "takes": {}, "joints": joints}
     head = {**arm, "name": "head", "command": (), "takes": {"go": {}, "stop": {}}}
     console = Console(file=io.StringIO(), width=width)
-    show(controllers({"controllers": [arm | {"command": ("position",)}, head]}), console=console)
+    show_parts(controllers({"controllers": [arm | {"command": ("position",)}, head]}), console=console)
     words = console.file.getvalue().split()  # type: ignore[attr-defined]  # a StringIO, given above
     assert {f"{joint}," for joint in joints[:-1]} | {joints[-1]} <= set(words)
     assert {"arm", "head", "active", "go;", "stop"} <= {word.strip(":,") for word in words}

@@ -11,7 +11,7 @@ import pytest
 
 from dxlrun.cli.inputs import check_report, write_report
 from dxlrun.errors import InputError
-from dxlrun.output.html import document
+from dxlrun.output.html_tree import document
 from dxlrun.output.target import check_target, open_empty, write_target
 
 Dxlrun = Callable[..., object]

@@ -12,7 +12,7 @@ from pathlib import Path
 
 import pytest
 
-from dxlrun.channels.heartbeat import Phase, Steering
+from dxlrun.channels.heartbeat import GatewayAvailability, Phase
 
 Begin = Callable[..., subprocess.Popen[str]]
 LOOP = """\
@@ -77,14 +77,23 @@ while True:
 @pytest.mark.parametrize(
     ("phase", "steering", "said"),
     [
-        (Phase.LOADING, Steering.IMPOSSIBLE, "is starting and cannot be steered yet"),
-        (Phase.RUNNING, Steering.AWAITED, "is starting and cannot be steered yet"),
-        (Phase.RUNNING, Steering.IMPOSSIBLE, "runs but cannot be steered: it has no gateway; `dxlrun stop"),
-        (Phase.DONE, Steering.POSSIBLE, "is ending"),
+        (Phase.LOADING, GatewayAvailability.IMPOSSIBLE, "is starting and cannot be steered yet"),
+        (Phase.RUNNING, GatewayAvailability.AWAITED, "is starting and cannot be steered yet"),
+        (
+            Phase.RUNNING,
+            GatewayAvailability.IMPOSSIBLE,
+            "runs but cannot be steered: it has no gateway; `dxlrun stop",
+        ),
+        (Phase.DONE, GatewayAvailability.POSSIBLE, "is ending"),
     ],
 )
 def test_only_a_run_without_a_gateway_gets_the_advice_to_stop_it(  # noqa: PLR0917  fixtures
-    dxlrun, monkeypatch: pytest.MonkeyPatch, tmp_path: Path, phase: Phase, steering: Steering, said: str
+    dxlrun,
+    monkeypatch: pytest.MonkeyPatch,
+    tmp_path: Path,
+    phase: Phase,
+    steering: GatewayAvailability,
+    said: str,
 ) -> None:
     monkeypatch.setenv("XDG_RUNTIME_DIR", str(tmp_path))
     source = SUPERVISOR.replace("PHASE", str(int(phase))).replace("STEERING", str(int(steering)))
@@ -99,7 +108,7 @@ def test_only_a_run_without_a_gateway_gets_the_advice_to_stop_it(  # noqa: PLR09
         finally:
             child.kill()
     assert err.startswith(f"dxlrun: young_arm {said}")
-    assert ("dxlrun stop" in err) == (steering is Steering.IMPOSSIBLE and phase is Phase.RUNNING)
+    assert ("dxlrun stop" in err) == (steering is GatewayAvailability.IMPOSSIBLE and phase is Phase.RUNNING)
 
 
 def test_a_stopped_loop_is_continued_to_its_end(dxlrun, orphan: Begin) -> None:

@@ -10,7 +10,7 @@ from typing import Any
 import pytest
 from tests.kit.packages import Install, installing
 
-from dxlrun.cli import app, verbs
+from dxlrun.cli import app, verb_registry
 from dxlrun.cli.help import TEXT
 
 GREETING = """
@@ -51,14 +51,14 @@ def test_the_text_of_the_help_is_what_the_commands_say(capsys: pytest.CaptureFix
     assert capsys.readouterr().out == TEXT.read_text()
 
 
-@pytest.mark.parametrize("name", verbs.packaged())
+@pytest.mark.parametrize("name", verb_registry.packaged())
 def test_a_verb_of_our_packages_is_described_by_its_docstring_alone(name: str) -> None:
-    assert verbs.packaged()[name].help == ""
+    assert verb_registry.packaged()[name].help == ""
     assert app.build(name)[name].help.partition("\n")[0]
-    assert verbs.package_of(name) == verbs.packaged()[name].place.partition(".")[0]
+    assert verb_registry.package_of(name) == verb_registry.packaged()[name].place.partition(".")[0]
 
 
-@pytest.mark.parametrize("name", verbs.names())
+@pytest.mark.parametrize("name", verb_registry.names())
 def test_the_help_of_a_verb_has_examples_that_can_be_typed(name: str, dxlrun: Dxlrun) -> None:
     said = dxlrun("help", name)
     assert (said.code, said.err) == (0, "")
@@ -80,8 +80,8 @@ def test_help_without_a_verb_lists_them_and_an_unknown_one_is_refused(dxlrun: Dx
 
 
 def test_a_verb_of_each_package_has_a_heading_of_the_help() -> None:
-    assert {one.group for one in verbs.packaged().values()} <= set(verbs.GROUPS)
-    assert len(verbs.GROUPS[verbs.EVERY_DAY]) == 10  # `help`, and with `analyze` ten more
+    assert {one.group for one in verb_registry.packaged().values()} <= set(verb_registry.GROUPS)
+    assert len(verb_registry.GROUPS[verb_registry.EVERY_DAY]) == 10  # `help`, and with `analyze` ten more
 
 
 def test_a_foreign_verb_stands_in_the_group_that_it_names_or_behind_all(
@@ -135,7 +135,7 @@ def test_a_verb_whose_code_is_broken_is_left_out_of_the_list(install: Install, t
     install(
         "bad-manners", "bad", GREETING.replace("greeting_work", "greeting_gone").replace('"greet"', '"bow"')
     )
-    assert {"greet", "bow"} <= {*verbs.packaged()}
+    assert {"greet", "bow"} <= {*verb_registry.packaged()}
     assert "bow" not in app.build(listed=True)
 
 
@@ -151,7 +151,7 @@ def test_a_package_takes_no_verb_of_the_core(install: Install, dxlrun: Dxlrun) -
 def test_a_verb_whose_package_is_absent_names_the_line_that_installs_it(
     dxlrun: Dxlrun, monkeypatch: pytest.MonkeyPatch, verb: str, package: str, place: str
 ) -> None:
-    monkeypatch.setattr(verbs, "packaged", dict)
+    monkeypatch.setattr(verb_registry, "packaged", dict)
     said = dxlrun(verb, "run.mcap")
     assert said.code == 2
     assert said.errors == [

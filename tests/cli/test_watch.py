@@ -15,10 +15,10 @@ from tests.kit.answers import result_of
 from dxlrun import DxlrunError
 from dxlrun.channels.cycle import CycleLayout, CycleRecord, Torque
 from dxlrun.cli.steering import watch
-from dxlrun.cli.steering.steer import Chosen
-from dxlrun.output.table import Sentence
+from dxlrun.cli.steering.steer import RobotChoice
+from dxlrun.output.text_table import Sentence
 from dxlrun.remote.live.states import RobotStates
-from dxlrun.remote.named.joints import states_of
+from dxlrun.remote.named.named_joints import states_of
 from dxlwire.joint_unit import ROTARY
 from dxlwire.modes import Mode
 
@@ -100,7 +100,7 @@ def shown(monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]) -
         monkeypatch.setattr(watch, "connect_robot", lambda *_: robot)
         monkeypatch.setattr(robot, "link", SimpleNamespace(alive=runs), raising=False)
         monkeypatch.setattr(watch, "REFRESH_S", 0.0)
-        code = watch.watch(once=once, chosen=Chosen(as_json=as_json))
+        code = watch.watch_robot(once=once, chosen=RobotChoice(as_json=as_json))
         return code, capsys.readouterr().out
 
     return run
@@ -108,9 +108,9 @@ def shown(monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]) -
 
 def frame(width: int, height: int, joints: int = 20, looks: int = 3, sources: bool = False) -> list[str]:
     """Return the lines of a view."""
-    watched = watch.Watched(Robot(joints, sources=sources))  # type: ignore[arg-type]  # a stand-in
+    watched = watch.WatchedRobot(Robot(joints, sources=sources))  # type: ignore[arg-type]  # a stand-in
     for _ in range(looks):
-        watched.look()
+        watched.poll_robot()
     console = Console(file=io.StringIO(), width=width, height=height, force_terminal=False)
     console.print(watch.view(watched, width, height))
     return console.file.getvalue().splitlines()  # type: ignore[attr-defined]  # it is a StringIO
@@ -199,8 +199,8 @@ def test_an_interrupt_is_its_end(shown: Any, monkeypatch: pytest.MonkeyPatch) ->
 
 
 def test_the_newest_event_stands_last() -> None:
-    watched = watch.Watched(Robot())  # type: ignore[arg-type]  # a stand-in
-    watched.look()
+    watched = watch.WatchedRobot(Robot())  # type: ignore[arg-type]  # a stand-in
+    watched.poll_robot()
     watched.events = [{"time": at, "severity": 20, "source": "loop", "text": str(at)} for at in (1.0, 2.0)]
     assert watch.event_lines(watched, 0) == []
     assert watch.event_lines(watched, 1) == [Sentence(" 99.0 s ago, loop: 2.0", "plain")]

@@ -5,8 +5,8 @@ import numpy as np
 import pytest
 
 from dxlrun import Controller, Interfaces, ParametersModel
-from dxlrun.compile import robot
-from dxlrun.control.controllers.plugins import Offer, PlugIns, load_plugins
+from dxlrun.compile import robot_compiler
+from dxlrun.control.controllers.plugin_loading import Offer, PlugIns, load_plugins
 from dxlrun.run import virtual_run
 
 
@@ -70,7 +70,7 @@ class Part(Controller[PartParameters]):
 @pytest.fixture
 def part_plugins(monkeypatch: pytest.MonkeyPatch) -> dict[str, list[np.ndarray]]:
     """Offer the type `part`, to the compiler and to runs on virtual time; return what parts read."""
-    for room in (robot, virtual_run):
+    for room in (robot_compiler, virtual_run):
         monkeypatch.setattr(room, "load_plugins", lambda **_: _with_part())
     return READ
 

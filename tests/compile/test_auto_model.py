@@ -3,10 +3,10 @@ from pathlib import Path
 import pytest
 from tests.kit.robots import PAIR, compile_text
 
-from dxlrun.compile.joints.joints import compile_joints
+from dxlrun.compile.joints.compiled_joints import compile_joints
 from dxlrun.compile.joints.motors import Motors
 from dxlrun.compile.problems import RobotFile
-from dxlrun.compile.robot import compile_robot
+from dxlrun.compile.robot_compiler import compile_robot
 from dxlrun.description.reading import read_robot
 from dxlrun.errors import InputError
 
@@ -54,4 +54,4 @@ def test_an_id_of_protocol_1_only_is_refused_on_a_bus_of_protocol_2():
     compile_joints(file, {}, Motors())
 
     with pytest.raises(InputError, match="servo ID 253 of right_arm_joint is not valid in Protocol"):
-        file.refuse()
+        file.raise_errors()

@@ -5,7 +5,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from dxlrun.compile.samples import LONGEST_FORMULA, Expression
+from dxlrun.compile.motion_samples import LONGEST_FORMULA, Expression
 
 
 @settings(max_examples=50, deadline=None)

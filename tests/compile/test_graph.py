@@ -8,7 +8,7 @@ import pytest
 from tests.kit.pages import page_text
 from tests.kit.robots import compile_text, problems_in, robot_text
 
-from dxlrun.compile.graph import ControllerGraph, GraphEdge
+from dxlrun.compile.controller_graph import ControllerGraph, GraphEdge
 from dxlrun.plan.loop_plan import ControllerPlan
 
 pytestmark = pytest.mark.usefixtures("part_plugins")
@@ -92,7 +92,7 @@ def test_a_controller_that_reads_itself_is_warned_about_and_can_be_ordered() -> 
         "filter", "part", "", "{}", (), (), (), True, 1, reads=("filter/x", "filter/age"), provides=("x",)
     )
     graph = ControllerGraph(("j",), (low, filter_))
-    assert [*graph.mistakes()] == []
+    assert [*graph.find_mistakes()] == []
     assert graph.order == ("low", "filter")
     assert [one.what for one in graph.warnings()] == [
         "low reads low/j/position, its own reference, which it has without",
@@ -102,6 +102,6 @@ def test_a_controller_that_reads_itself_is_warned_about_and_can_be_ordered() -> 
 
 def test_a_mistake_has_its_path_in_the_file() -> None:
     plan = ControllerPlan("up", "part", "", "{}", ("j",), ("position",), (), True, 1, into=("low",))
-    (mistake,) = ControllerGraph(("j",), (plan,)).mistakes()
+    (mistake,) = ControllerGraph(("j",), (plan,)).find_mistakes()
     assert mistake.at == ("controllers", "up", "into", 0)
     assert mistake.what == "`into` of up names low, which is not a controller of the robot"

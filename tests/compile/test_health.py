@@ -9,7 +9,7 @@ import pytest
 from msgspec.structs import replace
 from tests.kit.robots import compile_text
 
-from dxlrun.channels.events import EventCode
+from dxlrun.channels.event_records import EventCode
 from dxlrun.compile.buses import slowest_period_ns
 from dxlrun.testing import read_log, simulated_robot
 

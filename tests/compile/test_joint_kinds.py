@@ -17,9 +17,9 @@ TEXT = robot_text("cart")
 
 def test_a_wheel_has_turns_but_no_limits_that_stop_it() -> None:
     wheel, arm = compile_text(TEXT).plan.loop.joints
-    assert (wheel.continuous, wheel.bounded, wheel.rest) == (True, False, Mode.VELOCITY)
+    assert (wheel.continuous, wheel.bounded, wheel.rest_mode) == (True, False, Mode.VELOCITY)
     assert (wheel.lower, wheel.upper) == pytest.approx((-512 * math.pi, 512 * math.pi))
-    assert (arm.continuous, arm.bounded, arm.rest, arm.effort) == (False, True, Mode.POSITION, 0.8)
+    assert (arm.continuous, arm.bounded, arm.rest_mode, arm.effort) == (False, True, Mode.POSITION, 0.8)
 
 
 def test_limits_of_a_continuous_joint_bind_it_in_every_mode() -> None:

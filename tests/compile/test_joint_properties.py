@@ -9,8 +9,8 @@ import msgspec
 import pytest
 
 from dxlrun.cli import check
-from dxlrun.compile.robot import compile_files
-from dxlrun.output.table import Table
+from dxlrun.compile.robot_compiler import compile_files
+from dxlrun.output.text_table import Table
 from dxlrun.plan.loop_plan import JOINT_PROPERTIES, JointProperty, JointValues
 from dxlrun.remote.requests.replies import RobotInfo
 
@@ -24,7 +24,7 @@ def _joint_table() -> tuple[list[dict[str, object]], Table]:
 
 def test_property_with_a_column_is_in_json_and_table(monkeypatch: pytest.MonkeyPatch) -> None:
     wide = JointProperty("tolerance", lambda joint: joint.goal_tolerance, column="")
-    monkeypatch.setattr("dxlrun.compile.report.JOINT_PROPERTIES", (*JOINT_PROPERTIES, wide))
+    monkeypatch.setattr("dxlrun.compile.check_report.JOINT_PROPERTIES", (*JOINT_PROPERTIES, wide))
     rows, table = _joint_table()
     assert all(row["tolerance"] for row in rows)
     names = [column.name for column in table.columns]
@@ -42,7 +42,7 @@ def test_limit_of_the_servo_is_marked_in_the_table() -> None:
 
 def test_running_robot_lists_the_same_properties() -> None:
     joints = compile_files(ROBOT, {}, []).plan.loop.joints
-    values = JointValues.collect(joints, {})
+    values = JointValues.from_joints(joints, {})
     fields = {one.listed for one in JOINT_PROPERTIES if one.listed}
     assert fields | {"effort_units", "joint_keys"} == {one.name for one in dataclasses.fields(JointValues)}
     found = msgspec.to_builtins(values)

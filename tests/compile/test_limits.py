@@ -13,8 +13,8 @@ from dxlrun.compile.joints.limits import (
     check_samples,
     limits_of,
 )
+from dxlrun.compile.motion_samples import MotionSample, SampledTarget
 from dxlrun.compile.problems import Problems
-from dxlrun.compile.samples import Sample, SampledTarget
 from dxlrun.contract.controller import SpeedPeak
 from dxlrun.errors import Mark
 from dxlrun.plan.loop_plan import JointPlan
@@ -54,10 +54,10 @@ def test_positions_are_written_with_their_signs() -> None:
     assert (str(limits_of(ARM)), str(limits_of(SLIDE))) == ("-57.3..+28.65 deg", "-20..+50 mm")
 
 
-def samples(*rows: tuple[float, float | None, float | None]) -> list[Sample]:
+def samples(*rows: tuple[float, float | None, float | None]) -> list[MotionSample]:
     """Return samples of `arm`: time s, position, velocity."""
     return [
-        Sample(
+        MotionSample(
             round(t * SOME_S),
             {"arm": SampledTarget(position, velocity, None, Mark("m.yaml", 3 + index))},
             MARK,

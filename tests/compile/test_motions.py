@@ -163,7 +163,7 @@ def many(samples: int, formula: str = "sin(t)") -> str:
     ],
 )
 def test_what_would_take_minutes_is_refused_at_once(monkeypatch: pytest.MonkeyPatch, motion: str, says: str):
-    monkeypatch.setattr("dxlrun.compile.samples.Expression.at", lambda *_: pytest.fail("evaluated"))
+    monkeypatch.setattr("dxlrun.compile.motion_samples.Expression.at", lambda *_: pytest.fail("evaluated"))
 
     (problem,) = problems_in(PAIR, motion)
 

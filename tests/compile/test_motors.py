@@ -13,7 +13,7 @@ from tests.kit.robots import compile_text, problems_in
 from dxlrun import MotorLoad, MotorModel, Stribeck
 from dxlrun.cli.app import run_tokens
 from dxlrun.compile.simulation import simulation_of
-from dxlrun.control.controllers.plugins import load_plugins
+from dxlrun.control.controllers.plugin_loading import load_plugins
 from dxlrun.description.joints.motor_file import motor_text
 from dxlrun.errors import InputError
 from dxlrun.plan.robot_plan import from_json, to_json

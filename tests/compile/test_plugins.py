@@ -10,9 +10,9 @@ from tests.kit.robots import PAIR, compile_text, problems_in
 from tests.kit.stories import plugin_folder
 
 from dxlrun import CommandModel, Controller, Interfaces, ParametersModel
-from dxlrun.compile import robot
-from dxlrun.compile.robot import compile_files
-from dxlrun.control.controllers.plugins import Offer, PlugIns, load_plugins
+from dxlrun.compile import robot_compiler
+from dxlrun.compile.robot_compiler import compile_files
+from dxlrun.control.controllers.plugin_loading import Offer, PlugIns, load_plugins
 from dxlrun.remote.preparation import Preparation, RefusedRequest
 
 
@@ -68,7 +68,7 @@ def foreign_plugins(monkeypatch: pytest.MonkeyPatch):
     offers["raising"] = Offer("raising", Raising, "elsewhere 2.1")
     offers["sleepy"] = Offer("sleepy", Sleepy, "elsewhere 2.1")
     plugins = PlugIns(offers, {"sad": "plug-in sad of sad-robots 0.3 cannot be imported; reinstall it"})
-    monkeypatch.setattr(robot, "load_plugins", lambda **_: plugins)
+    monkeypatch.setattr(robot_compiler, "load_plugins", lambda **_: plugins)
 
 
 FOREIGN = PAIR.partition("controllers:")[0] + "controllers:\n  mine: {type: foreign}\n"
@@ -97,7 +97,7 @@ def test_its_topics_are_in_the_plan_and_none_is_that_of_a_bus():
 )
 def test_an_entry_gets_the_same_sentences_in_a_file_and_from_a_client(entry: dict[str, object]) -> None:
     said = problems_in(FOREIGN.replace("{type: foreign}", json.dumps(entry)))
-    plugins = robot.load_plugins()
+    plugins = robot_compiler.load_plugins()
     loop = compile_text(FOREIGN).plan.loop
     preparation = Preparation({joint.name: joint for joint in loop.joints}, plugins)
     with pytest.raises(RefusedRequest) as refused:

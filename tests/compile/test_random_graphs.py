@@ -25,9 +25,9 @@ from hypothesis import HealthCheck, Phase, settings
 from hypothesis import given as given_
 from hypothesis import strategies as st
 
-from dxlrun.compile.robot import compile_files
-from dxlrun.control.controllers.claims import Standing
-from dxlrun.control.controllers.graph import above
+from dxlrun.compile.robot_compiler import compile_files
+from dxlrun.control.controllers.claims import ControllerSnapshot
+from dxlrun.control.controllers.update_order import above
 from dxlrun.errors import InputError
 from dxlrun.plan.loop_plan import ControllerPlan
 from dxlrun.run.virtual_run import VirtualRobot
@@ -477,7 +477,7 @@ def require_takeovers(plans: tuple[ControllerPlan, ...]) -> None:
         if plan.fallback:
             taken = [*above(plans, name), name]
             staying = {each: one for each, one in active.items() if each not in taken}
-            assert Standing(known, staying).fall_back(plan.fallback, taken, {name}), (
+            assert ControllerSnapshot(known, staying).fall_back(plan.fallback, taken, {name}), (
                 f"{plan.fallback} of {name}"
             )
 

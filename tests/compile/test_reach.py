@@ -5,8 +5,8 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from tests.kit.robots import compile_text
 
+from dxlrun.compile.joints.compiled_servos import joint_reach, servo_travel
 from dxlrun.compile.joints.limits import Interval, degrees
-from dxlrun.compile.joints.servos import joint_reach, servo_travel
 from dxlwire.control_table import all_tables, find_table
 
 AX = find_table("AX-12A")

@@ -4,7 +4,7 @@ from pathlib import Path
 
 import pytest
 
-from dxlrun.compile.robot import compile_files
+from dxlrun.compile.robot_compiler import compile_files
 from dxlrun.errors import InputError
 
 HUMANOID = Path(__file__).parents[2] / "robots" / "humanoid_20.yaml"

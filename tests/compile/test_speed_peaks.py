@@ -8,8 +8,8 @@ from pathlib import Path
 
 import pytest
 
-from dxlrun.compile.robot import compile_robot
-from dxlrun.control.controllers.plugins import load_plugins
+from dxlrun.compile.robot_compiler import compile_robot
+from dxlrun.control.controllers.plugin_loading import load_plugins
 from dxlrun.description.motion import read_motion
 from dxlrun.description.reading import read_robot
 from dxlrun.errors import InputError, Problem

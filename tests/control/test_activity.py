@@ -14,9 +14,9 @@ from functools import partial
 import pytest
 from tests.kit.loops import Scripted, on_update
 
-from dxlrun.channels.events import EventCode
+from dxlrun.channels.event_records import EventCode
 from dxlrun.channels.heartbeat import ControllerMethod, Heartbeat, create
-from dxlrun.control import realtime
+from dxlrun.control import realtime_grants
 from dxlrun.control.controllers.activity import Activity
 from dxlrun.errors import ControllerFault
 
@@ -153,7 +153,7 @@ def no_thread_ends():
     counts = []
     while len(counts) < 20 or len(set(counts[-20:])) > 1:
         time.sleep(0.005)
-        counts.append(realtime.thread_count())
+        counts.append(realtime_grants.thread_count())
 
 
 def test_the_count_sees_a_thread_of_foreign_machine_code(page, no_thread_ends):
@@ -162,7 +162,7 @@ def test_the_count_sees_a_thread_of_foreign_machine_code(page, no_thread_ends):
     go = threading.Event()
     body = run(lambda _: go.wait() and None)
     handle = ctypes.c_ulong()
-    activity = Activity(page, realtime.thread_count)
+    activity = Activity(page, realtime_grants.thread_count)
     begin = partial(libc.pthread_create, ctypes.byref(handle), None, body, None)
     assert breach(activity, begin) == f"started 1 thread {NEVER}"
     go.set()

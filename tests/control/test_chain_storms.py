@@ -14,8 +14,8 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from tests.kit.loops import PERIOD_NS, Robot
 
-from dxlrun.channels.answers import Code, Done
-from dxlrun.channels.events import EventCode
+from dxlrun.channels.answers import Code, Completion
+from dxlrun.channels.event_records import EventCode
 from dxlwire.modes import Mode
 
 GRAPHS = int(os.environ.get("DXLRUN_CHAIN_STORMS", "120"))
@@ -175,7 +175,7 @@ class Judge:
 
     def judge_answer(self, number, cycle, activate, deactivate, faults) -> None:
         answer = self.robot.inbox.answers.get(number)
-        if not isinstance(answer, Done):
+        if not isinstance(answer, Completion):
             at_once = answer is not None and answer.code not in LATE
             self.refused += at_once
             if at_once and cycle not in faults and self.alone(number, cycle):

@@ -6,9 +6,9 @@ import numpy as np
 import pytest
 from tests.kit.loops import PERIOD_NS, Robot, on_update
 
-from dxlrun.channels.answers import Code, Done, Waiting
+from dxlrun.channels.answers import Acceptance, Code, Completion
 from dxlrun.channels.cycle import Clamp, Torque
-from dxlrun.channels.events import EventCode
+from dxlrun.channels.event_records import EventCode
 from dxlrun.errors import ControllerFault
 
 NAN = np.nan
@@ -76,7 +76,7 @@ def test_the_lower_end_enters_with_the_upper_one_first(story):
     story.chain(active=False).run(6, {2: story.switches(["upper"])})
     assert [story.active(cycle) for cycle in (1, 2)] == [[], ["lower", "upper"]]
     assert story.order("activate") == ["lower", "upper"]
-    assert story.answer() == Done(2)
+    assert story.answer() == Completion(2)
     assert story.column("position", 0)[2] == 0.4
 
 
@@ -120,7 +120,7 @@ def test_both_ends_leave_together_the_upper_one_first(story):
 
 def test_a_chain_begins_anew_together(story):
     story.chain().run(6, {2: story.switches(["upper"], ["lower", "upper"])})
-    assert story.answer() == Done(2)
+    assert story.answer() == Completion(2)
     assert story.active(2) == ["lower", "upper"]
     assert story.order("activate") == ["lower", "upper"] * 2
 
@@ -130,7 +130,7 @@ def test_the_upper_end_leaves_alone_and_the_lower_one_has_no_references(story):
     assert story.active(3) == ["lower"]
     assert story.reference(2) == [0.4, 0.4]
     assert np.isnan(story.reference(3)).all()
-    assert story.answer(2) == Done(4), "and takes commands"
+    assert story.answer(2) == Completion(4), "and takes commands"
 
 
 def test_another_one_takes_over_the_references_in_one_cycle(story):
@@ -380,14 +380,14 @@ def slow(story, cycles, stubborn=()):
 
 def test_a_chain_enters_together_when_the_modes_of_its_lower_end_are_there():
     story, answers = effort_chain(3), []
-    keep = story.inbox.answer
-    story.inbox.answer = lambda number, answer: (answers.append(answer), keep(number, answer))
+    keep = story.inbox.answer_command
+    story.inbox.answer_command = lambda number, answer: (answers.append(answer), keep(number, answer))
     story.run(12, {2: story.switches(["upper"], ["direct"])})
     states = [story.active(cycle) for cycle in range(8)]
     entered = states.index(["lower", "upper"])
     assert states[:entered] == [["direct"]] * 2 + [[]] * (entered - 2)
     assert entered > 4
-    assert answers == [Waiting(("lower", "upper")), Done(entered)]
+    assert answers == [Acceptance(("lower", "upper")), Completion(entered)]
 
 
 def test_while_a_chain_waits_neither_end_can_be_taken_from_the_other():
@@ -406,7 +406,7 @@ def test_waiting_chain_can_be_restarted_as_a_whole():
     story, both = effort_chain(4), ["lower", "upper"]
     story.run(14, {2: story.switches(["upper"], ["direct"]), 4: story.switches(both, both)})
     assert story.answer(1) == (Code.SWITCHED_AGAIN, {"controller": "lower"})
-    assert isinstance(story.answer(2), Done)
+    assert isinstance(story.answer(2), Completion)
     assert story.active(13) == both
     assert story.order("activate") == ["direct", *both]
 
@@ -470,7 +470,7 @@ def loaded(story, at=(), **options):
 
 def test_a_controller_that_is_loaded_may_command_references(story):
     answer = loaded(story, {7: story.switches(["extra"], ["upper"])}, **UPPER)
-    assert isinstance(answer, Done)
+    assert isinstance(answer, Completion)
     assert story.active(8) == ["lower", "extra"]
     assert story.column("position", 0)[8] == 0.4
 
@@ -499,7 +499,7 @@ def test_the_lower_end_of_one_that_is_loaded_is_not_unloaded(story):
     load = story.loads("lower", active=False, **LOWER)
     story.chain(active=False).run(9, {2: story.asks("pause"), 3: unload, 6: [load, story.asks("resume")]})
     assert story.answer(2) == commanded("lower", "upper", "unload upper first")
-    assert all(isinstance(story.answer(number), Done) for number in (3, 4, 5))
+    assert all(isinstance(story.answer(number), Completion) for number in (3, 4, 5))
 
 
 def test_a_rate_at_which_a_lower_end_is_slower_than_the_upper_one_is_refused(story):
@@ -507,4 +507,4 @@ def test_a_rate_at_which_a_lower_end_is_slower_than_the_upper_one_is_refused(sto
     story.run(6, {2: story.asks("rate", rate=100.0), 3: story.asks("rate", rate=50.0)})
     code, fields = story.answer()
     assert (code, fields["controller"], fields["upper"]) == (Code.RATE_BELOW_UPPER, "lower", "upper")
-    assert isinstance(story.answer(2), Done)
+    assert isinstance(story.answer(2), Completion)

@@ -84,14 +84,14 @@ def test_what_is_read_without_a_claim_is_of_this_cycle(robot):
     look = on_update(lambda context, *_: seen.append(context.reads.copy()))
     robot.script("eye", look, joints=(), command=(), reads=tuple(reads.split()))
     robot.script("lower", following, **LOWER).script("upper", commanding(position=0.3), **UPPER).build()
-    states, read = robot.record.states, robot.hardware.read
+    states, read = robot.record.states, robot.hardware.read_states
     states.velocity[0], states.effort[1], states.temperature[0] = 2.0, 0.5, 41.0
 
     def hardware_read():
         read()
         states.age_ns[:] = [-1, 3_000_000]
 
-    robot.hardware.read = hardware_read
+    robot.hardware.read_states = hardware_read
     robot.run(1)
     here = float(states.position[1])
     np.testing.assert_allclose(seen[0], [0.3, here, 2.0, 0.003, NAN, 41.0, 0.5])

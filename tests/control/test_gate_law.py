@@ -13,7 +13,7 @@ from dxlrun.channels.cycle import Torque
 from dxlrun.control import gate
 from dxlrun.plan.loop_plan import JointPlan
 from dxlwire.compiled import load_compiled
-from dxlwire.errors import NotCompiled
+from dxlwire.exceptions import NotCompiled
 from dxlwire.joint_unit import LINEAR, ROTARY
 from dxlwire.modes import Mode
 
@@ -72,7 +72,7 @@ def test_goals_and_what_was_done_are_those_of_the_law(seed, count, cycles):
         rig.states.velocity[:] = [joint.velocity for joint in joints]
         dt_ns = random.choice(DT_NS)
         commands = np.array([joint.commands for joint in joints]).T
-        rig.record.renew()
+        rig.record.reset_counts()
         rig.cycle(dt_ns, commands)
         passes = [joint.begin(dt_ns) for joint in joints]
         for joint in joints:

@@ -12,14 +12,14 @@ import pytest
 from pydantic import Field
 from tests.kit.loops import PERIOD_NS, Hardware, Robot
 
-from dxlrun.channels.answers import Code, Done
+from dxlrun.channels.answers import Code, Completion
 from dxlrun.channels.commands import data_of
 from dxlrun.channels.cycle import CycleLayout, CycleRecord, Torque
-from dxlrun.channels.events import RUN_ENDED, EventCode, GoalReport
+from dxlrun.channels.event_records import RUN_ENDED, EventCode, GoalReport
 from dxlrun.contract.controller import LIVE, CommandModel, Controller, Interfaces, Outcome, ParametersModel
-from dxlrun.control.controllers.goals import KEPT, Commanded, Goals, GoalStatus
-from dxlrun.control.controllers.plugins import controller_breach
-from dxlrun.control.controllers.topics import TopicLog
+from dxlrun.control.controllers.goal_registry import KEPT, CurrentCommands, GoalRegistry, GoalStatus
+from dxlrun.control.controllers.plugin_loading import controller_breach
+from dxlrun.control.controllers.published_topics import TopicLog
 from dxlrun.messages.declared import declared_message
 from dxlrun.plan.loop_plan import JointPlan
 
@@ -101,7 +101,7 @@ class Story(Robot):
         self.given = []
         self.script("leg", self._leg, joints=("j1",))
         self.reports = []
-        self.emit, self.events.emit = self.events.emit, self._emit
+        self.emit, self.events.emit_event = self.events.emit_event, self._emit
 
     def _leg(self, controller, step, time_ns, value):
         if step == "command":
@@ -161,13 +161,13 @@ def test_a_goal_has_a_number_and_a_result(story):
     first, last = story.reports[1][1], story.reports[-1][1]
     assert first == GoalReport(1, "arm", "move", "anna", "reached", "after 0.040 s")
     assert (last.goal, last.origin) == (3, "motion.yaml:7:5")
-    assert story.answer() == Done(2, goals=(1,))
+    assert story.answer() == Completion(2, goals=(1,))
     assert story.done("goal")[:2] == [(1, "move", [3.0]), (2, "move", [1.0])]
 
 
 def test_a_command_that_is_no_goal_goes_on_command_and_has_no_number(story):
     story.run(4, {2: story.posts("arm", "nudge")})
-    assert story.answer() == Done(2)
+    assert story.answer() == Completion(2)
     assert (story.done("command"), story.statuses) == ([("nudge",)], [])
 
 
@@ -184,7 +184,7 @@ def test_each_goal_takes_the_place_of_the_one_before(story):
 def test_a_cancelled_goal_ends_when_its_controller_is_at_rest(story, which):
     story.run(8, {1: story.moves(50), 3: story.cancels(**which)})
     assert story.timed == [(1, "accepted"), (4, "cancelled")]
-    assert story.answer(2) == Done(3)
+    assert story.answer(2) == Completion(3)
 
 
 def test_a_cancel_that_comes_twice_is_refused_with_one_sentence(story):
@@ -366,9 +366,11 @@ def test_a_goal_that_a_limp_joint_misses_is_aborted_because_of_it(torque, outcom
     seen = []
     record = CycleRecord(CycleLayout(("j0",), ("arm",)))
     record.states.torque[:], record.states.valid[:] = torque, True
-    events = type("Events", (), {"emit": lambda self, *event: seen.append(event)})()
+    events = type("Events", (), {"emit_event": lambda self, *event: seen.append(event)})()
     joints = (JointPlan("j0", -1.0, 1.0, None),)
-    goal = Goals(record, events, joints, lambda controller: Commanded(("j0",))).accept("arm", "move", "anna")
+    goal = GoalRegistry(record, events, joints, lambda controller: CurrentCommands(("j0",))).accept_goal(
+        "arm", "move", "anna"
+    )
     goal.end(Outcome.MISSED, "", "j0", 0.2)
     assert goal.outcome == outcome
     assert ("j0 is limp" in seen[-1][1].text) is (outcome == "aborted")
@@ -384,7 +386,7 @@ def changes(story, values):
 def test_live_parameters_change_together_at_one_cycle(story):
     story.run(5, {3: changes(story, {"speed": 0.5, "careful": True, "gains.p": 4.0})})
     assert story.done("parameters") == [(Speeds(speed=0.5, careful=True, gains=Gains(p=4.0)),)]
-    assert story.answer() == Done(3)
+    assert story.answer() == Completion(3)
     assert story.events.of(EventCode.PARAMETERS) == [("arm", "speed = 0.5, careful = 1, gains.p = 4")]
     assert story.taken[0].kind == "parameters"
 
@@ -471,7 +473,7 @@ ARM = ("arm", "move", (0,), ([4.0],), 0)
 
 def test_the_parts_of_a_motion_begin_in_one_cycle_and_are_goals(story):
     story.run(12, {2: plays(story, LEG, ARM)})
-    assert story.answer() == Done(2, goals=(1, 2))
+    assert story.answer() == Completion(2, goals=(1, 2))
     assert story.given == [(2, [1.0]), (3, [2.0]), (6, [3.0])]
     assert story.done("goal") == [(2, "move", [4.0])]
     assert [(cycle, one.goal, one.status) for cycle, one in story.reports] == [
@@ -480,7 +482,7 @@ def test_the_parts_of_a_motion_begin_in_one_cycle_and_are_goals(story):
     assert story.manager._motions == {}
     (taken,) = story.taken
     assert (taken.kind, taken.numbers.tolist()) == ("play", [1.0, 2.0, 3.0, 4.0])
-    assert data_of("", taken.text, taken.numbers) == taken.data
+    assert data_of("", taken.data_text, taken.numbers) == taken.data
     assert len(story.events.texts(EventCode.STEERED)[0]) < 400
 
 
@@ -513,10 +515,10 @@ def test_joint_with_a_velocity_command_is_not_at_rest(commanded, outcome):
     record = CycleRecord(CycleLayout(("j0",), ("arm",)))
     record.states.torque[:], record.states.valid[:] = Torque.ON, True
     record.states.position[:] = record.states.velocity[:] = 0.0
-    events = type("Events", (), {"emit": lambda self, *event: None})()
-    velocities = Commanded(("j0",), velocities=np.array([commanded]))
-    goals = Goals(record, events, (JointPlan("j0", -1.0, 1.0, None),), lambda controller: velocities)
-    goal = goals.accept("arm", "move", "anna")
+    events = type("Events", (), {"emit_event": lambda self, *event: None})()
+    velocities = CurrentCommands(("j0",), velocities=np.array([commanded]))
+    goals = GoalRegistry(record, events, (JointPlan("j0", -1.0, 1.0, None),), lambda controller: velocities)
+    goal = goals.accept_goal("arm", "move", "anna")
     goal.judge(np.array([np.nan]))
     goals.time_ns = 2_000_000_000
     goals.judge_running()
@@ -550,7 +552,7 @@ def test_reached_is_judged_by_what_the_controller_commands(story, monkeypatch):
             self.goal = None
 
     story.mover.update = update
-    monkeypatch.setattr(Hardware, "read", lambda self: None)
+    monkeypatch.setattr(Hardware, "read_states", lambda self: None)
     story.run(70, {2: story.moves(1)})
     assert story.timed == [(2, "accepted"), (52, "missed")]
     assert story.reports[-1][1].text == "after 1.000 s, joint j0 is 8.59 deg off"
@@ -565,7 +567,7 @@ def judged_off(story, monkeypatch):
             self.goal = None
 
     story.mover.update = update
-    monkeypatch.setattr(Hardware, "read", lambda self: None)
+    monkeypatch.setattr(Hardware, "read_states", lambda self: None)
 
 
 def test_a_stop_in_the_settling_time_aborts_the_goal_and_does_not_fail_it(story, monkeypatch):

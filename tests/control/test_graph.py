@@ -9,7 +9,15 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from dxlrun.control.controllers.graph import Edge, above, below, circles, drawn, edges, update_order
+from dxlrun.control.controllers.update_order import (
+    UpdateEdge,
+    above,
+    below,
+    circles,
+    drawn,
+    edges,
+    update_order,
+)
 
 
 @dataclass(frozen=True)
@@ -37,10 +45,10 @@ def test_a_reader_of_a_reference_is_updated_after_all_that_command_it():
         Node("right", ("pid",)),
     ]
     assert edges(nodes) == (
-        Edge("left", "pid"),
-        Edge("right", "pid"),
-        Edge("left", "watch"),
-        Edge("right", "watch"),
+        UpdateEdge("left", "pid"),
+        UpdateEdge("right", "pid"),
+        UpdateEdge("left", "watch"),
+        UpdateEdge("right", "watch"),
     )
     assert update_order(nodes) == ("left", "right", "watch", "pid")
 

@@ -4,9 +4,9 @@ import numpy as np
 import pytest
 from tests.kit.loops import Robot, commanding
 
-from dxlrun.channels.answers import Code, Done, Refusal, Waiting
+from dxlrun.channels.answers import Acceptance, Code, Completion, Refusal
 from dxlrun.channels.cycle import Torque
-from dxlrun.channels.events import EventCode
+from dxlrun.channels.event_records import EventCode
 from dxlrun.plan.policy_plan import SLOW_SPEED
 from dxlwire.modes import Mode
 
@@ -29,7 +29,7 @@ class Story(Robot):
         super().build(**plan)
         self.states = self.record.states
         self.states.torque[:] = Torque.ON
-        for name in ("set_register", "switch_torque", "reboot", "read_register"):
+        for name in ("write_register", "switch_torque", "reboot_servo", "read_register"):
             setattr(self.hardware, name, lambda *words: self.asked.append(words))
         return self
 
@@ -74,7 +74,7 @@ def test_a_free_joint_is_switched_and_answered_when_it_is_done(story):
 
     story.run(6, {1: story.torques("j2"), 2: look, 3: story.done(), 4: look})
     assert story.what == [(2, False)]
-    assert answers == [Waiting(()), Done(2)]
+    assert answers == [Acceptance(()), Completion(2)]
     assert story.events.texts(EventCode.STEERED) == ['torque {"joints":["j2"],"on":false} from anna']
 
 
@@ -137,7 +137,7 @@ def test_a_controller_is_activated_when_the_joint_has_torque_again(story):
     story.run(9, at | {5: story.shows(2, torque=Torque.ON), 6: switch})
     codes = [one.code if isinstance(one, Refusal) else type(one) for one in story.inbox.answers.values()]
     # the run ended before the servo had its torque
-    assert codes == [Done, Code.RUN_ENDING, Code.JOINT_LIMP, Done]
+    assert codes == [Completion, Code.RUN_ENDING, Code.JOINT_LIMP, Completion]
 
 
 @pytest.mark.parametrize(
@@ -173,7 +173,7 @@ def test_what_went_wrong_with_one_of_several_is_the_answer(story):
         story.done(which=2)()
 
     story.run(5, {1: story.torques("j0", "j1", "j2", release=True), 3: answer})
-    assert waits == [Waiting(())]
+    assert waits == [Acceptance(())]
     assert story.answer() == (Code.TORQUE_NOT_SWITCHED, {"joint": ("j1",), "problem": why})
 
 
@@ -202,10 +202,10 @@ def test_a_register_is_answered_when_the_servo_has_it_and_not_before(story):
     story.run(6, {1: [write, read], 4: settled})
     assert answers == [{}]
     assert story.what == [(1, "p_gain", 40), (1, "p_gain")]
-    assert [story.answer(number) for number in (1, 2)] == [Done(3, value=32), Done(3, value=40)]
+    assert [story.answer(number) for number in (1, 2)] == [Completion(3, value=32), Completion(3, value=40)]
     text = 'register {"joint":"j1","item":"p_gain","value":40}'
     assert story.events.texts(EventCode.STEERED)[0] == f"{text} from anna"
-    assert (story.taken[0].cycle, story.taken[0].text) == (1, text.removeprefix("register "))
+    assert (story.taken[0].cycle, story.taken[0].data_text) == (1, text.removeprefix("register "))
 
 
 @pytest.mark.parametrize(
@@ -277,7 +277,7 @@ def test_the_goal_of_a_limp_joint_follows_it_and_its_first_goals_with_torque_are
 
 def _let_lie(story):
     """Let joints be where they are put from now on."""
-    story.hardware.read = lambda: None
+    story.hardware.read_states = lambda: None
 
 
 def test_a_commanded_joint_that_gets_torque_begins_where_it_is(story):

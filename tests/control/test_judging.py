@@ -8,9 +8,9 @@ import numpy as np
 import pytest
 
 from dxlrun.channels.cycle import CycleLayout, CycleRecord, Torque
-from dxlrun.channels.events import EventBody
+from dxlrun.channels.event_records import EventBody
 from dxlrun.contract.controller import GoalTolerances, Outcome
-from dxlrun.control.controllers.goals import Commanded, Goals, RunningGoal
+from dxlrun.control.controllers.goal_registry import CurrentCommands, GoalRegistry, RunningGoal
 from dxlrun.plan.loop_plan import JointPlan
 
 PERIOD_NS = 20_000_000
@@ -33,13 +33,13 @@ class Judged:
         self.record.period_ns = PERIOD_NS
         self.states = self.record.states
         self.states.motion[:], self.states.valid[:], self.states.torque[:] = 0.0, True, Torque.ON
-        self.goals = Goals(self.record, self, plans, lambda controller: Commanded(("a", "b")))
+        self.goals = GoalRegistry(self.record, self, plans, lambda controller: CurrentCommands(("a", "b")))
 
-    def emit(self, source: str, event: EventBody, data: bytes = b"") -> None:
+    def emit_event(self, source: str, event: EventBody, data: bytes = b"") -> None:
         self.events.append(event.text)
 
     def accept(self) -> RunningGoal:
-        return self.goals.accept("arm", "move", "anna")
+        return self.goals.accept_goal("arm", "move", "anna")
 
     def cycles(self, count: int) -> None:
         for _ in range(count):

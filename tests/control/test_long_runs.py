@@ -82,7 +82,7 @@ def test_the_phase_is_kept_exactly_through_overruns_rates_and_pauses(policy):
         if counts["cycles"] == CYCLES:
             robot.stop.request()
 
-    robot.sink.append, robot.hardware.idle = append, before
+    robot.sink.append_cycle, robot.hardware.idle = append, before
     robot.hardware.work_ns = lambda: int(chance.expovariate(1 / 3e7)) if chance.random() < 0.05 else 1000
     assert robot.loop.run().cycles == counts["cycles"] == CYCLES + 1
     assert counts["skipped"] > CYCLES // 200

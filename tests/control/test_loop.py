@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from tests.kit.loops import PERIOD_NS
 
-from dxlrun.channels.events import EventCode, Severity
+from dxlrun.channels.event_records import EventCode, Severity
 from dxlrun.errors import PortError
 
 
@@ -14,7 +14,7 @@ def test_the_phase_stays_and_every_period_is_accounted_for(robot):
     """100,000 periods with random overruns: what ran plus what was skipped is what passed."""
     periods, chance, seen = 100_000, random.Random(7), []
     robot.script("idle", joints=("j0",), command=()).build(end_ns=periods * PERIOD_NS).keep_nothing()
-    robot.sink.append = lambda record: seen.append(
+    robot.sink.append_cycle = lambda record: seen.append(
         (record.cycle, record.scheduled_ns, record.woken_ns, record.skipped, record.period_ns)
     )
     robot.hardware.work_ns = lambda: int(chance.expovariate(1 / PERIOD_NS)) if chance.random() < 0.2 else 1000
@@ -85,7 +85,7 @@ def test_a_stop_ends_after_a_whole_cycle(robot):
     assert robot.events.seen[-1][:2] == (EventCode.LOOP_STOPPED, Severity.INFO)
 
 
-@pytest.mark.parametrize("step", ["read", "write", "idle"])
+@pytest.mark.parametrize("step", ["read_states", "write_goals", "idle"])
 def test_a_lost_port_ends_the_loop_with_a_sentence(robot, step):
     robot.script("idle").build()
     calls = []

@@ -6,9 +6,9 @@ import numpy as np
 import pytest
 from tests.kit.loops import PERIOD_NS, Robot, Scripted, commanding, on_update
 
-from dxlrun.channels.events import EventCode
+from dxlrun.channels.event_records import EventCode
 from dxlrun.control.controllers.claims import Conflict, conflicts
-from dxlrun.control.controllers.managed import TRANSITIONS, Event, State
+from dxlrun.control.controllers.managed import TRANSITIONS, ControllerEvent, State
 from dxlrun.errors import ControllerFault, PlugInError
 
 NAN = np.nan
@@ -249,14 +249,16 @@ def test_joints_of_a_faulty_controller_stop_where_the_gate_last_let_them():
 def test_every_event_leads_from_every_state_to_another_or_is_a_fault(robot, state):
     robot.script("one").build()
     managed = robot.manager._named["one"]
-    for event in Event:
+    for event in ControllerEvent:
         managed.state, after = state, TRANSITIONS[state].get(event)
         if after is not None:
             managed.on(event)
             assert managed.state is after
             assert robot.record.active == (after is State.ACTIVE)
             continue
-        assert event in (Event.ENTER, Event.COMMAND), "what is called without a fallback fits every state"
+        assert event in (ControllerEvent.ENTER, ControllerEvent.COMMAND), (
+            "what is called without a fallback fits every state"
+        )
         with pytest.raises(ControllerFault, match=f"one is {state.value}, where {event.value} cannot happen"):
             managed.on(event)
         assert managed.state is state

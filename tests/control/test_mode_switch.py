@@ -8,8 +8,8 @@ import numpy as np
 import pytest
 from tests.kit.loops import PERIOD_NS, Robot, commanding, plan_of
 
-from dxlrun.channels.answers import Code, Done, Waiting
-from dxlrun.channels.events import EventCode
+from dxlrun.channels.answers import Acceptance, Code, Completion
+from dxlrun.channels.event_records import EventCode
 from dxlrun.control.controllers.claims import claimed_modes, start_modes
 from dxlrun.control.controllers.switching import MODE_TIMEOUT_NS
 from dxlrun.plan.loop_plan import JointPlan
@@ -35,13 +35,13 @@ class Story(Robot):
         """Run so many cycles; joints change their modes in `slow` of them."""
         self.build()
         self.hardware.mode_cycles = lambda: slow
-        keep = self.inbox.answer
+        keep = self.inbox.answer_command
 
         def answer(number: int, given: Any) -> None:
             self.answered.append((self.record.cycle, given))
             keep(number, given)
 
-        self.inbox.answer = answer  # type: ignore[method-assign]
+        self.inbox.answer_command = answer  # type: ignore[method-assign]
         return self.run(cycles, dict(at))
 
     def refused(self) -> list[str]:
@@ -57,7 +57,7 @@ def test_the_leaving_one_is_out_at_once_and_the_entering_one_waits_for_its_modes
     story.through(10, {2: story.switches(["wheels"], ["arm"])})
     active = [story.active(cycle) for cycle in range(10)]
     assert active == [["arm"]] * 2 + [[]] * 4 + [["wheels"]] * 4
-    assert story.answered == [(2, Waiting(("wheels",))), (6, Done(6))]
+    assert story.answered == [(2, Acceptance(("wheels",))), (6, Completion(6))]
     assert story.hardware.asked == [[VELOCITY, VELOCITY]]
     assert story.events.of(EventCode.MODE) == [("wheels", "waits until its joints are in their modes")]
     assert story.record.goals.velocity.tolist() == [0.1, 0.1]
@@ -81,7 +81,7 @@ def test_joints_that_never_come_into_their_modes_keep_the_controller_out(story):
     late = "press: press is not activated: j1 did not enter effort mode within 5 s"
     assert (story.result.reason, story.refused()) == ("stopped", [late])
     (_, waiting), (_, given_up) = story.answered
-    assert waiting == Waiting(("press",))
+    assert waiting == Acceptance(("press",))
     assert (given_up.code, given_up.fields["controller"]) == (Code.MODE_NOT_ENTERED, ("press",))
     assert story.active(-1) == []
     assert story.hardware.asked == [[0, EFFORT], [0, POSITION]]
@@ -99,7 +99,7 @@ def test_a_joint_that_refuses_its_mode_keeps_the_controller_out_at_once(story):
 def test_a_waiting_controller_can_be_deactivated_and_its_joints_go_to_rest(story):
     story.through(12, {2: story.switches(["press"], ["arm"]), 4: story.switches(["arm"], ["press"])})
     assert story.answer(1) == (Code.SWITCHED_AGAIN, {"controller": "press"})
-    assert story.answer(2) == Done(8)
+    assert story.answer(2) == Completion(8)
     assert story.hardware.asked == [[0, EFFORT], [0, POSITION]]
     assert story.active(-1) == ["arm"]
     assert not story.refused()
@@ -109,9 +109,9 @@ def test_a_switch_continues_without_a_waiting_controller_that_is_deactivated(sto
     story.script("left", HOLDS, joints=("j0",), command=("velocity",), **SPARE)
     both, one = story.switches(["left", "press"], ["arm"]), story.switches([], ["press"])
     story.through(16, {2: both, 4: one})
-    assert [type(given) for _, given in story.answered] == [Waiting, Done, Done]
+    assert [type(given) for _, given in story.answered] == [Acceptance, Completion, Completion]
     assert story.active(-1) == ["left"]
-    assert isinstance(story.inbox.answers[1], Done)
+    assert isinstance(story.inbox.answers[1], Completion)
 
 
 def test_a_waiting_controller_has_its_joints_and_gets_no_commands_yet(story):

@@ -11,9 +11,9 @@ from msgspec.structs import replace
 from tests.kit.loops import loop_plan
 
 from dxlrun.channels.cycle import CycleRecord
-from dxlrun.channels.events import EventCode, Severity, event_text
+from dxlrun.channels.event_records import EventCode, Severity, event_text
 from dxlrun.control.monitors import build_monitors
-from dxlrun.control.monitors.monitor import MonitorStage
+from dxlrun.control.monitors.monitor_stage import MonitorStage
 from dxlrun.control.monitors.policy_actions import PolicyActions
 from dxlrun.features.feature import Feature, S
 from dxlrun.features.lost_servos import LostServos
@@ -51,7 +51,7 @@ class FarJoints:
         """Return a monitor for every robot."""
         return cls(actions)
 
-    def check(self, time_ns: int) -> None:
+    def check_cycle(self, time_ns: int) -> None:
         """Act by the time."""
         if time_ns > 0.5e9 * ENDS_S and not self.limp:
             self.limp = True
@@ -67,7 +67,7 @@ class Broken(FarJoints):
 
     error: BaseException = ValueError("no such joint")
 
-    def check(self, time_ns: int) -> None:
+    def check_cycle(self, time_ns: int) -> None:
         """Raise by the time."""
         if time_ns > 1e9 * ENDS_S:
             raise self.error

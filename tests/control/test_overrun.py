@@ -6,8 +6,8 @@ from tests.kit.loops import PERIOD_NS
 from tests.kit.stories import plugin_folder
 
 from dxlrun.channels.answers import Code
-from dxlrun.channels.events import EventCode, Severity
-from dxlrun.control.controllers.plugins import OverrunHook, load_plugins
+from dxlrun.channels.event_records import EventCode, Severity
+from dxlrun.control.controllers.plugin_loading import OverrunHook, load_plugins
 
 CAUGHT_UP, SKIPPED = [0, 1, 2, 3, 4, 5], [0, 1, 4, 5]
 

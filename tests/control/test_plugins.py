@@ -5,7 +5,7 @@ import sys
 import pytest
 from tests.kit.packages import installing
 
-from dxlrun.control.controllers.plugins import load_plugins
+from dxlrun.control.controllers.plugin_loading import load_plugins
 
 GOOD = """
 from dxlrun import Controller, Interfaces, hookimpl

@@ -13,8 +13,8 @@ import threading
 
 import pytest
 
-from dxlrun.control import realtime
-from dxlrun.control.realtime import Pacing, overshoot_ns
+from dxlrun.control import realtime_grants
+from dxlrun.control.realtime_grants import Pacing, overshoot_ns
 from dxlrun.plan.loop_plan import SchedulerPlan
 from dxlwire.clock import MonotonicClock
 
@@ -32,7 +32,7 @@ def asked(monkeypatch):
     monkeypatch.setattr(os, "sched_setscheduler", lambda *arguments: calls.append(arguments))
     monkeypatch.setattr(os, "sched_setaffinity", lambda _, cores: calls.append(("cores", cores)))
     monkeypatch.setattr(os, "sched_getaffinity", lambda _: {0, 1, 2, 3})
-    monkeypatch.setattr(realtime, "freeze_collector", lambda: calls.append("gc"))
+    monkeypatch.setattr(realtime_grants, "freeze_collector", lambda: calls.append("gc"))
     return calls
 
 
@@ -46,22 +46,22 @@ def may(monkeypatch):
             resource.RLIMIT_RTPRIO: rtprio,
             resource.RLIMIT_NICE: nice,
         }
-        monkeypatch.setattr(realtime, "has_capability", lambda bit: bit in capabilities)
+        monkeypatch.setattr(realtime_grants, "has_capability", lambda bit: bit in capabilities)
         monkeypatch.setattr(resource, "getrlimit", lambda which: (limits[which],) * 2)
 
     return set_rights
 
 
-SLICE = ["syscall", "syscall"] if os.uname().machine in realtime._SCHED_CALLS else []
+SLICE = ["syscall", "syscall"] if os.uname().machine in realtime_grants._SCHED_CALLS else []
 """What an ordinary process is asked last: a short time slice, and whether it has it."""
 
 
 def test_everything_is_asked_for_and_the_policy_last(asked, may, monkeypatch, tmp_path):
-    may(realtime.IPC_LOCK)
-    monkeypatch.setattr(realtime, "IDLE_LATENCY", tmp_path / "cpu_dma_latency")
-    realtime.IDLE_LATENCY.touch()
+    may(realtime_grants.IPC_LOCK)
+    monkeypatch.setattr(realtime_grants, "IDLE_LATENCY", tmp_path / "cpu_dma_latency")
+    realtime_grants.IDLE_LATENCY.touch()
     plan = SchedulerPlan("fifo", 40, True, cores=(0, 1, 2, 3), idle_latency=True)
-    grants = realtime.apply(plan)
+    grants = realtime_grants.apply_scheduler(plan)
     assert all(grant.granted for grant in grants[1:])
     (pid, policy, parameters) = asked.pop()
     assert (pid, policy, parameters.sched_priority) == (0, os.SCHED_FIFO | os.SCHED_RESET_ON_FORK, 40)
@@ -74,11 +74,11 @@ def test_everything_is_asked_for_and_the_policy_last(asked, may, monkeypatch, tm
         "idle latency",
         "scheduler",
     ]
-    assert struct.unpack("i", realtime.IDLE_LATENCY.read_bytes()) == (0,)
+    assert struct.unpack("i", realtime_grants.IDLE_LATENCY.read_bytes()) == (0,)
 
 
 def test_the_ordinary_policy_asks_for_nothing_that_needs_a_right(asked):
-    realtime.apply(SchedulerPlan("other", 31, False))
+    realtime_grants.apply_scheduler(SchedulerPlan("other", 31, False))
     assert asked == ["gc", "prctl", "mallopt", "mallopt", *SLICE]
 
 
@@ -88,18 +88,18 @@ def refuse(*_):
 
 def test_a_refused_policy_names_the_consequence_and_the_fix(asked, monkeypatch):
     monkeypatch.setattr(os, "sched_setscheduler", refuse)
-    grant = realtime.apply(SchedulerPlan("round_robin", 31, False))[-1]
+    grant = realtime_grants.apply_scheduler(SchedulerPlan("round_robin", 31, False))[-1]
     assert not grant.granted
     assert "round_robin 31 was refused" in grant.sentence
     assert "may delay it" in grant.sentence
     assert "rtprio 32" in grant.fix  # the guardian needs one more
-    assert "rtprio 32" in realtime.apply_to_guardian(32, lock=False)[0].fix
-    assert grant.text == f"{grant.sentence}: {grant.fix}"
+    assert "rtprio 32" in realtime_grants.apply_to_guardian(32, lock=False)[0].fix
+    assert grant.full_sentence == f"{grant.sentence}: {grant.fix}"
 
 
 def test_memory_is_not_locked_where_later_allocations_would_fail(asked, may):
     may()
-    grant = realtime.lock_memory()
+    grant = realtime_grants.lock_memory()
     assert (grant.request, grant.granted) == ("locked memory", False)
     assert "memlock unlimited" in grant.fix
     assert asked == []
@@ -107,7 +107,7 @@ def test_memory_is_not_locked_where_later_allocations_would_fail(asked, may):
 
 def test_an_unlimited_allowance_is_enough_to_lock(asked, may):
     may(memlock=resource.RLIM_INFINITY)
-    assert realtime.apply(SchedulerPlan("other", 31, True))[-1].granted
+    assert realtime_grants.apply_scheduler(SchedulerPlan("other", 31, True))[-1].granted
     assert asked[-1 - len(SLICE)] == "mlockall"
 
 
@@ -126,50 +126,50 @@ def invalid(*_):
 def test_a_core_that_there_is_not_is_named(asked, monkeypatch, asked_for, changed, sentence):
     for name, function in changed.items():
         monkeypatch.setattr(os, name, function)
-    grant = realtime.apply(SchedulerPlan("other", 31, False, cores=asked_for))[2]
+    grant = realtime_grants.apply_scheduler(SchedulerPlan("other", 31, False, cores=asked_for))[2]
     assert (grant.granted, grant.sentence) == (sentence.startswith("stays"), sentence)
 
 
 def test_a_refused_idle_latency_names_the_rule_that_allows_it(asked, monkeypatch):
     monkeypatch.setattr(os, "open", refuse)
-    grant = realtime.apply(SchedulerPlan("other", 31, False, idle_latency=True))[-1]
+    grant = realtime_grants.apply_scheduler(SchedulerPlan("other", 31, False, idle_latency=True))[-1]
     assert (grant.request, grant.granted) == ("idle latency", False)
     assert 'KERNEL=="cpu_dma_latency", OWNER="' in grant.fix
 
 
 def test_another_system_is_a_refusal_and_not_a_crash(asked, may, monkeypatch):
-    may(realtime.IPC_LOCK)
+    may(realtime_grants.IPC_LOCK)
     monkeypatch.setattr(sys, "platform", "plan9")
     monkeypatch.delattr(os, "sched_setscheduler")
     monkeypatch.delattr(os, "sched_setaffinity")
     plan = SchedulerPlan("fifo", 40, True, cores=(1,))
-    for grant in realtime.apply(plan)[1:]:
+    for grant in realtime_grants.apply_scheduler(plan)[1:]:
         assert not grant.granted
         assert "this system does not offer it" in grant.sentence
 
 
 def test_a_c_library_without_mallopt_is_a_refusal(asked, monkeypatch):
-    monkeypatch.setattr(realtime, "libc", object)
-    grant = realtime.apply(SchedulerPlan("other", 31, False))[2]
+    monkeypatch.setattr(realtime_grants, "libc", object)
+    grant = realtime_grants.apply_scheduler(SchedulerPlan("other", 31, False))[2]
     assert (grant.request, grant.granted) == ("memory in place", False)
     assert "mallopt is missing" in grant.sentence
 
 
 def test_the_guardian_asks_for_one_priority_above_the_loop(asked, may):
-    may(realtime.IPC_LOCK)
-    locked, scheduler = realtime.apply_to_guardian(32, lock=True)
+    may(realtime_grants.IPC_LOCK)
+    locked, scheduler = realtime_grants.apply_to_guardian(32, lock=True)
     assert locked.granted
     assert scheduler.sentence == "scheduler round_robin, priority 32"
-    assert realtime.apply_to_guardian(0, lock=False) == ()
+    assert realtime_grants.apply_to_guardian(0, lock=False) == ()
 
 
 @pytest.mark.parametrize(
     ("capabilities", "rtprio", "highest"),
-    [((realtime.SYS_NICE,), 0, 99), ((), 0, 0), ((), 40, 40), ((), resource.RLIM_INFINITY, 99)],
+    [((realtime_grants.SYS_NICE,), 0, 99), ((), 0, 0), ((), 40, 40), ((), resource.RLIM_INFINITY, 99)],
 )
 def test_the_highest_priority_is_what_limit_and_capability_allow(may, capabilities, rtprio, highest):
     may(*capabilities, rtprio=rtprio)
-    assert realtime.highest_priority() == highest
+    assert realtime_grants.highest_priority() == highest
 
 
 def test_a_share_is_raised_as_far_as_the_limit_allows(may):
@@ -177,28 +177,28 @@ def test_a_share_is_raised_as_far_as_the_limit_allows(may):
     with subprocess.Popen([sys.executable, "-c", "input()"], stdin=subprocess.PIPE) as process:
 
         def raised(nice):
-            realtime.raise_share(process.pid, nice)
+            realtime_grants.raise_share(process.pid, nice)
             return os.getpriority(os.PRIO_PROCESS, process.pid)
 
         own = os.getpriority(os.PRIO_PROCESS, 0)
         assert raised(-10) == own
         may(nice=20 - own + 1)
-        assert realtime.lowest_nice() == own - 1
-        may(realtime.SYS_NICE)
+        assert realtime_grants.lowest_nice() == own - 1
+        may(realtime_grants.SYS_NICE)
         if os.geteuid() == 0:  # the right itself, not what this process believes of it
             assert raised(own - 3) == own - 3
             assert raised(own - 1) == own - 3
         assert process.communicate(b"\n")[0] is None
-    realtime.raise_share(process.pid, -10)
+    realtime_grants.raise_share(process.pid, -10)
 
 
 def test_capabilities_are_read_from_the_kernels_mask(tmp_path):
     status = tmp_path / "status"
     status.write_text("Name:\tx\nCapEff:\t0000000000804000\n")
-    assert realtime.has_capability(realtime.SYS_NICE, status)
-    assert realtime.has_capability(realtime.IPC_LOCK, status)
-    assert not realtime.has_capability(12, status)
-    assert not realtime.has_capability(realtime.SYS_NICE, tmp_path / "nothing")
+    assert realtime_grants.has_capability(realtime_grants.SYS_NICE, status)
+    assert realtime_grants.has_capability(realtime_grants.IPC_LOCK, status)
+    assert not realtime_grants.has_capability(12, status)
+    assert not realtime_grants.has_capability(realtime_grants.SYS_NICE, tmp_path / "nothing")
 
 
 # The margin that is polled
@@ -211,7 +211,9 @@ def pacing(most_ns, late, period_ns=20_000_000):
     naps = []
     pace = Pacing(clock, most_ns)
     beats = []
-    grant = pace.measure(period_ns, lambda: beats.append(1), lambda nap: naps.append(nap) or next(turns))
+    grant = pace.measure_margin(
+        period_ns, lambda: beats.append(1), lambda nap: naps.append(nap) or next(turns)
+    )
     assert len(beats) == len(naps) == 32
     assert max(naps) <= period_ns
     return clock, pace, grant
@@ -270,15 +272,17 @@ def outcome(script):
 
 WISHES = """
 import gc, json, os, resource
-from dxlrun.control import realtime
+from dxlrun.control import realtime_grants
 from dxlrun.plan.loop_plan import SchedulerPlan
 {before}
 plan = SchedulerPlan('round_robin', 31, True, cores=(min(os.sched_getaffinity(0)),), idle_latency=True)
-may = (realtime.lockable_bytes() == realtime.UNLIMITED, realtime.highest_priority() >= 31)
-grants = realtime.apply(plan) + realtime.apply_to_guardian(32, True)
+may = (
+    realtime_grants.lockable_bytes() == realtime_grants.UNLIMITED, realtime_grants.highest_priority() >= 31
+)
+grants = realtime_grants.apply_scheduler(plan) + realtime_grants.apply_to_guardian(32, True)
 print(json.dumps({{
-    "granted": [[one.request, one.granted] for one in grants], "told": [one.text for one in grants],
-    "collector": gc.isenabled(), "threads": realtime.thread_count(), "may": may,
+    "granted": [[one.request, one.granted] for one in grants], "told": [one.full_sentence for one in grants],
+    "collector": gc.isenabled(), "threads": realtime_grants.thread_count(), "may": may,
     "policy": os.sched_getscheduler(0) & ~os.SCHED_RESET_ON_FORK, "cores": len(os.sched_getaffinity(0)),
 }}))
 """
@@ -291,16 +295,16 @@ if os.getuid() == 0: os.setuid(65534)
 
 SLICED = """
 import ctypes, json, os
-from dxlrun.control import realtime
+from dxlrun.control import realtime_grants
 from dxlrun.plan.loop_plan import SchedulerPlan
 {before}
-grants = realtime.apply(SchedulerPlan('{policy}', 1, False))
-found = ctypes.create_string_buffer(realtime._SCHED_ATTR.size)
-ctypes.CDLL(None).syscall(realtime._SCHED_CALLS[os.uname().machine][1], 0, found, len(found), 0)
-_, policy, flags, nice, *_, = realtime._SCHED_ATTR.unpack(found.raw)
+grants = realtime_grants.apply_scheduler(SchedulerPlan('{policy}', 1, False))
+found = ctypes.create_string_buffer(realtime_grants._SCHED_ATTR.size)
+ctypes.CDLL(None).syscall(realtime_grants._SCHED_CALLS[os.uname().machine][1], 0, found, len(found), 0)
+_, policy, flags, nice, *_, = realtime_grants._SCHED_ATTR.unpack(found.raw)
 print(json.dumps({{
     "slice": "time slice" in [one.request for one in grants], "policy": policy, "flags": flags, "nice": nice,
-    "runtime": realtime._SCHED_ATTR.unpack(found.raw)[5],
+    "runtime": realtime_grants._SCHED_ATTR.unpack(found.raw)[5],
 }}))
 """
 
@@ -309,7 +313,7 @@ print(json.dumps({{
 @pytest.mark.parametrize("before", ["", "os.nice(5)", "import resource" + NOBODY])
 def test_an_ordinary_process_has_short_slices_where_the_kernel_gives_them(before):
     found = outcome(SLICED.format(before=before, policy="other"))
-    assert found["slice"] == (found["runtime"] == realtime.SLICE_NS)
+    assert found["slice"] == (found["runtime"] == realtime_grants.SLICE_NS)
     nicer = 5 if "nice" in before else 0
     assert (found["policy"], found["nice"]) == (os.SCHED_OTHER, min(os.nice(0) + nicer, 19))
     release = tuple(map(int, re.findall(r"\d+", os.uname().release)[:2]))
@@ -325,10 +329,12 @@ def test_a_process_without_the_real_time_policy_that_it_asked_for_has_short_slic
 
 
 def test_an_unknown_architecture_or_an_older_kernel_has_nothing_to_report(asked, monkeypatch):
-    grants = realtime.apply(SchedulerPlan("other", 31, False))  # the call succeeds and says 0, as before 6.12
+    grants = realtime_grants.apply_scheduler(
+        SchedulerPlan("other", 31, False)
+    )  # the call succeeds and says 0, as before 6.12
     assert "time slice" not in [one.request for one in grants[1:]]
-    monkeypatch.setattr(realtime, "_SCHED_CALLS", {})
-    realtime.apply(SchedulerPlan("other", 31, False))
+    monkeypatch.setattr(realtime_grants, "_SCHED_CALLS", {})
+    realtime_grants.apply_scheduler(SchedulerPlan("other", 31, False))
     assert asked.count("syscall") == len(SLICE)
 
 
@@ -371,7 +377,7 @@ def test_a_real_process_gets_what_its_rights_allow():
 
 FAULTS = """
 import resource
-from dxlrun.control import realtime
+from dxlrun.control import realtime_grants
 {before}
 before = sum(resource.getrusage(resource.RUSAGE_SELF)[6:8])
 for size in range(100_000, 4_000_000, 100_000):
@@ -383,25 +389,26 @@ print(sum(resource.getrusage(resource.RUSAGE_SELF)[6:8]) - before)
 def test_touched_memory_is_there_when_it_is_needed():
     """Arrays that come and go, each bigger than the one before: none misses a page once all was prepared."""
     assert outcome(FAULTS.format(before="")) > 100
-    assert outcome(FAULTS.format(before="realtime.keep_freed(); realtime.touch()")) < 10
+    assert outcome(FAULTS.format(before="realtime_grants.keep_freed(); realtime_grants.touch_memory()")) < 10
 
 
 def test_the_collector_is_off_and_what_lives_is_frozen():
     script = (
-        "import gc, json\nfrom dxlrun.control import realtime\n"
-        "realtime.freeze_collector()\nprint(json.dumps([gc.isenabled(), gc.get_freeze_count() > 1000]))\n"
+        "import gc, json\nfrom dxlrun.control import realtime_grants\n"
+        "realtime_grants.freeze_collector()\n"
+        "print(json.dumps([gc.isenabled(), gc.get_freeze_count() > 1000]))\n"
     )
     assert outcome(script) == [False, True]
     assert gc.isenabled()
 
 
 def test_a_thread_is_counted():
-    before = realtime.thread_count()
+    before = realtime_grants.thread_count()
     go = threading.Event()
     thread = threading.Thread(target=go.wait)
     thread.start()
     try:
-        assert realtime.thread_count() == before + 1
+        assert realtime_grants.thread_count() == before + 1
     finally:
         go.set()
         thread.join()

@@ -9,14 +9,14 @@ import pytest
 
 from dxlrun.control.safe_motion import ARRIVED, MODES_NS, SETTLE_NS, STAND_NS
 from dxlrun.control.steering import PAUSED_CYCLE_NS
-from dxlrun.plan.policy_plan import HOLD, LIMP, SLOW_SPEED, Policy, PolicyPlan, Step
+from dxlrun.plan.policy_plan import HOLD, LIMP, SLOW_SPEED, Policy, PolicyPlan, PolicyStepPlan
 from dxlwire.joint_unit import ROTARY
 from dxlwire.modes import Mode
 
 NEAR = ARRIVED[ROTARY]
 
 PERIOD_NS = 20_000_000
-POSE = Policy((Step("pose home at 60 deg/s", 10**9, (0.3, None), 1.0),), "limp")
+POSE = Policy((PolicyStepPlan("pose home at 60 deg/s", 10**9, (0.3, None), 1.0),), "limp")
 
 
 def drives(self: Any, step: str, time_ns: int, _: object) -> None:
@@ -33,7 +33,7 @@ def ended(robot: Any, command: str, policy: Policy, slow: bool = False) -> list[
     if slow:
         robot.hardware.set_modes = lambda modes: robot.hardware.asked.append(modes.tolist())
     seen: list[list[float]] = []
-    write = robot.hardware.write
+    write = robot.hardware.write_goals
 
     def watched() -> None:
         write()
@@ -41,7 +41,7 @@ def ended(robot: Any, command: str, policy: Policy, slow: bool = False) -> list[
             goals = robot.record.goals
             seen.append([*goals.velocity, *goals.effort, *goals.position])
 
-    robot.hardware.write = watched
+    robot.hardware.write_goals = watched
     assert robot.loop.run().reason == "ended"
     return seen
 
@@ -103,16 +103,16 @@ def test_a_pose_lasts_until_its_joints_are_there_or_settle_time_is_over(robot, o
         record.states.position[0] = goal + off
         record.states.valid[0] = not there or record.woken_ns - there[0] >= valid_after_ns
 
-    robot.hardware.read = read
+    robot.hardware.read_states = read
     assert robot.loop.run().last == "limp"
     assert there[-1] - there[0] == lasts_ns
 
 
 def test_the_second_of_two_poses_is_reached_as_the_first_one_was(robot):
-    poses = tuple(Step(f"pose {end}", 10**9, (end, None), 1.0) for end in (0.3, 0.35))
+    poses = tuple(PolicyStepPlan(f"pose {end}", 10**9, (end, None), 1.0) for end in (0.3, 0.35))
     robot.build(end_ns=PERIOD_NS, policies=PolicyPlan(on_exit=Policy(poses, "limp")))
     seen: list[tuple[int, float]] = []
-    robot.hardware.write = lambda: seen.append((robot.record.woken_ns, robot.record.goals.position[0]))
+    robot.hardware.write_goals = lambda: seen.append((robot.record.woken_ns, robot.record.goals.position[0]))
     robot.loop.run()
     for end in (0.3, 0.35):
         times = [t_ns for t_ns, goal in seen if goal == pytest.approx(end, abs=1e-9)]
@@ -120,7 +120,7 @@ def test_the_second_of_two_poses_is_reached_as_the_first_one_was(robot):
 
 
 def test_less_torque_lasts_its_time_at_each_of_its_steps(robot):
-    step = Step("torque down", 300_000_000, fraction=0.4, levels=3)
+    step = PolicyStepPlan("torque down", 300_000_000, fraction=0.4, levels=3)
     robot.build(end_ns=PERIOD_NS, policies=PolicyPlan(on_exit=Policy((step,), "limp")))
     record, limits = robot.record, []
     robot.hardware.limit_torque = lambda fraction: limits.append((record.woken_ns, round(fraction, 6)))

@@ -119,8 +119,8 @@ class Run:
                 robot.ask(kind, **data)
 
         robot.hardware.idle = idle
-        append = robot.sink.append
-        robot.sink.append = lambda record: (append(record), self.judge(record))
+        append = robot.sink.append_cycle
+        robot.sink.append_cycle = lambda record: (append(record), self.judge(record))
         return robot.loop.run()
 
     def judge(self, record):

@@ -12,7 +12,7 @@ from tests.kit.stories import replayed, send, silence, tell
 from tests.kit.wire import all_writes
 
 from dxlrun.channels.cycle import Clamp
-from dxlrun.channels.events import EventCode, Severity
+from dxlrun.channels.event_records import EventCode, Severity
 from dxlrun.errors import StartUpError
 from dxlrun.plan.loop_plan import JointPlan, ServoLimit
 from dxlrun.testing import VirtualRobot

@@ -4,10 +4,10 @@ import numpy as np
 import pytest
 from tests.kit.loops import PERIOD_NS, Robot, Scripted, commanding, on_update, plan_of
 
-from dxlrun.channels.answers import Code, Done
+from dxlrun.channels.answers import Code, Completion
 from dxlrun.channels.commands import LOOP
 from dxlrun.channels.cycle import Torque
-from dxlrun.channels.events import EventCode
+from dxlrun.channels.event_records import EventCode
 from dxlrun.control.steering import PAUSED_CYCLE_NS
 from dxlrun.errors import PlugInError
 from dxlrun.plan.policy_plan import LIMP, SLOW_SPEED, PolicyPlan
@@ -54,7 +54,7 @@ def test_a_switch_happens_in_one_cycle_or_not_at_all(steered):
     assert steered.steps("left") == [0, 1, 2]
     assert steered.steps("whole") == [3, 4, 5]
     assert steered.steps("left", "deactivate") == steered.steps("whole", "activate") == [3]
-    assert steered.answer() == Done(3)
+    assert steered.answer() == Completion(3)
     assert steered.events.texts(EventCode.STEERED)[0].endswith("from anna")
 
 
@@ -387,22 +387,22 @@ def test_a_controller_that_is_loaded_while_its_servo_is_lost_is_held(steered):
     manager = steered.build().manager
     manager.hold_lost({0}, "all its joints answer again")
     for name, joint in (("extra", "j0"), ("other", "j1")):
-        assert isinstance(manager.load(plan_of(name, type="left", joints=(joint,))), int)
+        assert isinstance(manager.load_controller(plan_of(name, type="left", joints=(joint,))), int)
     assert [manager._named[name].held for name in ("extra", "other")] == [True, False]
 
 
 def test_a_controller_that_is_loaded_anew_after_its_failure_may_stand_in_again():
     robot = Left(fallback="extra")
     manager, extra = robot.build().manager, plan_of("extra", fallback="left", **LEFT)
-    assert manager.load(extra) == 1
+    assert manager.load_controller(extra) == 1
     assert manager.switching.switch_controllers(("extra",), ()) is None
     for failed, stands_in in (("extra", "left"), ("left", "extra")):
         robot.breaks(failed)()
         manager.update(0)
         assert manager.active == (stands_in,)
         if stands_in == "left":
-            assert manager.unload("extra") is None
-            assert manager.load(extra) == 1
+            assert manager.unload_controller("extra") is None
+            assert manager.load_controller(extra) == 1
     assert manager.switching.fault is None
 
 

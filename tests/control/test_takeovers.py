@@ -9,9 +9,9 @@ import pytest
 from tests.kit.loops import PERIOD_NS, Robot, on_update, plan_of
 
 from dxlrun.channels.cycle import Torque
-from dxlrun.channels.events import EventCode
-from dxlrun.control.controllers.claims import Standing, Step, conflicts
-from dxlrun.control.controllers.graph import lowers_first
+from dxlrun.channels.event_records import EventCode
+from dxlrun.control.controllers.claims import ControllerSnapshot, SwitchStep, conflicts
+from dxlrun.control.controllers.update_order import lowers_first
 from dxlrun.plan.loop_plan import ControllerPlan
 from dxlwire.modes import Mode
 
@@ -198,8 +198,8 @@ def test_what_is_active_afterwards_claims_nothing_twice_and_chains_are_whole():
         active: dict[str, ControllerPlan] = {}
         for _ in range(12):
             names = draw.sample(sorted(known), draw.randint(1, 2))
-            step = Standing(known, active).request(names)
-            if not isinstance(step, Step):
+            step = ControllerSnapshot(known, active).request(names)
+            if not isinstance(step, SwitchStep):
                 needed = [known[name] for name in lowers_first(names, known)]
                 assert conflicts(needed), "only what claims the same is refused"
                 continue
@@ -213,8 +213,8 @@ def test_what_is_active_afterwards_claims_nothing_twice_and_chains_are_whole():
                 lowers = [lower for lower in known[name].into if lower in step.leave]
                 assert lowers or conflicts([known[name], *entering])
             if draw.random() < 0.3 and active:
-                leaving = Standing(known, active).switch((), [draw.choice(sorted(active))])
-                if isinstance(leaving, Step):
+                leaving = ControllerSnapshot(known, active).switch((), [draw.choice(sorted(active))])
+                if isinstance(leaving, SwitchStep):
                     active = without(active, leaving.leave)
 
 
@@ -236,12 +236,12 @@ ALL = {
 def takes_over(fallback: str, active: str = "", waiting: str = "", failed: tuple[str, ...] = ()) -> object:
     """Return how a fallback takes over for `high`."""
     engaged = [{name: ALL[name] for name in names.split()} for names in (active, waiting)]
-    return Standing(ALL, *engaged).fall_back(fallback, ["high"], failed)
+    return ControllerSnapshot(ALL, *engaged).fall_back(fallback, ["high"], failed)
 
 
 def test_a_fallback_takes_over_from_those_below_the_one_that_failed():
-    assert takes_over("rest", "low", failed=("high",)) == Step(("low",), ("rest",))
-    assert takes_over("on_low", "low", failed=("high",)) == Step((), ("on_low",))
+    assert takes_over("rest", "low", failed=("high",)) == SwitchStep(("low",), ("rest",))
+    assert takes_over("on_low", "low", failed=("high",)) == SwitchStep((), ("on_low",))
 
 
 @pytest.mark.parametrize(

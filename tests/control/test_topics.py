@@ -11,8 +11,8 @@ from tests.kit.loops import on_update
 
 from dxlrun import ControllerFault, Floats
 from dxlrun.channels.cycle import CycleLayout, CycleRecord
-from dxlrun.channels.messages import LONGEST_MESSAGE, PublishedTopic
-from dxlrun.control.controllers.topics import MOST_PER_CYCLE, TopicLog
+from dxlrun.channels.topic_messages import LONGEST_MESSAGE, PublishedTopic
+from dxlrun.control.controllers.published_topics import MOST_PER_CYCLE, TopicLog
 from dxlrun.messages import Header
 from dxlrun.messages.cdr import Codec
 
@@ -49,7 +49,7 @@ class Stage:
         log = TopicLog(self.record, self.sink, EPOCH_NS)
         self.goals = log.open("/goals", State)
         self.topics = log.of_controller("wave", 1)
-        self.topics.open({"state": State, "other": Header}, "My-Robotics 1.0", ("a", "b"))
+        self.topics.open_topics({"state": State, "other": Header}, "My-Robotics 1.0", ("a", "b"))
 
     def read(self, index: int) -> Any:
         number, _, data = self.sink.messages[index]

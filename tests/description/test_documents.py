@@ -8,17 +8,17 @@ from tests.kit import desk
 from tests.kit.pages import page_text
 
 from dxlrun.cli.examples import schema_text
+from dxlrun.description.base_form import Form
 from dxlrun.description.bus import Adapter, Bus, BusSimulation, SlowRegisters
-from dxlrun.description.form import Form
-from dxlrun.description.joints.joints import Joint, JointSimulation, SharedJoint
-from dxlrun.description.joints.mechanics import (
+from dxlrun.description.joints.joint_forms import Joint, JointSimulation, SharedJoint
+from dxlrun.description.joints.joint_mechanics import (
     GoalTolerance,
     Limits,
     OneOfServos,
     SharedTolerance,
 )
 from dxlrun.description.joints.motor_file import MotorForm, read_motor
-from dxlrun.description.motion import Formula, FormulaPart, Motion, Point, PointsPart, Target
+from dxlrun.description.motion import Formula, FormulaPart, MotionForm, Point, PointsPart, Target
 from dxlrun.description.robot import (
     ControllerEntry,
     Gateway,
@@ -99,7 +99,7 @@ def test_every_part_has_a_table() -> None:
     assert {part.__name__ for part in PARTS} | {"robot", "motor"} == TABLES
 
 
-@pytest.mark.parametrize("part", [*PARTS, robot_form(), SharedJoint, MotorForm, Motion, Point, Target])
+@pytest.mark.parametrize("part", [*PARTS, robot_form(), SharedJoint, MotorForm, MotionForm, Point, Target])
 def test_every_key_is_described(part: type[Form]) -> None:
     for key, field in part.model_fields.items():
         assert field.description, key

@@ -6,7 +6,7 @@ from pathlib import Path
 
 import pytest
 
-from dxlrun.description.mistakes.foreign import ros_type
+from dxlrun.description.mistakes.foreign_files import ros_type
 from dxlrun.description.motion import read_motion
 from dxlrun.description.reading import read_robot
 from dxlrun.errors import InputError

@@ -8,7 +8,7 @@ import pytest
 from pydantic import BaseModel, ConfigDict, Field, ValidationError, field_validator
 
 from dxlrun.description.document import Marks, grow, literal, parse
-from dxlrun.description.problems import problems_of
+from dxlrun.description.form_problems import problems_of
 from dxlrun.description.units import Angle
 from dxlrun.errors import near, suggestion
 

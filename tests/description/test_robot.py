@@ -9,10 +9,10 @@ from pydantic import ValidationError
 from tests.kit import desk
 from tests.kit.desk import TORSO
 
+from dxlrun.description.base_form import Form
 from dxlrun.description.bus import Adapter, Bus
-from dxlrun.description.form import Form
-from dxlrun.description.joints.joints import Joint
-from dxlrun.description.joints.mechanics import Limits
+from dxlrun.description.joints.joint_forms import Joint
+from dxlrun.description.joints.joint_mechanics import Limits
 from dxlrun.description.robot import (
     ControllerEntry,
     Loop,

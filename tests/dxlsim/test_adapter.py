@@ -15,7 +15,7 @@ from dxlsim.bus.simulated_bus import SimulatedBus
 from dxlsim.simulation_plan import AdapterConfig, BusConfig, ServoConfig
 from dxlsim.virtual_ports import VirtualPorts
 from dxlwire.clock import VirtualClock
-from dxlwire.errors import PortError
+from dxlwire.exceptions import PortError
 
 PING_1 = bytes.fromhex("ff ff 01 02 01 fb")
 PONG_1 = bytes.fromhex("ff ff 01 02 00 fc")
@@ -35,7 +35,7 @@ def handed_over(bus: SimulatedBus, until_ns: int = 10**12) -> list[tuple[int, by
     """Take whatever comes as soon as it comes."""
     parts = []
     while (due_ns := bus.next_due_ns()) is not None and due_ns <= until_ns:
-        if data := bus.take(due_ns):
+        if data := bus.drain_bytes(due_ns):
             parts.append((due_ns, data))
     return parts
 
@@ -47,7 +47,7 @@ def notes(bus: SimulatedBus) -> list[str]:
 @pytest.mark.parametrize("timer_ms", [1, 4, 16])
 def test_the_latency_timer_keeps_a_short_reply_back(timer_ms):
     bus = new_bus(AdapterConfig(latency_timer_ns=timer_ms * MS))
-    bus.receive(PING_1, 0)
+    bus.receive_bytes(PING_1, 0)
     assert handed_over(bus) == [(timer_ms * MS, PONG_1)]
     assert [entry.t_ns for entry in bus.ledger.entries] == [
         0,
@@ -59,7 +59,7 @@ def test_a_host_that_requests_at_once_waits_a_whole_timer_for_each_reply():
     bus = new_bus(AdapterConfig(latency_timer_ns=16 * MS))
     now = 0
     for turn in range(1, 9):
-        bus.receive(PING_1, now)
+        bus.receive_bytes(PING_1, now)
         ((now, data),) = handed_over(bus)
         assert (now, data) == (turn * 16 * MS, PONG_1)
 
@@ -79,14 +79,14 @@ def test_the_timer_may_run_out_in_the_middle_of_a_reply():
 
 def test_bytes_one_by_one_come_as_they_pass_the_wire():
     bus = new_bus(AdapterConfig(split="byte"))
-    bus.receive(PING_1, 0)
+    bus.receive_bytes(PING_1, 0)
     first = PONG_ENDS - 5 * BYTE
     assert handed_over(bus) == [(first + index * BYTE, PONG_1[index : index + 1]) for index in range(6)]
 
 
 def test_a_burst_of_the_timer_can_be_split_too():
     bus = new_bus(AdapterConfig(latency_timer_ns=4 * MS, split="byte"))
-    bus.receive(PING_1, 0)
+    bus.receive_bytes(PING_1, 0)
     parts = handed_over(bus)
     assert [data for _, data in parts] == [PONG_1[index : index + 1] for index in range(6)]
     assert parts[0][0] == 4 * MS
@@ -96,8 +96,8 @@ def test_random_pieces_are_drawn_from_the_seed():
     def pieces(seed: int) -> list[int]:
         bus = new_bus(AdapterConfig(split="random", seed=seed))
         for turn in range(20):
-            bus.receive(READ_1, turn * MS * 2)
-            bus.advance(turn * MS * 2 + MS)
+            bus.receive_bytes(READ_1, turn * MS * 2)
+            bus.advance_to(turn * MS * 2 + MS)
         return [len(data) for _, data in handed_over(bus)]
 
     assert pieces(1) == pieces(1)
@@ -122,11 +122,11 @@ def test_every_byte_comes_once_in_order_and_not_before_it_passed(timer_ns, split
         now += len(data) * BYTE
     received = bytearray()
     for t_ns in range(0, now + 17 * MS, look_ns):
-        part = bus.take(t_ns)
+        part = bus.drain_bytes(t_ns)
         for index in range(len(received), len(received) + len(part)):
             assert arrivals[index][0] <= t_ns
         received += part
-    received += bus.take(now + 1000 * MS)
+    received += bus.drain_bytes(now + 1000 * MS)
     assert bytes(received) == bytes(byte for _, byte in arrivals)
     assert bus.next_due_ns() is None
     assert b"".join(each.data for each in bus.ledger.entries if each.direction == "out") == bytes(received)
@@ -134,28 +134,28 @@ def test_every_byte_comes_once_in_order_and_not_before_it_passed(timer_ns, split
 
 def test_an_adapter_that_echoes_gives_the_host_its_own_bytes_first():
     bus = new_bus(AdapterConfig(echo=True))
-    bus.receive(PING_1, 0)
+    bus.receive_bytes(PING_1, 0)
     assert handed_over(bus) == [(6 * BYTE, PING_1), (PONG_ENDS, PONG_1)]
 
 
 def test_a_collision_in_a_reply_that_is_half_handed_over_takes_only_the_rest():
     bus = new_bus(AdapterConfig(split="byte"))
-    bus.receive(READ_1, 0)  # the reply passes from 580 to 700 us
+    bus.receive_bytes(READ_1, 0)  # the reply passes from 580 to 700 us
     whole = b"".join(data for _, data in handed_over(bus, 610_000))
     assert len(whole) == 3
-    bus.receive(bytes(1), 612_000)  # into its fourth byte
+    bus.receive_bytes(bytes(1), 612_000)  # into its fourth byte
     assert b"".join(data for _, data in handed_over(bus)) == b""
     assert any("sends into" in note for note in notes(bus))
 
 
 def test_an_unplugged_adapter_loses_what_was_on_its_way():
     bus = new_bus(AdapterConfig())
-    bus.receive(PING_1, 0)
+    bus.receive_bytes(PING_1, 0)
     bus.at(300_000, bus.unplug)
     assert handed_over(bus) == []
     assert not bus.plugged
     bus.plug_in()
-    bus.receive(PING_1, 10 * MS)
+    bus.receive_bytes(PING_1, 10 * MS)
     assert [data for _, data in handed_over(bus)] == [PONG_1]
     assert [note for note in notes(bus) if note.startswith("adapter")] == [
         "adapter unplugged",
@@ -170,10 +170,10 @@ def test_a_port_does_not_outlive_its_adapter_though_it_comes_back():
     bus.unplug()
     bus.plug_in()
     with pytest.raises(PortError, match="adapter of bus main is gone"):
-        port.write(PING_1)
+        port.write_packet(PING_1)
     again = VirtualPorts(clock, [bus])
-    again.ports[0].write(PING_1)
-    assert again.wait(10**9) == [0]
+    again.ports[0].write_packet(PING_1)
+    assert again.wait_for_bytes(10**9) == [0]
 
 
 # Hooks for faults
@@ -184,11 +184,11 @@ def test_a_cut_instruction_swallows_the_begin_of_the_next_one_unless_a_pause_end
     bus.alter_next_instruction("cut", lambda packet: packet[:4])
     counted: list[int] = []
     bus.after(1, lambda: counted.append(1))
-    bus.receive(PING_1, 0)
+    bus.receive_bytes(PING_1, 0)
     assert counted == [1]
-    bus.receive(PING_1, 1 * MS)
+    bus.receive_bytes(PING_1, 1 * MS)
     assert handed_over(bus, 10 * MS) == []
-    bus.receive(PING_1, 300 * MS)
+    bus.receive_bytes(PING_1, 300 * MS)
     assert [data for _, data in handed_over(bus)] == [PONG_1]
 
 
@@ -199,9 +199,9 @@ def test_something_can_be_planned_after_so_many_instructions():
     bus.after(1, lambda: happened.append("one"))
     bus.after(0, lambda: happened.append("now"))
     assert happened == ["now"]
-    bus.receive(packet1(0xFE, 3, 25, 1), 0)
+    bus.receive_bytes(packet1(0xFE, 3, 25, 1), 0)
     assert happened == ["now", "one"]
-    bus.receive(PING_1, MS)
+    bus.receive_bytes(PING_1, MS)
     assert happened == ["now", "one", "two"]
 
 
@@ -210,8 +210,8 @@ def test_each_servo_counts_instructions_and_replies():
     asked = (PING_1, packet1(0xFE, 3, 25, 1), packet1(1, 3, 25, 1), packet1(2, 3, 25, 9))
     spoiled = packet1(2, 2, 36, 2)[:-1] + b"\x00"
     for turn, data in enumerate((*asked, spoiled)):
-        bus.receive(data, turn * 10 * MS)
-        bus.take((turn + 1) * 10 * MS)
+        bus.receive_bytes(data, turn * 10 * MS)
+        bus.drain_bytes((turn + 1) * 10 * MS)
     one, two = (bus.servo(servo_id).counts for servo_id in (1, 2))
     assert (one.received, one.replied, one.last_error) == (3, 2, 0)
     assert (two.received, two.replied) == (2, 1)
@@ -228,7 +228,7 @@ def sync_read(line: Any) -> None:
 def test_a_servo_that_waits_for_its_turn_gives_up_when_it_receives_another_instruction(make_line2):
     line = make_line2((1, 2, 3), return_delay_ns=500_000)
     sync_read(line)
-    line.bus.receive(packet2(9, 1), line.clock.now_ns() + 200_000)  # before the first one talks
+    line.bus.receive_bytes(packet2(9, 1), line.clock.now_ns() + 200_000)  # before the first one talks
     assert [each.servo_id for each in line.statuses()] == [1]
 
 
@@ -247,7 +247,7 @@ def test_the_host_that_talks_into_a_chain_ends_it(make_line2):
     line = make_line2((1, 2, 3), return_delay_ns=100_000)
     sync_read(line)  # 17 bytes; the first status from 270 to 420 us
     start = line.clock.now_ns()
-    line.bus.receive(b"\x55", start + 400_000)
+    line.bus.receive_bytes(b"\x55", start + 400_000)
     received = line.receive()
     assert len(received) == 13
     assert any("wait for it in vain" in note for note in line.notes())

@@ -79,9 +79,9 @@ def test_what_is_wrong_is_refused_whole_with_the_manual_s_error(
 ):
     line = line_of(word)
     registers = line.servo().registers
-    before = registers.read(0, registers.size - 30)
+    before = registers.read_bytes(0, registers.size - 30)
     assert line.request(1, instruction, bytes.fromhex(parameters)) == (1, ERROR[word][error], b"")
-    assert registers.read(0, registers.size - 30) == before
+    assert registers.read_bytes(0, registers.size - 30) == before
     assert any("refuses" in note for note in line.notes())
     if instruction == REG_WRITE:
         assert line.request(1, ACTION) == (1, ERROR[word]["unknown"], b"")
@@ -91,7 +91,7 @@ def test_what_is_wrong_is_refused_whole_with_the_manual_s_error(
 def test_a_damaged_instruction_is_not_obeyed(both, answers):
     both.servo().answers_damaged = answers
     led_on = "ff ff 01 04 03 19 01 00" if both.WORD == 1 else "fffffd00 01 0600 03 410001 0000"
-    both.ports.ports[0].write(bytes.fromhex(led_on))
+    both.ports.ports[0].write_packet(bytes.fromhex(led_on))
     received = both.receive()
     at = 4 if both.WORD == 1 else 8
     assert received[at : at + 1] == bytes([ERROR[both.WORD]["damaged"]] * answers)
@@ -120,10 +120,10 @@ def test_a_pause_inside_an_instruction_ends_it(both):
     ping, most_ns = (packet1(1, 1), 100_000_000) if both.WORD == 1 else (packet2(1, 1), 1_500_000)
     at_ns = 0
     for pause_ns, answered in ((most_ns, True), (most_ns + 1, False)):
-        both.bus.receive(ping[:3], at_ns)
-        both.bus.receive(ping[3:], at_ns + 30_000 + pause_ns)
+        both.bus.receive_bytes(ping[:3], at_ns)
+        both.bus.receive_bytes(ping[3:], at_ns + 30_000 + pause_ns)
         at_ns += 10**9
-        assert (both.bus.take(at_ns) != b"") == answered
+        assert (both.bus.drain_bytes(at_ns) != b"") == answered
     assert both.notes() == ["an instruction of 3 bytes was broken off"]
 
 

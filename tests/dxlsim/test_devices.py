@@ -9,11 +9,11 @@ import pytest
 
 from dxlsim.bus.ledger import Ledger
 from dxlsim.bus.simulated_bus import SimulatedBus
-from dxlsim.device.measured import on_the_wire
+from dxlsim.device.device_quantities import on_the_wire
 from dxlsim.faults.fault import parse_fault
 from dxlsim.faults.script import FaultScript
-from dxlsim.simulation_plan import BusConfig, DeviceConfig, Shown
-from dxlwire.errors import InputError
+from dxlsim.simulation_plan import BusConfig, DeviceConfig, DeviceReadings
+from dxlwire.exceptions import InputError
 
 PING, READ, WRITE, REBOOT, SYNC_READ, SYNC_WRITE = 0x01, 0x02, 0x03, 0x08, 0x82, 0x83
 FAST_SYNC_READ, BULK_READ = 0x8A, 0x92
@@ -90,7 +90,7 @@ def test_boards_of_the_slave_class_answer_no_group_instruction(line):
 
 
 def test_a_device_takes_part_in_group_reads_with_servos(line):
-    wire = line(DeviceConfig(7, "generic", shown=Shown(values={"register_1": 513.0})))
+    wire = line(DeviceConfig(7, "generic", shown=DeviceReadings(values={"register_1": 513.0})))
     wire.instruct(0xFE, SYNC_READ, words(128, 2) + bytes((7,)))
     (answer,) = wire.statuses()
     assert answer.parameters == words(513)
@@ -127,7 +127,7 @@ def test_states_say_what_is_measured(line):
     wire = line(
         DeviceConfig(241, "bitbots-imu"),
         DeviceConfig(
-            7, "generic", shown=Shown(states={"register_1": "voltage", "register_2": "temperature"})
+            7, "generic", shown=DeviceReadings(states={"register_1": "voltage", "register_2": "temperature"})
         ),
     )
     shown = struct.unpack("<10f", wire.read_bytes(241, 36, 40))
@@ -175,7 +175,7 @@ def test_a_device_tips_about_its_own_axis_and_stays_so(line, axis, seen):
 
 
 def test_bits_of_one_byte_are_buttons(line):
-    wire = line(DeviceConfig(200, "OpenCR", shown=Shown(values={"button_start": 1.0})))
+    wire = line(DeviceConfig(200, "OpenCR", shown=DeviceReadings(values={"button_start": 1.0})))
     assert wire.read_bytes(200, 30, 1) == b"\x02"
     wire.bus.device(200).poke("button_reset", 1)
     assert wire.read_bytes(200, 30, 1) == b"\x0a"
@@ -183,7 +183,7 @@ def test_bits_of_one_byte_are_buttons(line):
 
 def test_noise_is_around_the_value_and_repeats_itself(make_line2):
     config = DeviceConfig(
-        101, "bitbots-foot", shown=Shown(values={"sensor_0": 40.0}, noise={"sensor_0": 2.0})
+        101, "bitbots-foot", shown=DeviceReadings(values={"sensor_0": 40.0}, noise={"sensor_0": 2.0})
     )
 
     def readings() -> list[float]:

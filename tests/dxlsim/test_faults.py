@@ -10,7 +10,7 @@ from tests.kit.line_faults import turn_by_hand
 
 from dxlsim.faults.fault import parse_fault
 from dxlsim.faults.script import FaultScript
-from dxlwire.errors import InputError, PortError
+from dxlwire.exceptions import InputError, PortError
 
 PING, READ, WRITE = 0x01, 0x02, 0x03
 TORQUE_ENABLE, LED = 24, 25
@@ -143,12 +143,12 @@ def test_an_unplugged_adapter_is_gone_and_comes_back(line):
     inject(line, "unplug at=1s for=2s")
     assert ping(line) == PONG[1]
     line.clock.wait_until(1_000 * MS)
-    line.bus.advance(1_000 * MS)
+    line.bus.advance_to(1_000 * MS)
     with pytest.raises(PortError):
         line.send(1, PING)
-    line.bus.advance(2_999 * MS)
+    line.bus.advance_to(2_999 * MS)
     assert not line.bus.plugged
-    line.bus.advance(3_000 * MS)
+    line.bus.advance_to(3_000 * MS)
     assert line.bus.plugged
     assert happened(line) == ["unplug at=1s for=2s"]
 
@@ -236,18 +236,18 @@ def test_a_hand_turns_a_limp_shaft_evenly(make_line2, model, by):
     line2 = make_line2((1, 2), model)
     inject(line2, f"turn servo=1 by={by:g}deg for=1s")
     line2.wait(0.5)
-    assert math.degrees(line2.servo(1).position - 2.0) == pytest.approx(by / 2, rel=0.02)
+    assert math.degrees(line2.servo(1).shaft_angle - 2.0) == pytest.approx(by / 2, rel=0.02)
     assert math.degrees(line2.servo(1).velocity) == pytest.approx(by)
     name = "present_speed" if model == "XL-320" else "present_velocity"
     shown = line2.get(name) * line2.servo(1).registers.table.rad_s_per_tick
     assert math.degrees(shown) == pytest.approx(by, abs=1.0)
     line2.wait(2.0)
-    assert math.degrees(line2.servo(1).position - 2.0) == pytest.approx(by)
+    assert math.degrees(line2.servo(1).shaft_angle - 2.0) == pytest.approx(by)
     assert line2.servo(1).velocity == 0.0
     assert line2.get("present_position") * line2.servo(1).registers.table.rad_per_tick == pytest.approx(
-        line2.servo(1).position, abs=0.005
+        line2.servo(1).shaft_angle, abs=0.005
     )
-    assert line2.servo(2).position == 2.0
+    assert line2.servo(2).shaft_angle == 2.0
     assert happened(line2) == [f"turn servo=1 by={by:g}deg for=1s"]
 
 
@@ -257,10 +257,10 @@ def test_a_hand_gives_way_to_a_servo_with_torque(line2, mode, goal):
     if goal is not None:
         line2.set("goal_current" if mode == 0 else "goal_pwm", goal)
     line2.wait(0.1)
-    before = line2.servo(1).position
+    before = line2.servo(1).shaft_angle
     inject(line2, "turn servo=1 by=-30deg")
     line2.wait(0.5)
-    moved = line2.servo(1).position - before
+    moved = line2.servo(1).shaft_angle - before
     assert moved == pytest.approx(0.0, abs=0.002) if goal is None else moved > 0.01
     way = "servo 1: holds or drives its shaft, so the hand that turns it yields after 0.0 of -30 deg"
     assert way in line2.notes()
@@ -272,7 +272,7 @@ def test_a_hand_turns_a_shaft_whose_servo_is_commanded_to_no_torque(line2, mode,
     assert line2.get(name) == 0
     inject(line2, "turn servo=1 by=30deg")
     line2.wait(1.5)
-    assert math.degrees(line2.servo(1).position - 2.0) == pytest.approx(30.0, abs=0.1)
+    assert math.degrees(line2.servo(1).shaft_angle - 2.0) == pytest.approx(30.0, abs=0.1)
 
 
 def test_torque_that_comes_on_midway_ends_the_turning(line):
@@ -280,7 +280,7 @@ def test_torque_that_comes_on_midway_ends_the_turning(line):
     line.clock.wait_until(500 * MS)
     line.write(1, 30, *line.servo(1).registers.data("present_position"))  # the goal where it is: torque on
     line.clock.wait_until(2000 * MS)
-    assert math.degrees(line.servo(1).position - 2.0) == pytest.approx(15.0, abs=1.0)
+    assert math.degrees(line.servo(1).shaft_angle - 2.0) == pytest.approx(15.0, abs=1.0)
     (way,) = [note for note in line.notes() if "yields" in note]
     assert way.startswith("servo 1: holds or drives its shaft, so the hand that turns it yields after 15.")
 
@@ -288,7 +288,7 @@ def test_torque_that_comes_on_midway_ends_the_turning(line):
 def test_a_servo_that_lost_its_power_is_still_turned(line2):
     inject(line2, "turn servo=1 by=30deg for=1s", "reboot servo=1 at=500ms")
     line2.wait(1.5)
-    assert math.degrees(line2.servo(1).position - 2.0) == pytest.approx(30.0)
+    assert math.degrees(line2.servo(1).shaft_angle - 2.0) == pytest.approx(30.0)
 
 
 def test_two_servos_with_one_id_talk_at_once(line):
@@ -367,15 +367,15 @@ def test_a_blocked_shaft_stays_until_it_is_free(line):
     servo = line.servo(1)
     line.send(1, WRITE, TORQUE_ENABLE, 1)
     line.receive(20 * MS)
-    before = servo.position
+    before = servo.shaft_angle
     inject(line, "jam servo=1 for=300ms")
     line.send(1, WRITE, 30, 100, 3)
     line.receive(250 * MS)
-    line.bus.advance(line.clock.now_ns())
-    assert servo.position == pytest.approx(before, abs=1e-3)
+    line.bus.advance_to(line.clock.now_ns())
+    assert servo.shaft_angle == pytest.approx(before, abs=1e-3)
     line.receive(2_000 * MS)
-    line.bus.advance(line.clock.now_ns())
-    assert abs(servo.position - before) > 0.1
+    line.bus.advance_to(line.clock.now_ns())
+    assert abs(servo.shaft_angle - before) > 0.1
 
 
 def test_a_supply_with_a_resistance_sags_for_all_when_one_draws(line):

@@ -11,7 +11,7 @@ from dxlsim.faults.fault import parse_fault
 from dxlsim.faults.kinds import DEVICE, KINDS
 from dxlsim.faults.script import FaultScript
 from dxlsim.faults.values import READERS
-from dxlwire.errors import InputError
+from dxlwire.exceptions import InputError
 
 MS = 1_000_000
 VALUES: dict[str, tuple[str, ...]] = {
@@ -86,9 +86,9 @@ def test_faults_of_every_kind_together_end_nothing_and_are_noted_once(protocol, 
         planned = [str(fault) for fault in script.waiting]
         while line.clock.now_ns() < 300 * MS:
             for servo_id in (1, 2):
-                line.bus.receive(ping(servo_id, 0x01), line.clock.now_ns())
+                line.bus.receive_bytes(ping(servo_id, 0x01), line.clock.now_ns())
                 line.clock.wait_until(line.clock.now_ns() + 5 * MS)
-                assert len(line.bus.take(line.clock.now_ns())) < 10_000
+                assert len(line.bus.drain_bytes(line.clock.now_ns())) < 10_000
         happened = [n.removeprefix("fault: ") for n in line.notes() if n.startswith("fault: ")]
         assert sorted([*happened, *map(str, script.waiting)]) == sorted(planned)
         share.append(len(happened) / len(planned))

@@ -16,7 +16,7 @@ from dxlsim.faults.script import FaultScript
 from dxlsim.simulation_plan import BusConfig, ServoConfig
 from dxlsim.virtual_ports import VirtualPorts
 from dxlwire.clock import VirtualClock
-from dxlwire.errors import InputError
+from dxlwire.exceptions import InputError
 
 READ = 0x02
 MS = 1_000_000
@@ -73,7 +73,7 @@ def stormy(text: str, *, seed: int = 0, model: str = "AX-12A", ids: tuple[int, .
     while clock.now_ns() < 3_000 * MS:
         for servo_id in ids:
             body = bytes((servo_id, 4, READ, 36, 2))
-            port.write(b"\xff\xff" + body + bytes((~sum(body) & 0xFF,)))
+            port.write_packet(b"\xff\xff" + body + bytes((~sum(body) & 0xFF,)))
             clock.wait_until(clock.now_ns() + 5 * MS)
             port.read_into(buffer)
     return ledger.entries

@@ -7,7 +7,7 @@ import pytest
 from dxlsim.faults.fault import fault_help, parse_fault
 from dxlsim.faults.kinds import KINDS
 from dxlsim.faults.values import READERS
-from dxlwire.errors import InputError
+from dxlwire.exceptions import InputError
 
 LINES = (
     "lose servo=3 at=2s",

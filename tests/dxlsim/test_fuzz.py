@@ -11,7 +11,7 @@ from hypothesis import strategies as st
 from tests.bench import fuzz_simulation
 from tests.kit.packets import crc, packet1, packet2
 
-from dxlsim.wire.protocol1 import ErrorBit
+from dxlsim.wire.servo_protocol1 import ErrorBit
 
 LIKE_PACKETS = st.sampled_from([0xFF, 0xFD, 0xFE, 0x00, 0x01, 0x02, 0x03, 0x55, 0x74, 0x82, 0x83, 0x92])
 NOISE = st.lists(LIKE_PACKETS | st.integers(0, 255), max_size=60).map(bytes)
@@ -59,7 +59,7 @@ def test_random_and_mutated_strings_do_no_harm_and_get_no_false_answer(protocol)
 def test_noise_and_any_packet_of_protocol_1(make_line, model, pieces):
     line = make_line((1,), model)
     for piece in pieces:
-        line.ports.ports[0].write(
+        line.ports.ports[0].write_packet(
             piece if isinstance(piece, bytes) else packet1(piece[0], piece[1], *piece[2])
         )
         check1(line.receive())
@@ -72,7 +72,7 @@ def test_noise_and_any_packet_of_protocol_2(make_line2, model, pieces):
     line = make_line2((1,), model)
     line.bus.absent = "slot"
     for piece in pieces:
-        line.ports.ports[0].write(piece if isinstance(piece, bytes) else packet2(*piece))
+        line.ports.ports[0].write_packet(piece if isinstance(piece, bytes) else packet2(*piece))
         received = line.receive()
         if isinstance(piece, bytes) or piece[1] not in (0x8A, 0x9A):
             check2(received)
@@ -88,7 +88,7 @@ def test_a_broken_crc_is_never_obeyed(make_line2, answers, parameters, bit, plac
     before = bytes(line.read_bytes(1, 0, 120))
     packet = bytearray(packet2(1, 0x03, bytes((64, 0)) + parameters))
     packet[7 + place % (len(packet) - 7)] ^= 1 << bit
-    line.ports.ports[0].write(packet)
+    line.ports.ports[0].write_packet(packet)
     assert line.statuses() == ([(1, 3, b"")] if answers else [])
     line.wait(0.1)
     assert line.read_bytes(1, 0, 120) == before
@@ -102,6 +102,6 @@ def test_a_broken_checksum_is_never_obeyed(make_line, answers, parameters, bit, 
     line.servo().answers_damaged = answers
     packet = bytearray(packet1(1, 0x03, 24, *parameters))
     packet[4 + place % (len(packet) - 4)] ^= 1 << bit
-    line.ports.ports[0].write(packet)
+    line.ports.ports[0].write_packet(packet)
     assert line.receive() == (packet1(1, ErrorBit.CHECKSUM) if answers else b"")
     assert line.read(1, 24, 1) == 0

@@ -74,21 +74,23 @@ def entries_of(
     """
     chance, ledger, now_ns, hands = random.Random(seed), Ledger(), 0, 0
     bus = bus_of(ledger, absent=absent)
-    bus.receive(packet2(0xFE, 0x83, bytes((64, 0, 1, 0)) + b"".join(bytes((each, 1)) for each in IDS)), 0)
+    bus.receive_bytes(
+        packet2(0xFE, 0x83, bytes((64, 0, 1, 0)) + b"".join(bytes((each, 1)) for each in IDS)), 0
+    )
     for _ in range(60):
         disturb(bus, chance, now_ns)
         if one_by_one:
             for t_ns in range(now_ns, now_ns + 300_000, 5_000):
                 bus.at(t_ns, lambda: bus.alter_next(99, "of a servo that is never read", bytes))
-        bus.receive(question(chance), now_ns)
+        bus.receive_bytes(question(chance), now_ns)
         if midway and chance.randint(0, 1):
             within_ns = now_ns + chance.randrange(200_000)
-            bus.take(within_ns)
+            bus.drain_bytes(within_ns)
             disturb(bus, chance, within_ns)
         end_ns = now_ns + chance.choice((200_000, 2_000_000))  # the first is within most replies
         while (due_ns := next_ns(bus)) is not None and due_ns <= end_ns:
-            hands += bool(bus.take(due_ns))
-        bus.take(end_ns)
+            hands += bool(bus.drain_bytes(due_ns))
+        bus.drain_bytes(end_ns)
         now_ns = end_ns
     return ledger.entries, hands
 
@@ -118,10 +120,10 @@ def test_replies_sent_ahead_are_those_that_are_decided_one_by_one(seed, absent):
 def test_no_reply_waits_longer_than_a_microframe_and_the_last_one_not_at_all():
     ledger = Ledger()
     bus = bus_of(ledger)
-    bus.receive(packet2(0xFE, SYNC_READ, PRESENT_POSITION + bytes(IDS)), 0)
+    bus.receive_bytes(packet2(0xFE, SYNC_READ, PRESENT_POSITION + bytes(IDS)), 0)
     handed = []
     while (due_ns := bus.next_delivery_ns(MICROFRAME_NS)) is not None:
-        size = len(bus.take(due_ns))
+        size = len(bus.drain_bytes(due_ns))
         handed.append((due_ns, size // 15))
     replies = [entry.t_ns for entry in ledger.entries if entry.direction == "out"]
     assert handed == [(replies[3], 4), (replies[4], 1)]  # 37.5 us each: the fourth one ends 112.5 us later
@@ -130,7 +132,7 @@ def test_no_reply_waits_longer_than_a_microframe_and_the_last_one_not_at_all():
 
 def test_slow_lines_gather_nothing():
     bus = bus_of(Ledger(), baud_rate=57_600)
-    bus.receive(packet2(0xFE, SYNC_READ, PRESENT_POSITION + bytes(IDS)), 0)
+    bus.receive_bytes(packet2(0xFE, SYNC_READ, PRESENT_POSITION + bytes(IDS)), 0)
     while (due_ns := bus.next_due_ns()) is not None:
         assert bus.next_delivery_ns(MICROFRAME_NS) == due_ns
-        bus.take(due_ns)
+        bus.drain_bytes(due_ns)

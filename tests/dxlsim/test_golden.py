@@ -12,7 +12,7 @@ TICK = math.tau / 4096
 
 
 def exchange(line: Any, received: str) -> bytes:
-    line.ports.ports[0].write(bytes.fromhex(received))
+    line.ports.ports[0].write_packet(bytes.fromhex(received))
     return line.receive(20_000_000)
 
 

@@ -66,7 +66,7 @@ def test_a_wider_slope_sags_more_under_the_same_load(make_line):
             goal_position=round(2.0 / math.radians(300) * 1023),
         )
         line.wait(3)
-        sags.append(2.0 - line.servo().position)
+        sags.append(2.0 - line.servo().shaft_angle)
         output = line.get("present_load") / 1023
         assert held("AX-12A", output * 1.5, 0.5 * math.cos(sags[-1]))
         # 0.031 of punch and 0.969 of the slope, beyond a margin of 0.29 degrees
@@ -85,7 +85,7 @@ def test_each_slope_and_margin_counts_in_its_own_direction(make_line, side, what
         line.set(soft, 128)
         line.put(goal_position=round(2.0 / math.radians(300) * 1023))
         line.wait(3)
-        sags.append(abs(2.0 - line.servo().position))
+        sags.append(abs(2.0 - line.servo().shaft_angle))
     pushed, let_go = sags[::side]  # a load that pulls CW is pushed CCW
     assert pushed > 2.5 * let_go
 
@@ -94,13 +94,13 @@ def test_an_mx_servo_holds_as_hard_as_its_p_gain_and_exactly_with_an_i_gain(make
     line = make_line((1,), "MX-64", position=2.0, load=Load(gravity=2.0, gravity_angle=2.0 - math.pi / 2))
     line.put(goal_position=round(2.0 / math.tau * 4096))
     line.wait(2)
-    soft = 2.0 - line.servo().position
+    soft = 2.0 - line.servo().shaft_angle
     line.put(p_gain=128)
     line.wait(2)
-    assert 2.0 - line.servo().position == pytest.approx(soft / 4, rel=0.1)
+    assert 2.0 - line.servo().shaft_angle == pytest.approx(soft / 4, rel=0.1)
     line.put(i_gain=50)
     line.wait(3)
-    assert line.servo().position == pytest.approx(2.0, abs=0.002)
+    assert line.servo().shaft_angle == pytest.approx(2.0, abs=0.002)
 
 
 def test_goal_acceleration_is_the_slope_of_the_speed(make_line):
@@ -131,7 +131,7 @@ def test_in_torque_control_mode_goal_torque_is_the_current(make_line):
     line.put(torque_enable=1, torque_ctrl_mode_enable=1)
     line.set("goal_torque", 1024 + 200)  # clockwise, 0.9 A of 1.63 Nm each
     line.wait(3)
-    pulled = 2.0 * math.sin(line.servo().position - 2.0)
+    pulled = 2.0 * math.sin(line.servo().shaft_angle - 2.0)
     assert held("MX-64", -0.9 * 1.6315, pulled, more_friction=0.1)
     assert line.get("current") == pytest.approx(2048 - 200, abs=2)
 
@@ -141,7 +141,7 @@ def test_torque_limit_limits_what_it_holds(make_line):
     line.put(shutdown=0, torque_limit=341, goal_position=round(2.0 / math.radians(300) * 1023))
     line.wait(3)
     assert line.get("present_load") == 341
-    assert held("AX-12A", 0.5, math.cos(2.0 - line.servo().position))
+    assert held("AX-12A", 0.5, math.cos(2.0 - line.servo().shaft_angle))
 
 
 @pytest.mark.parametrize("goal", [1000, 20])
@@ -167,7 +167,9 @@ def test_a_servo_that_holds_a_heavy_load_gets_hot_and_lets_go(make_line2):
     line.wait(400)
     assert line.get("hardware_error_status") == 0x04
     assert line.get("torque_enable") == 0
-    assert line.servo().position == pytest.approx(2.0 - math.pi / 2, abs=0.04)  # it hangs, but for friction
+    assert line.servo().shaft_angle == pytest.approx(
+        2.0 - math.pi / 2, abs=0.04
+    )  # it hangs, but for friction
 
 
 def test_an_x_servo_sags_by_its_p_gain(make_line2):
@@ -176,7 +178,7 @@ def test_an_x_servo_sags_by_its_p_gain(make_line2):
     )
     line.put(torque_enable=1, goal_position=round(2.0 / math.tau * 4096))
     line.wait(2)
-    sag = line.get("goal_position") / 4096 * math.tau - line.servo().position
+    sag = line.get("goal_position") / 4096 * math.tau - line.servo().shaft_angle
     # 800 / 128 of 885 PWM units for a tick of 4096 a turn, 4.1 Nm at 885
     torque = sag * 800 / 128 / 885 * 4096 / math.tau * 4.1
     assert held("XM430-W350", torque, math.cos(sag))
@@ -212,17 +214,17 @@ def test_every_model_settles_where_it_should_without_much_overshoot():
         servo.poke("goal_position", goals[-1])
     highest = [0.0] * len(servos)
     for now in range(0, 3 * S, 10_000_000):
-        mechanics.advance(now)
+        mechanics.step_to(now)
         highest = [max(pair) for pair in zip(highest, mechanics.plant.angle.tolist(), strict=True)]
     torques = mechanics.law.torque.tolist()
     for servo, goal, top, torque in zip(servos, goals, highest, torques, strict=True):
-        servo.advance(3 * S)
+        servo.advance_to(3 * S)
         table, margin = servo.registers.table, servo.registers.get("cw_compliance_margin")
         motor = motor_of(table)
         assert abs(torque) <= 1.001 * motor.friction / (1 - motor.load_friction)
         # so much friction leaves where gains are weakest, those of YM070
         rest = math.radians(2.3) + margin * table.rad_per_tick
-        assert servo.position == pytest.approx(goal * table.rad_per_tick, abs=rest)
+        assert servo.shaft_angle == pytest.approx(goal * table.rad_per_tick, abs=rest)
         assert top < goal * table.rad_per_tick + 0.25 * 0.5, table.model  # most: the quick XL330-M077
         assert servo.registers.get("moving") == 0
 
@@ -234,7 +236,7 @@ def test_multi_turn_mode_counts_turns_to_either_side(make_line):
     assert line.set("goal_position", -5000) == 0
     line.wait(4)
     assert line.get("present_position") == pytest.approx(-5000 & 0xFFFF, abs=2)
-    assert line.servo().position == pytest.approx(-5100 * math.tau / 4096, abs=4e-3)
+    assert line.servo().shaft_angle == pytest.approx(-5100 * math.tau / 4096, abs=4e-3)
     line.put(resolution_divider=4, goal_position=5000)
     line.wait(20)
-    assert line.servo().position == pytest.approx(4 * 4900 * math.tau / 4096, abs=1e-2)
+    assert line.servo().shaft_angle == pytest.approx(4 * 4900 * math.tau / 4096, abs=1e-2)

@@ -6,7 +6,7 @@ from typing import IO
 import pytest
 
 from dxlsim.bus.ledger import FLUSH_NS, Ledger, LedgerEntry, read_ledger
-from dxlwire.errors import InputError
+from dxlwire.exceptions import InputError
 
 ENTRIES = (
     LedgerEntry(5, "main", "in", b"\xff\xff\x01", ""),

@@ -21,7 +21,7 @@ import serial
 
 import dxlsim
 from dxlsim import ServedBus, read_ledger, serve_bus
-from dxlwire.errors import InputError
+from dxlwire.exceptions import InputError
 
 pytest_plugins = ["dxlsim.pytest_plugin"]
 
@@ -97,14 +97,14 @@ def ping(bus: ServedBus) -> bytes:
 
 def test_fixture_serves_two_servos_and_keeps_every_byte(dynamixel_bus: ServedBus) -> None:
     reply = ping(dynamixel_bus)
-    assert [servo.id for servo in dynamixel_bus.look()] == [1, 2]
+    assert [servo.id for servo in dynamixel_bus.snapshot_servos()] == [1, 2]
     passed = [(entry.direction, entry.data) for entry in dynamixel_bus.ledger.entries]
     assert passed == [("in", PING_1), ("out", reply)]
 
 
 @pytest.mark.dynamixel_bus("XM430-W350:1", baud_rate=1_000_000, faults=["overheat servo=1 celsius=90"])
 def test_mark_chooses_the_servos_of_the_fixture(dynamixel_bus: ServedBus) -> None:
-    (servo,) = dynamixel_bus.look()
+    (servo,) = dynamixel_bus.snapshot_servos()
     assert (dynamixel_bus.baud_rate, servo.model, servo.temperature) == (1_000_000, "XM430-W350", 90.0)
 
 

@@ -9,7 +9,7 @@ from tests.kit.line_faults import turn_by_hand
 
 from dxlsim.servo.making import make_servo
 from dxlsim.simulation_plan import ServoConfig
-from dxlsim.wire.protocol2 import ErrorNumber
+from dxlsim.wire.servo_protocol2 import StatusErrorNumber
 
 PING, READ, WRITE, REG_WRITE, ACTION, RESET, REBOOT, CLEAR, BACKUP = 1, 2, 3, 4, 5, 6, 8, 0x10, 0x20
 SYNC_READ, SYNC_WRITE, FAST_SYNC_READ = 0x82, 0x83, 0x8A
@@ -20,7 +20,7 @@ CLEAR_ERROR = bytes.fromhex("02 4552434c")
 BACK_UP = bytes.fromhex("01 4354524c")
 RESTORE = bytes.fromhex("02 4354524c")
 LED_ON = bytes.fromhex("4100 01")
-UNKNOWN = (1, ErrorNumber.INSTRUCTION, b"")
+UNKNOWN = (1, StatusErrorNumber.INSTRUCTION, b"")
 DONE = (1, 0, b"")
 
 
@@ -121,7 +121,7 @@ def test_clear_brings_the_position_into_one_turn(line2):
 
 def test_clear_is_refused_while_it_moves(line2):
     line2.put(torque_enable=1, goal_position=3500)
-    assert line2.request(1, CLEAR, CLEAR_TURNS).error == ErrorNumber.RESULT_FAIL
+    assert line2.request(1, CLEAR, CLEAR_TURNS).error == StatusErrorNumber.RESULT_FAIL
 
 
 def test_clear_came_with_firmware_42(line2):
@@ -187,9 +187,9 @@ def test_restoring_brings_the_eeprom_alone_where_the_ram_is_not_asked_for(make_l
 
 
 def test_no_backup_with_torque_and_no_restoring_of_none(line2):
-    assert line2.request(1, BACKUP, RESTORE).error == ErrorNumber.RESULT_FAIL
+    assert line2.request(1, BACKUP, RESTORE).error == StatusErrorNumber.RESULT_FAIL
     line2.set("torque_enable", 1)
-    assert line2.request(1, BACKUP, BACK_UP).error == ErrorNumber.RESULT_FAIL
+    assert line2.request(1, BACKUP, BACK_UP).error == StatusErrorNumber.RESULT_FAIL
 
 
 @pytest.mark.parametrize(
@@ -221,8 +221,8 @@ def test_backup_and_fast_reads_came_with_a_firmware(make_line2, model, firmware,
 def test_startup_configuration_came_with_a_firmware(make_line2, model, firmware):
     line = make_line2((1,), model, firmware=firmware)
     assert "startup_configuration" not in line.servo().registers
-    assert line.write_bytes(1, 60, b"\x01") == ErrorNumber.ACCESS
-    line.servo().reset()
+    assert line.write_bytes(1, 60, b"\x01") == StatusErrorNumber.ACCESS
+    line.servo().power_cycle()
     assert line.get("torque_enable") == 0
 
 
@@ -234,10 +234,10 @@ def test_at_power_up_the_backup_comes_back_and_the_torque_on(make_line2, model):
     line.put(startup_configuration=3, position_p_gain=77)
     assert line.request(1, BACKUP, BACK_UP) == DONE
     line.set("position_p_gain", 5)
-    line.servo().reset()
+    line.servo().power_cycle()
     assert (line.get("position_p_gain"), line.get("torque_enable"), line.get("backup_ready")) == (77, 1, 1)
     line.servo().poke("startup_configuration", 0)
-    line.servo().reset()
+    line.servo().power_cycle()
     assert line.get("position_p_gain") == line.servo().registers.table.items["position_p_gain"].initial
     assert line.get("torque_enable") == 0
 
@@ -297,10 +297,10 @@ def test_a_y_servo_keeps_its_turns_until_it_clears_them_without_torque(make_line
     line = make_line2((1,), "YM070-210-M001")
     turn = round(6.283185307 / line.servo().registers.table.rad_per_tick)
     turn_by_hand(line.servo(), 3 * 6.283185307 + 0.5)
-    line.servo().reset()
+    line.servo().power_cycle()
     assert line.get("present_position") > 3 * turn
     line.servo().poke("torque_enable", 1)
-    assert line.request(1, CLEAR, CLEAR_TURNS).error == ErrorNumber.RESULT_FAIL
+    assert line.request(1, CLEAR, CLEAR_TURNS).error == StatusErrorNumber.RESULT_FAIL
     line.servo().poke("torque_enable", 0)
     assert line.request(1, CLEAR, CLEAR_TURNS) == DONE
     assert line.request(1, PING) is None  # it reboots
@@ -312,7 +312,7 @@ def test_goals_of_a_y_servo_go_as_far_as_its_position_limits(make_line2):
     line = make_line2((1,), "YM070-210-M001")
     line.set("max_position_limit", 2_000_000)  # nearly four turns
     assert line.set("goal_position", 2_000_000) == 0
-    assert line.set("goal_position", 2_000_001) == ErrorNumber.DATA_LIMIT
+    assert line.set("goal_position", 2_000_001) == StatusErrorNumber.DATA_LIMIT
 
 
 def test_a_y_servo_reports_errors_by_code_and_forgets_them_when_they_are_over(make_line2):
@@ -323,8 +323,8 @@ def test_a_y_servo_reports_errors_by_code_and_forgets_them_when_they_are_over(ma
     assert line.request(1, PING).error == ALERT
     assert (line.get("error_code"), line.get("error_code_history_1")) == (4, 4)
     assert (line.get("torque_enable"), line.get("controller_state")) == (0, 8)
-    assert line.set("torque_enable", 1) == ALERT | ErrorNumber.RESULT_FAIL
-    assert line.request(1, CLEAR, CLEAR_ERROR).error & 0x7F == ErrorNumber.RESULT_FAIL
+    assert line.set("torque_enable", 1) == ALERT | StatusErrorNumber.RESULT_FAIL
+    assert line.request(1, CLEAR, CLEAR_ERROR).error & 0x7F == StatusErrorNumber.RESULT_FAIL
     line.servo().set_temperature(30)
     assert line.request(1, PING).error == ALERT  # it stays until it is cleared
     assert line.request(1, CLEAR, CLEAR_ERROR) == DONE
@@ -345,7 +345,9 @@ def test_a_y_servo_reports_errors_by_code_and_forgets_them_when_they_are_over(ma
 def test_a_newer_registered_write_takes_the_place_of_the_older(line2):
     assert line2.request(1, REG_WRITE, b"\x70\x00\x05\x00\x00\x00") == DONE
     assert line2.request(1, REG_WRITE, LED_ON) == DONE
-    assert line2.request(1, REG_WRITE, b"\x40\x00\x02").error == ErrorNumber.DATA_RANGE  # and not this one
+    assert (
+        line2.request(1, REG_WRITE, b"\x40\x00\x02").error == StatusErrorNumber.DATA_RANGE
+    )  # and not this one
     assert line2.request(1, ACTION) == DONE
     assert (line2.get("led"), line2.get("profile_velocity")) == (1, 0)
     assert line2.request(1, ACTION) == UNKNOWN
@@ -354,7 +356,7 @@ def test_a_newer_registered_write_takes_the_place_of_the_older(line2):
 def test_a_registered_write_is_checked_again_when_it_acts(line2):
     assert line2.request(1, REG_WRITE, b"\x0a\x00\x01") == DONE
     line2.set("torque_enable", 1)
-    assert line2.request(1, ACTION).error == ErrorNumber.ACCESS
+    assert line2.request(1, ACTION).error == StatusErrorNumber.ACCESS
     assert line2.get("drive_mode") == 0
 
 
@@ -381,8 +383,8 @@ def test_a_sync_read_goes_through_indirect_data(line2):
 
 
 def test_indirect_addresses_are_of_the_ram_only_and_lost_with_it(line2):
-    assert line2.set("indirect_address_1", 63) == ErrorNumber.DATA_RANGE
-    assert line2.set("indirect_address_1", 662) == ErrorNumber.DATA_RANGE
+    assert line2.set("indirect_address_1", 63) == StatusErrorNumber.DATA_RANGE
+    assert line2.set("indirect_address_1", 662) == StatusErrorNumber.DATA_RANGE
     assert line2.set("indirect_address_56", 65) == 0
     line2.request(1, REBOOT)
     boot(line2)
@@ -398,7 +400,7 @@ def test_indirect_addresses_of_p_are_eeprom(make_line2):
     boot(line)
     assert line.get("indirect_address_1") == 513
     line.set("torque_enable", 1)
-    assert line.set("indirect_address_1", 514) == ErrorNumber.ACCESS
+    assert line.set("indirect_address_1", 514) == StatusErrorNumber.ACCESS
 
 
 def test_indirect_data_is_read_and_written_through(line2):
@@ -408,7 +410,7 @@ def test_indirect_data_is_read_and_written_through(line2):
     assert line2.read_bytes(1, 224, 5) == position + led
     assert line2.write_bytes(1, 228, b"\x01") == 0
     assert line2.get("led") == 1
-    assert line2.write_bytes(1, 224, b"\x00") == ErrorNumber.ACCESS  # present position is read-only
+    assert line2.write_bytes(1, 224, b"\x00") == StatusErrorNumber.ACCESS  # present position is read-only
 
 
 def test_a_goal_may_go_through_indirect_data(line2):
@@ -418,4 +420,4 @@ def test_a_goal_may_go_through_indirect_data(line2):
     assert line2.write_bytes(1, 224, (3000).to_bytes(4, "little")) == 0
     line2.wait(2)
     assert line2.get("present_position") == pytest.approx(3000, abs=3)  # what friction leaves
-    assert line2.write_bytes(1, 224, b"\x00\x00") == ErrorNumber.DATA_LENGTH
+    assert line2.write_bytes(1, 224, b"\x00\x00") == StatusErrorNumber.DATA_LENGTH

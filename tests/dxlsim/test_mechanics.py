@@ -27,8 +27,8 @@ S = 1_000_000_000
 
 def one(command: ServoCommand = LIMP, load: Load | None = None, angle: float = 0.0) -> Mechanics:
     mechanics = Mechanics(0)
-    mechanics.add(MOTOR, load or Load(), angle)
-    mechanics.command(0, command)
+    mechanics.add_servo(MOTOR, load or Load(), angle)
+    mechanics.command_servo(0, command)
     return mechanics
 
 
@@ -50,38 +50,38 @@ def is_scaled(table: ControlTable) -> bool:
 @pytest.mark.parametrize("duty", [1.0, 0.5, -0.25])
 def test_an_unloaded_motor_turns_at_its_duty_of_the_no_load_speed(duty):
     mechanics = one(ServoCommand(bias=duty, limit=1.0))
-    mechanics.advance(S)
+    mechanics.step_to(S)
     assert state(mechanics)[1] == pytest.approx(6.0 * duty)
 
 
 def test_speed_falls_with_torque_in_a_line_down_to_stall():
     half = one(ServoCommand(bias=1.0, limit=1.0), Load(friction=1.0))
-    half.advance(S)
+    half.step_to(S)
     assert state(half)[1] == pytest.approx(3.0)
     stalled = one(ServoCommand(bias=1.0, limit=1.0), Load(friction=2.01))
-    stalled.advance(S)
+    stalled.step_to(S)
     assert state(stalled) == (0.0, 0.0)
 
 
 def test_it_comes_to_speed_with_the_time_constant_of_motor_and_load():
     mechanics = one(ServoCommand(bias=1.0, limit=1.0), Load(inertia=0.03))
-    mechanics.advance(100_000_000)  # 0.033 kg m^2 * 6 rad/s / 2 Nm = 0.099 s
+    mechanics.step_to(100_000_000)  # 0.033 kg m^2 * 6 rad/s / 2 Nm = 0.099 s
     assert state(mechanics)[1] == pytest.approx(6.0 * (1 - math.exp(-0.1 / 0.099)), rel=0.02)
 
 
 def test_less_voltage_is_less_speed_and_less_torque():
     mechanics = one(ServoCommand(bias=1.0, limit=1.0), Load(friction=0.5))
     mechanics.supply(0, 9.0)
-    mechanics.advance(S)
+    mechanics.step_to(S)
     assert state(mechanics)[1] == pytest.approx(6.0 * 0.75 - 0.5 / MOTOR.damping)
 
 
 def test_every_model_has_a_motor_that_turns():
     mechanics, tables = Mechanics(0), all_tables()
     for table in tables:
-        index = mechanics.add(motor_of(table), Load(), 0.0)
-        mechanics.command(index, ServoCommand(bias=1.0, limit=1.0))
-    mechanics.advance(S // 2)
+        index = mechanics.add_servo(motor_of(table), Load(), 0.0)
+        mechanics.command_servo(index, ServoCommand(bias=1.0, limit=1.0))
+    mechanics.step_to(S // 2)
     speeds = [motor_of(table).no_load_speed for table in tables]
     assert mechanics.plant.velocity == pytest.approx(speeds, rel=1e-3)
     manual = [
@@ -93,10 +93,10 @@ def test_every_model_has_a_motor_that_turns():
 
 def test_current_control_holds_the_torque_up_to_what_the_voltage_gives():
     mechanics = one(ServoCommand(bias=1.0, limit=1.0, torque_limit=0.5), Load(inertia=1.0))
-    mechanics.advance(S)
+    mechanics.step_to(S)
     assert state(mechanics)[1] == pytest.approx(0.5 / 1.003, rel=0.01)
     free = one(ServoCommand(bias=1.0, limit=1.0, torque_limit=0.5))
-    free.advance(S)
+    free.step_to(S)
     assert state(free)[1] == pytest.approx(6.0)
 
 
@@ -105,23 +105,23 @@ def test_current_control_holds_the_torque_up_to_what_the_voltage_gives():
 
 def test_a_held_pendulum_sags_by_gravity_over_stiffness():
     mechanics = one(pid(5.0, 1.0), Load(gravity=0.8, gravity_angle=1.0 - math.pi / 2))
-    mechanics.advance(2 * S)
+    mechanics.step_to(2 * S)
     sag = 1.0 - state(mechanics)[0]
     assert 5.0 * 2.0 * sag == pytest.approx(0.8 * math.cos(sag), rel=1e-3)
 
 
 def test_a_limp_link_falls_to_where_it_hangs_and_its_friction_holds_a_light_one():
     falling = one(LIMP, Load(gravity=0.5, gravity_angle=0.0), angle=1.5)
-    falling.advance(10 * S)
+    falling.step_to(10 * S)
     assert state(falling) == pytest.approx((0.0, 0.0), abs=1e-4)
     stuck = one(LIMP, Load(gravity=0.5, friction=0.6), angle=1.5)
-    stuck.advance(10 * S)
+    stuck.step_to(10 * S)
     assert state(stuck) == (1.5, 0.0)
 
 
 def test_friction_leaves_the_error_that_its_torque_needs():
     mechanics = one(pid(5.0, 1.0, speed=1.0), Load(friction=0.2))
-    mechanics.advance(3 * S)
+    mechanics.step_to(3 * S)
     left = 1.0 - state(mechanics)[0]
     assert 0 < 5.0 * 2.0 * left <= 0.2 + 1e-6
     assert state(mechanics)[1] == 0.0
@@ -129,15 +129,15 @@ def test_friction_leaves_the_error_that_its_torque_needs():
 
 def test_an_integral_takes_that_error_away():
     mechanics = one(pid(5.0, 1.0, i=20.0), Load(gravity=0.8, gravity_angle=1.0 - math.pi / 2))
-    mechanics.advance(3 * S)
+    mechanics.step_to(3 * S)
     assert state(mechanics)[0] == pytest.approx(1.0, abs=1e-3)
 
 
 def test_an_integral_moves_what_friction_held_for_long():
     mechanics = one(pid(5.0, 1.0, i=0.2), Load(friction=0.2), angle=0.99)
-    mechanics.advance(20 * S)
+    mechanics.step_to(20 * S)
     assert state(mechanics) == (0.99, 0.0)
-    mechanics.advance(60 * S)
+    mechanics.step_to(60 * S)
     assert state(mechanics)[0] == pytest.approx(1.0, abs=0.005)
 
 
@@ -148,7 +148,7 @@ def test_a_step_settles_with_little_overshoot():
     mechanics = one(pid(5.0, 1.0))
     highest = 0.0
     for now in range(0, S, STEP_NS):
-        mechanics.advance(now)
+        mechanics.step_to(now)
         highest = max(highest, state(mechanics)[0])
     assert highest < 1.02
     assert state(mechanics) == pytest.approx((1.0, 0.0), abs=1e-5)
@@ -157,10 +157,10 @@ def test_a_step_settles_with_little_overshoot():
 def test_within_the_margin_nothing_drives_and_beyond_it_the_punch_does():
     soft = pid(2.0, 1.0, margin_ccw=0.1, margin_cw=0.1, punch=0.05)
     inside = one(soft, angle=0.91)
-    inside.advance(S)
+    inside.step_to(S)
     assert state(inside) == (0.91, 0.0)
     outside = one(soft, Load(friction=0.09), angle=0.89)  # the punch gives 0.1 Nm
-    outside.advance(S)
+    outside.step_to(S)
     assert 0.9 <= state(outside)[0] < 0.95
 
 
@@ -168,15 +168,15 @@ def test_each_side_has_a_margin_and_a_slope_of_its_own():
     load = Load(gravity=0.4, gravity_angle=1.0)
     sides = pid(2.0, 1.0, p_cw=20.0, margin_ccw=0.2)
     below, above = one(sides, load, angle=0.6), one(sides, load, angle=1.4)
-    below.advance(3 * S)
-    above.advance(3 * S)
+    below.step_to(3 * S)
+    above.step_to(3 * S)
     assert state(below)[0] == pytest.approx(1.0, abs=0.2)
     assert state(above)[0] == pytest.approx(1.0, abs=0.02)
 
 
 def test_a_limit_of_the_duty_limits_speed_and_torque():
     mechanics = one(pid(5.0, 9.0, limit=0.2))
-    mechanics.advance(S // 2)
+    mechanics.step_to(S // 2)
     assert state(mechanics)[1] == pytest.approx(1.2)
 
 
@@ -187,7 +187,7 @@ def test_steps_do_not_depend_on_when_somebody_looks():
     def run(period_ns: int) -> tuple[float, float]:
         mechanics = one(pid(5.0, 1.0, speed=2.0, acceleration=9.0), Load(gravity=0.3, friction=0.05))
         for now in range(period_ns, 730_000_001, period_ns):
-            mechanics.advance(now)
+            mechanics.step_to(now)
         return state(mechanics)
 
     assert run(1_000_000) == run(10_000_000) == run(730_000_000)
@@ -196,10 +196,10 @@ def test_steps_do_not_depend_on_when_somebody_looks():
 def test_a_servo_that_is_added_later_leaves_the_others_as_they_are():
     alone, joined = one(pid(5.0, 1.0, speed=2.0)), one(pid(5.0, 1.0, speed=2.0))
     for mechanics in (alone, joined):
-        mechanics.advance(200_000_000)
-    joined.add(MOTOR, Load(), -1.0)
+        mechanics.step_to(200_000_000)
+    joined.add_servo(MOTOR, Load(), -1.0)
     for mechanics in (alone, joined):
-        mechanics.advance(S)
+        mechanics.step_to(S)
     assert state(joined) == state(alone)
     assert joined.plant.angle[1] == -1.0
 
@@ -212,19 +212,19 @@ def test_motor_of_a_servo_keeps_its_state_when_another_servo_is_added():
         mechanics = one(pid(0.3, 1.0, i=2.0), Load(friction=0.8))
         mechanics.supply(0, 8.0)
         mechanics.heat(0, 50.0)
-        mechanics.watch(0, lambda: noted.append((mechanics.grid_ns, mechanics.overloaded(0))))
-        mechanics.advance(700_000_000)
+        mechanics.watch_servo(0, lambda: noted.append((mechanics.grid_ns, mechanics.overloaded(0))))
+        mechanics.step_to(700_000_000)
         if joins:
-            mechanics.add(MOTOR, Load(), -1.0)
-        mechanics.advance(950_000_000)
+            mechanics.add_servo(MOTOR, Load(), -1.0)
+        mechanics.step_to(950_000_000)
         moved = state(mechanics)
-        mechanics.command(0, pid(50.0, 9.0))
+        mechanics.command_servo(0, pid(50.0, 9.0))
         mechanics.plant.jam(0, True)
-        mechanics.advance(1_500_000_000)
+        mechanics.step_to(1_500_000_000)
         if joins:
-            mechanics.add(MOTOR, Load(), -1.0)
+            mechanics.add_servo(MOTOR, Load(), -1.0)
             mechanics.plant.jam(0, True)
-        mechanics.advance(4 * S)
+        mechanics.step_to(4 * S)
         return [moved, state(mechanics), float(mechanics.strain.temperature[0]), noted]
 
     alone, joined = told(False), told(True)
@@ -237,12 +237,12 @@ def test_overload_that_ends_is_not_added_to_the_next_one():
     overloaded = []
     for burst in range(3):
         begun = 2 * burst * S
-        mechanics.command(0, pid(50.0, 9.0))
+        mechanics.command_servo(0, pid(50.0, 9.0))
         mechanics.plant.jam(0, True)
-        mechanics.advance(begun + 700_000_000)
+        mechanics.step_to(begun + 700_000_000)
         overloaded.append(mechanics.overloaded(0))
-        mechanics.command(0, LIMP)
-        mechanics.advance(begun + 2 * S)
+        mechanics.command_servo(0, LIMP)
+        mechanics.step_to(begun + 2 * S)
     assert overloaded == [False] * 3
 
 
@@ -250,7 +250,7 @@ def times_of(mechanics: Mechanics, planned: tuple[int, ...]) -> list[int]:
     times: list[int] = []
     for t_ns in planned:
         mechanics.call_at(t_ns, lambda: times.append(mechanics.grid_ns))
-    mechanics.advance(2 * S)
+    mechanics.step_to(2 * S)
     return times
 
 
@@ -261,9 +261,9 @@ def test_what_is_planned_happens_at_its_time_moving_or_at_rest():
 
 def test_a_servo_at_rest_wakes_for_a_new_goal():
     mechanics = one(pid(5.0, 1.0))
-    mechanics.advance(5 * S)
+    mechanics.step_to(5 * S)
     mechanics.aim(0, 0.5, 1.0, 100.0)
-    mechanics.advance(8 * S)
+    mechanics.step_to(8 * S)
     assert state(mechanics)[0] == pytest.approx(0.5, abs=1e-5)
 
 
@@ -272,9 +272,9 @@ def test_a_geared_load_hangs_where_it_was_when_a_turn_is_counted_anew():
     for turns in (0, 1):
         motor, load = motor_of(find_table("XM430-W350")), Load(gravity=1.0, gravity_angle=0.5, turns=0.5)
         mechanics = Mechanics(0)
-        index = mechanics.add(motor, load, 2.0)
-        mechanics.recount(index, 2.0 + turns * math.tau)
-        mechanics.advance(50_000_000)
+        index = mechanics.add_servo(motor, load, 2.0)
+        mechanics.recount_turns(index, 2.0 + turns * math.tau)
+        mechanics.step_to(50_000_000)
         speeds.append(mechanics.plant.velocity.item(index))
     assert speeds[1] == pytest.approx(speeds[0])
     assert speeds[0] < -0.1
@@ -283,11 +283,11 @@ def test_a_geared_load_hangs_where_it_was_when_a_turn_is_counted_anew():
 @pytest.mark.parametrize("by", [-0.45, 0.3, 0.45])
 def test_geared_load_turns_with_a_shaft_that_is_put_within_half_a_turn(by: float):
     speeds = []
-    for put in (Mechanics.place, Mechanics.recount):
+    for put in (Mechanics.move_shaft, Mechanics.recount_turns):
         load = Load(gravity=1.0, gravity_angle=0.5, turns=0.5)
         mechanics = one(LIMP, load, 2.0)
         put(mechanics, 0, 2.0 + by * math.tau)
-        mechanics.advance(50_000_000)
+        mechanics.step_to(50_000_000)
         speeds.append(mechanics.plant.velocity.item(0))
     assert speeds[1] == speeds[0] != 0.0
 
@@ -297,22 +297,22 @@ def test_geared_load_turns_with_a_shaft_that_is_put_within_half_a_turn(by: float
 
 def test_copper_warms_by_the_square_of_the_torque_and_cools_again():
     mechanics = one(ServoCommand(bias=0.5, limit=1.0), Load(friction=2.0))
-    mechanics.advance(60 * S)
+    mechanics.step_to(60 * S)
     warm = AMBIENT_C + STALLED_RISE_C * 0.25 * (1 - math.exp(-60 / COOLING_S))
     assert mechanics.strain.temperature[0] == pytest.approx(warm, rel=0.01)
-    mechanics.command(0, LIMP)
-    mechanics.advance(3060 * S)
+    mechanics.command_servo(0, LIMP)
+    mechanics.step_to(3060 * S)
     assert mechanics.strain.temperature[0] == pytest.approx(AMBIENT_C, abs=0.1)
 
 
 def test_a_load_that_cannot_be_held_is_reported_after_a_second_and_a_hard_start_is_not():
     noted = []
     blocked = one(pid(5.0, 1.0), Load(friction=3.0))
-    blocked.watch(0, lambda: noted.append(blocked.grid_ns) if blocked.overloaded(0) else None)
-    blocked.advance(3 * S)
+    blocked.watch_servo(0, lambda: noted.append(blocked.grid_ns) if blocked.overloaded(0) else None)
+    blocked.step_to(3 * S)
     assert noted[0] == pytest.approx(S, abs=200_000_000)
     starting = one(pid(5.0, 50.0), Load(inertia=0.1))
-    starting.advance(3 * S)
+    starting.step_to(3 * S)
     assert not starting.overloaded(0)
 
 
@@ -324,13 +324,13 @@ def test_torque_figures_are_those_of_the_tables():
 
 def test_in_real_time_it_advances_often_while_it_moves_and_seldom_while_it_cools():
     mechanics = one(pid(5.0, 1.0))
-    mechanics.advance(100_000_000)
+    mechanics.step_to(100_000_000)
     assert mechanics.due_ns() == mechanics.grid_ns + EAGER_NS
-    mechanics.advance(3 * S)
+    mechanics.step_to(3 * S)
     mechanics.heat(0, 30.01)
-    mechanics.advance(4 * S)
+    mechanics.step_to(4 * S)
     assert mechanics.due_ns() == mechanics.grid_ns + EASY_NS
-    mechanics.advance(2_000 * S)
+    mechanics.step_to(2_000 * S)
     assert mechanics.due_ns() is None
     mechanics.call_at(2_001 * S, lambda: None)
     assert mechanics.due_ns() == 2_001 * S + STEP_NS

@@ -12,7 +12,7 @@ import pytest
 
 from dxlsim.servo.making import make_servo
 from dxlsim.simulation_plan import ServoConfig
-from dxlsim.wire.packets import InstructionPacket
+from dxlsim.wire.servo_packets import InstructionPacket
 from dxlwire.control_table import ControlItem, ControlTable, all_tables
 
 OLD = [table for table in all_tables() if table.protocol == 1.0]
@@ -100,7 +100,7 @@ class Desk:
 
     def _ask(self, instruction: int, parameters: bytes) -> tuple[int, bytes]:
         packet = InstructionPacket(1, instruction, parameters, intact=True, end=0)
-        reply = self.servo.execute(packet, 0)
+        reply = self.servo.execute_packet(packet, 0)
         assert reply is not None
         return reply.error, reply.parameters
 

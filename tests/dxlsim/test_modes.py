@@ -10,7 +10,7 @@ import pytest
 
 from dxlsim.motion.motor import motor_of
 from dxlsim.simulation_plan import Load
-from dxlsim.wire.protocol2 import ErrorNumber
+from dxlsim.wire.servo_protocol2 import StatusErrorNumber
 from dxlwire.control_table import find_table
 
 TICK = math.tau / 4096
@@ -56,7 +56,7 @@ def test_position_control_goes_there_and_rests(line2):
     assert move(line2, 3000) == near(3000)
     assert line2.get("present_velocity") == 0
     assert line2.get("moving") == 0
-    assert line2.servo().position == pytest.approx(3000 * TICK, abs=REST * TICK)
+    assert line2.servo().shaft_angle == pytest.approx(3000 * TICK, abs=REST * TICK)
 
 
 def test_profile_velocity_is_the_speed(line2):
@@ -121,16 +121,16 @@ def test_homing_offset_shifts_position_and_goal(line2):
     line2.set("homing_offset", 100)
     assert line2.get("present_position") == round(2.0 / TICK) + 100
     assert move(line2, 1100) == near(1100)
-    assert line2.servo().position == pytest.approx(1000 * TICK, abs=REST * TICK)
+    assert line2.servo().shaft_angle == pytest.approx(1000 * TICK, abs=REST * TICK)
 
 
 def test_reverse_mode_turns_the_direction(line2):
     line2.set("drive_mode", 1)
-    line2.servo().reset()
+    line2.servo().power_cycle()
     before = line2.get("present_position")
     assert before == 4096 - round(2.0 / TICK)
     assert move(line2, before + 100) == near(before + 100)
-    assert line2.servo().position - (2.0 - math.tau) == pytest.approx(-100 * TICK, abs=(REST + 1) * TICK)
+    assert line2.servo().shaft_angle - (2.0 - math.tau) == pytest.approx(-100 * TICK, abs=(REST + 1) * TICK)
 
 
 @pytest.mark.parametrize("reverse", [0, 1])
@@ -151,7 +151,7 @@ def test_current_control_gives_the_torque_of_its_current(make_loaded2, sign):
     line.put(operating_mode=0, torque_enable=1, goal_current=sign * 100)
     line.wait(3)
     ampere = sign * 100 * 0.00269
-    torque, pulled = ampere * MOTOR.torque_per_ampere, math.sin(line.servo().position - 2.0)
+    torque, pulled = ampere * MOTOR.torque_per_ampere, math.sin(line.servo().shaft_angle - 2.0)
     assert abs(torque - pulled) <= MOTOR.friction + 0.02 + MOTOR.load_friction * abs(torque + pulled)
     assert line.get("present_current") == pytest.approx(sign * 100, abs=1)
 
@@ -160,7 +160,7 @@ def test_current_based_position_control_pushes_no_harder_than_its_current(make_l
     line = make_loaded2(Load(gravity=1.0, gravity_angle=2.0, friction=0.02))
     line.put(operating_mode=5, torque_enable=1, goal_current=100, goal_position=4000)
     line.wait(3)
-    torque, pulled = 100 * 0.00269 * MOTOR.torque_per_ampere, math.sin(line.servo().position - 2.0)
+    torque, pulled = 100 * 0.00269 * MOTOR.torque_per_ampere, math.sin(line.servo().shaft_angle - 2.0)
     assert abs(torque - pulled) <= MOTOR.friction + 0.02 + MOTOR.load_friction * (torque + pulled)
     assert line.set("goal_current", 800) == 0
     line.wait(3)
@@ -205,8 +205,8 @@ def test_an_xl320_moves_by_its_own_items(make_line2):
 def test_a_pro_before_a_moves_by_its_own_items(make_line2, model):
     line = make_line2((1,), model, position=0.0)
     table = line.servo().registers.table
-    assert line.set("goal_velocity", line.get("velocity_limit") + 1) == ErrorNumber.DATA_LIMIT
-    assert line.set("goal_torque", line.get("torque_limit") + 1) == ErrorNumber.DATA_LIMIT
+    assert line.set("goal_velocity", line.get("velocity_limit") + 1) == StatusErrorNumber.DATA_LIMIT
+    assert line.set("goal_torque", line.get("torque_limit") + 1) == StatusErrorNumber.DATA_LIMIT
     line.put(goal_velocity=3000, torque_enable=1, goal_position=50_000)
     line.wait(0.5)
     assert line.servo().velocity == pytest.approx(3000 * table.rad_s_per_tick, rel=0.05)
@@ -221,7 +221,7 @@ def test_a_pro_before_a_moves_by_its_own_items(make_line2, model):
     line.put(torque_enable=1, goal_torque=50)
     assert line.get("present_current") == pytest.approx(50, abs=2)
     line.set("torque_enable", 0)
-    assert line.set("operating_mode", 16) == ErrorNumber.DATA_RANGE
+    assert line.set("operating_mode", 16) == StatusErrorNumber.DATA_RANGE
 
 
 @pytest.mark.parametrize(
@@ -258,7 +258,7 @@ def test_an_l42_counts_as_an_ax_does(make_line2):
     line = make_line2((1,), "L42-10-S300-R")
     assert move(line, 3000) == pytest.approx(3000, abs=3)
     line.set("torque_enable", 0)
-    assert line.set("operating_mode", 0) == ErrorNumber.DATA_RANGE
+    assert line.set("operating_mode", 0) == StatusErrorNumber.DATA_RANGE
     line.put(operating_mode=1, torque_enable=1, goal_velocity=100)
     line.wait(1)
     assert line.get("present_velocity") == pytest.approx(100, abs=2)
@@ -268,7 +268,7 @@ def test_an_l42_counts_as_an_ax_does(make_line2):
 def test_an_rh_p12_closes(make_line2, model, rest):
     line = make_line2((1,), model, position=0.0)
     assert move(line, 740) == pytest.approx(740, abs=rest)
-    assert line.set("goal_position", 1151) == ErrorNumber.DATA_RANGE
+    assert line.set("goal_position", 1151) == StatusErrorNumber.DATA_RANGE
 
 
 def test_feed_forward_of_what_motor_and_rotor_take_leaves_no_lag(make_line2):

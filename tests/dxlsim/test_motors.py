@@ -154,7 +154,7 @@ def move(servo: SimulatedServo, mechanics: Mechanics, goal: float, seconds: floa
     servo.poke("goal_position", tick)
     angles = []
     for _ in range(round(seconds * S / STEP_NS)):
-        mechanics.advance(mechanics.grid_ns + STEP_NS)
+        mechanics.step_to(mechanics.grid_ns + STEP_NS)
         angles.append(float(mechanics.plant.angle[0]))
     return np.array(angles), tick * unit
 
@@ -264,7 +264,7 @@ def test_the_output_for_a_rad_of_error_is_that_which_was_identified(model, proto
     error = 0.02  # rad; less than friction holds, or caught before it moves
     unit = servo.registers.table.rad_per_tick
     servo.poke("goal_position", round((START + error) / unit))
-    mechanics.advance(STEP_NS)
+    mechanics.step_to(STEP_NS)
     duty = float(mechanics.law.duty[0]) / (round((START + error) / unit) * unit - START)
     assert duty == pytest.approx(stiffness, rel=0.01)
     assert servo.registers[item] == find_table(model, protocol).items[item].initial
@@ -314,7 +314,7 @@ def test_simulated_motors_take_up_speed_with_their_own_time_constant(model, prot
         dt_s = STEP_NS * 1e-9
         steps = round(2 * motor.time_constant / dt_s)
         for _ in range(steps):
-            plant.step(np.array([motor.stall_torque]), np.array([motor.damping]), dt_s)
+            plant.step_shafts(np.array([motor.stall_torque]), np.array([motor.damping]), dt_s)
         constant = (motor.inertia + load.inertia) / motor.damping
         exact = motor.stall_torque / motor.damping * -math.expm1(-steps * dt_s / constant)
         assert plant.velocity[0] == pytest.approx(exact, rel=0.003)

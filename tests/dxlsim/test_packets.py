@@ -9,8 +9,8 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from tests.kit.packets import packet1, packet2
 
-from dxlsim.wire import protocol1, protocol2
-from dxlsim.wire.packets import (
+from dxlsim.wire import servo_protocol1, servo_protocol2
+from dxlsim.wire.servo_packets import (
     BROADCAST,
     GroupRead,
     InstructionPacket,
@@ -18,9 +18,9 @@ from dxlsim.wire.packets import (
     ReadEntry,
     ServoReply,
 )
-from dxlsim.wire.protocol2 import FastStatusPacket, crc16, stuffed, unstuffed
+from dxlsim.wire.servo_protocol2 import FastStatusPacket, crc16, stuffed, unstuffed
 
-ONE, TWO = protocol1.CODEC, protocol2.CODEC
+ONE, TWO = servo_protocol1.CODEC, servo_protocol2.CODEC
 MANY = settings(max_examples=200, deadline=None)
 BODIES = st.lists(st.sampled_from([0xFF, 0xFF, 0xFD, 0x00, 0x55]) | st.integers(0, 255), min_size=1).map(
     bytes
@@ -88,7 +88,7 @@ STATUSES = [
 
 def found_in(receiver: InstructionReceiver, data: bytes) -> Iterator[InstructionPacket]:
     at = 0
-    while (packet := receiver.feed(data, at)) is not None:
+    while (packet := receiver.feed_bytes(data, at)) is not None:
         assert at < packet.end <= len(data)
         at = packet.end
         yield packet
@@ -131,15 +131,15 @@ def test_what_cannot_be_a_packet_hides_none(codec, text):
 @pytest.mark.parametrize("servo_id", [0xFD, 0xFF])
 def test_ids_that_cannot_be_begin_no_packet(servo_id):
     receiver = InstructionReceiver(TWO)
-    assert receiver.feed(bytes((0xFF, 0xFF, 0xFD, 0x00, servo_id, 3, 0, 1))) is None
+    assert receiver.feed_bytes(bytes((0xFF, 0xFF, 0xFD, 0x00, servo_id, 3, 0, 1))) is None
     assert receiver.pending < 3
 
 
 def test_a_forgotten_begin_does_not_spoil_the_next_packet():
     receiver = InstructionReceiver(ONE)
-    assert receiver.feed(bytes.fromhex("ff ff 01 04 02")) is None
+    assert receiver.feed_bytes(bytes.fromhex("ff ff 01 04 02")) is None
     assert receiver.pending == 5
-    receiver.forget()
+    receiver.discard_packet()
     assert next(found_in(receiver, bytes.fromhex("ff ff 01 02 01 fb"))).intact
 
 
@@ -184,7 +184,7 @@ def test_how_any_bytes_are_cut_makes_no_difference(codec, data, sizes):
         size = sizes[at % len(sizes)]
         pieces += found_in(receiver, data[at : at + size])
         at += size
-        assert codec is TWO or receiver.pending <= protocol1.LONGEST
+        assert codec is TWO or receiver.pending <= servo_protocol1.LONGEST
     assert [(each.parameters, each.intact) for each in pieces] == whole
 
 

@@ -20,7 +20,7 @@ def run(profiles: Profiles, seconds: float) -> list[tuple[float, float]]:
     """Return position and velocity after each step."""
     seen = []
     for _ in range(round(seconds / DT)):
-        profiles.step()
+        profiles.advance_trajectories()
         seen.append((float(profiles.position[0]), float(profiles.velocity[0])))
     return seen
 
@@ -69,14 +69,14 @@ def test_turning_continues_for_ever_and_never_arrives():
     seen = run(profiles, 1.2)
     assert seen[round(0.1 / DT) - 1][1] == pytest.approx(-1.0)
     assert seen[-1] == pytest.approx((-0.2 - 2.0, -2.0), abs=0.01)
-    profiles.look()
+    profiles.check_arrival()
     assert not profiles.arrived
 
 
 def test_it_arrives_exactly_and_then_costs_nothing():
     profiles = profile(LIMP._replace(goal=0.1 + 0.2, speed=1.0, acceleration=7.0))
     run(profiles, 1.0)
-    profiles.look()
+    profiles.check_arrival()
     assert profiles.arrived
     assert profiles.position[0] == 0.1 + 0.2
     assert profiles.velocity[0] == 0.0

@@ -6,7 +6,7 @@ import pytest
 from tests.kit.line_faults import turn_by_hand
 
 from dxlsim.registers.memory import Memory
-from dxlsim.wire.protocol1 import ErrorBit
+from dxlsim.wire.servo_protocol1 import ErrorBit
 from dxlwire.control_table import find_table
 
 PING, READ, WRITE, REG_WRITE, ACTION, FACTORY_RESET, SYNC_WRITE, BULK_READ = 1, 2, 3, 4, 5, 6, 0x83, 0x92
@@ -29,7 +29,7 @@ def test_model_number_and_initial_values_of_the_manual(line):
 def test_broadcasts_are_obeyed_and_never_answered(line):
     line.send(BROADCAST, WRITE, 25, 1)
     line.send(BROADCAST, SYNC_WRITE, 26, 2, 1, 7, 8, 2, 9, 10)
-    line.ports.ports[0].write(bytes.fromhex("ff ff fe 04 03 19 01 00"))  # wrong checksum
+    line.ports.ports[0].write_packet(bytes.fromhex("ff ff fe 04 03 19 01 00"))  # wrong checksum
     line.send(BROADCAST, BULK_READ, 0, 2, 1, 30, 2, 2, 36)
     line.send(BROADCAST, READ, 36, 2)
     assert line.receive() == b""
@@ -62,7 +62,7 @@ def test_lock_holds_until_the_power_is_cut(line):
     assert line.write(1, 5, 100) == ErrorBit.RANGE
     assert line.write(1, 47, 0) == ErrorBit.RANGE
     assert line.write(1, 25, 1) == 0  # RAM is free
-    line.servo().reset()
+    line.servo().power_cycle()
     assert line.write(1, 5, 100) == 0
 
 
@@ -70,7 +70,7 @@ def test_power_cycle_keeps_eeprom_and_loses_ram(line):
     line.write(1, 14, *low_high(512))
     line.write(1, 5, 10)
     line.write(1, 24, 1, 1)
-    line.servo().reset()
+    line.servo().power_cycle()
     assert line.read(1, 24, 2) == 0
     assert line.read(1, 5, 1) == 10
     assert line.read(1, 34, 2) == 512  # e-Manual: Torque Limit starts as Max Torque
@@ -90,7 +90,7 @@ def test_return_delay_is_that_of_its_register(line):
     line.receive()
     start = line.clock.now_ns()
     line.send(1, PING)
-    line.ports.wait(start + 10_000_000)
+    line.ports.wait_for_bytes(start + 10_000_000)
     assert line.clock.now_ns() - start == 60_000 + 200_000 + 60_000
 
 
@@ -100,7 +100,7 @@ def test_return_delay_is_that_of_its_register(line):
 def test_a_limp_servo_has_no_torque_and_stays(line):
     assert line.read(1, 24, 1) == 0
     line.clock.wait_until(2_000_000_000)
-    assert line.servo().position == 2.0
+    assert line.servo().shaft_angle == 2.0
     assert not line.servo().torque_on
 
 
@@ -110,7 +110,7 @@ def test_a_goal_wakes_a_limp_servo_and_it_goes_there(line):
     assert line.read(1, 46, 1) == 1
     line.clock.wait_until(2_000_000_000)
     assert line.read(1, 36, 2) == pytest.approx(700, abs=2)
-    assert line.servo().position == pytest.approx(700 * TICK, abs=2 * TICK)
+    assert line.servo().shaft_angle == pytest.approx(700 * TICK, abs=2 * TICK)
     assert line.read(1, 46, 1) == 0
     assert line.read(1, 38, 4) == 0  # speed and load
 
@@ -120,7 +120,7 @@ def test_waking_by_a_goal_can_be_switched_off(line):
     line.write(1, 30, *low_high(700))
     line.clock.wait_until(2_000_000_000)
     assert line.read(1, 24, 1) == 0
-    assert line.servo().position == 2.0
+    assert line.servo().shaft_angle == 2.0
     line.write(1, 24, 1)  # and then it moves to the goal that is there
     line.clock.wait_until(4_000_000_000)
     assert line.read(1, 36, 2) == pytest.approx(700, abs=2)
@@ -130,7 +130,7 @@ def test_waking_by_a_goal_can_be_switched_off(line):
 def test_a_sync_write_with_the_direction_bit_of_the_speed_moves_a_joint(make_line, model):
     # pypot does so with `orientation: indirect`: goal position and moving speed in one row, bit 10 set
     line = make_line((1, 2), model, position=2.0)
-    start = line.servo(1).position
+    start = line.servo(1).shaft_angle
     line.send(0xFE, 0x83, 30, 4, 1, *low_high(700), *low_high(1024 + 100), 2, *low_high(700), *low_high(100))
     assert line.receive() == b""
     for servo_id in (1, 2):
@@ -139,7 +139,7 @@ def test_a_sync_write_with_the_direction_bit_of_the_speed_moves_a_joint(make_lin
     unit = line.servo(1).registers.table.rad_s_per_tick
     assert abs(line.servo(1).velocity) == pytest.approx(100 * unit, rel=0.1)  # still coming to its speed
     assert line.servo(1).velocity == pytest.approx(line.servo(2).velocity)
-    assert line.servo(1).position != start
+    assert line.servo(1).shaft_angle != start
     assert not [note for note in line.notes() if "refuse" in note]
 
 
@@ -153,10 +153,10 @@ def test_torque_off_in_the_middle_stops_it_there(line):
     line.write(1, 30, *low_high(1023), *low_high(100))
     line.clock.wait_until(500_000_000)
     line.write(1, 24, 0)
-    stopped = line.servo().position
+    stopped = line.servo().shaft_angle
     assert 2.0 < stopped < 1023 * TICK
     line.clock.wait_until(3_000_000_000)
-    assert line.servo().position == pytest.approx(stopped, abs=0.1)  # it comes to rest by itself
+    assert line.servo().shaft_angle == pytest.approx(stopped, abs=0.1)  # it comes to rest by itself
     assert line.servo().velocity == 0.0
 
 
@@ -204,9 +204,9 @@ def test_overload_takes_the_torque_until_the_limit_is_written(line):
     assert line.ask(1, READ, 24, 1) == (1, ErrorBit.OVERLOAD, b"\x01")  # torque enable stays
     assert line.read(1, 34, 2) == 0
     assert not line.servo().torque_on
-    stopped = line.servo().position
+    stopped = line.servo().shaft_angle
     line.clock.wait_until(3_000_000_000)
-    assert line.servo().position == pytest.approx(stopped, abs=0.1)
+    assert line.servo().shaft_angle == pytest.approx(stopped, abs=0.1)
     assert line.write(1, 34, *low_high(1023)) == 0
     line.clock.wait_until(6_000_000_000)
     assert line.read(1, 36, 2) == pytest.approx(700, abs=2)
@@ -239,7 +239,7 @@ def test_a_cut_data_line_silences_but_does_not_stop(line):
     assert line.ask(1, PING) is None
     line.send(BROADCAST, WRITE, 24, 0)
     line.clock.wait_until(3_000_000_000)
-    assert line.servo().position == pytest.approx(1023 * TICK, abs=2 * TICK)
+    assert line.servo().shaft_angle == pytest.approx(1023 * TICK, abs=2 * TICK)
     line.servo().silence(False)
     assert line.read(1, 24, 1) == 1
 
@@ -248,10 +248,10 @@ def test_values_and_bytes_of_the_registers_never_differ():
     table = find_table("AX-12A")
     registers = Memory(table, 24)
     for run in registers.runs(26, bytes((5, 6, 7, 8, 0x23, 0x01))):
-        registers.write(run)
+        registers.write_run(run)
     registers["moving_speed"] = 77
     for item in table.items.values():
-        data = registers.read(item.address, item.size)
+        data = registers.read_bytes(item.address, item.size)
         assert data is not None
         assert int.from_bytes(data, "little") == registers[item.name]
     assert registers["goal_position"] == 0x123
@@ -283,7 +283,7 @@ def test_an_mx_counts_milliseconds_from_its_power_up(make_line):
     first = line.read(1, 50, 2)
     line.clock.wait_until(line.clock.now_ns() + 2_000_000_000)
     assert line.read(1, 50, 2) - first == pytest.approx(2010, abs=1)
-    line.servo().reset()
+    line.servo().power_cycle()
     assert line.read(1, 50, 2) < 10
     line.clock.wait_until(line.clock.now_ns() + 32_768_000_000)
     assert line.read(1, 50, 2) < 50

@@ -8,7 +8,7 @@ from unittest.mock import ANY
 import pytest
 from tests.kit.line_faults import turn_by_hand
 
-from dxlsim.wire.protocol2 import ErrorNumber
+from dxlsim.wire.servo_protocol2 import StatusErrorNumber
 
 PING, READ, WRITE, REG_WRITE, ACTION, RESET, REBOOT, CLEAR = 1, 2, 3, 4, 5, 6, 8, 0x10
 SYNC_WRITE, BULK_WRITE = 0x83, 0x93
@@ -45,25 +45,25 @@ def test_packets_of_the_manual_go_in_and_come_out(make_line2):
     for received, replied in talk:
         if received == "fffffd00 01 0800 10 0144584c22 b1dc":
             line.servo().poke("firmware_version", 42)  # the first one that knows Clear
-        line.ports.ports[0].write(bytes.fromhex(received))
+        line.ports.ports[0].write_packet(bytes.fromhex(received))
         assert line.receive() == bytes.fromhex(replied)
     line.wait(1)
     line.bus.baud_rate = 57_600  # the factory's, which reset option 1 does not keep
-    line.ports.ports[0].write(bytes.fromhex("fffffd00 01 0300 08 2f4e"))
+    line.ports.ports[0].write_packet(bytes.fromhex("fffffd00 01 0300 08 2f4e"))
     assert line.receive() == bytes.fromhex("fffffd00 01 0400 55 00 a10c")
 
 
 def test_a_place_without_an_item_is_not_read_one_beside_items_is(line2):
-    assert line2.request(1, READ, b"\x0e\x00\x02\x00") == (1, ErrorNumber.ACCESS, b"")  # 14 and 15
+    assert line2.request(1, READ, b"\x0e\x00\x02\x00") == (1, StatusErrorNumber.ACCESS, b"")  # 14 and 15
     assert line2.request(1, READ, b"\x0d\x00\x02\x00") == (1, 0, b"\x02\x00")  # Protocol Type (13) and 14
 
 
 def test_what_was_allowed_before_is_refused_when_a_limit_or_the_mode_changes(line2):
     line2.put(operating_mode=4, goal_position=100_000)
     line2.put(goal_position=0, operating_mode=3)
-    assert line2.set("goal_position", 50_000) == ErrorNumber.DATA_RANGE
+    assert line2.set("goal_position", 50_000) == StatusErrorNumber.DATA_RANGE
     line2.put(goal_position=4000, max_position_limit=2000)
-    assert line2.set("goal_position", 3000) == ErrorNumber.DATA_LIMIT
+    assert line2.set("goal_position", 3000) == StatusErrorNumber.DATA_LIMIT
     assert line2.set("goal_position", 1000) == 0
 
 
@@ -125,7 +125,7 @@ def test_overload_latches_until_a_reboot(line2):
     answer = line2.request(1, READ, b"\x46\x00\x01\x00")
     assert answer == (1, ALERT, bytes((0x20,)))
     assert line2.get("torque_enable") == 0
-    assert line2.set("torque_enable", 1) == ALERT | ErrorNumber.RESULT_FAIL
+    assert line2.set("torque_enable", 1) == ALERT | StatusErrorNumber.RESULT_FAIL
     line2.set("goal_position", 1000)
     assert line2.get("torque_enable") == 0
     line2.request(1, REBOOT)
@@ -151,7 +151,7 @@ def test_every_status_has_the_alert_bit_as_long_as_an_error_lasts(make_line2):
         (ACTION, b""),
     ):
         assert line.request(1, instruction, parameters) == (1, ALERT, ANY)
-    assert line.request(1, 0x07).error == ALERT | ErrorNumber.INSTRUCTION
+    assert line.request(1, 0x07).error == ALERT | StatusErrorNumber.INSTRUCTION
     line.instruct(BROADCAST, 0x82, bytes.fromhex("84000400 0102"))
     assert [each.error for each in line.statuses()] == [ALERT, 0]
     line.instruct(BROADCAST, 0x8A, bytes.fromhex("84000400 0102"))
@@ -199,8 +199,8 @@ def test_bus_watchdog_stops_and_closes_the_goals(line2):
     assert line2.servo().velocity == 0
     assert line2.get("bus_watchdog") == 0xFF
     assert (line2.get("profile_velocity"), line2.get("profile_acceleration")) == (0, 0)
-    assert line2.set("goal_velocity", 150) == ErrorNumber.DATA_RANGE
-    assert line2.set("goal_position", 150) == ErrorNumber.DATA_RANGE
+    assert line2.set("goal_velocity", 150) == StatusErrorNumber.DATA_RANGE
+    assert line2.set("goal_position", 150) == StatusErrorNumber.DATA_RANGE
     line2.put(bus_watchdog=0, goal_velocity=150)
     line2.wait(0.5)
     assert line2.servo().velocity > 0
@@ -212,10 +212,10 @@ def test_the_watchdog_s_stop_is_at_its_time(line2):
     line2.wait(0.08)
     assert line2.servo().velocity > 0.3
     line2.wait(0.2)
-    stopped = line2.servo().position
+    stopped = line2.servo().shaft_angle
     assert line2.servo().velocity == pytest.approx(0.0, abs=1e-3)
     line2.wait(3)
-    assert line2.servo().position == pytest.approx(stopped, abs=1e-3)
+    assert line2.servo().shaft_angle == pytest.approx(stopped, abs=1e-3)
 
 
 def test_watchdog_does_not_count_the_time_in_which_its_process_stood_still(line2):
@@ -248,7 +248,7 @@ def test_a_servo_at_rest_shows_at_once_what_turns_it_and_what_is_written(line2):
     resting = line2.get("present_position")
     assert line2.servo().shaft.mechanics.still, "this test is about a servo at rest"
     assert line2.get("present_position") == resting
-    turn_by_hand(line2.servo(), line2.servo().position + 0.5)
+    turn_by_hand(line2.servo(), line2.servo().shaft_angle + 0.5)
     turned = line2.get("present_position")
     assert turned == pytest.approx(resting + 0.5 / 0.001534, abs=2)
     line2.wait(1.0)

@@ -25,10 +25,10 @@ def way(bus: SimulatedBus, goal: int, until_ns: int) -> list[float]:
     for name, value in (("torque_enable", 1), ("goal_position", goal)):
         servo.registers[name] = value
         servo.shaft.plan((name,))
-    before, moved = servo.position, []
+    before, moved = servo.shaft_angle, []
     for now_ns in range(began_ns, began_ns + until_ns, MS // 10):
-        bus.advance(now_ns)
-        moved.append(servo.position - before)
+        bus.advance_to(now_ns)
+        moved.append(servo.shaft_angle - before)
     return moved
 
 
@@ -47,7 +47,7 @@ def test_a_servo_acts_a_response_delay_later_and_then_as_ever(model, protocol, g
 @pytest.mark.parametrize("after_ms", [0.1, 1.0, 1.9])
 def test_a_goal_between_two_points_of_the_grid_acts_at_the_next_one(after_ms):
     bus = bus_of("XM430-W350", 2.0)
-    bus.advance(round((10 + after_ms) * MS))
+    bus.advance_to(round((10 + after_ms) * MS))
     moved = way(bus, 3000, 10 * MS)
     ends = round((4.0 - after_ms) * 10)  # 0.1 ms until the end of the first step that begins after the goal
     assert not any(moved[: ends - 1])
@@ -70,8 +70,8 @@ def test_torque_off_acts_at_once_and_withdraws_what_has_not_acted_yet(model, pro
     servo = bus.servo(1)
     servo.registers[item] = 0
     servo.shaft.plan((item,))
-    bus.advance(200 * MS)
-    assert servo.position == pytest.approx(2.0)
+    bus.advance_to(200 * MS)
+    assert servo.shaft_angle == pytest.approx(2.0)
     assert servo.velocity == 0.0
 
 
@@ -82,13 +82,13 @@ def test_goals_act_in_the_order_and_at_the_distance_in_which_they_came():
     for goal in (1400, 1500):
         servo.registers["goal_position"] = goal
         servo.shaft.plan(("goal_position",))
-        bus.advance(bus.now_ns + 30 * MS)
+        bus.advance_to(bus.now_ns + 30 * MS)
     # 60 ms after the first goal only this one acts
     assert servo.shaft.mechanics.profiles.position[0] == pytest.approx(
         1400 * servo.registers.table.rad_per_tick
     )
-    bus.advance(bus.now_ns + 500 * MS)
-    assert servo.position == pytest.approx(1500 * servo.registers.table.rad_per_tick, abs=0.01)
+    bus.advance_to(bus.now_ns + 500 * MS)
+    assert servo.shaft_angle == pytest.approx(1500 * servo.registers.table.rad_per_tick, abs=0.01)
 
 
 @pytest.mark.parametrize("protocol", [1.0, 2.0])
@@ -106,11 +106,11 @@ def test_a_servo_receives_nothing_for_its_time_after_a_write(make_line, make_lin
     assert ask(line, port, read)
     assert ask(line, port, read), "a read takes no such time"
     for packet, wait_ms, answered in ((ping, 2.8, False), (ping, 3.2, True), (read, 3.2, True)):
-        port.write(write)
+        port.write_packet(write)
         line.clock.wait_until(line.clock.now_ns() + round(wait_ms * MS))
         assert ask(line, port, packet) is answered
 
 
 def ask(line: Any, port: Any, packet: bytes) -> bool:
-    port.write(packet)
+    port.write_packet(packet)
     return bool(line.receive(5 * MS))

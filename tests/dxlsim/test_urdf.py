@@ -8,7 +8,7 @@ from pathlib import Path
 import pytest
 
 from dxlsim.geometry.urdf import Mimic, UrdfLimits, leader, read_urdf
-from dxlwire.errors import InputError
+from dxlwire.exceptions import InputError
 
 ARM = """\
 <robot name="arm">

@@ -7,7 +7,7 @@ from dxlsim.bus.simulated_bus import SimulatedBus
 from dxlsim.simulation_plan import BusConfig, ServoConfig
 from dxlsim.virtual_ports import VirtualPorts
 from dxlwire.clock import VirtualClock
-from dxlwire.errors import PortError
+from dxlwire.exceptions import PortError
 from dxlwire.port.ports import Ports
 
 PING_1 = bytes.fromhex("ff ff 01 02 01 fb")
@@ -32,30 +32,30 @@ def read(ports: Ports, index: int) -> bytes:
 def test_waiting_ends_at_the_first_reply_and_names_its_line():
     clock, ports, _ = two_buses()
     for port in ports.ports:
-        port.write(PING_1)
-    assert ports.wait(10**9) == [1]
+        port.write_packet(PING_1)
+    assert ports.wait_for_bytes(10**9) == [1]
     assert clock.now_ns() == 1_000 + 220_000
     assert read(ports, 1) == PONG_1
-    assert ports.wait(10**9) == [0]
+    assert ports.wait_for_bytes(10**9) == [0]
     assert clock.now_ns() == 1_000 + 620_000
     assert read(ports, 0) == PONG_1
 
 
 def test_waiting_ends_at_the_deadline():
     clock, ports, _ = two_buses()
-    assert ports.wait(5_000) == []
+    assert ports.wait_for_bytes(5_000) == []
     assert clock.now_ns() == 5_000
-    assert ports.wait(100) == []  # the past: only a look
+    assert ports.wait_for_bytes(100) == []  # the past: only a look
     assert clock.now_ns() == 5_000
 
 
 def test_bytes_that_do_not_fit_stay_for_the_next_read():
     _, ports, _ = two_buses()
-    ports.ports[0].write(PING_1)
-    ports.wait(10**9)
+    ports.ports[0].write_packet(PING_1)
+    ports.wait_for_bytes(10**9)
     small = bytearray(4)
     assert ports.ports[0].read_into(memoryview(small)) == 4
-    assert ports.wait(10**9) == [0]
+    assert ports.wait_for_bytes(10**9) == [0]
     assert bytes(small) + read(ports, 0) == PONG_1
     assert read(ports, 0) == b""
 
@@ -63,12 +63,12 @@ def test_bytes_that_do_not_fit_stay_for_the_next_read():
 def test_an_unplugged_adapter_is_a_port_error():
     _, ports, virtual = two_buses()
     virtual.ports[0].unplug()
-    assert ports.wait(10**9) == [0]
+    assert ports.wait_for_bytes(10**9) == [0]
     with pytest.raises(PortError, match="bus left is gone"):
-        ports.ports[0].write(PING_1)
+        ports.ports[0].write_packet(PING_1)
     with pytest.raises(PortError):
         read(ports, 0)
-    ports.ports[1].write(PING_1)
+    ports.ports[1].write_packet(PING_1)
 
 
 def test_a_planned_fault_happens_while_somebody_waits(make_line):
@@ -80,16 +80,16 @@ def test_a_planned_fault_happens_while_somebody_waits(make_line):
 def test_a_lost_line_is_back_when_its_adapter_is_and_delays_no_other_meanwhile():
     clock, ports, virtual = two_buses()
     virtual.ports[0].unplug()
-    assert ports.wait(5_000) == [0]
+    assert ports.wait_for_bytes(5_000) == [0]
     assert not ports.reopen(0)
-    assert ports.wait(5_000) == []
+    assert ports.wait_for_bytes(5_000) == []
     assert clock.now_ns() == 5_000
     with pytest.raises(PortError):
-        ports.ports[0].write(PING_1)
+        ports.ports[0].write_packet(PING_1)
     virtual._buses[0].plug_in()
     assert ports.reopen(0)
-    ports.ports[0].write(PING_1)
-    assert ports.wait(10**9) == [0]
+    ports.ports[0].write_packet(PING_1)
+    assert ports.wait_for_bytes(10**9) == [0]
     assert read(ports, 0) == PONG_1
 
 
@@ -99,6 +99,6 @@ def test_time_passes_on_a_lost_line():
     bus.unplug()
     assert not ports.reopen(0)
     bus.at(2_000_000, bus.plug_in)
-    assert ports.wait(3_000_000) == []
+    assert ports.wait_for_bytes(3_000_000) == []
     assert bus.plugged
     assert clock.now_ns() == 3_000_000

@@ -17,8 +17,8 @@ def parsed(packet):
 
 def test_the_manuals_instruction_packets():
     assert protocol1.ping(1).hex(" ") == "ff ff 01 02 01 fb"
-    assert protocol1.read(1, 0x2B, 1).hex(" ") == "ff ff 01 04 02 2b 01 cc"
-    assert protocol1.write(0xFE, 3, b"\x01").hex(" ") == "ff ff fe 04 03 03 01 f6"
+    assert protocol1.read_range(1, 0x2B, 1).hex(" ") == "ff ff 01 04 02 2b 01 cc"
+    assert protocol1.write_range(0xFE, 3, b"\x01").hex(" ") == "ff ff fe 04 03 03 01 f6"
     assert protocol1.factory_reset(0).hex(" ") == "ff ff 00 02 06 f7"
 
 
@@ -57,7 +57,7 @@ def test_one_changed_byte_is_always_noticed(servo_id, parameters, data):
 
 
 def test_an_echoed_instruction_parses_as_a_status():
-    assert parsed(protocol1.read(5, 36, 6)) == Status(5, 2, bytes((36, 6)))
+    assert parsed(protocol1.read_range(5, 36, 6)) == Status(5, 2, bytes((36, 6)))
 
 
 def test_the_error_byte_in_words():
@@ -81,7 +81,7 @@ def test_the_error_byte_in_words():
     [
         lambda: protocol1.ping(255),
         lambda: protocol1.ping(-1),
-        lambda: protocol1.write(1, 0, bytes(253)),
+        lambda: protocol1.write_range(1, 0, bytes(253)),
         lambda: protocol1.sync_write(30, 4, {1: b"\0\0"}),
         lambda: protocol1.sync_write(30, 4, {1: bytes(5), 2: bytes(4)}),
         lambda: protocol1.sync_write(30, 4, {i: bytes(4) for i in range(51)}),
@@ -103,8 +103,8 @@ def test_an_error_bit_is_a_refusal_only_where_data_are_missing():
 def test_a_status_reads_as_an_instruction_only_where_code_and_length_are_one():
     for packet in (
         protocol1.ping(1),
-        protocol1.read(1, 36, 2),
-        protocol1.write(1, 30, b"\0"),
+        protocol1.read_range(1, 36, 2),
+        protocol1.write_range(1, 30, b"\0"),
         protocol1.factory_reset(1),
     ):
         assert protocol1.instructs(memoryview(packet))

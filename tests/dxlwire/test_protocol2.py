@@ -10,8 +10,8 @@ from dxlwire.wire import protocol2 as p2
 INSTRUCTIONS = {
     "ping": (p2.ping(1), "FF FF FD 00 01 03 00 01 19 4E"),
     "broadcast ping": (p2.ping(), "FF FF FD 00 FE 03 00 01 31 42"),
-    "read": (p2.read(1, 132, 4), "FF FF FD 00 01 07 00 02 84 00 04 00 1D 15"),
-    "write": (p2.write(1, 116, b"\0\2\0\0"), "FF FF FD 00 01 09 00 03 74 00 00 02 00 00 CA 89"),
+    "read": (p2.read_range(1, 132, 4), "FF FF FD 00 01 07 00 02 84 00 04 00 1D 15"),
+    "write": (p2.write_range(1, 116, b"\0\2\0\0"), "FF FF FD 00 01 09 00 03 74 00 00 02 00 00 CA 89"),
     "factory reset": (p2.factory_reset(1, p2.Reset.KEEP_ID), "FF FF FD 00 01 04 00 06 01 A1 E6"),
     "reboot": (p2.reboot(1), "FF FF FD 00 01 03 00 08 2F 4E"),
     "back up": (p2.back_up(1), "FF FF FD 00 01 08 00 20 01 43 54 52 4C 16 F5"),
@@ -142,7 +142,7 @@ def test_a_status_survives_the_line(servo_id, error, data):
 def test_stuffing_is_what_the_sdk_would_do_if_it_kept_the_result(data):
     handler = sdk.Protocol2PacketHandler()
     plain = [*p2.HEADER, 1, *(len(data) + 3).to_bytes(2, "little"), 0x03, *data, 0, 0]
-    ours = p2.instruction_packet(1, p2.Instruction.WRITE, data)
+    ours = p2.instruction_packet(1, p2.Protocol2Instruction.WRITE, data)
     assert bytes(handler.addStuffing(plain))[:-2] == ours[:-2]
     assert p2.unstuffed(p2.stuffed(data)) == data
 
@@ -165,7 +165,7 @@ def test_no_status_is_wider_than_its_widest(length):
 
 def test_a_status_that_is_none():
     good = p2.status_packet(1, 0, b"\1\2")
-    for wrong in (good[:-1], good[:-1] + b"\0", b"\xff" + good, p2.ping(1) + b"\0", p2.read(1, 0, 2)):
+    for wrong in (good[:-1], good[:-1] + b"\0", b"\xff" + good, p2.ping(1) + b"\0", p2.read_range(1, 0, 2)):
         assert parsed(wrong) is None
 
 

@@ -49,7 +49,7 @@ def feed_in_pieces(receiver, stream, cuts):
     ends = sorted({min(cut, len(stream)) for cut in cuts} | {len(stream)})
     start = 0
     for time, end in enumerate(ends):
-        receiver.feed(stream[start:end], time)
+        receiver.feed_bytes(stream[start:end], time)
         start = end
 
 
@@ -73,7 +73,7 @@ def test_every_intact_packet_between_noise_is_delivered_once_however_it_is_split
 @given(stream=header_bytes | st.binary(max_size=600), cuts=st.lists(st.integers(0, 600), max_size=20))
 def test_any_bytes_leave_once_and_in_order(dialect, stream, cuts):
     whole, pieces = Heard(dialect), Heard(dialect)
-    whole.receiver.feed(stream, 0)
+    whole.receiver.feed_bytes(stream, 0)
     feed_in_pieces(pieces.receiver, stream, cuts)
     assert pieces.packets == whole.packets
     whole.receiver.flush()
@@ -87,7 +87,7 @@ def test_any_bytes_leave_once_and_in_order(dialect, stream, cuts):
 def test_flush_finds_the_packet_behind_any_unfinished_header(dialect, data, noise):
     packet = draw_packet(data, dialect)
     heard = Heard(dialect)
-    heard.receiver.feed(noise + packet, 0)
+    heard.receiver.feed_bytes(noise + packet, 0)
     heard.receiver.flush()
     assert heard.all_bytes == noise + packet
     # a false packet that swallows the real one with a right checksum is possible and legal
@@ -104,7 +104,7 @@ def test_a_mutated_byte_spoils_no_packet_before_it_and_stays_visible(dialect, da
     broken[data.draw(st.integers(2, len(broken) - 1))] ^= 1 << data.draw(st.integers(0, 6))
     stream = b"".join([*packets[:victim], bytes(broken), *packets[victim + 1 :]])
     heard = Heard(dialect)
-    heard.receiver.feed(stream, 0)
+    heard.receiver.feed_bytes(stream, 0)
     heard.receiver.flush()
     assert heard.all_bytes == stream
     assert heard.packets[:victim] == packets[:victim]
@@ -113,7 +113,7 @@ def test_a_mutated_byte_spoils_no_packet_before_it_and_stays_visible(dialect, da
 def test_a_long_false_header_holds_packets_back_until_flush():
     packet = protocol1.status_packet(1, 0, b"\x20")
     heard = Heard()
-    heard.receiver.feed(b"\xff\xff\x05\xf0" + packet, 0)
+    heard.receiver.feed_bytes(b"\xff\xff\x05\xf0" + packet, 0)
     assert heard.packets == []
     heard.receiver.flush()
     assert heard.packets == [packet]
@@ -124,32 +124,32 @@ def test_a_packet_behind_a_false_header_is_found_with_the_times_of_its_own_reads
     """The false one ends within the true one, which begins with a read()."""
     packet, false = protocol1.status_packet(1, 0, b"\x20"), b"\xff\xff\x05\x05\0\0"
     heard = Heard()
-    heard.receiver.feed(false, 10)
-    heard.receiver.feed(packet, 20)
+    heard.receiver.feed_bytes(false, 10)
+    heard.receiver.feed_bytes(packet, 20)
     assert heard.parts == [("noise", false, 10, 10), ("packet", packet, 20, 20)]
 
 
 def test_a_third_ff_before_a_packet_is_noise():
     packet = protocol1.status_packet(1)
     heard = Heard()
-    heard.receiver.feed(b"\xff" + packet, 0)
+    heard.receiver.feed_bytes(b"\xff" + packet, 0)
     assert heard.parts == [("noise", b"\xff", 0, 0), ("packet", packet, 0, 0)]
 
 
 def test_times_are_those_of_the_reads_that_brought_first_and_last_byte():
     one, two = protocol1.status_packet(1, 0, b"\1\2"), protocol1.status_packet(2)
     heard = Heard()
-    heard.receiver.feed(one[:3], 10)
-    heard.receiver.feed(one[3:5], 20)
-    heard.receiver.feed(one[5:] + two[:2], 30)
-    heard.receiver.feed(two[2:], 40)
+    heard.receiver.feed_bytes(one[:3], 10)
+    heard.receiver.feed_bytes(one[3:5], 20)
+    heard.receiver.feed_bytes(one[5:] + two[:2], 30)
+    heard.receiver.feed_bytes(two[2:], 40)
     assert heard.parts == [("packet", one, 10, 30), ("packet", two, 30, 40)]
 
 
 def test_memory_is_bounded_and_nothing_is_lost_in_a_flood():
     heard = Heard()
     stream = (b"\xff\xff\x01\xff" + bytes(300)) * 40
-    heard.receiver.feed(stream, 0)
+    heard.receiver.feed_bytes(stream, 0)
     assert heard.receiver.pending < protocol1.LONGEST
     heard.receiver.flush()
     assert heard.all_bytes == stream
@@ -161,7 +161,7 @@ def test_a_status_of_a_fast_form_is_framed_by_its_length_alone():
     body += protocol2.crc(body).to_bytes(2, "little") + bytes((0, 4)) + bytes(4)
     packet = body + protocol2.crc(body).to_bytes(2, "little")
     heard = Heard(protocol2)
-    heard.receiver.feed(packet + protocol2.status_packet(5), 0)
+    heard.receiver.feed_bytes(packet + protocol2.status_packet(5), 0)
     assert heard.packets == [packet, protocol2.status_packet(5)]
     assert protocol2.fast_answers(packet, (4, 4)) == [(3, 0, protocol2.HEADER), (4, 0, bytes(4))]
 
@@ -169,7 +169,7 @@ def test_a_status_of_a_fast_form_is_framed_by_its_length_alone():
 def test_a_header_that_announces_more_than_anybody_says_holds_nothing_back():
     packet = protocol2.status_packet(1, 0, b"\x20")
     heard = Heard(protocol2)
-    heard.receiver.feed(protocol2.HEADER + b"\x01\xff\xff" + packet, 0)
+    heard.receiver.feed_bytes(protocol2.HEADER + b"\x01\xff\xff" + packet, 0)
     assert heard.packets == [packet]
 
 

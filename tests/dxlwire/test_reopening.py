@@ -5,9 +5,9 @@ import select
 
 import pytest
 
-from dxlwire.errors import PortError
+from dxlwire.exceptions import PortError
 from dxlwire.port.ports import SerialPort, SerialPorts
-from dxlwire.port.reopening import KeptLines, Wanted, lasting_name
+from dxlwire.port.reopening import KeptLines, LineSettings, lasting_name
 
 PATIENCE_S = 60.0
 
@@ -47,7 +47,7 @@ def adapters(tmp_path):
 
 @pytest.fixture
 def kept(adapters):
-    lines = KeptLines([Wanted(str(adapter.link), 1_000_000, 0) for adapter in adapters])
+    lines = KeptLines([LineSettings(str(adapter.link), 1_000_000, 0) for adapter in adapters])
     yield lines
     lines.close()
 
@@ -95,14 +95,14 @@ def test_a_line_that_is_back_is_locked_against_every_other_program(adapters, kep
     adapters[0].plug_in()
     returned(kept)
     with pytest.raises(PortError, match="in use"):
-        KeptLines([Wanted(str(adapters[0].link), 1_000_000, 0)])
+        KeptLines([LineSettings(str(adapters[0].link), 1_000_000, 0)])
 
 
 def test_of_two_lines_of_which_one_is_missing_neither_is_kept(adapters):
     left = str(adapters[0].link)
     with pytest.raises(PortError, match="there is no /dev/ttyNOPE"):
-        KeptLines([Wanted(left, 1_000_000, 0), Wanted("/dev/ttyNOPE", 1_000_000, 0)])
-    KeptLines([Wanted(left, 1_000_000, 0)]).close()
+        KeptLines([LineSettings(left, 1_000_000, 0), LineSettings("/dev/ttyNOPE", 1_000_000, 0)])
+    KeptLines([LineSettings(left, 1_000_000, 0)]).close()
 
 
 def test_reopened_line_takes_the_place_of_the_lost_one(adapters, kept):
@@ -118,7 +118,7 @@ def test_reopened_line_takes_the_place_of_the_lost_one(adapters, kept):
     assert returned(kept) == [0]
     back.append(os.dup(kept.descriptors[0]))
     assert ports.reopen(0)
-    ports.ports[0].write(b"again")
+    ports.ports[0].write_packet(b"again")
     assert adapters[0].heard() == b"again"
 
 

@@ -4,14 +4,14 @@ import pytest
 from tests.kit.rigs import make_x
 
 from dxlrun.dynamixel.findings import Findings
-from dxlrun.dynamixel.servo.access import reach
-from dxlrun.dynamixel.servo.registers import settle
+from dxlrun.dynamixel.servo.item_access import access_servo
+from dxlrun.dynamixel.servo.registers import write_registers
 from dxlwire.bus_plan import RegisterValue
 from dxlwire.control_table import decoded, find_table
-from dxlwire.transaction import Outcome, Reply
+from dxlwire.transaction import Reply, TransactionOutcome
 
 PLAN = make_x((11,))
-ONE = reach(PLAN, PLAN.servos[0])
+ONE = access_servo(PLAN, PLAN.servos[0])
 READ, WRITE = 2, 3
 GAIN = RegisterValue(84, 2, 900, "position_p_gain")
 
@@ -25,8 +25,10 @@ def played(program, *answers):
         while True:
             sent.append((request.packet[7], int.from_bytes(request.packet[8:10], "little")))
             answer = left.pop(0) if len(left) > 1 else left[0]
-            failed = isinstance(answer, Outcome)
-            reply = Reply(answer if failed else Outcome.OK, 7, b"" if failed else answer, 0, 0, False)
+            failed = isinstance(answer, TransactionOutcome)
+            reply = Reply(
+                answer if failed else TransactionOutcome.OK, 7, b"" if failed else answer, 0, 0, False
+            )
             request = program.send(reply)
     except StopIteration as end:
         return end.value, sent
@@ -37,7 +39,7 @@ def played(program, *answers):
     [
         ((b"", b"\x10"), ""),
         ((b"", b"\x03", b"", b"\x03", b"", b"\x03", b"\0"), "was given Operating Mode (11) = 16, but has 3"),
-        ((b"", Outcome.TIMEOUT), "did not answer when Operating Mode (11) was read back"),
+        ((b"", TransactionOutcome.TIMEOUT), "did not answer when Operating Mode (11) was read back"),
         (
             (b"", b"\x03", b"", b"\x03", b"", b"\x03", b"\1"),
             "holds torque, so Operating Mode (11) = 16 in its EEPROM was not written: switch its torque off "
@@ -46,47 +48,47 @@ def played(program, *answers):
     ],
 )
 def test_an_item_counts_as_written_when_it_is_read_back(answers, problem):
-    found, sent = played(ONE.write("operating_mode", 16), *answers)
+    found, sent = played(ONE.write_item("operating_mode", 16), *answers)
     assert found == problem
     assert sent[:2] == [(WRITE, 11), (READ, 11)]
 
 
 def test_a_refused_write_is_not_read_back():
-    problem, sent = played(ONE.write("operating_mode", 16), Outcome.REFUSED)
+    problem, sent = played(ONE.write_item("operating_mode", 16), TransactionOutcome.REFUSED)
     assert problem.startswith("refuses Operating Mode (11) = 16: access error")
     assert (READ, 11) not in sent
 
 
 def test_a_refused_goal_names_the_register_that_bounds_it():
     hundred, more = (100).to_bytes(2, "little"), (900).to_bytes(2, "little")
-    problem, sent = played(ONE.write("goal_pwm", -885), Outcome.REFUSED, hundred)
+    problem, sent = played(ONE.write_item("goal_pwm", -885), TransactionOutcome.REFUSED, hundred)
     assert problem.startswith("refuses Goal PWM (100) = -885: ")
     assert problem.endswith("; its PWM Limit (36) is 100: write 885 or more there")
     assert sent == [(WRITE, 100), (READ, 36)]
-    problem, _ = played(ONE.write("goal_pwm", 885), Outcome.REFUSED, more)
+    problem, _ = played(ONE.write_item("goal_pwm", 885), TransactionOutcome.REFUSED, more)
     assert "PWM Limit" not in problem
 
 
 def test_items_are_read_side_by_side_and_none_counts_where_one_does_not_come():
     names = ("position_d_gain", "position_i_gain", "torque_enable")
-    found, sent = played(ONE.read(names), b"\1\0", b"\1\0\2\0")
+    found, sent = played(ONE.read_items(names), b"\1\0", b"\1\0\2\0")
     assert found == {"torque_enable": 1, "position_d_gain": 1, "position_i_gain": 2}
     assert sent == [(READ, 64), (READ, 80)]
-    found, _ = played(ONE.read(names), b"\1\0", Outcome.TIMEOUT)
+    found, _ = played(ONE.read_items(names), b"\1\0", TransactionOutcome.TIMEOUT)
     assert found is None
 
 
 def test_a_register_is_written_again_until_it_is_read_back():
     right, wrong = (900).to_bytes(2, "little"), (800).to_bytes(2, "little")
-    assert played(ONE.write(GAIN.name, GAIN.value), b"", wrong, b"", right)[0] == ""
-    problem, sent = played(ONE.write(GAIN.name, GAIN.value), b"", wrong, b"", wrong, b"", wrong)
+    assert played(ONE.write_item(GAIN.name, GAIN.value), b"", wrong, b"", right)[0] == ""
+    problem, sent = played(ONE.write_item(GAIN.name, GAIN.value), b"", wrong, b"", wrong, b"", wrong)
     assert problem == "was given Position P Gain (84) = 900, but has 800"
     assert sent == [(WRITE, 84), (READ, 84)] * 3
 
 
 def test_nothing_is_written_where_one_register_cannot_be_read():
     found, other = Findings(), RegisterValue(80, 2, 5, "position_d_gain")
-    before, sent = played(settle(ONE, (GAIN, other), found), b"\0\0", Outcome.TIMEOUT)
+    before, sent = played(write_registers(ONE, (GAIN, other), found), b"\0\0", TransactionOutcome.TIMEOUT)
     assert found.problems == [f"{ONE} did not answer when Position D Gain (80) was read"]
     assert before == {"position_p_gain": 0}
     assert {instruction for instruction, _ in sent} == {READ}

@@ -5,7 +5,7 @@ import math
 import pytest
 from tests.kit.rigs import make_plan, make_rig, start_rig
 
-from dxlrun.channels.events import EventCode
+from dxlrun.channels.event_records import EventCode
 from dxlwire.wire import protocol1
 
 MIXED = ("AX-12A", "MX-64", "MX-28", "AX-12A", "MX-64")
@@ -22,9 +22,9 @@ def test_mx_are_read_together_and_ax_one_by_one(started):
     started.cycle()
     *reads, goals = started.into_bus()[count:]
     assert reads == [
-        protocol1.read(1, 36, 6),
+        protocol1.read_range(1, 36, 6),
         protocol1.bulk_read([(2, 36, 6), (3, 36, 6), (5, 36, 6)]),
-        protocol1.read(4, 36, 6),
+        protocol1.read_range(4, 36, 6),
     ]
     assert goals[4:7] == bytes((0x83, 30, 4))
     assert started.states.valid.all()
@@ -32,7 +32,10 @@ def test_mx_are_read_together_and_ax_one_by_one(started):
 
 def test_one_mx_alone_is_read_plainly():
     plan = make_plan((1, 2), models=("AX-12A", "MX-64"))
-    assert [read.packet for read in plan.reads] == [protocol1.read(1, 36, 6), protocol1.read(2, 36, 6)]
+    assert [read.packet for read in plan.reads] == [
+        protocol1.read_range(1, 36, 6),
+        protocol1.read_range(2, 36, 6),
+    ]
 
 
 def test_an_absent_servo_breaks_the_chain_for_one_cycle(started):

@@ -56,8 +56,8 @@ def started() -> Rig:
 def test_part_gets_time_of_the_cycle_in_idle_time(calls: list[Any]) -> None:
     rig = started()
     for time_ns in (0, 20):
-        rig.hardware.read()
-        rig.hardware.write()
+        rig.hardware.read_states()
+        rig.hardware.write_goals()
         rig.hardware.idle(rig.clock.now_ns() + 10_000_000, time_ns)
     assert calls == ["0 ns", "20 ns"]
 
@@ -84,9 +84,9 @@ def test_part_recovers_line_then_each_of_its_servos(calls: list[Any]) -> None:
 
 
 def test_safe_stage_gets_plan_of_its_feature(calls: list[Any]) -> None:
-    end = SafeEnd.of((NOTED,), {"noted": b"left and right", "devices": b"others"})
+    end = SafeEnd.import_stages((NOTED,), {"noted": b"left and right", "devices": b"others"})
     assert end.make_safe(started().hardware._lines) == ("1 lines, left and right",)
-    assert SafeEnd.of((NOTED,), {}).make_safe(started().hardware._lines) == ("1 lines, ",)
+    assert SafeEnd.import_stages((NOTED,), {}).make_safe(started().hardware._lines) == ("1 lines, ",)
 
 
 @pytest.mark.parametrize(
@@ -102,7 +102,7 @@ def test_feature_that_fails_at_the_end_leaves_the_others_safe(
     (failing / "safe.py").write_text(
         f"from dxlrun.tooling.features import SafeStage\nSTAGE = SafeStage(lambda lines, plan: {call})\n"
     )
-    end = SafeEnd.of((Feature(name, f"{name}_feature", f"{name} 1.0"), NOTED), {})
+    end = SafeEnd.import_stages((Feature(name, f"{name}_feature", f"{name} 1.0"), NOTED), {})
     assert end.make_safe(started().hardware._lines) == (
         f"the section {name} was not left safe ({raised}); report it to the author of {name} 1.0",
         "1 lines, ",

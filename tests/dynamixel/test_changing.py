@@ -4,7 +4,7 @@ import pytest
 from tests.kit.line_faults import delay_next
 from tests.kit.rigs import VirtualLine
 
-from dxlrun.cli.tools.servo import VERBS, Asked
+from dxlrun.cli.tools.servo import VERBS, VerbCall
 from dxlrun.dynamixel.tools import servo_backup
 from dxlrun.dynamixel.tools.one_servo import OneServo
 from dxlrun.dynamixel.tools.scanning import Search, find_servo
@@ -30,7 +30,7 @@ class Rig:
 
     @property
     def servo(self):
-        self.line.bus.advance(self.line.clock.now_ns())
+        self.line.bus.advance_to(self.line.clock.now_ns())
         return self.line.bus.servos[0]
 
     def wait(self, seconds=1.0):
@@ -64,7 +64,7 @@ def test_a_change_of_the_address_that_did_not_happen_is_noticed():
         lambda one: one.change_rate(1_000_000),
         r"was given Baud Rate \(8\) = 3, but still answers at 57600 bit/s",
     )
-    assert rig.one.read(["id", "baud_rate"]) == {"id": 1, "baud_rate": 1}
+    assert rig.one.read_items(["id", "baud_rate"]) == {"id": 1, "baud_rate": 1}
 
 
 def test_another_servo_at_the_new_address_is_not_taken_for_it():
@@ -88,7 +88,7 @@ def test_a_servo_gets_another_id_and_is_looked_for_there(model, protocol):
     rig = Rig(model, protocol)
     assert rig.one.change_id(42) == "has ID 42; it had 1"
     assert rig.servo.registers["id"] == 42
-    assert rig.one.read(["id"]) == {"id": 42}
+    assert rig.one.read_items(["id"]) == {"id": 42}
     assert rig.instructions().count(3) == 1  # EEPROM wears
 
 
@@ -124,7 +124,7 @@ def test_a_rate_is_not_given_that_the_adapter_or_the_model_does_not_have_or_some
         rig.one.change_rate(12_345)
     rig.refused(lambda one: one.change_rate(1_000_000), "another servo has ID 1 at 1000000 bit/s")
     assert 3 not in rig.instructions()
-    assert rig.one.read(["id"]) == {"id": 1}  # and it is still talked to at its own
+    assert rig.one.read_items(["id"]) == {"id": 1}  # and it is still talked to at its own
 
 
 def test_two_servos_of_one_id_are_not_dealt_with():
@@ -156,7 +156,7 @@ def test_what_a_servo_cannot_do_is_refused_and_nothing_is_written(model, poked, 
         lambda one: one.change_id(7),
         lambda one: one.change_rate(1_000_000),
         lambda one: one.factory_reset(Reset.ALL),
-        lambda one: one.write([one.register("return_delay_time", 0)]),
+        lambda one: one.write_registers([one.register("return_delay_time", 0)]),
         OneServo.back_up,
     ],
 )
@@ -170,7 +170,7 @@ def test_nothing_in_the_eeprom_changes_while_the_servo_holds_torque(change):
 def test_a_register_is_written_only_where_it_differs():
     rig = Rig()
     wanted = [rig.one.register("return_delay_time", 0), rig.one.register("position_p_gain", 800)]
-    assert rig.one.write(wanted) == ("Return Delay Time (9) was changed from 250 to 0",)
+    assert rig.one.write_registers(wanted) == ("Return Delay Time (9) was changed from 250 to 0",)
     assert rig.servo.registers["return_delay_time"] == 0
     assert rig.instructions().count(3) == 1
 
@@ -192,7 +192,7 @@ def test_a_servo_that_does_not_come_back_is_missed():
 def test_a_reboot_that_did_not_happen_is_noticed():
     rig = Rig()
     rig.wait(9)
-    rig.line.bus.advance(rig.line.clock.now_ns())
+    rig.line.bus.advance_to(rig.line.clock.now_ns())
     rig.line.bus.after(1, lambda: rig.line.bus.alter_next_instruction("lost", lambda data: b""))
     rig.refused(OneServo.reboot, "did not reboot: its Realtime Tick is")
 
@@ -207,7 +207,7 @@ def test_a_reboot_that_did_not_happen_is_noticed():
 )
 def test_a_factory_reset_keeps_what_it_shall(keep, address):
     rig = Rig()
-    rig.one.write([rig.one.register("return_delay_time", 7)])
+    rig.one.write_registers([rig.one.register("return_delay_time", 7)])
     rig.one.change_id(9)
     rig.one.change_rate(1_000_000)
     said = rig.one.factory_reset(keep)
@@ -232,9 +232,9 @@ def test_a_factory_reset_beside_a_servo_as_shipped_is_refused():
 
 def test_a_servo_keeps_and_takes_back_its_own_backup():
     rig = Rig()
-    rig.one.write([rig.one.register("return_delay_time", 7)])
+    rig.one.write_registers([rig.one.register("return_delay_time", 7)])
     assert rig.one.back_up() == "stored its control table in its own backup"
-    rig.one.write([rig.one.register("return_delay_time", 9)])
+    rig.one.write_registers([rig.one.register("return_delay_time", 9)])
     rig.one.take_back()
     assert rig.servo.registers["return_delay_time"] == 7
 
@@ -242,11 +242,11 @@ def test_a_servo_keeps_and_takes_back_its_own_backup():
 @pytest.mark.parametrize(("model", "protocol"), PROTOCOLS)
 def test_torque_comes_where_the_servo_stands(model, protocol):
     rig = Rig(model, protocol)
-    before = rig.servo.position
+    before = rig.servo.shaft_angle
     assert "holds torque in position mode at tick" in rig.one.torque(True)[0]
     rig.wait()
     assert rig.servo.torque_on
-    assert rig.servo.position == pytest.approx(before, abs=0.01)
+    assert rig.servo.shaft_angle == pytest.approx(before, abs=0.01)
     assert rig.one.torque(True) == ("holds torque, as before",)
     assert rig.one.torque(False) == ("is limp",)
     assert not rig.servo.torque_on
@@ -269,12 +269,12 @@ WHEEL = {"cw_angle_limit": 0, "ccw_angle_limit": 0}  # of Protocol 1.0
 def test_torque_comes_in_every_mode_and_moves_nothing(registers, mode):
     rig = Rig(*PROTOCOLS[0]) if registers is WHEEL else Rig()
     for name, value in registers.items():
-        rig.one.write([rig.one.register(name, value)])
-    before = rig.servo.position
+        rig.one.write_registers([rig.one.register(name, value)])
+    before = rig.servo.shaft_angle
     assert f"holds torque in {mode} mode" in rig.one.torque(True)[0]
     rig.wait()
     assert rig.servo.torque_on
-    assert rig.servo.position == pytest.approx(before, abs=0.01)
+    assert rig.servo.shaft_angle == pytest.approx(before, abs=0.01)
 
 
 def test_the_led_blinks_and_is_left_as_it_was():
@@ -292,8 +292,8 @@ def test_the_backup_of_every_model_fits_that_model_and_heals_it(tmp_path, protoc
             continue
         rig = Rig(table.model, protocol)
         names = [name for name in table.items if not name.startswith("indirect_")]
-        assert list(rig.one.read(names, refused=True)) == names, "all of it can be read"
-        values = rig.one.read(servo_backup.kept_items(table), refused=True)
+        assert list(rig.one.read_items(names, refused=True)) == names, "all of it can be read"
+        values = rig.one.read_items(servo_backup.kept_items(table), refused=True)
         path = tmp_path / f"{table.model}.json"
         servo_backup.write_backup(path, servo_backup.stamped(table, 1, (1, RATE), values))
         wanted = servo_backup.registers_to_restore(path, servo_backup.read_backup(path), table)
@@ -302,7 +302,7 @@ def test_the_backup_of_every_model_fits_that_model_and_heals_it(tmp_path, protoc
         assert changed
         for each in changed:
             rig.servo.poke(each.name, 3)
-        rig.one.write(wanted)
+        rig.one.write_registers(wanted)
         assert rig.instructions().count(3) == len(changed)
         assert all(rig.servo.registers[each.name] == each.value for each in changed)
 
@@ -328,7 +328,7 @@ def test_torque_on_clears_a_tripped_bus_watchdog_and_holds_where_the_servo_stand
     rig.wait()
     assert rig.servo.torque_on
     assert rig.servo.registers["bus_watchdog"] == 0
-    assert rig.servo.position == pytest.approx(2.0, abs=0.002)
+    assert rig.servo.shaft_angle == pytest.approx(2.0, abs=0.002)
 
 
 def test_torque_on_clears_a_bus_watchdog_that_would_trip():
@@ -347,7 +347,7 @@ def test_torque_on_clears_a_bus_watchdog_that_would_trip():
 def test_a_goal_that_is_written_clears_a_tripped_bus_watchdog(torque):
     rig = Rig()
     trip(rig, torque)
-    done = rig.one.write([rig.one.register("goal_position", 1500)])
+    done = rig.one.write_registers([rig.one.register("goal_position", 1500)])
     assert done[0] == TRIPPED
     assert done[-1].endswith(" to 1500")
     assert (STOOD in done) == bool(torque)
@@ -358,28 +358,30 @@ def test_a_goal_that_is_written_clears_a_tripped_bus_watchdog(torque):
 def test_a_goal_that_is_set_already_clears_a_tripped_bus_watchdog_too(torque):
     rig, already = Rig(), "Goal Position (116) is 3000 already"
     trip(rig, torque)
-    asked = Asked(("goal_position", "3000"), None, yes=False)
+    asked = VerbCall(("goal_position", "3000"), None, yes=False)
     done = VERBS["set"].do(rig.one, asked)
     moved = [STOOD, "Goal Position (116) was changed from 1304 to 3000"]
     assert [*done] == [already, TRIPPED, *(moved if torque else [])]
     assert (rig.servo.registers["bus_watchdog"], rig.servo.registers["goal_position"]) == (0, 3000)
     rig.wait(6)
-    assert rig.servo.position == pytest.approx(3000 * rig.one.table.rad_per_tick if torque else 2.0, abs=0.01)
-    again = Asked(("goal_position", "3000"), None, yes=False)
+    assert rig.servo.shaft_angle == pytest.approx(
+        3000 * rig.one.table.rad_per_tick if torque else 2.0, abs=0.01
+    )
+    again = VerbCall(("goal_position", "3000"), None, yes=False)
     assert [*VERBS["set"].do(rig.one, again)] == [already]
 
 
 def test_a_bus_watchdog_that_is_armed_stays_where_only_a_goal_is_written():
     rig = Rig()
     rig.servo.poke("bus_watchdog", 10)
-    assert len(rig.one.write([rig.one.register("goal_position", 1500)])) == 1
+    assert len(rig.one.write_registers([rig.one.register("goal_position", 1500)])) == 1
     assert rig.servo.registers["bus_watchdog"] == 10
 
 
 def test_other_registers_leave_a_tripped_bus_watchdog_and_a_register_of_it_is_shown_as_tripped():
     rig = Rig()
     trip(rig, 0)
-    done = rig.one.write([rig.one.register("position_p_gain", 500)])
+    done = rig.one.write_registers([rig.one.register("position_p_gain", 500)])
     assert done == ("Position P Gain (84) was changed from 800 to 500",)
     assert rig.one.torque(False) == ("is limp, as before",)
     assert rig.servo.registers["bus_watchdog"] == 255
@@ -390,17 +392,17 @@ def test_other_registers_leave_a_tripped_bus_watchdog_and_a_register_of_it_is_sh
 def test_a_servo_whose_tripped_bus_watchdog_is_written_stays_where_it_stands(torque, ticks):
     rig = Rig()
     trip(rig, torque)
-    done = rig.one.write([rig.one.register("bus_watchdog", ticks)])
+    done = rig.one.write_registers([rig.one.register("bus_watchdog", ticks)])
     armed = ("Bus Watchdog (98) was changed from 0 to 100",) if ticks else ()
     assert done == ((TRIPPED, STOOD) if torque else (TRIPPED,)) + armed
     rig.wait()
-    assert rig.servo.position == pytest.approx(2.0, abs=0.002)
+    assert rig.servo.shaft_angle == pytest.approx(2.0, abs=0.002)
 
 
 def test_a_bus_watchdog_that_cannot_be_cleared_is_named_and_gets_no_torque():
     rig = Rig()
     trip(rig, 0)
-    rig.servo.registers.watch(("bus_watchdog",), lambda: rig.servo.poke("bus_watchdog", -1))
+    rig.servo.registers.watch_items(("bus_watchdog",), lambda: rig.servo.poke("bus_watchdog", -1))
     with pytest.raises(ServoFault, match=r"was given Bus Watchdog \(98\) = 0, but has 255"):
         rig.one.torque(True)
     assert not rig.servo.torque_on
@@ -415,14 +417,14 @@ def test_a_value_that_comes_late_is_not_shown_for_the_next_register(model, proto
     """The host stalls again and again: what it then hears was asked before."""
     rig = Rig(model, protocol)
     names = [limit, "present_position"]  # of one length
-    true = [rig.one.read([name])[name] for name in names]
+    true = [rig.one.read_items([name])[name] for name in names]
     assert true[0] != true[1]
     for _ in range(40):
         delay_next(rig.line.bus, 1, late_ms * 1_000_000)
     shown = []
     for name in names * 3:
         try:
-            shown.append(rig.one.read([name])[name])
+            shown.append(rig.one.read_items([name])[name])
         except ServoFault:
             shown.append(None)
     assert all(value in (None, right) for value, right in zip(shown, true * 3, strict=True)), shown
@@ -459,8 +461,8 @@ def test_what_is_read_is_never_the_reply_to_an_earlier_request(at, late_ms, copi
     found = {}
     for name in (*TRUE, *TRUE):
         try:
-            found = rig.one.read([name])
+            found = rig.one.read_items([name])
         except ServoFault:  # said, and nothing is shown
             continue
         assert found == {name: TRUE[name]}
-    assert rig.one.read(list(TRUE)) == TRUE
+    assert rig.one.read_items(list(TRUE)) == TRUE

@@ -7,14 +7,14 @@ import pytest
 from msgspec.structs import replace
 from tests.kit.rigs import make_plan
 
-from dxlrun.channels.events import EventCode
+from dxlrun.channels.event_records import EventCode
 from dxlrun.dynamixel.findings import Findings
-from dxlrun.dynamixel.servo.access import reach
-from dxlrun.dynamixel.servo.checks import CHECKS, inspect, survey
+from dxlrun.dynamixel.servo.checks import CHECKS, inspect_servo, survey
+from dxlrun.dynamixel.servo.item_access import access_servo
 from dxlwire.bus_plan import RegisterValue
 from dxlwire.control_table import find_table
 from dxlwire.plan.planning import plan_line
-from dxlwire.transaction import Outcome, Reply
+from dxlwire.transaction import Reply, TransactionOutcome
 
 FAILS = (
     (1.0, {"error": 0x04}, "reports an error: overheating"),
@@ -85,8 +85,8 @@ def look(protocol, change, *, take_over=False, refused=()):
     for item in table.items.values():
         if not item.name.startswith("indirect"):
             memory[item.address : item.address + item.size] = item.encode(values[item.name])
-    found, one = Findings(), reach(plan, servo)
-    program = inspect(one, found, take_over=take_over)
+    found, one = Findings(), access_servo(plan, servo)
+    program = inspect_servo(one, found, take_over=take_over)
     read = next(program)
     try:
         while True:
@@ -94,9 +94,9 @@ def look(protocol, change, *, take_over=False, refused=()):
             data = bytes(memory[start : start + length])
             gaps = [table.items[name].address for name in refused]
             if any(start <= gap < start + length for gap in gaps):
-                read = program.send(Reply(Outcome.REFUSED, 7, b"", 0, 0, False))
+                read = program.send(Reply(TransactionOutcome.REFUSED, 7, b"", 0, 0, False))
                 continue
-            read = program.send(Reply(Outcome.OK, change.get("error", 0), data, 0, 0, False))
+            read = program.send(Reply(TransactionOutcome.OK, change.get("error", 0), data, 0, 0, False))
     except StopIteration as end:
         mode = end.value
     assert (mode is None) == any(
@@ -181,11 +181,11 @@ def test_a_servo_that_answers_twice_is_read_no_further():
     with suppress(StopIteration):
         while True:
             sent.append(request.packet)
-            request = program.send(Reply(Outcome.OK, 0, b"\0\0\0", 0, 1, False))
+            request = program.send(Reply(TransactionOutcome.OK, 0, b"\0\0\0", 0, 1, False))
     (problem,) = found.problems
     assert "answers 3 of 3 pings garbled or twice" in problem
     reads = [packet for packet in sent if packet and packet[7] == 2]
-    assert reads == [plan_line(plan).read(1, 0, 3).packet], "the look for an echo alone"
+    assert reads == [plan_line(plan).read_range(1, 0, 3).packet], "the look for an echo alone"
 
 
 def test_every_row_of_the_table_has_a_case_here():

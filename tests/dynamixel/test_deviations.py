@@ -10,10 +10,10 @@ import pytest
 from msgspec.structs import replace
 from tests.kit.rigs import make_rig, make_x, start_rig
 
-from dxlrun.channels.events import EventCode
+from dxlrun.channels.event_records import EventCode
 from dxlrun.dynamixel.findings import Findings
-from dxlrun.dynamixel.servo.access import first_reach
-from dxlrun.dynamixel.servo.checks import inspect
+from dxlrun.dynamixel.servo.checks import inspect_servo
+from dxlrun.dynamixel.servo.item_access import first_reach
 from dxlrun.dynamixel.servo.torque_limits import restore_torque_limits
 from dxlrun.errors import StartUpError
 from dxlrun.features.registers.settings import register_value
@@ -27,7 +27,7 @@ from dxlwire.control_table import (
     read_control_table,
 )
 from dxlwire.control_table.deviation import UNDESCRIBED, Deviation, deviation_of, deviations_by_name
-from dxlwire.exchange.bus import Lines
+from dxlwire.exchange.bus_engine import Lines
 from dxlwire.modes import Mode
 from dxlwire.plan.planning import Wiring, bus_plan, position_layout
 
@@ -87,7 +87,7 @@ class Bench:
         for name, value in left.items():
             self.servo.poke(name, value)
         found = Findings()
-        self.lines.run([inspect(self.one, found, take_over=False)])
+        self.lines.run_programs([inspect_servo(self.one, found, take_over=False)])
         for name, value in before.items():
             self.servo.poke(name, value)
         return found
@@ -241,7 +241,7 @@ def test_a_torque_limit_is_restored_or_reported(table):
     (item,) = (item for item in table.items.values() if item.address == place.address)
     bench.servo.poke(item.name, 20)
     full = bench.servo.registers["max_torque" if item.name == "torque_limit" else "pwm_limit"]
-    bench.lines.run([restore_torque_limits(bench.plan, Findings())])
+    bench.lines.run_programs([restore_torque_limits(bench.plan, Findings())])
     assert bench.servo.registers[item.name] == full > 20
 
 
@@ -284,7 +284,7 @@ def test_a_refused_setting_comes_with_the_command_that_writes_it_on_a_real_port_
     ):
         found, other = Findings(), replace(plan, port=port)
         lines = Lines([plan], rig.ports, rig.clock, rig.packets)
-        lines.run([inspect(first_reach(other, other.servos[0]), found, take_over=False)])
+        lines.run_programs([inspect_servo(first_reach(other, other.servos[0]), found, take_over=False)])
         (problem,) = found.problems
         assert problem.startswith(f"arm_4_joint (ID 4 on bus arm) {sentence}")
         assert problem.endswith(f": write {factory} there{command}")
@@ -348,11 +348,11 @@ def test_a_servo_that_refuses_to_read_between_its_items_is_read_without_what_is_
     rig = make_rig(plan)
     rig.servo(4).poke("secondary_shadow_id", 2)
     table, memory = first_reach(plan, plan.servos[0]).table, rig.servo(4).registers
-    read = memory.read
-    memory.read = lambda start, size: read(start, size) if table.readable(start, start + size) else None
+    read = memory.read_bytes
+    memory.read_bytes = lambda start, size: read(start, size) if table.readable(start, start + size) else None
     found = Findings()
     lines = Lines([plan], rig.ports, rig.clock, rig.packets)
-    lines.run([inspect(first_reach(plan, plan.servos[0]), found, take_over=False)])
+    lines.run_programs([inspect_servo(first_reach(plan, plan.servos[0]), found, take_over=False)])
     (problem,) = found.problems
     assert "Secondary (Shadow) ID (12) = 2" in problem
 
@@ -361,7 +361,7 @@ def test_inspection_reads_identity_and_each_area_once():
     for plan, reads in ((make_x((4,)), 3), (full_range(TABLES[0]), 2)):
         rig = make_rig(plan)
         lines = Lines([plan], rig.ports, rig.clock, rig.packets)
-        lines.run([inspect(first_reach(plan, plan.servos[0]), Findings(), take_over=False)])
+        lines.run_programs([inspect_servo(first_reach(plan, plan.servos[0]), Findings(), take_over=False)])
         assert len(rig.into_bus()) == reads
 
 

@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 from tests.kit.rigs import make_plan, start_rig
 
-from dxlrun.channels.events import EventCode
+from dxlrun.channels.event_records import EventCode
 from dxlsim.faults.fault import parse_fault
 from dxlsim.faults.script import FaultScript
 

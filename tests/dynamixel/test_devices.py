@@ -14,12 +14,12 @@ import pytest
 from msgspec.structs import replace
 from tests.kit.rigs import make_plan, make_rig, start_rig
 
-from dxlrun.channels.events import EventCode
+from dxlrun.channels.event_records import EventCode
 from dxlrun.errors import StartUpError
 from dxlrun.features.devices.plan import DeviceCommand
 from dxlwire.bus_plan import DevicePlan
 from dxlwire.control_table.device_table import read_device_table
-from dxlwire.plan.devices import device_blocks
+from dxlwire.plan.device_reads import device_blocks
 from dxlwire.plan.line import Line
 from dxlwire.wire import protocol1, protocol2
 
@@ -133,10 +133,10 @@ def test_a_lost_device_costs_the_servos_nothing(fast, capabilities):
             device(rig, 2).silence(on=False)
         rig.restless = 0.01
         began = rig.clock.now_ns()
-        rig.hardware.read()
+        rig.hardware.read_states()
         latest.append(rig.clock.now_ns() - began)
         rig.goals.position[:] += 0.001 * (-1) ** cycle
-        rig.hardware.write()
+        rig.hardware.write_goals()
         rig.hardware.idle(began + period_ns)
         assert rig.clock.now_ns() <= began + period_ns
         rig.clock.wait_until(began + period_ns)
@@ -180,8 +180,8 @@ def test_a_device_is_found_again_on_a_bus_without_idle_time_for_it():
         if cycle in {10, 11}:
             device(rig).silence(on=cycle == 10)
         until_ns = rig.clock.now_ns() + rig.period_ns
-        rig.hardware.read()
-        rig.hardware.write()
+        rig.hardware.read_states()
+        rig.hardware.write_goals()
         rig.hardware.idle(until_ns)
         rig.clock.wait_until(until_ns)  # or later: what is asked of the device may skip a period
         assert rig.states.valid.all()
@@ -211,9 +211,11 @@ def test_a_device_that_answers_only_alone_is_read_alone(monkeypatch, fast):
 def test_a_device_that_answers_only_between_the_cycles_is_asked_seldom(monkeypatch):
     rig = started(("speed",), capabilities=NONE)
     rig.hardware._kernel.plan = lambda *_: False  # the parser shows when it reads
-    execute = device(rig).execute
+    execute = device(rig).execute_packet
     reads = rig.hardware._servos[0].reads
-    monkeypatch.setattr(device(rig), "execute", lambda *given: None if reads.begun else execute(*given))
+    monkeypatch.setattr(
+        device(rig), "execute_packet", lambda *given: None if reads.begun else execute(*given)
+    )
     for _ in range(120):
         rig.cycle()
         assert rig.states.valid.all()
@@ -302,11 +304,11 @@ def test_release_disarms_watchdogs_before_they_can_wait_for_a_device(silent):
     rig.hardware.start()
     rig.cycles(5)
     (bus,) = rig.hardware._lines.buses
-    bus.owed.add(Line(1_000_000, 0, 500_000, protocol2).write(101, 65, b"\1"), 0, rig.clock.now_ns())
+    bus.owed.add(Line(1_000_000, 0, 500_000, protocol2).write_range(101, 65, b"\1"), 0, rig.clock.now_ns())
     if silent:
         device(rig).silence()
     before_ns = rig.clock.now_ns()
-    rig.hardware.release()
+    rig.hardware.leave_torque_on()
     assert rig.clock.now_ns() - before_ns < 100_000_000
     rig.wait(1_000_000_000)
     assert rig.registers("bus_watchdog")[: len(SERVOS)] == [0] * len(SERVOS)

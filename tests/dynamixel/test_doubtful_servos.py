@@ -8,7 +8,7 @@ from msgspec.structs import replace
 from tests.kit.line_faults import turn_by_hand
 from tests.kit.rigs import make_plan, make_rig, make_x, start_rig
 
-from dxlrun.channels.events import EventCode
+from dxlrun.channels.event_records import EventCode
 from dxlrun.dynamixel.servo.torque_off import limp, stand
 from dxlwire.modes import Mode
 
@@ -33,10 +33,12 @@ def test_a_joint_that_forgot_its_turns_over_a_reboot_does_not_wind_them_up_again
         rig.cycle()
     servo = rig.servo(1)
     servo.cut_power(rig.clock.now_ns() + 300_000_000)
-    standing = servo.position
+    standing = servo.shaft_angle
     rig.cycles(150)
     assert rig.states.valid[0]
-    assert servo.position == pytest.approx(standing, abs=0.1), "it wound up the turns that it had forgotten"
+    assert servo.shaft_angle == pytest.approx(standing, abs=0.1), (
+        "it wound up the turns that it had forgotten"
+    )
     assert rig.torque() == [False, True]
     (text,) = rig.events.texts(EventCode.SERVO_LIMP)
     assert "lost its count of turns" in text
@@ -45,7 +47,7 @@ def test_a_joint_that_forgot_its_turns_over_a_reboot_does_not_wind_them_up_again
     rig.hardware.switch_torque(0, True)
     rig.cycles(20)
     assert rig.torque() == [True, True]
-    assert servo.position == pytest.approx(standing, abs=0.1)
+    assert servo.shaft_angle == pytest.approx(standing, abs=0.1)
 
 
 def test_a_wheel_that_is_led_by_its_velocity_gets_torque_again_after_a_reboot():
@@ -106,9 +108,9 @@ def test_a_wheel_that_made_more_turns_than_its_servo_counts_does_not_wind_them_b
     rig = make_wheel("MX-28", 1.0)
     servo = rig.servo(1)
     turn_by_hand(servo, 7.8 * math.tau)
-    standing = servo.position
+    standing = servo.shaft_angle
     change(rig, Mode.POSITION, 60)
-    assert servo.position == pytest.approx(standing, abs=0.1)
+    assert servo.shaft_angle == pytest.approx(standing, abs=0.1)
     ((source, text),) = rig.events.of(EventCode.MODE)[-1:]
     assert (source, "outside its limits" in text) == ("main_1_joint", True)
 
@@ -118,8 +120,8 @@ def test_a_loop_that_is_late_again_and_again_asks_for_a_servos_watchdog_once():
     rig = start_rig(replace(plan, watchdog_ticks=10))
     events = len(rig.events.of(EventCode.WATCHDOG))
     for _ in range(20):
-        rig.hardware.read()
-        rig.hardware.write()
+        rig.hardware.read_states()
+        rig.hardware.write_goals()
         rig.clock.wait_until(rig.clock.now_ns() + 300_000_000)
         rig.hardware.idle(rig.clock.now_ns())  # no time for anything in it
     assert len(rig.events.of(EventCode.WATCHDOG)) - events == 19
@@ -136,15 +138,15 @@ def test_wheels_of_a_robot_that_is_left_with_torque_by_a_loop_that_died_stand(mo
     rig.goals.velocity[:] = 1.0, 0.0
     rig.cycles(20)
     rig.servo(2).poke("torque_enable", 0)
-    rig.hardware.read()  # and the loop dies
+    rig.hardware.read_states()  # and the loop dies
     said = stand(rig.lines)
     assert said == ("main_1_joint (ID 1 on bus main) stands: its goal is 0",)
     rig.clock.wait_until(rig.clock.now_ns() + 500_000_000)
     assert rig.torque() == [True, False], "a servo without torque was given some"
-    standing = rig.servo(1).position
+    standing = rig.servo(1).shaft_angle
     rig.clock.wait_until(rig.clock.now_ns() + 500_000_000)
     rig.torque()
-    assert rig.servo(1).position == pytest.approx(standing, abs=0.05)
+    assert rig.servo(1).shaft_angle == pytest.approx(standing, abs=0.05)
 
 
 def test_a_wheel_that_takes_no_goal_any_more_loses_its_torque_when_the_loop_died():
@@ -162,7 +164,7 @@ def test_a_wheel_whose_torque_off_was_lost_is_tried_again():
     rig.goals.velocity[0] = 1.0
     rig.cycle()
     rig.servo(1).poke("bus_watchdog", -1)
-    write, lost = rig.ports.ports[0].write, []
+    write, lost = rig.ports.ports[0].write_packet, []
 
     def lose_the_first(data):
         if data[4] == 1 and data[7:11] == b"\x03\x40\x00\x00" and not lost:
@@ -170,7 +172,7 @@ def test_a_wheel_whose_torque_off_was_lost_is_tried_again():
             rig.buses[0].alter_next_instruction("lost", lambda _: b"")
         write(data)
 
-    rig.ports.ports[0].write = lose_the_first
+    rig.ports.ports[0].write_packet = lose_the_first
     said = stand(rig.lines)
     assert lost
     assert "main_1_joint (ID 1 on bus main) is limp, as " in said[-1]
@@ -183,7 +185,7 @@ def test_a_wheel_that_keeps_its_torque_whatever_is_written_is_named():
     rig.cycle()
     servo = rig.servo(1)
     servo.poke("bus_watchdog", -1)
-    servo.registers.watch(("torque_enable",), lambda: servo.poke("torque_enable", 1))
+    servo.registers.watch_items(("torque_enable",), lambda: servo.poke("torque_enable", 1))
     (said, _) = stand(rig.lines)[::-1]
     assert said.startswith("main_1_joint (ID 1 on bus main) may keep moving: ")
     assert said.endswith("torque off was not confirmed")
@@ -201,13 +203,13 @@ def test_a_joint_that_is_let_go_is_limp_though_noise_hit_every_attempt_to_switch
     rig = start_rig(plan)
     rig.cycle()
     bus = rig.buses[0]
-    write = rig.ports.ports[0].write
+    write = rig.ports.ports[0].write_packet
     lose = partial(bus.alter_next_instruction, "lost", lambda _: b"")
     rig.when(lambda data: data[4:9] == b"\x01\x06\x00\x03\x40" and not data[10], lose)
     rig.hardware.switch_torque(0, False)
     rig.cycles(10)
     assert rig.torque() == [True, True]
-    rig.ports.ports[0].write = write
+    rig.ports.ports[0].write_packet = write
     rig.cycles(10)
     assert rig.torque() == [False, True]
 
@@ -221,7 +223,7 @@ def test_a_wheel_stands_before_silent_ones_are_awaited_for_long():
         rig.servo(servo_id).silence()
     begin_ns, stood_ns = rig.clock.now_ns(), []
     moving = rig.servo(4).registers
-    moving.watch(("moving_speed",), lambda: stood_ns.append(rig.clock.now_ns()))
+    moving.watch_items(("moving_speed",), lambda: stood_ns.append(rig.clock.now_ns()))
     said = stand(rig.lines)
     assert stood_ns[-1] - begin_ns < 500_000_000
     assert [text.split()[0] for text in said] == [f"main_{one}_joint" for one in (4, 1, 2, 3)]
@@ -233,7 +235,7 @@ def test_the_last_hand_waits_for_the_end_of_a_reply_that_is_on_its_way(last_hand
     rig = start_rig()
     rig.clock.wait_until(rig.clock.now_ns() + 5_000_000)
     begun_ns = rig.clock.now_ns()
-    rig.ports.ports[0].write(rig.plans[0].reads[0].packet)
+    rig.ports.ports[0].write_packet(rig.plans[0].reads[0].packet)
     rig.clock.wait_until(begun_ns + 640_000)  # 80 us of instruction, 500 us of delay
     last_hand(rig.lines)
     notes = [entry.note for entry in rig.ledger.entries if entry.t_ns > begun_ns]

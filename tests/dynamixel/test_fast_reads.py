@@ -7,7 +7,7 @@ from tests.kit import rigs
 from tests.kit.line_faults import corrupt_next
 from tests.kit.rigs import make_plan, make_rig, start_rig
 
-from dxlrun.channels.events import EventCode, Severity
+from dxlrun.channels.event_records import EventCode, Severity
 from dxlwire.control_table import find_table, model_names
 from dxlwire.packets import PacketKind
 from dxlwire.wire import protocol2
@@ -31,7 +31,7 @@ def read_bytes(rig, cycles=20):
 
 def test_a_cycle_is_one_fast_sync_read_with_one_status(started):
     since, start = len(started.ledger.entries), started.clock.now_ns()
-    started.hardware.read()
+    started.hardware.read_states()
     took_ns = started.clock.now_ns() - start
     asked = [e.data for e in started.ledger.entries[since:] if e.direction == "in"]
     told = b"".join(e.data for e in started.ledger.entries[since:] if e.direction == "out")
@@ -181,8 +181,8 @@ def test_a_servo_that_forgets_the_fast_form_makes_its_group_be_read_plainly(star
         started.cycle()
         assert started.states.valid.all()
     asked = [entry.data[7] for entry in started.ledger.entries[since:] if entry.direction == "in"]
-    assert asked.count(protocol2.Instruction.SYNC_READ) == 5
-    assert protocol2.Instruction.FAST_SYNC_READ not in asked
+    assert asked.count(protocol2.Protocol2Instruction.SYNC_READ) == 5
+    assert protocol2.Protocol2Instruction.FAST_SYNC_READ not in asked
 
 
 def test_a_servo_that_is_silent_now_and_then_leaves_its_group_the_fast_form(started):
@@ -193,7 +193,7 @@ def test_a_servo_that_is_silent_now_and_then_leaves_its_group_the_fast_form(star
         started.cycles(3)
     since = len(started.ledger.entries)
     started.cycle()
-    assert started.ledger.entries[since].data[7] == protocol2.Instruction.FAST_SYNC_READ
+    assert started.ledger.entries[since].data[7] == protocol2.Protocol2Instruction.FAST_SYNC_READ
     assert [e for e in started.events.list if "fast reads in a row" in e[3]] == []
 
 

@@ -36,7 +36,7 @@ class Writer:
         """Send what is due; return the packets."""
         (line,) = self.side.lines.ports
         line.sent = []
-        self.side.hardware.write()
+        self.side.hardware.write_goals()
         return line.sent
 
     def sent(self):
@@ -208,8 +208,8 @@ def test_goals_beyond_one_sync_write_are_split_and_logged(case):
     plan = make_plan(range(sum(counts)), model=model, protocol=protocol)
     side = fuzz.Side([plan], memoryview(bytearray(2064)))  # a batch of the log that holds but one of them
     side.goals.values[:] = 0.0
-    side.hardware.write()
+    side.hardware.write_goals()
     (line,) = side.lines.ports
-    side.packets.commit()
+    side.packets.commit_packets()
     assert [packet.data for packet in side.log] == line.sent
     assert [len(records(packet, protocol)) for packet in line.sent] == counts

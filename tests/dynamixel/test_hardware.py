@@ -7,8 +7,8 @@ import pytest
 from tests.kit.line_faults import corrupt_next, delay_next
 from tests.kit.rigs import goals_in, make_plan, make_rig, make_x, position_tick, start_rig
 
-from dxlrun.channels.events import EventCode
-from dxlrun.dynamixel.servo.access import reach
+from dxlrun.channels.event_records import EventCode
+from dxlrun.dynamixel.servo.item_access import access_servo
 from dxlrun.dynamixel.servo.torque_off import limp
 from dxlrun.errors import StartUpError
 from dxlsim.simulation_plan import ServoConfig
@@ -16,7 +16,7 @@ from dxlwire.wire import protocol1
 
 
 def torque_read(plan, index):
-    return next(reach(plan, plan.servos[index]).read_torque()).packet
+    return next(access_servo(plan, plan.servos[index]).read_torque()).packet
 
 
 def torque_given(rig, since=0):
@@ -51,9 +51,9 @@ class OneBus:
         assert rig.states.valid.all()
         assert np.isnan(rig.goals.velocity).all()
         assert rig.goals.position == pytest.approx(rig.states.position, abs=0.006)
-        before = [servo.position for servo in rig.buses[0].servos]
+        before = [servo.shaft_angle for servo in rig.buses[0].servos]
         rig.cycles(10)
-        assert [servo.position for servo in rig.buses[0].servos] == pytest.approx(before, abs=0.006)
+        assert [servo.shaft_angle for servo in rig.buses[0].servos] == pytest.approx(before, abs=0.006)
         assert len(rig.events.of(EventCode.SETUP)) == len(before)
         assert len(rig.events.of(EventCode.TORQUE_ON)) == 1
         assert rig.events.of(EventCode.REGISTER_DIFFERS) == []
@@ -132,7 +132,7 @@ class OneBus:
         servo = rig.servo(self.ids[2])
         servo.silence()
         rig.cycle()
-        servo.reset()
+        servo.power_cycle()
         servo.silence(False)
         rig.cycles(20)
         assert rig.torque() == [row != 2 for row in range(len(self.ids))]
@@ -167,7 +167,7 @@ class OneBus:
             servo.silence()
         for most_ms in (30, 20):
             start = rig.clock.now_ns()
-            rig.hardware.read()
+            rig.hardware.read_states()
             assert rig.clock.now_ns() - start < most_ms * 1_000_000
         assert not rig.states.valid.any()
 
@@ -175,7 +175,7 @@ class OneBus:
         """Return where a joint stands, as the simulated servo itself knows, rad."""
         servo = self.plan.servos[row]
         rig.torque()  # lets it move until now
-        return servo.direction * (rig.servo(servo.servo_id).position - servo.reference)
+        return servo.direction * (rig.servo(servo.servo_id).shaft_angle - servo.reference)
 
     @pytest.mark.parametrize(("place", "late_ms"), [(4 * (at % 2), late) for at, late in enumerate(LATE_MS)])
     def test_a_late_reply_is_never_taken_as_current(self, rig, place, late_ms):
@@ -186,12 +186,12 @@ class OneBus:
         missed = 0
         for _ in range(8):
             deadline = rig.clock.now_ns() + rig.period_ns
-            rig.hardware.read()
+            rig.hardware.read_states()
             for row in np.flatnonzero(rig.states.valid):
                 aged = 1.1 * rig.states.age_ns[row] * 1e-9  # rad that it turned since it answered
                 assert rig.states.position[row] == pytest.approx(self.truth(rig, row), abs=aged + 0.005)
             missed += not rig.states.valid[place]
-            rig.hardware.write()
+            rig.hardware.write_goals()
             rig.hardware.idle(deadline)
             rig.clock.wait_until(deadline)
         assert missed >= 1
@@ -202,9 +202,9 @@ class OneBus:
         end_ns, count = rig.clock.now_ns() + 1_000_000_000, 0
         while rig.clock.now_ns() < end_ns:
             rig.goals.position[:] += 1e-3 * math.sin(rig.clock.now_ns() * 1e-9)
-            rig.hardware.read()
+            rig.hardware.read_states()
             count += int(rig.states.valid[1:].sum())
-            rig.hardware.write()
+            rig.hardware.write_goals()
             # what the goals take on the wire, and a little for controllers
             deadline = rig.clock.now_ns() + self.plan.budget.goals_ns + 100_000
             rig.hardware.idle(deadline)
@@ -303,7 +303,7 @@ def test_the_exchange_takes_what_the_budget_says():
     rig = start_rig()
     rig.cycle()
     start = rig.clock.now_ns()
-    rig.hardware.read()
+    rig.hardware.read_states()
     budget = rig.plans[0].budget
     assert rig.clock.now_ns() - start == budget.total_ns - 480_000
 
@@ -340,13 +340,13 @@ def test_a_servo_that_was_lost_goes_slowly_to_a_goal_that_went_on(started, step)
         if started.states.valid[2]:
             break
     before = len(started.into_bus())
-    standing = servo.position
+    standing = servo.shaft_angle
     started.cycles(20)
     writes = [packet for packet in started.into_bus()[before:] if packet[4] == 0x83]
     speeds = [dict(zip(p[7:-1:5], p[10:-1:5], strict=True)) for p in writes]  # all fit the low byte
     assert {one[5] for one in speeds if 5 in one} == {129}  # 1.5 rad/s, and never 0, which is the maximum
     assert {one[3] for one in speeds} == {0}
-    assert 0.3 < abs(servo.position - standing) < 1.5 * 20 * 0.02
+    assert 0.3 < abs(servo.shaft_angle - standing) < 1.5 * 20 * 0.02
     started.cycles(40)
     last = [packet for packet in started.into_bus() if packet[4] == 0x83][-1]
     assert dict(zip(last[7:-1:5], last[10:-1:5], strict=True))[5] == 0
@@ -385,7 +385,7 @@ def test_a_servo_that_is_reset_while_the_others_get_torque_ends_the_start():
     def brown_out():
         if not reset and sum(rig.torque()) == 4:
             reset.append(1)
-            rig.servo(1).reset()
+            rig.servo(1).power_cycle()
 
     for step in range(4000):
         rig.buses[0].at(rig.clock.now_ns() + step * 100_000, brown_out)
@@ -398,9 +398,9 @@ def test_a_servo_that_is_reset_while_the_others_get_torque_ends_the_start():
 
 def test_a_line_that_goes_between_read_and_write_is_named_and_the_others_get_their_goals():
     rig = start_rig(make_plan((1, 2), name="left"), make_plan((1, 7), name="right", first_row=2))
-    rig.hardware.read()
+    rig.hardware.read_states()
     rig.ports.ports[0].unplug()
-    rig.hardware.write()
+    rig.hardware.write_goals()
     ((source, text),) = rig.events.of(EventCode.PORT_LOST)
     assert source == "left"
     assert text.startswith("bus left on sim: ")
@@ -427,7 +427,7 @@ def test_two_buses_are_read_side_by_side(right):
     rig = start_rig(make_plan((1, 2), name="left"), right)
     rig.goals.position[:] = [0.1, 0.2, 0.3, -0.4]
     start = rig.clock.now_ns()
-    rig.hardware.read()
+    rig.hardware.read_states()
     assert rig.clock.now_ns() - start == 2 * 700_000
     rig.cycles(80)
     assert rig.states.position == pytest.approx([0.1, 0.2, 0.3, -0.4], abs=0.01)

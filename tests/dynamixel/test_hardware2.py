@@ -16,7 +16,7 @@ from tests.kit.rigs import (
     start_rig,
 )
 
-from dxlrun.channels.events import EventCode
+from dxlrun.channels.event_records import EventCode
 from dxlrun.errors import StartUpError
 from dxlwire.bus_plan import RegisterValue
 from dxlwire.control_table import all_tables
@@ -47,7 +47,7 @@ def test_a_cycle_is_one_sync_read_and_one_sync_write(started):
 
 def test_the_exchange_takes_what_protocol_md_has(started):
     start = started.clock.now_ns()
-    started.hardware.read()
+    started.hardware.read_states()
     assert started.clock.now_ns() - start == 220_000 + 8 * 210_000
 
 
@@ -61,7 +61,7 @@ def test_a_silent_servo_costs_the_others_one_cycle_at_most(started, others_answe
     started.cycle()
     assert started.states.valid.tolist() == [row != 2 for row in range(8)]
     start = started.clock.now_ns()
-    started.hardware.read()
+    started.hardware.read_states()
     assert started.clock.now_ns() - start < 5_000_000
     started.cycle()
     started.servo(13).silence(False)
@@ -158,7 +158,7 @@ def test_an_alert_is_read_once_and_reported_in_the_manuals_words(started):
     assert "alert" in told[0]
     assert "Hardware Error Status (70) = 32: overload error" in told[1]
     assert started.states.valid.all()
-    assert started.into_bus()[begun:].count(protocol2.read(14, 70, 1)) == 1
+    assert started.into_bus()[begun:].count(protocol2.read_range(14, 70, 1)) == 1
 
 
 def test_a_hardware_error_that_comes_back_is_reported_again(started):

@@ -5,7 +5,7 @@ from __future__ import annotations
 import pytest
 from tests.kit.rigs import Rig, VirtualLine, make_plan, make_rig
 
-from dxlrun.channels.events import EventCode, Severity
+from dxlrun.channels.event_records import EventCode, Severity
 from dxlrun.dynamixel.servo.registers import meaning
 from dxlrun.dynamixel.tools.scanning import Search, scan
 from dxlrun.dynamixel.tools.tool_line import ToolLine
@@ -117,7 +117,7 @@ def test_an_error_item_is_read_where_the_model_has_it(table):
 def test_bits_and_codes_are_those_of_the_manual(model):
     table = find_table(model, 1.0 if model == "AX-12A" else 2.0)
     for value, name in MANUALS[model].items():
-        assert table.errors.describe(value) == f"{name} error"
+        assert table.errors.describe_errors(value) == f"{name} error"
     assert table.errors.has_codes == model.startswith("Y")
     if not table.errors.has_codes:
         assert sorted(table.errors.values.values()) == sorted(MANUALS[model])
@@ -153,11 +153,12 @@ def test_scan_names_the_error_of_a_servo(table):
 
 def test_a_second_error_is_named_besides_the_first():
     errors = find_table("XL-320").errors
-    assert errors.describe(0x03) == "overload error; overheating error"
-    assert errors.describe(0) == "no hardware error"
-    assert errors.describe(0x28) == "bits 28, which the control table does not define"
+    assert errors.describe_errors(0x03) == "overload error; overheating error"
+    assert errors.describe_errors(0) == "no hardware error"
+    assert errors.describe_errors(0x28) == "bits 28, which the control table does not define"
     assert (
-        find_table("YM070-210-M001").errors.describe(6) == "code 6, which the control table does not define"
+        find_table("YM070-210-M001").errors.describe_errors(6)
+        == "code 6, which the control table does not define"
     )
 
 
@@ -202,15 +203,15 @@ def test_errors_that_cannot_be_are_refused(entries, plain_table):
 
 def test_a_table_without_errors_names_none(plain_table):
     errors = read_control_table(plain_table).errors
-    assert errors.describe(0x20) == "bits 20, which the control table does not define"
+    assert errors.describe_errors(0x20) == "bits 20, which the control table does not define"
 
 
 @pytest.fixture
 def plain_table():
     """The text of a table of Protocol 2.0 that names no errors, as a plug-in may have it."""
     path = "XM/XM430-W350.toml"
-    from dxlwire.control_table import sources
+    from dxlwire.control_table import table_files
 
-    text = (sources._TABLES / "protocol2" / path).read_text("utf-8")
+    text = (table_files._TABLES / "protocol2" / path).read_text("utf-8")
     before, _, rest = text.partition("[errors]")
     return f"{before}[items]{rest.partition('[items]')[2]}"

@@ -8,11 +8,11 @@ from tests.kit.line_faults import truncate_next, turn_by_hand
 from tests.kit.rigs import every_servo, goals_in, make_plan, make_x, start_rig
 
 from dxlrun.channels.cycle import Torque
-from dxlrun.channels.events import EventCode
+from dxlrun.channels.event_records import EventCode
 from dxlrun.dynamixel.servo.reboots import RebootCount, TickReading
 from dxlwire.bus_plan import RegisterValue
 from dxlwire.modes import Mode
-from dxlwire.transaction import Outcome, Reply
+from dxlwire.transaction import Reply, TransactionOutcome
 from dxlwire.wire import protocol1, protocol2
 
 PROTOCOLS = pytest.mark.parametrize("protocol", [1.0, 2.0])
@@ -27,7 +27,7 @@ def start(protocol=2.0, *, returning=False, watchdog=0):
 def reboot(rig, servo_id):
     """Let a servo start anew while it is away."""
     with rig.away(servo_id) as servo:
-        servo.reset()
+        servo.power_cycle()
     return servo
 
 
@@ -66,8 +66,8 @@ def test_a_bus_that_stands_still_for_a_moment_loses_no_servo_at_any_rate():
         rig.buses[0].at(begun + 200_000_000, servo.silence)
     missed = 0
     while not (lost := rig.events.of(EventCode.SERVO_LOST)):
-        rig.hardware.read()
-        rig.hardware.write()
+        rig.hardware.read_states()
+        rig.hardware.write_goals()
         missed += not rig.states.valid.any()
         rig.clock.wait_until(rig.clock.now_ns() + 1_000_000)
     assert 250_000_000 <= rig.clock.now_ns() - begun < 280_000_000
@@ -93,7 +93,7 @@ def test_a_dead_servo_of_eight_costs_the_others_no_time():
 
     def read_takes():
         before = rig.clock.now_ns()
-        rig.hardware.read()
+        rig.hardware.read_states()
         return rig.clock.now_ns() - before
 
     healthy = read_takes()
@@ -110,7 +110,7 @@ def test_a_servo_whose_plug_was_loose_comes_back_with_the_torque_it_kept():
     assert rig.events.sources(EventCode.SERVO_BACK) == ["arm_13_joint"]
     assert rig.events.of(EventCode.SERVO_REBOOTED) == []
     assert 13 in rig.goals_sent()[-1][1]
-    assert rig.into_bus().count(protocol2.write(13, 64, b"\1")) == 1, "no policy gives it torque"
+    assert rig.into_bus().count(protocol2.write_range(13, 64, b"\1")) == 1, "no policy gives it torque"
 
 
 @pytest.mark.parametrize("returning", [False, True])
@@ -121,9 +121,9 @@ def test_a_servo_that_rebooted_gets_torque_back_only_by_the_policy(returning, pr
     assert rig.torque()[1] is returning
     assert len(rig.events.of(EventCode.SERVO_REBOOTED)) == 1
     assert len(rig.events.of(EventCode.SERVO_LIMP)) == (not returning)
-    held = servo.position
+    held = servo.shaft_angle
     rig.cycles(20)
-    assert servo.position == pytest.approx(held, abs=0.01)
+    assert servo.shaft_angle == pytest.approx(held, abs=0.01)
 
 
 @pytest.mark.parametrize("rebooted", [False, True])
@@ -138,9 +138,9 @@ def test_a_servo_whose_clock_was_not_read_has_not_started_anew_before_it_was(reb
 
     with rig.away(13, 5) as servo:
         if rebooted:
-            servo.reset()
+            servo.power_cycle()
         servo.poke("torque_enable", 0)
-        rig.when(lambda data: data == protocol2.read(13, 120, 2), spoil)
+        rig.when(lambda data: data == protocol2.read_range(13, 120, 2), spoil)
         servo.silence(False)
         while len(asked) < 3:
             rig.cycle()
@@ -174,7 +174,7 @@ def test_a_servo_that_reboots_twice_in_a_minute_gets_no_torque_again():
 )
 def test_two_reboots_latch_a_servo_only_within_a_minute(times_s, latched):
     count = RebootCount()
-    assert tuple(count.add(round(at_s * 1e9)) for at_s in times_s) == latched
+    assert tuple(count.count_reboot(round(at_s * 1e9)) for at_s in times_s) == latched
     assert count.exhausted == any(latched)
 
 
@@ -212,7 +212,7 @@ def test_a_servo_of_a_group_that_was_let_go_gets_no_torque_when_it_is_back(proto
     servo_id = rig.plans[0].servos[1].servo_id
     with rig.away(servo_id, 20) as servo:
         rig.hardware.switch_torque(1, False)
-        servo.reset()
+        servo.power_cycle()
         given = rig.torque_given(servo_id)
     assert not any(given)
     assert rig.torque() == [index != 1 for index in range(len(rig.buses[0].servos))]
@@ -222,7 +222,7 @@ def test_a_servo_that_was_turned_out_of_its_limits_while_it_was_away_gets_no_tor
     rig = start(returning=True)
     plan = rig.plans[0].servos[2]
     with rig.away(13, 20) as servo:
-        servo.reset()
+        servo.power_cycle()
         turn_by_hand(servo, (plan.upper_tick + 30) * plan.rad_per_tick)
         servo.silence(False)
         rig.cycles(100)
@@ -241,7 +241,7 @@ def _answer_no_third_question_for_torque(rig):
         if 3 <= len(asked) <= 5:
             truncate_next(rig.buses[0], 13, 0)
 
-    rig.when(lambda data: data == protocol2.read(13, 64, 1), spoil)
+    rig.when(lambda data: data == protocol2.read_range(13, 64, 1), spoil)
 
 
 @pytest.mark.parametrize(
@@ -258,7 +258,7 @@ def test_a_servo_that_is_not_certain_to_be_in_order_does_not_come_back_and_is_re
     servo = rig.servo(13)
     servo.silence()
     rig.cycles(20)
-    servo.reset()
+    servo.power_cycle()
     trick(rig)
     servo.silence(False)
     while len(rig.events.of(EventCode.SERVO_LOST)) < 2:
@@ -278,7 +278,7 @@ def test_registers_that_a_reboot_took_are_written_again():
     rig = start_rig(every_servo(make_x((11, 12, 13, 14)), settings=(gain,)))
     assert rig.registers(gain.name) == [555] * 4
     with rig.away(13) as servo:
-        servo.reset()
+        servo.power_cycle()
         assert servo.registers[gain.name] != 555
     assert servo.registers[gain.name] == 555
     assert len(rig.events.of(EventCode.REGISTER_WRITTEN)) == 5
@@ -316,7 +316,9 @@ def test_returned_servo_reports_settings_that_differ_but_those_of_the_run():
 
 def _tick(tick, sent_ns, last_ns=None):
     last_ns = sent_ns if last_ns is None else last_ns
-    return Reply(Outcome.OK, 0, (tick % 32768).to_bytes(2, "little"), last_ns, 0, False, sent_ns, sent_ns)
+    return Reply(
+        TransactionOutcome.OK, 0, (tick % 32768).to_bytes(2, "little"), last_ns, 0, False, sent_ns, sent_ns
+    )
 
 
 @pytest.mark.parametrize(
@@ -333,14 +335,14 @@ def _tick(tick, sent_ns, last_ns=None):
     ],
 )
 def test_a_tick_shows_a_reboot(tick, after_ms, rebooted):
-    before = TickReading.of(_tick(30_000, 0))
+    before = TickReading.from_reply(_tick(30_000, 0))
     assert before.rebooted(None) is None
-    assert TickReading.of(_tick(tick, after_ms * 1_000_000)).rebooted(before) is rebooted
+    assert TickReading.from_reply(_tick(tick, after_ms * 1_000_000)).rebooted(before) is rebooted
 
 
 def test_a_reply_that_was_long_under_way_is_no_reboot():
-    before = TickReading.of(_tick(0, 0))
-    assert TickReading.of(_tick(1_000, 1_000_000_000, 1_150_000_000)).rebooted(before) is False
+    before = TickReading.from_reply(_tick(0, 0))
+    assert TickReading.from_reply(_tick(1_000, 1_000_000_000, 1_150_000_000)).rebooted(before) is False
 
 
 def test_torque_that_was_cut_without_a_reboot_is_not_given_back():

@@ -33,9 +33,9 @@ class Liars:
         self._rig = rig
         self._chance = chance
         self._dialect = dialect_of(rig.plans[0].protocol)
-        self._write = rig.ports.ports[0].write
+        self._write = rig.ports.ports[0].write_packet
         self._often = chance.choice((0.1, 0.2, 0.4))
-        rig.ports.ports[0].write = self.write
+        rig.ports.ports[0].write_packet = self.write
 
     def write(self, data):
         packet, chance = bytes(data), self._chance
@@ -58,7 +58,7 @@ class Liars:
         return packets
 
     def end(self):
-        self._rig.ports.ports[0].write = self._write
+        self._rig.ports.ports[0].write_packet = self._write
 
 
 def robot(name):
@@ -79,7 +79,7 @@ def act(rig, chance, name):
         rig.hardware.set_modes(wanted)
     if chance.random() < 0.1:
         value = chance.choice((8, 16, 32))
-        rig.hardware.set_register(chance.randrange(3), item, value, lambda *_: None)
+        rig.hardware.write_register(chance.randrange(3), item, value, lambda *_: None)
 
 
 def cycle(rig):
@@ -89,8 +89,8 @@ def cycle(rig):
     for mode, array in ((2, rig.goals.velocity), (3, rig.goals.effort), (4, rig.goals.pwm)):
         array[rig.states.mode == mode] = 0.0
     start = rig.clock.now_ns()
-    rig.hardware.read()
-    rig.hardware.write()
+    rig.hardware.read_states()
+    rig.hardware.write_goals()
     rig.hardware.idle(start + rig.period_ns)
     rig.clock.wait_until(max(start + rig.period_ns, rig.clock.now_ns()))
 

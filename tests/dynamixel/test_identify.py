@@ -3,7 +3,7 @@ import math
 import pytest
 from tests.kit.rigs import make_plan
 
-from dxlrun.compile.robot import compile_files
+from dxlrun.compile.robot_compiler import compile_files
 from dxlrun.dynamixel.tools.inspection import identify, read_models
 from dxlrun.errors import PortError, StartUpError
 from dxlsim.bus.ledger import Ledger

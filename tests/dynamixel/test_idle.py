@@ -1,12 +1,12 @@
 import pytest
 from tests.kit.rigs import make_plan, make_rig, make_x, start_rig
 
-from dxlrun.channels.events import EventCode
+from dxlrun.channels.event_records import EventCode
 from dxlrun.dynamixel.wire_reports import WireReports
 from dxlwire.exchange.idle import STARVED, STARVED_AGAIN, IdleScheduler, Urgency
-from dxlwire.plan.line import listen
+from dxlwire.plan.line import listen_transaction
 from dxlwire.plan.planning import plan_line
-from dxlwire.transaction import Outcome
+from dxlwire.transaction import TransactionOutcome
 from dxlwire.wire import protocol2
 
 READ_NS = 270_000
@@ -25,8 +25,8 @@ class Rounds:
     def gap(self, length_ns):
         until = self.rig.clock.now_ns() + length_ns
         count = len(self.rig.into_bus())
-        if self.idle.begin(until):
-            self.bus.load(self.idle)
+        if self.idle.begin_idle(until):
+            self.bus.load_job(self.idle)
             self.lines.pump()
         self.over_ns = self.rig.clock.now_ns() - until
         self.rig.clock.wait_until(until + 1_000_000)
@@ -39,7 +39,7 @@ class Rounds:
         self.idle.add(ended(), *others, **more)
 
     def read(self, servo_id, address, size=1):
-        return plan_line(self.rig.plans[0]).read(servo_id, address, size)
+        return plan_line(self.rig.plans[0]).read_range(servo_id, address, size)
 
 
 @pytest.fixture
@@ -59,7 +59,7 @@ def test_a_program_goes_on_from_gap_to_gap(rounds):
     found = []
     rounds.add(reading(rounds, 11, 7, 11, 64), found.append, Urgency.SLOW, "three reads")
     sent = [rounds.gap(READ_NS + 150_000) for _ in range(4)]
-    assert sent == [[protocol2.read(11, address, 1)] for address in (7, 11, 64)] + [[]]
+    assert sent == [[protocol2.read_range(11, address, 1)] for address in (7, 11, 64)] + [[]]
     assert found == [[11, 3, 0]]
     assert rounds.idle.waiting == 0
 
@@ -103,8 +103,8 @@ def test_a_pause_of_one_program_leaves_the_line_to_the_others(rounds):
     def pausing():
         yield rounds.read(11, 7)
         before = rounds.rig.clock.now_ns()
-        reply = yield listen(5_000_000)
-        assert reply.outcome is Outcome.SENT
+        reply = yield listen_transaction(5_000_000)
+        assert reply.outcome is TransactionOutcome.SENT
         return rounds.rig.clock.now_ns() - before
 
     rounds.add(pausing(), ended.append, Urgency.MODE, "pausing")
@@ -142,18 +142,18 @@ def test_every_program_of_a_line_that_is_gone_ends_with_time_outs(rounds):
 
     rounds.add(reading(rounds, 12, 7), adding, Urgency.SLOW, "not begun")
     rounds.idle.abandon()
-    assert found == [[11, Outcome.TIMEOUT], [Outcome.TIMEOUT]]
+    assert found == [[11, TransactionOutcome.TIMEOUT], [TransactionOutcome.TIMEOUT]]
     assert rounds.idle.waiting == 1
 
 
 def test_a_transaction_that_a_cycle_cut_off_is_asked_again(rounds):
     found = []
     rounds.add(reading(rounds, 11, 7), found.append, Urgency.MODE, "one")
-    assert rounds.idle.begin(rounds.rig.clock.now_ns() + 5_000_000)
-    rounds.bus.load(rounds.idle)
-    rounds.bus.step(rounds.rig.clock.now_ns())  # sent, and nothing waits for the reply
+    assert rounds.idle.begin_idle(rounds.rig.clock.now_ns() + 5_000_000)
+    rounds.bus.load_job(rounds.idle)
+    rounds.bus.process_due(rounds.rig.clock.now_ns())  # sent, and nothing waits for the reply
     rounds.rig.clock.wait_until(rounds.rig.clock.now_ns() + 5_000_000)
-    assert rounds.gap(1_000_000) == [protocol2.read(11, 7, 1)]
+    assert rounds.gap(1_000_000) == [protocol2.read_range(11, 7, 1)]
     assert found == [[11]]
 
 

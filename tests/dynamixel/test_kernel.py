@@ -19,12 +19,12 @@ from tests.kit.rigs import make_plan, make_rig, start_rig
 
 import fuzz_kernel as fuzz
 from dxlrun.channels.cycle import Commands, States
-from dxlrun.dynamixel.hardware import DynamixelHardware, ServoArrays
+from dxlrun.dynamixel.dynamixel_hardware import DynamixelHardware, ServoArrays
 from dxlwire.clock import MonotonicClock
 from dxlwire.compiled import parse_structs
-from dxlwire.errors import NotCompiled
-from dxlwire.exchange import bus, kernel
-from dxlwire.exchange.bus import FREE_NS, Lines
+from dxlwire.exceptions import NotCompiled
+from dxlwire.exchange import bus_engine, kernel
+from dxlwire.exchange.bus_engine import FREE_NS, Lines
 from dxlwire.exchange.cyclic_reads import CALM_CYCLES
 from dxlwire.packets import RECORD_HEADER, PacketKind
 from dxlwire.port import ports
@@ -43,9 +43,11 @@ def test_numbers_that_both_sides_share_are_the_same():
         for name, _, value in (one.partition(" = ") for one in names.split(", ")):
             found[name.strip()] = place = int(value or place + 1)
     shared = {one.name: int(one) for one in kernel.Answer}
-    shared |= {name: getattr(bus, name) for name in ("FREE_NS", "LATE_NS", "LOST", "ASKED_NS", "SILENCE_NS")}
+    shared |= {
+        name: getattr(bus_engine, name) for name in ("FREE_NS", "LATE_NS", "LOST", "ASKED_NS", "SILENCE_NS")
+    }
     shared |= {name.upper(): value for name, value in kernel._ENCODINGS.items()}
-    shared |= {"MOST_LATE_NS": bus.MOST_LATE_NS, "AWAITING": kernel.AWAITING}
+    shared |= {"MOST_LATE_NS": bus_engine.MOST_LATE_NS, "AWAITING": kernel.AWAITING}
     shared |= {"WRITE_TIMEOUT_NS": ports._WRITE_TIMEOUT_NS, "RECORD_HEADER": RECORD_HEADER}
     shared |= {one.name: int(one) for one in (PacketKind.INSTRUCTION, PacketKind.STATUS)}
     assert {name: found[name] for name in shared} == shared
@@ -163,13 +165,13 @@ typedef struct Big {
     assert [found.size(0), found.size(1)] == [ctypes.sizeof(small), ctypes.sizeof(big)]
 
 
-@pytest.mark.parametrize("call", ["wait", "write", "read_into", "now_ns"])
+@pytest.mark.parametrize("call", ["wait_for_bytes", "write_packet", "read_into", "now_ns"])
 def test_an_interrupt_on_virtual_time_comes_out_of_the_kernel(monkeypatch, call):
     rig = start_rig(make_plan((1, 2)))
     rig.cycles(5)
     assert rig.hardware._by_kernel
     port = rig.ports.ports[0]
-    owner = {"wait": rig.ports, "now_ns": rig.hardware._kernel}.get(call, port)
+    owner = {"wait_for_bytes": rig.ports, "now_ns": rig.hardware._kernel}.get(call, port)
 
     def interrupted(*_):
         raise KeyboardInterrupt
@@ -177,7 +179,7 @@ def test_an_interrupt_on_virtual_time_comes_out_of_the_kernel(monkeypatch, call)
     with monkeypatch.context() as patch:
         patch.setattr(owner, "_now_ns" if call == "now_ns" else call, interrupted)
         with pytest.raises(KeyboardInterrupt):
-            rig.hardware.read()
+            rig.hardware.read_states()
     rig.clock.wait_until(rig.clock.now_ns() + 100_000_000)
     rig.cycles(5)
     assert rig.states.valid.all()
@@ -194,14 +196,14 @@ def two_lines():
 @pytest.mark.parametrize("accident", [False, True])
 def test_no_row_is_valid_of_a_line_that_took_no_goals(two_lines, accident):
     rig = two_lines
-    rig.hardware.read()
+    rig.hardware.read_states()
     rig.ports.ports[0].unplug()
     rig.goals.position[:] += 0.1
-    rig.hardware.write()
+    rig.hardware.write_goals()
     assert rig.hardware._buses[0].failure is not None
     if accident:  # on the other line: the parser ends the cycle
         rig.ports.ports[1]._arrived += b"\x55"
-    rig.hardware.read()  # no gap came between, in which the lost line is set aside
+    rig.hardware.read_states()  # no gap came between, in which the lost line is set aside
     assert rig.states.valid.tolist() == [False, False, True]
 
 
@@ -216,7 +218,7 @@ def test_two_servos_that_jump_to_the_place_of_one_another_are_not_believed():
     before = rig.states.position.tolist()
     for servo, angle in zip(shafts, reversed(shafts.values()), strict=True):
         turn_by_hand(servo, angle)
-    rig.hardware.read()
+    rig.hardware.read_states()
     assert rig.states.valid.tolist() == [False, False]
     assert rig.states.position.tolist() == before
 
@@ -227,8 +229,8 @@ def test_a_servo_that_jumps_is_not_believed_in_either_direction(step):
     rig.cycles(8)
     assert rig.hardware._by_kernel
     before = rig.states.position.tolist()
-    turn_by_hand(rig.servo(2), rig.servo(2).position + step)
-    rig.hardware.read()
+    turn_by_hand(rig.servo(2), rig.servo(2).shaft_angle + step)
+    rig.hardware.read_states()
     assert rig.states.valid.tolist() == [True, False]
     assert rig.states.position.tolist() == before
 
@@ -239,7 +241,7 @@ def test_line_that_is_gone_gets_no_second_packet_with_goals():
     (line,) = side.lines.ports
     side.goals.values[:] = 0.1
     line.lost = True
-    side.hardware.write()
+    side.hardware.write_goals()
     assert len(line.sent) == 1
     assert side.hardware._buses[0].failure is not None
 
@@ -264,10 +266,10 @@ def test_what_is_sent_behind_goals_is_awaited_from_when_they_are_off_the_wire():
     rig.cycles(5)
     (bus,) = rig.hardware._buses
     assert rig.hardware._by_kernel
-    rig.hardware.read()
+    rig.hardware.read_states()
     rig.goals.position[:] += 0.1
     before_ns = rig.clock.now_ns()
-    rig.hardware.write()
+    rig.hardware.write_goals()
     assert bus.words[FREE_NS] == before_ns + len(rig.into_bus()[-1]) * bus.byte_ns
 
 
@@ -275,11 +277,11 @@ def test_goals_go_out_behind_what_the_parser_sent():
     rig = start_rig(make_plan((1, 2)))
     rig.cycles(5)
     (bus,) = rig.hardware._buses
-    rig.hardware.read()
+    rig.hardware.read_states()
     rig.goals.position[:] += 0.1
     bus.send(bytes(100))  # such as reduced limits of torque
     before_ns = bus.words[FREE_NS]
-    rig.hardware.write()
+    rig.hardware.write_goals()
     assert bus.words[FREE_NS] == before_ns + len(rig.into_bus()[-1]) * bus.byte_ns
 
 
@@ -295,7 +297,7 @@ def test_a_large_robot_gets_its_goals_and_what_the_kernel_has_no_room_for_is_rea
     ]
     side = fuzz.Side(plans, memoryview(bytearray(2064)))
     side.goals.values[:] = 0.0
-    side.hardware.write()
+    side.hardware.write_goals()
     assert all(line.sent for line in side.lines.ports)
     side.lines.clock.wait_until(50_000_000)  # until that is off the wire
     for _ in range(5):
@@ -376,7 +378,7 @@ class TestOnDescriptors:
         hardware = DynamixelHardware(lines, rig.packets, ServoArrays(states, goals), rig.events)
         (servos,) = hardware._servos
         while servos.reads.plan().program is None:  # as after some cycles in which every servo answered
-            servos.reads.end()
+            servos.reads.end_cycle()
         yield plan, hardware, ours, states, rig
         for end in (ours, theirs):
             os.close(end)
@@ -388,7 +390,7 @@ class TestOnDescriptors:
         said = [protocol2.status_packet(one.servo_id, 0, bytes(one.length)) for one in read.awaited]
         answering = Thread(target=answer, args=(ours, len(read.packet), b"".join(said)))
         answering.start()
-        hardware.read()
+        hardware.read_states()
         answering.join()
         assert states.valid.tolist() == [True, True]
         kinds = [packet.kind for packet in rig.packets.list]
@@ -410,7 +412,7 @@ class TestOnDescriptors:
         hardware._goals.position[:] = 0.1
         end = Timer(5.0, os.read, (emptied, 1 << 20))  # of a write that has none itself
         end.start()
-        hardware.write()
+        hardware.write_goals()
         end.cancel()
         for descriptor in (emptied, full):
             os.close(descriptor)
@@ -419,7 +421,7 @@ class TestOnDescriptors:
 
     def test_silence_ends_in_the_parser_and_the_loop_shows_that_it_lives(self, line):
         _, hardware, _, states, rig = line
-        hardware.read()
+        hardware.read_states()
         assert states.valid.tolist() == [False, False]
         assert len(rig.beats) > 1  # a beat a millisecond while replies are awaited; a busy machine has fewer
         assert hardware._servos[0].reads._calm == 0  # the parser ended the cycle
@@ -427,7 +429,7 @@ class TestOnDescriptors:
     def test_a_line_that_hangs_up_is_gone_and_names_its_port(self, line):
         _, hardware, ours, states, _ = line
         os.dup2(os.open(os.devnull, os.O_RDONLY), ours)  # the other end is closed
-        hardware.read()
+        hardware.read_states()
         (bus,) = hardware._buses
         assert "pty is gone" in str(bus.failure)
         assert not states.valid.any()

@@ -335,13 +335,13 @@ def test_a_wrong_byte_at_an_end_of_a_piece_is_seen(line):
 
 @every
 def test_a_line_that_is_ready_without_a_byte_is_waited_for(line, monkeypatch):
-    wait, calls = line.side.lines.wait, []
+    wait, calls = line.side.lines.wait_for_bytes, []
 
     def ready(deadline_ns):
         calls.append(deadline_ns)
         return [0] if len(calls) == 2 else wait(deadline_ns)
 
-    monkeypatch.setattr(line.side.lines, "wait", ready)
+    monkeypatch.setattr(line.side.lines, "wait_for_bytes", ready)
     assert line.cycle() == (True, GOOD)
     assert len(calls) > 2
 
@@ -372,7 +372,7 @@ def test_reply_is_awaited_from_when_the_host_had_sent_its_request(line):
 
 @every
 def test_reply_that_came_while_the_host_stood_still_is_taken(line, monkeypatch):
-    wait = line.side.lines.wait
+    wait = line.side.lines.wait_for_bytes
 
     def late(deadline_ns):
         if deadline_ns:
@@ -380,5 +380,5 @@ def test_reply_that_came_while_the_host_stood_still_is_taken(line, monkeypatch):
             return []
         return wait(0)
 
-    monkeypatch.setattr(line.side.lines, "wait", late)
+    monkeypatch.setattr(line.side.lines, "wait_for_bytes", late)
     assert line.cycle() == (True, GOOD)

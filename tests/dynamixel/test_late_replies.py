@@ -167,11 +167,11 @@ def servo(protocol: float, faults: Faults) -> tuple[set[str], int]:
     singles = ["temperature_limit", "return_delay_time", "id", "led", "torque_enable"]
     for names in (*([name] for name in singles), list(ODD[protocol])):
         try:
-            said += [f"{name} {value}" for name, value in one.read(names).items()]
+            said += [f"{name} {value}" for name, value in one.read_items(names).items()]
         except ServoFault as error:
             said += error.sentences
     for act in (
-        lambda: one.write([one.register("temperature_limit", 65)]),
+        lambda: one.write_registers([one.register("temperature_limit", 65)]),
         lambda: one.torque(True),
         lambda: one.torque(False),
     ):

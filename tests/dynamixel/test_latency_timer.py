@@ -17,7 +17,7 @@ from dxlrun.errors import PortError, StartUpError
 from dxlrun.plan.machine_load import MachineLoad
 from dxlrun.testing import VirtualRobot, plan_of
 from dxlwire.port.latency_timer import latency_timer, shorten
-from dxlwire.port.reopening import KeptLines, Wanted
+from dxlwire.port.reopening import KeptLines, LineSettings
 from dxlwire.port.serial_open import open_serial
 
 BUSY = MachineLoad(10.0, busy_s=10.0, no_idle_core_s=10.0)
@@ -79,13 +79,13 @@ def test_a_timer_that_this_user_may_not_set_is_one_sentence_with_the_command(
     assert f"{line} keeps replies back for 16 ms, and 1 ms were planned: `echo 1 | sudo tee " in wrong
     assert f"`echo 1 | sudo tee {timer}`" in wrong
     with pytest.raises(PortError, match="sudo tee"):
-        KeptLines([Wanted(line, 1_000_000, MS)], tmp_path)
+        KeptLines([LineSettings(line, 1_000_000, MS)], tmp_path)
     with open_serial(line, 1_000_000):
         pass  # a start that was refused let go of it
 
 
 def test_a_line_is_opened_with_its_timer_set(tmp_path, line, timer):
-    lines = KeptLines([Wanted(line, 1_000_000, MS)], tmp_path)
+    lines = KeptLines([LineSettings(line, 1_000_000, MS)], tmp_path)
     assert lines.done == [f"{line}: latency timer set from 16 ms to 1 ms"]
     lines.close()
 

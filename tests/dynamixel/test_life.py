@@ -44,7 +44,9 @@ def one():
 
 def put(servo, state):
     servo.states[0] = state
-    servo.losses = {0: life.Loss(True, True, False, False, False, 0)} if state is ServoState.OFFLINE else {}
+    servo.losses = (
+        {0: life.OfflineServo(True, True, False, False, False, 0)} if state is ServoState.OFFLINE else {}
+    )
     servo.reads.away[0] = state is ServoState.OFFLINE
 
 
@@ -210,7 +212,7 @@ class Story:
             self.reset()
         self.rig.buses[0].unplug()
         self.rig.goals.position[0] += 0.1
-        self.rig.hardware.write()
+        self.rig.hardware.write_goals()
         self.rig.buses[0].plug_in()
         self.rig.hardware.idle(self.rig.clock.now_ns() + 10_000_000)
 
@@ -236,7 +238,7 @@ class Story:
         self.until(ServoState.RETURNING)
 
     def returned_limp(self):
-        self.servo.reset()
+        self.servo.power_cycle()
         self.servo.silence(False)
         self.until(ServoState.LIMP)
 
@@ -277,7 +279,7 @@ def test_torque_that_was_read_before_a_servo_was_let_go_gives_it_no_goals():
     rig.restless = 0.02
     story.servo.silence(False)
     rig.cycle(idle=False)
-    rig.hardware._servos[0].look(0)  # the read is due, and waits for idle time
+    rig.hardware._servos[0].schedule_reads(0)  # the read is due, and waits for idle time
     rig.hardware.switch_torque(1, False)
     since = len(rig.into_bus())
     rig.cycles(20)
@@ -323,11 +325,11 @@ def test_whatever_happens_in_whatever_order_only_legal_transitions_follow(seed, 
             let_go.discard(row)
             rig.hardware.switch_torque(row, True, answers[-1].append)
         else:
-            rig.hardware.reboot(row, answers[-1].append)
+            rig.hardware.reboot_servo(row, answers[-1].append)
 
     happenings = (
         lambda: chance.choice(line.servos).silence(chance.random() < 0.5),
-        lambda: chance.choice(line.servos).reset(),
+        lambda: chance.choice(line.servos).power_cycle(),
         lambda: chance.choice(line.servos).poke("torque_enable", 0),
         lambda: chance.choice(line.servos).trigger_overload(),
         lambda: truncate_next(line, chance.choice((11, 12, 13)), chance.randrange(6)),
@@ -342,8 +344,8 @@ def test_whatever_happens_in_whatever_order_only_legal_transitions_follow(seed, 
         chance.choices(happenings, (9, 2, 2, 1, 6, 3, 2, 2, 1, 3))[0]()
         for _ in range(chance.randrange(1, 12)):
             begun = len(rig.into_bus())
-            rig.hardware.read()
-            rig.hardware.write()
+            rig.hardware.read_states()
+            rig.hardware.write_goals()
             gets = [
                 servo.servo_id for servo, on in zip(story.plan.servos, story.life.torqued, strict=True) if on
             ]

@@ -53,12 +53,12 @@ def test_what_answers_late_is_heard_before_the_ports_are_closed():
 def test_it_works_after_a_half_sent_instruction_and_a_half_read_reply():
     rig = start_rig()
     port = rig.ports.ports[0]
-    port.write(rig.plans[0].reads[0].packet)
+    port.write_packet(rig.plans[0].reads[0].packet)
     rig.clock.wait_until(rig.clock.now_ns() + 650_000)
-    port.write(b"\xff\xff\xfe\x2c\x83\x1e\x04\x01")
+    port.write_packet(b"\xff\xff\xfe\x2c\x83\x1e\x04\x01")
     off_ns = []
     for servo in rig.buses[0].servos:
-        servo.registers.watch(("torque_enable",), lambda: off_ns.append(rig.buses[0].now_ns))
+        servo.registers.watch_items(("torque_enable",), lambda: off_ns.append(rig.buses[0].now_ns))
     outcomes = limp(rig.lines)
     assert all(one.confirmed for one in outcomes)
     assert rig.torque() == [False] * 8

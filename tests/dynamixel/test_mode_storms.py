@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 from tests.kit.rigs import make_plan, random_fault, start_rig
 
-from dxlrun.channels.events import EventCode
+from dxlrun.channels.event_records import EventCode
 from dxlwire.modes import Mode
 from dxlwire.plan.mode_plan import in_mode
 
@@ -83,8 +83,8 @@ def storm(name, seed):
             random_fault(rig, chance)
         follow(rig, -0.02 if cycle % 2 else 0.02)  # one that stays is not sent
         seen = len(rig.into_bus())
-        rig.hardware.read()
-        rig.hardware.write()
+        rig.hardware.read_states()
+        rig.hardware.write_goals()
         judge(rig, rig.goals_sent(seen))
         rig.hardware.idle(rig.clock.now_ns() + chance.choice((2_000_000, 12_000_000)))
         rig.clock.wait_until(2_000_000_000 + cycle * rig.period_ns)

@@ -8,7 +8,7 @@ from msgspec.structs import replace
 from tests.kit.line_faults import truncate_next, turn_by_hand
 from tests.kit.rigs import make_plan, make_rig, start_rig
 
-from dxlrun.channels.events import EventCode
+from dxlrun.channels.event_records import EventCode
 from dxlrun.errors import StartUpError
 from dxlwire.bus_plan import RegisterValue
 from dxlwire.control_table import find_table
@@ -88,9 +88,9 @@ def command(rig, mode, value, row=0):
 def moved(rig, cycles=15):
     """Return how far the first joint's servo turns in some cycles, rad of the joint."""
     servo, plan = rig.servo(1), rig.plans[0].servos[0]
-    before = servo.position
+    before = servo.shaft_angle
     rig.cycles(cycles)
-    return plan.direction * (servo.position - before)
+    return plan.direction * (servo.shaft_angle - before)
 
 
 CASES = [
@@ -109,9 +109,9 @@ def test_a_model_has_the_modes_of_its_manual(model, protocol):
 @pytest.mark.parametrize(("model", "protocol", "mode"), CASES)
 def test_a_model_goes_into_a_mode_follows_its_goals_there_and_comes_back(model, protocol, mode):
     rig = make_one(model, protocol)
-    standing = rig.servo(1).position
+    standing = rig.servo(1).shaft_angle
     change(rig, mode)
-    assert rig.servo(1).position == pytest.approx(standing, abs=0.02), "it jumped"
+    assert rig.servo(1).shaft_angle == pytest.approx(standing, abs=0.02), "it jumped"
     slow = (
         3.0 if model == "XL-320" else 0.4
     )  # of its output, which is no controlled speed, friction takes 9 %
@@ -390,12 +390,12 @@ def test_a_servo_that_lost_its_torque_over_a_change_gets_no_goal_which_would_swi
     rig.servo(1).poke("lock", 1)
     since = len(rig.into_bus())
     rig.set_modes(Mode.VELOCITY, 0)
-    rig.hardware.read()
-    rig.hardware.write()
+    rig.hardware.read_states()
+    rig.hardware.write_goals()
     rig.hardware.idle(rig.clock.now_ns() + 15_000_000)
     assert rig.states.mode[0] == Mode.POSITION
-    rig.hardware.read()
-    rig.hardware.write()
+    rig.hardware.read_states()
+    rig.hardware.write_goals()
     writes = [data for data in rig.into_bus()[since:] if data[4] == 0x83]
     assert [1 in data[7:-1:5] for data in writes] == [False, False], "a goal before torque enable was read"
 
@@ -416,7 +416,7 @@ def test_a_request_that_comes_in_the_middle_of_a_change_is_followed(arm):
 def test_a_request_that_comes_while_a_servo_is_taken_back_is_carried_out_once(arm):
     left = [Mode.VELOCITY]
     with arm.away(1, 20, 80):
-        looks = protocol2.read(1, 0, 7)
+        looks = protocol2.read_range(1, 0, 7)
         arm.when(lambda data: data == looks, lambda: left and arm.set_modes(left.pop(), 0))
     assert arm.states.mode[0] == Mode.VELOCITY
     assert len([text for text in arm.events.texts(EventCode.MODE) if "is in velocity mode" in text]) == 1
@@ -437,7 +437,7 @@ def test_a_mode_that_was_refused_is_not_entered_after_a_reboot():
 
 
 def test_a_servo_whose_torque_could_not_be_read_after_a_change_gets_no_goal_until_it_was(arm):
-    ask, asked, goals = protocol2.read(1, 64, 1), [], []
+    ask, asked, goals = protocol2.read_range(1, 64, 1), [], []
 
     def lose():
         asked.append(arm.clock.now_ns())
@@ -478,7 +478,7 @@ def limited():
 
 def test_a_servo_of_protocol_1_goes_to_a_position_with_no_more_torque_than_its_limit(limited):
     """Its shaft is blocked, so that what it exerts is what it may."""
-    limited.servo(1).jam(True)
+    limited.servo(1).jam_shaft(True)
     command(limited, Mode.EFFORT_POSITION, 0.5)
     for effort, ticks in ((0.2, 205), (0.5, 512), (0.1, 102)):
         limited.goals.effort[0] = effort
@@ -558,10 +558,10 @@ def test_a_start_gives_no_torque_limit_to_a_servo_that_would_be_driven_by_it():
     rig = make_rig(make_pair(continuous=True, start_mode=Mode.PWM, lower=-np.inf, upper=np.inf))
     rig.hardware.start()
     assert rig.registers("goal_pwm") == [0, 0]
-    standing = rig.servo(1).position
+    standing = rig.servo(1).shaft_angle
     rig.wait(100_000_000)
     assert rig.torque() == [True, True]
-    assert rig.servo(1).position == pytest.approx(standing, abs=0.001)
+    assert rig.servo(1).shaft_angle == pytest.approx(standing, abs=0.001)
 
 
 def test_no_torque_limit_is_written_while_a_mode_changes(arm):
@@ -609,8 +609,8 @@ def test_a_mode_is_entered_though_no_cycle_leaves_time_for_it():
     rig.set_modes(V, Mode.UNKNOWN)
     for _ in range(400):
         rig.hardware.idle(rig.clock.now_ns())
-        rig.hardware.read()
-        rig.hardware.write()
+        rig.hardware.read_states()
+        rig.hardware.write_goals()
         rig.wait(1_000_000)
     assert rig.states.mode.tolist() == [V, P]
     assert "waits for idle time" in rig.events.texts(EventCode.OVERRUN)[0]

@@ -4,7 +4,7 @@ import pytest
 from tests.kit.answers import result_of
 
 from dxlrun.cli import main
-from dxlrun.log.reader import read_log
+from dxlrun.log.log_reader import read_log
 from dxlsim.simulation_plan import BusConfig, ServoConfig
 from dxlwire.packets import PacketKind
 

@@ -6,8 +6,8 @@ import pytest
 from tests.kit.line_faults import delay_next, other_host, truncate_next
 from tests.kit.rigs import make_plan, start_rig
 
-from dxlrun.channels.events import EventCode
-from dxlrun.dynamixel.servo.servos import UNREQUESTED_EVENT_NS
+from dxlrun.channels.event_records import EventCode
+from dxlrun.dynamixel.servo.servo_supervision import UNREQUESTED_EVENT_NS
 from dxlwire.wire import protocol1, protocol2
 
 WAYS = ["plain", "bulk", "sync", "fast"]
@@ -44,7 +44,7 @@ def test_another_host_that_asks_between_the_exchanges_leaves_an_event(way, heard
     rig, dialect = build(way)
     bus = rig.buses[0]
     for number in range(2):
-        other_host(bus, dialect.read(2, 24, 1), rig.clock.now_ns() + IDLE_NS, received=heard)
+        other_host(bus, dialect.read_range(2, 24, 1), rig.clock.now_ns() + IDLE_NS, received=heard)
         assert told(rig) == []
         rig.cycle()
         assert rig.states.valid.all()
@@ -65,7 +65,7 @@ def test_another_host_that_asks_between_the_exchanges_leaves_an_event(way, heard
 def test_another_host_that_talks_into_the_exchange_leaves_an_event(way):
     rig, dialect = build(way)
     for _ in range(20):
-        other_host(rig.buses[0], dialect.write(3, 25, b"\x01"), rig.clock.now_ns() + 600_000)
+        other_host(rig.buses[0], dialect.write_range(3, 25, b"\x01"), rig.clock.now_ns() + 600_000)
         rig.cycle()
     assert len(told(rig)) == 1
     assert rig.packets.received() == rig.out_of_bus()
@@ -85,7 +85,9 @@ def test_a_host_that_goes_on_leaves_one_event_in_ten_seconds():
 
 def test_one_packet_is_not_yet_another_host():
     rig, dialect = build("plain")
-    other_host(rig.buses[0], dialect.read(9, 24, 1), rig.clock.now_ns() + IDLE_NS)  # there is none of this ID
+    other_host(
+        rig.buses[0], dialect.read_range(9, 24, 1), rig.clock.now_ns() + IDLE_NS
+    )  # there is none of this ID
     rig.cycles(3)
     assert told(rig) == []
 
@@ -94,7 +96,7 @@ def test_one_packet_is_not_yet_another_host():
 def test_two_packets_are_another_host_only_near_each_other(apart, events):
     rig, dialect = build("plain")
     for _ in range(2):
-        other_host(rig.buses[0], dialect.read(9, 24, 1), rig.clock.now_ns() + IDLE_NS)
+        other_host(rig.buses[0], dialect.read_range(9, 24, 1), rig.clock.now_ns() + IDLE_NS)
         since_ns = rig.clock.now_ns()
         while rig.clock.now_ns() < since_ns + apart * UNREQUESTED_EVENT_NS:
             rig.cycle()

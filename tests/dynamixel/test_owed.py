@@ -4,18 +4,18 @@ import pytest
 from tests.kit.line_faults import delay_next, truncate_next
 from tests.kit.rigs import Rig, make_plan, make_x, start_rig
 
-from dxlrun.dynamixel.servo.access import reach
+from dxlrun.dynamixel.servo.item_access import access_servo
 from dxlrun.dynamixel.servo.torque_off import limp
-from dxlwire.exchange.bus import Lines
+from dxlwire.exchange.bus_engine import Lines
 from dxlwire.exchange.owed import LEAST_WINDOW_NS, SLOW_MEMORY_NS, OwedReplies
 from dxlwire.plan.line import MOST_SPARE
-from dxlwire.plan.retry import ReplyTimes, extend_timeouts, retry
+from dxlwire.plan.retry import ReplyLateness, extend_timeouts, retry
 from dxlwire.transaction import Program, Reply, Transaction
 
 READ = 2  # Instruction of Protocol 1.0
 MILLISECOND_NS = 1_000_000
 PLAN = make_x((11,))
-ONE = reach(PLAN, PLAN.servos[0])
+ONE = access_servo(PLAN, PLAN.servos[0])
 
 
 def read_once(request: Transaction) -> Program[Reply]:
@@ -24,10 +24,10 @@ def read_once(request: Transaction) -> Program[Reply]:
 
 def delay_torque_reads(rig: Rig) -> Lines:
     """Send one read of Torque Enable of each length, whose replies come 40 ms late; return the lines."""
-    lines, one = rig.lines, reach(rig.plans[0], rig.plans[0].servos[0])
+    lines, one = rig.lines, access_servo(rig.plans[0], rig.plans[0].servos[0])
     for length in range(1, 2 + MOST_SPARE):
         delay_next(rig.buses[0], 1, 40 * MILLISECOND_NS)
-        lines.run([read_once(one.line.read(1, one.servo.torque_address, length))])
+        lines.run_programs([read_once(one.line.read_range(1, one.servo.torque_address, length))])
     return lines
 
 
@@ -110,7 +110,7 @@ def test_slow_reply_widens_the_window_for_a_minute():
     owed, read = Owed(), ONE.reading(64, 1)
     owed.miss(read, 0)
     owed.at_ns = slow_ns = 700 * MILLISECOND_NS
-    owed.replies.settle(11, 1, 0)
+    owed.replies.charge_reply(11, 1, 0)
     assert owed.replies.window_ns == slow_ns * 5 // 4
     owed.at_ns += SLOW_MEMORY_NS
     assert owed.replies.window_ns == slow_ns * 5 // 4
@@ -122,14 +122,14 @@ def test_slow_reply_widens_the_window_for_a_minute():
 def test_lost_reply_is_not_lateness_of_the_next_one(register):
     """Neither the repetition of the lost read nor a read of another register of as many bytes is late."""
     rig = start_rig(PLAN)
-    times = ReplyTimes()
+    times = ReplyLateness()
 
     def program() -> Program[Reply]:
         yield ONE.reading(64, 1)
         return (yield from retry(ONE.reading(register, 1)))
 
     truncate_next(rig.buses[0], 11, 0)
-    (reply,) = rig.lines.run([extend_timeouts(program(), times=times)])
+    (reply,) = rig.lines.run_programs([extend_timeouts(program(), times=times)])
     assert reply is not None
     assert reply.answered
     assert all(each < MILLISECOND_NS for each in times.late_ns)

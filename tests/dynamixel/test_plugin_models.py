@@ -12,10 +12,10 @@ import pytest
 from tests.kit.answers import result_of
 
 import dxlwire.control_table
-import dxlwire.control_table.devices
-import dxlwire.control_table.models
-from dxlrun.control.controllers.plugins import load_plugins
-from dxlrun.log.reader import read_log
+import dxlwire.control_table.device_models
+import dxlwire.control_table.servo_models
+from dxlrun.control.controllers.plugin_loading import load_plugins
+from dxlrun.log.log_reader import read_log
 from dxlwire.control_table import added_control_tables, find_table
 
 TABLES = Path(dxlwire.control_table.__file__).parent / "tables"
@@ -59,9 +59,9 @@ def table(tmp_path: Path) -> Path:
 @pytest.fixture
 def install(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[Callable[[str], None]]:
     """Return a function that installs a plug-in which returns an expression as its servo models."""
-    monkeypatch.setattr(dxlwire.control_table.models, "_ADDED", {1.0: [], 2.0: []})
-    monkeypatch.setattr(dxlwire.control_table.models, "_TEXTS", {})
-    monkeypatch.setattr(dxlwire.control_table.devices, "_ADDED", [])
+    monkeypatch.setattr(dxlwire.control_table.servo_models, "_ADDED", {1.0: [], 2.0: []})
+    monkeypatch.setattr(dxlwire.control_table.servo_models, "_TEXTS", {})
+    monkeypatch.setattr(dxlwire.control_table.device_models, "_ADDED", [])
     monkeypatch.syspath_prepend(tmp_path)
 
     def put(offer: str) -> None:
@@ -167,4 +167,4 @@ def test_a_robot_with_a_device_of_a_plug_in_runs_in_simulation(
     assert last.tolist() == [25.0]
     taken = BOARD.replace("60002", "12")
     with pytest.raises(ValueError, match="Theirs-1 has the model number 12 of the AX-12A"):
-        dxlwire.control_table.devices.add_device_table(taken)
+        dxlwire.control_table.device_models.add_device_table(taken)

@@ -41,7 +41,7 @@ class Wishes:
             if not problem:
                 self.possible[row, name] = {value}
 
-        self.rig.hardware.set_register(row, name, value, done)
+        self.rig.hardware.write_register(row, name, value, done)
 
 
 def storm(protocol, seed):

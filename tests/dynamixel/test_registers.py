@@ -4,17 +4,17 @@ import pytest
 from msgspec.structs import replace
 from tests.kit.rigs import make_plan, make_rig, make_x
 
-from dxlrun.channels.events import EventCode
+from dxlrun.channels.event_records import EventCode
 from dxlrun.compile.joints.register_values import UnfitRegister
 from dxlrun.dynamixel.findings import Findings
-from dxlrun.dynamixel.servo.access import first_reach, reach
+from dxlrun.dynamixel.servo.item_access import access_servo, first_reach
 from dxlrun.dynamixel.servo.offline import rejoin
-from dxlrun.dynamixel.servo.registers import read_registers, settle
+from dxlrun.dynamixel.servo.registers import read_registers, write_registers
 from dxlrun.errors import StartUpError
 from dxlrun.features.registers.settings import declarable, register_value
 from dxlwire.bus_plan import RegisterValue
 from dxlwire.control_table import all_tables, find_table
-from dxlwire.exchange.bus import Lines
+from dxlwire.exchange.bus_engine import Lines
 from dxlwire.packets import PacketLog
 
 
@@ -39,7 +39,7 @@ def bench(plan, **change):
     lines = Lines([plan], rig.ports, rig.clock, PacketLog())
 
     def execute(program):
-        (result,) = lines.run([program])
+        (result,) = lines.run_programs([program])
         return result
 
     return rig, execute
@@ -48,14 +48,14 @@ def bench(plan, **change):
 def settled(execute, plan):
     """Settle the declared registers of the first servo; return what was found."""
     found = Findings()
-    execute(settle(first_reach(plan, plan.servos[0]), plan.servos[0].settings, found))
+    execute(write_registers(first_reach(plan, plan.servos[0]), plan.servos[0].settings, found))
     return found
 
 
 def rejoined(execute, plan, torque):
     """Take the first servo back; return whether it has torque, and what was found."""
     found, servo = Findings(), plan.servos[0]
-    one = reach(plan, servo)
+    one = access_servo(plan, servo)
     return execute(rejoin(one, found, servo.start_mode, servo.settings, torque=torque)), found
 
 
@@ -65,7 +65,7 @@ def written(found):
 
 def held(rig, name, index=0):
     item = rig.buses[0].servos[index].registers.table.items[name]
-    return item.decode(rig.buses[0].servos[index].registers.read(item.address, item.size))
+    return item.decode(rig.buses[0].servos[index].registers.read_bytes(item.address, item.size))
 
 
 def test_only_what_differs_is_written_and_it_is_read_back():
@@ -107,13 +107,13 @@ def test_no_eeprom_is_written_where_torque_cannot_be_read():
     rig, execute = bench(plan)
     servo, line = rig.servo(11), rig.ports.ports[0]
     servo.poke("return_delay_time", 0)
-    write, torque = line.write, next(reach(plan, plan.servos[0]).read_torque()).packet
+    write, torque = line.write_packet, next(access_servo(plan, plan.servos[0]).read_torque()).packet
 
     def listen(data):
         servo.silence(bytes(data) == torque)
         write(data)
 
-    line.write = listen
+    line.write_packet = listen
     (problem,) = settled(execute, plan).problems
     assert "did not answer when its torque was read, so Return Delay Time (9) was not written" in problem
     assert rig.writes() == []
@@ -123,7 +123,7 @@ def test_a_servo_that_was_reset_gets_its_registers_and_its_torque_again():
     plan = declared(make_x((11, 12)), position_p_gain=900)
     rig, execute = bench(plan)
     settled(execute, plan)
-    rig.servo(11).reset()
+    rig.servo(11).power_cycle()
     rig.clock.wait_until(rig.clock.now_ns() + 2_000_000_000)
     assert held(rig, "position_p_gain") == 800
     torqued, found = rejoined(execute, plan, torque=True)
@@ -132,7 +132,9 @@ def test_a_servo_that_was_reset_gets_its_registers_and_its_torque_again():
     assert found.texts(EventCode.REGISTER_WRITTEN) == [("arm_11_joint", text)]
     assert rig.torque() == [True, False]
     assert (
-        abs(rig.servo(11).registers["goal_position"] * plan.servos[0].rad_per_tick - rig.servo(11).position)
+        abs(
+            rig.servo(11).registers["goal_position"] * plan.servos[0].rad_per_tick - rig.servo(11).shaft_angle
+        )
         < 0.002
     )
 
@@ -243,4 +245,4 @@ def test_whatever_may_be_declared_of_any_model_is_written_once_and_then_there(pr
         assert len(written(found)) == len(rig.writes()) > 5, table.model
         assert written(settled(execute, plan)) == []
         memory = rig.buses[0].servos[0].registers
-        assert all(memory.read(one.address, one.size) == one.data for one in wanted)
+        assert all(memory.read_bytes(one.address, one.size) == one.data for one in wanted)

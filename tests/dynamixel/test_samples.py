@@ -10,7 +10,7 @@ from msgspec.structs import replace
 from tests.kit.rigs import make_plan, make_rig
 
 import fuzz_kernel as fuzz
-from dxlrun.channels.events import EventCode
+from dxlrun.channels.event_records import EventCode
 from dxlwire.exchange.samples import MARGIN_NS, MARGIN_RAD, REPORT_AGAIN_NS, Jumps
 from dxlwire.modes import Mode
 
@@ -51,8 +51,8 @@ class Robot:
             for index in range(len(plan.servos)):
                 came, reply, age_ns = next(said)
                 if came:
-                    bus.take(index, bytes(reply), self.now_ns - age_ns)
-        self.samples.settle(self.now_ns)
+                    bus.store_state(index, bytes(reply), self.now_ns - age_ns)
+        self.samples.fill_states(self.now_ns)
 
     def all_said(self, *raw, age_ns=0):
         """Let every servo say the same."""
@@ -220,14 +220,14 @@ def test_states_of_devices_are_what_the_rules_make_of_their_bytes(name):
         now_ns += 10 * MS
         valid = [False] * len(shown)
         for bus, plan in zip(samples.buses, plans, strict=True):
-            bus.clear()
+            bus.clear_fresh()
             member = len(plan.servos)
             for device in plan.devices:
                 found, times = {}, []
                 for block in device.blocks:
                     data, at_ns = rng.randbytes(block.length), now_ns - rng.randrange(4 * MS)
                     if rng.random() < 0.8:
-                        bus.take(member, data, at_ns)
+                        bus.store_state(member, data, at_ns)
                         times.append(at_ns)
                         found |= {field.column: told(field, data) for field in block.fields}
                     member += 1
@@ -235,7 +235,7 @@ def test_states_of_devices_are_what_the_rules_make_of_their_bytes(name):
                     valid[device.source], shown[device.source] = True, min(times)
                     for column, value in found.items():
                         values[column] = value
-        samples.settle(now_ns)
+        samples.fill_states(now_ns)
         assert sources.valid.tolist() == valid
         assert sources.values == pytest.approx(values, nan_ok=True, rel=1e-12)
         assert sources.age_ns.tolist() == [-1 if at_ns < 0 else now_ns - at_ns for at_ns in shown]

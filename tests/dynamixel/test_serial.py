@@ -15,19 +15,19 @@ import pytest
 from tests.kit.rigs import make_plan, make_rig
 
 import dxlrun
+from dxlrun.channels.child_processes import memory_file
 from dxlrun.channels.cycle import Commands, States
-from dxlrun.channels.process import memory_file
-from dxlrun.compile.robot import compile_files
-from dxlrun.dynamixel.hardware import DynamixelHardware, ServoArrays
+from dxlrun.compile.robot_compiler import compile_files
+from dxlrun.dynamixel.dynamixel_hardware import DynamixelHardware, ServoArrays
 from dxlrun.dynamixel.tools.tool_line import TunablePort
 from dxlrun.errors import PortError
 from dxlrun.plan.robot_plan import to_json
 from dxlrun.process_table import robot_of
 from dxlsim.simulation_plan import BusConfig, ServoConfig
 from dxlwire.clock import MonotonicClock
-from dxlwire.exchange.bus import Lines
+from dxlwire.exchange.bus_engine import Lines
 from dxlwire.port.ports import SerialPort, SerialPorts
-from dxlwire.port.reopening import KeptLines, Wanted
+from dxlwire.port.reopening import KeptLines, LineSettings
 from dxlwire.port.serial_open import let_go, open_serial, rate_remark
 
 
@@ -52,14 +52,14 @@ def opened(terminal):
 def test_bytes_go_out_and_come_in_unchanged(opened):
     master, port, _ = opened
     everything = bytes(range(256))
-    port.write(everything)
+    port.write_packet(everything)
     assert os.read(master, 1000) == everything
     ports = SerialPorts([port])
     os.write(master, everything)
     buffer = memoryview(bytearray(1000))
-    assert ports.wait(time.monotonic_ns() + 5_000_000_000) == [0]
+    assert ports.wait_for_bytes(time.monotonic_ns() + 5_000_000_000) == [0]
     assert bytes(buffer[: port.read_into(buffer)]) == everything
-    assert ports.wait(time.monotonic_ns()) == ()
+    assert ports.wait_for_bytes(time.monotonic_ns()) == ()
     assert port.read_into(buffer) == 0
 
 
@@ -68,7 +68,7 @@ def test_a_line_whose_bytes_somebody_took_is_not_gone(terminal):
     tty.setraw(slave)
     port = SerialPort(slave, "line")
     os.write(master, b"abc")
-    assert SerialPorts([port]).wait(time.monotonic_ns() + 5_000_000_000) == [0]
+    assert SerialPorts([port]).wait_for_bytes(time.monotonic_ns() + 5_000_000_000) == [0]
     assert os.read(slave, 10) == b"abc"
     assert port.read_into(memoryview(bytearray(10))) == 0
 
@@ -77,11 +77,11 @@ def test_an_adapter_that_is_gone_is_a_port_error(opened):
     master, port, path = opened
     os.close(master)
     ports = SerialPorts([port])
-    assert ports.wait(time.monotonic_ns() + 5_000_000_000) == [0]
+    assert ports.wait_for_bytes(time.monotonic_ns() + 5_000_000_000) == [0]
     with pytest.raises(PortError, match=f"{path} is gone"):
         port.read_into(memoryview(bytearray(10)))
     with pytest.raises(PortError, match=f"{path} is gone"):
-        port.write(b"x")
+        port.write_packet(b"x")
 
 
 def test_a_line_that_is_back_has_the_place_and_the_number_of_the_one_that_is_gone(opened):
@@ -89,18 +89,18 @@ def test_a_line_that_is_back_has_the_place_and_the_number_of_the_one_that_is_gon
     again = []
     ports = SerialPorts([port], lambda index: again.pop() if again else None)
     os.close(master)
-    ports.wait(time.monotonic_ns() + 5_000_000_000)
+    ports.wait_for_bytes(time.monotonic_ns() + 5_000_000_000)
     assert not ports.reopen(0)
     # nothing here has the device open any more, and nothing waits for it
     assert os.readlink(f"/proc/self/fd/{port.descriptor}") == os.devnull
-    assert ports.wait(time.monotonic_ns() + 1_000_000) == ()
+    assert ports.wait_for_bytes(time.monotonic_ns() + 1_000_000) == ()
     master, slave = pty.openpty()
     again.append(slave)
     assert ports.reopen(0)
     (renewed,) = ports.ports
     assert (renewed.descriptor, renewed.name) == (port.descriptor, path)
     os.write(master, b"hello\n")
-    assert ports.wait(time.monotonic_ns() + 5_000_000_000) == [0]
+    assert ports.wait_for_bytes(time.monotonic_ns() + 5_000_000_000) == [0]
     buffer = memoryview(bytearray(10))
     assert bytes(buffer[: renewed.read_into(buffer)]) == b"hello\n"
     os.close(master)
@@ -111,7 +111,7 @@ def test_a_line_that_takes_nothing_is_a_port_error(opened):
     while select.select([], [port.descriptor], [], 0)[1]:
         os.write(port.descriptor, bytes(1000))
     with pytest.raises(PortError, match="takes no more bytes"):
-        port.write(bytes(100_000))
+        port.write_packet(bytes(100_000))
 
 
 def test_a_missing_device_is_named():
@@ -154,7 +154,7 @@ def test_the_rate_that_the_driver_set_is_read_back(terminal, monkeypatch, real, 
     assert bool(remark) == bool(said)
     if said:
         assert f"{path} was asked for 1000000 bit/s, and its driver set {real} ({said})" in remark
-    lines = KeptLines([Wanted(path, 1_000_000, 0)])
+    lines = KeptLines([LineSettings(path, 1_000_000, 0)])
     assert lines.remarks == ([remark] if remark else [])
     lines.close()
 
@@ -231,10 +231,10 @@ def test_the_run_that_has_the_line_is_named_and_how_to_end_it(terminal):
     _, path, _ = terminal
     code = (
         "import sys\n"
-        "from dxlrun.channels import process\n"
+        "from dxlrun.channels import child_processes\n"
         "from dxlwire.port.serial_open import open_serial\n"
         "port = open_serial(sys.argv[1], 1_000_000)\n"
-        'plan = process.memory_file(\'dxlrun-plan\', b\'{"robot":"pan_tilt","loop":{}}\')\n'
+        'plan = child_processes.memory_file(\'dxlrun-plan\', b\'{"robot":"pan_tilt","loop":{}}\')\n'
         "print('opened', flush=True)\n"
         "sys.stdin.read()\n"
     )
@@ -297,10 +297,10 @@ def test_the_same_code_drives_the_simulated_process(simulated_line):
         hardware.start()
         assert states.valid.all()
         for _ in range(5):
-            hardware.read()
-            hardware.write()
+            hardware.read_states()
+            hardware.write_goals()
         assert hardware.stop() == ()
-        ports.wait(clock.now_ns() + 5_000_000)
+        ports.wait_for_bytes(clock.now_ns() + 5_000_000)
     ledger = finish()
     recorded = rig.packets
     assert recorded.received() == b"".join(entry.data for entry in ledger if entry.direction == "out")

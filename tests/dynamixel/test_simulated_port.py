@@ -51,26 +51,26 @@ def extended(port: SerialPort, now: int, heard: int = 0) -> int:
 
 
 def test_request_that_was_not_taken_is_awaited(port: SimulatedPort, simulation: LineProgress) -> None:
-    simulation.take(SENT - 1)
-    simulation.serve(ENDLESS_NS)
+    simulation.publish_received(SENT - 1)
+    simulation.publish_served(ENDLESS_NS)
     assert extended(port, DEADLINE) == DEADLINE + MS
 
 
 def test_deadline_counts_from_when_the_request_was_taken(
     port: SimulatedPort, simulation: LineProgress
 ) -> None:
-    simulation.serve(SENT + 100 * MS)
-    simulation.take(SENT + 100 * MS)
+    simulation.publish_served(SENT + 100 * MS)
+    simulation.publish_received(SENT + 100 * MS)
     assert extended(port, SENT + 101 * MS) > SENT + 101 * MS
-    simulation.serve(ENDLESS_NS)  # nothing is due any more: the servo is silent on purpose
+    simulation.publish_served(ENDLESS_NS)  # nothing is due any more: the servo is silent on purpose
     assert extended(port, SENT + 102 * MS) <= SENT + 102 * MS
 
 
 def test_silent_servo_of_a_running_process_is_given_up_at_once(
     port: SimulatedPort, simulation: LineProgress, stalls: StallCounter
 ) -> None:
-    simulation.serve(ENDLESS_NS)
-    simulation.take(SENT + MS // 10)
+    simulation.publish_served(ENDLESS_NS)
+    simulation.publish_received(SENT + MS // 10)
     assert extended(port, DEADLINE) <= DEADLINE
     assert (stalls.times, stalls.waited_ns) == (0, 0)
 
@@ -79,23 +79,23 @@ def test_reply_that_is_late_on_purpose_is_given_up_at_once(
     port: SimulatedPort, simulation: LineProgress
 ) -> None:
     """A latency timer of 16 ms: the process sleeps until the reply is due, which is behind the deadline."""
-    simulation.serve(SENT + 16 * MS)
-    simulation.take(SENT)
+    simulation.publish_served(SENT + 16 * MS)
+    simulation.publish_received(SENT)
     assert extended(port, DEADLINE) <= DEADLINE
 
 
 def test_reply_that_was_due_and_was_not_handed_over_is_awaited(
     port: SimulatedPort, simulation: LineProgress
 ) -> None:
-    simulation.serve(SENT + MS)  # when the reply is due; the process has not run since
-    simulation.take(SENT)
+    simulation.publish_served(SENT + MS)  # when the reply is due; the process has not run since
+    simulation.publish_received(SENT)
     assert extended(port, DEADLINE) > DEADLINE
 
 
 def test_bytes_that_the_kernel_still_has_are_awaited(port: SimulatedPort, simulation: LineProgress) -> None:
-    simulation.take(SENT)
-    simulation.give(SENT + MS, SENT + 11 * MS)
-    simulation.serve(ENDLESS_NS)
+    simulation.publish_received(SENT)
+    simulation.publish_delivery(SENT + MS, SENT + 11 * MS)
+    simulation.publish_served(ENDLESS_NS)
     assert extended(port, DEADLINE, heard=SENT - MS) > DEADLINE
     assert extended(port, DEADLINE, heard=SENT + 11 * MS) <= DEADLINE
 
@@ -108,7 +108,7 @@ def test_wait_is_bounded_and_not_repeated_for_the_same_stall(
     assert extended(port, late) <= late
     later, sent = late + 100 * MS, late + 80 * MS
     assert port.extend_deadline(sent + 12 * MS, sent, 0, later) <= later
-    simulation.take(late)  # the process runs again
+    simulation.publish_received(late)  # the process runs again
     assert port.extend_deadline(sent + 12 * MS, sent, 0, later) > later
 
 
@@ -132,8 +132,8 @@ def test_real_port_never_extends_a_deadline(port: SimulatedPort) -> None:
 def test_late_reply_is_split_into_what_its_process_was_late(
     port: SimulatedPort, simulation: LineProgress
 ) -> None:
-    simulation.take(SENT + 5 * MS)
-    simulation.give(SENT + 6 * MS, SENT + 9 * MS)
+    simulation.publish_received(SENT + 5 * MS)
+    simulation.publish_delivery(SENT + 6 * MS, SENT + 9 * MS)
     assert port.late_ns(SENT, SENT + 10 * MS) == (5 + 4) * MS
 
 
@@ -149,5 +149,5 @@ def test_stalls_count_as_far_as_they_overlap(memory: int, port: SimulatedPort) -
 def test_port_of_a_line_that_is_back_keeps_its_progress(
     port: SimulatedPort, simulation: LineProgress
 ) -> None:
-    simulation.take(SENT - 1)
+    simulation.publish_received(SENT - 1)
     assert extended(port.renewed(), DEADLINE) > DEADLINE

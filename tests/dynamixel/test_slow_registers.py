@@ -7,7 +7,7 @@ import pytest
 from msgspec.structs import replace
 from tests.kit.rigs import make_plan, start_rig
 
-from dxlrun.channels.events import EventCode
+from dxlrun.channels.event_records import EventCode
 from dxlwire.control_table import find_table
 from dxlwire.plan.reads import slow_items
 
@@ -90,7 +90,7 @@ def test_a_reboot_that_no_read_missed_is_seen_by_the_tick(returning):
     rig.period_ns = 250_000_000  # it boots between two reads
     rig.cycles(12)
     rig.servo(12).boot_ns = 0
-    rig.servo(12).reset()
+    rig.servo(12).power_cycle()
     rig.cycles(12)
     assert rig.events.sources(EventCode.SERVO_REBOOTED) == ["main_12_joint"]
     assert rig.events.of(EventCode.READ_LOST) == []

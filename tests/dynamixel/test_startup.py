@@ -6,12 +6,12 @@ from msgspec.structs import replace
 from tests.kit.line_faults import corrupt_next, delay_next, disturb_replies, truncate_next, turn_by_hand
 from tests.kit.rigs import make_plan, make_rig, make_x, start_rig
 
-from dxlrun.channels.events import EventCode, Severity
+from dxlrun.channels.event_records import EventCode, Severity
 from dxlrun.dynamixel.remedies import INJECTED
 from dxlrun.dynamixel.servo.checks import _silence
 from dxlrun.errors import PortError, StartUpError
-from dxlsim.bus.line import flipped
 from dxlsim.bus.simulated_bus import PacketFault
+from dxlsim.bus.simulated_line import flipped
 from dxlsim.simulation_plan import ServoConfig
 from dxlwire.wire import protocol1
 
@@ -235,7 +235,7 @@ def test_a_servo_that_jumps_between_two_readings_of_its_state_gets_no_torque(jum
     """Between them pass 5.7 ms for eight servos: at 11.9 rad/s that is 0.07 rad."""
     rig = make_rig()
     servo = rig.servo(6)
-    after_first_state(rig, 6, lambda: turn_by_hand(servo, servo.position + jump))
+    after_first_state(rig, 6, lambda: turn_by_hand(servo, servo.shaft_angle + jump))
     if starts:
         rig.hardware.start()
         assert rig.torque() == [True] * 8
@@ -334,7 +334,7 @@ def test_answers_that_come_late_are_those_to_what_was_asked():
 
 def test_first_states_that_a_standing_host_did_not_hear_are_read_again(monkeypatch):
     rig = make_rig()
-    read, reads = rig.hardware.read, []
+    read, reads = rig.hardware.read_states, []
 
     def late():
         """Let no servo hear anything for 70 ms when the first states are read."""
@@ -345,7 +345,7 @@ def test_first_states_that_a_standing_host_did_not_hear_are_read_again(monkeypat
         reads.append(rig.clock.now_ns())
         read()
 
-    monkeypatch.setattr(type(rig.hardware), "read", lambda _: late())
+    monkeypatch.setattr(type(rig.hardware), "read_states", lambda _: late())
     rig.hardware.start()
     assert rig.torque() == [True] * 8
     assert len(reads) > 1
@@ -382,7 +382,7 @@ def test_goal_comes_before_torque_and_is_where_the_servo_stands():
         (lambda rig: rig.stick(5, "goal_position", 3), "but has goal 3 and torque enable 1"),
         (lambda rig: rig.stick(5, "torque_enable", 0), "and torque enable 0"),
         (
-            lambda rig: rig.when(lambda data: data == protocol1.read(5, 24, 8), rig.servo(5).silence),
+            lambda rig: rig.when(lambda data: data == protocol1.read_range(5, 24, 8), rig.servo(5).silence),
             "did not answer when its torque was read back",
         ),
     ],
@@ -400,7 +400,7 @@ def test_a_goal_and_torque_count_only_when_they_were_read_back(trick, said):
 
 def test_a_servo_that_is_silent_when_all_have_torque_ends_the_start():
     rig = make_rig()
-    rig.when(lambda data: data == protocol1.read(5, 24, 1), rig.servo(5).silence)
+    rig.when(lambda data: data == protocol1.read_range(5, 24, 1), rig.servo(5).silence)
     with pytest.raises(StartUpError, match=r"ID 5 on bus main\) did not answer after torque was switched on"):
         rig.hardware.start()
 
@@ -408,15 +408,15 @@ def test_a_servo_that_is_silent_when_all_have_torque_ends_the_start():
 def test_a_servo_whose_state_cannot_be_read_once_it_has_torque_ends_the_start():
     """It may answer all other questions: goals without states would be blind."""
     rig = make_rig()
-    write, plan = rig.ports.ports[0].write, rig.plans[0].servos[2]
-    block = protocol1.read(plan.servo_id, plan.state.address, plan.state.length)[:6]
+    write, plan = rig.ports.ports[0].write_packet, rig.plans[0].servos[2]
+    block = protocol1.read_range(plan.servo_id, plan.state.address, plan.state.length)[:6]
 
     def through(data):
         if bytes(data[:6]) == block and rig.torque()[7]:
             truncate_next(rig.buses[0], plan.servo_id, 0)
         write(data)
 
-    rig.ports.ports[0].write = through
+    rig.ports.ports[0].write_packet = through
     with pytest.raises(
         StartUpError, match=r"ID 5 on bus main\) did not answer after torque was switched on: "
     ):

@@ -1,7 +1,7 @@
 import pytest
 from tests.kit.rigs import make_x, start_rig
 
-from dxlrun.channels.events import EventCode
+from dxlrun.channels.event_records import EventCode
 from dxlwire.modes import Mode
 
 
@@ -17,12 +17,12 @@ def keep(answers):
 
 def gain_of(rig, index):
     registers = rig.buses[0].servos[index].registers
-    return registers.table.items["position_p_gain"].decode(registers.read(84, 2))
+    return registers.table.items["position_p_gain"].decode(registers.read_bytes(84, 2))
 
 
 def test_a_gain_is_changed_between_cycles_read_back_and_reported(started):
     answers, before = [], len(started.into_bus())
-    started.hardware.set_register(1, "position_p_gain", 900, keep(answers))
+    started.hardware.write_register(1, "position_p_gain", 900, keep(answers))
     assert answers == []
     started.cycles(3)
     assert answers == [""]
@@ -37,7 +37,7 @@ def test_a_gain_is_changed_between_cycles_read_back_and_reported(started):
 
 def test_what_a_servo_has_already_is_not_written(started):
     answers, before = [], len(started.into_bus())
-    started.hardware.set_register(0, "position_p_gain", 800, keep(answers))
+    started.hardware.write_register(0, "position_p_gain", 800, keep(answers))
     started.cycle()
     assert answers == [""]
     assert started.writes(before) == []
@@ -45,7 +45,7 @@ def test_what_a_servo_has_already_is_not_written(started):
 
 def test_a_servo_that_refuses_is_reported_and_keeps_what_it_had(started):
     answers = []
-    started.hardware.set_register(0, "velocity_p_gain", 20_000, keep(answers))
+    started.hardware.write_register(0, "velocity_p_gain", 20_000, keep(answers))
     started.cycles(3)
     (answer,) = answers
     assert answer.startswith("arm_11_joint (ID 11 on bus arm) refuses Velocity P Gain (78) = 20000: ")
@@ -55,7 +55,7 @@ def test_a_servo_that_refuses_is_reported_and_keeps_what_it_had(started):
 def test_a_servo_that_is_silent_is_reported(started):
     answers = []
     started.servo(11).silence()
-    started.hardware.set_register(0, "position_p_gain", 900, keep(answers))
+    started.hardware.write_register(0, "position_p_gain", 900, keep(answers))
     started.cycles(20)
     assert answers == ["arm_11_joint (ID 11 on bus arm) did not answer when Position P Gain (84) was read"]
 
@@ -65,7 +65,7 @@ def test_a_servo_that_is_silent_for_a_moment_gets_its_register(started):
     servo = started.servo(11)
     servo.silence()
     started.buses[0].at(started.clock.now_ns() + 130_000_000, lambda: servo.silence(False))
-    started.hardware.set_register(0, "position_p_gain", 900, keep(answers))
+    started.hardware.write_register(0, "position_p_gain", 900, keep(answers))
     started.cycles(80)
     assert answers == [""]
     assert gain_of(started, 0) == 900
@@ -74,7 +74,7 @@ def test_a_servo_that_is_silent_for_a_moment_gets_its_register(started):
 @pytest.mark.parametrize("item", ["temperature_limit", "present_position", "nonsense"])
 def test_nothing_else_than_ram_is_written_whatever_comes_out_of_the_mailbox(started, item):
     answers = []
-    started.hardware.set_register(0, item, 60, keep(answers))
+    started.hardware.write_register(0, item, 60, keep(answers))
     assert answers == [f"arm_11_joint has no register {item} that could be written now"]
 
 
@@ -82,7 +82,7 @@ def test_many_requests_are_done_in_their_order_and_no_cycle_is_late(started):
     answers = []
     for value in (500, 600, 700):
         for row in (0, 1):
-            started.hardware.set_register(
+            started.hardware.write_register(
                 row, "position_p_gain", value, lambda why, _, at=(row, value): answers.append((*at, why))
             )
     for _ in range(6):
@@ -93,10 +93,10 @@ def test_many_requests_are_done_in_their_order_and_no_cycle_is_late(started):
 
 def test_what_was_set_in_the_run_is_set_again_after_a_reset(started):
     answers = []
-    started.hardware.set_register(1, "position_p_gain", 900, keep(answers))
+    started.hardware.write_register(1, "position_p_gain", 900, keep(answers))
     started.cycles(3)
     with started.away(12, 5) as servo:
-        servo.reset()
+        servo.power_cycle()
         assert gain_of(started, 1) == 800
     assert gain_of(started, 1) == 900
     assert (

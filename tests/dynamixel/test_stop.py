@@ -4,7 +4,7 @@ import pytest
 from tests.kit.line_faults import corrupt_next, truncate_next
 from tests.kit.rigs import make_plan, make_rig, start_rig
 
-from dxlrun.channels.events import EventCode
+from dxlrun.channels.event_records import EventCode
 from dxlrun.errors import StartUpError
 from dxlwire.wire import protocol1
 
@@ -44,7 +44,7 @@ def test_stop_with_a_silent_servo_limps_the_others_and_names_it(started):
     assert "ID 4 on bus main" in failure
     assert "does not answer" in failure
     assert started.torque() == [servo.servo_id == 4 for servo in started.buses[0].servos]
-    last = protocol1.write(21, 24, b"\0")
+    last = protocol1.write_range(21, 24, b"\0")
     off_ns = next(e.t_ns for e in started.ledger.entries if e.t_ns >= start and e.data == last)
     assert off_ns - start < 50_000_000  # the servos behind it do not wait for it
     assert started.clock.now_ns() - start < 400_000_000
@@ -62,14 +62,14 @@ def test_stop_in_noise_tries_again(started):
 def test_a_start_that_fails_says_whose_torque_was_not_confirmed_off(monkeypatch):
     """A servo that falls silent once it has torque: it is not called limp."""
     rig = make_rig()
-    emit = rig.events.emit
+    emit = rig.events.emit_event
 
     def unplug(source, event):
         if event.code is EventCode.TORQUE_ON:
             rig.servo(4).silence()
         emit(source, event)
 
-    monkeypatch.setattr(rig.events, "emit", unplug)
+    monkeypatch.setattr(rig.events, "emit_event", unplug)
     with pytest.raises(StartUpError) as caught:
         rig.hardware.start()
     assert len(caught.value.sentences) == 2

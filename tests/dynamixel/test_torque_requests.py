@@ -7,7 +7,7 @@ from tests.kit.line_faults import turn_by_hand
 from tests.kit.rigs import make_plan, make_rig, make_x, start_rig
 
 from dxlrun.channels.cycle import Torque
-from dxlrun.channels.events import EventCode, Severity
+from dxlrun.channels.event_records import EventCode, Severity
 from dxlrun.dynamixel.servo.life import ServoState
 from dxlrun.errors import StartUpError
 from dxlwire.modes import Mode
@@ -74,7 +74,7 @@ class Arm:
         return self.asked
 
     def reboot(self, row=1):
-        self.rig.hardware.reboot(row, self._answer())
+        self.rig.hardware.reboot_servo(row, self._answer())
         return self.asked
 
     def told(self, number, most=300):
@@ -151,7 +151,7 @@ def test_a_joint_that_the_file_wants_limp_loses_the_torque_that_it_has():
     assert (12, 0) in arm.torque_bytes()
     other = Arm(limp=(12,), take_over=True)
     other.servo.poke("torque_enable", 1)
-    other.servo.registers.watch(("torque_enable",), lambda: other.servo.poke("torque_enable", 1))
+    other.servo.registers.watch_items(("torque_enable",), lambda: other.servo.poke("torque_enable", 1))
     with pytest.raises(StartUpError, match="did not confirm that its torque is off"):
         other.start()
 
@@ -172,7 +172,7 @@ def test_servo_that_resets_after_torque_on_gets_no_goal(protocol):
 def test_torque_off_that_was_not_heard_is_written_again_and_one_that_is_never_heard_is_named():
     arm = Arm().start()
     written = arm.rig.torque_given(12)
-    arm.servo.registers.watch(
+    arm.servo.registers.watch_items(
         ("torque_enable",), lambda: len(written) == 1 and arm.servo.poke("torque_enable", 1)
     )
     assert arm.told(arm.switch(False)) == ""
@@ -437,7 +437,7 @@ def test_a_servo_that_reboots_while_it_is_checked_gets_no_torque():
     arm = Arm(returning=True).let_go()
     begun = len(arm.rig.into_bus())
     assert arm.told(arm.switch(True)) == ""
-    tick = protocol2.read(12, 120, 2)
+    tick = protocol2.read_range(12, 120, 2)
     first, last = (number for number, packet in enumerate(arm.rig.into_bus()[begun:]) if packet == tick)
     assert last - first > 5
     for packets in range(first + 1, last + 1):
@@ -445,7 +445,7 @@ def test_a_servo_that_reboots_while_it_is_checked_gets_no_torque():
         given = arm.rig.torque_given(12)
         begun = len(arm.rig.into_bus())
         number = arm.switch(True)
-        arm.rig.buses[0].after(packets, arm.servo.reset)
+        arm.rig.buses[0].after(packets, arm.servo.power_cycle)
         assert "rebooted while it was checked" in arm.told(number), packets
         assert (12, 1) not in arm.torque_bytes(begun)
         arm.follow(100)
@@ -457,7 +457,7 @@ def test_a_servo_that_reboots_while_it_is_checked_gets_no_torque():
 def test_a_servo_that_reboots_while_its_mode_changes_gets_torque_by_the_policy_alone(returning, after):
     arm = Arm(returning=returning).start()
     arm.rig.set_modes(0, Mode.VELOCITY, 0)
-    arm.rig.buses[0].after(after + 2, arm.servo.reset)
+    arm.rig.buses[0].after(after + 2, arm.servo.power_cycle)
     arm.follow(150)
     assert arm.rig.torque() == [True, returning, True]
     assert arm.rig.states.mode[1] == Mode.VELOCITY

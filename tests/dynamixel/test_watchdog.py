@@ -9,14 +9,14 @@ from msgspec.structs import replace
 from tests.kit.line_faults import delay_next, truncate_next
 from tests.kit.rigs import every_servo, make_plan, make_rig, make_x, start_rig
 
-from dxlrun.channels.events import EventCode
+from dxlrun.channels.event_records import EventCode
 from dxlrun.dynamixel.servo import watchdog
-from dxlrun.dynamixel.servo.access import reach
+from dxlrun.dynamixel.servo.item_access import access_servo
 from dxlrun.dynamixel.servo.watchdog import RETURN_SPEED
 from dxlrun.errors import StartUpError
 from dxlwire.bus_plan import RegisterValue
 from dxlwire.control_table import find_table
-from dxlwire.transaction import Outcome, Reply
+from dxlwire.transaction import Reply, TransactionOutcome
 from dxlwire.wire import protocol2
 
 TRIPPED = 0xFF
@@ -44,7 +44,7 @@ def once_armed(rig, servo_id, what):
         if servo.registers["bus_watchdog"] == 10 and left:
             left.pop()(servo_id)
 
-    servo.registers.watch(("bus_watchdog",), written)
+    servo.registers.watch_items(("bus_watchdog",), written)
 
 
 def trip(servo):
@@ -86,7 +86,7 @@ def _answer_once(rig):
         if len(asked) > 1:
             truncate_next(rig.buses[0], 12, 0)
 
-    rig.when(lambda data: data == protocol2.read(12, 98, 1), spoil)
+    rig.when(lambda data: data == protocol2.read_range(12, 98, 1), spoil)
 
 
 @pytest.mark.parametrize(
@@ -148,14 +148,14 @@ class TestWhileOthersAreArmed:
     def test_none_is_taken_for_tripped_before_it_was_armed(self):
         """The first states are read once more after a pause that is longer than the watchdogs."""
         rig = make_rig(arm(ticks=2))
-        read = rig.hardware.read
+        read = rig.hardware.read_states
 
         def spoilt():
             truncate_next(rig.buses[0], 11, 4)
-            rig.hardware.read = read
+            rig.hardware.read_states = read
             read()
 
-        rig.hardware.read = spoilt
+        rig.hardware.read_states = spoilt
         rig.hardware.start()
         assert rig.events.of(EventCode.READ_LOST)
         assert rig.events.of(EventCode.WATCHDOG) == []
@@ -175,7 +175,7 @@ def test_a_process_that_stands_still_again_and_again_before_a_read_shows_no_olde
 
     started.hardware._prepare_read = prepared
     started.wait(SECOND_NS)
-    started.hardware.read()
+    started.hardware.read_states()
     assert not left
     assert started.states.valid.all()
     assert max(started.states.age_ns) < started.period_ns
@@ -188,7 +188,7 @@ class TestLeftHolding:
 
     def test_servos_are_not_stopped(self, started):
         started.cycles(5)
-        started.hardware.release()
+        started.hardware.leave_torque_on()
         started.wait(SECOND_NS)
         assert started.torque() == [True] * 4
         assert armed(started) == [0] * 4
@@ -197,10 +197,10 @@ class TestLeftHolding:
         move_far(started)
         started.wait(300_000_000)
         servos = started.buses[0].servos
-        stood = [servo.position for servo in servos]
-        started.hardware.release()
+        stood = [servo.shaft_angle for servo in servos]
+        started.hardware.leave_torque_on()
         started.wait(2 * SECOND_NS)
-        assert [servo.position for servo in servos] == pytest.approx(stood, abs=0.002)
+        assert [servo.shaft_angle for servo in servos] == pytest.approx(stood, abs=0.002)
         assert armed(started) == [TRIPPED] * 4
         told = started.events.texts(EventCode.WATCHDOG)
         assert len(told) == 4
@@ -211,17 +211,17 @@ class TestLeftHolding:
         move_far(started)
         trip(servo)
         started.wait(100_000_000)
-        stood = servo.position
-        started.hardware.release()
+        stood = servo.shaft_angle
+        started.hardware.leave_torque_on()
         started.wait(SECOND_NS)
         assert armed(started) == [0, TRIPPED, 0, 0]
-        assert servo.position == pytest.approx(stood, abs=0.002)
+        assert servo.shaft_angle == pytest.approx(stood, abs=0.002)
 
     def test_a_silent_one_stops_no_others(self):
         rig = start_rig(arm(range(11, 23)))
         rig.cycles(5)
         rig.servo(14).silence()
-        rig.hardware.release()
+        rig.hardware.leave_torque_on()
         rig.wait(SECOND_NS)
         assert armed(rig) == [0, 0, 0, TRIPPED] + [0] * 8
         (told,) = rig.events.texts(EventCode.WATCHDOG)
@@ -234,7 +234,7 @@ class TestLeftHolding:
         rig.cycles(5)
         assert armed(rig) == [2] * 24
         told = rig.events.of(EventCode.WATCHDOG)
-        rig.hardware.release()
+        rig.hardware.leave_torque_on()
         rig.wait(SECOND_NS)
         assert armed(rig) == [0] * 24
         assert rig.events.of(EventCode.WATCHDOG) == told
@@ -326,7 +326,7 @@ def test_a_servo_that_its_watchdog_stopped_gets_no_goal_before_its_torque_was_re
     started.cycles(30)
     since = started.into_bus()[count:]
     for servo_id in (11, 12, 13, 14):
-        asked = since.index(protocol2.read(servo_id, 64, 1))
+        asked = since.index(protocol2.read_range(servo_id, 64, 1))
         named = [at for at, p in enumerate(since) if p[7] == 0x83 and p[8] != 98 and servo_id in p[12:-2:9]]
         assert named
         assert named[0] > asked
@@ -346,16 +346,19 @@ def run(program, answer):
     ("reply", "said"),
     [
         (
-            Reply(Outcome.TIMEOUT, 0, b"", 0, 0, False),
+            Reply(TransactionOutcome.TIMEOUT, 0, b"", 0, 0, False),
             "did not answer when Bus Watchdog (98) was read back",
         ),
-        (Reply(Outcome.OK, 0, b"\x0a", 0, 0, False), "was given Bus Watchdog (98) = 0, but has 10"),
+        (
+            Reply(TransactionOutcome.OK, 0, b"\x0a", 0, 0, False),
+            "was given Bus Watchdog (98) = 0, but has 10",
+        ),
     ],
 )
 def test_a_watchdog_that_is_not_read_as_0_is_written_and_is_not_cleared(reply, said):
     plan = arm()
-    sent, problem = run(watchdog.disarm(reach(plan, plan.servos[0])), lambda _: reply)
-    assert protocol2.write(11, 98, b"\0") in sent
+    sent, problem = run(watchdog.disarm(access_servo(plan, plan.servos[0])), lambda _: reply)
+    assert protocol2.write_range(11, 98, b"\0") in sent
     assert said in problem
 
 
@@ -375,9 +378,11 @@ def test_a_servo_that_follows_velocities_is_freed_of_its_watchdog_only_to_stand(
         if packet[7] == 3:
             found[address] = packet[10:-2]
         data = b"" if packet[7] == 3 else b"\1\xff" if address == 11 else found.get(98, b"\xff")
-        return Reply(Outcome.TIMEOUT if address == silent else Outcome.OK, 0, data, 0, 0, False)
+        return Reply(
+            TransactionOutcome.TIMEOUT if address == silent else TransactionOutcome.OK, 0, data, 0, 0, False
+        )
 
-    _, problem = run(watchdog.disarm(reach(plan, plan.servos[0])), answer)
+    _, problem = run(watchdog.disarm(access_servo(plan, plan.servos[0])), answer)
     assert said in problem
     assert bool(problem) == bool(said)
     assert set(found) == written

@@ -2,7 +2,7 @@
 
 import pytest
 
-from dxlrun.channels.events import EventBody
+from dxlrun.channels.event_records import EventBody
 from dxlrun.dynamixel.wire_reports import WireReports
 from dxlwire.exchange.reports import Reason
 
@@ -13,7 +13,7 @@ class Events:
     def __init__(self) -> None:
         self.found: list[tuple[str, str]] = []
 
-    def emit(self, source: str, event: EventBody, data: bytes = b"") -> None:
+    def emit_event(self, source: str, event: EventBody, data: bytes = b"") -> None:
         self.found.append((source, event.text))
 
 

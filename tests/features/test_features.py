@@ -13,12 +13,12 @@ import pytest
 from msgspec import to_builtins
 
 import dxlrun.features
-from dxlrun.channels.events import Event, EventCode, EventStage, event_names
+from dxlrun.channels.event_records import Event, EventCode, EventStage, event_names
 from dxlrun.compile.contribution import CompileStage
-from dxlrun.compile.robot import compile_files
-from dxlrun.description.form import Form, with_keys
-from dxlrun.description.joints.joints import BareJoint, Joint, SharedJoint
-from dxlrun.description.joints.mechanics import OneOfServos
+from dxlrun.compile.robot_compiler import compile_files
+from dxlrun.description.base_form import Form, with_keys
+from dxlrun.description.joints.joint_forms import BareJoint, Joint, SharedJoint
+from dxlrun.description.joints.joint_mechanics import OneOfServos
 from dxlrun.description.robot import Group, GroupPolicies, Policies, Robot, robot_form
 from dxlrun.errors import InputError
 from dxlrun.features import FEATURES, RESERVED, stages
@@ -52,7 +52,8 @@ def test_feature_without_file_takes_no_part_in_stage() -> None:
 def test_guardian_does_not_import_a_feature_of_one_module() -> None:
     code = (
         "import sys; from dxlrun.dynamixel.bus_part import SafeEnd; from dxlrun.features import FEATURES; "
-        "SafeEnd.of(FEATURES, {}); print(*(one.package for one in FEATURES if one.package in sys.modules))"
+        "SafeEnd.import_stages(FEATURES, {}); "
+        "print(*(one.package for one in FEATURES if one.package in sys.modules))"
     )
     done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
     imported = done.stdout.split()

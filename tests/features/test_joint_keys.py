@@ -14,9 +14,9 @@ from tests.kit.rigs import Events
 from dxlrun import InputError
 from dxlrun.channels.cycle import Commands, States
 from dxlrun.cli import check
-from dxlrun.compile.robot import Compiled, compile_files
-from dxlrun.description.joints import joints
-from dxlrun.description.joints.joints import kind_of_joint
+from dxlrun.compile.robot_compiler import CompiledRobot, compile_files
+from dxlrun.description.joints import joint_forms
+from dxlrun.description.joints.joint_forms import kind_of_joint
 from dxlrun.description.json_schema import robot_schema
 from dxlrun.description.robot import robot_form
 from dxlrun.dynamixel.hardware_layer import HardwareLayers
@@ -66,7 +66,7 @@ def with_backlash(tmp_path: Path) -> Iterator[None]:
     robot_form.cache_clear()
 
 
-def compiled(tmp_path: Path, text: str) -> Compiled:
+def compiled(tmp_path: Path, text: str) -> CompiledRobot:
     """Compile the text of a robot file."""
     (tmp_path / "robot.yaml").write_text(text)
     return compile_files(tmp_path / "robot.yaml", {}, [])
@@ -115,8 +115,8 @@ def test_key_with_a_name_like_a_key_of_servos_makes_no_joint_with_a_servo(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
     assert kind_of_joint({"lead": "1 mm"}) == "<one servo>"  # means travel_per_turn
-    lead = structs.replace(joints.joint_keys()[0], name="lead")
-    monkeypatch.setattr(joints, "joint_keys", lambda: [lead])
+    lead = structs.replace(joint_forms.joint_keys()[0], name="lead")
+    monkeypatch.setattr(joint_forms, "joint_keys", lambda: [lead])
     assert kind_of_joint({"lead": "1 mm"}) == "<no servo>"
 
 
@@ -185,7 +185,7 @@ def test_check_shows_values_that_are_not_a_number(  # noqa: PLR0917  parameters
     )
     (tmp_path / "robot.yaml").write_text(ROBOT.replace("backlash: 4 deg", f"window: {written}"))
     with installed(project):
-        assert check.check(tmp_path / "robot.yaml") == 0
+        assert check.check_robot(tmp_path / "robot.yaml") == 0
     assert shown in capsys.readouterr().out
 
 
@@ -195,7 +195,7 @@ def test_no_column_while_no_joint_has_the_key(tmp_path: Path) -> None:
 
 
 def test_clients_of_a_run_get_the_key(tmp_path: Path) -> None:
-    values = JointValues.collect(compiled(tmp_path, ROBOT).plan.loop.joints, {})
+    values = JointValues.from_joints(compiled(tmp_path, ROBOT).plan.loop.joints, {})
     assert values.joint_keys == {"backlash": {"knee": np.radians(4)}}
 
 

@@ -10,12 +10,12 @@ from typing import NamedTuple
 import pytest
 
 from dxlrun import InputError, Log
-from dxlrun.channels.events import EventCode
+from dxlrun.channels.event_records import EventCode
 from dxlrun.cli import check
-from dxlrun.compile.robot import compile_files
+from dxlrun.compile.robot_compiler import compile_files
 from dxlrun.plan.robot_plan import from_json
 from dxlrun.testing import installed, plan_of, read_log, simulated_robot
-from dxlrun_analysis.replay.replay import replay_log
+from dxlrun_analysis.replay.log_replay import replay_log
 
 HOT = "policies: {on_hot_servo: {above: 70 degC, do: %s}}\n"
 STEPS = "[{pose: rest, speed: 60 deg/s}, limp]"
@@ -137,7 +137,7 @@ def test_check_shows_the_policy(tmp_path: Path, capsys: pytest.CaptureFixture[st
     rows = {row.name: row.does for row in compile_files(file, {}, []).report["policies"]}
     assert list(rows)[-2:] == ["on_hot_servo", "on_returned_servo"]
     assert rows["on_hot_servo"] == "pan above 70 degC: hold, tilt above 70 degC: hold"
-    assert check.check(file) == 0
+    assert check.check_robot(file) == 0
     assert "on_hot_servo" in capsys.readouterr().out
 
 

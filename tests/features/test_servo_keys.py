@@ -10,7 +10,7 @@ from pathlib import Path
 import pytest
 
 from dxlrun import InputError
-from dxlrun.compile.robot import Compiled, compile_files
+from dxlrun.compile.robot_compiler import CompiledRobot, compile_files
 from dxlrun.description.json_schema import robot_schema
 from dxlrun.features import feature
 from dxlrun.testing import installed, simulated_robot
@@ -35,7 +35,7 @@ from dxlrun_glow.servo_key import STAGE as GLOW
 
 
 def glow(file, servo, table):
-    if not GLOW.of(servo):
+    if not GLOW.value_of(servo):
         return
     led = table.items.get("led")
     if led is None:
@@ -92,7 +92,7 @@ def with_glow(tmp_path: Path) -> Iterator[None]:
         yield
 
 
-def compiled(tmp_path: Path, text: str) -> Compiled:
+def compiled(tmp_path: Path, text: str) -> CompiledRobot:
     """Compile the text of a robot file."""
     (tmp_path / "robot.yaml").write_text(text)
     return compile_files(tmp_path / "robot.yaml", {}, [])

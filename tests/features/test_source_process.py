@@ -6,7 +6,7 @@ import base64
 import json
 from pathlib import Path
 
-from dxlrun.control.source_process import planned_processes
+from dxlrun.control.sampled_sources import planned_processes
 from dxlrun.features.sensors.plan import decode_sensors
 from dxlrun.plan.policy_plan import HOLD, LIMP
 from dxlrun.plan.robot_plan import from_json, to_json

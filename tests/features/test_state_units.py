@@ -13,7 +13,7 @@ from dxlrun import Sensor
 from dxlrun.cli import main
 from dxlrun.cli.steering.steer import sources
 from dxlrun.features.sensors.compile import is_units
-from dxlrun.log.reader import open_log
+from dxlrun.log.log_reader import open_log
 from dxlrun.output.quantity import names_with_units, quantity_text
 from dxlrun.testing import simulated_robot
 from dxlrun_analysis.report import analyze, tables

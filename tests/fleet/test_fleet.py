@@ -34,11 +34,11 @@ from dxlrun.output.live_view import compact
 from dxlrun.remote.network.certificates import keys_place
 from dxlrun.remote.network.network_link import NetworkLink
 from dxlrun.remote.requests.replies import EventRow, Events, RobotInfo
-from dxlrun.remote.requests.table import Role
+from dxlrun.remote.requests.request_table import Role
 from dxlrun.remote.sockets import Address
-from dxlrun_fleet.agent import START, Starter
+from dxlrun_fleet.agent import START, AgentApp
 from dxlrun_fleet.fleet_file import Agent, read_fleet
-from dxlrun_fleet.fleet_view import SILENT_S, RobotView, Seen, fleet_table
+from dxlrun_fleet.fleet_view import SILENT_S, RobotStatus, RobotView, fleet_table
 
 authority = pytest.importorskip("dxlrun_fleet.authority", reason="needs the extra network")
 
@@ -140,7 +140,7 @@ def test_a_robot_is_started_seen_killed_and_seen_again_beside_one_that_hangs(
 
 
 def test_a_long_error_takes_no_room_from_the_names() -> None:
-    row = Seen(
+    row = RobotStatus(
         "joint_7", "running", voltage=12.0, temperature=30.0, error="a packet was lost " * 20, log="x" * 90
     )
     shown = io.StringIO()
@@ -182,7 +182,7 @@ def test_the_last_error_stays_and_warnings_are_none(lab: Path) -> None:
         assert view.seen().state == "unreachable"
         assert view.seen().reason == "joint no longer answers: [Errno 111] Connection refused"
         for last in (0, 2):
-            assert view._look(Begins(), last) == 2
+            assert view._poll_robot(Begins(), last) == 2
             assert (view.seen().state, view.seen().error, view.seen().voltage) == (
                 "starting",
                 "a motor fell off",
@@ -198,7 +198,7 @@ def test_what_an_agent_answers(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) 
         "import sys\nprint(sys.argv[1:], flush=True)\nsys.stdin.read()\ninput()\n"
     )
     monkeypatch.setattr("dxlrun_fleet.agent._MAIN", (tmp_path / "wait.py").read_text())
-    first, second = (Starter(Agent(ADDRESS, {"arm": ("arm.yaml", "port:=x")}), tmp_path) for _ in range(2))
+    first, second = (AgentApp(Agent(ADDRESS, {"arm": ("arm.yaml", "port:=x")}), tmp_path) for _ in range(2))
     for method, path, role, status in (
         ("POST", START + "arm", Role.COMMAND, 403),
         ("GET", START + "arm", Role.OBSERVE, 403),
@@ -208,27 +208,29 @@ def test_what_an_agent_answers(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) 
         ("POST", "/stop", Role.ADMIN, 404),
         ("DELETE", START + "arm", Role.ADMIN, 404),
     ):
-        assert first.answer(method, path, role)[0] == status, (method, path)
+        assert first.answer_request(method, path, role)[0] == status, (method, path)
     assert [path.name for path in tmp_path.iterdir()] == ["wait.py"]
-    assert first.answer("POST", START + "arm", Role.ADMIN) == (200, "it was started")
+    assert first.answer_request("POST", START + "arm", Role.ADMIN) == (200, "it was started")
     out = tmp_path / "arm.out"
     until(lambda: "EOFError" in out.read_text(), "its end")
-    status, text = until(lambda: (one := second.answer("GET", START + "arm", Role.ADMIN))[0] == 410 and one)
+    status, text = until(
+        lambda: (one := second.answer_request("GET", START + "arm", Role.ADMIN))[0] == 410 and one
+    )
     head, *_, last = text.split("\n  ")
     assert (head, last) == (f"it does not run; {out} ends with:", "EOFError: EOF when reading a line")
     assert out.read_text().startswith("['arm.yaml', 'port:=x']\n")
 
     monkeypatch.setattr("dxlrun_fleet.agent._MAIN", "import time; time.sleep(20)")
-    assert first.answer("POST", START + "arm", Role.ADMIN)[0] == 200
+    assert first.answer_request("POST", START + "arm", Role.ADMIN)[0] == 200
     assert out.read_text() == ""
     for starter in (first, second):
-        assert starter.answer("GET", START + "arm", Role.ADMIN) == (200, "it runs")
-        assert starter.answer("POST", START + "arm", Role.ADMIN) == (409, "it runs already")
+        assert starter.answer_request("GET", START + "arm", Role.ADMIN) == (200, "it runs")
+        assert starter.answer_request("POST", START + "arm", Role.ADMIN) == (409, "it runs already")
     (run,) = first._runs
     assert os.getsid(run.pid) == run.pid
     run.kill()
     run.wait()
-    assert until(lambda: second.answer("GET", START + "arm", Role.ADMIN)[0] == 410)
+    assert until(lambda: second.answer_request("GET", START + "arm", Role.ADMIN)[0] == 410)
 
 
 def test_an_agent_asks_for_a_certificate_with_the_role_admin(
@@ -312,7 +314,7 @@ def test_fleet_md_has_a_file_that_is_read_and_lines_that_can_be_typed(tmp_path: 
     for line in lines:
         _, bound, _ = app.build("fleet").parse_args(line, print_error=False, exit_on_error=False)
         assert bound.arguments["file"] == Path("lab.yaml")
-        fleet.require((*bound.arguments.get("start", ()), *bound.arguments.get("stop", ())))
+        fleet.require_robots((*bound.arguments.get("start", ()), *bound.arguments.get("stop", ())))
         assert bound.arguments.get("serve") in (None, *fleet.agents)
     for agent in fleet.agents.values():
         assert set(agent.starts) <= set(fleet.robots)

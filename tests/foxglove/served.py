@@ -8,7 +8,7 @@ import threading
 from concurrent.futures import Future
 
 from dxlrun.remote.network.listener import Listener
-from dxlrun_foxglove.server import FoxgloveServer
+from dxlrun_foxglove.foxglove_server import FoxgloveServer
 
 PAGE = "https://app.foxglove.dev"
 
@@ -28,7 +28,7 @@ class Served:
 
     async def _serve(self, begun: Future[int]) -> None:
         listener = Listener("127.0.0.1", 0)
-        async with await self.server.serve(listener, self._tls):
+        async with await self.server.accept_viewers(listener, self._tls):
             begun.set_result(listener.getsockname()[1])
             await self._ended.wait()
         await self._loop.shutdown_default_executor()

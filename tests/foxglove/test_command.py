@@ -9,7 +9,7 @@ from pathlib import Path
 import pytest
 
 from dxlrun import DxlrunError, InputError
-from dxlrun_foxglove.command import foxglove
+from dxlrun_foxglove.foxglove import foxglove
 
 
 @pytest.fixture(autouse=True)

@@ -17,7 +17,7 @@ from websockets.exceptions import ConnectionClosed, InvalidMessage, InvalidStatu
 
 from dxlrun import InputError
 from dxlrun.remote.network.listener import MOST_UNPROVED
-from dxlrun_foxglove.command import tls_of
+from dxlrun_foxglove.foxglove import tls_of
 
 
 def refused(url: str, origin: str | None = None, subprotocol: str = "foxglove.websocket.v1") -> int:

@@ -37,13 +37,13 @@ def test_the_oldest_messages_are_left_out_for_a_slow_viewer() -> None:
         viewer = Viewer(cast("ServerConnection", connection))
         viewer.subscriptions[3] = 7
         most = MOST_BYTES // (1000 + 13)
-        sending = asyncio.create_task(viewer.send())
+        sending = asyncio.create_task(viewer.send_queued())
         for number in range(3 * most):
-            viewer.show(CHANNEL, number, b"x" * 1000)
+            viewer.queue_message(CHANNEL, number, b"x" * 1000)
         connection.let = asyncio.Semaphore(10**6)
         await asyncio.sleep(0)
         sending.cancel()
-        sending = asyncio.create_task(viewer.send())
+        sending = asyncio.create_task(viewer.send_queued())
         while len(connection.taken) < most + 1:
             await asyncio.sleep(0)
         sending.cancel()
@@ -72,9 +72,9 @@ def test_what_it_has_not_subscribed_to_does_not_wait() -> None:
     async def run() -> None:
         connection = SlowConnection()
         viewer = Viewer(cast("ServerConnection", connection))
-        viewer.show(CHANNEL, 0, b"x")
+        viewer.queue_message(CHANNEL, 0, b"x")
         connection.let.release()
-        sending = asyncio.create_task(viewer.send())
+        sending = asyncio.create_task(viewer.send_queued())
         await asyncio.sleep(0)
         sending.cancel()
         assert not connection.taken

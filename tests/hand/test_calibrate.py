@@ -10,7 +10,7 @@ from pathlib import Path
 import pytest
 from tests.kit.hands import HandLine, Script, interrupt, written
 
-from dxlrun.compile.robot import compile_files
+from dxlrun.compile.robot_compiler import compile_files
 from dxlrun.dynamixel.tools.tool_line import TunablePort
 from dxlrun.errors import InputError, PortError, ServoFault
 from dxlrun_hand.commands.calibrate import calibrated

@@ -23,12 +23,12 @@ from tests.hand.test_teach import points, positions
 from tests.kit.hands import HandLine, LiveRobot, Script, written
 
 from dxlrun import connect
-from dxlrun.compile.robot import compile_files
+from dxlrun.compile.robot_compiler import compile_files
 from dxlrun.description.motion import read_motion
 from dxlrun.description.reading import read_robot
 from dxlrun_hand.commands.calibrate import calibrated
 from dxlrun_hand.commands.setup import set_up
-from dxlrun_hand.servo_setup import SetUp, factory_rate
+from dxlrun_hand.servo_setup import ServoSetup, factory_rate
 from dxlrun_hand.teaching import taught
 from dxlsim.simulation_plan import ServoConfig
 from dxlwire.control_table import ControlTable, find_table
@@ -75,7 +75,7 @@ class World:
         """Turn a servo to an angle, a bit there and back on the way."""
         servo = self.line.bus.servos[index]
         for angle in (degrees - wander, degrees) if wander else (degrees,):
-            self.line.turn(servo.servo_id, angle - math.degrees(servo.position), look)
+            self.line.turn(servo.servo_id, angle - math.degrees(servo.shaft_angle), look)
 
 
 def drawn(chance: random.Random) -> World:
@@ -168,7 +168,7 @@ def test_random_robots_are_set_up_and_calibrated(number: int, tmp_path: Path) ->
         ),
         ("Connect all", lambda: line.connect(*range(len(world.joints)))),
     )
-    assert set_up(SetUp(read_robot(robot, {}), setting_up), line.open, tuple) == 0, setting_up.text
+    assert set_up(ServoSetup(read_robot(robot, {}), setting_up), line.open, tuple) == 0, setting_up.text
     for one, servo in zip(world.joints, line.bus.servos, strict=True):
         assert servo.servo_id == one.servo_id
         assert one.table.baud_rates[servo.registers["baud_rate"]] == world.rate

@@ -19,8 +19,8 @@ def put(directory: Path, text: str, *changes: tuple[tuple[str, ...], str | list[
     path = written(directory, text)
     edited = RobotText(path)
     for place, value in changes:
-        edited.put(place, value)
-    edited.write()
+        edited.plan_value(place, value)
+    edited.write_files()
     return path.read_bytes().decode()
 
 
@@ -85,19 +85,19 @@ def test_what_an_included_file_has_is_changed_there(tmp_path: Path) -> None:
     main = written(tmp_path, f"include: [fragment.yaml]\n{HEAD}joints: {{elbow: {{direction: 1}}}}\n")
     before = main.read_bytes()
     text = RobotText(main)
-    text.put(REFERENCE, "2 deg")
+    text.plan_value(REFERENCE, "2 deg")
     assert [line for line in text.diff() if line.startswith(("+", "-"))] == [
         f"--- {fragment} as it is",
         f"+++ {fragment} as it will be",
         "-joints: {elbow: {id: 1, reference: 1 deg}}  # arm",
         "+joints: {elbow: {id: 1, reference: 2 deg}}  # arm",
     ]
-    text.write()
+    text.write_files()
     assert fragment.read_text() == "joints: {elbow: {id: 1, reference: 2 deg}}  # arm\n"
     assert main.read_bytes() == before
     text = RobotText(main)
-    text.put(("joints", "elbow", "direction"), "-1")
-    text.write()
+    text.plan_value(("joints", "elbow", "direction"), "-1")
+    text.write_files()
     assert "direction: -1}" in main.read_text()
 
 
@@ -113,7 +113,7 @@ def test_what_an_included_file_has_is_changed_there(tmp_path: Path) -> None:
 def test_what_cannot_be_replaced_is_refused_at_its_place(tmp_path: Path, joints: str, said: str) -> None:
     path = written(tmp_path, f"{HEAD}joints: {joints}\n")
     with pytest.raises(InputError) as refused:
-        RobotText(path).put(REFERENCE, "2 deg")
+        RobotText(path).plan_value(REFERENCE, "2 deg")
     assert said in str(refused.value)
     assert str(refused.value).startswith(f"{path}:4:")
 
@@ -121,10 +121,10 @@ def test_what_cannot_be_replaced_is_refused_at_its_place(tmp_path: Path, joints:
 def test_a_file_that_was_changed_meanwhile_is_left_alone(tmp_path: Path) -> None:
     path = written(tmp_path, HEAD + "joints: {elbow: {reference: 1 deg}}\n")
     text = RobotText(path)
-    text.put(REFERENCE, "2 deg")
+    text.plan_value(REFERENCE, "2 deg")
     path.write_text("name: other\n")
     with pytest.raises(InputError, match="was changed by another program, so nothing was written"):
-        text.write()
+        text.write_files()
     assert path.read_text() == "name: other\n"
     assert list(tmp_path.iterdir()) == [path]
 
@@ -135,7 +135,7 @@ def test_a_file_that_cannot_be_written_is_refused_before_anything_is_measured(
     path = written(tmp_path, HEAD + "joints: {elbow: {reference: 1 deg}}\n")
     monkeypatch.setattr("os.access", lambda *_: False)  # root may write everything
     with pytest.raises(InputError, match="it is read-only"):
-        RobotText(path).check(REFERENCE)
+        RobotText(path).check_path(REFERENCE)
 
 
 def test_rights_and_links_stay(tmp_path: Path) -> None:
@@ -144,8 +144,8 @@ def test_rights_and_links_stay(tmp_path: Path) -> None:
     link = tmp_path / "link.yaml"
     link.symlink_to(path)
     text = RobotText(link)
-    text.put(REFERENCE, "2 deg")
-    text.write()
+    text.plan_value(REFERENCE, "2 deg")
+    text.write_files()
     assert link.is_symlink()
     assert "2 deg" in path.read_text()
     assert path.stat().st_mode & 0o777 == 0o640

@@ -14,7 +14,7 @@ from dxlrun.dynamixel.tools.one_servo import OneServo
 from dxlrun.errors import InputError, PortError
 from dxlrun_hand.commands.setup import set_up
 from dxlrun_hand.lines import find_port
-from dxlrun_hand.servo_setup import SetUp
+from dxlrun_hand.servo_setup import ServoSetup
 from dxlsim.simulation_plan import ServoConfig
 from dxlsim.virtual_ports import VirtualPorts
 
@@ -51,7 +51,7 @@ class Bench:
         search: bool = False,
     ) -> Script:
         self.script = Script(*steps)
-        task = SetUp(read_robot(self.path, {}), self.script)
+        task = ServoSetup(read_robot(self.path, {}), self.script)
         devices = self.devices if hasattr(self, "devices") else tuple
         self.code = set_up(task, self.line.open, devices, joints, search=search)
         assert not self.script.steps, self.script.steps

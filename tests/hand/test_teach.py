@@ -12,9 +12,9 @@ from msgspec.structs import replace
 from tests.kit.hands import LiveRobot, Script, interrupt, written
 
 from dxlrun import ROTARY, RemoteRobot, connect
-from dxlrun.description.motion import Motion, read_motion
+from dxlrun.description.motion import MotionForm, read_motion
 from dxlrun.errors import InputError, Refused, ServoFault
-from dxlrun_hand.taught_motion import Shown, Taught
+from dxlrun_hand.taught_motion import TaughtJoints, TaughtMotion
 from dxlrun_hand.teaching import Teaching, taught
 
 ROBOT = """\
@@ -71,7 +71,7 @@ def positions(robot: RemoteRobot) -> dict[str, float]:
     return dict(zip(states.joints, np.degrees(states.position).tolist(), strict=True))
 
 
-def points(motion: Motion) -> dict[str, list[tuple[float, float]]]:
+def points(motion: MotionForm) -> dict[str, list[tuple[float, float]]]:
     """Return the points of each joint, s and degrees."""
     return {
         name: [(point.time * 1e-9, math.degrees(point.joints[name].position)) for point in part.points]
@@ -207,15 +207,15 @@ def test_what_cannot_be_taught_is_refused(robot: RemoteRobot) -> None:
 # What was shown
 
 
-def motion_of(seconds: float, position: Callable[[np.ndarray], np.ndarray]) -> Shown:
+def motion_of(seconds: float, position: Callable[[np.ndarray], np.ndarray]) -> TaughtMotion:
     """Return a recording of two joints, at 50 Hz."""
     time = np.arange(0.0, seconds, 0.02)
-    return Shown(time, np.stack([position(time), np.zeros_like(time)], axis=1))
+    return TaughtMotion(time, np.stack([position(time), np.zeros_like(time)], axis=1))
 
 
-def two(speed: float = math.inf, way_speed: float = 1.0) -> Taught:
+def two(speed: float = math.inf, way_speed: float = 1.0) -> TaughtJoints:
     ends = np.array([-1.0, -1.0])
-    return Taught(("a", "b"), (ROTARY, ROTARY), ends, -ends, np.array([speed, math.inf]), way_speed)
+    return TaughtJoints(("a", "b"), (ROTARY, ROTARY), ends, -ends, np.array([speed, math.inf]), way_speed)
 
 
 def test_standstill_is_cut_off_at_both_ends() -> None:
@@ -242,7 +242,7 @@ def test_a_motion_that_is_too_fast_takes_longer() -> None:
 
 
 def test_the_way_between_poses_is_as_fast_as_it_is_to_be() -> None:
-    poses = [Shown(np.zeros(1), np.array([[angle, 0.0]])) for angle in (0.0, 0.8, 1.4)]
+    poses = [TaughtMotion(np.zeros(1), np.array([[angle, 0.0]])) for angle in (0.0, 0.8, 1.4)]
     motion = two(way_speed=0.4).joined(poses, Path("m.yaml"))
     assert motion.time_s.tolist() == pytest.approx([0.0, 0.2, 2.2, 2.7, 2.9])
     assert motion.position[:, 0].tolist() == [0.0, 0.0, 0.8, 1.0, 1.0]

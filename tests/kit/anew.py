@@ -17,11 +17,11 @@ import numpy as np
 from msgspec import structs
 
 from dxlrun.channels.commands import CommandRing
-from dxlrun.channels.events import EventBody, EventRing, Severity
-from dxlrun.channels.messages import MessageRing, PublishedTopic
+from dxlrun.channels.event_records import EventBody, EventRing, Severity
 from dxlrun.channels.ring import Handover, RecordKind
+from dxlrun.channels.topic_messages import MessageRing, PublishedTopic
+from dxlrun.log.log_reader import Log, read_log
 from dxlrun.log.log_writer import LogWriter
-from dxlrun.log.reader import Log, read_log
 from dxlwire.clock import VirtualClock
 
 Change = Callable[[Log], Log]
@@ -40,16 +40,16 @@ def written_anew(path: Path, target: Path, *changes: Change, gaps: Sequence[tupl
     )
     target.unlink(missing_ok=True)
     writer = LogWriter(target, header)
-    take = Handover(writer.take)
+    take = Handover(writer.write_record)
     if log.activation is not None:
-        writer.take(RecordKind.CYCLE, log.activation.tobytes())
+        writer.write_record(RecordKind.CYCLE, log.activation.tobytes())
     for command in log.commands:
-        CommandRing(take).take(command)
+        CommandRing(take).record_command(command)
     for row in range(len(log.cycles)):
-        writer.take(RecordKind.CYCLE, log.cycles[row : row + 1].tobytes())
+        writer.write_record(RecordKind.CYCLE, log.cycles[row : row + 1].tobytes())
     for event in log.events:
         ring = EventRing(take, VirtualClock(event.t_ns))
-        ring.emit(event.source, EventBody(event.code, Severity(event.severity), event.text), event.data)
+        ring.emit_event(event.source, EventBody(event.code, Severity(event.severity), event.text), event.data)
     published = MessageRing(take)
     for topic in log.topics.values():
         number = published.announce(PublishedTopic(topic.name, topic.type))

@@ -46,7 +46,7 @@ def urdf(*parts: str) -> str:
 def run(plant: Plant, seconds: float, drive: float | Sequence[float] = 0.0, damping: float = 0.0) -> None:
     count = len(plant.angle)
     for _ in range(round(seconds / STEP_S)):
-        plant.step(np.broadcast_to(np.asarray(drive, float), count), np.full(count, damping), STEP_S)
+        plant.step_shafts(np.broadcast_to(np.asarray(drive, float), count), np.full(count, damping), STEP_S)
 
 
 class Turned(NamedTuple):

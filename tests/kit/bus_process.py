@@ -13,7 +13,7 @@ from typing import Any
 
 import msgspec
 
-from dxlrun.channels import process
+from dxlrun.channels import child_processes
 from dxlsim.messages import SimulationJob
 from dxlsim.simulation_plan import BusConfig, SimulationConfig
 
@@ -29,7 +29,7 @@ def started(
     `options`: of the SimulationJob.
     """
     whole = config if isinstance(config, SimulationConfig) else SimulationConfig(tuple(config))
-    job = process.memory_file("bus-process", msgspec.json.encode(SimulationJob(whole, **options)))
+    job = child_processes.memory_file("bus-process", msgspec.json.encode(SimulationJob(whole, **options)))
     ours, theirs = socket.socketpair()
     command = [sys.executable, "-m", "dxlrun.run.simulation_process", "--job-fd", str(job)]
     command += ["--control-fd", str(theirs.fileno())]

@@ -9,10 +9,10 @@ from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
-from dxlrun.channels.answers import Done
-from dxlrun.channels.commands import Command, QueueInbox
-from dxlrun.control.controllers.plugins import load_plugins
-from dxlrun.log.reader import Log, read_log
+from dxlrun.channels.answers import Completion
+from dxlrun.channels.commands import CommandMessage, QueueInbox
+from dxlrun.control.controllers.plugin_loading import load_plugins
+from dxlrun.log.log_reader import Log, read_log
 from dxlrun.remote.preparation import Preparation
 from dxlrun.run.virtual_run import VirtualRobot
 from dxlrun.testing import simulated_robot
@@ -79,7 +79,7 @@ class Client(QueueInbox):
         self._asks = deque(
             (
                 round(ask.at_s * 1e9),
-                Command(
+                CommandMessage(
                     number,
                     ask.controller,
                     ask.kind,
@@ -94,10 +94,10 @@ class Client(QueueInbox):
             for number, ask in enumerate(sorted(asks, key=lambda ask: ask.at_s), 1)
         )
 
-    def take(self) -> Sequence[Command]:
+    def drain_commands(self) -> Sequence[CommandMessage]:
         while self._asks and self._asks[0][0] <= self._record.cycle * self._period_ns:
             self.waiting.append(self._asks.popleft()[1])
-        return super().take()
+        return super().drain_commands()
 
 
 def steered(
@@ -118,7 +118,9 @@ def steered(
     before(virtual)
     result = virtual.run()
     assert (result.reason, result.detail, virtual.failures) == ("ended", "", ())
-    refused = {number: answer for number, answer in client.answers.items() if not isinstance(answer, Done)}
+    refused = {
+        number: answer for number, answer in client.answers.items() if not isinstance(answer, Completion)
+    }
     assert not refused, refused
     report = replay_log(log)
     assert (report.different, report.compared) == (0, report.cycles)

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dxlrun.channels.packets import LoggedPacket, split_packets
+from dxlrun.channels.logged_packets import LoggedPacket, split_packets
 from dxlrun.channels.ring import Payload
 from dxlwire.packets import PacketKind
 

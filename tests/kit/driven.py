@@ -11,14 +11,14 @@ from typing import Any
 from tests.kit.wire import all_writes
 
 from dxlrun import RemoteRobot
-from dxlrun.channels.answers import Done
-from dxlrun.channels.commands import Command, QueueInbox
-from dxlrun.control.controllers.plugins import load_plugins
+from dxlrun.channels.answers import Completion
+from dxlrun.channels.commands import CommandMessage, QueueInbox
+from dxlrun.control.controllers.plugin_loading import load_plugins
 from dxlrun.plan.robot_plan import Plan
 from dxlrun.remote.gateway import GatewayApp
-from dxlrun.remote.link import Loaded
+from dxlrun.remote.link import LoadedController
 from dxlrun.remote.preparation import Preparation
-from dxlrun.remote.requests.table import Role
+from dxlrun.remote.requests.request_table import Role
 from dxlrun.testing import simulated_robot
 from dxlsim.bus.ledger import LedgerEntry
 
@@ -33,9 +33,11 @@ class _Loop:
         loop = self.plan.loop
         self.rate, self.paused, self.number = 1e9 / loop.period_ns, False, 0
         self.heartbeat = SimpleNamespace(cycles=0, skipped=0)
-        self.controllers = {one.name: Loaded(one, place) for place, one in enumerate(loop.controllers)}
+        self.controllers = {
+            one.name: LoadedController(one, place) for place, one in enumerate(loop.controllers)
+        }
 
-    def active(self, loaded: Loaded) -> bool:
+    def active(self, loaded: LoadedController) -> bool:
         return bool(self._robot.record.active >> loaded.place & 1)
 
     def newest(self) -> Any:
@@ -46,13 +48,15 @@ class _Loop:
         record = self.newest()
         return int(record.woken_ns) - record.cycle * self.plan.loop.period_ns
 
-    def set_point(self, loaded: Loaded, *rest: Any) -> None:
+    def set_point(self, loaded: LoadedController, *rest: Any) -> None:
         self.number += 1
-        self._inbox.waiting.append(Command(self.number, loaded.plan.name, *rest))
+        self._inbox.waiting.append(CommandMessage(self.number, loaded.plan.name, *rest))
 
-    async def command(self, name: str, kind: str, data: bytes, origin: str, *, request: bytes = b"") -> Done:
+    async def command(
+        self, name: str, kind: str, data: bytes, origin: str, *, request: bytes = b""
+    ) -> Completion:
         self.set_point(self.controllers[name], kind, data, origin, 0, request)
-        return Done(self._robot.record.cycle)
+        return Completion(self._robot.record.cycle)
 
 
 class _Gateway:
@@ -115,12 +119,12 @@ class DrivenRobot(QueueInbox):
         self._tick: Callable[[float], object] = lambda now: None
         self._due_ns = 0
 
-    def take(self) -> Sequence[Command]:
+    def drain_commands(self) -> Sequence[CommandMessage]:
         now_ns = self.virtual.clock.now_ns()
         if now_ns >= self._due_ns:
             self._due_ns = now_ns + 20 * MS
             self._tick(now_ns * 1e-9)
-        return super().take()
+        return super().drain_commands()
 
     def run(self, begin: Callable[[RemoteRobot], Callable[[float], object]]) -> None:
         """Run; `begin` gets the client in the first cycle, and returns what is called from then on."""
@@ -132,7 +136,7 @@ class DrivenRobot(QueueInbox):
             self._tick = first
             result = self.virtual.run()
         assert (result.reason, result.detail) == ("ended", ""), result
-        refused = {number: one for number, one in self.answers.items() if not isinstance(one, Done)}
+        refused = {number: one for number, one in self.answers.items() if not isinstance(one, Completion)}
         assert not refused, refused
 
 

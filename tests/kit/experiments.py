@@ -13,14 +13,21 @@ from tests.kit.pages import page_text
 from dxlrun.errors import Refused
 from dxlrun.testing import plan_of
 from dxlrun_lab.guided.choice import situation_of
-from dxlrun_lab.guided.experiment import Abort, Joint, Performed, Procedure, Situation, perform
+from dxlrun_lab.guided.experiment import (
+    Abort,
+    ExperimentJoint,
+    ExperimentOutcome,
+    Procedure,
+    Situation,
+    perform_experiment,
+)
 from dxlrun_lab.guided.rig import Rig
-from dxlrun_lab.guided.segment import Recorded, Segment
+from dxlrun_lab.guided.segment import Segment, SegmentRecording
 from dxlrun_lab.guided.virtual_rig import virtual_rig
 
 ROOT = Path(__file__).parents[2]
 ROBOTS = ROOT / "robots"
-Segments = Callable[[Joint], Iterator[Segment]]
+Segments = Callable[[ExperimentJoint], Iterator[Segment]]
 
 
 class Plays:
@@ -28,10 +35,10 @@ class Plays:
 
     def __init__(self, segments: Segments) -> None:
         self.segments = segments
-        self.got: list[Recorded] = []
+        self.got: list[SegmentRecording] = []
         self.refused: list[str] = []
 
-    def moves(self, situation: Situation) -> Sequence[str]:
+    def describe_motions(self, situation: Situation) -> Sequence[str]:
         return ()
 
     def procedure(self, situation: Situation) -> Procedure:
@@ -41,11 +48,13 @@ class Plays:
             except Refused as refusal:
                 self.refused.append(str(refusal))
 
-    def finish(self, situation: Situation, recorded: Sequence[Recorded], why: str) -> int:
+    def evaluate_recordings(
+        self, situation: Situation, recorded: Sequence[SegmentRecording], why: str
+    ) -> int:
         return len(recorded)
 
 
-def sine(joint: Joint, rate: float = 320, seconds: float = 1.0, **more: object) -> Segment:
+def sine(joint: ExperimentJoint, rate: float = 320, seconds: float = 1.0, **more: object) -> Segment:
     wave = joint.middle + 0.2 * np.sin(2 * np.pi * np.arange(round(rate * seconds)) / rate)
     return Segment("sine", 1 / rate, {joint.name: wave}, **more)
 
@@ -72,10 +81,10 @@ class Stage:
 
     def perform(
         self, rig: Rig, joint: str, segments: Segments, abort: Abort = lambda: None
-    ) -> tuple[Plays, Performed]:
+    ) -> tuple[Plays, ExperimentOutcome]:
         """Perform, and check that the run is as it was before."""
         before, plays = self.state(rig), Plays(segments)
-        done = perform(rig, plays, situation_of(rig, [joint], {}), abort)
+        done = perform_experiment(rig, plays, situation_of(rig, [joint], {}), abort)
         assert done.not_restored == ()
         assert self.state(rig) == before
         return plays, done

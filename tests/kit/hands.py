@@ -47,7 +47,7 @@ class HandLine(VirtualLine, AbstractContextManager["HandLine"]):
     def wait(self, duration_ns: int) -> None:
         """Let time pass."""
         self.clock.wait_until(self.clock.now_ns() + duration_ns)
-        self.bus.advance(self.clock.now_ns())
+        self.bus.advance_to(self.clock.now_ns())
 
     def connect(self, *indices: int) -> None:
         """Connect these servos, by their order, and no others."""
@@ -59,7 +59,7 @@ class HandLine(VirtualLine, AbstractContextManager["HandLine"]):
         if abs(degrees) < 0.01:
             return
         now_ns = self.clock.now_ns()
-        self.bus.advance(now_ns)
+        self.bus.advance_to(now_ns)
         self._faults.add(parse_fault(f"turn servo={servo_id} by={degrees:.3f}deg for={seconds:g}s"), now_ns)
         end_ns = now_ns + round(seconds * 1e9) + LOOK_NS
         while self.clock.now_ns() < end_ns:
@@ -82,10 +82,10 @@ class Script:
         """All that was printed."""
         return "\n".join(self.said)
 
-    def say(self, *lines: str) -> None:
+    def print_lines(self, *lines: str) -> None:
         self.said += lines
 
-    def ask(self, question: str) -> str:
+    def ask_question(self, question: str) -> str:
         return self._answered(question)
 
     def ask_while(self, question: str, look: Callable[[], str]) -> str:

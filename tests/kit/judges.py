@@ -16,10 +16,10 @@ from typing import NamedTuple
 
 from tests.kit.line_faults import OTHER_HOST
 
-from dxlrun.channels.events import Event, EventCode, Severity
+from dxlrun.channels.event_records import Event, EventCode, Severity
 from dxlrun.errors import InputError
-from dxlrun.log.reader import Log
-from dxlrun_analysis.plan import plan_of
+from dxlrun.log.log_reader import Log
+from dxlrun_analysis.plan_excerpt import plan_of
 from dxlsim.bus.ledger import FAULT, LedgerEntry
 from dxlsim.faults.fault import Fault, parse_fault
 from dxlsim.faults.kinds import BABBLE_NS, BOOT_NS, BROWNOUT_NS, TURN_NS

@@ -5,10 +5,10 @@ from __future__ import annotations
 from collections import deque
 from collections.abc import Callable, Mapping
 
-from dxlsim.bus.line import Transmission, flipped
 from dxlsim.bus.simulated_bus import PacketFault, SimulatedBus
+from dxlsim.bus.simulated_line import LineTransmission, flipped
 from dxlsim.servo.simulated_servo import SimulatedServo
-from dxlsim.wire.packets import InstructionReceiver
+from dxlsim.wire.servo_packets import InstructionReceiver
 
 STALLED = "the adapter stalls"
 OTHER_HOST = "another host sends"  # How the note of an instruction of another host begins
@@ -37,7 +37,7 @@ def disturb_replies(bus: SimulatedBus, servo_id: int, faults: Mapping[int, Packe
     """
     send, count, stalled_until_ns = bus._send_reply, 0, 0
 
-    def send_disturbed(replying: int, reply: Transmission) -> bool:
+    def send_disturbed(replying: int, reply: LineTransmission) -> bool:
         nonlocal count, stalled_until_ns
         if replying == servo_id:
             fault = faults.get(count)
@@ -64,11 +64,11 @@ def other_host(bus: SimulatedBus, packet: bytes, at_ns: int, *, received: bool =
 
     def send() -> None:
         bus._withdraw_waiting()
-        bus.note(f"{OTHER_HOST} {packet.hex(' ')}")
+        bus.add_note(f"{OTHER_HOST} {packet.hex(' ')}")
         start_ns, end_ns = bus.now_ns, bus.now_ns + bus._line.duration_ns(len(packet))
         if received:
-            bus._line.send(Transmission(start_ns, end_ns, packet, "another host"))
-        instruction = InstructionReceiver(bus._codec).feed(packet, 0)
+            bus._line.send(LineTransmission(start_ns, end_ns, packet, "another host"))
+        instruction = InstructionReceiver(bus._codec).feed_bytes(packet, 0)
         if instruction is not None:
             bus._execute(instruction, end_ns)
 
@@ -78,7 +78,7 @@ def other_host(bus: SimulatedBus, packet: bytes, at_ns: int, *, received: bool =
 def turn_by_hand(servo: SimulatedServo, angle: float) -> None:
     """Turn the shaft to an angle, rad; a servo with torque goes back to its goal."""
     servo.note(f"servo {servo.servo_id}: turned by hand to {angle} rad")
-    servo.shaft.mechanics.place(servo.shaft.index, angle)
+    servo.shaft.mechanics.move_shaft(servo.shaft.index, angle)
     servo.shaft._forget()
     servo.shaft.plan(servo.shaft.items.aims)
 
@@ -87,7 +87,7 @@ def lose_replies(bus: SimulatedBus, servo_id: int, begin_ns: int, end_ns: int) -
     """Lose every reply of a servo that would begin in a time; the servo still executes its instructions."""
     send = bus._send_reply
 
-    def send_or_lose(replying: int, reply: Transmission) -> bool:
+    def send_or_lose(replying: int, reply: LineTransmission) -> bool:
         if replying == servo_id and begin_ns <= reply.first_ns < end_ns:
             truncate_next(bus, servo_id, 0)
         return send(replying, reply)

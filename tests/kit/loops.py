@@ -11,15 +11,15 @@ import msgspec
 import numpy as np
 
 from dxlrun.channels.answers import Refusal
-from dxlrun.channels.commands import LOOP, Command, QueueInbox
+from dxlrun.channels.commands import LOOP, CommandMessage, QueueInbox
 from dxlrun.channels.cycle import Clamp, Commands, CycleRecord, Floats
-from dxlrun.channels.events import EventBody, EventCode, Severity
+from dxlrun.channels.event_records import EventBody, EventCode, Severity
 from dxlrun.contract.controller import Controller, Interfaces, ParametersModel
 from dxlrun.control.context import ControlContext, StopFlag
 from dxlrun.control.controllers.manager import Manager
-from dxlrun.control.controllers.plugins import Offer, OverrunHook, PlugIns
+from dxlrun.control.controllers.plugin_loading import Offer, OverrunHook, PlugIns
 from dxlrun.control.gate import Gate
-from dxlrun.control.loop import Loop
+from dxlrun.control.loop import ControlLoop
 from dxlrun.plan.loop_plan import (
     ControllerPlan,
     JointPlan,
@@ -115,7 +115,7 @@ def following(context: Any, *_: object) -> None:
 class Events:
     seen: list[tuple[EventCode, Severity, str, str]] = field(default_factory=list)
 
-    def emit(self, source: str, event: EventBody, data: bytes = b"") -> None:
+    def emit_event(self, source: str, event: EventBody, data: bytes = b"") -> None:
         self.seen.append((event.code, event.severity, source, event.text))
 
     def of(self, code: EventCode) -> list[tuple[str, str]]:
@@ -153,7 +153,7 @@ class Hardware:
         states.mode[:] = Mode.POSITION
         self.record.goals.position[:] = states.position
 
-    def read(self) -> None:
+    def read_states(self) -> None:
         for row, (at, mode) in list(self._coming.items()):
             if self._reads >= at:
                 self.record.states.mode[row] = mode
@@ -163,7 +163,7 @@ class Hardware:
         np.copyto(self.record.states.position, goal, where=np.isfinite(goal))
         self.clock.wait_until(self.clock.now_ns() + self.work_ns())
 
-    def write(self) -> None:
+    def write_goals(self) -> None:
         goals = self.record.goals
         self.written.append((goals.position.copy(), goals.velocity.copy()))
 
@@ -194,10 +194,10 @@ class Sink:
     def wake(self, cycle: int) -> None:
         pass
 
-    def begin(self, record: CycleRecord) -> None:
+    def append_activation(self, record: CycleRecord) -> None:
         pass
 
-    def append(self, record: CycleRecord) -> None:
+    def append_cycle(self, record: CycleRecord) -> None:
         numbers = "cycle scheduled_ns woken_ns period_ns skipped active published command_count"
         cycle = {name: getattr(record, name) for name in numbers.split()}
         arrays = {name: getattr(record.commands, name) for name in ("position", "velocity", "effort")}
@@ -270,7 +270,7 @@ class Robot:
         """Put a command into the inbox; return its number."""
         self._asked += 1
         raw = data if isinstance(data, bytes) else np.array(data, dtype="<f8").tobytes()
-        self.inbox.waiting.append(Command(self._asked, controller, kind, raw, "anna", lease_ns))
+        self.inbox.waiting.append(CommandMessage(self._asked, controller, kind, raw, "anna", lease_ns))
         return self._asked
 
     def ask(self, kind: str, **data: Any) -> int:
@@ -325,7 +325,7 @@ class Robot:
         missing = {"broken_one": "plug-in broken_one of x 1 cannot be imported"}
         plugins = PlugIns(self._offers, missing, after_each=self._after_each)
         self.manager = Manager(context, plugins, activity=activity)
-        self.loop = Loop(context, self.manager, self.sink, overrun_hooks=overrun_hooks)
+        self.loop = ControlLoop(context, self.manager, self.sink, overrun_hooks=overrun_hooks)
         self.manager.configure()
         self.hardware.start()
         return self
@@ -379,9 +379,9 @@ class Robot:
         """Record nothing more: memory is what the test measures."""
         nothing: Any = type("Nothing", (), {"append": idle})()
         self.calls = self.hardware.written = self.taken = nothing
-        self.sink.append = self.events.emit = self.inbox.answer = idle  # type: ignore[method-assign]
+        self.sink.append_cycle = self.events.emit_event = self.inbox.answer_command = idle  # type: ignore[method-assign]
 
-    def take(self, command: Any) -> None:
+    def record_command(self, command: Any) -> None:
         """Keep what the log gets."""
         self.taken.append(command)
 
@@ -480,11 +480,11 @@ class GateRig:
         if mode in {Mode.POSITION, Mode.EFFORT_POSITION}:
             self.goals.position[:] = start
         self.gate = Gate(self.plan, self.record, self)
-        self.gate.begin()
+        self.gate.initialize_goals()
         if eased:
             self.apply(SLOW_START_NS)
 
-    def emit(self, source: str, event: EventBody, data: bytes = b"") -> None:
+    def emit_event(self, source: str, event: EventBody, data: bytes = b"") -> None:
         assert event.code in self._accepts
         self.texts.append(event.text)
 
@@ -504,4 +504,4 @@ class GateRig:
         self.record.commands.values[:] = commands
         if self.states.mode.tobytes() != self.gate.modes:
             self.gate.enter_modes()
-        self.gate.apply(dt_ns)
+        self.gate.move_goals(dt_ns)

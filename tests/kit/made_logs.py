@@ -11,12 +11,12 @@ import msgspec
 from msgspec import structs
 
 from dxlrun.channels.cycle import CycleLayout, CycleRecord
-from dxlrun.channels.events import EventBody, EventCode, EventRing, Severity
-from dxlrun.channels.packets import PacketBatch
+from dxlrun.channels.event_records import EventBody, EventCode, EventRing, Severity
+from dxlrun.channels.logged_packets import PacketBatch
 from dxlrun.channels.ring import Handover, RecordKind
 from dxlrun.log.log_writer import LogWriter
 from dxlrun.log.schemas import LoggedController, LogHeader
-from dxlrun_analysis.plan import NO_LOOP
+from dxlrun_analysis.plan_excerpt import NO_LOOP
 from dxlwire.clock import VirtualClock
 from dxlwire.packets import PacketKind
 
@@ -104,21 +104,21 @@ def made_log(
     record = CycleRecord(CycleLayout(JOINTS, ["head", "idle"]))
     for cycle in cycles:
         fill(record, cycle)
-        log.take(RecordKind.CYCLE, record.raw)
-    batch = PacketBatch(Handover(log.take))
+        log.write_record(RecordKind.CYCLE, record.raw)
+    batch = PacketBatch(Handover(log.write_record))
     for wire in wires:
         last = wire.at if wire.last is None else wire.last
         batch.packet(0, wire.kind, wire.servo_id, wire.at * 1000, last * 1000, wire.data)
-    batch.commit()
-    ring = EventRing(Handover(log.take), VirtualClock(9))
+    batch.commit_packets()
+    ring = EventRing(Handover(log.write_record), VirtualClock(9))
     for said in events:
-        ring.emit(said.source, EventBody(said.code, said.severity, said.text), said.data)
+        ring.emit_event(said.source, EventBody(said.code, said.severity, said.text), said.data)
     if gaps:
         log.gap("loop/packets", gaps)
     if close:
         log.close()
     else:
-        log.flush()
+        log.finish_chunk()
     return path
 
 

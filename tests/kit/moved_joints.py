@@ -75,7 +75,7 @@ def findings(*joints: Joint, names: Sequence[str] = ()) -> list[Finding]:
     for begin in range(0, len(TIME), 150):  # slice by slice, two cycles of the one before with each
         known = min(begin, 2)
         part = slice(begin - known, begin + 150)
-        movement.take(cycles[part], ways[part], known)
+        movement.add_cycles(cycles[part], ways[part], known)
     return list(movement.findings())
 
 

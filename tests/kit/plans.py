@@ -32,7 +32,7 @@ class ScriptedLine(OwnProcessors):
     def ports(self) -> list[ScriptedLine]:
         return [self]
 
-    def write(self, data: bytes) -> None:
+    def write_packet(self, data: bytes) -> None:
         self.written.append(bytes(data))
         said = self.script.pop(0) if self.script else ()
         self.coming = sorted(
@@ -46,7 +46,7 @@ class ScriptedLine(OwnProcessors):
         buffer[: len(data)] = data
         return len(data)
 
-    def wait(self, deadline_ns: int) -> list[int]:
+    def wait_for_bytes(self, deadline_ns: int) -> list[int]:
         self.clock.wait_until(min([deadline_ns, *(at for at, _ in self.coming)]))
         return [0] if self.coming and self.coming[0][0] <= self.clock.now_ns() else []
 

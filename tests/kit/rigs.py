@@ -29,11 +29,11 @@ from tests.kit.line_faults import corrupt_next, truncate_next
 from tests.kit.plans import make_plan
 
 from dxlrun.channels.cycle import Commands, SourceStates, States, Torque
-from dxlrun.channels.events import EventBody, EventCode, Severity
-from dxlrun.channels.packets import LoggedPacket, PacketBatch
+from dxlrun.channels.event_records import EventBody, EventCode, Severity
+from dxlrun.channels.logged_packets import LoggedPacket, PacketBatch
 from dxlrun.channels.ring import Handover
 from dxlrun.dynamixel.bus_part import FeatureParts
-from dxlrun.dynamixel.hardware import DynamixelHardware, ServoArrays
+from dxlrun.dynamixel.dynamixel_hardware import DynamixelHardware, ServoArrays
 from dxlrun.features import FEATURES
 from dxlrun.features.devices.plan import decode_devices
 from dxlsim.bus.ledger import Ledger
@@ -43,7 +43,7 @@ from dxlsim.simulation_plan import AdapterConfig, BusConfig, ServoConfig
 from dxlsim.virtual_ports import VirtualPorts
 from dxlwire.bus_plan import BusPlan, ServoPlan
 from dxlwire.clock import VirtualClock
-from dxlwire.exchange.bus import Lines
+from dxlwire.exchange.bus_engine import Lines
 from dxlwire.packets import PacketKind
 
 X_IDS = (11, 12, 13, 14, 15, 16, 17, 18)
@@ -59,7 +59,7 @@ class Packets(PacketBatch):
 
     @property
     def list(self) -> list[LoggedPacket]:
-        self.commit()
+        self.commit_packets()
         return self._decoded
 
     def sent(self, bus: int = 0) -> list[bytes]:
@@ -75,7 +75,7 @@ class Events:
 
     list: list[tuple[EventCode, Severity, str, str]] = field(default_factory=list)
 
-    def emit(self, source: str, event: EventBody, data: bytes = b"") -> None:
+    def emit_event(self, source: str, event: EventBody, data: bytes = b"") -> None:
         self.list.append((event.code, event.severity, source, event.text))
 
     def of(self, code: EventCode) -> list[tuple[str, str]]:
@@ -112,11 +112,11 @@ class Rig:
 
     def cycle(self, *, idle: bool = True) -> None:
         start = self.clock.now_ns()
-        self.hardware.read()
+        self.hardware.read_states()
         self.anchor()
         self.restless = -self.restless
         self.goals.position[:] += self.restless
-        self.hardware.write()
+        self.hardware.write_goals()
         deadline = start + self.period_ns
         if idle:
             self.hardware.idle(deadline)
@@ -173,26 +173,28 @@ class Rig:
     def stick(self, servo_id: int, name: str, value: int) -> None:
         """Let an item of a servo keep a value, whatever is written."""
         servo = self.servo(servo_id)
-        servo.registers.watch((name,), lambda: servo.poke(name, value))
+        servo.registers.watch_items((name,), lambda: servo.poke(name, value))
 
     def torque_given(self, servo_id: int) -> list[int]:
         """Return a list that collects what is written into a servo's Torque Enable from now on."""
         servo, given = self.servo(servo_id), list[int]()
-        servo.registers.watch(("torque_enable",), lambda: given.append(servo.registers["torque_enable"]))
+        servo.registers.watch_items(
+            ("torque_enable",), lambda: given.append(servo.registers["torque_enable"])
+        )
         given.clear()  # what it has now
         return given
 
     def when(self, packet_is: Callable[[bytes], bool], act: Callable[[], object]) -> None:
         """Do something before each packet of a kind goes out on the first line."""
         port = self.ports.ports[0]
-        write = port.write
+        write = port.write_packet
 
         def through(data: bytes) -> None:
             if packet_is(bytes(data)):
                 act()
             write(data)
 
-        port.write = through  # type: ignore[method-assign]
+        port.write_packet = through  # type: ignore[method-assign]
 
     def set_modes(self, *modes: int) -> None:
         """Ask for a mode of each joint, 0: none."""
@@ -219,7 +221,7 @@ class Rig:
 
     def torque(self, index: int = 0) -> list[bool]:
         for bus in self.buses:
-            bus.advance(self.clock.now_ns())
+            bus.advance_to(self.clock.now_ns())
         return [servo.torque_on for servo in self.buses[index].servos]
 
 

@@ -5,7 +5,7 @@ from __future__ import annotations
 from pathlib import Path
 from textwrap import dedent
 
-from dxlrun.compile.robot import Compiled, compile_files
+from dxlrun.compile.robot_compiler import CompiledRobot, compile_files
 from dxlrun.errors import InputError, Problem
 
 MISTAKES = Path(__file__).parents[1] / "compile" / "mistakes"
@@ -21,7 +21,7 @@ PAIR = robot_text("pair")
 """A small robot in which everything is right; tests break one thing of it."""
 
 
-def compile_text(text: str, *motions: str, duration_ns: int | None = None) -> Compiled:
+def compile_text(text: str, *motions: str, duration_ns: int | None = None) -> CompiledRobot:
     """Compile the text of a robot file, and of motion files."""
     robot = Path.cwd() / "robot.yaml"
     robot.write_text(text, encoding="utf-8")

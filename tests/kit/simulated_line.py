@@ -35,14 +35,14 @@ class Line:
     ports: VirtualPorts
 
     def send(self, servo_id: int, instruction: int, *parameters: int) -> None:
-        self.ports.ports[0].write(packet1(servo_id, instruction, *parameters))
+        self.ports.ports[0].write_packet(packet1(servo_id, instruction, *parameters))
 
     def receive(self, wait_ns: int = 10_000_000) -> bytes:
         """Return everything that arrives in a time."""
         deadline = self.clock.now_ns() + wait_ns
         received = bytearray()
         buffer = memoryview(bytearray(4096))
-        while self.ports.wait(deadline):
+        while self.ports.wait_for_bytes(deadline):
             received += buffer[: self.ports.ports[0].read_into(buffer)]
         return bytes(received)
 
@@ -107,7 +107,7 @@ class Line:
         return [entry.note for entry in self.ledger.entries if entry.direction == "note"]
 
     def servo(self, servo_id: int = 1) -> SimulatedServo:
-        self.bus.advance(self.clock.now_ns())
+        self.bus.advance_to(self.clock.now_ns())
         return self.bus.servo(servo_id)
 
 
@@ -117,7 +117,7 @@ class Line2(Line):
     WORD = 2
 
     def instruct(self, servo_id: int, instruction: int, parameters: bytes = b"") -> None:
-        self.ports.ports[0].write(packet2(servo_id, instruction, parameters))
+        self.ports.ports[0].write_packet(packet2(servo_id, instruction, parameters))
 
     def statuses(self, wait_ns: int = 10_000_000) -> list[Answer]:
         """Return the status packets that arrive in a time; nothing else may."""

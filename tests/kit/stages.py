@@ -21,14 +21,14 @@ from dxlrun import (
     States,
 )
 from dxlrun.channels.cycle import Torque
-from dxlrun.control.controllers.goals import Commanded, Goals, RunningGoal
+from dxlrun.control.controllers.goal_registry import CurrentCommands, GoalRegistry, RunningGoal
 from dxlrun.plan.loop_plan import JointPlan
 
 
 class Goal(RunningGoal):
     """A goal as the runtime hands it over, and as its judge ends it; keeps what its controller reports."""
 
-    def __init__(self, goals: Goals, number: int, kind: str) -> None:
+    def __init__(self, goals: GoalRegistry, number: int, kind: str) -> None:
         super().__init__(goals, number, "tested", kind, "test")
         self.progresses: list[tuple[float, float]] = []
         """Progress and error"""
@@ -148,10 +148,10 @@ class Stage:
         self.states.motion[:] = 0.0
         self.states.position[:] = self.sent.position[:] = np.resize(self.present, count)
         self.states.valid[:], self.states.torque[:] = True, Torque.ON
-        events = type("Events", (), {"emit": lambda self, *_: None})()
+        events = type("Events", (), {"emit_event": lambda self, *_: None})()
         plans = [JointPlan(joint, -np.inf, np.inf, None, wrap=self.wrap) for joint in joints]
-        commanded = Commanded.by_interfaces(joints, self.interfaces.command, self.commands)
-        self.judge = Goals(_Record(self), events, plans, lambda _: commanded)  # type: ignore[arg-type]  # of a record it reads states and times alone
+        commanded = CurrentCommands.by_interfaces(joints, self.interfaces.command, self.commands)
+        self.judge = GoalRegistry(_Record(self), events, plans, lambda _: commanded)  # type: ignore[arg-type]  # of a record it reads states and times alone
         self.controller.on_configure(self.context)
 
     def _publish(self, topic: str = "", message: object = None) -> None:

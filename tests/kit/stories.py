@@ -9,45 +9,45 @@ from pathlib import Path
 import msgspec
 import numpy as np
 
-from dxlrun.channels.commands import Command, QueueInbox
-from dxlrun.control.controllers.plugins import load_plugins
-from dxlrun.log.reader import Log, read_log
+from dxlrun.channels.commands import CommandMessage, QueueInbox
+from dxlrun.control.controllers.plugin_loading import load_plugins
+from dxlrun.log.log_reader import Log, read_log
 from dxlrun.remote.preparation import Preparation
 from dxlrun.testing import VirtualRobot, simulated_robot
 from dxlrun_analysis.replay import ReplayDifference, ReplayReport, Setting, replay_log
 
-Asked = Mapping[int, Sequence[Command]]
+Asked = Mapping[int, Sequence[CommandMessage]]
 """Commands by the cycle that takes them."""
 
 
-def ask(kind: str, data: object = None) -> Command:
+def ask(kind: str, data: object = None) -> CommandMessage:
     """Return a command for the loop."""
-    return Command(0, "", kind, b"" if data is None else msgspec.json.encode(data), "anna")
+    return CommandMessage(0, "", kind, b"" if data is None else msgspec.json.encode(data), "anna")
 
 
-def send(controller: str, kind: str, *numbers: float, lease_ns: int = 0) -> Command:
+def send(controller: str, kind: str, *numbers: float, lease_ns: int = 0) -> CommandMessage:
     """Return a command for a controller, as it was prepared."""
-    return Command(0, controller, kind, np.array(numbers).tobytes(), "anna", lease_ns)
+    return CommandMessage(0, controller, kind, np.array(numbers).tobytes(), "anna", lease_ns)
 
 
-def prepared(robot: VirtualRobot, controller: str, kind: str, **data: object) -> Command:
+def prepared(robot: VirtualRobot, controller: str, kind: str, **data: object) -> CommandMessage:
     """Return a command for a controller, prepared from what a client sends, as by the gateway."""
     loop = robot.plan.loop
     preparation = Preparation({joint.name: joint for joint in loop.joints}, load_plugins())
     plan = next(one for one in loop.controllers if one.name == controller)
     found = preparation.command(plan, kind, json.dumps(data).encode(), units=False)
-    return Command(0, controller, kind, found.data, "anna")
+    return CommandMessage(0, controller, kind, found.data, "anna")
 
 
-def switch(activate: Sequence[str] = (), deactivate: Sequence[str] = ()) -> Command:
+def switch(activate: Sequence[str] = (), deactivate: Sequence[str] = ()) -> CommandMessage:
     return ask("switch", {"activate": activate, "deactivate": deactivate})
 
 
-def rate(hz: float) -> Command:
+def rate(hz: float) -> CommandMessage:
     return ask("rate", {"rate": hz})
 
 
-def torque(joints: Sequence[str], *, on: bool, release: bool = False) -> Command:
+def torque(joints: Sequence[str], *, on: bool, release: bool = False) -> CommandMessage:
     return ask("torque", {"joints": joints, "on": on, "release": release})
 
 
@@ -59,9 +59,9 @@ class Clients(QueueInbox):
         self.record, self.asked = robot.record, asked
         robot.robot.loop.steering.inbox = self
 
-    def take(self) -> Sequence[Command]:
+    def drain_commands(self) -> Sequence[CommandMessage]:
         self.waiting.extend(self.asked.get(self.record.cycle, ()))
-        return super().take()
+        return super().drain_commands()
 
 
 def tell(

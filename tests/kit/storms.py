@@ -31,9 +31,9 @@ from tests.kit.wire import (
     written,
 )
 
-from dxlrun.channels.events import EventCode
+from dxlrun.channels.event_records import EventCode
 from dxlrun.errors import DxlrunError
-from dxlrun.log.reader import Log
+from dxlrun.log.log_reader import Log
 from dxlrun.testing import VirtualRobot
 from dxlrun_analysis.conduct.client_commands import client_commands
 from dxlsim.bus.ledger import LedgerEntry
@@ -94,7 +94,7 @@ class Witness:
         for servo in alone(bus):
             torque = servo.registers["torque_enable"]
             if torque and not self.torque.get(servo, 0):
-                self.found.append((bus.now_ns, servo.servo_id, servo.position))
+                self.found.append((bus.now_ns, servo.servo_id, servo.shaft_angle))
             self.torque[servo] = torque
         bus.at(bus.now_ns + 2 * MS, self.look)
 
@@ -341,7 +341,7 @@ def held_back(replies: Sequence[StateReply], delayed: Sequence[StateReply]) -> d
 def everybody_who_hears_is_limp(robot: VirtualRobot, number: int, sentences: Sequence[str]) -> None:
     """Look for torque after the end; a servo that did not confirm torque off is in a sentence of its own."""
     bus = robot.buses[number]
-    bus.advance(robot.clock.now_ns())
+    bus.advance_to(robot.clock.now_ns())
     on = {servo.servo_id for servo in alone(bus) if servo.registers["torque_enable"]}
     replies = {
         servo.servo_id

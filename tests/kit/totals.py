@@ -12,5 +12,5 @@ def totals_of(path: str | Path) -> RunTotals:
     """Count the log at a path, slice by slice. Raises LogError when it cannot be read."""
     tally, reader = Tally(), open_log(path)
     for part in reader.slices():
-        tally.take(part)
+        tally.add_slice(part)
     return tally.totals(reader.about)

@@ -8,7 +8,7 @@ from pathlib import Path
 import pytest
 from tests.kit.made_logs import Cycle, Wire, made_log
 
-from dxlrun.log.reader import read_log
+from dxlrun.log.log_reader import read_log
 from dxlrun_lab.late_servos import overruns_by_servos, transactions, waits_for_servos
 from dxlsim.bus.ledger import LedgerEntry
 from dxlwire.packets import PacketKind

@@ -23,15 +23,15 @@ from tests.kit.anew import written_anew
 
 from dxlrun.control.deadlines import Deadlines
 from dxlrun.errors import InputError, LogError
-from dxlrun.log.reader import open_log, read_log
-from dxlrun_analysis.latency import latency_log, tables
+from dxlrun.log.log_reader import open_log, read_log
+from dxlrun_analysis.latency import latency_log, latency_tables
 from dxlrun_analysis.latency.conditions import Condition, Settings, conditions, order
-from dxlrun_analysis.latency.page import page
+from dxlrun_analysis.latency.latency_page import page
 from dxlrun_analysis.latency.statistics import Block, figures, interval, mode_us, t_quantile
 from dxlrun_lab.latency import wake_ups
-from dxlrun_lab.latency.buffer import Buffer, Place
-from dxlrun_lab.latency.measurement import compiled_yardstick
-from dxlrun_lab.latency.wake_ups import measure
+from dxlrun_lab.latency.buffer import Buffer, BufferOffset
+from dxlrun_lab.latency.latency_measurement import compiled_yardstick
+from dxlrun_lab.latency.wake_ups import measure_wake_ups
 
 PERIOD = 1_000_000
 OTHER, FIFO, ROUND_ROBIN = (Condition(name, name) for name in ("other", "fifo", "round_robin"))
@@ -66,10 +66,10 @@ def measured(late: list[int], stop_after: int = 0) -> np.ndarray[tuple[int, int]
     buffer = Buffer.create(len(late))
     clock = LateClock(late)
     if stop_after:
-        buffer.words[Place.STOP] = 1
-    measure(Deadlines(PERIOD, clock), len(late), buffer)
+        buffer.words[BufferOffset.STOP] = 1
+    measure_wake_ups(Deadlines(PERIOD, clock), len(late), buffer)
     times = buffer.wake_ups()
-    assert buffer.words[Place.DONE] == len(times)
+    assert buffer.words[BufferOffset.DONE] == len(times)
     buffer.close()
     return times - (5_000 + PERIOD)
 
@@ -90,9 +90,9 @@ def test_the_buffer_can_be_read_while_it_is_filled():
     buffer = Buffer.create(3)
     assert (buffer.wake_ups().shape, buffer.worst_ns(0, 0)) == ((0, 2), 0)
     for number, (due, woken) in enumerate(((10, 12), (20, 29), (30, 31))):
-        buffer.words[Place.WAKE_UPS + 2 * number] = due
-        buffer.words[Place.WAKE_UPS + 2 * number + 1] = woken
-    buffer.words[Place.DONE] = 2
+        buffer.words[BufferOffset.WAKE_UPS + 2 * number] = due
+        buffer.words[BufferOffset.WAKE_UPS + 2 * number + 1] = woken
+    buffer.words[BufferOffset.DONE] = 2
     assert buffer.wake_ups().tolist() == [[10, 12], [20, 29]]
     assert [buffer.worst_ns(0, 2), buffer.worst_ns(0, 1), buffer.worst_ns(2, 3)] == [9, 2, 1]
     buffer.close()
@@ -106,8 +106,8 @@ def test_a_wake_up_is_published_when_both_its_times_are_there(monkeypatch):
     measured([100, 0])
     first, second = PERIOD + 5_000, 2 * PERIOD + 5_000
     assert published == [
-        (Place.DONE, 1, [first, first + 100, 0, 0]),
-        (Place.DONE, 2, [first, first + 100, second, second]),
+        (BufferOffset.DONE, 1, [first, first + 100, 0, 0]),
+        (BufferOffset.DONE, 2, [first, first + 100, second, second]),
     ]
 
 
@@ -123,8 +123,8 @@ def test_the_yardstick_skips_deadlines_that_passed_and_keeps_their_phase():
     assert not ((times[:, 0] - times[0, 0]) % period_ns).any()
     assert (times[:, 1] >= times[:, 0]).all()
     assert (times[1:, 0] >= times[:-1, 1]).all()  # not one whose time had come before the wait for it began
-    assert buffer.words[Place.CPU_NS] > 0
-    assert buffer.words[Place.WALL_NS] > 0
+    assert buffer.words[BufferOffset.CPU_NS] > 0
+    assert buffer.words[BufferOffset.WALL_NS] > 0
     buffer.close()
 
 
@@ -194,9 +194,9 @@ def test_a_comparison_that_makes_no_sense_is_one_sentence(compare, policy, sente
 )
 def test_values_with_which_nothing_can_be_measured_are_one_sentence(change, sentence):
     right = settings(OTHER)
-    right.check(frozenset({0, 1}))
+    right.validate_settings(frozenset({0, 1}))
     with pytest.raises(InputError) as refused:
-        replace(right, **change).check(frozenset({0, 1}))
+        replace(right, **change).validate_settings(frozenset({0, 1}))
     assert str(refused.value).startswith(sentence)
     assert "\n" not in str(refused.value)
 
@@ -315,9 +315,9 @@ def test_the_tables_have_a_column_for_each_condition():
     found = settings(ROUND_ROBIN, C)
     blocks = [block(one, number, [1.0, 20_000.0]) for one in (ROUND_ROBIN, C) for number in (0, 1)]
     result = figures(found, blocks, "2 busy processes")
-    first, second, *remarks = tables.parts(result)
-    assert isinstance(first, tables.Table)
-    assert isinstance(second, tables.Table)
+    first, second, *remarks = latency_tables.parts(result)
+    assert isinstance(first, latency_tables.Table)
+    assert isinstance(second, latency_tables.Table)
     assert first.title == "Wake-up latency, period 1 ms, 2 blocks; load: 2 busy processes"
     assert [column.name for column in first.columns] == ["", "round_robin", "c (round_robin)"]
     rows = {row[0].text: [cell.text for cell in row[1:]] for row in first.rows}
@@ -336,7 +336,7 @@ def log(tmp_path):
     found = settings(ROUND_ROBIN, C)
     blocks = [block(one, number, [1.5 + number, 300.0]) for number in (0, 1) for one in (ROUND_ROBIN, C)]
     path = tmp_path / "latency.mcap"
-    summary = latency_log.write(path, found, blocks, "a load", ("a remark",))
+    summary = latency_log.write_log(path, found, blocks, "a load", ("a remark",))
     assert (summary.messages, summary.error) == (8, None)
     return path, found, blocks
 

@@ -17,13 +17,12 @@ from tests.kit.pages import page_text
 
 import dxlrun
 from dxlrun import LogError, open_log
-from dxlrun.channels.packets import PacketBatch
+from dxlrun.channels.logged_packets import PacketBatch
 from dxlrun.channels.ring import Handover, RecordKind
 from dxlrun.errors import InputError
-from dxlrun.log import reader as log_reader
-from dxlrun.log import schemas
+from dxlrun.log import log_reader, schemas
+from dxlrun.log.log_reader import read_log
 from dxlrun.log.log_writer import LogWriter
-from dxlrun.log.reader import read_log
 from dxlrun.messages.cdr import Codec
 from dxlrun.messages.cdr_columns import ColumnReader
 from dxlrun.messages.definition import MessageType
@@ -102,7 +101,7 @@ def test_every_field_is_what_the_codec_reads(rows: Any, front: int, data: st.Dat
     codec, reader = Codec(WRITTEN), ColumnReader(MIXED)
     messages = [codec.pack(*row) for row in rows]
     fields = data.draw(st.one_of(st.none(), st.lists(st.sampled_from(reader.leaves), unique=True)))
-    whole, tree = reader.read(*laid(messages, front), fields)
+    whole, tree = reader.read_columns(*laid(messages, front), fields)
     assert len(whole) == len(messages)
     expected = [plain(codec.unpack(message)) for message in messages]
     for place in reader.leaves if fields is None else fields:
@@ -118,11 +117,11 @@ def test_a_damaged_message_is_left_out_and_the_others_are_read(rows: Any, data: 
     for _ in range(data.draw(st.integers(1, 4))):
         messages[hit][data.draw(st.integers(4, len(messages[hit]) - 1))] = data.draw(st.integers(0, 255))
     messages[hit] = messages[hit][: data.draw(st.integers(4, len(messages[hit])))]
-    whole, tree = reader.read(*laid([bytes(one) for one in messages], 0))
+    whole, tree = reader.read_columns(*laid([bytes(one) for one in messages], 0))
     others = [row for row in range(len(rows)) if row != hit]
     assert set(others) <= set(whole.tolist())
     for place in reader.leaves:
-        column = plain(tree.take(np.flatnonzero(whole != hit)).leaf(place).array())
+        column = plain(tree.select_rows(np.flatnonzero(whole != hit)).leaf(place).array())
         assert column == [at_place(plain(codec.unpack(bytes(messages[row]))), place) for row in others]
 
 
@@ -141,17 +140,17 @@ def test_a_definition_that_cannot_be_laid_out_is_refused(text: str, sentence: st
 
 @pytest.fixture
 def path(tmp_path: Path, log: LogWriter, cycle: Cycle) -> Path:
-    batch = PacketBatch(Handover(log.take))
+    batch = PacketBatch(Handover(log.write_record))
     for number in range(100):
         batch.wake(number)
         batch.packet(0, PacketKind.INSTRUCTION, 1, 7 + number, 9 + number, b"abc")
         batch.packet(1, PacketKind.STATUS, 2, 8 + number, 9 + number, bytes([number]))
-        batch.commit()
-        log.take(RecordKind.CYCLE, cycle(number))
+        batch.commit_packets()
+        log.write_record(RecordKind.CYCLE, cycle(number))
         if number % 10 == 5:
-            log.flush()
+            log.finish_chunk()
         batch.packet(0, PacketKind.NOISE, 3, 8 + number, 9 + number, b"idle")
-    batch.commit()
+    batch.commit_packets()
     log.close()
     return tmp_path / "run.mcap"
 

@@ -25,11 +25,11 @@ import pytest
 from mcap.records import Chunk
 from mcap.stream_reader import StreamReader
 
-from dxlrun.channels.packets import PacketBatch
+from dxlrun.channels.logged_packets import PacketBatch
 from dxlrun.channels.ring import Handover, RecordKind
 from dxlrun.errors import LogError
+from dxlrun.log.log_reader import LogReader, open_log, read_log
 from dxlrun.log.log_writer import LogWriter
-from dxlrun.log.reader import LogReader, open_log, read_log
 from dxlrun.log.schemas import LogHeader
 from dxlwire.packets import PacketKind
 
@@ -62,16 +62,16 @@ class Written:
 def written(tmp_path: Path, header: LogHeader, cycle: Callable[[int], bytes]) -> Written:
     path = tmp_path / "written.mcap"
     log = LogWriter(path, header)
-    batch = PacketBatch(Handover(log.take))
+    batch = PacketBatch(Handover(log.write_record))
     cycles = [cycle(number) for number in range(CHUNKS * CYCLES)]
     for number, record in enumerate(cycles):
         batch.wake(number)
         batch.packet(0, PacketKind.INSTRUCTION, 1, number, number + 5, b"request")
         batch.packet(1, PacketKind.STATUS, 1, number, number + 9, bytes([number]))
-        batch.commit()
-        log.take(RecordKind.CYCLE, record)
+        batch.commit_packets()
+        log.write_record(RecordKind.CYCLE, record)
         if number % CYCLES == CYCLES - 1:
-            log.flush()
+            log.finish_chunk()
     log.close()
     ends = []
     with path.open("rb") as stream:
@@ -208,7 +208,7 @@ WRITER = """
         record.cycle = number
         record.scheduled_ns = record.woken_ns = record.written_ns = number * 10**6
         print(number, flush=True)  # from here on it is handed to the recorder
-        log.take(RecordKind.CYCLE, bytes(record.raw))
+        log.write_record(RecordKind.CYCLE, bytes(record.raw))
         if number % 50 == 49:
             log.flush()
             print("flushed", number, flush=True)

@@ -34,7 +34,7 @@ def said(data: bytes | None) -> Any:
 def test_each_joint_has_the_status_of_its_servo() -> None:
     record = record_of()
     row = np.frombuffer(bytes(record.raw), dtype=record.layout.dtype)[0]
-    message = said(Diagnostics(JOINTS).of(row, 5, (7, 8)))
+    message = said(Diagnostics(JOINTS).pack_diagnostics(row, 5, (7, 8)))
     assert message["header"]["stamp"] == {"sec": 7, "nanosec": 8}
     told = [(one["level"], one["name"], one["message"]) for one in message["status"]]
     assert told == [
@@ -57,6 +57,6 @@ def test_it_is_published_once_a_second() -> None:
     times = [
         time
         for time in range(0, 5 * DIAGNOSTICS_NS, DIAGNOSTICS_NS // 50)
-        if diagnostics.of(row, time, (0, 0))
+        if diagnostics.pack_diagnostics(row, time, (0, 0))
     ]
     assert times == [second * DIAGNOSTICS_NS for second in range(5)]

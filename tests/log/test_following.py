@@ -8,12 +8,12 @@ from pathlib import Path
 
 import pytest
 
-from dxlrun.channels.events import EventBody, EventCode, EventRing, Severity
-from dxlrun.channels.packets import PacketBatch
+from dxlrun.channels.event_records import EventBody, EventCode, EventRing, Severity
+from dxlrun.channels.logged_packets import PacketBatch
 from dxlrun.channels.ring import Handover, RecordKind
 from dxlrun.errors import LogError
+from dxlrun.log.log_reader import LogFollower, read_log
 from dxlrun.log.log_writer import LogWriter
-from dxlrun.log.reader import LogFollower, read_log
 from dxlwire.clock import VirtualClock
 from dxlwire.packets import PacketKind
 
@@ -21,15 +21,15 @@ from dxlwire.packets import PacketKind
 @pytest.fixture
 def written(log: LogWriter, tmp_path: Path, cycle: Callable[[int], bytes]) -> bytes:
     """The bytes of a log with 400 cycles in 20 chunks and an event in each."""
-    events = EventRing(Handover(log.take), VirtualClock())
+    events = EventRing(Handover(log.write_record), VirtualClock())
     for number in range(400):
-        log.take(RecordKind.CYCLE, cycle(number))
+        log.write_record(RecordKind.CYCLE, cycle(number))
         if number % 20 == 19:
-            events.emit("arm", EventBody(EventCode.CONTROLLER_SAYS, Severity.INFO, f"cycle {number}"))
-            log.flush()
-    batch = PacketBatch(Handover(log.take))
+            events.emit_event("arm", EventBody(EventCode.CONTROLLER_SAYS, Severity.INFO, f"cycle {number}"))
+            log.finish_chunk()
+    batch = PacketBatch(Handover(log.write_record))
     batch.packet(0, PacketKind.INSTRUCTION, 1, 10, 11, bytes.fromhex("ffff0104022406ce"))
-    batch.commit()
+    batch.commit_packets()
     log.close()
     return (tmp_path / "run.mcap").read_bytes()
 

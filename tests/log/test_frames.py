@@ -23,9 +23,9 @@ from dxlrun.channels.cycle import CycleRecord
 from dxlrun.channels.ring import RecordKind
 from dxlrun.description.frames.tree import ORIENTATION, FramesPlan
 from dxlrun.log import schemas
+from dxlrun.log.log_reader import open_log
 from dxlrun.log.log_writer import LogWriter
 from dxlrun.log.packing.frame_messages import FrameMessages
-from dxlrun.log.reader import open_log
 from dxlrun.log.schemas import LogHeader
 from dxlrun.plan.recording_plan import RecordingPlan
 from dxlrun.testing import VirtualRobot, plan_of, read_log
@@ -87,7 +87,7 @@ class Scene:
         self.cycle += 1
         self.record.scheduled_ns = math.ceil(self.cycle * 1e9 / self.rate)
         row = np.frombuffer(self.record.raw, self.header.layout.dtype)[0]
-        data = self.messages.of(row, (5, 6))
+        data = self.messages.pack_frames(row, (5, 6))
         return None if data is None else STORE.deserialize_cdr(data, schemas.FRAMES.name)
 
     @property
@@ -304,7 +304,7 @@ def test_the_stamp_is_when_the_states_were_read(
     path = tmp_path / "log.mcap"
     writer = LogWriter(path, replace(header, robot_description=urdf, frames=FramesPlan(1000, (joint,))))
     data = cycle(3)
-    writer.take(RecordKind.CYCLE, data)
+    writer.write_record(RecordKind.CYCLE, data)
     writer.close()
     read_ns = int(np.frombuffer(data, header.layout.dtype)[0]["read_ns"]) + header.epoch_offset_ns
     ((t_ns, message),) = decoded(path, "/tf")

@@ -12,7 +12,7 @@ import pytest
 
 from dxlrun.log import identity
 from dxlrun.log.identity import IDENTITY_NAME, code_hashes, git_state, module_files, package_of
-from dxlrun.log.reader import read_log
+from dxlrun.log.log_reader import read_log
 from dxlrun.testing import simulated_robot
 
 ROBOTS = Path(__file__).parents[2] / "robots"

@@ -15,8 +15,8 @@ from msgspec import structs
 
 from dxlrun.channels.commands import CommandRing, TakenCommand
 from dxlrun.channels.ring import Handover, RecordKind
+from dxlrun.log.log_reader import read_log
 from dxlrun.log.log_writer import LogWriter
-from dxlrun.log.reader import read_log
 
 PLANNED = TakenCommand(5_000, 3, 7, "left_arm", "trajectory", "wave.yaml:7:5", b"")
 GIVEN = TakenCommand(6_000, 4, -1, "head", "positions", "anna", np.array([0.5, -0.0, np.nan]).tobytes())
@@ -31,13 +31,13 @@ TAKEN = (PLANNED, GIVEN, STREAMED, STEERING, LONG, NO_NUMBERS)
 
 @pytest.fixture
 def written(log: LogWriter, tmp_path: Path, cycle: Callable[[int], bytes]) -> Path:
-    log.take(RecordKind.CYCLE, cycle(-1))
-    ring = CommandRing(Handover(log.take))
+    log.write_record(RecordKind.CYCLE, cycle(-1))
+    ring = CommandRing(Handover(log.write_record))
     for number in range(5):
         for command in TAKEN:
             if command.cycle == number:
-                ring.take(command)
-        log.take(RecordKind.CYCLE, cycle(number))
+                ring.record_command(command)
+        log.write_record(RecordKind.CYCLE, cycle(number))
     log.close()
     return tmp_path / "run.mcap"
 
@@ -69,7 +69,7 @@ def test_another_reader_decodes_them(written: Path) -> None:
 
 def test_what_was_no_json_is_none_in_the_log(log: LogWriter, tmp_path: Path) -> None:
     for data in (b'{"a": "\xff"}', b"\xfe", b""):
-        CommandRing(Handover(log.take)).take(structs.replace(STEERING, data=data))
+        CommandRing(Handover(log.write_record)).record_command(structs.replace(STEERING, data=data))
     log.close()
     read = read_log(tmp_path / "run.mcap")
     first, second, third = (command.data for command in read.commands)
@@ -80,7 +80,7 @@ def test_what_was_no_json_is_none_in_the_log(log: LogWriter, tmp_path: Path) -> 
 
 
 def test_a_log_without_them_has_none(log: LogWriter, tmp_path: Path, cycle: Callable[[int], bytes]) -> None:
-    log.take(RecordKind.CYCLE, cycle(0))
+    log.write_record(RecordKind.CYCLE, cycle(0))
     log.close()
     read = read_log(tmp_path / "run.mcap")
     assert (read.activation, read.commands) == (None, ())

@@ -27,13 +27,21 @@ from msgspec import structs
 from rosbags.typesys.store import Typestore
 
 from dxlrun.channels.cycle import CycleLayout
-from dxlrun.channels.events import MOST_FAILED, Event, EventBody, EventCode, EventRing, GoalReport, Severity
-from dxlrun.channels.packets import LoggedPacket, PacketBatch
+from dxlrun.channels.event_records import (
+    MOST_FAILED,
+    Event,
+    EventBody,
+    EventCode,
+    EventRing,
+    GoalReport,
+    Severity,
+)
+from dxlrun.channels.logged_packets import LoggedPacket, PacketBatch
 from dxlrun.channels.ring import Handover, RecordKind
 from dxlrun.errors import LogError
 from dxlrun.log import schemas
+from dxlrun.log.log_reader import read_log
 from dxlrun.log.log_writer import LogWriter
-from dxlrun.log.reader import read_log
 from dxlrun.log.reading import chunks
 from dxlrun.log.schemas import LogHeader, LogSummary, from_metadata, to_metadata
 from dxlwire.clock import VirtualClock
@@ -53,14 +61,14 @@ SAID = [
 
 def fill(log: LogWriter, cycle: Cycle, cycles: int = 10) -> LogSummary:
     for number in range(cycles):
-        log.take(RecordKind.CYCLE, cycle(number))
-    batch = PacketBatch(Handover(log.take))
+        log.write_record(RecordKind.CYCLE, cycle(number))
+    batch = PacketBatch(Handover(log.write_record))
     for packet in PACKETS:
         batch.packet(packet.bus, packet.kind, packet.servo_id, packet.first_ns, packet.last_ns, packet.data)
-    batch.commit()
-    events = EventRing(Handover(log.take), VirtualClock(7_000))
+    batch.commit_packets()
+    events = EventRing(Handover(log.write_record), VirtualClock(7_000))
     for code, severity, source, text in SAID:
-        events.emit(source, EventBody(code, severity, text))
+        events.emit_event(source, EventBody(code, severity, text))
     return log.close()
 
 
@@ -84,9 +92,9 @@ def test_everything_comes_back_as_it_was(
 
 
 def test_the_data_of_an_event_come_back(log: LogWriter, tmp_path: Path) -> None:
-    ring = EventRing(Handover(log.take), VirtualClock(7))
-    ring.emit("loop", EventBody(EventCode.STEERED, Severity.INFO, "in words"), b'{"kind":"pause"}')
-    ring.emit("loop", EventBody(EventCode.STEERED, Severity.INFO, "too long"), b"x" * 5000)
+    ring = EventRing(Handover(log.write_record), VirtualClock(7))
+    ring.emit_event("loop", EventBody(EventCode.STEERED, Severity.INFO, "in words"), b'{"kind":"pause"}')
+    ring.emit_event("loop", EventBody(EventCode.STEERED, Severity.INFO, "too long"), b"x" * 5000)
     log.gap("loop/packets", 3)
     log.close()
     first, long, gap = read_log(tmp_path / "run.mcap").events
@@ -96,13 +104,17 @@ def test_the_data_of_an_event_come_back(log: LogWriter, tmp_path: Path) -> None:
 
 
 def test_failed_goals_of_clients_hide_none_of_a_motion_file(log: LogWriter) -> None:
-    ring = EventRing(Handover(log.take), VirtualClock(7))
+    ring = EventRing(Handover(log.write_record), VirtualClock(7))
     ring.goals.planned = {"motion.yaml:7:5"}
     for number in range(MOST_FAILED + 50):
         report = GoalReport(number, "arm", "trajectory", "a client", "missed")
-        ring.emit("arm", EventBody(EventCode.GOAL_ENDED, Severity.WARNING, ""), msgspec.json.encode(report))
+        ring.emit_event(
+            "arm", EventBody(EventCode.GOAL_ENDED, Severity.WARNING, ""), msgspec.json.encode(report)
+        )
     planned = GoalReport(999, "arm", "trajectory", "motion.yaml:7:5", "missed")
-    ring.emit("arm", EventBody(EventCode.GOAL_ENDED, Severity.WARNING, ""), msgspec.json.encode(planned))
+    ring.emit_event(
+        "arm", EventBody(EventCode.GOAL_ENDED, Severity.WARNING, ""), msgspec.json.encode(planned)
+    )
     log.close()
     assert len(ring.totals.goals.failed) == MOST_FAILED + 1
     assert ring.totals.goals.failed[-1] == planned
@@ -161,7 +173,7 @@ def test_two_writers_of_the_same_records_write_the_same_bytes(
 
 
 def test_a_gap_is_an_event_and_counted(log: LogWriter, tmp_path: Path, cycle: Cycle) -> None:
-    log.take(RecordKind.CYCLE, cycle(0))
+    log.write_record(RecordKind.CYCLE, cycle(0))
     log.gap("loop/packets", 17)
     assert log.close().gaps == 17
     (event,) = read_log(tmp_path / "run.mcap").events
@@ -245,8 +257,8 @@ def rewritten(log: LogWriter, tmp_path: Path, cycle: Cycle) -> Rewritten:
     def rewritten(change: Callable[[Chunk], object]) -> Path:
         path, chunks = tmp_path / "run.mcap", []
         for number in range(4):
-            log.take(RecordKind.CYCLE, cycle(number))
-            log.flush()
+            log.write_record(RecordKind.CYCLE, cycle(number))
+            log.finish_chunk()
         log.close()
         with path.open("rb") as stream:
             records = [*StreamReader(stream, emit_chunks=True).records]
@@ -370,7 +382,7 @@ def test_a_mode_that_is_none_is_reported(
 ) -> None:
     record = np.frombuffer(bytearray(cycle(7)), dtype=layout.dtype)
     record["mode"][0, 1] = 77
-    log.take(RecordKind.CYCLE, record.tobytes())
+    log.write_record(RecordKind.CYCLE, record.tobytes())
     log.close()
     with pytest.raises(LogError, match="cycle 7 has a mode of a servo that is not known"):
         read_log(tmp_path / "run.mcap")
@@ -398,15 +410,15 @@ def test_a_full_disk_stops_the_writing_and_leaves_a_readable_log(
     log: LogWriter, tmp_path: Path, cycle: Cycle
 ) -> None:
     path = tmp_path / "run.mcap"
-    log.take(RecordKind.CYCLE, cycle(0))
-    log.flush()
+    log.write_record(RecordKind.CYCLE, cycle(0))
+    log.finish_chunk()
     whole = path.stat().st_size
     with files_of_at_most(whole + 100):
-        log.take(RecordKind.CYCLE, cycle(1))
-        log.flush()
+        log.write_record(RecordKind.CYCLE, cycle(1))
+        log.finish_chunk()
         assert log.error is not None
-        log.take(RecordKind.CYCLE, cycle(2))
-        log.flush()
+        log.write_record(RecordKind.CYCLE, cycle(2))
+        log.finish_chunk()
         summary = log.close()
     assert path.stat().st_size == whole == summary.bytes
     assert summary.error is not None
@@ -418,7 +430,7 @@ def test_a_full_disk_stops_the_writing_and_leaves_a_readable_log(
 
 
 def test_a_disk_that_is_full_at_the_end_is_reported(log: LogWriter, tmp_path: Path, cycle: Cycle) -> None:
-    log.take(RecordKind.CYCLE, cycle(0))
+    log.write_record(RecordKind.CYCLE, cycle(0))
     with files_of_at_most((tmp_path / "run.mcap").stat().st_size):
         summary = log.close()
     assert summary.error is not None
@@ -428,8 +440,8 @@ def test_a_disk_that_is_full_at_the_end_is_reported(log: LogWriter, tmp_path: Pa
 @pytest.mark.parametrize("what", ["deleted", "moved", "replaced"])
 def test_a_file_that_is_gone_is_reported(log: LogWriter, tmp_path: Path, cycle: Cycle, what: str) -> None:
     path, elsewhere = tmp_path / "run.mcap", tmp_path / "elsewhere.mcap"
-    log.take(RecordKind.CYCLE, cycle(0))
-    log.flush()
+    log.write_record(RecordKind.CYCLE, cycle(0))
+    log.finish_chunk()
     path.rename(elsewhere)
     if what == "deleted":
         elsewhere.unlink()
@@ -442,10 +454,10 @@ def test_a_file_that_was_cut_is_reported_and_gets_no_hole(
     log: LogWriter, tmp_path: Path, cycle: Cycle
 ) -> None:
     path = tmp_path / "run.mcap"
-    log.take(RecordKind.CYCLE, cycle(0))
-    log.flush()
+    log.write_record(RecordKind.CYCLE, cycle(0))
+    log.finish_chunk()
     os.truncate(path, 100)
-    log.take(RecordKind.CYCLE, cycle(1))
+    log.write_record(RecordKind.CYCLE, cycle(1))
     assert log.close().error == "writing the log stopped: the file was cut by another program"
     assert path.stat().st_size == 100
 
@@ -457,7 +469,7 @@ def test_the_urdf_comes_first_and_once(header: LogHeader, cycle: Cycle, tmp_path
     path = tmp_path / "described.mcap"
     writer = LogWriter(path, structs.replace(header, robot_description="<robot name='körper'/>"))
     for number in range(3):
-        writer.take(RecordKind.CYCLE, cycle(number))
+        writer.write_record(RecordKind.CYCLE, cycle(number))
     summary = writer.close()
     with path.open("rb") as stream:
         reader: Any = make_reader(stream, decoder_factories=[DecoderFactory()])

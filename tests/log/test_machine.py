@@ -10,8 +10,8 @@ import numpy as np
 import pytest
 
 from dxlrun.log import schemas
+from dxlrun.log.log_reader import read_log
 from dxlrun.log.machine import MachineSampler
-from dxlrun.log.reader import read_log
 from dxlrun.messages.cdr import Codec
 from dxlrun.testing import simulated_robot
 
@@ -46,9 +46,9 @@ def write(root: Path, files: dict[str, str]) -> None:
 def sampled(root: Path, first: dict[str, str], then: dict[str, str]) -> Any:
     write(root, first)
     sampler = MachineSampler(PID, root)
-    assert sampler.sample(10**9) is None
+    assert sampler.sample_machine(10**9) is None
     write(root, then)
-    data = sampler.sample(2 * 10**9)
+    data = sampler.sample_machine(2 * 10**9)
     assert data is not None
     return Codec(schemas.MACHINE).unpack(data)
 

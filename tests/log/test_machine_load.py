@@ -24,8 +24,8 @@ def sample(
 def measured(*samples: LoadSample, begin_s: float = 0, end_s: float | None = None) -> MachineLoad:
     meter = LoadMeter(round(begin_s * SECOND), None if end_s is None else round(end_s * SECOND))
     for one in samples:
-        meter.add(one)
-    return meter.load()
+        meter.add_sample(one)
+    return meter.compute_load()
 
 
 @pytest.mark.parametrize(
@@ -41,12 +41,12 @@ def measured(*samples: LoadSample, begin_s: float = 0, end_s: float | None = Non
 )
 def test_sample_is_busy_by_idle_cores_steal_and_waiting(busy: dict[str, float], text: str) -> None:
     load = measured(sample(0, 1), sample(1, 2, **busy))
-    assert (load.text, load.busy_s, load.seconds) == (text, float(bool(text)), 2.0)
+    assert (load.clause, load.busy_s, load.seconds) == (text, float(bool(text)), 2.0)
 
 
 def test_sample_counts_by_its_overlap_with_the_interval() -> None:
     load = measured(sample(0, 4, idle=0), sample(4, 5), sample(5, 6, idle=0), begin_s=3.5, end_s=5.2)
-    assert load.text == "no core was idle in 0.7 of 1.7 s, the recorder took no sample in 0.5 of 1.7 s"
+    assert load.clause == "no core was idle in 0.7 of 1.7 s, the recorder took no sample in 0.5 of 1.7 s"
     assert (load.busy_s, load.seconds) == pytest.approx((0.7, 1.7))
 
 
@@ -65,7 +65,7 @@ def test_sampler_without_a_core_is_evidence_of_a_busy_machine(
     """humanoid_20 at 1 kHz on two cores left one sample of 11 s, which began before the first deadline."""
     load = measured(sample(-5, length_s - 5, idle), begin_s=-2, end_s=6)
     assert load.too_busy is busy
-    assert ("the recorder took no sample in" in load.text) is busy
+    assert ("the recorder took no sample in" in load.clause) is busy
 
 
 @pytest.mark.parametrize("gap_s", [1.9, 2.1])

@@ -14,13 +14,13 @@ from rosbags.typesys.store import Typestore
 from tests.kit.decoded import decode_packets
 
 from dxlrun.channels.cycle import CycleRecord
-from dxlrun.channels.packets import BatchedPacket, PacketBatch
+from dxlrun.channels.logged_packets import BatchedPacket, PacketBatch
 from dxlrun.channels.ring import Handover, RecordKind
 from dxlrun.log import log_writer, schemas
 from dxlrun.log.columns import PacketColumns
+from dxlrun.log.log_reader import read_log
 from dxlrun.log.log_writer import LogWriter
 from dxlrun.log.packing.bus_messages import pack_packets, read_packets
-from dxlrun.log.reader import read_log
 from dxlrun.log.schemas import LogHeader
 from dxlrun.messages.cdr import Codec
 from dxlwire.packets import PacketKind
@@ -113,16 +113,16 @@ def test_what_contradicts_itself_is_left_out(at: int, value: int, all_of_them: b
 
 def test_a_message_has_the_packets_of_a_bus_in_many_cycles(tmp_path: Path) -> None:
     log = LogWriter(tmp_path / "run.mcap", LogHeader("r", (), ("main", "arm"), (), 10**6, 0))
-    batch = PacketBatch(Handover(log.take))
+    batch = PacketBatch(Handover(log.write_record))
     batch.packet(*PACKETS[0])
-    batch.commit()
+    batch.commit_packets()
     for cycle in (0, 1, 249, 251):
         batch.wake(cycle)
         for packet in PACKETS:
             batch.packet(*packet)
-        batch.commit()
+        batch.commit_packets()
         batch.packet(0, PacketKind.NOISE, 9, 6, 6, b"idle")
-    batch.commit()
+    batch.commit_packets()
     log.close()
 
     path = tmp_path / "run.mcap"
@@ -133,7 +133,7 @@ def test_a_message_has_the_packets_of_a_bus_in_many_cycles(tmp_path: Path) -> No
         ]
     assert written == [("/bus/main", 4), ("/bus/arm", 2), ("/bus/main", 2), ("/bus/arm", 2)]
     packets = read_log(path).packets
-    main = packets.take(packets.bus == 0)
+    main = packets.select_rows(packets.bus == 0)
     assert list(zip(main.cycle.tolist(), main.servo_id.tolist(), strict=True)) == [
         (-1, 254),
         *((cycle, servo_id) for cycle in (0, 1, 249, 251) for servo_id in (254, 255, 9)),
@@ -147,13 +147,13 @@ def test_a_chunk_has_the_packets_of_its_cycles(tmp_path: Path, monkeypatch: pyte
     monkeypatch.setattr(log_writer, "CHUNK_BYTES", 2000)
     header = LogHeader("r", (), ("main",), (), 10**6, 0)
     log, record = LogWriter(tmp_path / "run.mcap", header), CycleRecord(header.layout)
-    batch = PacketBatch(Handover(log.take))
+    batch = PacketBatch(Handover(log.write_record))
     for cycle in range(100):
         batch.wake(cycle)
         batch.packet(*PACKETS[0])
-        batch.commit()
+        batch.commit_packets()
         record.cycle = cycle
-        log.take(RecordKind.CYCLE, record.raw)
+        log.write_record(RecordKind.CYCLE, record.raw)
     read = read_log(tmp_path / "run.mcap")
     assert 80 < len(read.cycles) < 100
     assert not read.complete
@@ -164,6 +164,6 @@ def test_a_kind_that_is_none_is_refused(tmp_path: Path) -> None:
     slots: list[bytes] = []
     batch = PacketBatch(Handover(lambda _, payload: slots.append(bytes(payload))))
     batch.packet(*PACKETS[0])
-    batch.commit()
+    batch.commit_packets()
     with pytest.raises(ValueError, match="kind 9"):
         decode_packets(slots[0].replace(b"\x00\x01\xfe", b"\x00\x09\xfe", 1))

@@ -14,18 +14,18 @@ from mcap_ros2.decoder import DecoderFactory
 from msgspec import structs
 from msgspec.structs import replace
 
-from dxlrun.channels.events import EventBody, EventCode, EventRing, Severity
-from dxlrun.channels.packets import PacketBatch
+from dxlrun.channels.event_records import EventBody, EventCode, EventRing, Severity
+from dxlrun.channels.logged_packets import PacketBatch
 from dxlrun.channels.ring import Handover, RecordKind
 from dxlrun.errors import LogError
 from dxlrun.log.log_file import LogFile
+from dxlrun.log.log_reader import Log, LogFollower, open_log, read_log
 from dxlrun.log.part_writer import PartWriter, open_writer
-from dxlrun.log.reader import Log, LogFollower, open_log, read_log
 from dxlrun.log.schemas import LogHeader
 from dxlrun.plan.recording_plan import PART_END_NAME, PART_NAME, RecordingPlan
 from dxlrun.run.virtual_run import VirtualRobot
 from dxlrun.testing import plan_of
-from dxlrun_analysis.cycles.latency import Punctuality
+from dxlrun_analysis.cycles.punctuality import Punctuality
 from dxlwire.clock import VirtualClock
 from dxlwire.packets import PacketKind
 
@@ -42,13 +42,13 @@ class Run:
         self.log = open_writer(path, header, plan)
         self._cycle = cycle
         self._clock = VirtualClock()
-        to_log = Handover(self.log.take)
+        to_log = Handover(self.log.write_record)
         self._packets = PacketBatch(to_log)
         self._events = EventRing(to_log, self._clock)
 
     def event(self, text: str, severity: Severity = Severity.INFO) -> None:
         """Report something now."""
-        self._events.emit("head", EventBody(EventCode.CONTROLLER_SAYS, severity, text))
+        self._events.emit_event("head", EventBody(EventCode.CONTROLLER_SAYS, severity, text))
 
     def cycles(self, first: int, end: int) -> None:
         """Run some cycles: packets, then the cycle."""
@@ -57,10 +57,10 @@ class Run:
             self._clock.wait_until(t_ns)
             self._packets.wake(number)
             self._packets.packet(0, PacketKind.STATUS, 1, t_ns, t_ns + 10, bytes(8))
-            self._packets.commit()
-            self.log.take(RecordKind.CYCLE, self._cycle(number))
+            self._packets.commit_packets()
+            self.log.write_record(RecordKind.CYCLE, self._cycle(number))
             if isinstance(self.log, PartWriter):
-                self.log.settle()
+                self.log.split_if_due()
 
 
 Start = Callable[[RecordingPlan], Run]
@@ -111,7 +111,7 @@ def test_a_split_by_size_ends_a_part_at_its_size(tmp_path: Path, start: Start) -
     run = start(RecordingPlan(split_bytes=20_000))
     for number in range(0, 400, 20):
         run.cycles(number, number + 20)
-        run.log.flush()
+        run.log.finish_chunk()
     run.log.close()
     sizes = [path.stat().st_size for path in sorted((tmp_path / "run").iterdir())]
     assert len(sizes) > 2
@@ -150,7 +150,7 @@ def test_a_log_that_a_full_disk_ended_loses_no_older_part(
         raise OSError(errno.ENOSPC, "No space left on device")
 
     monkeypatch.setattr(LogFile, "write", full)
-    run.log.flush()
+    run.log.finish_chunk()
     run.cycles(3 * PER_SECOND, 20 * PER_SECOND)
     assert run.log.close().error
     assert numbers(read_log(tmp_path / "run"))[0] == 0
@@ -180,8 +180,8 @@ def test_the_account_of_a_log_without_its_first_parts_begins_with_what_is_there(
         (tmp_path / f"run/part_000{part}.mcap").unlink(missing_ok=True)
     reader, account = open_log(tmp_path / "run"), Punctuality()
     for part_of_log in reader.slices():
-        account.take(part_of_log)
-    periods, _ = account.finish()
+        account.add_slice(part_of_log)
+    periods, _ = account.compute_latency()
     count = len(read_log(tmp_path / "run").cycles)
     assert (periods.elapsed, periods.records, periods.missing, periods.agree) == (count, count, 0, True)
     assert periods.seconds == pytest.approx(count / PER_SECOND)
@@ -318,7 +318,7 @@ def test_a_follower_goes_from_part_to_part_also_when_older_ones_are_deleted(
     seen: list[int] = []
     for number in range(0, 475, 25):
         run.cycles(number, number + 25)
-        run.log.flush()
+        run.log.finish_chunk()
         seen += numbers(follower.new())
     run.log.close()
     seen += numbers(follower.new())
@@ -343,7 +343,7 @@ def test_a_disk_that_is_full_ends_the_log_with_whole_parts(
     run = start(RecordingPlan(split_ns=SECOND))
     for number in range(0, 300, 10):
         run.cycles(number, number + 10)
-        run.log.flush()
+        run.log.finish_chunk()
     summary = run.log.close()
 
     assert summary.error is not None
@@ -360,5 +360,5 @@ def test_a_record_that_is_none_is_refused_as_in_one_file(start: Start) -> None:
     run = start(RecordingPlan(split_ns=SECOND))
     for kind, sentence in ((RecordKind.CYCLE, "buffer"), (RecordKind.TAGGED, "Expected")):
         with pytest.raises(ValueError, match=sentence):
-            run.log.take(kind, b"?")
+            run.log.write_record(kind, b"?")
     run.log.close()

@@ -19,7 +19,7 @@ from mcap_ros2.decoder import DecoderFactory
 from msgspec.structs import replace
 from rosbags.highlevel import AnyReader
 
-from dxlrun.log.reader import open_log
+from dxlrun.log.log_reader import open_log
 from dxlrun.plan.recording_plan import RecordingPlan
 from dxlrun.testing import VirtualRobot, plan_of
 

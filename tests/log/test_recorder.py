@@ -21,12 +21,12 @@ import numpy as np
 import pytest
 
 from dxlrun.channels import ring
+from dxlrun.channels.child_processes import LateMetadata, LoopRuns, MessageChannel
 from dxlrun.channels.cycle import CycleLayout
-from dxlrun.channels.events import LONGEST_EVENT, EventBody, EventCode, EventRing, Severity
-from dxlrun.channels.packets import LONGEST_BATCH, PacketBatch
-from dxlrun.channels.process import LateMetadata, LoopRuns, MessageChannel
+from dxlrun.channels.event_records import LONGEST_EVENT, EventBody, EventCode, EventRing, Severity
+from dxlrun.channels.logged_packets import LONGEST_BATCH, PacketBatch
 from dxlrun.channels.ring import RecordKind, RingWriter, record_size
-from dxlrun.log.reader import read_log
+from dxlrun.log.log_reader import read_log
 from dxlrun.log.recorder import _MOST_PER_TURN, REQUESTS, Recorder
 from dxlrun.log.schemas import CycleSpan, LogHeader, LogTopic, RecorderJob
 from dxlwire.clock import VirtualClock
@@ -137,8 +137,8 @@ def test_what_the_rings_carry_is_in_the_log_byte_for_byte(start: Start, cycle: C
     for number in range(30):
         recording.cycles.append(RecordKind.CYCLE, cycle(number))
         recording.packets.packet(0, PacketKind.STATUS, 1, number, number + 1, sent[number])
-        recording.packets.commit()
-    recording.events.emit("loop", EventBody(EventCode.TORQUE_OFF, Severity.INFO, "every servo is limp"))
+        recording.packets.commit_packets()
+    recording.events.emit_event("loop", EventBody(EventCode.TORQUE_OFF, Severity.INFO, "every servo is limp"))
     summary = recording.finish()
     assert recording.process.wait(60) == 0
     log = read_log(recording.path)
@@ -200,9 +200,9 @@ def test_recorder_measures_the_machine_from_the_loop_s_begin_to_its_end(
         return len(turns) == 5
 
     with ours, theirs:
-        MessageChannel(ours, REQUESTS).send(LoopRuns(os.getpid()))
+        MessageChannel(ours, REQUESTS).send_message(LoopRuns(os.getpid()))
         job = RecorderJob(str(tmp_path / "run.mcap"), header, {"loop/cycles": memory})
-        closed = Recorder(job, MessageChannel(theirs, REQUESTS)).run(asked_to_stop)
+        closed = Recorder(job, MessageChannel(theirs, REQUESTS)).record_until_stopped(asked_to_stop)
     os.close(memory)
     assert LogTopic.MACHINE in read_log(tmp_path / "run.mcap").topics
     # the sample at the end covers half a second or more; the first cycle was due before it began
@@ -223,9 +223,9 @@ def test_what_waits_at_the_end_is_drained_however_much_it_is(
     ours, theirs = socket.socketpair()
     with ours, theirs:
         control = MessageChannel(theirs, REQUESTS)
-        MessageChannel(ours, REQUESTS).send(LateMetadata({"grants": {"loop": "none"}}))
+        MessageChannel(ours, REQUESTS).send_message(LateMetadata({"grants": {"loop": "none"}}))
         job = RecorderJob(str(tmp_path / "run.mcap"), header, {"loop/cycles": memory})
-        summary = Recorder(job, control).run(lambda: True).summary
+        summary = Recorder(job, control).record_until_stopped(lambda: True).summary
     os.close(memory)
     log = read_log(tmp_path / "run.mcap")
     assert len(log.cycles) + summary.gaps == count + overwritten
@@ -277,7 +277,7 @@ def test_a_recorder_that_is_short_of_processor_time_flushes_every_half_second(
     with ours, theirs:
         job = RecorderJob(str(tmp_path / "run.mcap"), header, rings)
         recorder = Recorder(job, MessageChannel(theirs, REQUESTS))
-        take, flush = recorder._log.take, recorder._log.flush
+        take, flush = recorder._log.write_record, recorder._log.finish_chunk
 
         def take_slowly(kind: int, payload: ring.Payload) -> None:
             clock.wait_until(clock.now_ns() + 5_000_000)
@@ -287,9 +287,9 @@ def test_a_recorder_that_is_short_of_processor_time_flushes_every_half_second(
             flushed.append(clock.now_ns())
             flush()
 
-        monkeypatch.setattr(recorder._log, "take", take_slowly)
-        monkeypatch.setattr(recorder._log, "flush", note_flush)
-        recorder.run(lambda: True)
+        monkeypatch.setattr(recorder._log, "write_record", take_slowly)
+        monkeypatch.setattr(recorder._log, "finish_chunk", note_flush)
+        recorder.record_until_stopped(lambda: True)
     for memory in rings.values():
         os.close(memory)
     assert len(read_log(tmp_path / "run.mcap").cycles) == 3000

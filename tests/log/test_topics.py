@@ -14,10 +14,10 @@ from mcap.reader import make_reader
 from mcap_ros2.decoder import DecoderFactory
 
 from dxlrun import Floats, LogError
-from dxlrun.channels.messages import MessageRing, PublishedTopic
 from dxlrun.channels.ring import Handover, RecordKind
+from dxlrun.channels.topic_messages import MessageRing, PublishedTopic
+from dxlrun.log.log_reader import open_log, read_log
 from dxlrun.log.log_writer import LogWriter
-from dxlrun.log.reader import open_log, read_log
 from dxlrun.messages import Header, Odometry
 from dxlrun.messages.declared import declared_message
 from dxlrun_analysis.report import analyze_log, tables
@@ -43,7 +43,7 @@ def moved(x: float) -> Odometry:
 @pytest.fixture
 def path(log: LogWriter, tmp_path: Path, cycle: Callable[[int], bytes]) -> Path:
     """50 cycles with messages of two topics, one in every fifth; the first one has nothing in its arrays."""
-    ring, offset_ns = MessageRing(Handover(log.take)), log.header.epoch_offset_ns
+    ring, offset_ns = MessageRing(Handover(log.write_record)), log.header.epoch_offset_ns
     kinds = {"state": declared_message(WaveState, "my_robotics"), "odometry": declared_message(Odometry, "")}
     numbers = {
         name: ring.announce(PublishedTopic(f"/wave/{name}", kind.type)) for name, kind in kinds.items()
@@ -56,7 +56,7 @@ def path(log: LogWriter, tmp_path: Path, cycle: Callable[[int], bytes]) -> Path:
     publish("state", 10**9 - 1, WaveState(Header(frame_id="begin"), 0.0, np.zeros(0), ()))
     for number in range(50):
         t_ns, time_s = 10**9 + 60_000 + number * PERIOD_NS, number * 0.02
-        log.take(RecordKind.CYCLE, cycle(number))
+        log.write_record(RecordKind.CYCLE, cycle(number))
         publish("state", t_ns, WaveState(Header(), time_s, np.array([time_s, np.nan]), ("pan", "tilt")))
         if number % 5 == 0:
             publish("odometry", t_ns, moved(time_s))

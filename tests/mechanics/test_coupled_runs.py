@@ -8,15 +8,15 @@ from msgspec.structs import replace
 from tests.kit.line_faults import turn_by_hand
 from tests.kit.rigs import Events
 
-from dxlrun.channels.answers import Done, Refusal
-from dxlrun.channels.commands import Command
+from dxlrun.channels.answers import Completion, Refusal
+from dxlrun.channels.commands import CommandMessage
 from dxlrun.channels.cycle import Commands, States
-from dxlrun.channels.events import EventCode, Severity
+from dxlrun.channels.event_records import EventCode, Severity
 from dxlrun.compile.simulation import simulation_of
 from dxlrun.errors import StartUpError
-from dxlrun.features.mechanics.joint_arrays import JointArrays
-from dxlrun.features.mechanics.joint_hardware import ServosTogether
-from dxlrun.log.reader import read_log
+from dxlrun.features.mechanics.joint_arrays import CoupledJointArrays
+from dxlrun.features.mechanics.joint_hardware import CouplingCheck
+from dxlrun.log.log_reader import read_log
 from dxlrun.run import virtual_run
 from dxlrun.run.virtual_run import VirtualRobot
 from dxlrun_analysis.replay import replay_log
@@ -99,7 +99,7 @@ def test_states_in_the_log_are_those_of_joints_and_no_servo_moves_at_the_start(p
     turn_by_hand(bus.servo(5), math.radians(200))
     turn_by_hand(bus.servo(1), math.radians(200))
     turn_by_hand(bus.servo(7), math.radians(270))
-    present = {servo.servo_id: round(servo.position / math.tau * TURN) for servo in bus.servos}
+    present = {servo.servo_id: round(servo.shaft_angle / math.tau * TURN) for servo in bus.servos}
     robot.run()
     for servo, tick in present.items():
         assert {sent for _, sent in goals(robot, servo)} == {tick}
@@ -139,13 +139,13 @@ def test_servos_that_disagree_are_refused_before_any_gets_torque(plan, monkeypat
 
 def test_servos_that_begin_to_disagree_in_the_run_are_one_event_until_they_agree(plan):
     robot, events = plan(), Events()
-    arrays = JointArrays(robot.mechanics, States.empty(5), Commands.empty(5))
-    together = ServosTogether(robot.mechanics, robot.loop, robot.buses, arrays, events)
+    arrays = CoupledJointArrays(robot.mechanics, States.empty(5), Commands.empty(5))
+    together = CouplingCheck(robot.mechanics, robot.loop, robot.buses, arrays, events)
     arrays.servo_states.position[:], arrays.servo_states.valid[:] = 0.0, True
     for degrees in (0, 2.9, 3.2, 5, 2.9, 3.5, 2.2, 1, 2.9, 4):
         arrays.servo_states.position[2] = math.radians(degrees)
-        arrays.read()
-        together.watch()
+        arrays.fill_joint_states()
+        together.report_disagreement()
     assert [(code, severity, source) for code, severity, source, _ in events.list] == [
         (EventCode.SERVOS_DISAGREE, Severity.WARNING, "hip"),  # at 3.2 deg
         (EventCode.SERVOS_DISAGREE, Severity.INFO, "hip"),  # below 2.1, at 1 deg
@@ -154,8 +154,8 @@ def test_servos_that_begin_to_disagree_in_the_run_are_one_event_until_they_agree
     assert "ID 3 on bus main has it at 3.2 deg, ID 2 on bus main at 0.0 deg" in events.list[0][3]
     arrays.servo_states.valid[1] = False  # where one stands is not known
     arrays.servo_states.position[2] = 0.0
-    arrays.read()
-    together.watch()
+    arrays.fill_joint_states()
+    together.report_disagreement()
     assert len(events.list) == 3
 
 
@@ -246,10 +246,10 @@ def test_a_controller_for_one_joint_of_a_wrist_is_not_loaded_in_another_mode(pla
     robot = VirtualRobot(plan())
     known = robot.plan.loop.controllers[1]
     part = replace(known, name="part", joints=("pitch",), command=("velocity",))
-    refusal = robot.robot.manager.load(part)
+    refusal = robot.robot.manager.load_controller(part)
     assert isinstance(refusal, Refusal)
     assert "another mode of pitch without roll" in str(refusal.fields["problem"])
-    assert robot.robot.manager.load(replace(part, command=("position",))) == 2
+    assert robot.robot.manager.load_controller(replace(part, command=("position",))) == 2
 
 
 def test_a_wrist_outside_its_limits_is_refused_though_each_servo_is_within_its_range(plan):
@@ -295,7 +295,7 @@ def ask_torque(robot, joint, *wanted):
     """Let a client ask for the torque of a joint, each at its time, ms."""
     for number, (ms, on) in enumerate(wanted, 1):
         data = f'{{"joints": ["{joint}"], "on": {on}, "release": true}}'.encode()
-        command = Command(number, "", "torque", data, "anna")
+        command = CommandMessage(number, "", "torque", data, "anna")
         robot.buses[0].at(ms * 1_000_000, partial(robot.inbox.waiting.append, command))
 
 
@@ -305,7 +305,7 @@ def test_torque_off_at_one_joint_is_off_at_all_its_servos_together(plan, joint, 
     robot = VirtualRobot(plan(duration_s=1.2), log=tmp_path / "run.mcap")
     ask_torque(robot, joint, (400, "false"), (800, "true"))
     robot.run()
-    assert all(isinstance(robot.inbox.answers[number], Done) for number in (1, 2))
+    assert all(isinstance(robot.inbox.answers[number], Completion) for number in (1, 2))
     for servo in servos:
         changes = [value for t, value in torque_writes(robot, servo) if t > 300_000_000]
         assert changes[:2] == [0, 1]
@@ -350,7 +350,7 @@ def test_torque_off_at_one_joint_of_a_wrist_takes_the_controllers_of_both(plan, 
     robot = VirtualRobot(plan((", " + hands[0], hands[1])), log=tmp_path / "run.mcap")
     ask_torque(robot, "roll", (400, "false"))
     robot.run()
-    assert isinstance(robot.inbox.answers[1], Done)
+    assert isinstance(robot.inbox.answers[1], Completion)
     active = read_log(tmp_path / "run.mcap").cycles["active"]  # bits: states, all, up, around
     assert (int(active[10]), int(active[-1])) == (0b1111, 0b0011)
 
@@ -358,7 +358,7 @@ def test_torque_off_at_one_joint_of_a_wrist_takes_the_controllers_of_both(plan, 
 def test_a_servo_that_shuts_itself_down_takes_the_torque_of_its_partner(plan, tmp_path):
     robot = VirtualRobot(plan(), log=tmp_path / "run.mcap")
     (bus,) = robot.buses
-    bus.at(400_000_000, bus.servo(2).reset)
+    bus.at(400_000_000, bus.servo(2).power_cycle)
     robot.run()
     assert [value for t, value in torque_writes(robot, 3) if 400_000_000 < t < 900_000_000][:1] == [0]
     events = read_log(tmp_path / "run.mcap").events

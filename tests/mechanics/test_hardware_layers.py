@@ -11,9 +11,9 @@ from tests.kit.stories import replayed
 
 from dxlrun import features
 from dxlrun.channels.cycle import Commands, States
-from dxlrun.channels.events import EventSink
+from dxlrun.channels.event_records import EventSink
 from dxlrun.contract.hardware import Hardware
-from dxlrun.dynamixel.hardware import DynamixelHardware
+from dxlrun.dynamixel.dynamixel_hardware import DynamixelHardware
 from dxlrun.dynamixel.hardware_layer import HardwareLayer, HardwareLayers, LayerStage, PreparedLayer
 from dxlrun.features.feature import Feature, S
 from dxlrun.features.mechanics.joint_hardware import JointHardware
@@ -54,10 +54,10 @@ class OffsetLayer(HardwareLayer):
         self.above.values[:] = self.below.values
         self.first[:] = self.above.position
 
-    def write(self) -> None:
+    def write_goals(self) -> None:
         self.below.values[:] = self.above.values
         self.below.position[self.above.position != self.first] += OFFSET
-        super().write()
+        super().write_goals()
 
     def follow_goals(self, rows: Sequence[int]) -> None:
         self.first[list(rows)] = self.above.position[list(rows)]

@@ -10,9 +10,9 @@ from msgspec.structs import replace
 from tests.kit.rigs import Events
 
 from dxlrun.channels.cycle import Commands, States, Torque
-from dxlrun.channels.events import EventCode
-from dxlrun.features.mechanics.joint_arrays import JointArrays
-from dxlrun.features.mechanics.joint_hardware import JointHardware, ServosTogether
+from dxlrun.channels.event_records import EventCode
+from dxlrun.features.mechanics.joint_arrays import CoupledJointArrays
+from dxlrun.features.mechanics.joint_hardware import CouplingCheck, JointHardware
 from dxlrun.plan.robot_plan import Plan
 from dxlwire.modes import Mode
 
@@ -29,14 +29,16 @@ class Servos:
         self.rows: list[int] = []  # servos whose registers were requested
         self.followed: list[int] = []  # servos that are to get goals
 
-    def read(self) -> None:
+    def read_states(self) -> None:
         pass
 
     def switch_torque(self, row: int, on: bool, done: Callable[[str], None]) -> None:
         self.switched.append((row, on))
         self.done.append(done)
 
-    def set_register(self, row: int, item: str, value: int, done: Callable[[str, int | None], None]) -> None:
+    def write_register(
+        self, row: int, item: str, value: int, done: Callable[[str, int | None], None]
+    ) -> None:
         self.rows.append(row)
         self.done.append(done)
 
@@ -44,7 +46,7 @@ class Servos:
         self.rows.append(row)
         self.done.append(done)
 
-    def write(self) -> None:
+    def write_goals(self) -> None:
         pass
 
     def follow_goals(self, rows: Sequence[int]) -> None:
@@ -55,12 +57,12 @@ class Joints:
     """The joints of the robot in front of them, with torque, and what was answered and reported."""
 
     def __init__(self, plan: Plan) -> None:
-        self.arrays = arrays = JointArrays(plan.mechanics, States.empty(5), Commands.empty(5))
+        self.arrays = arrays = CoupledJointArrays(plan.mechanics, States.empty(5), Commands.empty(5))
         self.torque = arrays.servo_states.torque
         arrays.servo_states.motion[:], arrays.servo_states.valid[:] = 0.0, True
         self.torque[:], arrays.servo_states.mode[:] = Torque.ON, Mode.POSITION
         self.servos, self.events = Servos(), Events()
-        self.together = ServosTogether(plan.mechanics, plan.loop, plan.buses, arrays, self.events)
+        self.together = CouplingCheck(plan.mechanics, plan.loop, plan.buses, arrays, self.events)
         self.hardware = JointHardware(self.servos, plan.mechanics, arrays, self.together, 20_000_000)
         self.answers: list[str] = []
 
@@ -73,8 +75,8 @@ def joints(plan: Callable[..., Plan]) -> Joints:
 @pytest.mark.parametrize("partner", [Torque.ON, Torque.DOUBT])
 def test_a_servo_without_torque_takes_it_from_its_partner_once(joints: Joints, partner: Torque) -> None:
     joints.torque[HIP_SERVOS] = Torque.OFF, partner
-    joints.hardware.read()
-    joints.hardware.read()
+    joints.hardware.read_states()
+    joints.hardware.read_states()
     assert joints.servos.switched == [(2, False)]
     ((name, text),) = joints.events.of(EventCode.TORQUE_OFF)
     assert name == "hip"
@@ -84,7 +86,7 @@ def test_a_servo_without_torque_takes_it_from_its_partner_once(joints: Joints, p
 @pytest.mark.parametrize("partner", [Torque.LOST, Torque.REBOOTING, Torque.UNKNOWN])
 def test_partner_without_certain_torque_is_not_switched_off(joints: Joints, partner: Torque) -> None:
     joints.torque[HIP_SERVOS] = Torque.OFF, partner
-    joints.hardware.read()
+    joints.hardware.read_states()
     assert joints.servos.switched == []
     assert not joints.events.of(EventCode.TORQUE_OFF)
 
@@ -92,7 +94,7 @@ def test_partner_without_certain_torque_is_not_switched_off(joints: Joints, part
 def test_it_does_so_while_another_mechanism_is_switched(joints: Joints) -> None:
     joints.hardware.switch_torque(PITCH, False, joints.answers.append)
     joints.torque[HIP_SERVOS] = Torque.OFF, Torque.ON
-    joints.hardware.read()
+    joints.hardware.read_states()
     assert joints.servos.switched == [(4, False), (5, False), (2, False)]
 
 
@@ -110,7 +112,7 @@ def test_a_register_is_answered_with_what_any_servo_refused(
     joints: Joints, problems: tuple[str, str]
 ) -> None:
     found: list[tuple[str, int | None]] = []
-    joints.hardware.set_register(HIP, "led", 1, lambda problem, value: found.append((problem, value)))
+    joints.hardware.write_register(HIP, "led", 1, lambda problem, value: found.append((problem, value)))
     for done, problem, value in zip(joints.servos.done, problems, (7, 8), strict=True):
         done(problem, value)
     assert found == [("".join(problems), 7)]
@@ -133,7 +135,7 @@ def test_servos_of_a_joint_that_differ_in_a_register_are_named_with_their_values
 def test_row_after_the_joints_is_the_register_of_a_single_servo(joints: Joints, servo: int) -> None:
     found: list[tuple[str, int | None]] = []
     joints.hardware.read_register(5 + servo, "led", lambda *answer: found.append(answer))
-    joints.hardware.set_register(5 + servo, "led", 1, lambda *answer: found.append(answer))
+    joints.hardware.write_register(5 + servo, "led", 1, lambda *answer: found.append(answer))
     assert joints.servos.rows == [servo, servo]
     for done in joints.servos.done:
         done("", 3)
@@ -144,11 +146,11 @@ def test_start_offset_of_two_servos_is_gone_after_one_second_of_writes(joints: J
     goals = joints.arrays.servo_goals.position
     goals[:] = 0.0
     goals[HIP_SERVOS] = 0.20, 0.24
-    joints.arrays.begin()
+    joints.arrays.fill_joint_goals()
     joints.arrays.servo_states.mode[:] = Mode.POSITION
     spread = []
     for _ in range(50):  # 20 ms each
-        joints.hardware.write()
+        joints.hardware.write_goals()
         spread.append(goals[2] - goals[1])
     assert spread[24] == pytest.approx(0.02)
     assert spread[49] == pytest.approx(0.0, abs=1e-9)
@@ -186,7 +188,7 @@ def test_no_joint_with_a_limp_servo_gets_torque_outside_its_limits(
 ) -> None:
     joints.torque[HIP_SERVOS] = Torque.RELEASED, second
     joints.arrays.servo_states.position[HIP_SERVOS] = position
-    joints.arrays.read()
+    joints.arrays.fill_joint_states()
     joints.hardware.switch_torque(HIP, True, joints.answers.append)
     assert joints.servos.switched == []
     (answer,) = joints.answers
@@ -203,7 +205,7 @@ def test_no_joint_of_a_limp_wrist_may_be_outside_its_limits(
     wrist = [4, 5]
     joints.torque[wrist] = Torque.RELEASED
     joints.arrays.servo_states.position[wrist] = pitch + roll, pitch - roll
-    joints.arrays.read()
+    joints.arrays.fill_joint_states()
     joints.hardware.switch_torque(PITCH, True, joints.answers.append)
     assert bool(joints.servos.switched) == (not outside)
     assert [answer.split(" (")[0] for answer in joints.answers] == [outside] * bool(outside)
@@ -212,13 +214,13 @@ def test_no_joint_of_a_limp_wrist_may_be_outside_its_limits(
 def test_servos_that_are_given_torque_apart_keep_their_places_and_then_agree(joints: Joints) -> None:
     arrays = joints.arrays
     arrays.servo_states.position[HIP_SERVOS] = 0.20, 0.24
-    joints.hardware.read()
+    joints.hardware.read_states()
     arrays.goals.position[:] = arrays.states.position
     joints.hardware.follow_goals([HIP])
     assert joints.servos.followed == HIP_SERVOS
     goals = arrays.servo_goals.position
-    joints.hardware.write()
+    joints.hardware.write_goals()
     assert goals[HIP_SERVOS] == pytest.approx([0.20, 0.24], abs=0.001)
     for _ in range(50):  # 20 ms each
-        joints.hardware.write()
+        joints.hardware.write_goals()
     assert goals[HIP_SERVOS] == pytest.approx([0.22, 0.22])

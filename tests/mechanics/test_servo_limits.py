@@ -10,7 +10,7 @@ import pytest
 from tests.kit.stories import replayed, send, tell
 from tests.kit.wire import all_writes
 
-from dxlrun.channels.events import EventCode
+from dxlrun.channels.event_records import EventCode
 from dxlrun.plan.robot_plan import Plan
 from dxlrun.testing import VirtualRobot
 

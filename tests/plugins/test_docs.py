@@ -66,7 +66,7 @@ def test_its_commands_end_well_in_their_order(fresh: Shell, tmp_path: Path) -> N
         said += told.stdout
     assert re.search(r"my_robotics_controller +my-robotics 0\.1\.0 ", said)
     assert [path.name for path in (place / "dist").iterdir()] == ["my_robotics-0.1.0-py3-none-any.whl"]
-    source = place / "src/my_robotics/controller.py"
+    source = place / "src/my_robotics/easing.py"
     assert source.read_text().count(" * share") == 1
     source.write_text(source.read_text().replace(" * share", ""))
     assert (

@@ -36,9 +36,7 @@ def told(
         package = tmp_path / "dxlrun_easing"
         package.mkdir()
         (package / "__init__.py").touch()
-        (package / "controller.py").write_text(
-            CONTROLLER.replace(old, new) if old in CONTROLLER else CONTROLLER
-        )
+        (package / "easing.py").write_text(CONTROLLER.replace(old, new) if old in CONTROLLER else CONTROLLER)
         (package / "plugin.py").write_text(PLUGIN.replace(old, new) if old in PLUGIN else PLUGIN)
         if install:
             info = tmp_path / "dxlrun_easing-0.1.0.dist-info"

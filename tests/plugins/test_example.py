@@ -37,7 +37,7 @@ def test_the_wheels_do_not_share_a_file(wheels: Path) -> None:
         set(zipfile.ZipFile(next(wheels.glob(name))).namelist()) for name in ("dxlrun-*", "dxlrun_e*")
     )
     assert not ours & theirs
-    assert {"dxlrun_easing/controller.py", "dxlrun_easing/py.typed"} <= theirs
+    assert {"dxlrun_easing/easing.py", "dxlrun_easing/py.typed"} <= theirs
     assert any(name.endswith("licenses/LICENSE") for name in theirs)
 
 
@@ -62,7 +62,7 @@ def test_the_whole_run_through_all_processes_ends_well(fresh: Shell, copy: Path)
 
 
 def test_every_parameter_of_the_readme_is_one_of_the_model() -> None:
-    tree = ast.parse((EXAMPLE / "src/dxlrun_easing/controller.py").read_text())
+    tree = ast.parse((EXAMPLE / "src/dxlrun_easing/easing.py").read_text())
     law = next(node for node in ast.walk(tree) if isinstance(node, ast.ClassDef) and node.name == "Easing")
     own = [node.target.id for node in law.body if isinstance(node, ast.AnnAssign)]
     fields = ["joints", *(name for name in own if name != "Commands")]
@@ -76,4 +76,4 @@ def test_it_imports_the_public_face_alone() -> None:
         for node in ast.walk(ast.parse(path.read_text()))
         if isinstance(node, ast.ImportFrom) and str(node.module).startswith("dxlrun")
     }
-    assert imported <= {"dxlrun", "dxlrun.testing", "dxlrun_easing", "dxlrun_easing.controller"}
+    assert imported <= {"dxlrun", "dxlrun.testing", "dxlrun_easing", "dxlrun_easing.easing"}

@@ -21,7 +21,7 @@ from dxlrun import Floats, InputError, JointController, connect, reading, runnin
 from dxlrun.cli import main
 from dxlrun.contract.joint_controller import _TAKEN
 from dxlrun.control.controllers import single_files
-from dxlrun.control.controllers.plugins import controller_breach
+from dxlrun.control.controllers.plugin_loading import controller_breach
 from dxlrun.description.robot import ControllerEntry
 from dxlrun.log.identity import IDENTITY_NAME
 from dxlrun.remote.client import RemoteRobot

@@ -11,7 +11,7 @@ import yaml
 from tests.kit.pages import page_text
 
 from dxlrun.cli.examples import schema_text
-from dxlrun.control.controllers.plugins import load_plugins
+from dxlrun.control.controllers.plugin_loading import load_plugins
 
 ROOT = Path(__file__).parents[2]
 PAGE = page_text("standard-controllers.md")

@@ -20,7 +20,7 @@ import pytest
 from tests.kit.stories import Clients, send, silence
 
 from dxlrun import Controller
-from dxlrun.log.reader import LogReader, open_log
+from dxlrun.log.log_reader import LogReader, open_log
 from dxlrun.testing import simulated_robot
 from dxlrun_controllers.plugin import dxlrun_controllers
 
@@ -181,7 +181,7 @@ def run(
         bus.at(
             base_ns + ms * 1_000_000,
             lambda: seen.append(
-                (robot.record.cycle * PERIOD_S, *(bus.servo(one).position for one in (1, 2)))
+                (robot.record.cycle * PERIOD_S, *(bus.servo(one).shaft_angle for one in (1, 2)))
             ),
         )
     if lost_s is not None:

@@ -14,13 +14,13 @@ import pytest
 
 import dxlrun
 from dxlrun.channels import heartbeat, mailbox, ring
-from dxlrun.channels.answers import Done
+from dxlrun.channels.answers import Completion
 from dxlrun.channels.cycle import CycleRecord
-from dxlrun.channels.events import LONGEST_EVENT, EventRing
+from dxlrun.channels.event_records import LONGEST_EVENT, EventRing
 from dxlrun.channels.heartbeat import Heartbeat, Phase
 from dxlrun.channels.mailbox import Mailbox
-from dxlrun.channels.messages import LONGEST_RECORD, MessageRing
-from dxlrun.control.controllers.plugins import Offer, PlugIns
+from dxlrun.channels.topic_messages import LONGEST_RECORD, MessageRing
+from dxlrun.control.controllers.plugin_loading import Offer, PlugIns
 from dxlrun.plan.loop_plan import ControllerPlan, JointPlan, LoopPlan, SchedulerPlan
 from dxlrun.plan.recording_plan import RecordingPlan
 from dxlrun.plan.robot_plan import Plan
@@ -29,8 +29,8 @@ from dxlrun.remote.job import Descriptors
 from dxlrun.remote.link import Link
 from dxlrun.remote.preparation import Preparation
 from dxlrun.remote.requests.replies import FRAME_LENGTH, Frame
-from dxlrun.remote.requests.table import Role
-from dxlrun.remote.server import serve
+from dxlrun.remote.requests.request_table import Role
+from dxlrun.remote.server import serve_gateway
 
 PERIOD_NS = 20_000_000
 
@@ -145,7 +145,7 @@ class Desk:
             messages=ring.create("messages", 1 << 20, LONGEST_RECORD),
         )
         self.heartbeat = Heartbeat(memory.heartbeat)
-        self.heartbeat.enter(Phase.RUNNING)
+        self.heartbeat.enter_phase(Phase.RUNNING)
         self.mailbox = Mailbox(memory.mailbox, ring.RingWriter(memory.answers))
         self.record = CycleRecord(plan.loop.layout)
         self.record.active = 0b011
@@ -176,10 +176,10 @@ class Desk:
 
     def take(self, refusal=None):
         """Take what a cycle takes and answer it; return it."""
-        commands = list(self.mailbox.take())
+        commands = list(self.mailbox.drain_commands())
         for command in commands:
             place = self._place(command) if refusal is None else None
-            self.mailbox.answer(command.number, refusal or Done(self.ended - 1, place))
+            self.mailbox.answer_command(command.number, refusal or Completion(self.ended - 1, place))
         self.taken += commands
         return commands
 
@@ -212,7 +212,7 @@ class Desk:
         asked = asyncio.ensure_future(self.request(*words, **options))
         while not asked.done():
             self.take(refusal)
-            self.link.collect()
+            self.link.collect_messages()
             await asyncio.sleep(0)
         return asked.result()
 
@@ -301,7 +301,7 @@ class Door:
         listener.listen(64)
         ours, control = socket.socketpair()
         serving = asyncio.ensure_future(
-            serve(self.desk.link, self.desk.gateway, listener, control, self.network)
+            serve_gateway(self.desk.link, self.desk.gateway, listener, control, self.network)
         )
         looping = asyncio.ensure_future(self._loop())
         try:

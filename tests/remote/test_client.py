@@ -8,7 +8,7 @@ import pytest
 
 import dxlrun
 from dxlrun.remote import client as module
-from dxlrun.remote.sockets import MOST_BYTES, SocketLink, listen
+from dxlrun.remote.sockets import MOST_BYTES, SocketLink, create_listener
 
 
 def answer(body, status=b"200 OK"):
@@ -22,7 +22,7 @@ class Peer:
     """A gateway that gives one answer after the other: bytes, or None to hang up."""
 
     def __init__(self, answers):
-        self.listener, self.path = listen("pair")
+        self.listener, self.path = create_listener("pair")
         self.answers = list(answers)
         self.heard = []
         self.connections = 0
@@ -95,7 +95,7 @@ def test_arrays_of_numpy_are_sent_as_lists_and_names_cannot_leave_their_place(pe
 
 
 def test_a_clients_name_may_be_any_text(place):
-    with listen("pair")[0]:
+    with create_listener("pair")[0]:
         robot = dxlrun.connect(client="Jürgen 机器\r\nX-Evil: 1")
     assert robot.link.client == "Jürgen 机器X-Evil: 1"
 
@@ -189,13 +189,13 @@ def test_a_connection_that_was_idle_for_long_is_not_used_again(peer, monkeypatch
 def test_the_choice_of_a_robot_must_be_clear():
     with pytest.raises(dxlrun.DxlrunError, match="no robot runs that can be steered; start one"):
         dxlrun.connect()
-    with listen("torso")[0]:
+    with create_listener("torso")[0]:
         assert dxlrun.connect().name == "torso"
         with pytest.raises(
             dxlrun.DxlrunError, match="no robot pair runs that can be steered; these do: torso"
         ):
             dxlrun.connect("pair")
-        with listen("pair")[0]:
+        with create_listener("pair")[0]:
             assert dxlrun.connect("pair").name == "pair"
             with pytest.raises(dxlrun.DxlrunError, match="several robots run: pair, torso; name one"):
                 dxlrun.connect()
@@ -222,7 +222,7 @@ def test_a_stop_that_a_living_robot_never_answers_is_an_error(peer, monkeypatch)
 
 def test_a_queue_of_connections_that_stays_full_is_an_error_with_its_reason(place, monkeypatch):
     monkeypatch.setattr("dxlrun.remote.sockets.TIMEOUT_S", 0.05)
-    listener, path = listen("pair")
+    listener, path = create_listener("pair")
     listener.listen(0)
     with listener, socket.socket(socket.AF_UNIX) as waiting:
         waiting.connect(str(path))

@@ -19,10 +19,10 @@ import pytest
 from dxlrun.channels.heartbeat import Phase
 from dxlrun.remote import gateway, server
 from dxlrun.remote.client import RemoteRobot
-from dxlrun.remote.live.topics import framed
+from dxlrun.remote.live.live_topics import framed
 from dxlrun.remote.network.commander import Client
 from dxlrun.remote.requests.replies import RunEnded
-from dxlrun.remote.requests.table import Role
+from dxlrun.remote.requests.request_table import Role
 from dxlrun.remote.server import MOST_CONNECTIONS, MOST_OF_PROCESS
 from dxlrun.remote.sockets import MOST_BYTES, SocketLink
 
@@ -158,7 +158,7 @@ def test_a_stream_stays_open_while_it_is_read_or_quiet_and_a_sleeping_listener_i
                 break
         else:
             raise AssertionError("the sleeping listener was never closed")
-        door.desk.heartbeat.enter(Phase.DONE)
+        door.desk.heartbeat.enter_phase(Phase.DONE)
         ends = [await asyncio.wait_for(one.read(), 60) for one in (reading, quiet)]
         for end in (reading_end, quiet_end, sleeping):
             end.close()

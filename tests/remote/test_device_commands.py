@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 from dxlrun.cli.steering.joints import source_facts
-from dxlrun.control.controllers.plugins import load_plugins
+from dxlrun.control.controllers.plugin_loading import load_plugins
 from dxlrun.messages.cdr import Codec
 from dxlrun.messages.definition import MessageType
 from dxlrun.remote.live.states import RobotStates, array
@@ -133,7 +133,7 @@ def test_states_of_a_device_are_asked_for_by_name_and_listened_to(board):
         content["refused"]
         == "there is no joint board; it is not a servo: `dxlrun get board` prints its states"
     )
-    opened, sample = board.frames(board.link.listen(["/foot"], newest=False))
+    opened, sample = board.frames(board.link.open_stream(["/foot"], newest=False))
     assert (opened.type, sample.number) == ("dxlrun_msgs/msg/SourceStates", 2)
     message = Codec(MessageType(opened.type, opened.definition)).unpack(sample.data)
     assert (message["valid"], message["age_ns"], message["name"]) == (True, 3_000_000, ["force.x"])

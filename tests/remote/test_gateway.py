@@ -15,17 +15,17 @@ from msgspec.structs import replace
 from pydantic import create_model
 from tests.kit.pages import page_text
 
-from dxlrun.channels.answers import Code, Done, Refusal, Waiting
+from dxlrun.channels.answers import Acceptance, Code, Completion, Refusal
 from dxlrun.channels.commands import MOST_PER_CYCLE
 from dxlrun.channels.cycle import CycleLayout, CycleRecord
-from dxlrun.channels.events import EventBody, EventCode, Severity
+from dxlrun.channels.event_records import EventBody, EventCode, Severity
 from dxlrun.channels.heartbeat import Phase
-from dxlrun.compile.joints.limits import BeyondLimit
+from dxlrun.compile.joints.limits import LimitViolation
 from dxlrun.plan.loop_plan import ControllerPlan
 from dxlrun.remote import asked, link, server
-from dxlrun.remote.preparation import Prepared, RefusedRequest, _of_motions, in_si
-from dxlrun.remote.requests import table as requests
-from dxlrun.remote.requests.table import MOST_OPERATIONS, MOST_SET_POINTS, Role
+from dxlrun.remote.preparation import PreparedCommand, RefusedRequest, _of_motions, in_si
+from dxlrun.remote.requests import request_table as requests
+from dxlrun.remote.requests.request_table import MOST_OPERATIONS, MOST_SET_POINTS, Role
 from dxlrun.remote.sockets import MOST_BYTES
 
 DONE = {"done": True, "cycle": 0}
@@ -285,11 +285,11 @@ def test_a_set_point_beyond_the_limits_is_passed_to_the_gate_and_the_answer_coun
 
 
 def test_of_many_values_beyond_the_limits_some_are_named_and_all_counted():
-    beyond = tuple(BeyondLimit(f"j{row % 6}", f"j{row} is beyond") for row in range(7))
+    beyond = tuple(LimitViolation(f"j{row % 6}", f"j{row} is beyond") for row in range(7))
     with pytest.raises(
         RefusedRequest, match=r"^go of arm: j0 is beyond; .*; j4 is beyond; and 2 more$"
     ) as raised:
-        Prepared("arm", "go", b"", beyond).require_within_limits()
+        PreparedCommand("arm", "go", b"", beyond).require_within_limits()
     refusal = raised.value.refusal
     assert (refusal.code, refusal.fields["joints"]) == (
         Code.BEYOND_LIMITS, ("j0", "j1", "j2", "j3", "j4", "j5"),
@@ -385,13 +385,13 @@ def test_an_answer_that_comes_too_late_is_still_what_the_gateway_knows(desk, mon
     assert "did not answer" in content["refused"]
     assert asyncio.run(desk.request("GET", "/robot"))[1]["paused"] is False
     desk.take()
-    desk.link.collect()
+    desk.link.collect_messages()
     assert desk.ask("GET", "/robot")[1]["paused"] is True
 
 
 @pytest.mark.parametrize("phase", [Phase.SETUP, Phase.STOPPING, Phase.DONE])
 def test_a_run_at_its_end_refuses_everything_at_once(desk, phase):
-    desk.heartbeat.enter(phase)
+    desk.heartbeat.enter_phase(phase)
     for path, body in (("/pause", b""), (SET_POINT, {"positions": [0]})):
         refused = {"refused": "the run is ending", "code": "run_ending", "fields": {}}
         assert desk.ask("POST", path, body) == (503, refused)
@@ -416,11 +416,11 @@ def test_a_switch_is_answered_when_the_record_of_its_cycle_shows_it(desk):
         asked = asyncio.ensure_future(
             desk.request("POST", "/switch", {"activate": ["spare"], "deactivate": ["left"]})
         )
-        while not (commands := list(desk.mailbox.take())):
+        while not (commands := list(desk.mailbox.drain_commands())):
             await asyncio.sleep(0)
-        desk.mailbox.answer(commands[0].number, Done(desk.ended))
+        desk.mailbox.answer_command(commands[0].number, Completion(desk.ended))
         for _ in range(20):
-            desk.link.collect()
+            desk.link.collect_messages()
             await asyncio.sleep(0)
         early = asked.done()
         desk.record.active = 0b110
@@ -439,7 +439,7 @@ def test_a_switch_is_answered_when_the_record_of_its_cycle_shows_it(desk):
 LATE = Refusal(Code.MODE_NOT_ENTERED, {"controller": ("spare",), "problem": "pan stays in position mode"})
 
 
-@pytest.mark.parametrize("last", [Done(0), LATE], ids=["done", "refused"])
+@pytest.mark.parametrize("last", [Completion(0), LATE], ids=["done", "refused"])
 def test_a_switch_that_waits_for_modes_is_answered_when_they_are_there_or_were_given_up(
     desk, monkeypatch, last
 ):
@@ -447,14 +447,14 @@ def test_a_switch_that_waits_for_modes_is_answered_when_they_are_there_or_were_g
 
     async def switch():
         asked = asyncio.ensure_future(desk.request("POST", "/switch", {"activate": ["spare"]}))
-        while not (commands := list(desk.mailbox.take())):
+        while not (commands := list(desk.mailbox.drain_commands())):
             await asyncio.sleep(0)
-        desk.mailbox.answer(commands[0].number, Waiting(("spare",)))
-        desk.link.collect()
+        desk.mailbox.answer_command(commands[0].number, Acceptance(("spare",)))
+        desk.link.collect_messages()
         await asyncio.sleep(0.2)
         waited = not asked.done()
-        desk.mailbox.answer(commands[0].number, last)
-        desk.link.collect()
+        desk.mailbox.answer_command(commands[0].number, last)
+        desk.link.collect_messages()
         return waited, await asked
 
     waited, (status, content) = asyncio.run(switch())
@@ -477,7 +477,7 @@ def test_a_controller_that_is_unloaded_while_a_set_point_arrives_gets_none_of_it
 
     status, told = asyncio.run(desk.request("POST", SET_POINT, chunks=chunks()))
     assert (status, told["code"]) == (404, "unknown_controller")
-    assert list(desk.mailbox.take()) == []
+    assert list(desk.mailbox.drain_commands()) == []
 
 
 def test_a_switch_names_the_controllers_that_are_activated_below_those_named(desk):
@@ -491,7 +491,7 @@ def test_a_switch_names_the_controllers_that_are_activated_below_those_named(des
 
 def test_a_switch_whose_modes_never_come_is_given_up(desk, monkeypatch):
     monkeypatch.setattr(link, "ENTER_S", 0.01)
-    status, content = desk.ask("POST", "/switch", {"activate": ["spare"]}, refusal=Waiting(("spare",)))
+    status, content = desk.ask("POST", "/switch", {"activate": ["spare"]}, refusal=Acceptance(("spare",)))
     assert (status, content["code"], content["fields"]) == (503, "no_answer", {"seconds": 0.01})
 
 
@@ -581,13 +581,13 @@ def test_states_show_the_references_by_their_names(desk):
 
 def test_events_of_both_processes_are_returned_whole_and_once(desk):
     long = "ä" * 400
-    desk.events.emit("loop", EventBody(EventCode.SETUP, Severity.INFO, long))
-    desk.guardian_events.emit("guardian", EventBody(EventCode.GUARDIAN, Severity.INFO, long))
-    desk.link.collect()
+    desk.events.emit_event("loop", EventBody(EventCode.SETUP, Severity.INFO, long))
+    desk.guardian_events.emit_event("guardian", EventBody(EventCode.GUARDIAN, Severity.INFO, long))
+    desk.link.collect_messages()
     told = desk.ask("GET", "/events")[1]
     assert [(one["source"], one["text"]) for one in told["events"]] == [("loop", long), ("guardian", long)]
-    desk.events.emit("loop", EventBody(EventCode.SETUP, Severity.INFO, "more"))
-    desk.link.collect()
+    desk.events.emit_event("loop", EventBody(EventCode.SETUP, Severity.INFO, "more"))
+    desk.link.collect_messages()
     told = desk.ask("GET", f"/events?after={told['last']}")[1]
     assert [one["text"] for one in told["events"]] == ["more"]
     assert desk.ask("GET", f"/events?after={told['last']}")[1] == {"events": [], "last": told["last"]}

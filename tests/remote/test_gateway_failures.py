@@ -6,8 +6,8 @@ import time
 import pytest
 from tests.remote.conftest import Arm, Desk
 
-from dxlrun.channels.events import EventBody, EventCode, Severity
-from dxlrun.control.controllers.plugins import Offer, PlugIns
+from dxlrun.channels.event_records import EventBody, EventCode, Severity
+from dxlrun.control.controllers.plugin_loading import Offer, PlugIns
 from dxlrun.remote import link, preparation
 
 DONE = {"done": True, "cycle": 0}
@@ -18,8 +18,8 @@ SET_POINT = "/controllers/left/set-points/go"
 @pytest.mark.parametrize(("text", "count"), [("x", 3000), ("x" * 7000, 300)])
 def test_a_storm_of_events_is_kept_in_bounded_memory(desk, text, count):
     for number in range(count):
-        desk.events.emit("pan", EventBody(EventCode.GATE, Severity.WARNING, f"{number} {text}"))
-        desk.link.collect()
+        desk.events.emit_event("pan", EventBody(EventCode.GATE, Severity.WARNING, f"{number} {text}"))
+        desk.link.collect_messages()
     kept = [event.text for _, event in desk.link.events]
     assert len(kept) <= link.KEPT_EVENTS
     assert sum(map(len, kept)) <= link.KEPT_TEXT
@@ -30,7 +30,7 @@ def test_a_storm_of_events_is_kept_in_bounded_memory(desk, text, count):
 
 def test_a_controller_whose_stream_ended_is_held_until_its_next_command(desk):
     def held():
-        desk.link.collect()
+        desk.link.collect_messages()
         return desk.ask("GET", "/robot")[1]["controllers"][0]["held"]
 
     for code, expected in (
@@ -40,7 +40,7 @@ def test_a_controller_whose_stream_ended_is_held_until_its_next_command(desk):
         (EventCode.STALE_COMMAND, True),
         (EventCode.CONTROLLER_DEACTIVATED, False),
     ):
-        desk.events.emit("left", EventBody(code, Severity.INFO, ""))
+        desk.events.emit_event("left", EventBody(code, Severity.INFO, ""))
         assert held() is expected
 
 

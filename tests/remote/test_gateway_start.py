@@ -10,11 +10,11 @@ import pytest
 from msgspec.structs import replace
 from rich.console import Console
 
+from dxlrun.channels.child_processes import Failed, Listening, Stop
 from dxlrun.channels.heartbeat import Heartbeat, Phase, create
 from dxlrun.channels.mailbox import Mailbox
-from dxlrun.channels.process import Failed, Listening, Stop
 from dxlrun.channels.ring import RingWriter
-from dxlrun.compile.robot import compile_files
+from dxlrun.compile.robot_compiler import compile_files
 from dxlrun.plan.robot_plan import from_json, to_json
 from dxlrun.remote.job import Descriptors
 from dxlrun.remote.link import Link
@@ -36,7 +36,7 @@ class Gateway:
         self.closed = not messages
         self.killed = False
 
-    def poll(self, timeout_s):
+    def poll_message(self, timeout_s):
         self.closed = True
         return self.messages.pop(0) if self.messages else None
 
@@ -69,7 +69,7 @@ def make_run(plan):
 @pytest.fixture
 def heartbeat():
     found = Heartbeat(create())
-    found.enter(Phase.RUNNING)
+    found.enter_phase(Phase.RUNNING)
     return found
 
 
@@ -103,7 +103,7 @@ def started(monkeypatch):
 def test_both_the_robot_file_and_the_command_line_can_forbid_it(make_run, started, block, wanted, count):
     run = make_run(block, gateway=wanted)
     heartbeat = Heartbeat(create())
-    heartbeat.enter(Phase.RUNNING)
+    heartbeat.enter_phase(Phase.RUNNING)
     for _ in range(3):
         run._look_after_gateway(heartbeat)
     assert len(started.found) == count
@@ -111,7 +111,7 @@ def test_both_the_robot_file_and_the_command_line_can_forbid_it(make_run, starte
 
 @pytest.mark.parametrize("phase", [Phase.LOADING, Phase.SETUP, Phase.STOPPING, Phase.DONE])
 def test_it_is_started_when_the_loop_runs_and_not_before_or_after(make_run, started, heartbeat, phase):
-    heartbeat.enter(phase)
+    heartbeat.enter_phase(phase)
     make_run()._look_after_gateway(heartbeat)
     assert started.found == []
 
@@ -154,11 +154,11 @@ def test_a_robot_that_must_be_reached_begins_when_the_gateway_answers(plan, star
     listen = "lab3:7660" if kind in {"listens", "listens not"} else ""
     options = RunOptions(record=False, gateway=kind != "not wanted", listen=listen)
     run = supervisor._Run(given, options, memory, Console(file=io.StringIO()))
-    run.hold()
+    run.post_pause()
     inbox = Mailbox(memory.mailbox, RingWriter(memory.answers))
     held = kind in {"held", "refused", "listens", "listens not"}
-    assert [(one.kind, one.origin) for one in inbox.take()] == [("pause", "loop")] * held
-    run.guardian = SimpleNamespace(channel=SimpleNamespace(send=(sent := []).append))
+    assert [(one.kind, one.origin) for one in inbox.drain_commands()] == [("pause", "loop")] * held
+    run.guardian = SimpleNamespace(channel=SimpleNamespace(send_message=(sent := []).append))
     if refused := kind in {"refused", "listens not"}:
         started.ready[0] = Gateway(Failed("no place"))
     for _ in range(2):
@@ -170,7 +170,7 @@ def test_a_robot_that_must_be_reached_begins_when_the_gateway_answers(plan, star
     )
     descriptors = Descriptors(*(getattr(memory, one.name) for one in fields(Descriptors)))
     Link(given, descriptors).let_begin()
-    assert [(one.kind, one.origin) for one in inbox.take()] == [("resume", "loop")] * held
+    assert [(one.kind, one.origin) for one in inbox.drain_commands()] == [("resume", "loop")] * held
 
 
 def real(plan):

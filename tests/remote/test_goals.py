@@ -10,16 +10,16 @@ import pytest
 from pydantic import Field, model_validator
 
 import dxlrun
-from dxlrun.channels.answers import Code, Done, Refusal
-from dxlrun.channels.events import EventBody, EventCode, GoalReport, Severity
+from dxlrun.channels.answers import Code, Completion, Refusal
+from dxlrun.channels.event_records import EventBody, EventCode, GoalReport, Severity
 from dxlrun.channels.heartbeat import Phase
-from dxlrun.channels.messages import PublishedTopic
-from dxlrun.control.controllers.goals import GoalStatus as LoopStatus
-from dxlrun.control.controllers.plugins import Offer, PlugIns
-from dxlrun.control.controllers.topics import TopicLog
+from dxlrun.channels.topic_messages import PublishedTopic
+from dxlrun.control.controllers.goal_registry import GoalStatus as LoopStatus
+from dxlrun.control.controllers.plugin_loading import Offer, PlugIns
+from dxlrun.control.controllers.published_topics import TopicLog
 from dxlrun.messages.declared import declared_message
 from dxlrun.remote import gateway
-from dxlrun.remote.goals import KEPT_GOALS
+from dxlrun.remote.goal_book import KEPT_GOALS
 from dxlrun.remote.preparation import Preparation
 
 GO = "/controllers/left/commands/go"
@@ -83,16 +83,16 @@ def arm(desk):
 def report(desk, number, status, controller="left", **more):
     code = EventCode.GOAL_ACCEPTED if status == "accepted" else EventCode.GOAL_ENDED
     data = msgspec.json.encode(GoalReport(number, controller, "go", "anna", status, **more))
-    desk.events.emit(controller, EventBody(code, Severity.INFO, f"goal {number} {status}"), data)
-    desk.link.collect()
+    desk.events.emit_event(controller, EventBody(code, Severity.INFO, f"goal {number} {status}"), data)
+    desk.link.collect_messages()
 
 
 def accept(desk, number):
     """Let the loop accept the next command as a goal."""
-    real = desk.mailbox.answer
-    desk.mailbox.answer = lambda command, _: (
+    real = desk.mailbox.answer_command
+    desk.mailbox.answer_command = lambda command, _: (
         report(desk, number, "accepted"),
-        real(command, Done(7, goals=(number,))),
+        real(command, Completion(7, goals=(number,))),
     )
 
 
@@ -131,11 +131,11 @@ def test_progress_is_that_of_the_topic(arm):
     report(arm, 1, "accepted")
     for progress in (0.1, 0.2, 0.3):
         publisher.publish(LoopStatus(goal=1, status="running", progress=progress))
-    arm.link.collect()
+    arm.link.collect_messages()
     goal = arm.ask("GET", "/goals/1")[1]
     assert (goal["progress"], goal["error"]) == (0.3, None)
     publisher.publish(LoopStatus(goal=1, status="running", progress=0.4, error=0.02))
-    arm.link.collect()
+    arm.link.collect_messages()
     (goal,) = arm.ask("GET", "/goals")[1]["running"]
     assert (goal["progress"], goal["error"]) == (0.4, 0.02)
 
@@ -194,7 +194,7 @@ def test_a_wait_ends_when_its_time_is_over(arm):
 def test_a_wait_at_the_end_of_the_run_is_refused_and_a_result_that_came_is_told(arm, monkeypatch):
     monkeypatch.setattr(gateway, "_ENDING_S", 0.01)
     report(arm, 1, "accepted")
-    arm.heartbeat.enter(Phase.STOPPING)
+    arm.heartbeat.enter_phase(Phase.STOPPING)
     assert arm.ask("GET", "/goals/1?wait=5")[1]["code"] == "run_ending"
     report(arm, 1, "aborted", text="the run ended")
     assert arm.ask("GET", "/goals/1?wait=5")[1]["text"] == "the run ended"
@@ -321,7 +321,7 @@ def test_a_controller_that_is_loaded_anew_has_the_parameters_of_its_entry(arm):
 
 def published(arm, **fields):
     TopicLog(arm.record, arm.messages).open("/goals", LoopStatus).publish(LoopStatus(**fields))
-    arm.link.collect()
+    arm.link.collect_messages()
 
 
 def statuses(arm):
@@ -377,11 +377,11 @@ def test_after_lost_events_a_goal_of_a_controller_that_is_not_active_has_ended(a
     report(arm, 1, "accepted")
     report(arm, 2, "accepted", controller="right")
     for _ in range(3000):
-        arm.events.emit("x", EventBody(EventCode.GUARDIAN, Severity.INFO, "x" * 400))
+        arm.events.emit_event("x", EventBody(EventCode.GUARDIAN, Severity.INFO, "x" * 400))
     arm.record.active = 0b001
     while arm.record.woken_ns < 8_000_000_000:  # later than the goals' beginnings
         arm.finish_cycle()
-    arm.link.collect()
+    arm.link.collect_messages()
     assert statuses(arm) == {1: "running", 2: "aborted"}
 
 
@@ -389,7 +389,7 @@ def test_without_lost_events_a_goal_runs_until_its_end_is_reported(arm):
     report(arm, 1, "accepted")
     arm.record.active = 0
     arm.finish_cycle()
-    arm.link.collect()
+    arm.link.collect_messages()
     assert statuses(arm) == {1: "running"}
 
 

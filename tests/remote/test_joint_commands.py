@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 import dxlrun
-from dxlrun.control.controllers.plugins import Offer, PlugIns
+from dxlrun.control.controllers.plugin_loading import Offer, PlugIns
 from dxlrun.plan.loop_plan import ControllerPlan, JointPlan, ServoLimit
 from dxlrun.remote.preparation import Preparation
 from dxlrun_controllers import group

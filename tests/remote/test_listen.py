@@ -17,13 +17,13 @@ from typing import Any
 import pytest
 
 import dxlrun
-from dxlrun.log.reader import read_log
+from dxlrun.log.log_reader import read_log
 from dxlrun.messages.cdr import Codec
 from dxlrun.messages.definition import MessageType
 from dxlrun.remote.client import RemoteRobot
-from dxlrun.remote.live.listening import Listening
-from dxlrun.remote.live.topics import framed
-from dxlrun.remote.requests.replies import Opened, RunEnded, Sample
+from dxlrun.remote.live.listening import MessageIterator
+from dxlrun.remote.live.live_topics import framed
+from dxlrun.remote.requests.replies import RunEnded, StreamMessage, StreamTopic
 from dxlrun_analysis.replay import replay_log
 
 ROBOT = """\
@@ -115,12 +115,12 @@ class Link:
 
 KIND = MessageType("mine/msg/State", "float64 amount\n")
 CODEC = Codec(KIND)
-OPENED = framed(Opened(0, "/arm/state", KIND.name, KIND.text, ("pan",), 10**9))
-OTHER = framed(Opened(1, "/leg/state", KIND.name, KIND.text, (), 10**9))
+OPENED = framed(StreamTopic(0, "/arm/state", KIND.name, KIND.text, ("pan",), 10**9))
+OTHER = framed(StreamTopic(1, "/leg/state", KIND.name, KIND.text, (), 10**9))
 
 
 def sent(*numbers: int, place: int = 0) -> bytes:
-    return b"".join(framed(Sample(place, n, n * 1000, CODEC.pack(float(n)))) for n in numbers)
+    return b"".join(framed(StreamMessage(place, n, n * 1000, CODEC.pack(float(n)))) for n in numbers)
 
 
 @pytest.fixture
@@ -204,7 +204,7 @@ def test_a_gateway_that_fails_while_the_run_goes_on_is_an_error_and_else_an_end(
         else:
             asyncio.run(collect(listening))
 
-    async def collect(listening: Listening) -> None:
+    async def collect(listening: MessageIterator) -> None:
         found.extend([message.number async for message in listening])
 
     with pytest.raises(dxlrun.DxlrunError, match="publisher no longer answers: the connection was closed"):
@@ -219,7 +219,7 @@ def test_a_gateway_that_fails_while_the_run_goes_on_is_an_error_and_else_an_end(
 def test_a_gateway_that_hangs_is_an_error(robot: Any, way: str, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr("dxlrun.remote.live.listening.TIMEOUT_S", 0.05)
 
-    async def collect(listening: Listening) -> None:
+    async def collect(listening: MessageIterator) -> None:
         assert [message.number async for message in listening] == []
 
     listening = robot(Link(OPENED)).listen("/arm/state")

@@ -11,8 +11,8 @@ from itertools import pairwise
 import numpy as np
 import pytest
 
-from dxlrun.channels.answers import Done
-from dxlrun.control.controllers.plugins import Offer, PlugIns
+from dxlrun.channels.answers import Completion
+from dxlrun.control.controllers.plugin_loading import Offer, PlugIns
 from dxlrun.plan.loop_plan import ControllerPlan, JointPlan, ServoLimit
 from dxlrun.remote import gateway
 from dxlrun.remote.preparation import Preparation
@@ -86,8 +86,8 @@ motions:
 
 
 def test_a_motion_begins_softly_when_the_slowest_joint_is_there(head):
-    real = head.mailbox.answer
-    head.mailbox.answer = lambda number, _: real(number, Done(7, goals=(4, 5)))
+    real = head.mailbox.answer_command
+    head.mailbox.answer_command = lambda number, _: real(number, Completion(7, goals=(4, 5)))
     status, answer, (positions, posvel) = play(head, NOD)
     assert (status, answer) == (200, {"done": True, "cycle": 7, "goals": [4, 5], "seconds": 4.4})
     name, kind, times, arrays, end = positions
@@ -229,7 +229,7 @@ def brood(*_):
 
 
 def test_a_motion_that_takes_long_to_check_keeps_no_stop_waiting(head, monkeypatch):
-    monkeypatch.setattr(gateway, "play", brood)
+    monkeypatch.setattr(gateway, "schedule_motion", brood)
     monkeypatch.setattr(gateway, "MOTION_S", 1.0)
 
     async def stop_meanwhile():
@@ -255,7 +255,7 @@ def test_a_motion_is_not_played_for_a_client_that_has_hung_up_meanwhile(head):
 
 
 def test_a_failure_in_the_check_of_a_motion_is_that_of_one_request(head, monkeypatch):
-    monkeypatch.setattr(gateway, "play", lambda *_: {}["no"])
+    monkeypatch.setattr(gateway, "schedule_motion", lambda *_: {}["no"])
     status, answer, _ = play(head, NOD)
     assert (status, answer["code"], answer["fields"]["problem"]) == (500, "gateway_failed", "KeyError: 'no'")
     monkeypatch.undo()

@@ -20,7 +20,7 @@ from dxlrun.remote.network.certificates import client_context, counts, keys_plac
 from dxlrun.remote.network.commander import LEASE_S
 from dxlrun.remote.network.listener import MOST_UNPROVED, Listener
 from dxlrun.remote.network.network_link import NetworkLink, known_robots
-from dxlrun.remote.requests.table import REQUESTS, Role
+from dxlrun.remote.requests.request_table import REQUESTS, Role
 from dxlrun.remote.sockets import Address
 
 authority = pytest.importorskip("dxlrun_fleet.authority", reason="needs the extra network")

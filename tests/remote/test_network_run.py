@@ -26,7 +26,7 @@ from dxlrun.cli import main
 from dxlrun.errors import Refused
 from dxlrun.remote.network.certificates import client_context, keys_place
 from dxlrun.remote.network.network_link import NetworkLink
-from dxlrun.remote.requests.table import EXAMPLES, REQUESTS, Role
+from dxlrun.remote.requests.request_table import EXAMPLES, REQUESTS, Role
 from dxlrun.remote.sockets import Address, SocketLink, sockets
 from dxlsim.bus.ledger import read_ledger
 

@@ -8,7 +8,7 @@ import json
 import pytest
 from msgspec.structs import replace
 
-from dxlrun.channels.answers import Code, Done, Refusal, Waiting
+from dxlrun.channels.answers import Acceptance, Code, Completion, Refusal
 from dxlrun.channels.cycle import Torque
 from dxlwire.control_table import find_table
 from dxlwire.plan.planning import Wiring, bus_plan
@@ -82,7 +82,9 @@ def test_what_cannot_be_written_does_not_reach_the_loop(arm, path, body, status,
 
 
 def test_an_item_is_read_with_its_meaning(arm):
-    status, content = arm.ask("GET", "/joints/pan/registers/return_delay_time", refusal=Done(7, value=250))
+    status, content = arm.ask(
+        "GET", "/joints/pan/registers/return_delay_time", refusal=Completion(7, value=250)
+    )
     assert status == 200
     assert content == {
         "done": True,
@@ -99,7 +101,7 @@ def test_an_item_is_read_with_its_meaning(arm):
 
 
 def test_the_old_value_is_answered(arm):
-    status, content = arm.ask("POST", GAIN, {"value": 900}, refusal=Done(7, value=800))
+    status, content = arm.ask("POST", GAIN, {"value": 900}, refusal=Completion(7, value=800))
     assert (status, content) == (200, {"done": True, "cycle": 7, "old": 800, "value": 900})
 
 
@@ -126,7 +128,7 @@ def test_a_joints_state_is_answered(arm):
 @pytest.mark.parametrize("kind", ["torque", "reboot"])
 def test_joints_and_groups_are_named(arm, kind, names, joints):
     data = {"on": False} if kind == "torque" else {}
-    status, content = arm.ask("POST", f"/{kind}", {"joints": names, **data}, refusal=Done(-1))
+    status, content = arm.ask("POST", f"/{kind}", {"joints": names, **data}, refusal=Completion(-1))
     assert (status, content["joints"]) == (200, joints)
     (taken,) = arm.taken
     assert (taken.kind, json.loads(taken.data)) == (kind, {"joints": joints, **data, "release": False})
@@ -180,18 +182,18 @@ def test_a_servo_of_protocol_1_is_not_rebooted(desk):
 
 def test_waiting_answers_keep_the_client_waiting(arm):
     """A joint after the other is done; the last answer counts."""
-    answers = [Waiting(()), Waiting(()), Done(9)]
+    answers = [Acceptance(()), Acceptance(()), Completion(9)]
 
     async def story():
         asked = asyncio.ensure_future(arm.request("POST", "/torque", {"joints": ["all"], "on": False}))
         commands = []
         while not commands:
-            commands = list(arm.mailbox.take())
+            commands = list(arm.mailbox.drain_commands())
             await asyncio.sleep(0)
         for answer in answers:
             assert not asked.done()
-            arm.mailbox.answer(commands[0].number, answer)
-            arm.link.collect()
+            arm.mailbox.answer_command(commands[0].number, answer)
+            arm.link.collect_messages()
             await asyncio.sleep(0.001)
         for _ in range(12):
             arm.finish_cycle()

@@ -6,7 +6,7 @@ import pytest
 from jsonschema import Draft202012Validator
 
 from dxlrun.remote.gateway import _HANDLERS
-from dxlrun.remote.requests.table import COMMAND, REGISTER, REQUESTS
+from dxlrun.remote.requests.request_table import COMMAND, REGISTER, REQUESTS
 
 
 @pytest.fixture

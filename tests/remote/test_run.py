@@ -17,8 +17,8 @@ import numpy as np
 import pytest
 
 import dxlrun
-from dxlrun.channels.events import EventCode
-from dxlrun.log.reader import read_log
+from dxlrun.channels.event_records import EventCode
+from dxlrun.log.log_reader import read_log
 
 DXLRUN = Path(sys.executable).with_name("dxlrun")
 ROBOT = """\

@@ -6,8 +6,8 @@ import msgspec
 from msgspec.structs import replace
 from tests.remote.conftest import PLAN, Desk
 
-from dxlrun.channels.events import EventBody, EventCode, Severity
-from dxlrun.control.controllers.plugins import load_plugins
+from dxlrun.channels.event_records import EventBody, EventCode, Severity
+from dxlrun.control.controllers.plugin_loading import load_plugins
 from dxlrun.plan.loop_plan import ControllerPlan, ServoLimit
 
 CURRENT = ServoLimit("effort", 0.0538, "Current Limit (38) = 20, 0.0538 A")
@@ -36,8 +36,10 @@ def push(kind: str, interface: str) -> Desk:
 
 
 def report(desk: Desk, *limits: ServoLimit) -> None:
-    desk.events.emit("pan", EventBody(EventCode.SERVO_LIMITS, Severity.INFO, ""), msgspec.json.encode(limits))
-    desk.link.collect()
+    desk.events.emit_event(
+        "pan", EventBody(EventCode.SERVO_LIMITS, Severity.INFO, ""), msgspec.json.encode(limits)
+    )
+    desk.link.collect_messages()
 
 
 def test_an_effort_beyond_the_servos_current_limit_is_refused_with_the_register():

@@ -7,10 +7,10 @@ import json
 import pytest
 from msgspec.structs import replace
 
-from dxlrun.compile.robot import compile_files
+from dxlrun.compile.robot_compiler import compile_files
 from dxlrun.errors import InputError
 from dxlrun.plan.robot_plan import Plan
-from dxlrun.remote.named.joints import (
+from dxlrun.remote.named.named_joints import (
     effort_units,
     position_unit,
     prepared_reading,

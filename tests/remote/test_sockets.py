@@ -11,7 +11,7 @@ import pytest
 
 from dxlrun.errors import DxlrunError
 from dxlrun.remote import sockets
-from dxlrun.remote.sockets import alive, listen, owned, running
+from dxlrun.remote.sockets import alive, create_listener, owned, running
 
 NOBODY = 65534
 CONNECT = """
@@ -33,7 +33,7 @@ def place(tmp_path, monkeypatch):
 
 
 def test_only_the_same_user_may_enter(place):
-    listener, path = listen("pair")
+    listener, path = create_listener("pair")
     with listener:
         assert path == place / "pair.sock"
         assert stat.S_IMODE(path.stat().st_mode) == 0o600
@@ -47,35 +47,35 @@ def test_only_the_same_user_may_enter(place):
 
 
 def test_a_second_run_of_the_same_robot_gets_a_name_of_its_own():
-    first, _ = listen("pair")
-    second, path = listen("pair")
+    first, _ = create_listener("pair")
+    second, path = create_listener("pair")
     with first, second:
         assert path.name == f"pair-{os.getpid()}.sock"
         assert running() == ("pair", f"pair-{os.getpid()}")
 
 
 def test_the_socket_of_a_dead_run_is_removed_or_taken_over(place):
-    listener, path = listen("pair")
+    listener, path = create_listener("pair")
     listener.close()
     assert path.exists()
     assert running() == ()
     assert not path.exists()
-    listen("pair")[0].close()
-    again, path = listen("pair")
+    create_listener("pair")[0].close()
+    again, path = create_listener("pair")
     with again:
         assert path == place / "pair.sock"
         assert running() == ("pair",)
 
 
 def test_what_is_no_socket_is_left_alone(place):
-    listen("pair")[0].close()
+    create_listener("pair")[0].close()
     (place / "folder.sock").mkdir()
     assert running() == ()
     assert [path.name for path in place.iterdir()] == ["folder.sock"]
 
 
 def test_a_gateway_that_is_too_busy_to_listen_is_not_taken_for_dead():
-    listener, path = listen("pair")
+    listener, path = create_listener("pair")
     listener.listen(0)
     with listener:
         waiting = []
@@ -112,31 +112,31 @@ def test_a_directory_that_is_not_ours_alone_is_not_used(place, tmp_path, wrong):
         place.chmod(0o755)
         (place / "pair.sock").touch()
     with pytest.raises(DxlrunError, match="must be a directory that only you may enter: remove it"):
-        listen("pair")
+        create_listener("pair")
     assert running() == ()
     assert wrong != "open to others" or (place / "pair.sock").exists()
 
 
 def test_the_runtime_directory_of_another_user_is_left_alone(tmp_path, monkeypatch):
-    assert sockets.place() == tmp_path / "dxlrun"
+    assert sockets.sockets_directory() == tmp_path / "dxlrun"
     monkeypatch.setattr(os, "getuid", lambda: NOBODY)  # as after `su` that keeps the environment
-    assert sockets.place() == Path("/", "tmp", f"dxlrun-{NOBODY}")
+    assert sockets.sockets_directory() == Path("/", "tmp", f"dxlrun-{NOBODY}")
 
 
 @pytest.mark.parametrize("value", ["", "relative", "/nowhere/at/all"])
 def test_without_a_runtime_directory_it_is_one_in_tmp(monkeypatch, value):
     monkeypatch.setenv("XDG_RUNTIME_DIR", value)
-    assert sockets.place() == Path("/", "tmp", f"dxlrun-{os.getuid()}")
+    assert sockets.sockets_directory() == Path("/", "tmp", f"dxlrun-{os.getuid()}")
 
 
 def test_with_a_runtime_directory_it_is_the_only_one(place, monkeypatch):
     looked_at = []
     monkeypatch.setattr(sockets, "owned", lambda directory: looked_at.append(directory) or owned(directory))
-    with listen("pair")[0]:
+    with create_listener("pair")[0]:
         assert running() == ("pair",)
     assert set(looked_at) == {place}
 
 
 def test_a_name_that_is_too_long_is_refused_in_plain_words():
     with pytest.raises(DxlrunError, match="too long for a socket: give the robot a shorter name"):
-        listen("a" * 100)
+        create_listener("a" * 100)

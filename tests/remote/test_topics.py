@@ -8,15 +8,15 @@ import numpy as np
 import pytest
 
 from dxlrun import Floats
-from dxlrun.channels.events import EventBody, EventCode, Severity
-from dxlrun.channels.messages import PublishedTopic
+from dxlrun.channels.event_records import EventBody, EventCode, Severity
+from dxlrun.channels.topic_messages import PublishedTopic
 from dxlrun.messages import Header
 from dxlrun.messages.cdr import Codec
 from dxlrun.messages.declared import declared_message
 from dxlrun.messages.definition import MessageType
-from dxlrun.remote.live.topics import MOST_RECORDS
+from dxlrun.remote.live.live_topics import MOST_RECORDS
 from dxlrun.remote.preparation import RefusedRequest
-from dxlrun.remote.requests.replies import Opened, Sample
+from dxlrun.remote.requests.replies import StreamMessage, StreamTopic
 
 
 @dataclass
@@ -34,19 +34,19 @@ def publish(desk, number, first, last, text=""):
     for index in range(first, last + 1):
         data = DECLARED.pack(State(Header(), np.array([index, np.nan]), text), (index, 0))
         desk.messages.message(number, index * 10_000_000, data)
-    desk.link.collect()
+    desk.link.collect_messages()
 
 
 @pytest.fixture
 def number(desk):
     """The number of an announced topic."""
     number = desk.messages.announce(TOPIC)
-    desk.link.collect()
+    desk.link.collect_messages()
     return number
 
 
 def samples(desk, stream):
-    return [one for one in desk.frames(stream) if isinstance(one, Sample)]
+    return [one for one in desk.frames(stream) if isinstance(one, StreamMessage)]
 
 
 def numbers(desk, stream):
@@ -73,10 +73,10 @@ def test_all_topics_are_listed_with_their_types_and_rates(desk, number):
 
 
 def test_a_stream_begins_with_what_the_topic_is_and_its_newest_message(desk, number):
-    assert numbers(desk, desk.link.listen(["/left/state"], newest=False)) == []
+    assert numbers(desk, desk.link.open_stream(["/left/state"], newest=False)) == []
     publish(desk, number, 1, 3)
-    opened, sample = desk.frames(desk.link.listen(["/left/state"], newest=False))
-    assert opened == Opened(0, "/left/state", DECLARED.type.name, DECLARED.type.text, ("pan", "tilt"), 0)
+    opened, sample = desk.frames(desk.link.open_stream(["/left/state"], newest=False))
+    assert opened == StreamTopic(0, "/left/state", DECLARED.type.name, DECLARED.type.text, ("pan", "tilt"), 0)
     assert (sample.place, sample.number, sample.time_ns) == (0, 3, 30_000_000)
     message = Codec(MessageType(opened.type, opened.definition)).unpack(sample.data)
     assert message["error"].tolist() == [3.0, pytest.approx(np.nan, nan_ok=True)]
@@ -84,7 +84,7 @@ def test_a_stream_begins_with_what_the_topic_is_and_its_newest_message(desk, num
 
 def test_each_message_comes_once_to_each_of_two_clients_at_their_own_pace(desk, number):
     publish(desk, number, 1, 1)
-    quick, slow = (desk.link.listen(["/left/state"], newest=False) for _ in range(2))
+    quick, slow = (desk.link.open_stream(["/left/state"], newest=False) for _ in range(2))
     seen = []
     for last in range(2, 2 * MOST_RECORDS, 5):
         publish(desk, number, last, last + 4)
@@ -95,7 +95,7 @@ def test_each_message_comes_once_to_each_of_two_clients_at_their_own_pace(desk, 
 
 def test_of_much_a_part_is_taken_at_once_so_that_others_are_served(desk, number):
     publish(desk, number, 1, 1)
-    stream = desk.link.listen(["/left/state"], newest=False)
+    stream = desk.link.open_stream(["/left/state"], newest=False)
     publish(desk, number, 2, 3 * MOST_RECORDS)
     stream.frames()
     assert stream.behind
@@ -107,7 +107,7 @@ def test_the_numbers_show_exactly_what_a_client_that_slept_has_missed(desk, numb
     """The ring has room for less than what is published meanwhile; other topics share it."""
     other = desk.messages.announce(PublishedTopic("/right/state", DECLARED.type))
     publish(desk, number, 1, 1)
-    stream = desk.link.listen(["/left/state"], newest=False)
+    stream = desk.link.open_stream(["/left/state"], newest=False)
     assert numbers(desk, stream) == [1]
     for index in range(2, 60):
         publish(desk, other, index, index, "x" * 30_000)
@@ -118,7 +118,7 @@ def test_the_numbers_show_exactly_what_a_client_that_slept_has_missed(desk, numb
 
 
 def test_of_the_newest_only_the_last_comes_of_each_topic(desk, number):
-    stream = desk.link.listen(["/joint_states", "/left/state"], newest=True)
+    stream = desk.link.open_stream(["/joint_states", "/left/state"], newest=True)
     assert [(one.place, one.number) for one in samples(desk, stream)] == [(0, 1)]
     publish(desk, number, 1, 9)
     for _ in range(4):
@@ -127,15 +127,15 @@ def test_of_the_newest_only_the_last_comes_of_each_topic(desk, number):
 
 
 def test_events_and_every_cycle_are_topics_too(desk):
-    desk.events.emit("left", EventBody(EventCode.COMMAND, Severity.INFO, "first"))
-    desk.events.emit("left", EventBody(EventCode.COMMAND, Severity.INFO, "second"))
-    desk.link.collect()
-    stream = desk.link.listen(["/events", "/joint_states", "/cycle"], newest=False)
+    desk.events.emit_event("left", EventBody(EventCode.COMMAND, Severity.INFO, "first"))
+    desk.events.emit_event("left", EventBody(EventCode.COMMAND, Severity.INFO, "second"))
+    desk.link.collect_messages()
+    stream = desk.link.open_stream(["/events", "/joint_states", "/cycle"], newest=False)
     event, states, cycle, *newest = desk.frames(stream)
     assert [(one.place, one.number) for one in newest] == [(1, 1), (2, 1), (0, 2)]
     codecs = [Codec(MessageType(one.type, one.definition)) for one in (event, states, cycle)]
-    desk.events.emit("left", EventBody(EventCode.COMMAND, Severity.INFO, "third"))
-    desk.link.collect()
+    desk.events.emit_event("left", EventBody(EventCode.COMMAND, Severity.INFO, "third"))
+    desk.link.collect_messages()
     (sample,) = samples(desk, stream)
     assert codecs[0].unpack(sample.data)["text"] == "third"
     desk.record.states.position[:] = (0.5, np.nan)
@@ -151,7 +151,7 @@ def test_events_and_every_cycle_are_topics_too(desk):
 
 def test_cycles_that_are_missing_show_in_the_numbers_though_their_own_numbers_skip_too(desk):
     """A loop that skips periods leaves out numbers of cycles: those are no messages."""
-    stream = desk.link.listen(["/joint_states"], newest=False)
+    stream = desk.link.open_stream(["/joint_states"], newest=False)
     assert numbers(desk, stream) == [1]
     desk.ended += 100
     desk.finish_cycle()
@@ -165,7 +165,7 @@ def test_cycles_that_are_missing_show_in_the_numbers_though_their_own_numbers_sk
 
 def test_an_unknown_topic_is_refused_with_those_that_exist(desk, number):
     with pytest.raises(RefusedRequest) as refused:
-        desk.link.listen(["/joint_states", "/left/states"], newest=False)
+        desk.link.open_stream(["/joint_states", "/left/states"], newest=False)
     assert str(refused.value) == (
         "there is no topic /left/states; there are /left/state, /events, /cycle, /joint_states"
     )
@@ -177,17 +177,17 @@ def test_an_unknown_topic_is_refused_with_those_that_exist(desk, number):
 
 def test_the_numbers_go_on_when_a_controller_is_loaded_again(desk, number):
     publish(desk, number, 1, 3)
-    stream = desk.link.listen(["/left/state"], newest=False)
+    stream = desk.link.open_stream(["/left/state"], newest=False)
     publish(desk, desk.messages.announce(TOPIC), 4, 4)
     found = desk.frames(stream)
-    assert [type(one) for one in found] == [Opened, Sample, Opened, Sample]
-    assert [one.number for one in found if isinstance(one, Sample)] == [3, 4]
-    assert numbers(desk, desk.link.listen(["/left/state"], newest=False)) == [4]
+    assert [type(one) for one in found] == [StreamTopic, StreamMessage, StreamTopic, StreamMessage]
+    assert [one.number for one in found if isinstance(one, StreamMessage)] == [3, 4]
+    assert numbers(desk, desk.link.open_stream(["/left/state"], newest=False)) == [4]
 
 
 def test_a_damaged_record_takes_nothing_along(desk, number):
     publish(desk, number, 1, 1)
-    stream = desk.link.listen(["/left/state"], newest=False)
+    stream = desk.link.open_stream(["/left/state"], newest=False)
     desk.message_ring.append(7, b"short")
     desk.message_ring.append(8, b"short")
     desk.message_ring.append(8, bytes(8) + b"\x63" + bytes(30))  # of topic 99, which there is not

@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 from tests.kit.clients import Ask, steered
 
-from dxlrun.channels.events import EventCode
+from dxlrun.channels.event_records import EventCode
 
 ARM = """
 name: chained_arm

@@ -9,9 +9,9 @@ from typing import Any
 import numpy as np
 import pytest
 
-from dxlrun.channels.events import EventCode
+from dxlrun.channels.event_records import EventCode
 from dxlrun.channels.ring import RecordKind
-from dxlrun.log.reader import Log, read_log
+from dxlrun.log.log_reader import Log, read_log
 from dxlrun.run.virtual_run import VirtualRobot
 from dxlrun.testing import plan_of
 from dxlrun_analysis.replay import replay_log

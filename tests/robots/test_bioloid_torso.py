@@ -6,7 +6,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from dxlrun.compile.robot import Compiled, compile_files
+from dxlrun.compile.robot_compiler import CompiledRobot, compile_files
 from dxlrun_controllers.laws.spline import SplineSample, Trajectory
 
 ROBOTS = Path(__file__).parents[2] / "robots"
@@ -25,7 +25,7 @@ TABLE = [
 
 
 @pytest.fixture(scope="module")
-def torso() -> Compiled:
+def torso() -> CompiledRobot:
     return compile_files(ROBOTS / "bioloid_torso.yaml", {}, [ROBOTS / "motions" / "three_parts.yaml"])
 
 

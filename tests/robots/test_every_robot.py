@@ -10,7 +10,7 @@ import pytest
 from tests.kit.clients import command_of, played
 from tests.kit.examples import as_parameters
 
-from dxlrun.compile.robot import compile_files
+from dxlrun.compile.robot_compiler import compile_files
 from dxlwire.joint_unit import LINEAR
 
 ROBOTS = Path(__file__).parents[2] / "robots"

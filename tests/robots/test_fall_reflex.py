@@ -11,9 +11,9 @@ from typing import Any
 import numpy as np
 import pytest
 
-from dxlrun.channels.events import EventCode
+from dxlrun.channels.event_records import EventCode
 from dxlrun.features.sensors.events import SensorEvent
-from dxlrun.log.reader import Log, read_log
+from dxlrun.log.log_reader import Log, read_log
 from dxlrun.testing import VirtualRobot, simulated_robot
 from dxlrun_analysis.replay import replay_log
 

@@ -13,7 +13,7 @@ from tests.kit.clients import Ask, steered
 from tests.kit.commands import Dxlrun
 from tests.kit.stories import Clients, prepared
 
-from dxlrun.channels.events import EventCode
+from dxlrun.channels.event_records import EventCode
 from dxlrun.run.virtual_run import VirtualRobot
 from dxlrun.testing import read_log, simulated_robot
 
@@ -85,7 +85,7 @@ def written(directory: Path, text: str, name: str = "robot.yaml") -> Path:
 
 def shaft(robot: VirtualRobot, number: int) -> float:
     """Return where the shaft of a servo stands, rad from the middle of its turn."""
-    return robot.buses[0].servo(number).position - math.pi
+    return robot.buses[0].servo(number).shaft_angle - math.pi
 
 
 def ended(run: Any) -> list[dict[str, Any]]:
@@ -132,7 +132,7 @@ def test_a_played_goal_that_is_aborted_at_once_fails_the_run(play):
 def test_a_jammed_gripper_under_a_trajectory_is_missed(tmp_path):
     def jam(robot: VirtualRobot) -> None:
         bus = robot.buses[0]
-        bus.at(500_000_000, lambda: bus.servo(2).jam(True))
+        bus.at(500_000_000, lambda: bus.servo(2).jam_shaft(True))
 
     to = {"points": [{"time": 1.0, "positions": [math.radians(40)] * 2}]}
     run = steered(
@@ -222,7 +222,7 @@ motions:
 
 def jam_tilt(robot: VirtualRobot) -> None:
     bus = robot.buses[0]
-    bus.at(1_050_000_000, lambda: bus.servo(2).jam(True))
+    bus.at(1_050_000_000, lambda: bus.servo(2).jam_shaft(True))
 
 
 def cut_tilt(robot: VirtualRobot) -> None:
@@ -326,7 +326,7 @@ def test_points_of_a_wrapped_joint_follow_each_other_on_the_shorter_way(tmp_path
 
 
 def test_a_motion_that_turns_a_continuous_joint_the_longer_way_is_warned_of(tmp_path):
-    from dxlrun.compile.robot import compile_robot
+    from dxlrun.compile.robot_compiler import compile_robot
     from dxlrun.description.motion import read_motion
     from dxlrun.description.reading import read_robot
 
@@ -365,7 +365,7 @@ controllers:
     ],
 )
 def test_a_weight_that_keeps_a_joint_beyond_its_tolerance_is_warned_of(tmp_path, keys, warned):
-    from dxlrun.compile.robot import compile_robot
+    from dxlrun.compile.robot_compiler import compile_robot
     from dxlrun.description.reading import read_robot
 
     robot = weighted(tmp_path, keys)

@@ -15,7 +15,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from dxlrun.channels.events import EventCode
+from dxlrun.channels.event_records import EventCode
 from dxlrun.compile.motions import LEAD_NS
 from dxlrun.testing import Log, read_log, simulated_robot
 from dxlrun_analysis.replay import Setting, replay_log

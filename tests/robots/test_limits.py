@@ -64,8 +64,8 @@ class Shaft:
             robot.buses[0].at(t_ns, partial(self.look, t_ns))
 
     def look(self, t_ns: int) -> None:
-        self._servo.advance(t_ns)
-        self.angles.append(self._servo.position - math.pi)
+        self._servo.advance_to(t_ns)
+        self.angles.append(self._servo.shaft_angle - math.pi)
 
     def too_far(self, limit: float) -> float:
         """Return by how much more than the limit's way, rad, the shaft went in any 10 ms to 1 s.

@@ -11,13 +11,13 @@ import pytest
 from msgspec.structs import replace
 from tests.kit.line_faults import turn_by_hand
 
-from dxlrun.channels.answers import Done, Refusal
-from dxlrun.channels.commands import Command
-from dxlrun.channels.events import EventCode
-from dxlrun.compile.robot import compile_files
+from dxlrun.channels.answers import Completion, Refusal
+from dxlrun.channels.commands import CommandMessage
+from dxlrun.channels.event_records import EventCode
+from dxlrun.compile.robot_compiler import compile_files
 from dxlrun.compile.simulation import simulation_of
 from dxlrun.errors import DxlrunError
-from dxlrun.log.reader import Log, read_log
+from dxlrun.log.log_reader import Log, read_log
 from dxlrun.plan.robot_plan import Plan
 from dxlrun.run import virtual_run
 from dxlrun.run.virtual_run import VirtualRobot
@@ -44,7 +44,7 @@ def disagreements(log: Log) -> list[str]:
 
 
 def request(robot: VirtualRobot, at_ms: int, number: int, kind: str, **data: object) -> None:
-    command = Command(number, "", kind, json.dumps(data).encode(), "anna")
+    command = CommandMessage(number, "", kind, json.dumps(data).encode(), "anna")
     robot.buses[0].at(at_ms * 1_000_000, lambda: robot.inbox.waiting.append(command))
 
 
@@ -110,7 +110,7 @@ def test_registers_are_those_of_all_servos_of_a_joint_or_of_the_one_that_is_name
     gains = {servo.servo_id: servo.registers["position_p_gain"] for servo in robot.buses[0].servos}
     assert (gains[1], gains[2]) == (850, 850)
     answers = robot.inbox.answers
-    assert isinstance(answers[1], Done)
+    assert isinstance(answers[1], Completion)
     assert answers[1].value == 800
     assert isinstance(answers[2], Refusal)
     assert "its servos differ: ID 1 on bus main has 800, ID 2 on bus main has 900" in answers[2].text
@@ -127,4 +127,4 @@ def test_torque_of_one_joint_of_a_wrist_is_that_of_both_its_servos(tmp_path):
     )
     robot.run()
     assert seen == [[1, 2, 3, 6]]
-    assert isinstance(robot.inbox.answers[1], Done)
+    assert isinstance(robot.inbox.answers[1], Completion)

@@ -11,7 +11,7 @@ from typing import Any
 import pytest
 from tests.kit.clients import Ask, steered
 
-from dxlrun.channels.events import EventCode
+from dxlrun.channels.event_records import EventCode
 from dxlrun.run.virtual_run import VirtualRobot
 
 MODELS = {1.0: ("AX-12A", "150 deg"), 2.0: ("XM430-W350", "180 deg")}
@@ -78,7 +78,7 @@ def test_limp_joints_reach_nothing(tmp_path, protocol):
 
     run = steered(tmp_path, robot_file(tmp_path, protocol), 2.5, asks(), before=reset)
     for number, joint in enumerate(JOINTS[:5], 1):
-        turned = run.robot.buses[0].servo(number).position - (2.618 if protocol == 1.0 else math.pi)
+        turned = run.robot.buses[0].servo(number).shaft_angle - (2.618 if protocol == 1.0 else math.pi)
         assert abs(turned) < 0.4, f"{joint} went to its goal without torque"
     for controller, joint in zip(("trajectory", "strict", "player", "grip", "samples"), JOINTS, strict=False):
         status, named, text = ended(run)[controller]
@@ -92,14 +92,14 @@ def test_a_joint_that_rests_needs_no_torque(tmp_path):
 
     run = steered(tmp_path, robot_file(tmp_path, 2.0), 2.5, asks(), before=reset)
     assert {status for status, _, _ in ended(run).values()} == {"reached"}
-    assert run.robot.buses[0].servo(1).position - math.pi == pytest.approx(0.7, abs=0.01)
+    assert run.robot.buses[0].servo(1).shaft_angle - math.pi == pytest.approx(0.7, abs=0.01)
 
 
 def jam(robot: VirtualRobot, number: int) -> None:
     """Block a joint on its last 5 to 10 deg, so that its servo stays on; the gripper sooner."""
     bus = robot.buses[0]
     at_ns = 300_000_000 if JOINTS[number - 1] == "thumb" else 1_000_000_000
-    bus.at(at_ns, lambda: bus.servo(number).jam(True))
+    bus.at(at_ns, lambda: bus.servo(number).jam_shaft(True))
 
 
 def test_jammed_joints_miss_their_goals_and_a_gripper_says_that_it_stalled(tmp_path):
@@ -113,7 +113,7 @@ def test_jammed_joints_miss_their_goals_and_a_gripper_says_that_it_stalled(tmp_p
     controllers = ("trajectory", "strict", "player", "grip", "samples")
     for number, (controller, joint) in enumerate(zip(controllers, JOINTS, strict=False), 1):
         status, named, text = ended(run)[controller]
-        off = 0.7 - (run.robot.buses[0].servo(number).position - math.pi)
+        off = 0.7 - (run.robot.buses[0].servo(number).shaft_angle - math.pi)
         assert named == joint, (controller, status, text)
         if controller == "grip":
             assert (status, text.split(",")[0]) == ("reached", "stalled"), text

@@ -13,9 +13,9 @@ import pytest
 from tests.kit.pages import page_text
 from tests.kit.wire import all_writes
 
-from dxlrun.channels.events import EventCode
-from dxlrun.cli.steering.written import Written
-from dxlrun.log.reader import Log, read_log
+from dxlrun.channels.event_records import EventCode
+from dxlrun.cli.steering.written import WrittenEntry
+from dxlrun.log.log_reader import Log, read_log
 from dxlrun.remote.client import RemoteGoal, RemoteRobot
 from dxlrun.testing import plan_of
 from dxlrun.tooling.runs import VirtualLink
@@ -52,7 +52,7 @@ class Stage:
     def push(self, line: str) -> None:
         """Do what a command line does."""
         controller, kind, *words = line.split()
-        self.robot.send(controller, kind, Written.read(words, None).data)
+        self.robot.send(controller, kind, WrittenEntry.from_words(words, None).data)
 
     def fault(self, text: str) -> None:
         self.faults.add(parse_fault(text), self.link.simulated.clock.now_ns())

@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 from tests.kit.clients import Ask, steered
 
-from dxlrun.channels.events import EventCode
+from dxlrun.channels.event_records import EventCode
 
 ROBOTS = Path(__file__).parents[2] / "robots"
 MS = 1_000_000
@@ -108,7 +108,7 @@ def test_followers_of_a_leader_that_does_not_answer_hold_until_it_does(tmp_path)
 
 def test_a_limp_leader_is_moved_by_hand_and_followed(tmp_path):
     def turn(robot: Any) -> None:
-        robot.buses[0].at(1_000 * MS, lambda: robot.buses[0].servo(1).turn(-0.6, 1_000 * MS))
+        robot.buses[0].at(1_000 * MS, lambda: robot.buses[0].servo(1).turn_shaft(-0.6, 1_000 * MS))
 
     run = steered(
         tmp_path,

@@ -13,7 +13,7 @@ from mcap.reader import make_reader
 from mcap_ros2.decoder import DecoderFactory
 from tests.kit.clients import Ask, steered
 
-from dxlrun.channels.events import EventCode
+from dxlrun.channels.event_records import EventCode
 
 ROBOTS = Path(__file__).parents[2] / "robots"
 

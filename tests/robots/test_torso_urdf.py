@@ -12,7 +12,7 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from dxlrun.compile.robot import compile_files
+from dxlrun.compile.robot_compiler import compile_files
 
 ROBOTS = Path(__file__).parents[2] / "robots"
 Matrix = NDArray[np.float64]

@@ -9,7 +9,7 @@ import pytest
 
 from dxlrun.testing import simulated_robot
 from dxlwire.control_table import find_table
-from dxlwire.control_table.devices import device_table
+from dxlwire.control_table.device_models import device_table
 
 WOLFGANG = Path(__file__).parents[2] / "robots" / "wolfgang.yaml"
 MX_64, MX_106, XH540 = 311, 321, 1100

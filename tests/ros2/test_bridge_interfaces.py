@@ -9,8 +9,8 @@ from types import ModuleType
 import pytest
 from rosbags.typesys import Stores, get_types_from_msg, get_typestore
 
-from dxlrun.control.controllers.goals import GoalStatus
-from dxlrun.control.controllers.topics import OWN_PACKAGE
+from dxlrun.control.controllers.goal_registry import GoalStatus
+from dxlrun.control.controllers.published_topics import OWN_PACKAGE
 from dxlrun.log.schemas import FRAMES
 from dxlrun.messages.declared import declared_message
 from dxlrun_controllers.feed_forward import FeedForwardState

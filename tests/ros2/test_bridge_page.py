@@ -8,7 +8,7 @@ from pathlib import Path
 
 import pytest
 
-from dxlrun_ros2 import command
+from dxlrun_ros2 import bridge_command
 
 ROOT = Path(__file__).parents[2]
 PAGE = (ROOT / "docs/how-to/ros2.md").read_text()
@@ -23,14 +23,14 @@ def test_the_commands_of_the_page_install_and_start_what_is_there() -> None:
     assert len(installs) + len(starts) == len(COMMANDS)
     for _, *words in starts:
         own = words[: words.index("--ros-args")] if "--ros-args" in words else words
-        robot = command.arguments(own).robot
+        robot = bridge_command.arguments(own).robot
         assert (ROOT / f"robots/{robot}.yaml").is_file()
 
 
 @pytest.mark.parametrize("words", [["--lease", "0"], ["--lease", "soon"], ["a", "b"], ["--nope"]])
 def test_a_wrong_command_line_ends_with_2(words: list[str], capsys: pytest.CaptureFixture[str]) -> None:
     with pytest.raises(SystemExit) as ended:
-        command.arguments(words)
+        bridge_command.arguments(words)
     assert ended.value.code == 2
     assert "dxlrun-ros2: error" in capsys.readouterr().err
 
@@ -38,8 +38,8 @@ def test_a_wrong_command_line_ends_with_2(words: list[str], capsys: pytest.Captu
 def test_one_of_several_robots_must_be_named(
     monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    monkeypatch.setattr(command, "running", lambda: ("left", "right"))
+    monkeypatch.setattr(bridge_command, "running", lambda: ("left", "right"))
     with pytest.raises(SystemExit):
-        command.arguments([])
+        bridge_command.arguments([])
     assert "several robots run: left, right; name one" in capsys.readouterr().err
-    assert command.arguments(["left"]).robot == "left"
+    assert bridge_command.arguments(["left"]).robot == "left"

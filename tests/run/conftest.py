@@ -19,7 +19,7 @@ import pytest
 from tests.kit.stories import plugin_folder
 from tests.kit.wire import all_writes
 
-from dxlrun.log.reader import Log, read_log
+from dxlrun.log.log_reader import Log, read_log
 from dxlrun_controllers.group import JointGroupPositionController
 from dxlsim.bus.ledger import LedgerEntry, read_ledger
 from dxlwire.packets import PacketKind

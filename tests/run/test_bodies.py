@@ -7,7 +7,7 @@ from pathlib import Path
 
 import pytest
 
-from dxlrun.log.reader import read_log
+from dxlrun.log.log_reader import read_log
 from dxlrun.testing import simulated_robot
 
 ARM = """\

@@ -11,13 +11,13 @@ from tests.kit.judges import log_has_every_byte, uncaused, unnoticed
 
 from dxlrun import Controller, Interfaces, ParametersModel
 from dxlrun.channels.cycle import Torque
-from dxlrun.channels.events import EventCode
-from dxlrun.compile import robot
-from dxlrun.control.controllers.plugins import Offer, PlugIns, load_plugins
+from dxlrun.channels.event_records import EventCode
+from dxlrun.compile import robot_compiler
+from dxlrun.control.controllers.plugin_loading import Offer, PlugIns, load_plugins
 from dxlrun.run import virtual_run
 from dxlrun.run.virtual_run import VirtualRobot
 from dxlrun.testing import read_log, simulated_robot
-from dxlrun_analysis.replay import replay, replay_log
+from dxlrun_analysis.replay import log_replay, replay_log
 from dxlrun_analysis.report import analyze_log
 from dxlsim.faults.fault import parse_fault
 from dxlsim.faults.script import FaultScript
@@ -74,7 +74,7 @@ class Blinker(Controller[BlinkerParameters]):
 def dozen(tmp_path, monkeypatch):
     """Build the robot on virtual time, with a log."""
     offers = {**load_plugins().controllers, "blinker": Offer("blinker", Blinker, "elsewhere 2.1")}
-    for room in (robot, virtual_run, replay):
+    for room in (robot_compiler, virtual_run, log_replay):
         monkeypatch.setattr(room, "load_plugins", lambda *_, **__: PlugIns(offers, {}))
 
     def build(duration_s):

@@ -15,7 +15,7 @@ from typing import Any
 
 import pytest
 
-from dxlrun.channels.events import EventCode, Severity
+from dxlrun.channels.event_records import EventCode, Severity
 from dxlrun_analysis.report import analyze
 from dxlsim.bus.ledger import read_ledger
 

@@ -6,7 +6,7 @@ from pathlib import Path
 
 from tests.kit.clients import Ask, steered
 
-from dxlrun.channels.events import EventCode
+from dxlrun.channels.event_records import EventCode
 
 ROBOT = """\
 name: k

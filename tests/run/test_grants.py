@@ -11,8 +11,8 @@ from pathlib import Path
 import pytest
 from rich.console import Console
 
-from dxlrun.channels.events import EventCode
-from dxlrun.control.realtime import Grant, highest_priority, lowest_nice
+from dxlrun.channels.event_records import EventCode
+from dxlrun.control.realtime_grants import Grant, highest_priority, lowest_nice
 from dxlrun.run.run_processes import RECORDER_NICE
 from dxlrun.run.run_summary import granted_text, refusals, show_grants
 

@@ -10,12 +10,12 @@ import numpy as np
 import pytest
 from tests.kit.wire import all_writes
 
-from dxlrun.channels.answers import Code, Done, Refusal
-from dxlrun.channels.commands import LOOP, Command
-from dxlrun.channels.events import EventCode
-from dxlrun.control.controllers.plugins import load_plugins
+from dxlrun.channels.answers import Code, Completion, Refusal
+from dxlrun.channels.commands import LOOP, CommandMessage
+from dxlrun.channels.event_records import EventCode
+from dxlrun.control.controllers.plugin_loading import load_plugins
 from dxlrun.control.halt import HALT_NS, STILL_NS, STILL_SPEEDS
-from dxlrun.log.reader import Log, read_log
+from dxlrun.log.log_reader import Log, read_log
 from dxlrun.remote.preparation import Preparation
 from dxlrun.run.virtual_run import VirtualRobot
 from dxlrun.testing import simulated_robot
@@ -49,19 +49,19 @@ HALTED_S = 1.56
 NUMBERS = itertools.count(1)
 
 
-def send(controller: str, kind: str, *values: float) -> Command:
-    return Command(next(NUMBERS), controller, kind, np.array(values).tobytes(), "anna")
+def send(controller: str, kind: str, *values: float) -> CommandMessage:
+    return CommandMessage(next(NUMBERS), controller, kind, np.array(values).tobytes(), "anna")
 
 
-def loop(kind: str, data: bytes = b"") -> Command:
-    return Command(next(NUMBERS), LOOP, kind, data, "anna")
+def loop(kind: str, data: bytes = b"") -> CommandMessage:
+    return CommandMessage(next(NUMBERS), LOOP, kind, data, "anna")
 
 
 def ran(folder, steps, *, seconds=3.0, text=ROBOT, before=lambda robot: None):
     (folder / "robot.yaml").write_text(text)
     robot = simulated_robot(folder / "robot.yaml", duration_s=seconds, log=folder / "run.mcap")
 
-    def steer(commands: list[Command]) -> Callable[[], None]:
+    def steer(commands: list[CommandMessage]) -> Callable[[], None]:
         return lambda: robot.inbox.waiting.extend(commands)
 
     for at, commands in steps.items():
@@ -106,7 +106,7 @@ def test_joints_in_every_mode_come_to_rest_and_hold(halted):
     during = cycles["velocity"][at(log, HALTED_S) - 2]
     assert (np.abs(during) > 2 * STILL_SPEEDS[ROTARY]).tolist() == [True, True, True, True], during
     answer = robot.inbox.answers[command.number]
-    assert isinstance(answer, Done)
+    assert isinstance(answer, Completion)
     assert answer.halted is not None
     assert STILL_NS * 1e-9 < answer.halted.seconds < 2.0
     assert answer.halted.velocity <= STILL_SPEEDS[ROTARY]
@@ -149,7 +149,7 @@ def test_a_halted_robot_goes_on_when_a_controller_is_activated(tmp_path):
         2.4: [loop("switch", b'{"activate":["a"]}'), send("a", "positions", -0.5)],
     }
     robot, log = ran(tmp_path, steps, seconds=4.0)
-    assert all(isinstance(one, Done) for one in robot.inbox.answers.values())
+    assert all(isinstance(one, Completion) for one in robot.inbox.answers.values())
     assert log.cycles["position"][-1, RAMPED] == pytest.approx(-0.5, abs=0.05)
     assert "halt from anna" in [event.text for event in log.events if event.code == EventCode.STEERED]
 
@@ -164,7 +164,7 @@ def test_two_halts_are_answered_and_one_of_a_standing_robot_at_once(tmp_path):
     robot, _ = ran(tmp_path, {1.5: both})
     for command in both:
         answer = robot.inbox.answers[command.number]
-        assert isinstance(answer, Done)
+        assert isinstance(answer, Completion)
         assert answer.halted is not None
 
 
@@ -206,7 +206,7 @@ def test_goals_that_still_decelerate_are_waited_for_also_where_the_joint_is_slow
     command = loop("halt")
     robot, log = ran(tmp_path, {1.2: [send("a", "positions", 1.0)], 1.6: [command]}, text=text)
     answer = robot.inbox.answers[command.number]
-    assert isinstance(answer, Done)
+    assert isinstance(answer, Completion)
     assert answer.halted is not None
     assert answer.halted.seconds == pytest.approx(0.4 + STILL_NS * 1e-9, abs=0.05)
     assert np.ptp(log.cycles["goal_position"][at(log, 1.6 + answer.halted.seconds) :, RAMPED]) == 0
@@ -265,12 +265,12 @@ def test_a_chain_is_halted_whole_and_its_goal_ends_as_aborted(tmp_path):
     prepared = Preparation({joint.name: joint for joint in robot.plan.loop.joints}, load_plugins()).command(
         plan, "trajectory", point, units=False
     )
-    move, stop = Command(next(NUMBERS), "arm", "trajectory", prepared.data, "anna"), loop("halt")
+    move, stop = CommandMessage(next(NUMBERS), "arm", "trajectory", prepared.data, "anna"), loop("halt")
     robot.buses[0].at(1_200_000_000, lambda: robot.inbox.waiting.append(move))
     robot.buses[0].at(1_900_000_000, lambda: robot.inbox.waiting.append(stop))
     assert robot.run().detail == ""
     answer = robot.inbox.answers[stop.number]
-    assert isinstance(answer, Done)
+    assert isinstance(answer, Completion)
     assert answer.halted is not None
     log = read_log(tmp_path / "run.mcap")
     events = [(event.code, event.source) for event in log.events]

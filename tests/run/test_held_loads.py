@@ -17,8 +17,8 @@ import pytest
 from tests.kit.stories import Clients, prepared, replayed, silence
 
 from dxlrun.channels.cycle import Floats, Torque
-from dxlrun.channels.events import EventCode
-from dxlrun.log.reader import Log, open_log, read_log
+from dxlrun.channels.event_records import EventCode
+from dxlrun.log.log_reader import Log, open_log, read_log
 from dxlrun.testing import VirtualRobot, simulated_robot
 
 RATE, PERIOD_MS = 100, 10

@@ -12,16 +12,16 @@ from tests.kit.answers import result_of
 from tests.kit.line_faults import turn_by_hand
 from tests.kit.totals import totals_of
 
-from dxlrun.channels.answers import Answer, Code, Done, Refusal
-from dxlrun.channels.commands import Command
+from dxlrun.channels.answers import Answer, Code, Completion, Refusal
+from dxlrun.channels.commands import CommandMessage
 from dxlrun.channels.cycle import Torque
-from dxlrun.channels.events import EventCode
+from dxlrun.channels.event_records import EventCode
 from dxlrun.errors import InputError
-from dxlrun.log.reader import Log, read_log
+from dxlrun.log.log_reader import Log, read_log
 from dxlrun.testing import VirtualRobot, simulated_robot
-from dxlrun_analysis.joints.tracking import tracking
+from dxlrun_analysis.joints.goal_tracking import tracking
 from dxlrun_analysis.replay import replay_log
-from dxlrun_analysis.verdict import judge
+from dxlrun_analysis.verdict import judge_run
 from dxlsim.faults.fault import parse_fault
 from dxlsim.faults.script import FaultScript
 
@@ -58,7 +58,7 @@ class Run:
 
     def ask(self, ms: int, kind: str, **data: object) -> int:
         self.asked += 1
-        command = Command(self.asked, "", kind, msgspec.json.encode(data) if data else b"", "anna")
+        command = CommandMessage(self.asked, "", kind, msgspec.json.encode(data) if data else b"", "anna")
         self.at(ms, lambda: self.robot.inbox.waiting.append(command))
         return self.asked
 
@@ -92,7 +92,7 @@ def test_a_joint_is_led_by_hand_and_holds_where_it_was_put(run):
     on = one.ask(1000, "torque", joints=["elbow"], on=True)
     back = one.ask(1300, "switch", activate=["arm"], deactivate=[])
     log = one.run()
-    assert all(isinstance(one.answer(number), Done) for number in (off, on, back))
+    assert all(isinstance(one.answer(number), Completion) for number in (off, on, back))
     shown = one.torque(log, 1)
     assert [torque for torque in shown if torque not in (Torque.OFF, Torque.DOUBT)] == [
         Torque.ON, Torque.RELEASED, Torque.GIVEN, Torque.ON,
@@ -118,7 +118,7 @@ def test_a_tripped_servo_is_rebooted_and_gets_torque_in_the_run(run):
     assert isinstance(one.answer(refused), Refusal)
     assert "dxlrun reboot elbow" in one.answer(refused).text  # type: ignore[union-attr]  # a refusal
     assert one.answer(commanded).text == "elbow is commanded by arm; deactivate arm first, or add --release"  # type: ignore[union-attr]  # a refusal
-    assert [isinstance(one.answer(number), Done) for number in (reboot, on, switch)] == [True] * 3
+    assert [isinstance(one.answer(number), Completion) for number in (reboot, on, switch)] == [True] * 3
     assert one.torque(log, 1)[-1] is Torque.ON
     assert Torque.REBOOTING in one.torque(log, 1)
     assert one.torque(log, 0) == [Torque.ON]
@@ -134,7 +134,7 @@ def test_a_requested_reboot_is_no_lost_servo(run, policy):
     one = run(text, duration_s=1.5)
     reboot = one.ask(400, "reboot", joints=["wrist"], release=True)
     log = one.run()
-    assert isinstance(one.answer(reboot), Done)
+    assert isinstance(one.answer(reboot), Completion)
     assert one.torque(log, 2)[-1] is Torque.ON
     assert len(log.cycles) >= 148
 
@@ -143,7 +143,7 @@ def test_a_joint_that_starts_limp_never_has_torque_until_it_is_asked_for(run):
     one = run(LIMP)
     given: list[int] = []
     registers = one.robot.buses[0].servo(2).registers
-    registers.watch(("torque_enable",), lambda: given.append(int(registers["torque_enable"])))
+    registers.watch_items(("torque_enable",), lambda: given.append(int(registers["torque_enable"])))
     switch = one.ask(500, "switch", activate=["arm"], deactivate=[])
     on = one.ask(1000, "torque", joints=["elbow"], on=True)
     again = one.ask(1400, "switch", activate=["arm"], deactivate=[])
@@ -154,8 +154,8 @@ def test_a_joint_that_starts_limp_never_has_torque_until_it_is_asked_for(run):
     assert 1 in given
     refused = "elbow (ID 2 on bus main) is limp; `dxlrun torque on elbow` gives it torque"
     assert one.answer(switch).text == refused  # type: ignore[union-attr]
-    assert isinstance(one.answer(on), Done)
-    assert isinstance(one.answer(again), Done)
+    assert isinstance(one.answer(on), Completion)
+    assert isinstance(one.answer(again), Completion)
     assert one.torque(log, 1)[0] is Torque.RELEASED
     assert one.torque(log, 1)[-1] is Torque.ON
     assert not registers["torque_enable"]  # on_exit
@@ -211,8 +211,8 @@ def test_all_joints_off_and_on_again_and_again(run):
     numbers = asked_by_many(one, (400, 420, 430, 900, 1500, 1510, 1520, 2300))
     log = one.run()
     # only a newer request makes an older one fail
-    assert isinstance(one.answer(numbers[-1]), Done)
-    assert isinstance(one.answer(numbers[3]), Done)
+    assert isinstance(one.answer(numbers[-1]), Completion)
+    assert isinstance(one.answer(numbers[3]), Completion)
     assert all(one.torque(log, row)[-1] is Torque.ON for row in range(3))
 
 
@@ -228,7 +228,7 @@ def test_a_requested_reboot_is_no_fault_of_the_run(run, requested):
     away = int(np.count_nonzero(~log.cycles["valid"][:, 2]))
     assert away > 10
     totals = totals_of(one.path)
-    verdict = judge(totals)
+    verdict = judge_run(totals)
     result = one.robot.result
     assert result is not None
     assert result.invalid == totals.invalid == tuple(joint.invalid for joint in tracking(log))
@@ -253,7 +253,7 @@ def test_a_reboot_that_never_ends_is_a_loss(run):
     assert one.torque(log, 2)[:3] == [Torque.ON, Torque.REBOOTING, Torque.LOST]
     totals = totals_of(one.path)
     assert 140 < totals.invalid[2] < 180  # of the end, not of the three seconds before
-    assert not judge(totals).good
+    assert not judge_run(totals).good
 
 
 def test_joint_holds_where_it_is_when_torque_is_requested_under_an_active_controller(run):
@@ -265,7 +265,7 @@ def test_joint_holds_where_it_is_when_torque_is_requested_under_an_active_contro
     one.at(1200, lambda: turn_by_hand(servo, 2.5))
     on = one.ask(1400, "torque", joints=["elbow"], on=True)
     log = one.run()
-    assert isinstance(one.answer(on), Done)
+    assert isinstance(one.answer(on), Completion)
     assert one.torque(log, 1)[-1] is Torque.ON
     arm = [name for name, *_ in [(plan.name,) for plan in log.controllers]].index("arm")
     assert (log.cycles["active"] >> np.uint64(arm) & np.uint64(1)).all()
@@ -286,14 +286,14 @@ PLAYER = ROBOT.replace(
 def test_a_player_goes_on_without_a_released_joint_and_begins_without_it(run):
     one = run(PLAYER, duration_s=3.0)
     off = one.ask(200, "torque", joints=["elbow"], on=False)
-    nod = Command(90, "arm", "play", np.array([0.0, 1.0, 1.0]).tobytes(), "anna")
+    nod = CommandMessage(90, "arm", "play", np.array([0.0, 1.0, 1.0]).tobytes(), "anna")
     one.at(500, lambda: one.robot.inbox.waiting.append(nod))
     one.ask(1500, "switch", activate=[], deactivate=["arm"])
     again = one.ask(1700, "switch", activate=["arm"], deactivate=[])
     both = one.ask(2000, "torque", joints=["shoulder"], on=False)
     log = one.run()
-    assert isinstance(one.answer(off), Done)
-    assert isinstance(one.answer(again), Done)
+    assert isinstance(one.answer(off), Completion)
+    assert isinstance(one.answer(again), Completion)
     assert one.answer(both) == Refusal(
         Code.JOINT_COMMANDED, {"joint": ("shoulder",), "controller": ("arm",)}
     ), "it has no other joint"

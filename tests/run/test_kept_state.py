@@ -25,7 +25,7 @@ from tests.kit.stories import plugin_folder
 
 from dxlrun import ControllerFault
 from dxlrun.channels.cycle import CycleLayout, CycleRecord
-from dxlrun.channels.events import EventBody, EventCode, Severity
+from dxlrun.channels.event_records import EventBody, EventCode, Severity
 from dxlrun.channels.kept import (
     LONGEST_FILE,
     MOST_KEPT,
@@ -37,8 +37,8 @@ from dxlrun.channels.kept import (
     file_pieces,
     opened_file,
 )
-from dxlrun.control.controllers.keeping import Keeping
-from dxlrun.control.controllers.topics import TopicLog
+from dxlrun.control.controllers.keeping import StateKeeper
+from dxlrun.control.controllers.published_topics import TopicLog
 from dxlrun.messages.cdr import Codec
 from dxlrun.messages.declared import declared_message
 from dxlrun.plan.loop_plan import ControllerPlan
@@ -292,7 +292,7 @@ class _Sink:
 
 
 class _Events:
-    def emit(self, source: str, event: EventBody, data: bytes = b"") -> None:
+    def emit_event(self, source: str, event: EventBody, data: bytes = b"") -> None:
         """Forget it."""
 
 
@@ -300,28 +300,28 @@ def controller(name: str) -> ControllerPlan:
     return ControllerPlan(name, "type", "", "{}", (), (), (), True, 1)
 
 
-def keeping(sink: _Sink, states: KeptStates | None = None) -> Keeping:
+def keeping(sink: _Sink, states: KeptStates | None = None) -> StateKeeper:
     record = CycleRecord(CycleLayout((), ()))
-    return Keeping(states or KeptStates(), TopicLog(record, sink), _Events())
+    return StateKeeper(states or KeptStates(), TopicLog(record, sink), _Events())
 
 
 def files_of(messages: list[bytes]) -> list[tuple[str, bytes]]:
     assembly = Assembly(Codec(declared_message(KeptPiece, "dxlrun_msgs").type))
-    return [file for data in messages if (file := assembly.take(data)) is not None]
+    return [file for data in messages if (file := assembly.add_piece(data)) is not None]
 
 
 def test_one_piece_leaves_a_cycle_and_the_newest_state_that_waits():
     sink = _Sink()
     leaving = keeping(sink)
-    (_, keep), (_, other) = leaving.open(controller("a"), {}), leaving.open(controller("b"), {})
+    (_, keep), (_, other) = leaving.open_state(controller("a"), {}), leaving.open_state(controller("b"), {})
     state = np.random.default_rng(1).bytes(3 * PIECE + 1)
     keep(state)
-    leaving.step()
+    leaving.publish_next()
     for text in (b"left out", b"newest"):
         keep(text)
     other(b"")
     for cycle in range(2, 60):
-        leaving.step()
+        leaving.publish_next()
         assert len(sink.messages) <= cycle
         assert all(len(data) < PIECE + 200 for data in sink.messages)
     files = [(name, opened_file(data, name)[0]) for name, data in files_of(sink.messages)]
@@ -331,11 +331,11 @@ def test_one_piece_leaves_a_cycle_and_the_newest_state_that_waits():
 def test_at_the_end_everything_leaves_at_once():
     sink = _Sink()
     leaving = keeping(sink)
-    _, keep = leaving.open(controller("a"), {})
+    _, keep = leaving.open_state(controller("a"), {})
     keep(bytes(MOST_KEPT))
-    leaving.step()
+    leaving.publish_next()
     keep(b"last")
-    leaving.finish()
+    leaving.publish_remaining()
     assert [len(opened_file(data, "a")[0]) for _, data in files_of(sink.messages)] == [MOST_KEPT, 4]
 
 
@@ -343,22 +343,22 @@ def test_at_the_end_everything_leaves_at_once():
 def test_a_file_with_a_lost_piece_is_left_out(lost):
     sink = _Sink()
     leaving = keeping(sink)
-    _, keep = leaving.open(controller("a"), {})
+    _, keep = leaving.open_state(controller("a"), {})
     for state in (bytes(3 * PIECE + 1), b"next"):
         keep(state)
-        leaving.finish()
+        leaving.publish_remaining()
     del sink.messages[lost]
     assert [opened_file(data, "a")[0] for _, data in files_of(sink.messages)] == [b"next"]
 
 
 def test_a_controller_that_comes_again_has_what_it_kept_last():
     leaving = keeping(_Sink(), KeptStates({"a": KeptFile("a.kept", problem="its file is damaged")}))
-    found, keep = leaving.open(controller("a"), {})
+    found, keep = leaving.open_state(controller("a"), {})
     assert found == b""
     keep(b"newest")
-    assert leaving.open(controller("a"), {})[0] == b"newest"
+    assert leaving.open_state(controller("a"), {})[0] == b"newest"
     other = replace(controller("a"), joints=("other",))
-    assert leaving.open(other, {})[0] == b"", "what it kept was of other joints"
+    assert leaving.open_state(other, {})[0] == b"", "what it kept was of other joints"
 
 
 @pytest.mark.parametrize(
@@ -366,7 +366,7 @@ def test_a_controller_that_comes_again_has_what_it_kept_last():
     [(bytes(MOST_KEPT + 1), "1048577 bytes; 1048576 is the most"), (bytearray(3), "bytearray")],
 )
 def test_what_cannot_be_kept_is_the_controllers_fault(state, why):
-    _, keep = keeping(_Sink()).open(controller("a"), {})
+    _, keep = keeping(_Sink()).open_state(controller("a"), {})
     with pytest.raises(ControllerFault, match=why):
         keep(state)
 

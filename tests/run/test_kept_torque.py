@@ -15,8 +15,8 @@ from tests.kit.line_faults import lose_replies
 from tests.kit.stories import Clients, prepared, replayed
 
 from dxlrun.channels.cycle import Floats
-from dxlrun.channels.events import EventCode
-from dxlrun.log.reader import Log, read_log
+from dxlrun.channels.event_records import EventCode
+from dxlrun.log.log_reader import Log, read_log
 from dxlrun.plan.policy_plan import SLOW_SPEED
 from dxlrun.testing import VirtualRobot, simulated_robot
 from dxlsim.faults.fault import parse_fault

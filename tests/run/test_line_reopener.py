@@ -5,7 +5,7 @@ import socket
 
 from msgspec.json import Decoder
 
-from dxlrun.channels.process import LineLost, LineReturned, MessageChannel
+from dxlrun.channels.child_processes import LineLost, LineReturned, MessageChannel
 from dxlrun.run.loop_process import LineReopener
 
 
@@ -17,8 +17,8 @@ def test_lost_line_is_requested_once_per_loss(tmp_path):
         for _ in range(2):
             assert reopen(0) is None
             assert reopen(0) is None
-            assert guardian.receive() == [LineLost(0)]
-            guardian.send(LineReturned(0), [line.fileno()])
+            assert guardian.receive_messages() == [LineLost(0)]
+            guardian.send_message(LineReturned(0), [line.fileno()])
             descriptor = reopen(0)
             assert os.fstat(descriptor).st_ino == os.fstat(line.fileno()).st_ino
             os.close(descriptor)

@@ -11,10 +11,10 @@ import pytest
 from tests.kit.line_faults import truncate_next
 from tests.kit.wire import all_writes
 
-from dxlrun.channels.answers import Done
-from dxlrun.channels.commands import LOOP, Command
+from dxlrun.channels.answers import Completion
+from dxlrun.channels.commands import LOOP, CommandMessage
 from dxlrun.channels.cycle import States
-from dxlrun.channels.events import EventBody, EventCode
+from dxlrun.channels.event_records import EventBody, EventCode
 from dxlrun.features.lost_servos import GroupPolicy, LostServos, MissedReplies
 from dxlrun.plan.policy_plan import LIMP, PolicyPlan
 from dxlrun.run.virtual_run import VirtualRobot
@@ -129,12 +129,12 @@ def test_two_missed_replies_hold_no_joint(built, acts, tmp_path):
 def test_a_command_does_not_wake_a_controller_whose_servo_is_lost(built):
     robot = built(1.2)
     lose_tilt(robot)
-    command = Command(1, "pair", "positions", bytes(8) + bytes(8), "anna")
-    shifted = Command(1, "pair", "positions", b"\0\0\0\0\0\0\xe0?" * 2, "anna")  # 0.5 rad
+    command = CommandMessage(1, "pair", "positions", bytes(8) + bytes(8), "anna")
+    shifted = CommandMessage(1, "pair", "positions", b"\0\0\0\0\0\0\xe0?" * 2, "anna")  # 0.5 rad
     robot.buses[0].at(GONE_NS - 100_000_000, lambda: robot.inbox.waiting.append(command))
     robot.buses[0].at(GONE_NS + 200_000_000, lambda: robot.inbox.waiting.append(shifted))
     robot.run()
-    assert isinstance(robot.inbox.answers[1], Done)
+    assert isinstance(robot.inbox.answers[1], Completion)
     assert swing(goals(robot, 3), GONE_NS, BACK_NS) == 0
 
 
@@ -142,10 +142,10 @@ def test_a_controller_that_is_activated_while_its_servo_is_lost_waits_for_it_too
     acts |= {"calm": sway}
     robot = built(2.5)
     lose_tilt(robot)
-    switch = Command(1, LOOP, "switch", b'{"activate":["calm"],"deactivate":["pair"]}', "anna")
+    switch = CommandMessage(1, LOOP, "switch", b'{"activate":["calm"],"deactivate":["pair"]}', "anna")
     robot.buses[0].at(GONE_NS + 200_000_000, lambda: robot.inbox.waiting.append(switch))
     robot.run()
-    assert isinstance(robot.inbox.answers[1], Done)
+    assert isinstance(robot.inbox.answers[1], Completion)
     assert swing(goals(robot, 3), GONE_NS, BACK_NS) == 0
     assert swing(goals(robot, 3), BACK_NS, 10 * BACK_NS) > 0.5
 
@@ -298,7 +298,7 @@ def test_group_becomes_limp_once_however_long_its_servo_stays_away():
     for lost in [(0,)] * 5 + [(0, 1)] * 5 + [()] * 2 + [(0,)] * 5:
         states.valid[:] = True
         states.valid[[*lost]] = False
-        monitor.check(0)
+        monitor.check_cycle(0)
     sentence = "group arm lost a servo: it is limp until a client requests torque"
     held = [("hold", {0}), ("hold", {0, 1}), ("hold", set()), ("hold", {0})]
     assert actions.done == [("limp", {0, 1}), ("ERROR", sentence), *held]
@@ -313,7 +313,7 @@ def test_a_lost_servo_of_a_group_ends_the_run_by_on_fault_if_the_group_says_stop
     monitor = LostServos(("a",), states, actions, groups)
     states.age_ns[:] = 100_000_000
     for _ in range(3):
-        monitor.check(0)
+        monitor.check_cycle(0)
     ending = [(policy, "a missed at least 3 replies in a row")] if policy else [("hold", {0})]
     assert actions.done[-1:] == ending
     assert [name for name, _ in actions.done if name.startswith("on_")] == [policy] * bool(policy)

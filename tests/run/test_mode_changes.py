@@ -6,8 +6,8 @@ import numpy as np
 import pytest
 from tests.kit.stories import replayed, send, switch, tell
 
-from dxlrun.channels.events import EventCode
-from dxlrun.log.reader import Log, read_log
+from dxlrun.channels.event_records import EventCode
+from dxlrun.log.log_reader import Log, read_log
 from dxlrun_analysis.conduct.client_commands import client_commands
 from dxlwire.modes import Mode
 

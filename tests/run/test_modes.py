@@ -7,7 +7,7 @@ import pytest
 from tests.kit.stories import Clients, send, switch
 from tests.kit.wire import BROADCAST, SYNC_WRITE, WRITE, instructions, writes
 
-from dxlrun.channels.answers import Done
+from dxlrun.channels.answers import Completion
 from dxlrun.testing import VirtualRobot, read_log, simulated_robot
 from dxlwire.modes import Mode
 
@@ -51,7 +51,7 @@ def ran(tmp_path_factory):
     result = robot.run()
     assert (result.reason, result.detail, result.skipped) == ("ended", "", 0)
     answers = inbox.answers.values()
-    assert all(isinstance(answer, Done) for answer in answers), answers
+    assert all(isinstance(answer, Completion) for answer in answers), answers
     return robot, read_log(folder / "run.mcap")
 
 

@@ -14,10 +14,10 @@ import pytest
 from tests.kit.line_faults import turn_by_hand
 from tests.kit.stories import Clients, ask, prepared, replayed, torque
 
-from dxlrun.channels.commands import Command
+from dxlrun.channels.commands import CommandMessage
 from dxlrun.channels.cycle import Floats
-from dxlrun.channels.events import EventCode
-from dxlrun.log.reader import Log
+from dxlrun.channels.event_records import EventCode
+from dxlrun.log.log_reader import Log
 from dxlrun.plan.policy_plan import SLOW_SPEED
 from dxlrun.testing import VirtualRobot, simulated_robot
 
@@ -72,10 +72,10 @@ class Run:
         self.at(RESUMED_MS, ask("resume"))
         self._sample()
 
-    def at(self, ms: int, *commands: Command) -> None:
+    def at(self, ms: int, *commands: CommandMessage) -> None:
         self.clients.asked = {**self.clients.asked, ms // PERIOD_MS: commands}
 
-    def commands(self) -> list[Command]:
+    def commands(self) -> list[CommandMessage]:
         point = {"positions": [REACH], "time": 2.0}
         return [
             prepared(self.robot, "arm", "play", motion="reach"),

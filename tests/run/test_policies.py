@@ -15,8 +15,8 @@ from tests.kit.line_faults import truncate_next
 from tests.kit.wire import all_writes
 
 from dxlrun.channels.answers import Code, Refusal
-from dxlrun.channels.commands import LOOP, Command
-from dxlrun.channels.events import EventRing
+from dxlrun.channels.commands import LOOP, CommandMessage
+from dxlrun.channels.event_records import EventRing
 from dxlrun.errors import StartUpError
 from dxlrun.plan.policy_plan import SLOW_SPEED
 from dxlrun.run.virtual_run import VirtualRobot
@@ -108,11 +108,15 @@ def stop_signal(robot: VirtualRobot, acts: dict[str, Act]) -> None:
 
 
 def stop_verb(robot: VirtualRobot, acts: dict[str, Act]) -> None:
-    robot.buses[0].at(START_NS, lambda: robot.inbox.waiting.append(Command(1, LOOP, "stop", b"", "anna")))
+    robot.buses[0].at(
+        START_NS, lambda: robot.inbox.waiting.append(CommandMessage(1, LOOP, "stop", b"", "anna"))
+    )
 
 
 def stop_in_a_pause(robot: VirtualRobot, acts: dict[str, Act]) -> None:
-    robot.buses[0].at(START_NS, lambda: robot.inbox.waiting.append(Command(1, LOOP, "pause", b"", "anna")))
+    robot.buses[0].at(
+        START_NS, lambda: robot.inbox.waiting.append(CommandMessage(1, LOOP, "pause", b"", "anna"))
+    )
     robot.buses[0].at(2 * START_NS, robot.stop.request)
 
 
@@ -138,7 +142,7 @@ def silence(robot: VirtualRobot, acts: dict[str, Act]) -> None:
 
 def stale(robot: VirtualRobot, acts: dict[str, Act]) -> None:
     data = np.zeros(1).tobytes()
-    command = Command(1, "single", "positions", data, "anna", lease_ns=100_000_000)
+    command = CommandMessage(1, "single", "positions", data, "anna", lease_ns=100_000_000)
     robot.buses[0].at(START_NS, lambda: robot.inbox.waiting.append(command))
 
 
@@ -201,13 +205,13 @@ def check_pose(robot: VirtualRobot) -> None:
         assert time_s > way / math.radians(60) - LATE_S
         steps = [abs(after - now) * TICK for (_, now), (_, after) in itertools.pairwise(sent)]
         assert max(steps) < math.radians(60) * (0.02 + LATE_S) + TICK
-        assert robot.buses[0].servo(servo).position == pytest.approx(ticks * TICK, abs=0.1)
+        assert robot.buses[0].servo(servo).shaft_angle == pytest.approx(ticks * TICK, abs=0.1)
     assert goals(robot, 9)[-1][1] == goals(robot, 9)[0][1]
 
 
 def test_a_pose_after_a_pause_begins_slowly(built):
     robot = built(on_exit="[{pose: home, speed: 180 deg/s}, limp]")
-    pause = Command(1, LOOP, "pause", b"", "anna")
+    pause = CommandMessage(1, LOOP, "pause", b"", "anna")
     robot.buses[0].at(2_000_000_000, lambda: robot.inbox.waiting.append(pause))
     robot.buses[0].at(2_500_000_000, robot.stop.request)
     assert robot.run().reason == "stopped"
@@ -228,14 +232,14 @@ def test_controllers_are_deactivated_before_a_policy_moves(built, acts):
     active: list[int] = []
     robot = built(on_exit=STEPS["pose"])
     stop_signal(robot, acts)
-    last = robot.robot.loop.sink.append
+    last = robot.robot.loop.sink.append_cycle
     seen: list[tuple[int, bool]] = []
 
     class Sink:
-        begin = staticmethod(robot.robot.loop.sink.begin)
+        append_activation = staticmethod(robot.robot.loop.sink.append_activation)
         wake = staticmethod(robot.robot.loop.sink.wake)
 
-        def append(self, record):
+        def append_cycle(self, record):
             seen.append((record.active, bool(np.isfinite(record.commands.position).any())))
             last(record)
 
@@ -251,7 +255,7 @@ def test_controllers_are_deactivated_before_a_policy_moves(built, acts):
 def test_a_request_during_a_policy_is_refused_because_the_run_ends(built, acts):
     robot = built(on_exit=STEPS["pose"])
     stop_signal(robot, acts)
-    switch = Command(1, LOOP, "switch", b'{"deactivate":["pair"]}', "anna")
+    switch = CommandMessage(1, LOOP, "switch", b'{"deactivate":["pair"]}', "anna")
     robot.buses[0].at(START_NS + 100_000_000, lambda: robot.inbox.waiting.append(switch))
     robot.run()
     assert robot.inbox.answers == {1: Refusal(Code.RUN_ENDING)}
@@ -269,9 +273,11 @@ def test_a_joint_that_cannot_reach_its_pose_is_said_and_does_not_keep_the_robot_
     cut, lose = lambda: servo.poke("torque_enable", 0), lambda: servo.cut_power(START_NS - 50_000_000)
     bus.at(START_NS - 100_000_000, lose if seen else cut)
     said: list[str] = []
-    monkeypatch.setattr(EventRing, "emit", lambda ring, source, event, data=b"": said.append(event.text))
+    monkeypatch.setattr(
+        EventRing, "emit_event", lambda ring, source, event, data=b"": said.append(event.text)
+    )
     robot.run()
-    assert servo.position < (HOME[3] - 20) * TICK
+    assert servo.shaft_angle < (HOME[3] - 20) * TICK
     limp = "is limp: it was reset, its torque was cut, or it shut itself down"
     assert [text for text in said if "not reached" in text] == [
         "on_exit: pose home at 60 deg/s is not reached: joint pan "
@@ -295,7 +301,7 @@ def test_a_reply_that_is_lost_as_the_pose_is_reached_does_not_end_it_before_the_
     bus.at(there_ns + 10_000_000, lambda: servo.silence(False))
     robot.run()
     assert goals(robot, 3)[-1][1] == HOME[3]
-    assert servo.position == pytest.approx(HOME[3] * TICK, abs=0.1)
+    assert servo.shaft_angle == pytest.approx(HOME[3] * TICK, abs=0.1)
 
 
 def test_steps_are_cut_short_when_the_time_for_them_is_over(built, acts):
@@ -311,7 +317,7 @@ def test_steps_are_cut_short_when_the_time_for_them_is_over(built, acts):
 def test_periods_are_skipped_behind_the_end_of_the_motions_too(built):
     robot = built(duration_s=0.2, on_exit=STEPS["pose"])
     hardware, clock = robot.robot.hardware, robot.clock
-    read, woken = hardware.read, []
+    read, woken = hardware.read_states, []
 
     def slow():
         woken.append(robot.record.woken_ns)
@@ -319,7 +325,7 @@ def test_periods_are_skipped_behind_the_end_of_the_motions_too(built):
             clock.wait_until(clock.now_ns() + 90_000_000)
         read()
 
-    hardware.read = slow  # type: ignore[method-assign]
+    hardware.read_states = slow  # type: ignore[method-assign]
     result = robot.run()
     assert result.skipped == 4
     assert np.diff(woken[10:]).min() >= 20_000_000, "two cycles never follow each other in a burst"
@@ -328,7 +334,7 @@ def test_periods_are_skipped_behind_the_end_of_the_motions_too(built):
 @pytest.mark.parametrize(("rate", "refused"), [(1.0, True), (25.0, False)])
 def test_a_rate_at_which_the_policies_would_not_end_in_time_is_refused(built, rate, refused):
     robot = built(duration_s=0.1, on_exit="[{pose: home, speed: 30 deg/s}, limp]")
-    robot.inbox.waiting.append(Command(1, LOOP, "rate", f'{{"rate": {rate}}}'.encode(), "anna"))
+    robot.inbox.waiting.append(CommandMessage(1, LOOP, "rate", f'{{"rate": {rate}}}'.encode(), "anna"))
     robot.run()
     answer = robot.inbox.answers[1]
     assert (isinstance(answer, Refusal) and answer.code is Code.RATE_UNDER_EXIT) is refused
@@ -362,14 +368,14 @@ def test_a_start_ends_when_a_servo_may_be_left_weak(built):
     robot = built(duration_s=0.1, on_fault=STEPS["less torque"])
     bus = robot.buses[0]
     bus.servo(7).poke("torque_limit", 307)
-    receive = bus.receive
+    receive = bus.receive_bytes
 
     def heard(data, at_ns):
         if data[2] == 7 and data[4:-1] == b"\x02\x22\x02":
             truncate_next(bus, 7, 0)
         receive(data, at_ns)
 
-    bus.receive = heard  # type: ignore[method-assign]
+    bus.receive_bytes = heard  # type: ignore[method-assign]
     said = "tilt (ID 7 on bus main) did not answer when its torque limit was read"
     with pytest.raises(StartUpError, match=re.escape(said)):
         robot.run()

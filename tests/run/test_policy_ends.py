@@ -12,9 +12,9 @@ import msgspec
 import pytest
 from tests.kit.decoded import decode_packets
 
-from dxlrun.channels.events import Event, Severity
+from dxlrun.channels.event_records import Event, Severity
 from dxlrun.channels.heartbeat import Heartbeat, Phase
-from dxlrun.channels.packets import PacketBatch
+from dxlrun.channels.logged_packets import PacketBatch
 from dxlrun.channels.ring import Handover, Record, RecordKind, RingReader, RingWriter
 from dxlrun.channels.shared_memory import mapped
 from dxlrun.channels.tagged import decode
@@ -24,7 +24,7 @@ from dxlrun.run.guardian import GuardianJob, SafeStop
 from dxlrun.run.run_processes import create_memory, guardian_job
 from dxlrun.testing import installed, plan_of, simulated_robot
 from dxlsim.virtual_ports import VirtualPorts
-from dxlwire.exchange.bus import Lines
+from dxlwire.exchange.bus_engine import Lines
 from dxlwire.packets import PacketKind
 
 Start = Callable[..., Any]
@@ -121,11 +121,13 @@ def test_the_guardian_holds_only_a_robot_that_was_running_by_the_policy_for_faul
     robot.write_text((tmp_path / "pair.yaml").read_text() + f"policies: {{{policy}: hold}}\n")
     plan = plan_of(robot)
     memory = create_memory(plan)
-    Heartbeat(memory.heartbeat).enter(phase)
+    Heartbeat(memory.heartbeat).enter_phase(phase)
     limp: list[str] = []
     monkeypatch.setattr(SafeStop, "limp", lambda safe_stop, ports, how, text: limp.append(how) or [how])
     monkeypatch.setattr(SafeStop, "stand", lambda safe_stop, ports: ())
-    said = SafeStop(guardian_job(plan, {}, memory, take_over=False)).end((), "it died", texts.loop_failed)
+    said = SafeStop(guardian_job(plan, {}, memory, take_over=False)).apply_final_state(
+        (), "it died", texts.loop_failed
+    )
     assert bool(limp) is not holds
     assert ("torque stays on" in " ".join(said)) is holds
 
@@ -152,11 +154,11 @@ def safe_stop(tmp_path, monkeypatch):
     hardware.start()
     robot.record.goals.velocity[0] = 2.0
     for _ in range(3):
-        hardware.read()
-        hardware.write()
+        hardware.read_states()
+        hardware.write_goals()
         hardware.idle(robot.clock.wait_until(robot.clock.now_ns() + 20_000_000))
     memory = create_memory(robot.plan)
-    Heartbeat(memory.heartbeat).enter(Phase.RUNNING)
+    Heartbeat(memory.heartbeat).enter_phase(Phase.RUNNING)
     safe_stop = SafeStop(guardian_job(robot.plan, {}, memory, take_over=False))
     safe_stop._clock = robot.clock  # type: ignore[assignment]  # the time of the simulated servos
     packets = PacketBatch(Handover(lambda kind, payload: None))
@@ -167,7 +169,7 @@ def safe_stop(tmp_path, monkeypatch):
 
 def records(ring: int, kind: RecordKind) -> list[bytes]:
     """The payloads of a kind in a ring."""
-    found = iter(RingReader(ring).read, None)
+    found = iter(RingReader(ring).read_record, None)
     return [one.payload for one in found if isinstance(one, Record) and one.kind == kind]
 
 
@@ -175,7 +177,7 @@ def test_a_guardian_that_leaves_torque_on_stops_what_is_led_by_a_velocity(safe_s
     robot, safe_stop, _ = safe_stop
     wheel = robot.buses[0].servo(1)
     assert wheel.registers["goal_velocity"] > 0
-    said = safe_stop.end((), "it died", texts.loop_failed)
+    said = safe_stop.apply_final_state((), "it died", texts.loop_failed)
     assert said == ["it died", TORQUE_STAYS, "left (ID 1 on bus main) stands: its goal is 0"]
     assert wheel.registers["goal_velocity"] == 0
     assert [servo.torque_on for servo in robot.buses[0].servos] == [True, True]

@@ -5,8 +5,8 @@ from __future__ import annotations
 import msgspec
 import pytest
 
-from dxlrun.channels.answers import Code, Done, Refusal
-from dxlrun.channels.commands import LOOP, Command
+from dxlrun.channels.answers import Code, Completion, Refusal
+from dxlrun.channels.commands import LOOP, CommandMessage
 from dxlrun.testing import simulated_robot
 
 ROBOT = """\
@@ -28,12 +28,12 @@ def test_the_slowest_bus_bounds_the_rate(tmp_path, share, refused):
     robot = simulated_robot(path, duration_s=0.2)
     highest = min(bus.budget.highest_rate_hz for bus in robot.plan.buses)
     request = msgspec.json.encode({"rate": share * highest})
-    robot.inbox.waiting.append(Command(1, LOOP, "rate", request, "anna", 0))
+    robot.inbox.waiting.append(CommandMessage(1, LOOP, "rate", request, "anna", 0))
     result = robot.run()
     answer = robot.inbox.answers[1]
     if refused:
         assert answer == Refusal(Code.RATE_OVER_BUSES, {"highest": pytest.approx(highest)})
     else:
-        assert isinstance(answer, Done)
+        assert isinstance(answer, Completion)
     assert result.skipped == 0
     assert (result.cycles > 11) == (not refused)

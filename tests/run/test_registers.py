@@ -1,6 +1,6 @@
 """Declared registers in a whole run on virtual time: written at the start, told in the log, and there."""
 
-from dxlrun.log.reader import read_log
+from dxlrun.log.log_reader import read_log
 from dxlrun.testing import simulated_robot
 
 ROBOT = """\

@@ -14,7 +14,7 @@ from typing import Any
 
 from tests.kit.totals import totals_of
 
-from dxlrun.channels.events import EventCode
+from dxlrun.channels.event_records import EventCode
 
 ROBOTS = Path(__file__).parents[2] / "robots"
 Running = Any

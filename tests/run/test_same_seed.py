@@ -9,7 +9,7 @@ from msgspec.structs import replace
 from tests.kit.judges import log_has_every_byte
 
 from dxlrun.log.ledger_file import open_ledger
-from dxlrun.log.reader import read_log
+from dxlrun.log.log_reader import read_log
 from dxlrun.plan.robot_plan import Plan
 from dxlrun.run.virtual_run import VirtualRobot
 from dxlrun.testing import plan_of

@@ -24,12 +24,12 @@ import numpy as np
 import pytest
 
 from dxlrun.channels import slot
+from dxlrun.channels.child_processes import RunMemory
 from dxlrun.channels.cycle import CycleRecord
-from dxlrun.channels.process import RunMemory
 from dxlrun.channels.shared_memory import mapped
 from dxlrun.channels.slot import SlotReader, SlotState
-from dxlrun.control.controllers.plugins import load_plugins
-from dxlrun.control.source_process import PlannedProcess, ReaderContext, SourceContext, planned_processes
+from dxlrun.control.controllers.plugin_loading import load_plugins
+from dxlrun.control.sampled_sources import PlannedProcess, ReaderContext, SourceContext, planned_processes
 from dxlrun.errors import PortError
 from dxlrun.features.sensors.events import SensorEvent
 from dxlrun.features.sensors.reader import Readings
@@ -123,7 +123,7 @@ def test_a_sensor_that_dies_sends_nan_or_stops_and_comes_back(tmp_path, unit, mo
     memory, record, events = create_memory(plan), CycleRecord(plan.loop.layout), []
 
     class Sink:
-        def emit(self, source, event):
+        def emit_event(self, source, event):
             events.append(event.text.removeprefix("sensor imu").lstrip(": "))
 
     slots = [mapped(descriptor) for descriptor in memory.slots["sensors"]]
@@ -135,8 +135,8 @@ def test_a_sensor_that_dies_sends_nan_or_stops_and_comes_back(tmp_path, unit, mo
     def read_until(valid, *, value=0.25):
         give_up = time.monotonic() + 60
         while True:
-            sensor.look()
-            readings.read()
+            sensor.supervise_process()
+            readings.read_sources()
             assert time.monotonic() < give_up, events
             time.sleep(0.01)
             if record.sources.valid[0] == valid and record.sources.values[0] == value:
@@ -162,7 +162,7 @@ def test_a_sensor_that_dies_sends_nan_or_stops_and_comes_back(tmp_path, unit, mo
         began = time.monotonic()
         process = sensor.child.process
     finally:
-        sensor.end()
+        sensor.end_process()
     assert process.returncode == 0  # it closed its device in time
     assert time.monotonic() - began < source_process.END_S
     assert events[:5] == [
@@ -341,10 +341,10 @@ def test_a_sensor_that_spoils_its_memory_costs_only_itself_and_its_children_end(
         os.kill(child.process.pid, signal.SIGKILL)
         while sensor.child is not None:
             assert time.monotonic() < until
-            sensor.look()
-        assert (reader.state, reader.hear()[:17]) == (SlotState.ENDED, "its process ended")
+            sensor.supervise_process()
+        assert (reader.state, reader.read_text()[:17]) == (SlotState.ENDED, "its process ended")
     else:
-        sensor.end()
+        sensor.end_process()
     assert select.select([pidfd], [], [], 20)[0]
     os.close(pidfd)
 
@@ -361,7 +361,7 @@ def test_a_time_in_the_future_is_reported(tmp_path, monkeypatch):
     sampled.open_first()
     for _ in range(2):
         assert sampled.sample()
-    assert (reader.read() or 1 << 62) <= time.monotonic_ns()
+    assert (reader.read_sample() or 1 << 62) <= time.monotonic_ns()
     assert re.fullmatch(
-        r"its times are [45]\d\d\d ms in the future: times of arrival are used", reader.hear()
+        r"its times are [45]\d\d\d ms in the future: times of arrival are used", reader.read_text()
     )

@@ -10,7 +10,7 @@ from tests.kit.line_faults import other_host
 
 from dxlrun.cli import main
 from dxlrun.cli.sim import sim
-from dxlrun.run.simulation_front import Served
+from dxlrun.run.simulation_front import SimulationResult
 from dxlrun.testing import simulated_robot
 from dxlsim.messages import SimulationMessage
 from dxlsim.simulation_plan import SimulationConfig
@@ -169,11 +169,11 @@ def test_an_imu_on_a_link_feels_how_the_link_is_and_turns(tmp_path):
     seen: list[tuple[float, float, float, float]] = []
 
     def look():
-        bus.advance(bus.now_ns)
+        bus.advance_to(bus.now_ns)
         imu = bus.device(241)
         imu.world.update()
         servo = bus.servo(1)
-        seen.append((servo.position - math.pi, servo.velocity, *imu.world.linear_acceleration[::2]))
+        seen.append((servo.shaft_angle - math.pi, servo.velocity, *imu.world.linear_acceleration[::2]))
         assert imu.world.angular_velocity == pytest.approx((0, servo.velocity, 0), abs=1e-9)
         assert imu.world.orientation[1] == pytest.approx(math.sin(seen[-1][0] / 2), abs=1e-9)
 
@@ -193,7 +193,9 @@ def test_dxlrun_sim_has_the_bodies_that_its_devices_are_on(tmp_path, monkeypatch
     (tmp_path / "nodding.yaml").write_text(ON_A_LINK)
     served: list[SimulationConfig] = []
     monkeypatch.setattr(
-        sim, "_serve", lambda job, *_, **__: served.append(job.config) or Served(1.0, SimulationMessage(), ())
+        sim,
+        "_serve",
+        lambda job, *_, **__: served.append(job.config) or SimulationResult(1.0, SimulationMessage(), ()),
     )
     assert main(["sim", str(tmp_path / "nodding.yaml")]) == 0
     assert served[0].sensed is not None

@@ -6,7 +6,7 @@ from pathlib import Path
 import pytest
 from msgspec.structs import replace
 
-from dxlrun.channels.process import spare_core
+from dxlrun.channels.child_processes import spare_core
 from dxlrun.run.loop_process import beside_simulation
 from dxlrun.testing import plan_of
 

@@ -11,7 +11,7 @@ from typing import Any
 
 import pytest
 
-from dxlrun.channels.events import EventCode, Severity
+from dxlrun.channels.event_records import EventCode, Severity
 
 Start = Callable[..., Any]
 WITH_WATCHDOG = """\

@@ -29,10 +29,10 @@ from tests.kit.line_faults import turn_by_hand
 from tests.kit.stories import replayed
 
 from dxlrun.channels.answers import Refusal
-from dxlrun.channels.commands import LOOP, Command
+from dxlrun.channels.commands import LOOP, CommandMessage
 from dxlrun.channels.cycle import Torque
-from dxlrun.channels.events import EventCode
-from dxlrun.control.controllers.plugins import load_plugins
+from dxlrun.channels.event_records import EventCode
+from dxlrun.control.controllers.plugin_loading import load_plugins
 from dxlrun.plan.policy_plan import SLOW_SPEED
 from dxlrun.remote.preparation import Preparation
 from dxlrun.testing import Log, VirtualRobot, read_log, simulated_robot
@@ -244,7 +244,7 @@ class Story:
     def ask(self, kind: str, **data: object) -> int:
         number = next(self.numbers)
         encoded = msgspec.json.encode(data) if data else b""
-        self.robot.inbox.waiting.append(Command(number, LOOP, kind, encoded, "anna"))
+        self.robot.inbox.waiting.append(CommandMessage(number, LOOP, kind, encoded, "anna"))
         return number
 
     def command(self, other: bool = False) -> None:
@@ -266,7 +266,7 @@ class Story:
             self.plans[controller], kind, json.dumps(data).encode(), units=False
         )
         number = next(self.numbers)
-        self.robot.inbox.waiting.append(Command(number, controller, kind, prepared.data, "anna"))
+        self.robot.inbox.waiting.append(CommandMessage(number, controller, kind, prepared.data, "anna"))
 
     def turn_leader(self, one: Steered, angle: float) -> None:
         (name,) = self.shafts[one.leader]

@@ -28,7 +28,7 @@ from typing import Any
 import pytest
 from tests.kit.answers import result_of
 
-from dxlrun.channels.events import EventCode
+from dxlrun.channels.event_records import EventCode
 from dxlsim.bus.ledger import LedgerEntry, read_ledger
 from dxlwire.packets import PacketKind
 

@@ -7,7 +7,7 @@ from pathlib import Path
 
 import pytest
 
-from dxlrun.log.reader import read_log
+from dxlrun.log.log_reader import read_log
 from dxlrun.testing import simulated_robot
 
 ROBOT = """name: wheel
@@ -32,9 +32,9 @@ def test_motion_is_reached_only_when_its_joint_is_at_rest(tmp_path: Path, last: 
     motion.write_text(MOTION.format(last=last))
     run = simulated_robot(robot, play=[motion], log=log)
     before: list[float] = []
-    run.clock.call_at(1_600_000_000, lambda: before.append(run.buses[0].servo(1).position))
+    run.clock.call_at(1_600_000_000, lambda: before.append(run.buses[0].servo(1).shaft_angle))
     after: list[float] = []
-    run.clock.call_at(1_800_000_000, lambda: after.append(run.buses[0].servo(1).position))
+    run.clock.call_at(1_800_000_000, lambda: after.append(run.buses[0].servo(1).shaft_angle))
 
     run.run()
 

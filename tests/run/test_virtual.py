@@ -10,13 +10,13 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from dxlrun.channels.commands import Command
-from dxlrun.channels.events import EventCode
+from dxlrun.channels.commands import CommandMessage
+from dxlrun.channels.event_records import EventCode
 from dxlrun.errors import InputError
-from dxlrun.log.reader import read_log
+from dxlrun.log.log_reader import read_log
 from dxlrun.run.virtual_run import VirtualRobot
 from dxlrun.testing import plan_of, simulated_robot
-from dxlrun_analysis.joints.tracking import tracking
+from dxlrun_analysis.joints.goal_tracking import tracking
 from dxlwire.packets import PacketKind
 
 ROBOTS = Path(__file__).parents[2] / "robots"
@@ -149,7 +149,7 @@ def test_the_command_line_runs_on_virtual_time(tmp_path):
 def test_set_points_beyond_the_limits_are_clamped_and_the_log_counts_the_cycles(tmp_path):
     robot = simulated_robot(TORSO, duration_s=2.5, log=tmp_path / "run.mcap")
     data = np.array([0.1, np.radians(9999), 1.0, 1e300]).tobytes()  # head_pitch_joint, head_yaw_joint
-    streamed = Command(1, "head", "posvel", data, "anna", lease_ns=10_000_000_000)
+    streamed = CommandMessage(1, "head", "posvel", data, "anna", lease_ns=10_000_000_000)
     begun_ns = 2_000_000_000  # the first second is slow
     robot.buses[0].at(begun_ns, lambda: robot.inbox.waiting.append(streamed))
     assert robot.run().reason == "ended"

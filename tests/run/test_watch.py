@@ -16,40 +16,40 @@ import pytest
 from msgspec.json import Decoder
 from rich.console import Console
 
-from dxlrun.channels import heartbeat, process
+from dxlrun.channels import child_processes, heartbeat
+from dxlrun.channels.child_processes import Cut, LineLost, Stop
 from dxlrun.channels.cycle import Commands, States
-from dxlrun.channels.events import Event, EventBody, EventCode, EventRing, Severity, Waited
+from dxlrun.channels.event_records import Event, EventBody, EventCode, EventRing, Severity, SimulationStall
 from dxlrun.channels.heartbeat import ControllerMethod, Heartbeat, Phase, ProcessorTime, Standstill
-from dxlrun.channels.process import Cut, LineLost, Stop
 from dxlrun.channels.ring import Handover
-from dxlrun.compile.robot import compile_robot
+from dxlrun.compile.robot_compiler import compile_robot
 from dxlrun.compile.simulation import simulation_of
 from dxlrun.control.context import StopFlag
 from dxlrun.description.reading import read_robot
-from dxlrun.dynamixel.hardware import DynamixelHardware, ServoArrays
+from dxlrun.dynamixel.dynamixel_hardware import DynamixelHardware, ServoArrays
 from dxlrun.process_table import read_stat
-from dxlrun.run import supervisor, watch
+from dxlrun.run import process_watch, supervisor
 from dxlrun.run.guardian import LONGEST_LOOK_NS, Ended, Guardian, GuardianMessage
-from dxlrun.run.loop_process import AskedToStop, Pulse, StallReport
-from dxlrun.run.run_processes import create_memory, guardian_job
-from dxlrun.run.run_summary import RunOptions
-from dxlrun.run.watch import (
+from dxlrun.run.loop_process import Pulse, StallReport, StopRequest
+from dxlrun.run.process_watch import (
     HALTED_NS,
     LEAST_TIMEOUT_NS,
     Duty,
     LoopWatch,
     SignsOfLife,
-    Watched,
+    WatchedProcess,
     duty_of,
     standstill_timeout_ns,
 )
+from dxlrun.run.run_processes import create_memory, guardian_job
+from dxlrun.run.run_summary import RunOptions
 from dxlrun.testing import plan_of
 from dxlsim.bus.ledger import Ledger
 from dxlsim.bus.simulated_bus import SimulatedBus
 from dxlsim.virtual_ports import VirtualPorts
 from dxlwire.clock import VirtualClock
-from dxlwire.exchange import bus
-from dxlwire.exchange.bus import Lines
+from dxlwire.exchange import bus_engine
+from dxlwire.exchange.bus_engine import Lines
 from dxlwire.packets import PacketLog
 from dxlwire.port.ports import StallCounter
 from dxlwire.port.reopening import KeptLines
@@ -119,9 +119,9 @@ def processor(tmp_path):
 
 
 def test_a_loop_that_got_no_processor_is_told_from_one_that_hangs(processor):
-    processor(100, "R").look(0)
-    processor(110, "R").look(10 * MS)
-    processor(113, "R").look(20 * MS)
+    processor(100, "R").note_standstill(0)
+    processor(110, "R").note_standstill(10 * MS)
+    processor(113, "R").note_standstill(20 * MS)
     assert processor(113, "R").starved_ns(80 * MS) == 3 * MS
     assert processor(149, "R").starved_ns(80 * MS) == 39 * MS
     assert processor(150, "R").starved_ns(80 * MS) is None  # it computes and computes
@@ -130,16 +130,16 @@ def test_a_loop_that_got_no_processor_is_told_from_one_that_hangs(processor):
 
 
 def test_each_standstill_counts_from_its_own_begin(processor):
-    processor(100, "R").look(10 * MS)
-    processor(200, "R").look(0)
+    processor(100, "R").note_standstill(10 * MS)
+    processor(200, "R").note_standstill(0)
     assert processor(200, "R").starved_ns(0) is None
-    processor(300, "R").look(10 * MS)
+    processor(300, "R").note_standstill(10 * MS)
     assert processor(301, "R").starved_ns(80 * MS) == MS
 
 
 def test_a_kernel_that_does_not_say_gives_no_reason(tmp_path):
     none = ProcessorTime(tmp_path)
-    none.look(10 * MS)
+    none.note_standstill(10 * MS)
     assert none.starved_ns(80 * MS) is None
 
 
@@ -147,7 +147,7 @@ def test_a_kernel_that_does_not_say_gives_no_reason(tmp_path):
 def test_the_guardian_says_that_other_programs_kept_the_loop_from_running(watcher, processor, priority, fix):
     made, _, page = watcher
     made._job = replace(made._job, plan=replace(made._job.plan, priority=priority))
-    page.enter(Phase.RUNNING)
+    page.enter_phase(Phase.RUNNING)
     page.cycle(1, 0)
     page.beat()
     found = []
@@ -181,7 +181,7 @@ def test_standstill_timeout(phase, rate, patience):
 def test_the_first_cycle_may_take_longer_never_less(watcher, period_ms, first, later):
     made, _, page = watcher
     page.may_take(period_ms * MS)
-    page.enter(Phase.RUNNING)
+    page.enter_phase(Phase.RUNNING)
     assert made._timeout_ns() == first * MS
     page.cycle(1, 0)
     assert made._timeout_ns() == later * MS
@@ -212,15 +212,15 @@ def test_a_loop_that_never_gets_on_is_ended(  # noqa: PLR0917  fixtures
     how: str,
 ) -> None:
     """Such as one whose plug-in waits for a server in on_configure, or for a child process at the end."""
-    monkeypatch.setattr(watch, patience, 100 * MS)
+    monkeypatch.setattr(process_watch, patience, 100 * MS)
     plan = plan_of(tmp_path / "pair.yaml")
     memory = create_memory(plan)
     page = Heartbeat(memory.heartbeat)
     page.name_controller(1, "arm")
-    page.enter(phase)
+    page.enter_phase(phase)
     page.call(1, called)
-    control, terminal = process.message_channel(Decoder(Stop | Cut))
-    line, loops_end = process.message_channel(Decoder(LineLost))
+    control, terminal = child_processes.message_channel(Decoder(Stop | Cut))
+    line, loops_end = child_processes.message_channel(Decoder(LineLost))
     watcher = Guardian(guardian_job(plan, {}, memory, take_over=False), control)
     with terminal, loops_end, subprocess.Popen(["/bin/sleep", "60"]) as loop:
         ended = watcher._watch(loop, KeptLines(()), line)
@@ -253,10 +253,10 @@ def test_only_a_set_up_is_given_up_and_only_once(page):
     stop = StopFlag(requested=True)
     beat = Pulse(page, stop, Unwatched(), no_events(), no_stalls(), lambda: 0).beat
     for phase in (Phase.LOADING, Phase.RUNNING, Phase.STOPPING):
-        page.enter(phase)
+        page.enter_phase(phase)
         beat()
-    page.enter(Phase.SETUP)
-    with pytest.raises(AskedToStop):
+    page.enter_phase(Phase.SETUP)
+    with pytest.raises(StopRequest):
         beat()
     beat()  # torque off goes on beating
     assert page.phase is Phase.STOPPING
@@ -265,7 +265,7 @@ def test_only_a_set_up_is_given_up_and_only_once(page):
 
 def test_a_stop_anywhere_in_the_set_up_leaves_no_servo_with_torque(start, tmp_path, monkeypatch):
     """Ask to stop at the first transaction, at the second ...: until one set-up is through without us."""
-    monkeypatch.setattr(bus, "BEAT_NS", 0)
+    monkeypatch.setattr(bus_engine, "BEAT_NS", 0)
     given = []
     while (found := set_up(tmp_path, len(given) + 1)) is not None:
         given.append(found)
@@ -296,23 +296,23 @@ def set_up(tmp_path: Path, transactions: int) -> bool | None:
     packets = PacketLog()
     lines = Lines(plan.buses, VirtualPorts(clock, buses), clock, packets, beat)
     hardware = DynamixelHardware(lines, packets, ServoArrays(States.empty(2), Commands.empty(2)), events)
-    page.enter(Phase.SETUP)
+    page.enter_phase(Phase.SETUP)
     try:
-        hardware.start(lambda: page.enter(Phase.ENGAGING))
-    except AskedToStop:
+        hardware.start(lambda: page.enter_phase(Phase.ENGAGING))
+    except StopRequest:
         assert [servo.torque_on for servo in buses[0].servos] == [False, False]
         return any(bytes((24, 1)) in entry.data for entry in ledger.entries if entry.direction == "in")
     return None
 
 
 def test_a_channel_whose_other_end_is_gone_still_gives_its_last_messages():
-    ours, theirs = process.message_channel(Decoder(GuardianMessage))
+    ours, theirs = child_processes.message_channel(Decoder(GuardianMessage))
     theirs.sendall(b'{"type": "Ended", "ending": "done"}\n')
     theirs.close()
-    ours.send(Stop())
+    ours.send_message(Stop())
     assert not ours.closed
-    assert ours.receive() == [Ended("done")]
-    assert ours.receive() == []
+    assert ours.receive_messages() == [Ended("done")]
+    assert ours.receive_messages() == []
     assert ours.closed
     ours.close()
 
@@ -323,8 +323,8 @@ def test_a_channel_whose_other_end_is_gone_still_gives_its_last_messages():
 def reason_to_kill(made: Guardian, processor: ProcessorTime | None = None) -> str | None:
     """Let a guardian look once, as its loop does."""
     processor = processor or ProcessorTime(Path("none"))
-    reason = made._reason_to_kill(duty_of(Watched.GUARDIAN, made._silent()))
-    processor.look(made._loop_signs.still_ns)
+    reason = made._reason_to_kill(duty_of(WatchedProcess.GUARDIAN, made._silent()))
+    processor.note_standstill(made._loop_signs.still_ns)
     if reason and not made._killed:
         made._note_standstill(reason, processor)
         made._killed = reason
@@ -336,7 +336,7 @@ def watcher(start, tmp_path):
     """A guardian of the robot `pair` on virtual time, the terminal's end of its line, and the loop's page."""
     plan = compile_robot(read_robot(tmp_path / "pair.yaml", {}), [], None).plan
     memory = create_memory(plan)
-    control, terminal = process.message_channel(Decoder(Stop | Cut))
+    control, terminal = child_processes.message_channel(Decoder(Stop | Cut))
     made = Guardian(guardian_job(plan, {}, memory, take_over=False), control)
     made._clock = VirtualClock(0)  # type: ignore[assignment]  # so that the test says how time passes
     made._loop_signs = SignsOfLife(os.getpid(), LONGEST_LOOK_NS, 0)
@@ -364,7 +364,7 @@ def watcher(start, tmp_path):
 )
 def test_a_loop_is_done_only_when_it_reports_it_and_ends_well(watcher, phase, code, killed, ending):
     made, _, page = watcher
-    page.enter(phase)
+    page.enter_phase(phase)
     made._killed = killed
     assert made._ending(code) == ending
 
@@ -375,7 +375,7 @@ def test_the_guardian_runs_one_priority_above_the_loop(watcher):
 
 def test_a_loop_that_was_asked_to_stop_while_it_loads_is_done(watcher):
     made, _, page = watcher
-    page.enter(Phase.LOADING)
+    page.enter_phase(Phase.LOADING)
     made._stop_by_ns = 5
     assert made._ending(-15) == "done"
 
@@ -396,12 +396,12 @@ def test_what_the_terminal_asks_for(watcher, said, wish):
     else:
         terminal.sendall(said)
     assert made._request() == wish
-    assert made._silent() == ({Watched.SUPERVISOR} if said is None else set())
+    assert made._silent() == ({WatchedProcess.SUPERVISOR} if said is None else set())
 
 
 def test_a_loop_that_stands_still_hangs_and_one_that_does_not_stop_is_late(watcher):
     made, _, page = watcher
-    page.enter(Phase.RUNNING)
+    page.enter_phase(Phase.RUNNING)
     page.cycle(1, 0)
     told = []
     for at_ms in range(0, 130, 10):
@@ -423,17 +423,21 @@ def test_a_loop_that_stands_still_hangs_and_one_that_does_not_stop_is_late(watch
 OTHERS = {
     which: tuple(
         frozenset(
-            other for at, other in enumerate(one for one in Watched if one is not which) if bits >> at & 1
+            other
+            for at, other in enumerate(one for one in WatchedProcess if one is not which)
+            if bits >> at & 1
         )
         for bits in range(4)
     )
-    for which in Watched
+    for which in WatchedProcess
 }
 
 
 def test_exactly_one_process_acts_whichever_are_silent():
     for silent in {silent for sets in OTHERS.values() for silent in sets}:
-        acting = [one for one in Watched if one not in silent and duty_of(one, silent) is not Duty.NONE]
+        acting = [
+            one for one in WatchedProcess if one not in silent and duty_of(one, silent) is not Duty.NONE
+        ]
         assert len(acting) == bool(silent), silent
 
 
@@ -450,7 +454,7 @@ def test_exactly_one_process_acts_whichever_are_silent():
     ],
 )
 def test_duty_of_each_survivor(watcher, silent, duty):
-    assert duty_of(Watched(watcher), {Watched(one) for one in silent}) is duty
+    assert duty_of(WatchedProcess(watcher), {WatchedProcess(one) for one in silent}) is duty
 
 
 @pytest.fixture
@@ -471,10 +475,10 @@ def test_a_process_that_is_stopped_or_dead_is_silent_soon(watched, state):
     watched(state)
     silent = []
     for at_ms in range(0, 400, 50):
-        signs.look("same", at_ms * MS)
+        signs.record_beat("same", at_ms * MS)
         silent.append(signs.is_silent(5000 * MS))
     assert silent == [at_ms * MS > HALTED_NS for at_ms in range(0, 400, 50)]
-    signs.look("beat", 400 * MS)
+    signs.record_beat("beat", 400 * MS)
     assert not signs.is_silent(5000 * MS)
 
 
@@ -483,7 +487,7 @@ def test_a_starved_process_is_not_silent_before_its_timeout(watched, state):
     signs = SignsOfLife(7, 100 * MS, 0, watched(state))
     silent = []
     for at_ms in range(0, 5200, 100):
-        signs.look("same", at_ms * MS)
+        signs.record_beat("same", at_ms * MS)
         silent.append(signs.is_silent(5000 * MS))
     assert silent == [False] * 51 + [True]
 
@@ -492,7 +496,7 @@ def test_a_process_id_of_another_process_is_of_a_dead_one(watched):
     signs = SignsOfLife(7, 1000 * MS, 0, watched("S", start_ticks=5))
     watched("S", start_ticks=6)
     for at_ms in (0, 300):
-        signs.look("same", at_ms * MS)
+        signs.record_beat("same", at_ms * MS)
     assert signs.is_silent(5000 * MS)
 
 
@@ -503,9 +507,9 @@ def test_an_unreadable_entry_is_not_a_dead_process(watched):
     entry.unlink()
     entry.mkdir()  # EISDIR
     for at_ms in range(0, 5001, 500):
-        signs.look("same", at_ms * MS)
+        signs.record_beat("same", at_ms * MS)
         assert not signs.is_silent(5000 * MS)
-    signs.look("same", 5500 * MS)
+    signs.record_beat("same", 5500 * MS)
     assert signs.is_silent(5000 * MS)
 
 
@@ -513,20 +517,20 @@ def test_a_process_without_an_entry_is_silent_soon(watched):
     signs = SignsOfLife(7, 1000 * MS, 0, watched("S"))
     (watched("S") / "7/stat").unlink()
     for at_ms in (0, 300):
-        signs.look("same", at_ms * MS)
+        signs.record_beat("same", at_ms * MS)
     assert signs.is_silent(5000 * MS)
 
 
 def test_a_process_whose_time_of_start_is_unknown_is_silent_after_its_timeout(tmp_path):
     signs = SignsOfLife(7, 1000 * MS, 0, tmp_path)
     for at_ms in (0, 1000, 2000):
-        signs.look("same", at_ms * MS)
+        signs.record_beat("same", at_ms * MS)
     assert not signs.is_silent(5000 * MS)
 
 
 def test_a_loop_that_nobody_looks_at_reads_the_process_table_ten_times_a_second(page, monkeypatch):
     read = []
-    monkeypatch.setattr(watch, "read_stat", lambda folder: read.append(folder) or read_stat(folder))
+    monkeypatch.setattr(process_watch, "read_stat", lambda folder: read.append(folder) or read_stat(folder))
     loop_watch = LoopWatch(page, os.getpid(), os.getpid(), MS, 0)
     read.clear()
     for at_ms in range(1250):
@@ -557,7 +561,7 @@ def test_a_loop_ends_by_itself_only_when_neither_of_the_others_responds(page, be
             if beating == "supervisor":
                 page.supervisor_look()
             elif beating == "guardian":
-                page.look()
+                page.mark_guardian_alive()
             duties.append(loop_watch.duty(at_ms * MS))
     ended = [duty is Duty.END for duty in duties]
     assert ended == [beating == "neither" and at_ms * MS > HALTED_NS for at_ms in range(0, 500, 20)]
@@ -576,7 +580,7 @@ def test_a_loop_that_nobody_watches_asks_itself_to_stop_and_reports_why(page):
         loop_watch = LoopWatch(page, supervisor, guardian, 20 * MS, 0)
         clock = VirtualClock(0)
         beat = Pulse(page, stop, loop_watch, events, no_stalls(), clock.now_ns).beat
-        page.enter(Phase.RUNNING)
+        page.enter_phase(Phase.RUNNING)
         while not stop.requested:
             clock.wait_until(clock.now_ns() + 20 * MS)
             beat()
@@ -588,7 +592,7 @@ def test_a_loop_that_nobody_watches_asks_itself_to_stop_and_reports_why(page):
 
 def test_a_guardian_stops_the_loop_in_order_when_its_supervisor_was_stopped(watcher):
     made, _, page = watcher
-    page.enter(Phase.RUNNING)
+    page.enter_phase(Phase.RUNNING)
     page.cycle(1, 0)
     with Stopped() as supervisor:
         made._supervisor_signs = SignsOfLife(supervisor, LONGEST_LOOK_NS, 0)
@@ -596,7 +600,7 @@ def test_a_guardian_stops_the_loop_in_order_when_its_supervisor_was_stopped(watc
         for at_ms in range(0, 300, 10):
             made._clock.wait_until(at_ms * MS)
             page.beat()
-            found.append(duty_of(Watched.GUARDIAN, made._silent()) is Duty.STOP_LOOP)
+            found.append(duty_of(WatchedProcess.GUARDIAN, made._silent()) is Duty.STOP_LOOP)
     assert found == [at_ms * MS > HALTED_NS for at_ms in range(0, 300, 10)]
 
 
@@ -605,11 +609,11 @@ class HangingGuardian:
 
     def __init__(self, pid: int) -> None:
         self.process = SimpleNamespace(pid=pid)
-        self.channel, self.theirs = process.message_channel(Decoder(GuardianMessage))
+        self.channel, self.theirs = child_processes.message_channel(Decoder(GuardianMessage))
         self.now_ns = 0
         self.killed_ns = 0
 
-    def poll(self, timeout_s: float, *_: int) -> None:
+    def poll_message(self, timeout_s: float, *_: int) -> None:
         self.now_ns += round(timeout_s * 1e9)
 
     def kill(self) -> None:
@@ -630,12 +634,12 @@ def test_a_supervisor_waits_for_a_guardian_only_shortly_once_torque_is_to_be_cut
 ):
     plan = plan_of(tmp_path / "pair.yaml")
     memory = create_memory(plan)
-    Heartbeat(memory.heartbeat).enter(phase)
+    Heartbeat(memory.heartbeat).enter_phase(phase)
     run = supervisor._Run(plan, RunOptions(gateway=False), memory, Console(file=io.StringIO()))
     run.signals = signals
     guardian = HangingGuardian(os.getpid())
     monkeypatch.setattr(supervisor, "time", SimpleNamespace(monotonic_ns=lambda: guardian.now_ns))
-    run.watch(guardian, lambda heartbeat: None)  # type: ignore[arg-type]  # what stands for the guardian
+    run.watch_guardian(guardian, lambda heartbeat: None)  # type: ignore[arg-type]  # what stands for the guardian
     assert least_s < guardian.killed_ns * 1e-9 <= most_s
     assert run.sentences == ["the guardian stopped watching the loop, and was killed"]
     guardian.channel.close()
@@ -647,7 +651,7 @@ def test_waits_for_simulated_servos_are_reported_once_a_second() -> None:
     clock = VirtualClock(10**10)
 
     class Sink:
-        def emit(self, source: str, event: EventBody, data: bytes = b"") -> None:
+        def emit_event(self, source: str, event: EventBody, data: bytes = b"") -> None:
             reported.append(Event(clock.now_ns(), event.code, event.severity, source, event.text, data))
 
     stalls = StallCounter()
@@ -657,10 +661,10 @@ def test_waits_for_simulated_servos_are_reported_once_a_second() -> None:
         stalls.count(now_ns, now_ns + MS)
         for _look in range(3):
             clock.wait_until(clock.now_ns() + 10 * MS)
-            report.look(clock.now_ns())
-    report.emit()
-    report.emit()  # nothing is left to report
-    waited = [msgspec.json.decode(one.data, type=Waited) for one in reported]
+            report.report_waits(clock.now_ns())
+    report.emit_waits()
+    report.emit_waits()  # nothing is left to report
+    waited = [msgspec.json.decode(one.data, type=SimulationStall) for one in reported]
     assert 89 <= len(reported) <= 92  # in 90 s
     assert {(one.code, one.severity) for one in reported} == {
         (EventCode.SIMULATION_STALLED, Severity.WARNING)

@@ -21,8 +21,8 @@ from tests.kit.line_faults import turn_by_hand
 from tests.run.test_torque_matrix import Steered, steered
 
 from dxlrun import nearest_turn
-from dxlrun.channels.commands import Command
-from dxlrun.control.controllers.plugins import load_plugins
+from dxlrun.channels.commands import CommandMessage
+from dxlrun.control.controllers.plugin_loading import load_plugins
 from dxlrun.remote.preparation import Preparation
 from dxlrun.testing import VirtualRobot, simulated_robot
 
@@ -123,7 +123,7 @@ class Story:
             for kind, data in one.asks:
                 asked = json.dumps(sent_to(data, self.goal)).encode()
                 prepared = self.preparation.command(self.plans[one.top], kind, asked, units=False)
-                command = Command(next(numbers), one.top, kind, prepared.data, "anna")
+                command = CommandMessage(next(numbers), one.top, kind, prepared.data, "anna")
                 self.robot.inbox.waiting.append(command)
 
     def watch(self) -> None:

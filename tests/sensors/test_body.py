@@ -12,7 +12,7 @@ from tests.kit.bodies import Turned, bodies_of
 from dxlrun.channels import slot
 from dxlrun.channels.slot import SlotReader, SlotWriter
 from dxlrun.run.source_process import RemoteBody
-from dxlsim.motion.body import SensedBody, ShaftsShown, SimulatedBody
+from dxlsim.motion.body import SensedBody, ShaftPublisher, SimulatedBody
 from dxlsim.motion.control_law import LIMP
 from dxlsim.motion.link_motion import Shafts
 from dxlsim.motion.mechanics import STEP_NS, Mechanics
@@ -76,7 +76,7 @@ def test_pose_rate_and_acceleration_are_what_mujocos_sensors_measure(urdf):
         data.qvel[:] = generator.uniform(-3, 3, model.nv)
         data.qfrc_applied[:] = generator.uniform(-2, 2, model.nv)
         mujoco.mj_forward(model, data)
-        body.move(Shafts(0, data.qpos.copy(), data.qvel.copy(), data.qacc.copy()))
+        body.set_shafts(Shafts(0, data.qpos.copy(), data.qvel.copy(), data.qacc.copy()))
         for link in links:
             motion = body.motion(link)
             sensed = {kind: data.sensor(f"{kind} {link}").data for kind in kinds}
@@ -100,14 +100,14 @@ def test_gears_references_couplings_and_mimic_joints_move_links():
     coupling = Mechanism(pair, ("slide",), ((0.5, 0.5),), (NO_LOAD,), ("prismatic",))
     geared = SimulatedBody(bodies_of(urdf, (turn, None, None), (coupling,)))
     shafts = [np.array(each) for each in ([1.2, 3.0, -2.0], [1.0, 2.0, 0.5], [0.3, 0.2, 0.1])]
-    geared.move(Shafts(0, *shafts))
+    geared.set_shafts(Shafts(0, *shafts))
     plain = body_of(CRANE, ["turn", "slide", "swing"])
     states = []
     for order, (a, b, c) in enumerate(shafts):
         q = -0.25 * (a - (0.4 if order == 0 else 0.0))
         x = 0.5 * (0.01 * (b - (0.1 if order == 0 else 0.0)) - 0.01 * (c - (0.2 if order == 0 else 0.0)))
         states.append(np.array([q, x, -0.5 * q + (0.2 if order == 0 else 0.0)]))
-    plain.move(Shafts(0, *states))
+    plain.set_shafts(Shafts(0, *states))
     for name in ("position", "orientation", "angular_velocity", "linear_acceleration", "linear_velocity"):
         expected = getattr(plain.motion("tip"), name)
         assert getattr(geared.motion("tip"), name) == pytest.approx(expected, abs=1e-12)
@@ -121,18 +121,18 @@ def test_an_unknown_link_is_a_key_error():
 def test_the_body_in_another_process_moves_as_in_this_one():
     mechanics = Mechanics(0)
     for angle in (0.1, 0.2, -0.3):
-        mechanics.add(ROTOR, NO_LOAD, angle)
+        mechanics.add_servo(ROTOR, NO_LOAD, angle)
     sensed = bodies_of(CRANE, [Turned(name, 0.0, 1.0) for name in ("turn", "slide", "swing")])
     memory = slot.private(9)
-    shown = ShaftsShown(mechanics, SlotWriter(memory))
+    shown = ShaftPublisher(mechanics, SlotWriter(memory))
     remote = RemoteBody(sensed, SlotReader(memory))
     here = SensedBody(sensed, mechanics, lambda: mechanics.grid_ns)
     for index in range(3):
         command = LIMP._replace(limit=1.0, torque_limit=1.0, bias=0.2 * (index + 1))
-        mechanics.command(index, command)
+        mechanics.command_servo(index, command)
     for ms in range(2, 60, 6):
-        mechanics.advance(ms * 1_000_000)
-        shown.show()
+        mechanics.step_to(ms * 1_000_000)
+        shown.write_shafts()
         remote.now_ns = lambda: mechanics.grid_ns
         for name in ("position", "orientation", "linear_velocity", "angular_velocity", "linear_acceleration"):
             expected = getattr(here.motion("tip"), name)
@@ -142,13 +142,13 @@ def test_the_body_in_another_process_moves_as_in_this_one():
 
 def test_accelerations_are_those_of_the_last_step_and_nothing_at_rest():
     mechanics = Mechanics(0)
-    mechanics.add(ROTOR, NO_LOAD, 0.0)
+    mechanics.add_servo(ROTOR, NO_LOAD, 0.0)
     sensed = bodies_of(CRANE, [Turned("turn", 0.0, 1.0)])
     here = SensedBody(sensed, mechanics, lambda: mechanics.grid_ns)
-    mechanics.command(0, LIMP._replace(limit=1.0, torque_limit=1.0, bias=0.5))
+    mechanics.command_servo(0, LIMP._replace(limit=1.0, torque_limit=1.0, bias=0.5))
     before = 0.0
     for step in range(1, 20):
-        mechanics.advance(step * STEP_NS)
+        mechanics.step_to(step * STEP_NS)
         velocity = mechanics.plant.velocity.item(0)
         assert mechanics.acceleration.item(0) == pytest.approx((velocity - before) * 1e9 / STEP_NS)
         before = velocity
@@ -157,8 +157,8 @@ def test_accelerations_are_those_of_the_last_step_and_nothing_at_rest():
     size = 0.2 * math.hypot(mechanics.acceleration.item(0), velocity**2)
     assert np.linalg.norm(motion.linear_acceleration) == pytest.approx(size)
     assert size > 1.0
-    mechanics.place(0, 0.0)
-    mechanics.command(0, LIMP)
-    mechanics.advance(1_000 * STEP_NS)
+    mechanics.move_shaft(0, 0.0)
+    mechanics.command_servo(0, LIMP)
+    mechanics.step_to(1_000 * STEP_NS)
     assert mechanics.still
     assert here.motion("trolley").linear_acceleration.tolist() == [0.0] * 3

@@ -15,7 +15,7 @@ from tests.kit.pages import page_text
 from dxlrun import SensorContext
 from dxlrun.cli import main
 from dxlrun.cli.examples import schema_text
-from dxlrun.control.source_process import REOPEN_NS
+from dxlrun.control.sampled_sources import REOPEN_NS
 from dxlrun.features.sensors.offer import sensor_breach
 from dxlrun.run import source_process, supervisor
 

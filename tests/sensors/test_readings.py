@@ -11,9 +11,9 @@ import pytest
 
 from dxlrun.channels import slot
 from dxlrun.channels.cycle import CycleRecord
-from dxlrun.channels.events import EventBody, Severity
+from dxlrun.channels.event_records import EventBody, Severity
 from dxlrun.channels.slot import SlotState, SlotWriter
-from dxlrun.control.source_process import ReaderContext
+from dxlrun.control.sampled_sources import ReaderContext
 from dxlrun.features.sensors.events import SensorEvent
 from dxlrun.features.sensors.plan import SensorPlan, encode_sensors
 from dxlrun.features.sensors.reader import Readings
@@ -48,18 +48,18 @@ class Desk:
         context = ReaderContext(encode_sensors(sensors), slots, self.record, lambda: self.now_ns, self)
         self.readings = Readings(context)
 
-    def emit(self, source: str, event: EventBody, data: bytes = b"") -> None:
+    def emit_event(self, source: str, event: EventBody, data: bytes = b"") -> None:
         self.events.append((event.code, event.severity, source, event.text))
 
     def cycle(self, ms: int = 20) -> tuple[list[float], bool, int]:
         """Let a cycle read; return values, validity and age of the first sensor."""
         self.now_ns += ms * MS
-        self.readings.read()
+        self.readings.read_sources()
         sources = self.record.sources
         return sources.values[1:3].tolist(), bool(sources.valid[1]), sources.age_ns.item(1)
 
     def sample(self, x: float, y: float = 0.0, *, age_ms: int = 0) -> None:
-        self.writer.write(self.now_ns - age_ms * MS, np.array((x, y)))
+        self.writer.write_sample(self.now_ns - age_ms * MS, np.array((x, y)))
 
     def told(self) -> list[tuple[SensorEvent, str]]:
         found = [(code, text) for code, _, source, text in self.events if source == "imu"]
@@ -180,18 +180,18 @@ def test_a_sample_that_is_not_finite_is_an_event_and_never_in_the_record(desk, w
 def test_the_end_of_its_process_is_an_event_and_its_row_is_not_valid_at_once(desk):
     desk.sample(1.0)
     desk.cycle(1)
-    desk.writer.say(SlotState.ENDED, "its process ended (signal SIGKILL), another one is started")
+    desk.writer.write_state(SlotState.ENDED, "its process ended (signal SIGKILL), another one is started")
     assert desk.cycle(1)[1] is False
     assert desk.events[0][:2] == (SensorEvent.SENSOR, Severity.ERROR)
     assert [code for code, _ in desk.told()] == [SensorEvent.SENSOR, SensorEvent.SENSOR_LOST]
-    desk.writer.say(SlotState.OPEN, "")
+    desk.writer.write_state(SlotState.OPEN, "")
     desk.sample(2.0)
     assert desk.cycle(1)[1] is True
     assert [code for code, _ in desk.told()] == [SensorEvent.SENSOR_BACK]
 
 
 def test_a_sentence_of_a_sensor_is_an_event_once(desk):
-    desk.writer.say(SlotState.OPEN, "calibrated")
+    desk.writer.write_state(SlotState.OPEN, "calibrated")
     desk.cycle(1)
     desk.cycle(1)
     assert desk.told() == [(SensorEvent.SENSOR, "sensor imu: calibrated")]
@@ -200,12 +200,12 @@ def test_a_sentence_of_a_sensor_is_an_event_once(desk):
 def test_a_sensor_that_never_is_silent_fills_no_log(desk):
     for number in range(100):
         desk.sample(1.0)
-        desk.writer.say(SlotState.OPEN, f"sample {number}")
+        desk.writer.write_state(SlotState.OPEN, f"sample {number}")
         desk.cycle(10)
     told = desk.told()
     assert len(told) == 10
     assert told[-1][1] == "sensor imu: sample 90"
-    desk.writer.say(SlotState.FAILED, "gone")  # what matters is not kept back
+    desk.writer.write_state(SlotState.FAILED, "gone")  # what matters is not kept back
     desk.cycle(1)
     assert desk.told()[0] == (SensorEvent.SENSOR, "sensor imu: gone")
 
@@ -223,7 +223,7 @@ def test_reading_allocates_nothing_that_stays(desk):
             desk.sample(1.0)
             desk.cycle(1)
 
-    desk.other.write(desk.now_ns, np.zeros(2))
+    desk.other.write_sample(desk.now_ns, np.zeros(2))
     some(100)
     desk.events.clear()
     tracemalloc.start()

@@ -19,8 +19,8 @@ import pytest
 from dxlrun import SensorContext
 from dxlrun.channels import slot
 from dxlrun.channels.slot import SlotReader, SlotState, SlotWriter
-from dxlrun.control.controllers.plugins import load_plugins
-from dxlrun.control.source_process import SourceContext
+from dxlrun.control.controllers.plugin_loading import load_plugins
+from dxlrun.control.sampled_sources import SourceContext
 from dxlrun.features.sensors.plan import SensorPlan
 from dxlrun.features.sensors.process import build_sampled_sensor
 from dxlrun_controllers.sensors.serial_imu import SerialImu, SerialImuParameters, checked
@@ -174,23 +174,23 @@ def test_pulled_and_plugged_in_again_it_goes_on(device, monkeypatch):
     sampled.open_first()
     device.send(b"\n" + LINE)
     assert sampled.sample()
-    assert (reader.read() is not None, reader.state) == (True, SlotState.OPEN)
+    assert (reader.read_sample() is not None, reader.state) == (True, SlotState.OPEN)
     device.pull()
     assert not sampled.sample()
-    assert (reader.state, sampled.open) == (SlotState.FAILED, False)
-    assert reader.hear() == f"{device.name} is gone"
+    assert (reader.state, sampled.is_open) == (SlotState.FAILED, False)
+    assert reader.read_text() == f"{device.name} is gone"
     ahead_ns += 500_000_000
     assert not sampled.sample()
-    assert reader.hear() == ""  # not asked again yet
+    assert reader.read_text() == ""  # not asked again yet
     ahead_ns += 600_000_000
     assert not sampled.sample()
-    assert f"there is no {device.name}" in reader.hear()
+    assert f"there is no {device.name}" in reader.read_text()
     device.plug()
     ahead_ns += 1_100_000_000
     device.send(b"\n" + LINE)
     sampled.sample()
-    assert (reader.state, reader.hear()) == (SlotState.OPEN, "is open again")
+    assert (reader.state, reader.read_text()) == (SlotState.OPEN, "is open again")
     device.send(b"\n" + LINE)
     assert sampled.sample()
-    assert reader.read() is not None
+    assert reader.read_sample() is not None
     sampled.close()

@@ -25,8 +25,8 @@ writer, values, number = slot.SlotWriter(shared_memory.mapped(int(sys.argv[1])))
 while True:
     number += 1
     values.fill(number)
-    writer.write(number, values)
-    writer.say(slot.SlotState.OPEN, "%d " % number * 20)
+    writer.write_sample(number, values)
+    writer.write_state(slot.SlotState.OPEN, "%d " % number * 20)
 """
 
 
@@ -38,26 +38,26 @@ def ends() -> tuple[SlotWriter, SlotReader]:
 
 def test_the_newest_sample_is_read_once(ends):
     writer, reader = ends
-    assert reader.read() is None
+    assert reader.read_sample() is None
     for number in range(1, 6):
-        writer.write(100 * number, np.full(VALUES, 1.5 * number))
-        assert reader.read() == 100 * number
+        writer.write_sample(100 * number, np.full(VALUES, 1.5 * number))
+        assert reader.read_sample() == 100 * number
         assert reader.sample.tolist() == [1.5 * number] * VALUES
-        assert reader.read() is None
-    writer.write(1, np.zeros(VALUES))
-    writer.write(2, np.ones(VALUES))
-    assert (reader.read(), reader.sample.tolist()) == (2, [1.0] * VALUES)
+        assert reader.read_sample() is None
+    writer.write_sample(1, np.zeros(VALUES))
+    writer.write_sample(2, np.ones(VALUES))
+    assert (reader.read_sample(), reader.sample.tolist()) == (2, [1.0] * VALUES)
 
 
 def test_a_later_writer_goes_on_where_one_was_killed_in_the_middle(ends):
     writer, reader = ends
-    writer.write(1, np.ones(VALUES))
-    reader.read()
+    writer.write_sample(1, np.ones(VALUES))
+    reader.read_sample()
     writer._places[0].fill(7)  # half a sample, not counted yet
-    assert reader.read() is None
+    assert reader.read_sample() is None
     later = SlotWriter(slot_memory(writer))
-    later.write(3, np.full(VALUES, 3.0))
-    assert (reader.read(), reader.sample.tolist()) == (3, [3.0] * VALUES)
+    later.write_sample(3, np.full(VALUES, 3.0))
+    assert (reader.read_sample(), reader.sample.tolist()) == (3, [3.0] * VALUES)
 
 
 def slot_memory(writer: SlotWriter) -> memoryview:
@@ -70,20 +70,20 @@ def slot_memory(writer: SlotWriter) -> memoryview:
 @pytest.mark.parametrize("place", [0, 1, 2, -1], ids=["number", "time", "value", "checksum"])
 def test_a_torn_sample_is_not_used(ends, place):
     writer, reader = ends
-    writer.write(1, np.ones(VALUES))
+    writer.write_sample(1, np.ones(VALUES))
     writer._places[1][place] += np.uint64(1)
-    assert reader.read() is None
-    writer.write(2, np.full(VALUES, 2.0))
-    assert reader.read() == 2
+    assert reader.read_sample() is None
+    writer.write_sample(2, np.full(VALUES, 2.0))
+    assert reader.read_sample() == 2
 
 
 def test_a_torn_sample_is_read_once_it_is_whole(ends):
     writer, reader = ends
-    writer.write(1, np.ones(VALUES))
+    writer.write_sample(1, np.ones(VALUES))
     writer._places[1][-1] ^= np.uint64(1)
-    assert reader.read() is None
+    assert reader.read_sample() is None
     writer._places[1][-1] ^= np.uint64(1)
-    assert (reader.read(), reader.sample.tolist()) == (1, [1.0] * VALUES)
+    assert (reader.read_sample(), reader.sample.tolist()) == (1, [1.0] * VALUES)
 
 
 def test_a_sample_is_whole_before_its_count_and_read_behind_it(ends, monkeypatch):
@@ -95,7 +95,7 @@ def test_a_sample_is_whole_before_its_count_and_read_behind_it(ends, monkeypatch
         words[index] = value
 
     monkeypatch.setattr(slot, "store", stored)
-    writer.write(7, np.full(VALUES, 1.0))
+    writer.write_sample(7, np.full(VALUES, 1.0))
     ((count, sample, _),) = seen
     assert count == 0
     assert sample.tolist() == writer._places[1].tolist()
@@ -106,24 +106,24 @@ def test_a_sample_is_whole_before_its_count_and_read_behind_it(ends, monkeypatch
         return words[index]
 
     monkeypatch.setattr(slot, "load", loaded)
-    assert reader.read() == 7
-    writer.say(SlotState.OPEN, "said")
+    assert reader.read_sample() == 7
+    writer.write_state(SlotState.OPEN, "said")
     number = writer._words[2]
-    writer.say(SlotState.OPEN, "more")
+    writer.write_state(SlotState.OPEN, "more")
     assert (seen[-1][0], seen[-1][2]) == (number, b"more")
 
 
 def test_texts_are_heard_once_and_cut(ends):
     writer, reader = ends
-    assert (reader.hear(), reader.state) == ("", SlotState.STARTING)
-    writer.say(SlotState.FAILED, "cannot be opened")
-    assert (reader.hear(), reader.state) == ("cannot be opened", SlotState.FAILED)
-    assert reader.hear() == ""
-    writer.say(SlotState.OPEN, "é" * 1000)
-    assert len(reader.hear()) <= slot.LONGEST_TEXT
-    writer.say(SlotState.OPEN, "torn")
+    assert (reader.read_text(), reader.state) == ("", SlotState.STARTING)
+    writer.write_state(SlotState.FAILED, "cannot be opened")
+    assert (reader.read_text(), reader.state) == ("cannot be opened", SlotState.FAILED)
+    assert reader.read_text() == ""
+    writer.write_state(SlotState.OPEN, "é" * 1000)
+    assert len(reader.read_text()) <= slot.LONGEST_TEXT
+    writer.write_state(SlotState.OPEN, "torn")
     writer._text[0] = 0
-    assert reader.hear() == ""
+    assert reader.read_text() == ""
 
 
 def test_garbage_is_no_sample_and_ends_no_reader():
@@ -132,12 +132,12 @@ def test_garbage_is_no_sample_and_ends_no_reader():
     reader, chance = SlotReader(memory), random.Random(1)
     for turn in range(300):
         memory[:] = b"\xff" * len(memory) if turn == 0 else chance.randbytes(len(memory))
-        assert (reader.read(), reader.hear(), reader.state) == (None, "", SlotState.FAILED)
+        assert (reader.read_sample(), reader.read_text(), reader.state) == (None, "", SlotState.FAILED)
         writer = SlotWriter(memory)
-        writer.say(SlotState.ENDED, "its process ended")
-        assert (reader.hear(), reader.state) == ("its process ended", SlotState.ENDED)
-        writer.write(turn + 1, np.full(VALUES, 3.0))
-        assert (reader.read(), SlotReader(memory).values) == (turn + 1, VALUES)
+        writer.write_state(SlotState.ENDED, "its process ended")
+        assert (reader.read_text(), reader.state) == ("its process ended", SlotState.ENDED)
+        writer.write_sample(turn + 1, np.full(VALUES, 3.0))
+        assert (reader.read_sample(), SlotReader(memory).values) == (turn + 1, VALUES)
 
 
 def test_the_memory_of_a_sensor_keeps_its_size():
@@ -159,12 +159,12 @@ def test_a_reader_beside_a_writer_that_never_rests_gets_whole_samples_only():
         got, heard, last = 0, 0, 0
         give_up = time.monotonic() + 30
         while (got < 2000 or heard < 100) and time.monotonic() < give_up:
-            t_ns = reader.read()
+            t_ns = reader.read_sample()
             if t_ns is not None:
                 assert reader.sample.tolist() == [t_ns] * VALUES
                 assert t_ns > last
                 got, last = got + 1, t_ns
-            if text := reader.hear():
+            if text := reader.read_text():
                 assert len(set(text.split())) == 1
                 heard += 1
         assert got >= 2000

@@ -9,11 +9,11 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from dxlrun.channels.commands import Command
-from dxlrun.control.source_process import SampledSource
+from dxlrun.channels.commands import CommandMessage
+from dxlrun.control.sampled_sources import SampledSource
 from dxlrun.errors import InputError, PlugInError, PortError
 from dxlrun.features.sensors.events import SensorEvent
-from dxlrun.log.reader import Log, read_log
+from dxlrun.log.log_reader import Log, read_log
 from dxlrun.run import virtual_run
 from dxlrun.run.virtual_run import VirtualRobot
 from dxlrun.testing import plan_of
@@ -26,7 +26,7 @@ IMU = "{type: simulated_imu, link: tip}"
 def run(path: Path, log: Path, positions: tuple[float, float], seconds: float = 2.0) -> Log:
     plan = plan_of(path, duration_s=seconds)
     robot = VirtualRobot(plan, log=log)
-    robot.inbox.waiting.append(Command(0, "arm", "position", np.array(positions).tobytes(), "test"))
+    robot.inbox.waiting.append(CommandMessage(0, "arm", "position", np.array(positions).tobytes(), "test"))
     assert robot.run().detail == ""
     return read_log(log)
 
@@ -264,7 +264,7 @@ def test_source_is_closed_when_a_later_part_cannot_start(crane, monkeypatch, par
         if part == "source" and opened:
             raise OSError("the second device is not there")
         opened.append(source)
-        source.open = True
+        source.is_open = True
 
     def fail(*_: object, **__: object) -> None:
         raise PlugInError("the controller cannot be configured")
@@ -276,4 +276,4 @@ def test_source_is_closed_when_a_later_part_cannot_start(crane, monkeypatch, par
     with pytest.raises((PortError, PlugInError), match=r"the second device|the controller"):
         VirtualRobot(plan)
     assert opened
-    assert not any(source.open for source in opened)
+    assert not any(source.is_open for source in opened)

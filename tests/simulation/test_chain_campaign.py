@@ -22,11 +22,11 @@ import pytest
 from tests.kit import storms
 from tests.kit.judges import log_has_every_byte
 
-from dxlrun.channels.answers import Waiting
-from dxlrun.channels.commands import Command
-from dxlrun.channels.events import EventCode
-from dxlrun.control.controllers.plugins import load_plugins
-from dxlrun.log.reader import Log, read_log
+from dxlrun.channels.answers import Acceptance
+from dxlrun.channels.commands import CommandMessage
+from dxlrun.channels.event_records import EventCode
+from dxlrun.control.controllers.plugin_loading import load_plugins
+from dxlrun.log.log_reader import Log, read_log
 from dxlrun.testing import VirtualRobot, simulated_robot
 from dxlsim.faults.kinds import KINDS
 from dxlwire.bus_plan import BusPlan
@@ -124,7 +124,7 @@ class Clients:
 
     def at(self, controller: str, kind: str, data: bytes) -> None:
         self.number += 1
-        command = Command(self.number, controller, kind, data, "anna")
+        command = CommandMessage(self.number, controller, kind, data, "anna")
         at_ns = self.chance.randrange(300, round(DURATION_S * 1000)) * MS
         self.robot.buses[0].at(at_ns, lambda: self.robot.inbox.waiting.append(command))
 
@@ -298,5 +298,5 @@ def test_a_storm_breaks_no_chain(storm, tmp_path):
     servos_get_the_goals_of_one_commander(sent, bus, log)
     nothing_for_released_joints(sent, bus, log)
     joints_begin_softly(sent, witness, bus, log)
-    assert not any(isinstance(answer, Waiting) for answer in robot.inbox.answers.values())
+    assert not any(isinstance(answer, Acceptance) for answer in robot.inbox.answers.values())
     assert not any("Traceback" in event.text and "storm" not in event.text for event in log.events)

@@ -63,8 +63,8 @@ def test_a_load_behind_a_gear_is_felt_through_its_ratio(per_rad):
     for _ in range(50):
         drive, damping = rng.uniform(-1, 1, 1), rng.uniform(0, 0.5, 1)
         for _ in range(10):
-            geared.step(drive, damping, STEP_S)
-            coupled.step(drive, damping, STEP_S)
+            geared.step_shafts(drive, damping, STEP_S)
+            coupled.step_shafts(drive, damping, STEP_S)
         ways.append((geared.angle[0], coupled.angle[0]))
     alike, other = np.array(ways).T
     assert np.ptp(alike) > 0.1, "it moved"
@@ -156,13 +156,13 @@ def test_friction_of_servo_and_joint_holds_what_it_can_hold():
 def test_a_hand_moves_what_is_on_one_axis_together():
     mechanics = Mechanics(0, without_bodies(on_one_axis()))
     for _ in range(3):
-        mechanics.add(ROTOR, NO_LOAD, 0.0)
-    mechanics.place(0, 0.4)
+        mechanics.add_servo(ROTOR, NO_LOAD, 0.0)
+    mechanics.move_shaft(0, 0.4)
     assert mechanics.plant.angle == pytest.approx([0.4, -0.4, 0.0])
     wrist = Mechanics(0, without_bodies(differential()))
     for angle in (0.0, 1.0):
-        wrist.add(ROTOR, NO_LOAD, angle)
-    wrist.place(1, 1.3)
+        wrist.add_servo(ROTOR, NO_LOAD, angle)
+    wrist.move_shaft(1, 1.3)
     assert wrist.plant.angle == pytest.approx([0.0, 1.3])
 
 
@@ -173,11 +173,11 @@ def test_a_servo_that_counts_anew_moves_nothing(coupled, later):
     couplings = [alone(0.25, load)] if coupled else []
     mechanics = Mechanics(0, without_bodies(*couplings))
     braked = msgspec.structs.replace(ROTOR, damping=0.05)
-    mechanics.add(braked, NO_LOAD if coupled else felt(load, 0.25), 0.3 + 1.2 + math.tau)
-    mechanics.recount(0, 0.3 + 1.2)
+    mechanics.add_servo(braked, NO_LOAD if coupled else felt(load, 0.25), 0.3 + 1.2 + math.tau)
+    mechanics.recount_turns(0, 0.3 + 1.2)
     if later:
-        mechanics.add(ROTOR, NO_LOAD, 0.0)  # the plant is made anew, and still knows
-    mechanics.advance(20 * S)
+        mechanics.add_servo(ROTOR, NO_LOAD, 0.0)  # the plant is made anew, and still knows
+    mechanics.step_to(20 * S)
     # it hangs down where the joint is at 0.3 rad, a whole turn of the servo lower than it was counted
     assert mechanics.plant.angle[0] == pytest.approx(0.3 + 4 * 0.3 - math.tau, abs=1e-2)
 
@@ -205,7 +205,7 @@ def test_servos_keep_their_order_whatever_that_of_their_coupling(in_bodies):
     made = mujoco_plant(bodies_of(ARMS, (), [reverse])) if in_bodies else without_bodies(reverse)
     moved = made([PlantJoint(ROTOR, NO_LOAD, 0.5), PlantJoint(ROTOR, NO_LOAD, 2.0)])
     assert moved.angle == pytest.approx([0.5, 2.0])
-    moved.place(0, 0.8)
+    moved.place_shaft(0, 0.8)
     assert moved.angle == pytest.approx([0.8, 1.7])
 
 
@@ -213,9 +213,9 @@ def test_a_commanded_pair_goes_to_its_goal_together():
     mechanics = Mechanics(0, without_bodies(on_one_axis(Load(0.05, gravity=0.5))))
     motor = msgspec.structs.replace(RUBBING, damping=0.2)
     for goal in (0.5, -0.5):
-        index = mechanics.add(motor, NO_LOAD, 0.0)
-        mechanics.command(index, ServoCommand(goal=goal, speed=1.0, p_ccw=8.0, p_cw=8.0, limit=1.0))
-    mechanics.advance(3 * S)
+        index = mechanics.add_servo(motor, NO_LOAD, 0.0)
+        mechanics.command_servo(index, ServoCommand(goal=goal, speed=1.0, p_ccw=8.0, p_cw=8.0, limit=1.0))
+    mechanics.step_to(3 * S)
     assert mechanics.plant.angle == pytest.approx([0.5, -0.5], abs=0.05)
     assert mechanics.still
 

@@ -11,8 +11,8 @@ from tests.kit import storms
 from tests.kit.judges import log_has_every_byte
 from tests.kit.line_faults import OTHER_HOST, other_host
 
-from dxlrun.channels.events import Event, EventCode, Severity
-from dxlrun.log.reader import Log, read_log
+from dxlrun.channels.event_records import Event, EventCode, Severity
+from dxlrun.log.log_reader import Log, read_log
 from dxlrun.testing import simulated_robot
 from dxlsim.bus.ledger import LedgerEntry
 from dxlwire.wire import protocol2
@@ -101,7 +101,7 @@ def shared_line(tmp_path_factory: pytest.TempPathFactory) -> Run:
     log = directory / "run.mcap"
     robot = simulated_robot(storms.servos(directory, THREE), duration_s=2.0, log=log)
     for number in range(10):
-        packet = protocol2.write(2, 116, (2048).to_bytes(4, "little"))
+        packet = protocol2.write_range(2, 116, (2048).to_bytes(4, "little"))
         other_host(robot.buses[0], packet, 1_000_000_000 + number * 31_000_000)
     robot.run()
     return Run(read_log(log), list(robot.ledger.entries))

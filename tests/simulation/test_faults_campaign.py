@@ -23,9 +23,9 @@ import numpy as np
 import pytest
 from tests.kit import storms
 
-from dxlrun.channels.answers import Answer, Code, Refusal, Waiting
-from dxlrun.channels.commands import Command
-from dxlrun.log.reader import read_log
+from dxlrun.channels.answers import Acceptance, Answer, Code, Refusal
+from dxlrun.channels.commands import CommandMessage
+from dxlrun.log.log_reader import read_log
 from dxlrun.testing import VirtualRobot, simulated_robot
 from dxlsim.faults.kinds import KINDS
 
@@ -89,7 +89,7 @@ def commanded(robot: VirtualRobot) -> dict[int, bytes]:
     rows = len(robot.plan.loop.joints)
     for number in range(1, round(10 * DURATION_S) - 5):
         goals = np.array([0.5 * math.sin(0.3 * number + row) for row in range(rows)])
-        command = Command(number, "all", "positions", goals.tobytes(), CLIENT)
+        command = CommandMessage(number, "all", "positions", goals.tobytes(), CLIENT)
         sent[number] = command.data
         at_ns = 300_000_000 + number * 100_000_000
         robot.buses[0].at(at_ns, lambda command=command: robot.inbox.waiting.append(command))
@@ -117,7 +117,7 @@ def requested(robot: VirtualRobot, storm: str) -> int:
                 ("switch", {"activate": [chance.choice(controllers)], "deactivate": []}),
             )
         )
-        command = Command(FIRST_REQUEST + number, "", kind, json.dumps(data).encode(), "berta")
+        command = CommandMessage(FIRST_REQUEST + number, "", kind, json.dumps(data).encode(), "berta")
         at_ns = chance.randrange(300, round(DURATION_S * 1000)) * 1_000_000
         robot.buses[0].at(at_ns, lambda command=command: robot.inbox.waiting.append(command))
     return count
@@ -136,7 +136,7 @@ def test_a_storm_breaks_no_promise(name, storm, tmp_path):
     trial.judge(log)
     answers = {number: answer for number, answer in robot.inbox.answers.items() if number in sent}
     accepted = {number for number, answer in answers.items() if not ended(answer)}
-    assert not any(isinstance(answer, Waiting) for answer in robot.inbox.answers.values())
+    assert not any(isinstance(answer, Acceptance) for answer in robot.inbox.answers.values())
     logged = [command for command in log.commands if command.origin == CLIENT]
     assert [one.data for one in logged] == [sent[number] for number in sorted(accepted)]
     assert not sent or {one.origin for one in log.commands} <= {CLIENT, "berta", "loop"}

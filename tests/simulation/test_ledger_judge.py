@@ -9,7 +9,7 @@ from typing import Any
 import pytest
 from tests.kit import judges
 
-from dxlrun.channels.events import Event, EventCode, Severity
+from dxlrun.channels.event_records import Event, EventCode, Severity
 from dxlsim.bus.ledger import LedgerEntry
 
 SERVOS = {"main": {3: "elbow", 5: "wrist"}, "legs": {3: "knee"}}

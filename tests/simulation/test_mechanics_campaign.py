@@ -22,10 +22,10 @@ import numpy as np
 import pytest
 from tests.kit.wire import FACTS, instructions, states, written
 
-from dxlrun.channels.commands import Command
+from dxlrun.channels.commands import CommandMessage
 from dxlrun.channels.cycle import LIMP
 from dxlrun.errors import DxlrunError
-from dxlrun.log.reader import Log, read_log
+from dxlrun.log.log_reader import Log, read_log
 from dxlrun.run.virtual_run import VirtualRobot
 from dxlrun.testing import simulated_robot
 from dxlrun_analysis.replay import replay_log
@@ -120,7 +120,7 @@ def built(chance: random.Random, directory: Path, duration_s: float, *, beyond: 
     joints = robot.plan.loop.joints
     for number in range(1, round(duration_s * 10)):
         goals = [chance.uniform(beyond * joint.lower, beyond * joint.upper) for joint in joints]
-        command = Command(number, "all", "positions", np.array(goals).tobytes(), "anna")
+        command = CommandMessage(number, "all", "positions", np.array(goals).tobytes(), "anna")
         at_ns = 250_000_000 + number * 100_000_000
         robot.buses[0].at(at_ns, lambda command=command: robot.inbox.waiting.append(command))
     return robot

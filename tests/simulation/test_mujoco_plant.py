@@ -44,8 +44,8 @@ def test_a_joint_without_weight_moves_as_an_independent_one(rotor):
     for _ in range(200):
         drive, damping = rng.uniform(-1, 1, 1), rng.uniform(0, 0.5, 1)
         for _ in range(25):
-            bodies.step(drive, damping, STEP_S)
-            alone.step(drive, damping, STEP_S)
+            bodies.step_shafts(drive, damping, STEP_S)
+            alone.step_shafts(drive, damping, STEP_S)
         ways.append((bodies.angle[0], alone.angle[0]))
     moved, expected = np.array(ways).T
     assert np.ptp(expected) > 1, "it moved"
@@ -179,7 +179,7 @@ def test_a_joint_is_placed_at_rest():
     plant = _plant(ONE, Turned("shoulder", 0.0, 1))
     run(plant, 0.2)
     assert plant.velocity[0] < -1
-    plant.place(0, -math.pi / 2)
+    plant.place_shaft(0, -math.pi / 2)
     run(plant, 1.0)
     assert plant.angle[0] == pytest.approx(-math.pi / 2, abs=1e-9)
 
@@ -255,12 +255,12 @@ def test_a_urdf_that_cannot_be_moved_is_reported_in_a_sentence(text, sentence):
 @pytest.mark.needs("physics")
 def test_a_hand_turns_a_body_evenly():
     mechanics = Mechanics(0, mujoco_plant(bodies_of(ONE, (Turned("shoulder", 0.0, 1),))))
-    mechanics.add(ROTOR, NO_LOAD, 0.0)
-    mechanics.turn(0, 0.5, 1_000_000_000, lambda turned: pytest.fail("nothing drives it"))
-    mechanics.advance(500_000_000)
+    mechanics.add_servo(ROTOR, NO_LOAD, 0.0)
+    mechanics.turn_shaft(0, 0.5, 1_000_000_000, lambda turned: pytest.fail("nothing drives it"))
+    mechanics.step_to(500_000_000)
     assert mechanics.plant.angle[0] == pytest.approx(0.25)
     assert mechanics.plant.velocity[0] == pytest.approx(0.5)
-    mechanics.advance(1_000_000_000)
+    mechanics.step_to(1_000_000_000)
     assert mechanics.plant.angle[0] == pytest.approx(0.5)
-    mechanics.advance(1_300_000_000)  # then the hand lets go, and it falls
+    mechanics.step_to(1_300_000_000)  # then the hand lets go, and it falls
     assert mechanics.plant.angle[0] < 0.4

@@ -21,8 +21,8 @@ from tests.kit.bus_process import PATIENCE_S, bare, opened, receive
 from dxlsim.bus.ledger import Ledger, read_ledger
 from dxlsim.bus.simulated_bus import SimulatedBus
 from dxlsim.serving.pseudo_terminal import DeviceLink, PseudoTerminal
-from dxlsim.serving.realtime import PollBudget
-from dxlsim.serving.server import _WRITTEN, lateness_us
+from dxlsim.serving.realtime_serving import PollBudget
+from dxlsim.serving.simulation_server import _WRITTEN, lateness_us
 from dxlsim.simulation_plan import BusConfig, ServoConfig, SimulationConfig
 from dxlwire.control_table import find_table
 
@@ -105,7 +105,7 @@ def test_a_terminal_without_a_host_is_reported_once():
             waiting.register(terminal.fileno(), _WRITTEN)
             os.write(port, PING_1)
             assert waiting.poll(PATIENCE_S) == [(terminal.fileno(), select.EPOLLIN)]
-            terminal.read()
+            terminal.read_chunk()
         waiting.poll(PATIENCE_S)  # the host is gone
         assert waiting.poll(0) == []
         with opened(terminal.path) as port:
@@ -142,8 +142,8 @@ def test_what_does_not_fit_into_the_terminal_is_lost_and_noted():
         bus.inject_noise(bytes(4000), now - 10**8)
         terminal.deliver(now)
     assert any("it does not read" in entry.note for entry in bus.ledger.entries)
-    terminal.read()  # the host has sent nothing
-    terminal.receive(10**11)
+    terminal.read_chunk()  # the host has sent nothing
+    terminal.deliver_bytes(10**11)
     terminal.close()
     assert not [entry for entry in bus.ledger.entries if entry.direction == "in"]
 
@@ -155,8 +155,8 @@ def test_a_host_that_opens_the_port_at_another_rate_changes_the_lines_rate():
         with serial.Serial(terminal.path, rate) as port:
             port.write(PING_1)
             select.select([terminal], [], [])
-            terminal.read()
-            terminal.receive(now * 10**9)
+            terminal.read_chunk()
+            terminal.deliver_bytes(now * 10**9)
         assert bus.baud_rate == rate
     terminal.close()
 
@@ -167,12 +167,12 @@ def test_what_a_host_writes_while_others_are_served_is_not_of_the_moment_before(
     with opened(terminal.path) as port:
         os.write(port, READ_1)
         select.select([terminal], [], [])
-        terminal.read()
+        terminal.read_chunk()
         os.write(port, READ_1)
         select.select([terminal], [], [])
-        terminal.receive(10**9)
-        terminal.read()
-        terminal.receive(2 * 10**9)
+        terminal.deliver_bytes(10**9)
+        terminal.read_chunk()
+        terminal.deliver_bytes(2 * 10**9)
     terminal.close()
     received = [(entry.t_ns, entry.data) for entry in bus.ledger.entries if entry.direction == "in"]
     assert received == [(10**9, READ_1), (2 * 10**9, READ_1)]

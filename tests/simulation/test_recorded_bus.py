@@ -18,10 +18,10 @@ from dxlrun.cli import main
 from dxlrun.cli.sim import sim as sim_command
 from dxlrun.errors import LogError
 from dxlrun.log.columns import PacketColumns
-from dxlrun.log.reader import Log, read_log
+from dxlrun.log.log_reader import Log, read_log
 from dxlrun.log.recorded_packets import read_recorded_packets
 from dxlrun.run import virtual_run
-from dxlrun.run.simulation_front import Served
+from dxlrun.run.simulation_front import SimulationResult
 from dxlsim.bus.ledger import Ledger
 from dxlsim.bus.recorded_bus import RecordedBus
 from dxlsim.bus.simulated_bus import SimulatedBus
@@ -142,8 +142,8 @@ class Host:
 
     def ask(self, instruction: bytes) -> bytes:
         self._now_ns += 20_000_000
-        self.bus.receive(instruction, self._now_ns)
-        return self.bus.take(self._now_ns + 20_000_000)
+        self.bus.receive_bytes(instruction, self._now_ns)
+        return self.bus.drain_bytes(self._now_ns + 20_000_000)
 
     @property
     def notes(self) -> list[str]:
@@ -256,9 +256,9 @@ def heard(log: Log) -> dict[bytes, list[bytes]]:
 def test_the_command_serves_the_buses_of_the_log(run, monkeypatch, capsys):
     served: list[SimulationConfig] = []
 
-    def serve(job: SimulationJob, *_: object, **__: object) -> Served:
+    def serve(job: SimulationJob, *_: object, **__: object) -> SimulationResult:
         served.append(job.config)
-        return Served(1.0, SimulationMessage(), ())
+        return SimulationResult(1.0, SimulationMessage(), ())
 
     monkeypatch.setattr(sim_command, "_serve", serve)
     log = run("2.0")

@@ -13,19 +13,19 @@ from dataclasses import dataclass
 import pytest
 from tests.kit.rigs import make_plan
 
-from dxlrun.channels import process
+from dxlrun.channels import child_processes
 from dxlrun.channels.heartbeat import SimulationProgress, create_progress
 from dxlrun.run.simulation_front import first_message, start_simulation
 from dxlsim.messages import SimulationJob
 from dxlsim.simulation_plan import BusConfig, ServoConfig, SimulationConfig
 from dxlwire.clock import MonotonicClock
-from dxlwire.exchange.bus import Lines
+from dxlwire.exchange.bus_engine import Lines
 from dxlwire.packets import PacketSink
 from dxlwire.plan.planning import plan_line
-from dxlwire.plan.retry import ReplyTimes, extend_timeouts
+from dxlwire.plan.retry import ReplyLateness, extend_timeouts
 from dxlwire.port.ports import SerialPorts, SimulatedPort, StallCounter
 from dxlwire.port.serial_open import open_serial
-from dxlwire.transaction import Outcome, Program, Reply
+from dxlwire.transaction import Program, Reply, TransactionOutcome
 
 IDS = (1, 2)
 PLAN = make_plan(IDS)
@@ -41,7 +41,7 @@ class Host:
         def ping() -> Program[Reply]:
             return (yield plan_line(PLAN).ping(servo_id))
 
-        (reply,) = self.lines.run([ping()])
+        (reply,) = self.lines.run_programs([ping()])
         assert reply is not None
         return reply
 
@@ -61,7 +61,7 @@ class Host:
 
 @contextmanager
 def simulated(*faults: str, latency_timer_ns: int = 0) -> Iterator[Host]:
-    progress, errors = create_progress(1), process.memory_file("errors")
+    progress, errors = create_progress(1), child_processes.memory_file("errors")
     bus = BusConfig("main", PLAN.baud_rate, tuple(ServoConfig(each, "AX-12A", 2.0) for each in IDS))
     job = SimulationJob(SimulationConfig((bus,), faults=faults), progress=progress)
     child = start_simulation(job, errors)
@@ -80,17 +80,17 @@ def simulated(*faults: str, latency_timer_ns: int = 0) -> Iterator[Host]:
 
 def test_reply_is_awaited_while_the_process_is_stopped() -> None:
     with simulated() as host:
-        assert host.ask(1).outcome is Outcome.OK
+        assert host.ask(1).outcome is TransactionOutcome.OK
         with host.stopped(0.2):
             reply = host.ask(1)
-        assert reply.outcome is Outcome.OK
+        assert reply.outcome is TransactionOutcome.OK
         assert host.stalls.waited_ns > 100_000_000
         assert reply.stalled_ns > 100_000_000
 
 
 def test_process_that_stays_stopped_is_given_up_once() -> None:
     with simulated() as host, host.stopped(20.0):
-        assert [host.ask(1).outcome for _ in range(3)] == [Outcome.TIMEOUT] * 3
+        assert [host.ask(1).outcome for _ in range(3)] == [TransactionOutcome.TIMEOUT] * 3
         # three times the bound would be 1.5 s
         assert 0 < host.stalls.waited_ns < 1_400_000_000
 
@@ -101,19 +101,19 @@ def test_process_that_stays_stopped_is_given_up_once() -> None:
 def test_servo_that_is_silent_or_late_on_purpose_is_lost(fault: str) -> None:
     with simulated(fault) as host:
         # what an adapter's timer held back of the first reply brings a later one in time
-        assert host.ask(1).outcome is Outcome.TIMEOUT
-        assert Outcome.TIMEOUT in [host.ask(1).outcome for _ in range(4)]
+        assert host.ask(1).outcome is TransactionOutcome.TIMEOUT
+        assert TransactionOutcome.TIMEOUT in [host.ask(1).outcome for _ in range(4)]
         assert host.stalls.waited_ns < 500_000_000  # on a busy machine; it would be 2.5 s
 
 
 def test_lateness_of_the_process_is_told_apart_from_that_of_the_servo() -> None:
     with simulated("slow servo=1 by=30ms") as host:
-        times = ReplyTimes()
+        times = ReplyLateness()
 
         def ping() -> Program[Reply]:
             return (yield plan_line(PLAN).ping(1))
 
         with host.stopped(0.1):
-            host.lines.run([extend_timeouts(ping(), times=times)])
+            host.lines.run_programs([extend_timeouts(ping(), times=times)])
         (late,) = times.late_ns
         assert 29_000_000 < late < 60_000_000  # of more than 100 ms

@@ -11,8 +11,8 @@ from typing import Any
 import pytest
 
 from dxlrun.errors import DxlrunError, InputError
-from dxlrun_teleop import devices
-from dxlrun_teleop.devices import EV_ABS, EV_KEY, Gamepad, KeyboardDevice, chosen, source_of
+from dxlrun_teleop import input_devices
+from dxlrun_teleop.input_devices import EV_ABS, EV_KEY, Gamepad, KeyboardDevice, chosen, source_of
 from dxlrun_teleop.source import Press
 
 LEFT_SHOULDER, SOUTH, START, Q, D, LEFT, TAB, ESC = 0x136, 0x130, 0x13B, 16, 32, 105, 15, 1
@@ -69,17 +69,17 @@ def test_a_gamepad_moves_its_axes_and_is_enabled_by_a_shoulder_button() -> None:
         "right stick left/right",
     )
     assert len(source.axes) == 6
-    assert source.read(0.0) == ((0.0,) * 6, False, frozenset())
+    assert source.read_input(0.0) == ((0.0,) * 6, False, frozenset())
     device.turn(1, -32768)  # up
     device.turn(0, 16384)  # half to the right
     device.turn(4, 2000)  # not quite in its middle
     device.turn(16, -1)
     device.down = {LEFT_SHOULDER}
-    axes, enabled, presses = source.read(0.02)
+    axes, enabled, presses = source.read_input(0.02)
     assert axes == (1.0, pytest.approx(-0.444, abs=1e-3), 0.0, 0.0, 0.0, 1.0)
     assert (enabled, presses) == (True, frozenset())
     device.down = set()
-    assert not source.read(0.04).enabled
+    assert not source.read_input(0.04).enabled
 
 
 def test_what_is_pressed_counts_once_and_not_when_it_was_down_before() -> None:
@@ -89,7 +89,7 @@ def test_what_is_pressed_counts_once_and_not_when_it_was_down_before() -> None:
     pressed = []
     for down in ({SOUTH}, set(), {SOUTH}, {SOUTH}, {START}):
         device.down = down
-        pressed.append(source.read(0.0).presses)
+        pressed.append(source.read_input(0.0).presses)
     assert pressed == [set(), set(), {Press.NEXT}, set(), {Press.QUIT}]
 
 
@@ -106,7 +106,7 @@ def test_a_gamepad_that_is_unplugged_is_gone(error: BaseException) -> None:
     source = Gamepad(device)
     device.gone = error
     with pytest.raises(DxlrunError, match=r"^Pad \(/dev/input/event3\) is gone, the robot holds; plug it in"):
-        source.read(0.0)
+        source.read_input(0.0)
     source.close()
     assert device.closed
 
@@ -115,17 +115,17 @@ def test_a_keyboard_of_its_own_is_taken_when_its_keys_are_up_and_reports_release
     device = keyboard()
     device.down = {28, Q}  # Enter, which began the command
     source = KeyboardDevice(device)
-    assert source.read(0.0) == ((0.0,) * 8, False, frozenset())
+    assert source.read_input(0.0) == ((0.0,) * 8, False, frozenset())
     assert not device.grabbed
     device.down = set()
-    source.read(0.02)
+    source.read_input(0.02)
     assert device.grabbed
     device.down = {Q, D}
-    assert source.read(0.04) == ((1.0, 0.0, -1.0, 0.0, 0.0, 0.0, 0.0, 0.0), True, frozenset())
+    assert source.read_input(0.04) == ((1.0, 0.0, -1.0, 0.0, 0.0, 0.0, 0.0, 0.0), True, frozenset())
     device.down = {LEFT, TAB}
-    assert source.read(0.06) == ((0.0, 1.0, *[0.0] * 6), True, frozenset({Press.NEXT}))
+    assert source.read_input(0.06) == ((0.0, 1.0, *[0.0] * 6), True, frozenset({Press.NEXT}))
     device.down = {ESC}
-    assert source.read(0.08) == ((0.0,) * 8, False, frozenset({Press.QUIT}))
+    assert source.read_input(0.08) == ((0.0,) * 8, False, frozenset({Press.QUIT}))
 
 
 def test_a_mouse_is_neither() -> None:
@@ -150,7 +150,7 @@ def plugged_in(monkeypatch: pytest.MonkeyPatch) -> Callable[..., list[Fake]]:
             return one
 
         monkeypatch.setitem(sys.modules, "evdev", SimpleNamespace(InputDevice=opened))
-        monkeypatch.setattr(devices, "glob", lambda pattern: list(named))
+        monkeypatch.setattr(input_devices, "glob", lambda pattern: list(named))
         return [one for one in found if one]
 
     return plug
@@ -216,6 +216,6 @@ def test_a_real_gamepad_of_the_kernel_is_read_and_gone() -> None:
         virtual.write(EV_ABS, 1, -100)
         virtual.write(EV_KEY, LEFT_SHOULDER, 1)
         virtual.syn()
-        assert source.read(0.0) == ((1.0, 0.0), True, frozenset())
+        assert source.read_input(0.0) == ((1.0, 0.0), True, frozenset())
     with pytest.raises(DxlrunError, match="is gone"):
-        source.read(0.02)
+        source.read_input(0.02)

@@ -14,7 +14,7 @@ from tests.kit.driven import DrivenRobot, changes
 from dxlrun import RemoteRobot
 from dxlrun_teleop.bank import banks_of
 from dxlrun_teleop.drive import Drive
-from dxlrun_teleop.source import Given
+from dxlrun_teleop.source import InputState
 
 ROBOTS = Path(__file__).parents[2] / "robots"
 BEGIN_S, END_S, HELD_S = 1.0, 2.0, 0.25
@@ -48,7 +48,7 @@ class Hand:
             if self._ending == "unplugged":  # as the command's `finally` does
                 self._drive.close()
             return
-        self._drive.step(Given(self._axes if held else (0.0,) * len(self._axes), held), now)
+        self._drive.apply_input(InputState(self._axes if held else (0.0,) * len(self._axes), held), now)
 
 
 def driven(
@@ -126,7 +126,7 @@ def test_client_that_stood_still_moves_on_from_where_the_joint_is(tmp_path: Path
 
         def step(now: float) -> None:
             if not 1.2 <= now < 1.7:
-                drive.step(Given((0.5,), 0.9 <= now < 2.0), now)
+                drive.apply_input(InputState((0.5,), 0.9 <= now < 2.0), now)
 
         return step
 

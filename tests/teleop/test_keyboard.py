@@ -48,14 +48,14 @@ def axes(**sides: float) -> tuple[float, ...]:
 
 def test_a_key_counts_as_held_until_it_was_not_repeated_for_a_while(terminal: Terminal) -> None:
     with closing(terminal.keyboard()) as keyboard:
-        assert keyboard.read(9.0) == (axes(), False, frozenset())
+        assert keyboard.read_input(9.0) == (axes(), False, frozenset())
         terminal.types("q")
-        assert keyboard.read(10.0) == (axes(a0=1.0), True, frozenset())
-        assert keyboard.read(9.99 + HELD_S) == (axes(a0=1.0), True, frozenset())
+        assert keyboard.read_input(10.0) == (axes(a0=1.0), True, frozenset())
+        assert keyboard.read_input(9.99 + HELD_S) == (axes(a0=1.0), True, frozenset())
         terminal.types("q")  # repeated
-        assert keyboard.read(10.1).enabled
-        assert keyboard.read(10.09 + HELD_S).enabled
-        assert keyboard.read(10.11 + HELD_S) == (axes(), False, frozenset())
+        assert keyboard.read_input(10.1).enabled
+        assert keyboard.read_input(10.09 + HELD_S).enabled
+        assert keyboard.read_input(10.11 + HELD_S) == (axes(), False, frozenset())
 
 
 @pytest.mark.parametrize(
@@ -75,24 +75,24 @@ def test_a_key_counts_as_held_until_it_was_not_repeated_for_a_while(terminal: Te
 def test_keys_and_arrows_move_axes(terminal: Terminal, typed: str, sides: dict[str, float]) -> None:
     with closing(terminal.keyboard()) as keyboard:
         terminal.types(typed)
-        assert keyboard.read(0.0) == (axes(**sides), bool(sides), frozenset())
+        assert keyboard.read_input(0.0) == (axes(**sides), bool(sides), frozenset())
 
 
 def test_an_arrow_that_comes_in_parts_is_no_letter(terminal: Terminal) -> None:
     with closing(terminal.keyboard()) as keyboard:
         for part in ("\x1b", "[", "1;"):
             terminal.types(part)
-            assert not keyboard.read(0.0).enabled
+            assert not keyboard.read_input(0.0).enabled
         terminal.types("5A")
-        assert keyboard.read(0.0).axes == axes(a0=1.0)
+        assert keyboard.read_input(0.0).axes == axes(a0=1.0)
 
 
 def test_what_is_pressed_and_the_end_of_the_terminal(terminal: Terminal) -> None:
     with closing(terminal.keyboard()) as keyboard:
         terminal.types("\t+-\x1b")
-        assert keyboard.read(0.0).presses == {Press.NEXT, Press.FASTER, Press.SLOWER}
+        assert keyboard.read_input(0.0).presses == {Press.NEXT, Press.FASTER, Press.SLOWER}
         terminal.types("\x04")
-        assert keyboard.read(0.0).presses == {Press.QUIT}
+        assert keyboard.read_input(0.0).presses == {Press.QUIT}
 
 
 def test_the_terminal_is_as_it_was(terminal: Terminal) -> None:

@@ -44,7 +44,7 @@ def test_an_arm_at_one_port_follows_the_hand_at_the_other() -> None:
     robot = simulated_robot(TWO_PORTS, duration_s=4.0)
     leader, _ = robot.buses
     hand_s = 1.0
-    leader.at(1_000_000_000, lambda: leader.servo(1).turn(-0.6, round(hand_s * 1e9)))
+    leader.at(1_000_000_000, lambda: leader.servo(1).turn_shaft(-0.6, round(hand_s * 1e9)))
     assert robot.run().reason == "ended"
     sent = changes(robot.ledger.entries, robot.plan, GOAL_POSITION)
     assert {*sent} == {3, 4}

@@ -13,7 +13,7 @@ from dxlrun import RemoteRobot
 from dxlrun.errors import InputError
 from dxlrun_teleop.bank import banks_of
 from dxlrun_teleop.drive import Drive
-from dxlrun_teleop.source import Given, Press
+from dxlrun_teleop.source import InputState, Press
 
 ROBOT = """\
 name: arm
@@ -30,12 +30,12 @@ controllers:
 policies: {on_stale_command: limp}  # a stream that is not ended in order ends the run
 """
 GOAL_POSITION, TICKS = 116, 4096 / 360
-FREE, HELD = Given((0.0,), False), Given((1.0,), True)
-NEXT = Given((1.0,), True, frozenset({Press.NEXT}))
+FREE, HELD = InputState((0.0,), False), InputState((1.0,), True)
+NEXT = InputState((1.0,), True, frozenset({Press.NEXT}))
 
 
 def driven(
-    directory: Path, *script: tuple[float, Given], targets: tuple[str, ...] = (), factor: float = 1.0
+    directory: Path, *script: tuple[float, InputState], targets: tuple[str, ...] = (), factor: float = 1.0
 ) -> DrivenRobot:
     """Run; of the script each counts from its time, s, on."""
     path = directory / "arm.yaml"
@@ -50,8 +50,8 @@ def driven(
             if at in once:
                 once.remove(at)
             elif given.presses:
-                given = Given(given.axes, given.enabled)
-            drive.step(given, now)
+                given = InputState(given.axes, given.enabled)
+            drive.apply_input(given, now)
 
         return step
 

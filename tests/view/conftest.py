@@ -12,9 +12,9 @@ import pytest
 from tests.kit.torso import Run
 from tests.view.served import Served
 
-from dxlrun_view.live import LiveRobot
-from dxlrun_view.recorded import RecordedRobot
-from dxlrun_view.shown import Source
+from dxlrun_view.live_robot import LiveRobot
+from dxlrun_view.recorded_robot import RecordedRobot
+from dxlrun_view.shown import ViewSource
 
 ROBOTS = Path(__file__).resolve().parents[2] / "robots"
 
@@ -65,7 +65,7 @@ def live(run: Run) -> Iterator[LiveRobot]:
 def serve() -> Iterator[Callable[..., Served]]:
     served: list[Served] = []
 
-    def make(source: Source, *, control: bool = False, tls: ssl.SSLContext | None = None) -> Served:
+    def make(source: ViewSource, *, control: bool = False, tls: ssl.SSLContext | None = None) -> Served:
         served.append(Served(source, control=control, tls=tls))
         return served[-1]
 

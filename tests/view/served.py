@@ -10,14 +10,16 @@ from contextlib import closing
 from typing import Any
 
 from dxlrun.remote.network.listener import Listener
-from dxlrun_view.server import HEADER, Page, hosts_of, server_of
-from dxlrun_view.shown import Source
+from dxlrun_view.page_server import HEADER, Page, hosts_of, server_of
+from dxlrun_view.shown import ViewSource
 
 
 class Served:
     """A page that is served, and what a browser would ask of it."""
 
-    def __init__(self, source: Source, *, control: bool = False, tls: ssl.SSLContext | None = None) -> None:
+    def __init__(
+        self, source: ViewSource, *, control: bool = False, tls: ssl.SSLContext | None = None
+    ) -> None:
         self.listener = Listener("127.0.0.1", 0, tls)
         self.port = self.listener.getsockname()[1]
         self.page = Page(source, self.listener, hosts=hosts_of("127.0.0.1", self.port), control=control)

@@ -14,9 +14,9 @@ from tests.kit.torso import GOAL_POSITION, JOINT, SERVO, TORQUE_ENABLE, Run
 from tests.view.served import Served
 
 from dxlrun_view.curves import Curve, Moment
-from dxlrun_view.live import LiveRobot
-from dxlrun_view.recorded import RecordedRobot
-from dxlrun_view.shown import Controller, LiveEvent, RobotInfo, Shown
+from dxlrun_view.live_robot import LiveRobot
+from dxlrun_view.recorded_robot import RecordedRobot
+from dxlrun_view.shown import LiveEvent, SourceProperties, ViewedController, ViewedRobot
 
 Serve = Callable[..., Served]
 VISIBLE = "(selector => document.querySelector(selector).offsetParent !== null)"
@@ -92,7 +92,7 @@ def test_switch_slider_and_stop_reach_the_servos(
     browser.click("[data-tab=controllers]")
     browser.click("[aria-label='Deactivate right_arm']")
     browser.until("!!document.querySelector('[aria-label=\"Activate right_arm\"]')")
-    assert not live.shown().info.controllers[3].active
+    assert not live.describe_page().info.controllers[3].active
     browser.click("[aria-label='Activate right_arm']")
     browser.until("!!document.querySelector('[aria-label=\"Deactivate right_arm\"]')")
 
@@ -144,13 +144,13 @@ class Scripted:
             known |= {f"{name}/{column}": one for name, one in zip(self.names, pair, strict=True)}
         self.values = known
 
-    def shown(self) -> Shown:
-        arm = Controller("arm", "position_controller", True, ("elbow_joint",), ("position",))
+    def describe_page(self) -> SourceProperties:
+        arm = ViewedController("arm", "position_controller", True, ("elbow_joint",), ("position",))
         began = bool(self.values)
         limits = dict.fromkeys(self.names, (-2.6, 0.17))
-        info = RobotInfo("arm", 50.0, 0.0, joints=self.names, limits=limits, controllers=(arm,))
-        return Shown(
-            info=info if began else RobotInfo("arm"),
+        info = ViewedRobot("arm", 50.0, 0.0, joints=self.names, limits=limits, controllers=(arm,))
+        return SourceProperties(
+            info=info if began else ViewedRobot("arm"),
             live=True,
             columns=tuple(self.values),
             span=(0.0, self.time),
@@ -159,7 +159,7 @@ class Scripted:
             control=True,
         )
 
-    def at(self, time_s: float | None) -> Moment:
+    def moment_at(self, time_s: float | None) -> Moment:
         self.time += 0.04 if self.moving else 0.0
         return Moment(self.time if self.values else 0.0, [*self.values.values()])
 

@@ -16,9 +16,9 @@ from tests.kit.torso import GOAL_POSITION, JOINT, SERVO, TORQUE_ENABLE, Run, set
 from tests.view.served import Served
 
 from dxlrun import Refused, RemoteRobot
-from dxlrun_view.actions import Stop
-from dxlrun_view.live import LiveRobot
-from dxlrun_view.server import HEADER
+from dxlrun_view.actions import StopAction
+from dxlrun_view.live_robot import LiveRobot
+from dxlrun_view.page_server import HEADER
 
 Serve = Callable[..., Served]
 ACTIONS: tuple[dict[str, object], ...] = (
@@ -211,7 +211,7 @@ def test_a_robot_that_ends_and_comes_back(live: LiveRobot, serve: Serve, run: Ru
 
 def test_a_robot_that_does_not_run_is_waited_for(run: Run) -> None:
     robot = LiveRobot("nowhere")
-    shown = robot.shown()
+    shown = robot.describe_page()
     robot.close()
     assert "nowhere" in shown.problem
     assert shown.columns == ()
@@ -230,6 +230,6 @@ def test_stop_ends_the_run_where_torque_off_is_refused(refused: bool) -> None:
         def stop(self, wait: bool) -> None:
             asked.append("stop")
 
-    said = Stop().perform(cast("RemoteRobot", Robot())).said
+    said = StopAction().perform_on(cast("RemoteRobot", Robot())).said
     assert asked == ["torque of all: False", *(["stop"] if refused else [])]
     assert ("The run ends" in said) is refused

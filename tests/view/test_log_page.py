@@ -12,11 +12,11 @@ import numpy as np
 import pytest
 from tests.view.served import Served
 
-import dxlrun_view.recorded as module
+import dxlrun_view.recorded_robot as module
 from dxlrun import LogError, open_log
 from dxlrun.remote.network.listener import MOST_UNPROVED
-from dxlrun_view.recorded import RecordedRobot
-from dxlrun_view.server import mesh_file
+from dxlrun_view.page_server import mesh_file
+from dxlrun_view.recorded_robot import RecordedRobot
 
 Serve = Callable[..., Served]
 JOINT = "right_elbow_joint"
@@ -54,10 +54,10 @@ def test_fields_of_topics_are_drawn(recorded: RecordedRobot, serve: Serve) -> No
 
 
 def test_a_long_log_is_thinned_and_keeps_its_worst_cycles(log: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    whole = RecordedRobot(log).shown()
+    whole = RecordedRobot(log).describe_page()
     monkeypatch.setattr(module, "MOST_CYCLES", 100)
     thin = RecordedRobot(log)
-    shown = thin.shown()
+    shown = thin.describe_page()
     assert shown.every in (4, 8)
     assert shown.span == pytest.approx(whole.span, abs=0.2)
     assert shown.marks == whole.marks

@@ -13,10 +13,10 @@ from tests.view.served import Served
 
 from dxlrun import InputError
 from dxlrun.remote.network.certificates import client_context, keys_place, server_context
-from dxlrun.remote.network.listener import Place
-from dxlrun.remote.requests.table import Role
-from dxlrun_view.recorded import RecordedRobot
-from dxlrun_view.server import HEADER
+from dxlrun.remote.network.listener import ListenAddress
+from dxlrun.remote.requests.request_table import Role
+from dxlrun_view.page_server import HEADER
+from dxlrun_view.recorded_robot import RecordedRobot
 
 authority = pytest.importorskip("dxlrun_fleet.authority", reason="needs the extra network")
 ROBOT = "bioloid_torso_imu"
@@ -98,4 +98,4 @@ def test_a_robot_without_a_certificate_is_not_served(browse: Browse) -> None:
     ],
 )
 def test_only_loopback_needs_no_certificate(address: str, expected: bool) -> None:
-    assert Place(address).is_loopback is expected
+    assert ListenAddress(address).is_loopback is expected

@@ -22,7 +22,7 @@ from typing import NamedTuple
 import numpy as np
 
 from dxlrun.tooling.logs import PacketColumns
-from dxlrun_analysis.cycles.worst import CauseKind
+from dxlrun_analysis.cycles.worst_cycles import CauseKind
 from dxlrun_analysis.servos.exchanges import Exchanges, Pairing, ordered
 from dxlwire import TIMEOUT_MARGIN_NS, PacketKind
 
@@ -52,7 +52,7 @@ class _Exchange(NamedTuple):
     lacks: int | None
     """ID of the first servo whose reply is missing; -1: no reply of a chain came; None: all replies came."""
 
-    def end(self, given_up: int) -> int:
+    def find_end(self, given_up: int) -> int:
         """Return the time at which the exchange ended, ns: its last reply. With a reply missing, return
         the time of the next instruction, or `given_up` if that is earlier."""
         return self.last if self.lacks is None else min(self.following, given_up)
@@ -93,7 +93,7 @@ class Account:
         self.shares[CauseName("late wake-up")] += late - idle
         if cycle["long"]:
             period, took = int(cycle["period"]), int(cycle["written"] - cycle["woken"])
-            planned, exchanged = self._read()
+            planned, exchanged = self._split_read_phase()
             self.shares[CauseName("plan")] += max(0, planned - period)
             for name, ns in zip(controllers, cycle["controllers"].tolist(), strict=False):
                 self.shares[CauseName("controller", name)] += ns
@@ -101,20 +101,20 @@ class Account:
             self.shares[CauseName("own work")] += max(0, took)
         self.shares = +self.shares
 
-    def _read(self) -> tuple[int, int]:
+    def _split_read_phase(self) -> tuple[int, int]:
         """Attribute the time that the read phase took beyond its plan; return the planned and the actual
         time of the exchanges on the slowest bus, ns."""
         woken, read = int(self._cycle["woken"]), int(self._cycle["read"])
         within = [one for one in self._exchanges if woken <= one.asked <= read]
         if not within:
             return 0, 0
-        slowest = max(within, key=lambda one: min(one.end(read), read)).bus
+        slowest = max(within, key=lambda one: min(one.find_end(read), read)).bus
         sums = [0, 0]
         asked: set[int] = set()
         for one in within:
             if one.bus != slowest:
                 continue
-            took = max(0, min(one.end(read), read) - one.asked)
+            took = max(0, min(one.find_end(read), read) - one.asked)
             # A second request to a servo within one read is a retry.
             again = len(one.servo_ids) == 1 and one.servo_ids[0] in asked
             asked.update(one.servo_ids)
@@ -134,7 +134,7 @@ class Account:
         self.shares[CauseName("write call", bus=one.bus)] += blocked
         beyond -= blocked
         if one.lacks is not None:
-            end = one.end(read)
+            end = one.find_end(read)
             heard = max(one.last, one.asked, min(one.planned_end, end))
             missed = min(max(end - heard, 0), beyond)
             self.shares[one.unanswered] += missed
@@ -158,7 +158,7 @@ class Account:
         deadline; return the attributed time, ns. `late` is the lateness in ns."""
         due = max(int(self._cycle["scheduled"]), int(before["written"]))
         over = [
-            (min(one.end(one.planned_end + TIMEOUT_MARGIN_NS) - due, late), one)
+            (min(one.find_end(one.planned_end + TIMEOUT_MARGIN_NS) - due, late), one)
             for one in self._exchanges
             if before["read"] < one.asked < self._cycle["woken"]
         ]

@@ -27,11 +27,11 @@ from dxlrun import Log
 from dxlrun.tooling.logs import PacketColumns
 from dxlrun.tooling.records import MachineLoad
 from dxlrun_analysis.causes.account import Account, CauseName
-from dxlrun_analysis.causes.machine import TAKERS, MachineHistory, MachineSample
+from dxlrun_analysis.causes.machine_history import TAKERS, MachineHistory, MachineSample
 from dxlrun_analysis.causes.timeline import timeline
-from dxlrun_analysis.cycles.latency import ROUGH_NS, begins, first_deadline_ns
-from dxlrun_analysis.cycles.worst import Cause, CauseShare, WorstCycle
-from dxlrun_analysis.plan import LoggedBus, plan_of
+from dxlrun_analysis.cycles.punctuality import ROUGH_NS, begins, first_deadline_ns
+from dxlrun_analysis.cycles.worst_cycles import Cause, CauseShare, WorstCycle
+from dxlrun_analysis.plan_excerpt import LoggedBus, plan_of
 from dxlrun_analysis.servos.exchanges import Pairing
 
 KEPT = 200
@@ -61,7 +61,7 @@ NO_CAUSES = Causes()
 """Result for a log without late or long cycles."""
 
 
-class _Kept(NamedTuple):
+class _WorstCycleCandidate(NamedTuple):
     """One of the worst late or long cycles so far, with the packets from the preceding cycle's read on."""
 
     cycle: np.void
@@ -83,11 +83,11 @@ class CycleCauses:
         self._controllers: tuple[str, ...] = ()
         self._machine = MachineHistory()
         self._samples: list[MachineSample] = []
-        self._kept: list[_Kept] = []
+        self._kept: list[_WorstCycleCandidate] = []
         self._begin_ns: int | None = None
         self._end_ns = 0  # End of the last cycle
 
-    def take(self, log: Log) -> None:
+    def add_slice(self, log: Log) -> None:
         """Add the cycles, packets and machine samples of the next slice of the log.
 
         Raises:
@@ -108,7 +108,7 @@ class CycleCauses:
             self._end_ns = int(cycles["written"][-1])
         self._advance(cycles if self._newest is None else np.concatenate([self._newest, cycles]))
 
-    def finish(self) -> Causes:
+    def find_causes(self) -> Causes:
         """Split the worst cycles by cause, and return the causes of the whole run."""
         if self._newest is not None:
             self._advance(self._newest, final=True)
@@ -131,7 +131,9 @@ class CycleCauses:
             tuple(causes),
             tuple(self._worst(one, account) for one, account in worst[:WORST]),
             self._machine.slow,
-            MachineLoad() if self._begin_ns is None else self._machine.load(self._begin_ns, self._end_ns),
+            MachineLoad()
+            if self._begin_ns is None
+            else self._machine.compute_load(self._begin_ns, self._end_ns),
         )
 
     def _advance(self, cycles: Cycles, *, final: bool = False) -> None:
@@ -152,13 +154,13 @@ class CycleCauses:
         between //= np.maximum(behind["cycle"] - ready["cycle"][:followed], 1)
         ready["period"][:followed] = np.where(between > 0, between, ready["period"][:followed])
         rows = ready if self._before is None else np.concatenate([self._before, ready])
-        self._look(rows, new=len(rows) - count)
+        self._count_late_cycles(rows, new=len(rows) - count)
         self._before = rows[-1:].copy()
         from_ns = int(rows["read"][-1])
-        kept = [part.take(part.last_ns >= from_ns) for part in self._packets]
+        kept = [part.select_rows(part.last_ns >= from_ns) for part in self._packets]
         self._packets = [part.compact() for part in kept if len(part)]
 
-    def _look(self, rows: Cycles, new: int) -> None:
+    def _count_late_cycles(self, rows: Cycles, new: int) -> None:
         """Count late and long cycles from row `new` on, and keep the worst of the run with their packets."""
         begin = np.maximum(rows["scheduled"], np.append(rows["scheduled"][:1], rows["written"][:-1]))
         rows["late"], took = np.maximum(rows["woken"] - begin, 0), rows["written"] - rows["woken"]
@@ -177,9 +179,9 @@ class CycleCauses:
         for at in worst[size[worst] > least].tolist():
             since = int(rows["read"][at - 1]) if at else int(rows["scheduled"][at] - rows["period"][at])
             mine = (packets.first_ns > since) & (packets.first_ns <= rows["written"][at])
-            part = packets.take(np.flatnonzero(mine)).compact()
+            part = packets.select_rows(np.flatnonzero(mine)).compact()
             before = rows[at - 1] if at else None
-            self._kept.append(_Kept(rows[at], before, part))
+            self._kept.append(_WorstCycleCandidate(rows[at], before, part))
         self._kept = sorted(self._kept, key=lambda one: -one.cycle["size"])[:KEPT]
 
     def _share_with_machine(self, accounts: Sequence[Account]) -> None:
@@ -227,7 +229,7 @@ class CycleCauses:
         joint = bus.names.get(servo, "")
         return f"servo {servo} ({joint or bus.name})", joint or f"{bus.name} {servo}"
 
-    def _worst(self, one: _Kept, account: Account) -> WorstCycle:
+    def _worst(self, one: _WorstCycleCandidate, account: Account) -> WorstCycle:
         """Return a cycle's record for reports: causes, and packets since the preceding cycle ended."""
         cycle, scheduled = one.cycle, int(one.cycle["scheduled"])
         shares = [
@@ -236,7 +238,7 @@ class CycleCauses:
             if ns
         ]
         begin = scheduled - int(cycle["period"]) if one.before is None else int(one.before["written"])
-        packets = one.packets.take(np.flatnonzero(one.packets.first_ns >= begin))
+        packets = one.packets.select_rows(np.flatnonzero(one.packets.first_ns >= begin))
         woken, read, updated, written = ((int(cycle[name]) - scheduled) / 1e3 for name in _TIMES[1:])
         return WorstCycle(
             int(cycle["cycle"]),

@@ -5,8 +5,8 @@ from __future__ import annotations
 from collections.abc import Iterator
 
 from dxlrun.tooling.logs import PacketColumns
-from dxlrun_analysis.cycles.worst import TimelineKind, TimelinePacket
-from dxlrun_analysis.plan import LoggedBus
+from dxlrun_analysis.cycles.worst_cycles import TimelineKind, TimelinePacket
+from dxlrun_analysis.plan_excerpt import LoggedBus
 from dxlwire import PacketKind
 
 _KIND_NAMES: dict[int, TimelineKind] = {

@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Annotated
 from cyclopts import Parameter
 
 from dxlrun import InputError, LogError
-from dxlrun.tooling.output import counted, print_error, progress_bar, show, show_json
+from dxlrun.tooling.output import counted, print_error, progress_bar, show_json, show_parts
 from dxlrun.tooling.verbs import DebugFlag, JsonOfItsOwn, check_report, missing_extra, write_report
 
 if TYPE_CHECKING:
@@ -67,12 +67,12 @@ def analyze(
     from dxlrun import open_log
     from dxlrun.tooling.logs import TOOL_NAME
     from dxlrun_analysis import report as analysis
-    from dxlrun_analysis.causes.tables import worst_tables
+    from dxlrun_analysis.causes.cause_tables import worst_tables
     from dxlrun_analysis.latency.latency_log import is_measurement
 
     reader = open_log(log)
     if not logs and not as_json:
-        show(f"log: {log}")
+        show_parts(f"log: {log}")
     if is_measurement(reader):
         return _analyze_measurement(reader, report, as_json=as_json)
     tool = reader.metadata.get(TOOL_NAME)
@@ -82,7 +82,7 @@ def analyze(
         if as_json:
             show_json({"command": command, "packets": packets})
         else:
-            show(f"{log}: the traffic of `{command}`, no run: {counted(packets, 'packet', 'packets')}")
+            show_parts(f"{log}: the traffic of `{command}`, no run: {counted(packets, 'packet', 'packets')}")
         return 0
     with progress_bar(hidden=as_json) as draw:
 
@@ -92,7 +92,7 @@ def analyze(
         if report is None:
             result = analysis.analyze(reader, reading)
         else:
-            from dxlrun_analysis.page.page import analyzed_page
+            from dxlrun_analysis.page.report_page import analyzed_page
 
             result, text = analyzed_page(reader, reading)
             write_report(report, text)
@@ -100,9 +100,9 @@ def analyze(
     if as_json:
         show_json(result.numbers, code=code, errors=result.verdict.sentences[:code])
         return code
-    show(*analysis.parts(result), *worst_tables(result.totals.causes.worst[:worst]))
+    show_parts(*analysis.parts(result), *worst_tables(result.totals.causes.worst[:worst]))
     if report is not None:
-        show(f"\nreport: {report}")
+        show_parts(f"\nreport: {report}")
     return code
 
 
@@ -130,20 +130,20 @@ def _check(logs: Sequence[Path], *, report: Path | None, worst: int) -> None:
 def _analyze_measurement(log: LogReader, report: Path | None, *, as_json: bool) -> int:
     """Show the result of `dxlrun latency` from its log, in the same form as that command."""
     from dxlrun_analysis.latency.latency_log import machine_of, measurement
-    from dxlrun_analysis.latency.tables import parts
+    from dxlrun_analysis.latency.latency_tables import parts
 
     blocks, result = measurement(log)
     if report is not None:
         check_report(report, "bokeh")
-        from dxlrun_analysis.latency.page import page
+        from dxlrun_analysis.latency.latency_page import page
 
         write_report(report, page(result, blocks, machine_of(log)))
     if as_json:
         show_json(result)
         return 0
-    show(*parts(result))
+    show_parts(*parts(result))
     if report is not None:
-        show(f"\nreport: {report}")
+        show_parts(f"\nreport: {report}")
     return 0
 
 
@@ -179,7 +179,7 @@ def _analyze_each(logs: Sequence[Path], *, as_json: bool) -> int:
     """
     from dxlrun import open_log
     from dxlrun_analysis.latency.latency_log import is_measurement, measurement
-    from dxlrun_analysis.latency.tables import line
+    from dxlrun_analysis.latency.latency_tables import line
     from dxlrun_analysis.report import analyze as analyze_log
 
     code = 0
@@ -207,7 +207,7 @@ def _analyze_each(logs: Sequence[Path], *, as_json: bool) -> int:
                 print_error(f"dxlrun: {error}")
             continue
         if not as_json:
-            show(f"{log}: {words}")
+            show_parts(f"{log}: {words}")
     if as_json:
         show_json({"logs": results}, code=code, errors=failures)
     return code

@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Annotated, Literal
 from cyclopts import Parameter
 
 from dxlrun import InputError
-from dxlrun.tooling.output import counted, err, show, show_json
+from dxlrun.tooling.output import counted, err, show_json, show_parts
 from dxlrun.tooling.verbs import DebugFlag, JsonFlag, missing_extra
 
 if TYPE_CHECKING:
@@ -63,9 +63,9 @@ def export(
         result = {"output": str(output), "format": file_format, f"{_OF[file_format]}s": count}
         show_json({**result, **({} if without is None else {"without_file": without})})
         return 0
-    show(f"{output}: {counted(count, _OF[file_format], f'{_OF[file_format]}s')}")
+    show_parts(f"{output}: {counted(count, _OF[file_format], f'{_OF[file_format]}s')}")
     for name, reason in (without or {}).items():
-        show(f"no {'file' if file_format == 'parquet' else 'table'} for {name}: {reason}")
+        show_parts(f"no {'file' if file_format == 'parquet' else 'table'} for {name}: {reason}")
     return 0
 
 
@@ -73,8 +73,8 @@ def _without_table(reader: LogReader, target: Path, to: Format) -> dict[str, str
     """Return the topics of the log that were not exported as a table, with reasons; None for LeRobot."""
     if to not in ("csv", "parquet"):
         return None
+    from dxlrun_analysis.export.arrow_tables import topics_without_table
     from dxlrun_analysis.export.parquet import has_file
-    from dxlrun_analysis.export.tables import topics_without_table
 
     # With --topic, CSV can hold any topic that has messages.
     return topics_without_table(reader, lambda name: to == "csv" or has_file(target, name))

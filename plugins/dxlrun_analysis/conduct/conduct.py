@@ -20,8 +20,8 @@ from numpy.typing import NDArray
 from dxlrun import Log
 from dxlrun.tooling.logs import UNREADABLE
 from dxlrun.tooling.records import Event, EventCode, GoalHistory, GoalReport, GoalTotals
-from dxlrun_analysis.cycles.latency import begins, first_deadline_ns
-from dxlrun_analysis.plan import LoggedPlan, plan_of
+from dxlrun_analysis.cycles.punctuality import begins, first_deadline_ns
+from dxlrun_analysis.plan_excerpt import LoggedPlan, plan_of
 
 _FALLEN_RAD = math.radians(60.0)  # Tilt of gravity from which the robot is down
 _SOME = 50  # Cycles at the start and at the end whose median gravity is compared
@@ -71,7 +71,7 @@ class ConductHistory:
         self._pending: list[Event] = []  # Faults of controllers without a takeover so far
         self._first, self._last = np.zeros((0, 3)), np.zeros((0, 3))  # Gravity in the frame of the IMU
 
-    def take(self, log: Log) -> None:
+    def add_slice(self, log: Log) -> None:
         """Add the events and IMU values of the next slice of the log."""
         if self._begin_ns is None and begins(log):
             self._begin_ns = first_deadline_ns(log)
@@ -80,7 +80,7 @@ class ConductHistory:
         for event in log.events:
             if event.code in _GOALS:
                 with suppress(*UNREADABLE):
-                    self._goals.add(msgspec.json.decode(event.data, type=GoalReport))
+                    self._goals.count_report(msgspec.json.decode(event.data, type=GoalReport))
             elif event.code in _ENDS:
                 self._ends.add(event.code)
             elif event.code == EventCode.TAKEOVER:
@@ -110,7 +110,7 @@ class ConductHistory:
             time_s = (event.t_ns - (self._begin_ns or event.t_ns)) / 1e9
             self._takeovers.append(Takeover(time_s, event.source, by, event.text, fell))
 
-    def finish(self) -> Conduct:
+    def summarize_conduct(self) -> Conduct:
         """Return the behaviour over all slices."""
         turned, lies = None, any(one.fell for one in self._takeovers)
         if len(self._first) and len(self._last):

@@ -21,7 +21,7 @@ from numpy.typing import NDArray
 
 from dxlrun import Floats, Log
 from dxlrun_analysis.finding import Finding, Rank, listed
-from dxlrun_analysis.plan import LoggedPlan, plan_of
+from dxlrun_analysis.plan_excerpt import LoggedPlan, plan_of
 
 _HANGS_S = 1.0
 _TIMES_LONGER = 10
@@ -41,7 +41,7 @@ Times = NDArray[np.int64]
 
 
 @dataclass(frozen=True, slots=True)
-class _Stay:
+class _LongestStandstill:
     """Longest time in which a value (or all of a source) did not change, with its circumstances."""
 
     hung_s: float = 0.0
@@ -54,7 +54,7 @@ class _Stay:
 
 
 @dataclass(slots=True)
-class _Watched:
+class _ChangeHistory:
     """Recent changes of one value of a source, or of all its values together, and its longest standstill."""
 
     since_ns: int  # Time of the last change
@@ -67,9 +67,9 @@ class _Watched:
     """The value after each of its last 40 changes."""
     places: Floats = field(default_factory=lambda: np.zeros((0, 0)))
     """Joint positions at each of the last 40 changes, shape (changes, joints)."""
-    stay: _Stay = field(default_factory=_Stay)
+    stay: _LongestStandstill = field(default_factory=_LongestStandstill)
 
-    def take(self, at_ns: Times, values: Floats, changed: NDArray[np.bool_], position: Floats) -> None:
+    def add_values(self, at_ns: Times, values: Floats, changed: NDArray[np.bool_], position: Floats) -> None:
         """Add cycles in which the source was valid.
 
         Args:
@@ -97,7 +97,7 @@ class _Watched:
             at = recent[kept + gap - 1] if kept + gap else 0.0
             rested = len(places[upto]) > 1 and float(np.ptp(places[upto], axis=0).max()) < _RESTED_RAD
             inside = bool(low < at < high and at != 0.0)
-            self.stay = _Stay(
+            self.stay = _LongestStandstill(
                 (end - begin) * 1e-9,
                 begin * 1e-9,
                 int(longest[gap]) * 1e-9,
@@ -120,10 +120,10 @@ class _Source:
 
     def __init__(self, at_ns: int, values: Floats, position: Floats) -> None:
         self._at_ns, self._lived_ns, self._was_valid, self._last = at_ns, 0, True, values
-        self.all = _Watched(0, position)
-        self.each = [_Watched(0, position) for _ in values]
+        self.all = _ChangeHistory(0, position)
+        self.each = [_ChangeHistory(0, position) for _ in values]
 
-    def take(self, at_ns: Times, valid: NDArray[np.bool_], values: Floats, position: Floats) -> None:
+    def add_cycles(self, at_ns: Times, valid: NDArray[np.bool_], values: Floats, position: Floats) -> None:
         """Add cycles: times in ns, validity, values of shape (cycles, values), and joint positions."""
         between = np.diff(at_ns, prepend=self._at_ns)
         between[~valid | ~np.append(self._was_valid, valid[:-1])] = 0
@@ -135,9 +135,9 @@ class _Source:
         self._lived_ns = int(lived[-1])
         changed = np.vstack([self._last, values[:-1]]) != values
         self._last = values[-1].copy()
-        self.all.take(lived, np.zeros(len(lived)), changed.any(axis=1), position)
+        self.all.add_values(lived, np.zeros(len(lived)), changed.any(axis=1), position)
         for one, mine, column in zip(self.each, changed.T, values.T, strict=True):
-            one.take(lived, column, mine, position)
+            one.add_values(lived, column, mine, position)
 
 
 class FrozenSources:
@@ -147,7 +147,7 @@ class FrozenSources:
         self._sources: dict[str, _Source] = {}
         self._plan, self._states = LoggedPlan(), dict[str, tuple[str, ...]]()
 
-    def take(self, log: Log) -> None:
+    def add_slice(self, log: Log) -> None:
         """Add the source values in the cycles of the next slice of the log."""
         if not len(log.cycles):
             return
@@ -165,9 +165,9 @@ class FrozenSources:
                 first = int(np.argmax(valid))
                 valid, values = valid[first:], values[first:]
                 self._sources[name] = _Source(int(at_ns[first]), values[0], position[first])
-                self._sources[name].take(at_ns[first:], valid, values, position[first:])
+                self._sources[name].add_cycles(at_ns[first:], valid, values, position[first:])
             else:
-                self._sources[name].take(at_ns, valid, values, position)
+                self._sources[name].add_cycles(at_ns, valid, values, position)
 
     def findings(self) -> Iterable[Finding]:
         """Report each sensor or device that was frozen as a whole, and single values that were."""
@@ -193,7 +193,7 @@ class FrozenSources:
                         others = ", while its other values changed"
                         yield replace(self._frozen(name, state, stay, others), rank=Rank.CAUSE)
 
-    def _frozen(self, name: str, values: str, stay: _Stay, then: str = "") -> Finding:
+    def _frozen(self, name: str, values: str, stay: _LongestStandstill, then: str = "") -> Finding:
         found = [(bus, each) for bus in self._plan.buses for each in bus.devices if each.name == name]
         where = "".join(f" (ID {each.servo_id} on bus {bus.name})" for bus, each in found)
         kind = next(source.kind for source in self._plan.loop.sources if source.name == name).capitalize()
@@ -214,7 +214,7 @@ def _trembled(values: Floats) -> int:
     return len(np.unique(values))
 
 
-def _at_once(stays: Collection[_Stay]) -> bool:
+def _at_once(stays: Collection[_LongestStandstill]) -> bool:
     """Return whether the standstills of several values began at the same time, up to 0.1 s and the longest
     standstill before."""
     begins = [stay.from_s for stay in stays]

@@ -11,7 +11,7 @@ from pyarrow import csv
 from dxlrun import LogError, LogReader
 from dxlrun.tooling.files import suggestion
 from dxlrun.tooling.topics import bus_topic
-from dxlrun_analysis.export.tables import COMMANDS, CYCLES, EVENTS, WITHOUT_TABLE, tables_of
+from dxlrun_analysis.export.arrow_tables import COMMANDS, CYCLES, EVENTS, WITHOUT_TABLE, tables_of
 
 
 def write_csv(reader: LogReader, target: Path, topic: str) -> int:

@@ -56,7 +56,7 @@ class _Statistics:
     squares: Floats = field(default_factory=lambda: np.zeros(1))
     """Sum of squared differences from the mean (Chan, Golub, LeVeque 1983: pairwise updates)."""
 
-    def take(self, rows: NDArray[np.generic]) -> None:
+    def add_rows(self, rows: NDArray[np.generic]) -> None:
         """Add the feature's values in some frames, shape (frames, elements)."""
         values = rows.astype(np.float64)
         mean = values.mean(axis=0)
@@ -92,7 +92,7 @@ def write_dataset(reader: LogReader, directory: Path) -> int:
     made = _Dataset(file)
     with closing(made):
         for stretch in _stretches(reader, goals):
-            made.take(stretch)
+            made.write_frames(stretch)
     if made.last is None:
         raise LogError(
             f"{reader.path}: it has no cycle in which every joint had a position and a goal, so no frames"
@@ -134,7 +134,7 @@ class _Dataset:
         """Number of frames written so far."""
         return self.episodes[-1].end if self.episodes else 0
 
-    def take(self, stretch: _Stretch) -> None:
+    def write_frames(self, stretch: _Stretch) -> None:
         """Write frames to the data file. Raises OSError."""
         self.last = stretch.log
         if stretch.begins:
@@ -148,7 +148,7 @@ class _Dataset:
         self._writer.write_table(table)
         for name, values in {_STATE: stretch.states, _ACTION: stretch.actions, **numbers}.items():
             for statistics in (self.statistics, episode.statistics):
-                statistics.setdefault(name, _Statistics()).take(values.reshape(len(index), -1))
+                statistics.setdefault(name, _Statistics()).add_rows(values.reshape(len(index), -1))
         episode.end += len(index)
 
     def close(self) -> None:

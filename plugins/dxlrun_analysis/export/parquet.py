@@ -11,7 +11,7 @@ import pyarrow.parquet as pq
 
 from dxlrun import LogReader
 from dxlrun.tooling.topics import BUS_PREFIX
-from dxlrun_analysis.export.tables import PACKETS, tables_of
+from dxlrun_analysis.export.arrow_tables import PACKETS, tables_of
 
 _NAMES = {"/cycle": "cycles"}
 _ODD = re.compile(r"[^\w.-]|^\.")

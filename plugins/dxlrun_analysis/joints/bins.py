@@ -23,7 +23,7 @@ class Bins:
         self.begin_ns, self.bin_ns = begin_ns, _FIRST_BIN_NS
         self._values = [np.full(shape, empty) for _, empty in _JOINS]
 
-    def take(self, times: NDArray[np.int64], values: Floats) -> None:
+    def bin_cycles(self, times: NDArray[np.int64], values: Floats) -> None:
         """Add the values of some cycles to their bins.
 
         Args:

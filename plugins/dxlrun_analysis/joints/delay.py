@@ -35,7 +35,7 @@ class DelayFit:
     lowest: float = math.inf
     highest: float = -math.inf
 
-    def take(self, times: Floats, goal: Floats, position: Floats, known: int) -> None:
+    def add_cycles(self, times: Floats, goal: Floats, position: Floats, known: int) -> None:
         """Add the cycles from number `known` on; the first `known` were already added.
 
         Args:

@@ -64,7 +64,7 @@ class Windows:
     mean: Floats
     most: Floats
 
-    def reach(self, quantity: int, when: Flags) -> float:
+    def compute_range(self, quantity: int, when: Flags) -> float:
         """Return the greatest minus the smallest value of a quantity in the windows `when`; 0 for none."""
         most = np.fmax.reduce(self.most[quantity, when], initial=-math.inf)
         return max(0.0, float(most - np.fmin.reduce(self.least[quantity, when], initial=math.inf)))
@@ -91,7 +91,7 @@ class Windows:
 
 
 @dataclass(frozen=True, slots=True)
-class Failing:
+class FollowingFailure:
     """Failure of one joint to follow its commands: rule, description, and windows in which it failed."""
 
     code: str
@@ -134,7 +134,7 @@ def distance(joint: PlannedJoint, way: float) -> str:
     return joint.logged.unit.text(way, digits=1)
 
 
-def failure_of(brief: Windows, one: Windows) -> tuple[Windows, Failing | None]:
+def failure_of(brief: Windows, one: Windows) -> tuple[Windows, FollowingFailure | None]:
     """Return the failure of one joint, if any, and the time series that shows it.
 
     A standstill precedes an oscillation, that a joint that follows worse, and that a joint far from its goal.
@@ -150,7 +150,7 @@ def failure_of(brief: Windows, one: Windows) -> tuple[Windows, Failing | None]:
     return brief, _far(brief)
 
 
-def _still(one: Windows) -> Failing | None:
+def _still(one: Windows) -> FollowingFailure | None:
     """Return the longest standstill of a joint whose trajectory moves, or None."""
     near, moves = max(_STILL_RAD * one.joint.share, 2 * one.joint.tick), MOVED_RAD * one.joint.share
     least, most = one.least[POSITION], one.most[POSITION]
@@ -166,7 +166,7 @@ def _still(one: Windows) -> Failing | None:
         seconds = float((away & when).sum()) * one.length_s
         if (
             seconds >= max(_STILL_S, found.seconds if found else 0.0)
-            and one.reach(WAY, when) >= moves
+            and one.compute_range(WAY, when) >= moves
             and np.nanmax(np.abs([one.least[ERROR, when], one.most[ERROR, when]])) >= moves
         ):
             there = when | (away & (least >= low - near) & (most <= high + near))
@@ -179,7 +179,7 @@ def _still(one: Windows) -> Failing | None:
     return found
 
 
-def _stood(one: Windows, when: Flags, there: Flags, seconds: float) -> Failing:
+def _stood(one: Windows, when: Flags, there: Flags, seconds: float) -> FollowingFailure:
     """Return a standstill as a failure. The joint stood still in the windows `when`; `there` are all
     windows at that position; `seconds` is their duration."""
     at = np.nanmedian(one.least[POSITION, when])
@@ -192,10 +192,10 @@ def _stood(one: Windows, when: Flags, there: Flags, seconds: float) -> Failing:
     most = np.nanmax(np.abs([one.least[ERROR, there], one.most[ERROR, there]]))
     text += f" {seconds:.1f} s although its goal was up to {one.distance(float(most))} away"
     text += one.load_text(when, ~there)
-    return Failing("stood_still", text, there, seconds)
+    return FollowingFailure("stood_still", text, there, seconds)
 
 
-def _far(one: Windows) -> Failing | None:
+def _far(one: Windows) -> FollowingFailure | None:
     """Return the windows in which a joint is far from its goal and approaches it slowly, as a failure."""
     away, speed = one.mean[AWAY], one.mean[SPEED]
     if not len(away):
@@ -207,17 +207,17 @@ def _far(one: Windows) -> Failing | None:
     seconds = float(far.sum()) * one.length_s
     if seconds < BAD_S:
         return None
-    moved = min(1.0, one.reach(POSITION, far) / max(one.reach(WAY, far), one.joint.tick))
+    moved = min(1.0, one.compute_range(POSITION, far) / max(one.compute_range(WAY, far), one.joint.tick))
     steps = np.abs(np.diff(one.mean[POSITION], prepend=np.nan))[far]
     fastest = (
         one.distance(float(np.nanquantile(steps, 0.9)) / one.length_s) if np.isfinite(steps).any() else ""
     )
     text = f"was {one.distance(one.typical(AWAY, far))} from its goal for {seconds:.1f} s, and followed "
     text += f"{moved:.0%} of its way, at up to {fastest}/s{one.load_text(far, ~far)}"
-    return Failing("follows_worse", text, far, seconds, shared=True)
+    return FollowingFailure("follows_worse", text, far, seconds, shared=True)
 
 
-def _oscillates(one: Windows) -> Failing | None:
+def _oscillates(one: Windows) -> FollowingFailure | None:
     """Return the windows in which the joint's error or its goal swings, as a failure; None if too short."""
     by_effort = np.isnan(one.mean[AWAY])
     shakes = one.mean[SWINGS] >= np.where(by_effort, _SHAKES_BY_EFFORT_HZ, _SHAKES_HZ)
@@ -229,14 +229,14 @@ def _oscillates(one: Windows) -> Failing | None:
         text = f"oscillates {one.typical(quantity, when) / 2:.0f} times a second"
         if math.isnan(off):
             text += " around its goal, to which a controller moves it with an effort"
-            return Failing("oscillates", text, when, seconds)
+            return FollowingFailure("oscillates", text, when, seconds)
         text += ", as its commands do" if when is told else " around its goal"
         text += f", {one.distance(off)} away on average{one.load_text(when, ~when)}"
-        return Failing("oscillates", text, when, seconds, commanded=when is told)
+        return FollowingFailure("oscillates", text, when, seconds, commanded=when is told)
     return None
 
 
-def _worse(one: Windows) -> Failing | None:
+def _worse(one: Windows) -> FollowingFailure | None:
     """Return the windows in which a joint follows worse than ever before, as a failure; None if too short."""
     away = one.mean[AWAY]
     bad, well, before = (np.zeros(len(away), np.bool_) for _ in range(3))
@@ -257,7 +257,7 @@ def _worse(one: Windows) -> Failing | None:
     before &= np.cumsum(bad) == 0
     error, usual = one.typical(AWAY, bad), one.typical(AWAY, before)
     text = f"follows worse than before: {one.distance(error)} away instead of {one.distance(usual)}"
-    return Failing("follows_worse", text + one.load_text(bad, before), bad, seconds, shared=True)
+    return FollowingFailure("follows_worse", text + one.load_text(bad, before), bad, seconds, shared=True)
 
 
 def _is_worse(one: Windows, at: int, before: Flags) -> bool:

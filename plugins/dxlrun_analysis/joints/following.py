@@ -26,7 +26,7 @@ from dxlrun import Floats
 from dxlrun_analysis.finding import Finding, Rank
 from dxlrun_analysis.joints.failing import joint_finding
 from dxlrun_analysis.joints.planned import PlannedJoint
-from dxlrun_analysis.joints.trail import Samples
+from dxlrun_analysis.joints.trail import TrailSamples
 
 STROKE_RAD = 0.1  # 6 deg: least amplitude of a reversal
 _LAGS_S = np.arange(0.0, 0.31, 0.01)
@@ -108,7 +108,7 @@ class _Stay(NamedTuple):
         return fast <= _FASTER * slow + _CREEPS_RAD_S
 
 
-class Followed(NamedTuple):
+class FollowedJoint(NamedTuple):
     """Samples of one joint, and its trajectory after the lag typical of its kind; rad of its servo."""
 
     row: int
@@ -200,7 +200,7 @@ class Followed(NamedTuple):
         return bends
 
 
-def followed(joints: Sequence[PlannedJoint], samples: Samples) -> list[Followed]:
+def followed(joints: Sequence[PlannedJoint], samples: TrailSamples) -> list[FollowedJoint]:
     """Return the joints that moved and lost few replies, each compared with its trajectory after the
     median lag of the joints of its kind."""
     lags: dict[str, dict[int, float]] = defaultdict(dict)
@@ -219,7 +219,9 @@ def followed(joints: Sequence[PlannedJoint], samples: Samples) -> list[Followed]
     return sorted(found, key=lambda one: one.row)
 
 
-def _followed(row: int, joint: PlannedJoint, alike: int, lag_s: float, samples: Samples) -> Followed:
+def _followed(
+    row: int, joint: PlannedJoint, alike: int, lag_s: float, samples: TrailSamples
+) -> FollowedJoint:
     at_s, position = samples.at_s, samples.position[:, row] / joint.share
     goal = _late(at_s, samples.way[:, row] / joint.share, lag_s)
     speed = np.gradient(goal, at_s)
@@ -232,7 +234,7 @@ def _followed(row: int, joint: PlannedJoint, alike: int, lag_s: float, samples: 
         near = np.flatnonzero(np.abs(off[begin:]) <= _NEAR_AGAIN_RAD)
         off[begin : begin + (int(near[0]) if len(near) else len(off))] = np.nan
     load = samples.load[:, row] / joint.top_effort
-    return Followed(row, joint, alike, lag_s, samples.step_s, at_s, goal, position, off, load, speed)
+    return FollowedJoint(row, joint, alike, lag_s, samples.step_s, at_s, goal, position, off, load, speed)
 
 
 def _late(at_s: Floats, way: Floats, lag_s: float) -> Floats:
@@ -311,10 +313,10 @@ def _nearest(value: float, before: Sequence[float]) -> float:
 # Rules
 
 
-class _Shown(NamedTuple):
+class _FollowingEvidence(NamedTuple):
     """Evidence about one joint for the rules below: its visits and swings, and the greatest changes."""
 
-    one: Followed
+    one: FollowedJoint
     visits: list[Visit]
     swings: Floats
 
@@ -327,7 +329,7 @@ class _Shown(NamedTuple):
         return max((visit.load_change for visit in self.visits), default=0.0)
 
 
-def changed(joints: Sequence[Followed], named: Set[int]) -> Iterator[Finding]:
+def changed(joints: Sequence[FollowedJoint], named: Set[int]) -> Iterator[Finding]:
     """Report each joint that follows worse or oscillates, by far more than any other joint does.
 
     Args:
@@ -335,7 +337,7 @@ def changed(joints: Sequence[Followed], named: Set[int]) -> Iterator[Finding]:
         named: Rows of joints that other rules report; they are omitted.
     """
     seen = [
-        _Shown(one, list(one.visits(_OFF_RAD / 2, _LOAD / 2)), one.swings())
+        _FollowingEvidence(one, list(one.visits(_OFF_RAD / 2, _LOAD / 2)), one.swings())
         for one in joints
         if one.row not in named
     ]
@@ -358,7 +360,7 @@ def _most(values: Iterable[tuple[float, str]], name: str) -> float:
     return max(0.0, ordered[-2 if alone else -1][0]) if ordered else 0.0
 
 
-def _follows_worse(mine: _Shown, others: Sequence[_Shown]) -> Finding | None:
+def _follows_worse(mine: _FollowingEvidence, others: Sequence[_FollowingEvidence]) -> Finding | None:
     joint = mine.one.joint
     least = max(_OFF_RAD, _OTHERS * _most(((one.off, one.one.joint.name) for one in others), joint.name))
     heavy = max(_LOAD, _OTHERS * _most(((one.load, one.one.joint.name) for one in others), joint.name))
@@ -376,7 +378,7 @@ def _lasts(visits: Sequence[Visit]) -> bool:
     return len(visits) >= _FEWEST_VISITS and sum(each.seconds for each in visits) >= _LASTS_S
 
 
-def _compared(one: Followed, name: str, visits: Iterable[Visit], way: int) -> str:
+def _compared(one: FollowedJoint, name: str, visits: Iterable[Visit], way: int) -> str:
     """Return error and load at those visits with the direction `way`, next to those of the earlier stays,
     as text. `name` is the direction in words; empty without such visits."""
     mine = [visit for visit in visits if visit.direction == way]
@@ -391,7 +393,7 @@ def _compared(one: Followed, name: str, visits: Iterable[Visit], way: int) -> st
     return text
 
 
-def _swings(mine: _Shown, others: Sequence[_Shown]) -> Finding | None:
+def _swings(mine: _FollowingEvidence, others: Sequence[_FollowingEvidence]) -> Finding | None:
     at_s, joint = mine.swings, mine.one.joint
     theirs = _most(((float(len(one.swings)), one.one.joint.name) for one in others), joint.name)
     if len(at_s) < max(_SWINGS, _OTHERS * theirs):

@@ -65,7 +65,7 @@ class ServoHealth:
         self._volts = np.zeros(0)
         self._samples: list[_Sample] = []
 
-    def take(self, log: Log) -> None:
+    def add_slice(self, log: Log) -> None:
         """Add the cycles of the next slice of the log."""
         cycles = log.cycles
         if not len(cycles):
@@ -75,7 +75,7 @@ class ServoHealth:
             self._bins = Bins(len(_QUANTITIES), len(log.joints), int(cycles["read_ns"][0]))
             self._faults = [set() for _ in log.joints]
             self._volts = np.full(len(log.joints), np.nan)
-        self._bins.take(cycles["read_ns"], np.array([cycles[name] for name in _QUANTITIES]))
+        self._bins.bin_cycles(cycles["read_ns"], np.array([cycles[name] for name in _QUANTITIES]))
         for joint, faults, values in zip(self._joints, self._faults, cycles["hardware_error"].T, strict=True):
             for value in np.unique(values).tolist():
                 faults.update(joint.faults(value))

@@ -53,7 +53,7 @@ class _Jumps:
     read_ns: int = 0
     position: float = math.nan
 
-    def take(self, joint: PlannedJoint, at_ns: NDArray[np.int64], position: Floats) -> None:
+    def add_positions(self, joint: PlannedJoint, at_ns: NDArray[np.int64], position: Floats) -> None:
         """Add positions of the joint with their times; NaN while it has no torque: not compared."""
         at_ns, position = np.append(self.read_ns, at_ns), np.append(self.position, position)
         seconds, moved = np.diff(at_ns) * 1e-9, np.abs(np.diff(position))
@@ -91,7 +91,7 @@ class Movement:
         self.bins = Bins(8, len(joints), begin_ns)
         self._trail = Trail(len(joints), begin_ns)
 
-    def take(self, cycles: NDArray[np.void], way: Floats, known: int) -> None:
+    def add_cycles(self, cycles: NDArray[np.void], way: Floats, known: int) -> None:
         """Add the cycles from number `known` on; the first `known` were already added, and are used for
         speeds only.
 
@@ -114,7 +114,7 @@ class Movement:
         for row, joint in enumerate(self._joints):
             kept = driven[:, row] | (cycles["torque"][:, row] != Torque.ON)
             jumping = np.where(driven, cycles["position"], np.nan)[kept, row]
-            self._jumps[row].take(joint, at_ns[kept, row], jumping)
+            self._jumps[row].add_positions(joint, at_ns[kept, row], jumping)
         position = np.where(driven & np.isfinite(way), cycles["position"], np.nan)
         error = position - way
         velocity = np.nan_to_num(cycles["velocity"])
@@ -140,8 +140,8 @@ class Movement:
             np.where(np.isnan(off), np.nan, swings),
             np.where(unknown, np.nan, self._swings(cycles, cycles["goal_position"])),
         ]
-        self.bins.take(cycles["read_ns"], np.array(values))
-        self._trail.take(
+        self.bins.bin_cycles(cycles["read_ns"], np.array(values))
+        self._trail.add_cycles(
             cycles["read_ns"], way, np.where(driven, cycles["position"], np.nan), cycles["effort"]
         )
 

@@ -10,7 +10,7 @@ import numpy as np
 
 from dxlrun import LINEAR, Log
 from dxlrun.tooling.plans import JointPlan
-from dxlrun_analysis.plan import UNKNOWN_JOINT, Mover, plan_of
+from dxlrun_analysis.plan_excerpt import UNKNOWN_JOINT, Mover, plan_of
 from dxlwire import ControlTable, Fault, HardwareErrors, find_table
 
 _TICK_RAD = math.tau / 4096  # For a servo that is not in the plan of the log

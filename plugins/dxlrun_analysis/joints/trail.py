@@ -16,7 +16,7 @@ STEP_S = 0.02  # 50 samples a second
 _MOST = 8_192  # Samples kept, nearly three minutes. A longer run keeps the first and the newest half
 
 
-class Samples(NamedTuple):
+class TrailSamples(NamedTuple):
     """Positions and loads of all joints over time; NaN if unknown, and at the gap in a long run."""
 
     step_s: float  # Time between samples; the period of a loop below 50 Hz
@@ -34,7 +34,7 @@ class Trail:
         self._step_s = STEP_S
         self._rows = np.zeros((0, 1 + 3 * joints))
 
-    def take(self, at_ns: NDArray[np.int64], way: Floats, position: Floats, load: Floats) -> None:
+    def add_cycles(self, at_ns: NDArray[np.int64], way: Floats, position: Floats, load: Floats) -> None:
         """Add the first cycle of each 20 ms; `at_ns` has shape (cycles,), the others (cycles, joints)."""
         since_s = (at_ns - self._begin_ns) * 1e-9
         if len(at_ns) > 2:
@@ -49,6 +49,6 @@ class Trail:
             self._rows = np.vstack([self._rows[:half], self._rows[-half:]])
             self._rows[half, 1:] = np.nan
 
-    def samples(self) -> Samples:
+    def samples(self) -> TrailSamples:
         """Return the kept samples of the run."""
-        return Samples(self._step_s, self._rows[:, 0], *np.split(self._rows[:, 1:], 3, axis=1))
+        return TrailSamples(self._step_s, self._rows[:, 0], *np.split(self._rows[:, 1:], 3, axis=1))

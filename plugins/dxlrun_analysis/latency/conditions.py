@@ -80,7 +80,7 @@ class Settings:
             polling_ns=self.polling_ns,
         )
 
-    def check(self, allowed_cores: frozenset[int]) -> None:
+    def validate_settings(self, allowed_cores: frozenset[int]) -> None:
         """Check that a measurement with these settings is possible on the allowed cores.
 
         Raises:

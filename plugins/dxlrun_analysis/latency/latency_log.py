@@ -37,7 +37,7 @@ class WakeUp:
     block: Annotated[int, Number("int32")]
 
 
-class About(msgspec.Struct, frozen=True):
+class MeasurementDetails(msgspec.Struct, frozen=True):
     """Metadata in the log of a measurement: settings, load, remarks, and processor time of each block."""
 
     settings: Settings
@@ -47,7 +47,7 @@ class About(msgspec.Struct, frozen=True):
     """One row per block: condition, number, processor time, elapsed time, polled time; ns."""
 
 
-def write(
+def write_log(
     path: Path, settings: Settings, blocks: Sequence[Block], load: str, remarks: Sequence[str]
 ) -> LogSummary:
     """Write the log of a latency measurement into a new or empty file.
@@ -56,7 +56,7 @@ def write(
         OSError: The file cannot be opened.
     """
     processes = tuple((one.condition, one.number, one.cpu_ns, one.wall_ns, one.margin_ns) for one in blocks)
-    about = About(settings, load, tuple(remarks), processes)
+    about = MeasurementDetails(settings, load, tuple(remarks), processes)
     metadata = {METADATA_NAME: {"about": msgspec.json.encode(about).decode()}}
     log = TopicWriter(path, ROBOT, settings.period_ns, metadata)
     topics = {one.name: log.open_topic(f"{_TOPIC}{one.name}", WakeUp) for one in settings.conditions}
@@ -93,7 +93,7 @@ def measurement(log: LogReader) -> tuple[tuple[Block, ...], Result]:
         LogError: The log is damaged.
     """
     try:
-        about = msgspec.json.decode(log.metadata[METADATA_NAME]["about"], type=About)
+        about = msgspec.json.decode(log.metadata[METADATA_NAME]["about"], type=MeasurementDetails)
     except (KeyError, msgspec.MsgspecError) as error:
         raise LogError(f"{log.path}: the log of a measurement that cannot be read: {error}") from error
     rows = {one.name: _rows(log, f"{_TOPIC}{one.name}") for one in about.settings.conditions}

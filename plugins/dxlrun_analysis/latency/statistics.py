@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from dxlrun_analysis.counts import Numbers, median, quantile
-from dxlrun_analysis.cycles.latency import ROUGH_NS
+from dxlrun_analysis.cycles.punctuality import ROUGH_NS
 from dxlrun_analysis.latency.conditions import Condition, Settings
 
 CONFIDENCE = 0.95
@@ -33,7 +33,7 @@ class Block:
     margin_ns: int = 0  # Polling time before each deadline
 
     @property
-    def late_ns(self) -> Numbers:
+    def lateness_ns(self) -> Numbers:
         """Lateness of each wake-up, ns."""
         late: Numbers = self.times[:, 1] - self.times[:, 0]
         return late
@@ -41,12 +41,12 @@ class Block:
     @property
     def late_us(self) -> NDArray[np.float64]:
         """Lateness of each wake-up, us."""
-        late: NDArray[np.float64] = self.late_ns / 1e3
+        late: NDArray[np.float64] = self.lateness_ns / 1e3
         return late
 
 
 @dataclass(frozen=True, slots=True)
-class Interval:
+class ConfidenceInterval:
     """Mean of a quantity over the blocks, with its 95 % confidence interval by Student's t."""
 
     mean: float
@@ -76,8 +76,8 @@ class Figures:
     polling_us: float
     """Time that the clock was polled before each deadline, on average over the blocks; 0 without polling."""
     # mean_us, median_us, p99_us of complete blocks, or of interrupted ones if none is complete.
-    over_blocks: dict[str, Interval]
-    ratios: dict[str, Interval]
+    over_blocks: dict[str, ConfidenceInterval]
+    ratios: dict[str, ConfidenceInterval]
     """Ratios of this condition's mean_us and p99_us to those of the reference condition (the C program, or
     the first) in the same block; empty for the reference."""
 
@@ -140,7 +140,7 @@ def _figures(
 ) -> Figures:
     own = [block for block in blocks if block.condition == condition.name]
     late_us = np.concatenate([block.late_us for block in own])
-    late_ns = np.concatenate([block.late_ns for block in own])
+    late_ns = np.concatenate([block.lateness_ns for block in own])
     seen = _seen(late_ns)
     values = _over_blocks(settings, own)
     other = (
@@ -196,7 +196,7 @@ def _over_blocks(settings: Settings, blocks: Sequence[Block]) -> dict[int, dict[
 
 
 def _of_block(block: Block) -> dict[str, float]:
-    seen = _seen(block.late_ns)
+    seen = _seen(block.lateness_ns)
     return {
         "mean_us": float(block.late_us.mean()),
         "median_us": median(*seen) / 1e3,
@@ -219,15 +219,15 @@ def mode_us(late_ns: NDArray[np.int64]) -> int:
     return int(bins[int(np.argmax(counts))])
 
 
-def interval(values: Sequence[float]) -> Interval:
+def interval(values: Sequence[float]) -> ConfidenceInterval:
     """Return mean and 95 % confidence interval of independently measured values (Student's t)."""
     number = len(values)
     mean = math.fsum(values) / number
     if number < 2:
-        return Interval(mean, None, None)
+        return ConfidenceInterval(mean, None, None)
     deviation = math.sqrt(math.fsum((value - mean) ** 2 for value in values) / (number - 1))
     half = t_quantile(number - 1) * deviation / math.sqrt(number)
-    return Interval(mean, mean - half, mean + half)
+    return ConfidenceInterval(mean, mean - half, mean + half)
 
 
 def t_quantile(freedom: int, confidence: float = CONFIDENCE) -> float:

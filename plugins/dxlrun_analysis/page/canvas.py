@@ -31,7 +31,7 @@ from numpy.typing import NDArray
 
 from dxlrun import Floats
 from dxlrun.tooling.html import data, figure, script
-from dxlrun_analysis.page.curves import Curves
+from dxlrun_analysis.page.run_curves import Curves
 
 PAPER = "#ffffff"
 INK, MUTED, GRID = "#1a1f26", "#5a6472", "#e1e5ea"
@@ -61,7 +61,7 @@ document.addEventListener("click", ({target}) => {
 
 
 @dataclass(frozen=True, slots=True)
-class Line:
+class PlotLine:
     """Appearance of one curve in a plot: legend, colour, dashes and width."""
 
     curve: str  # Name of the curve in `Curves`
@@ -71,7 +71,7 @@ class Line:
     width: float = 1.2
 
 
-def many_lines(curves: Curves, named: Iterable[tuple[str, str]]) -> list[Line]:
+def many_lines(curves: Curves, named: Iterable[tuple[str, str]]) -> list[PlotLine]:
     """Return a line for each curve that has values, in ten colours, then the same ones dashed; `named` are
     pairs of curve and legend.
 
@@ -83,7 +83,9 @@ def many_lines(curves: Curves, named: Iterable[tuple[str, str]]) -> list[Line]:
             same = next((one for one in found if _alike(curves, one, curve)), curve)
             found.setdefault(same, []).append(name)
     return [
-        Line(curve, ", ".join(names), MANY[number % len(MANY)], _DASHES[number // len(MANY) % len(_DASHES)])
+        PlotLine(
+            curve, ", ".join(names), MANY[number % len(MANY)], _DASHES[number // len(MANY) % len(_DASHES)]
+        )
         for number, (curve, names) in enumerate(found.items())
     ]
 
@@ -150,7 +152,7 @@ class Plot:
         """Identifier of the HTML element that the plot is drawn in."""
         return f"plot-{self.name}"
 
-    def place(self) -> Element:
+    def build_placeholder(self) -> Element:
         """Return the HTML element with the legend, and the empty element that the plot is drawn in."""
         about = {
             "id": self.place_name,
@@ -253,7 +255,13 @@ class Canvas:
     # Content of plots
 
     def curves(  # noqa: PLR0917  what is drawn, and how its axis is laid out
-        self, plot: Plot, curves: Curves, lines: Sequence[Line], unit: str, least: float, scale: float = 1.0
+        self,
+        plot: Plot,
+        curves: Curves,
+        lines: Sequence[PlotLine],
+        unit: str,
+        least: float,
+        scale: float = 1.0,
     ) -> None:
         """Draw curves into a plot, later ones on top, with a band from smallest to largest value.
 
@@ -295,7 +303,7 @@ class Canvas:
         missing = max(0.0, least - (high_end - low_end)) / 2 + 0.06 * (high_end - low_end)
         plot.model.y_range = Range1d(low_end - missing, high_end + missing)
 
-    def marks(self, plot: Plot, curves: Curves, lines: Sequence[Line]) -> None:
+    def marks(self, plot: Plot, curves: Curves, lines: Sequence[PlotLine]) -> None:
         """Draw a row of ticks at the bottom of a plot for each line, where its curve has a value."""
         shown = [line for line in lines if line.curve in curves]
         if not shown:
@@ -338,7 +346,7 @@ class Canvas:
 
     def elements(self, plots: Iterable[Plot]) -> list[Element]:
         """Return the HTML elements of plots, each with its title and caption."""
-        return [figure(plot.name, plot.title, plot.place(), plot.text) for plot in plots]
+        return [figure(plot.name, plot.title, plot.build_placeholder(), plot.text) for plot in plots]
 
     def scripts(self) -> list[Element]:
         """Return the script elements at the end of the page: plots as JSON, Bokeh's script, start script."""

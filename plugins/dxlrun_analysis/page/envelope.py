@@ -12,7 +12,7 @@ Times = NDArray[np.int64]  # Shape (rows,), ns
 
 
 @dataclass(frozen=True, slots=True)
-class Rows:
+class EnvelopeRows:
     """Smallest and largest value of several curves at common times, a row for each time bin.
 
     Equal values are a single sample.
@@ -22,7 +22,7 @@ class Rows:
     low: Samples
     high: Samples
 
-    def and_samples(self, times: Times, values: Samples, windows: list[tuple[int, int]]) -> Rows:
+    def and_samples(self, times: Times, values: Samples, windows: list[tuple[int, int]]) -> EnvelopeRows:
         """Return a copy in which single samples replace the time bins within windows.
 
         A bin that extends beyond the end of a window is drawn from that end on.
@@ -41,15 +41,15 @@ class Rows:
         t_ns = np.concatenate([t_ns[keep], times])
         order = np.argsort(t_ns, kind="stable")
         low, high = (np.concatenate([side[keep], values])[order] for side in (self.low, self.high))
-        return Rows(t_ns[order], low, high)
+        return EnvelopeRows(t_ns[order], low, high)
 
-    def with_gaps(self, longest_ns: int) -> Rows:
+    def with_gaps(self, longest_ns: int) -> EnvelopeRows:
         """Return a copy with a row of NaN in each gap longer than `longest_ns`: no line crosses it."""
         before = np.flatnonzero(np.diff(self.t_ns) > longest_ns) + 1
         if not len(before):
             return self
         nothing = np.float32(np.nan)
-        return Rows(
+        return EnvelopeRows(
             np.insert(self.t_ns, before, self.t_ns[before - 1] + 1),
             np.insert(self.low, before, nothing, axis=0),
             np.insert(self.high, before, nothing, axis=0),
@@ -78,7 +78,7 @@ class Envelope:
         self._low = np.full((most, curves), np.nan, np.float32)
         self._high = self._low.copy()
 
-    def take(self, t_ns: Times, values: Samples) -> None:
+    def add_samples(self, t_ns: Times, values: Samples) -> None:
         """Add the next samples; `values` has shape (samples, curves), NaN without a value."""
         if not len(t_ns):
             return
@@ -102,10 +102,10 @@ class Envelope:
         """Greatest time between two rows that have no gap in the samples between them, ns."""
         return 2 * self._width_ns
 
-    def rows(self) -> Rows:
+    def rows(self) -> EnvelopeRows:
         """Return a row for each bin that has samples, at the time of its first sample."""
         filled = np.flatnonzero(self._t_ns != np.iinfo(np.int64).max)
-        return Rows(self._t_ns[filled], self._low[filled], self._high[filled])
+        return EnvelopeRows(self._t_ns[filled], self._low[filled], self._high[filled])
 
     def _double(self) -> None:
         half = len(self._t_ns) // 2

@@ -5,8 +5,8 @@ from __future__ import annotations
 from collections.abc import Callable, Sequence
 
 from dxlrun.tooling.output import Column, Columns, Table, Value, flagged, microseconds
-from dxlrun_analysis.causes.tables import causes_table
-from dxlrun_analysis.cycles.latency import Duration, Durations, Periods
+from dxlrun_analysis.causes.cause_tables import causes_table
+from dxlrun_analysis.cycles.punctuality import Durations, Periods, StepDuration
 from dxlrun_analysis.parts.part import Report, ReportPart, listing
 
 
@@ -40,20 +40,20 @@ def _loop(report: Report, periods: Periods) -> Table:
         ("log complete", "yes" if report.about.complete else unfinished),
     ]
     title = f"{report.robot}, {periods.rates}, {periods.seconds:.1f} s"
-    return Table.of(title, [Column("loop", "name"), Column("")], rows)
+    return Table.from_rows(title, [Column("loop", "name"), Column("")], rows)
 
 
-def _controllers(_: Report, updates: Sequence[Duration]) -> Table:
+def _controllers(_: Report, updates: Sequence[StepDuration]) -> Table:
     # On virtual time updates take no time.
     shown = updates if any(item.cycles for item in updates) else ()
     return Table.listing("Controllers", [(Column("update of", "name"), "name"), *_DURATION], shown)
 
 
-def _time(name: str) -> Callable[[Duration], Value]:
+def _time(name: str) -> Callable[[StepDuration], Value]:
     return lambda item: microseconds(getattr(item, name)) if item.cycles else "-"
 
 
-_DURATION: Columns[Duration] = (
+_DURATION: Columns[StepDuration] = (
     (Column("cycles"), "cycles"),
     (Column("median"), _time("median_us")),
     (Column("99 %"), _time("p99_us")),
@@ -64,14 +64,14 @@ PERIODS = ReportPart("periods", lambda report: report.totals.periods, _loop, sec
 LATENCY = ReportPart("latency", lambda report: report.totals.latency)
 STEPS = ReportPart(
     "steps",
-    lambda report: report.tally.of(Durations).finish()[0],
+    lambda report: report.tally.find_collector(Durations).compute_durations()[0],
     listing("Steps of a cycle", ((Column("step", "name"), "name"), *_DURATION)),
     Durations,
     section="budget",
 )
 CONTROLLERS = ReportPart(
     "controllers",
-    lambda report: report.tally.of(Durations).finish()[1],
+    lambda report: report.tally.find_collector(Durations).compute_durations()[1],
     _controllers,
     Durations,
     section="budget",

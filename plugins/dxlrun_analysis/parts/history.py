@@ -10,7 +10,7 @@ import msgspec
 from dxlrun import Log
 from dxlrun.tooling.output import Cell, Column, Columns, Table, Tone
 from dxlrun.tooling.records import EventGroup, Severity
-from dxlrun_analysis.conduct.steering import Act
+from dxlrun_analysis.conduct.steering_history import Act
 from dxlrun_analysis.parts.part import Report, ReportPart, listing
 
 _MOST_ACTS = 100
@@ -41,14 +41,14 @@ class TopicCounts:
         self._found: dict[str, tuple[str, int, int, int]] = {}
         """Type, number of messages, times of the first and the last (ns), by topic."""
 
-    def take(self, log: Log) -> None:
+    def add_slice(self, log: Log) -> None:
         """Count the messages in the next slice of the log."""
         for one in log.topics.values():
             if one.data:
                 _, count, first_ns, _ = self._found.get(one.name, ("", 0, int(one.t_ns[0]), 0))
                 self._found[one.name] = one.type.name, count + len(one.data), first_ns, int(one.t_ns[-1])
 
-    def finish(self) -> tuple[TopicCount, ...]:
+    def count_topics(self) -> tuple[TopicCount, ...]:
         """Return the counted topics, in the order of their first messages."""
         return tuple(
             TopicCount(name, kind, count, (count - 1) * 1e9 / (last - first) if last > first else None)
@@ -121,7 +121,7 @@ STEERING = ReportPart("steering", lambda report: report.totals.acts, _steering, 
 PAUSES = ReportPart("pauses", lambda report: report.totals.pauses)
 TOPICS = ReportPart(
     "topics",
-    lambda report: report.tally.of(TopicCounts).finish(),
+    lambda report: report.tally.find_collector(TopicCounts).count_topics(),
     listing("Topics", _TOPIC),
     TopicCounts,
     late=1,

@@ -43,13 +43,13 @@ class ReportPart(Generic[T]):
     first: bool = False  # The table is the first of its section
     late: int = 0  # In a terminal, tables with a higher number come later
 
-    def of(self, report: Report) -> T:
+    def numbers_of(self, report: Report) -> T:
         """Return the numbers of this part from a finished report."""
         return cast("T", report.numbers[self.name])
 
     def table_of(self, report: Report) -> Table | None:
         """Return the table of this part for a report, or None without a table or rows."""
-        found = self.table and self.table(report, self.of(report))
+        found = self.table and self.table(report, self.numbers_of(report))
         return found if found and found.rows else None
 
 

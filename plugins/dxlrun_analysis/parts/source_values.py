@@ -36,7 +36,7 @@ class SourceHistory:
         self._least: Floats = np.zeros(0)
         self._greatest: Floats = np.zeros(0)
 
-    def take(self, log: Log) -> None:
+    def add_slice(self, log: Log) -> None:
         """Add the source values in the cycles of the next slice of the log."""
         layout = log.header.layout
         if not len(log.cycles) or not layout.source_states:
@@ -55,7 +55,7 @@ class SourceHistory:
         self._least = np.fmin(self._least, np.min(values, axis=0, where=known, initial=np.inf))
         self._greatest = np.fmax(self._greatest, np.max(values, axis=0, where=known, initial=-np.inf))
 
-    def finish(self) -> tuple[SourceValues, ...]:
+    def summarize_values(self) -> tuple[SourceValues, ...]:
         """Return the values of all states, in the order of the cycle's record."""
         rows = zip(self._names, self._counts.tolist(), self._sums, self._least, self._greatest, strict=True)
         return tuple(
@@ -79,7 +79,7 @@ _COLUMNS: Columns[SourceValues] = (
 
 SOURCES = ReportPart(
     "sources",
-    lambda report: report.tally.of(SourceHistory).finish(),
+    lambda report: report.tally.find_collector(SourceHistory).summarize_values(),
     listing("Devices, sensors and states of controllers", _COLUMNS),
     SourceHistory,
     section="joints",

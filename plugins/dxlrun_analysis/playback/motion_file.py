@@ -16,7 +16,7 @@ from dxlrun.tooling.plans import ControllerPlan, LoopPlan, from_json
 from dxlrun.tooling.robots import TRAJECTORY, command_kind, load_plugins, parse_motion
 from dxlrun_analysis.playback.recorded_motion import Floats, RecordedMotion
 from dxlrun_analysis.playback.spline_path import TURN_SIZES, SplinePath, fit
-from dxlrun_controllers.laws.tracking import CLOSING_SPEED
+from dxlrun_controllers.laws.tracking_law import CLOSING_SPEED
 
 LEAD_S = 1.0  # Before the first point, during which controllers move their joints there, as in the thesis
 _STEP_S = 0.02  # Between points of a controller that accepts single positions
@@ -29,7 +29,7 @@ class MotionFile(msgspec.Struct, frozen=True):
     points: Mapping[str, int]  # By controller
 
 
-class _Part(msgspec.Struct, frozen=True):
+class _ControllerShare(msgspec.Struct, frozen=True):
     """Joints of a recorded motion that one controller plays, and the form of points that it accepts."""
 
     controller: str
@@ -68,7 +68,7 @@ def motion_file(
     if speeds is None:
         robot = () if motion.plan is None else _logged_loop(motion).joints
         speeds = {joint.name: joint.highest_speed for joint in robot}
-    parts = [_Part(controller, motion.joints, True)] if controller else _parts(motion, plans)
+    parts = [_ControllerShare(controller, motion.joints, True)] if controller else _parts(motion, plans)
     name = re.sub(r"\W", "_", target.stem, flags=re.ASCII).strip("_") or "motion"
     name = name if name[0].isalpha() else f"motion_{name}"
     lines = [f"# {line}" for line in origin.split("\n")]
@@ -87,7 +87,7 @@ def motion_file(
     return MotionFile(text, points)
 
 
-def _path_of(part: _Part, motion: RecordedMotion, allowed: Floats) -> SplinePath:
+def _path_of(part: _ControllerShare, motion: RecordedMotion, allowed: Floats) -> SplinePath:
     columns = [motion.joints.index(joint) for joint in part.joints]
     return fit(replace(motion, joints=part.joints, position=motion.position[:, columns]), allowed[columns])
 
@@ -100,12 +100,12 @@ def _closing_speed(joint: str, unit: JointUnit, speeds: Mapping[str, float]) -> 
 
 
 def _points(
-    part: _Part, path: SplinePath, units: Sequence[JointUnit], closing: Sequence[float]
+    part: _ControllerShare, path: SplinePath, units: Sequence[JointUnit], closing: Sequence[float]
 ) -> Iterator[str]:
     times, positions, velocities = path.time_s, path.position, path.velocity
     if not part.trajectory:
         times = np.linspace(0.0, path.duration_s, max(2, round(path.duration_s / _STEP_S) + 1))
-        positions = path.at(times)
+        positions = path.positions_at(times)
         way = np.abs(np.diff(positions, axis=0, prepend=positions[:1]))
         velocities = np.maximum(way / (times[1] - times[0]), closing)
         moved: NDArray[np.bool_] = way.max(axis=1) > 0
@@ -159,11 +159,11 @@ def _logged_loop(motion: RecordedMotion) -> LoopPlan:
         raise LogError(f"{motion.path}: its plan cannot be read: {error}") from error
 
 
-def _parts(motion: RecordedMotion, plans: Sequence[ControllerPlan] | None) -> list[_Part]:
+def _parts(motion: RecordedMotion, plans: Sequence[ControllerPlan] | None) -> list[_ControllerShare]:
     """Assign each joint of the motion to an active controller of `plans`, by default of the log; return a
     part for each controller."""
     plans = _plans_of(motion) if plans is None else plans
-    parts: dict[str, _Part] = {}
+    parts: dict[str, _ControllerShare] = {}
     missing = []
     for joint in motion.joints:
         part = _part_of(joint, plans)
@@ -174,7 +174,7 @@ def _parts(motion: RecordedMotion, plans: Sequence[ControllerPlan] | None) -> li
             parts[part.controller] = (
                 part
                 if before is None
-                else _Part(part.controller, (*before.joints, joint), part.trajectory, part.speeds)
+                else _ControllerShare(part.controller, (*before.joints, joint), part.trajectory, part.speeds)
             )
     if missing:
         raise InputError(
@@ -193,7 +193,7 @@ def _parts(motion: RecordedMotion, plans: Sequence[ControllerPlan] | None) -> li
     return list(parts.values())
 
 
-def _part_of(joint: str, plans: Sequence[ControllerPlan]) -> _Part | None:
+def _part_of(joint: str, plans: Sequence[ControllerPlan]) -> _ControllerShare | None:
     """Return a part with one joint and a controller that can play it, preferably one that accepts
     trajectories; None if there is none."""
     offers = load_plugins().controllers
@@ -204,8 +204,8 @@ def _part_of(joint: str, plans: Sequence[ControllerPlan]) -> _Part | None:
         controller = offers[plan.type].controller
         kind = command_kind(controller)
         if kind == TRAJECTORY:
-            return _Part(plan.name, (joint,), True)
+            return _ControllerShare(plan.name, (joint,), True)
         if kind is not None and "positions" in controller.Commands[kind].model_fields:
             speeds = "velocities" in controller.Commands[kind].model_fields
-            found = found or _Part(plan.name, (joint,), False, speeds)
+            found = found or _ControllerShare(plan.name, (joint,), False, speeds)
     return found

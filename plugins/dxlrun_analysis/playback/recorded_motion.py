@@ -77,7 +77,7 @@ class Stretch(msgspec.Struct, frozen=True):
     begin_s: float | None = None
     end_s: float | None = None
 
-    def check(self) -> None:
+    def validate_times(self) -> None:
         """Check that the times are valid.
 
         Raises:

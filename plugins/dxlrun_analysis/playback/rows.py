@@ -23,7 +23,7 @@ RAMP_S = 0.3
 """Time in which the speed of a played motion ramps up from 0 at the start and down to 0 at the end."""
 
 
-class Rows(msgspec.Struct, frozen=True, eq=False):
+class PlaybackRows(msgspec.Struct, frozen=True, eq=False):
     """Table of positions that plays a motion at a given speed, which ramps up from 0 and down to 0."""
 
     motion: RecordedMotion
@@ -44,7 +44,7 @@ class Rows(msgspec.Struct, frozen=True, eq=False):
         return len(self.positions) * self.period_s
 
     @classmethod
-    def of(cls, motion: RecordedMotion, path: SplinePath, speed: float, period_s: float) -> Self:
+    def from_motion(cls, motion: RecordedMotion, path: SplinePath, speed: float, period_s: float) -> Self:
         """Sample a motion's path at a speed factor into rows, without regard to the limits of joints. A
         long motion has several periods per row."""
         duration_s = path.duration_s
@@ -57,7 +57,7 @@ class Rows(msgspec.Struct, frozen=True, eq=False):
         begin, end = speed * at_s**2 / (2 * ramp_s), duration_s - speed * left_s**2 / (2 * ramp_s)
         even = speed * (at_s - ramp_s / 2)
         recorded_s = np.where(at_s < ramp_s, begin, np.where(left_s < ramp_s, end, even))
-        return cls(motion, speed, row_s, at_s, recorded_s, path.at(recorded_s))
+        return cls(motion, speed, row_s, at_s, recorded_s, path.positions_at(recorded_s))
 
 
 def rows_of(
@@ -67,7 +67,7 @@ def rows_of(
     speed: float,
     tolerance: float | None,
     period_s: float,
-) -> Rows:
+) -> PlaybackRows:
     """Return the rows of a motion for a robot, one per cycle of `period_s`, after a check of all limits.
 
     Args:
@@ -87,7 +87,7 @@ def rows_of(
     plans = [joints[name] for name in motion.joints]
     allowed = tolerances(motion, tolerance)
     path = fit(motion, allowed)
-    played = Rows.of(motion, path, speed, period_s)
+    played = PlaybackRows.from_motion(motion, path, speed, period_s)
     wrong = _all_beyond(plans, played, allowed)
     if wrong:
         enough = _slow_enough(plans, played, path, period_s, allowed)
@@ -119,7 +119,7 @@ def _check_joints(motion: RecordedMotion, joints: Mapping[str, JointPlan]) -> No
         )
 
 
-def _all_beyond(plans: Sequence[JointPlan], played: Rows, allowed: Floats) -> list[str]:
+def _all_beyond(plans: Sequence[JointPlan], played: PlaybackRows, allowed: Floats) -> list[str]:
     """Return a sentence for each joint and each quantity (position, speed, acceleration) beyond its limit,
     at the greatest excess."""
     return [
@@ -165,13 +165,13 @@ def _beyond(
 
 
 def _slow_enough(
-    plans: Sequence[JointPlan], played: Rows, path: SplinePath, period_s: float, allowed: Floats
+    plans: Sequence[JointPlan], played: PlaybackRows, path: SplinePath, period_s: float, allowed: Floats
 ) -> float | None:
     """Return the highest lower speed factor at which no limit is exceeded, in steps of 0.01, or None."""
     low, high = 0, math.ceil(played.speed * 100)
     while high - low > 1:
         middle = (low + high) // 2
-        if _all_beyond(plans, Rows.of(played.motion, path, middle / 100, period_s), allowed):
+        if _all_beyond(plans, PlaybackRows.from_motion(played.motion, path, middle / 100, period_s), allowed):
             high = middle
         else:
             low = middle

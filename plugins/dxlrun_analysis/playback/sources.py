@@ -11,8 +11,8 @@ from msgspec.structs import replace
 from numpy.typing import NDArray
 
 from dxlrun import InputError, LogError, open_log
-from dxlrun_analysis.plan import plan_of
-from dxlrun_analysis.playback.foreign import foreign_series, is_foreign
+from dxlrun_analysis.plan_excerpt import plan_of
+from dxlrun_analysis.playback.foreign_recordings import foreign_series, is_foreign
 from dxlrun_analysis.playback.recorded_motion import (
     WHOLE,
     Floats,
@@ -52,7 +52,7 @@ def read_motion(
         InputError: The options do not select a motion.
         LogError: The recording cannot be read.
     """
-    stretch.check()
+    stretch.validate_times()
     if not path.exists():
         raise InputError(f"there is no log {path}; a run prints the path of its log when it ends")
     plan = None

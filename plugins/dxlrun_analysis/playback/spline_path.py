@@ -43,7 +43,7 @@ class SplinePath(msgspec.Struct, frozen=True, eq=False):
         """Time from the first knot to the last."""
         return float(self.time_s[-1])
 
-    def at(self, time_s: Floats) -> Floats:
+    def positions_at(self, time_s: Floats) -> Floats:
         """Return the positions of all joints at the given times, shape (times, joints)."""
         knots, position = self.time_s, self.position
         piece = np.clip(np.searchsorted(knots, time_s, side="right") - 1, 0, len(knots) - 2)
@@ -76,7 +76,7 @@ def fit(motion: RecordedMotion, tolerance: Floats) -> SplinePath:
     while True:
         knots = np.flatnonzero(chosen)
         path = SplinePath(times[knots], positions[knots], _velocities(times, positions, knots, tolerance))
-        off = (np.abs(path.at(times) - positions) / tolerance).max(axis=1)
+        off = (np.abs(path.positions_at(times) - positions) / tolerance).max(axis=1)
         off[knots] = 0.0
         if off.max() <= 1.0:
             return path

@@ -5,7 +5,7 @@ Playback of a recorded motion on a robot is not a replay; it belongs in `playbac
 
 from dxlrun_analysis.replay.changes import Setting
 from dxlrun_analysis.replay.comparison import JointDifferences
-from dxlrun_analysis.replay.recorded import ReplayDifference
-from dxlrun_analysis.replay.replay import ReplayReport, replay_log
+from dxlrun_analysis.replay.log_replay import ReplayReport, replay_log
+from dxlrun_analysis.replay.recorded_inputs import ReplayDifference
 
 __all__ = ["JointDifferences", "ReplayDifference", "ReplayReport", "Setting", "replay_log"]

@@ -14,7 +14,7 @@ from dxlrun import InputError
 from dxlrun.tooling.files import suggestion
 from dxlrun.tooling.plans import ControllerPlan, LoopPlan
 from dxlrun.tooling.robots import PlugIns, compile_texts, replan_controller
-from dxlrun_analysis.replay.recorded import RecordedPlan
+from dxlrun_analysis.replay.recorded_inputs import RecordedPlan
 
 
 class Setting(msgspec.Struct, frozen=True):

@@ -12,7 +12,7 @@ from msgspec.structs import replace
 
 from dxlrun import InputError
 from dxlrun.tooling.robots import published_by, read_file
-from dxlrun_analysis.replay.recorded import RecordedPlan
+from dxlrun_analysis.replay.recorded_inputs import RecordedPlan
 
 CodeChoice = Literal["current", "log"]
 """Python files that a replay executes. `current`: those next to the robot file, as they are now. `log`:

@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 from dxlrun import Floats, LogError
 from dxlrun.tooling.plans import ControllerPlan, LoopPlan
 from dxlrun.tooling.records import CycleRecord
-from dxlrun_analysis.replay.recorded import RecordedInputs, ReplayDifference
+from dxlrun_analysis.replay.recorded_inputs import RecordedInputs, ReplayDifference
 from dxlwire import COMMAND_INTERFACES
 
 _COMMANDS = tuple(f"command_{interface}" for interface in COMMAND_INTERFACES)
@@ -78,7 +78,7 @@ class Comparison:
         )
         return tuple(one for one in found if one.commands or one.goals or one.references)
 
-    def compare(self, record: CycleRecord, row: np.void, index: int) -> None:
+    def compare_cycle(self, record: CycleRecord, row: np.void, index: int) -> None:
         """Compare one replayed cycle with the recorded row of the same index.
 
         Raises:

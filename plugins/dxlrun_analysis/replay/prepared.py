@@ -25,7 +25,7 @@ from dxlrun.tooling.plans import LoopPlan, ScheduledCommand
 from dxlrun.tooling.records import Play, TakenCommand
 from dxlrun.tooling.robots import PlugIns
 from dxlrun_analysis.replay.comparison import shown_bits
-from dxlrun_analysis.replay.recorded import RecordedInputs, ReplayDifference
+from dxlrun_analysis.replay.recorded_inputs import RecordedInputs, ReplayDifference
 
 _LONGEST_REASON = 200  # Characters
 

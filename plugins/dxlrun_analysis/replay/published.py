@@ -14,7 +14,7 @@ from dxlrun.tooling.logs import UNREADABLE
 from dxlrun.tooling.output import counted
 from dxlrun.tooling.records import EventCode, LostRecords
 from dxlrun.tooling.topics import Codec, LogTopic, MessageSink, MessageType, PublishedTopic
-from dxlrun_analysis.replay.recorded import RecordedInputs, ReplayDifference
+from dxlrun_analysis.replay.recorded_inputs import RecordedInputs, ReplayDifference
 
 RING = "loop/messages"
 _NOT_COMPARED = frozenset((LogTopic.MACHINE, "/snapshots"))
@@ -23,7 +23,7 @@ _LONGEST_SHOWN = 120  # Characters
 
 
 @dataclass(slots=True)
-class _Pending:
+class _PendingTopic:
     """Topic of the log, with its recorded messages that were not compared yet."""
 
     type: MessageType
@@ -44,7 +44,7 @@ class MessageComparison(MessageSink):
         self._first_ns = 0
         self.compared = 0
         self.different = 0
-        self._topics: dict[str, _Pending] = {}
+        self._topics: dict[str, _PendingTopic] = {}
         self._announced: list[PublishedTopic] = []
         self._inputs = inputs
         self._until_ns = int(inputs.log.cycles["woken_ns"][inputs.end - 1])
@@ -63,12 +63,12 @@ class MessageComparison(MessageSink):
             return ()
         return (f"the log misses {counted(self.lost, 'message', 'messages')} of topics",)
 
-    def feed(self, part: Log) -> None:
+    def add_messages(self, part: Log) -> None:
         """Add the recorded messages of a slice of the log."""
         for name, logged in part.topics.items():
             if name in _NOT_COMPARED:
                 continue
-            pending = self._topics.setdefault(name, _Pending(logged.type))
+            pending = self._topics.setdefault(name, _PendingTopic(logged.type))
             pending.waiting += zip(logged.t_ns.tolist(), logged.data, strict=True)
 
     def announce(self, topic: PublishedTopic) -> int:
@@ -93,12 +93,12 @@ class MessageComparison(MessageSink):
             self.compared += 1
             self._differs(t_ns, name, "", "no message", "a message")
 
-    def finish(self, reached_ns: int) -> None:
+    def report_missing(self, reached_ns: int) -> None:
         """Count recorded messages until `reached_ns` that the replay did not publish as differences."""
         for name, pending in self._topics.items():
             self._pass(name, pending, min(reached_ns, self._until_ns) + 1)
 
-    def _pass(self, name: str, pending: _Pending, t_ns: int) -> None:
+    def _pass(self, name: str, pending: _PendingTopic, t_ns: int) -> None:
         """Count recorded messages from before a time as differences: the replay did not publish them."""
         while pending.waiting and pending.waiting[0][0] < t_ns:
             at_ns, _ = pending.waiting.popleft()

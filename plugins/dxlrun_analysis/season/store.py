@@ -24,7 +24,7 @@ from pyarrow import json
 from dxlrun import DxlrunError, InputError
 from dxlrun.tooling.logs import is_being_written
 from dxlrun.tooling.verbs import missing_extra
-from dxlrun_analysis.season.runs import SCHEMA, Folder, FoundLog, Progress, Row, kept_table, table_of
+from dxlrun_analysis.season.season_runs import SCHEMA, Folder, FoundLog, Progress, Row, kept_table, table_of
 
 _ROW, _LOG = ".run.json", ".mcap"
 UNFINISHED = "its upload has not ended; `dxlrun upload` of its robot continues it"
@@ -42,7 +42,7 @@ _OPTIONS: Mapping[str, Mapping[str, object]] = {
 }
 
 
-class StoredLog(NamedTuple):
+class StoreEntry(NamedTuple):
     """One log in an object store; without a row if its upload has not ended."""
 
     name: str
@@ -56,10 +56,10 @@ class Store(NamedTuple):
     directory: str  # URL
     files: fsspec.AbstractFileSystem
     root: str
-    logs: tuple[StoredLog, ...]
+    logs: tuple[StoreEntry, ...]
     others: tuple[str, ...]
 
-    def table(self, progress: Progress) -> tuple[pa.Table, int]:
+    def load_table(self, progress: Progress) -> tuple[pa.Table, int]:
         """Return the table of all logs, and how many rows were fetched now; the rest come from the cache.
 
         Raises:
@@ -67,7 +67,7 @@ class Store(NamedTuple):
         """
         return kept_table(self.directory.encode(), self.logs, lambda missing: self._rows(missing, progress))
 
-    def _rows(self, logs: Sequence[StoredLog], progress: Progress) -> dict[str, Row]:
+    def _rows(self, logs: Sequence[StoreEntry], progress: Progress) -> dict[str, Row]:
         rows: dict[str, Row] = {log.name: {"log": log.name, "unreadable": UNFINISHED} for log in logs}
         there = [log for log in logs if log.row]
         for first in range(0, len(there), _AT_ONCE):
@@ -91,7 +91,7 @@ def find_store(url: str) -> Store:
         found = files.find(root, detail=True)
     names = {path.removeprefix(root).lstrip("/"): (path, about) for path, about in found.items()}
     logs = {
-        name.removesuffix(_ROW): StoredLog(name.removesuffix(_ROW), path, _stamp(about))
+        name.removesuffix(_ROW): StoreEntry(name.removesuffix(_ROW), path, _stamp(about))
         for name, (path, about) in names.items()
         if name.endswith(_ROW)
     }
@@ -99,7 +99,7 @@ def find_store(url: str) -> Store:
     for name in names:
         folder = os.path.dirname(name)
         if name.endswith(_LOG) and name not in logs and folder not in logs:
-            logs[name] = StoredLog(name, "", "")
+            logs[name] = StoreEntry(name, "", "")
         elif not name.endswith((_ROW, _LOG)):
             others.append(name)
     return Store(url, files, root, tuple(logs[name] for name in sorted(logs)), tuple(sorted(others)))
@@ -132,7 +132,7 @@ def upload(folder: Folder, url: str, progress: Progress) -> Upload:
     """
     store = find_store(url)
     ended = folder._replace(logs=tuple(log for log in folder.logs if not is_being_written(log.path)))
-    known = {row["log"]: row for row in store.table(progress)[0].to_pylist()}
+    known = {row["log"]: row for row in store.load_table(progress)[0].to_pylist()}
     rows = table_of(ended, progress)[0].to_pylist() if ended.logs else []
     uploaded, there, others = [], [], []
     written = [log.name for log in folder.logs if log not in ended.logs]

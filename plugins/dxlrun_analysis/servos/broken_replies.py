@@ -9,10 +9,10 @@ import numpy as np
 from dxlrun.tooling.output import counted
 from dxlrun_analysis.counts import has_them_alone
 from dxlrun_analysis.finding import Finding, cause
-from dxlrun_analysis.plan import LoggedBus
+from dxlrun_analysis.plan_excerpt import LoggedBus
 from dxlrun_analysis.servos.exchanges import Exchanges, Loss
+from dxlrun_analysis.servos.logged_requests import IDS
 from dxlrun_analysis.servos.losses import ServoLosses
-from dxlrun_analysis.servos.requests import IDS
 
 _FEWEST = 5  # Fewer broken replies can be a coincidence
 # Fewer exchanges, or a smaller share, can come from a plug that is moved.
@@ -31,7 +31,7 @@ class BrokenReplies:
         self._noisy, self._disturbed, self._asked = np.zeros((3, buses), np.int64)
         """Exchanges by bus: those with stray bytes; those whose stray bytes are not cut replies; all."""
 
-    def take(self, exchanges: Exchanges) -> None:
+    def add_exchanges(self, exchanges: Exchanges) -> None:
         """Count the stray bytes in some exchanges."""
         due, buses = exchanges.due, len(self._noisy)
         # Count the first servo of a chain without an intact reply, if the bytes fit into its reply alone.

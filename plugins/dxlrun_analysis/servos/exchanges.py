@@ -15,10 +15,10 @@ from numpy.typing import NDArray
 
 from dxlrun import Log
 from dxlrun.tooling.logs import PacketColumns
-from dxlrun_analysis.cycles.latency import DISORDER_NS
-from dxlrun_analysis.plan import LoggedBus, plan_of
-from dxlrun_analysis.servos import requests
-from dxlrun_analysis.servos.requests import IDS, Flags, Numbers, Requests, RequestTable
+from dxlrun_analysis.cycles.punctuality import DISORDER_NS
+from dxlrun_analysis.plan_excerpt import LoggedBus, plan_of
+from dxlrun_analysis.servos import logged_requests
+from dxlrun_analysis.servos.logged_requests import IDS, DistinctRequests, Flags, Numbers, RequestTable
 from dxlwire import BROADCAST_ID, PacketKind
 
 _ROWS = 40  # Low bits of a key hold the index of the exchange; the bits above hold the servo
@@ -35,7 +35,7 @@ class Exchanges(NamedTuple):
     """
 
     buses: tuple[LoggedBus, ...]
-    requests: Requests  # Indexed by `request`
+    requests: DistinctRequests  # Indexed by `request`
     bus: Numbers
     cycle: Numbers  # Cycle of the instruction; -1 for the first exchange of each bus
     request: Numbers  # Index in `requests`
@@ -48,8 +48,8 @@ class Exchanges(NamedTuple):
     after the end of the log."""
     noise: Numbers  # Bytes that belong to no intact packet
     replies: Replies
-    due: Due
-    late: Late
+    due: DueReplies
+    late: LateReplies
     others: PacketColumns  # Instructions of other hosts on the line
     echoes: Numbers  # Bus of each own instruction that was echoed
     unasked: Numbers  # Servo of each intact reply that no instruction of this host requests
@@ -87,7 +87,7 @@ class Loss(IntEnum):
     LATE = 3  # Not lost: the reply came after it was given up
 
 
-class Due(NamedTuple):
+class DueReplies(NamedTuple):
     """Replies that instructions request, as columns of shape (due replies,); ordered by exchange, then by
     place in the chain."""
 
@@ -100,7 +100,7 @@ class Due(NamedTuple):
     """True if stray bytes came in place of the reply; always False if `loss` is not OWN."""
 
 
-class Late(NamedTuple):
+class LateReplies(NamedTuple):
     """Intact replies that came after the loop had given them up, as columns of shape (late replies,)."""
 
     servo: Numbers  # ID 254: the replies of several servos in one fast status packet
@@ -127,7 +127,7 @@ class Pairing:
         self._free_ns = np.zeros(len(buses), np.int64)
         """Time at which the line of each bus has carried everything that was sent."""
 
-    def take(self, log: Log) -> Exchanges | None:
+    def pair_packets(self, log: Log) -> Exchanges | None:
         """Add the packets of the next slice; return the exchanges that are now complete, or None.
 
         Raises:
@@ -150,10 +150,10 @@ class Pairing:
         last = np.full(IDS, len(packets), np.int64)
         last[packets.bus[instructions]] = instructions
         certain &= np.arange(len(packets)) < last[packets.bus]
-        self._waiting = [packets.take(~certain).compact()]
-        return self._paired(packets.take(certain))
+        self._waiting = [packets.select_rows(~certain).compact()]
+        return self._paired(packets.select_rows(certain))
 
-    def finish(self) -> Exchanges | None:
+    def pair_remaining(self) -> Exchanges | None:
         """Return the exchanges of the packets that were held back, or None; no more slices follow."""
         if not self._waiting:
             return None
@@ -181,7 +181,7 @@ class Pairing:
         delays = np.array([one.return_delay_ns for one in self.buses], np.int64)[bus]
         wire_ns = np.where(rates > 0, packets.length * _BYTE_NS // np.maximum(rates, 1), 0)
         request, asked_ns, blocked_ns, sent_ns, cycle = (np.zeros(size, np.int64) for _ in range(5))
-        request[at] = self._requests.of(packets.take(rows))
+        request[at] = self._requests.request_indices(packets.select_rows(rows))
         asked_ns[at] = packets.first_ns[rows]
         took_ns = packets.last_ns[rows] - packets.first_ns[rows]
         blocked_ns[at] = np.where(rates[rows] > 0, np.maximum(took_ns - wire_ns[rows], 0), 0)
@@ -197,7 +197,9 @@ class Pairing:
         noise_bytes = np.bincount(exchange[noise], packets.length[noise], size).astype(np.int64)
         replies = self._replies(packets, exchange, wire_ns, delays, request, sent_ns)
         due = self._due(of_bus, request, replies, noise_bytes)
-        blocks, block_ids = self._late_blocks(packets.take(noise), exchange[noise], request, asked_ns, due)
+        blocks, block_ids = self._late_blocks(
+            packets.select_rows(noise), exchange[noise], request, asked_ns, due
+        )
         np.subtract.at(noise_bytes, exchange[noise[blocks]], packets.length[noise[blocks]])
         due.broken[noise_bytes[due.exchange] <= 0] = False
         late = np.append(np.flatnonzero(kind == PacketKind.LATE), noise[blocks])
@@ -205,7 +207,12 @@ class Pairing:
         to = np.full(size, -1, np.int64)
         to[at] = packets.servo_id[rows]
         # Any servo may answer a broadcast ping.
-        to[at[(to[at] == BROADCAST_ID) & (requests.instruction_of(packets.take(rows)) == requests.PING)]] = -1
+        to[
+            at[
+                (to[at] == BROADCAST_ID)
+                & (logged_requests.instruction_of(packets.select_rows(rows)) == logged_requests.PING)
+            ]
+        ] = -1
         others = np.flatnonzero(kind == PacketKind.OTHER_HOST)
         back = _came_back(packets, others, rows, exchange - bus)
         return Exchanges(
@@ -223,10 +230,10 @@ class Pairing:
             replies,
             due,
             _late(bus[late] * IDS + ids, exchange[late], packets.last_ns[late], sent_ns, due),
-            packets.take(others[~back]),
+            packets.select_rows(others[~back]),
             np.append(bus[others[back]], bus[kind == PacketKind.ECHO]),
             _unasked(replies, due, to),
-            packets.take(noise),
+            packets.select_rows(noise),
         )
 
     def _replies(  # noqa: PLR0917  columns of one table
@@ -240,7 +247,7 @@ class Pairing:
     ) -> Replies:
         late = (packets.kind == PacketKind.LATE) & (packets.servo_id != BROADCAST_ID)
         rows = np.flatnonzero((packets.kind == PacketKind.STATUS) | late)
-        status = packets.take(rows)
+        status = packets.select_rows(rows)
         of, wire, last_ns = exchange[rows], wire_ns[rows], status.last_ns
         # Replies of a chain follow one another: each is due its return delay and its wire time after the
         # preceding one.
@@ -252,7 +259,7 @@ class Pairing:
         before_ns = np.empty(len(of), np.int64)
         before_ns[1:] = last_ns[:-1]
         before_ns[begins] = sent_ns[of[begins]]
-        second = requests.second_of(status)
+        second = logged_requests.second_of(status)
         joint = second & (status.servo_id == BROADCAST_ID)
         row = np.flatnonzero(~joint)
         servo_id, error = status.servo_id[row], np.where(second, status.byte(8), status.byte(4))[row]
@@ -285,7 +292,7 @@ class Pairing:
         pieces = []
         for index in np.unique(request[rows]).tolist():
             mine = rows[request[rows] == index]
-            packets = status.take(mine)
+            packets = status.select_rows(mine)
             at = _HEAD_2
             # A block consists of error, ID, data and CRC.
             for number, size in enumerate(self._requests.all.kinds[index].sizes):
@@ -295,7 +302,7 @@ class Pairing:
                 at += size + 4
         return pieces
 
-    def _due(self, bus: Numbers, request: Numbers, replies: Replies, noise: Numbers) -> Due:
+    def _due(self, bus: Numbers, request: Numbers, replies: Replies, noise: Numbers) -> DueReplies:
         count = self._requests.all.servos[request]
         exchange, begin = np.repeat(np.arange(len(request)), count), np.cumsum(count) - count
         place = np.arange(len(exchange)) - begin[exchange]
@@ -312,17 +319,17 @@ class Pairing:
         silent = (np.bincount(exchange[missing], minlength=len(request)) == count) & (count > 1)
         loss[silent[exchange]] = Loss.LINE
         broken = (loss == Loss.OWN) & (noise[exchange] > 0)
-        return Due(exchange, bus[exchange] * IDS + servo_id, place, reply, loss, broken)
+        return DueReplies(exchange, bus[exchange] * IDS + servo_id, place, reply, loss, broken)
 
     def _late_blocks(
-        self, noise: PacketColumns, exchange: Numbers, request: Numbers, asked_ns: Numbers, due: Due
+        self, noise: PacketColumns, exchange: Numbers, request: Numbers, asked_ns: Numbers, due: DueReplies
     ) -> tuple[Numbers, NDArray[np.uint8]]:
         """Return the noise packets that are the missing block of a fast status packet and came late: row
         in `noise`, and ID."""
         lacks = np.flatnonzero((due.loss == Loss.OWN) & self._requests.all.fast[request[due.exchange]])
         at = np.searchsorted(due.exchange[lacks], exchange) - 1
         rows = np.flatnonzero(at >= 0)
-        lacks, noise = lacks[at[rows]], noise.take(rows)
+        lacks, noise = lacks[at[rows]], noise.select_rows(rows)
         of, kinds = due.exchange[lacks], self._requests.all.kinds
         size = [
             kinds[index].sizes[place]
@@ -335,7 +342,7 @@ class Pairing:
         return rows[found], noise.byte(1)[found]
 
 
-def _unasked(replies: Replies, due: Due, to: Numbers) -> Numbers:
+def _unasked(replies: Replies, due: DueReplies, to: Numbers) -> Numbers:
     """Return the servo of each reply that no instruction of this host requests; `to` is the ID of each
     instruction, or -1.
 
@@ -361,7 +368,9 @@ def _last_ns(sent_ns: Numbers, replies: Replies) -> Numbers:
     return last_ns
 
 
-def _late(servo: Numbers, exchange: Numbers, at_ns: Numbers, sent_ns: Numbers, due: Due) -> Late:
+def _late(
+    servo: Numbers, exchange: Numbers, at_ns: Numbers, sent_ns: Numbers, due: DueReplies
+) -> LateReplies:
     """Match late replies to the exchanges that lack them, and set `due.loss` there to LATE."""
     missing = np.flatnonzero(due.reply < 0)
     # The late reply of a fast status packet covers all its servos; its first one represents them.
@@ -380,7 +389,7 @@ def _late(servo: Numbers, exchange: Numbers, at_ns: Numbers, sent_ns: Numbers, d
     all_late = np.isin(due.exchange, found[servo % IDS == BROADCAST_ID])
     due.loss[all_late & (due.loss == Loss.LINE)] = Loss.LATE
     due.broken[due.loss == Loss.LATE] = False
-    return Late(servo, found, at_ns, np.where(known, at_ns - sent_ns[found], 0))
+    return LateReplies(servo, found, at_ns, np.where(known, at_ns - sent_ns[found], 0))
 
 
 def _came_back(packets: PacketColumns, others: Numbers, rows: Numbers, sent: Numbers) -> Flags:
@@ -416,4 +425,4 @@ def ordered(packets: PacketColumns) -> PacketColumns:
     bus, first_ns = packets.bus[order], packets.first_ns[order]
     if ((np.diff(first_ns) < 0) & (np.diff(bus) == 0)).any():
         order = np.lexsort((packets.first_ns, packets.bus))
-    return packets.take(order)
+    return packets.select_rows(order)

@@ -12,17 +12,17 @@ from typing import NamedTuple
 
 from dxlrun.tooling.records import Event, EventCode, LoggedPacket
 from dxlrun_analysis.finding import HURTS, listed
-from dxlrun_analysis.plan import LoggedBus, LoggedServo
+from dxlrun_analysis.plan_excerpt import LoggedBus, LoggedServo
 from dxlwire import BROADCAST_ID, find_table, protocol1, protocol2
 
 _AFTER_NS = 2_000_000_000  # A failure within this time after a write is attributed to the write
 _MOST_KEPT = 1000  # Bounds memory
 _MOST_NAMED = 3
 _HEADER_2 = b"\xff\xff\xfd\x00"
-_WRITES = (protocol1.Instruction.WRITE, protocol1.Instruction.REG_WRITE)
+_WRITES = (protocol1.Protocol1Instruction.WRITE, protocol1.Protocol1Instruction.REG_WRITE)
 _RESETS = {
-    protocol2.Instruction.REBOOT: "a reboot",
-    protocol2.Instruction.FACTORY_RESET: "a factory reset",
+    protocol2.Protocol2Instruction.REBOOT: "a reboot",
+    protocol2.Protocol2Instruction.FACTORY_RESET: "a factory reset",
 }
 
 
@@ -44,17 +44,17 @@ class ForeignWrites:
         self._writes: list[_Write] = []
         self._failures: list[Event] = []
 
-    def take(self, bus: int, plan: LoggedBus, packet: LoggedPacket) -> None:
+    def add_write(self, bus: int, plan: LoggedBus, packet: LoggedPacket) -> None:
         """Add the writes in an instruction packet of another host."""
         if len(self._writes) < _MOST_KEPT:
             self._writes += _written(bus, plan, packet)
 
-    def failed(self, event: Event) -> None:
+    def add_failure(self, event: Event) -> None:
         """Keep an event that reports a lost, rebooted or limp servo; ignore others."""
         if event.code in HURTS and len(self._failures) < _MOST_KEPT:
             self._failures.append(event)
 
-    def of(self, bus: int) -> tuple[str, bool]:
+    def describe_writes(self, bus: int) -> tuple[str, bool]:
         """Return the writes on a bus as the end of a sentence, empty without any; and whether a written
         servo failed within 2 s."""
         writes = [one for one in self._writes if one.bus == bus]
@@ -97,7 +97,7 @@ def _written(bus: int, plan: LoggedBus, packet: LoggedPacket) -> Iterator[_Write
     code = data[at + 3] if second else data[at + 2]
     if code in _RESETS:
         for servo in _addressed(plan, data[at]):
-            what = _RESETS[protocol2.Instruction(code)]
+            what = _RESETS[protocol2.Protocol2Instruction(code)]
             yield _Write(packet.first_ns, bus, servo.servo_id, servo.joint, what, None)
         return
     body = protocol2.unstuffed(data[8:-2]) if second else data[5:-1]
@@ -112,11 +112,11 @@ def _parts(servo_id: int, code: int, body: bytes, width: int) -> Iterator[tuple[
     sizes have `width` bytes."""
     if code in _WRITES:
         yield servo_id, int.from_bytes(body[:width], "little"), body[width:]
-    elif code == protocol2.Instruction.SYNC_WRITE:
+    elif code == protocol2.Protocol2Instruction.SYNC_WRITE:
         address, size = (int.from_bytes(body[at : at + width], "little") for at in (0, width))
         for at in range(2 * width, len(body) - size, size + 1):
             yield body[at], address, body[at + 1 : at + 1 + size]
-    elif code == protocol2.Instruction.BULK_WRITE:
+    elif code == protocol2.Protocol2Instruction.BULK_WRITE:
         at = 0
         while at + 5 <= len(body):
             address, size = (int.from_bytes(body[at + i : at + i + 2], "little") for i in (1, 3))

@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 
 from dxlrun import LINEAR, Floats, Log
 from dxlrun.tooling.records import OFFLINE
-from dxlrun_analysis.plan import LoggedPlan
+from dxlrun_analysis.plan_excerpt import LoggedPlan
 
 Numbers = NDArray[np.int64]
 
@@ -58,7 +58,7 @@ class JointStates:
                 if name in rows and plan.joint(name).unit is LINEAR:
                     self.share[rows[name]] = share
 
-    def take(self, log: Log) -> None:
+    def add_states(self, log: Log) -> None:
         """Keep the joint states of the next slice of the log."""
         cycles = log.cycles
         if not len(cycles):

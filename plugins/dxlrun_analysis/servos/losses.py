@@ -27,10 +27,10 @@ import numpy as np
 from dxlrun.tooling.output import counted
 from dxlrun.tooling.records import BEFORE_FIRST_CYCLE
 from dxlrun_analysis.finding import Finding, cause
-from dxlrun_analysis.plan import LoggedBus
+from dxlrun_analysis.plan_excerpt import LoggedBus
 from dxlrun_analysis.servos.exchanges import Exchanges, Loss
 from dxlrun_analysis.servos.joint_states import ANGLE, BINS, QUANTITIES, JointStates, Places
-from dxlrun_analysis.servos.requests import IDS, Flags, Numbers
+from dxlrun_analysis.servos.logged_requests import IDS, Flags, Numbers
 
 _APART_NS = (
     200_000_000  # Occasions of one part within this time after the first count as one: a plug can flicker
@@ -101,7 +101,7 @@ class Losses:
 
     # Collection
 
-    def take(self, exchanges: Exchanges, places: Places) -> None:
+    def add_exchanges(self, exchanges: Exchanges, places: Places) -> None:
         """Add the missing replies of some exchanges; `places` has the joint states in their cycles."""
         due, count = exchanges.due, exchanges.requests.servos[exchanges.request]
         ended, exchange, bus = exchanges.ended[due.exchange], due.exchange, due.servo // IDS
@@ -156,7 +156,7 @@ class Losses:
 
     # Results
 
-    def finish(self) -> dict[tuple[int, int], ServoLosses]:
+    def count_losses(self) -> dict[tuple[int, int], ServoLosses]:
         """Return the missing replies of each servo that was asked, by index of the bus and ID."""
         return {
             divmod(servo, IDS): ServoLosses(
@@ -179,11 +179,11 @@ class Losses:
         for at, one in enumerate(outages):
             # A cycle after the end of all open outages begins a new occasion.
             if one.cycle > end and at:
-                found.add(outages[begin:at])
+                found.add_occasion(outages[begin:at])
                 begin = at
             end = max(end, one.last)
         if outages:
-            found.add(outages[begin:])
+            found.add_occasion(outages[begin:])
         return found
 
     def _heads(self) -> set[int]:
@@ -214,7 +214,7 @@ class Occasions:
         self._pairs: Counter[tuple[int, int]] = Counter()
         """Common occasions of two servos, or all occasions of one; not only those far apart."""
 
-    def add(self, outages: Sequence[_Outage]) -> None:
+    def add_occasion(self, outages: Sequence[_Outage]) -> None:
         """Attribute one occasion, given by its overlapping outages, and count it."""
         buses, begin = {one.servo // IDS for one in outages}, outages[0]
         self._all.update(buses)
@@ -258,7 +258,7 @@ class Occasions:
         sentence += f"{counted(self._machine.apart, 'time', 'times')}."
         yield cause("late_replies" if late else "lossy_line", "machine", sentence, share=1.2)
 
-    def findings(
+    def loss_findings(
         self, index: int, bus: LoggedBus, losses: dict[int, ServoLosses], explained: set[int]
     ) -> Iterator[Finding]:
         """Report servos that lose replies alone or together, and a bus that loses replies as a whole.

@@ -16,10 +16,10 @@ from dxlrun.tooling.logs import PacketColumns
 from dxlrun.tooling.output import counted
 from dxlrun_analysis.counts import Counts
 from dxlrun_analysis.finding import Finding, cause
-from dxlrun_analysis.plan import LoggedBus
+from dxlrun_analysis.plan_excerpt import LoggedBus
 from dxlrun_analysis.servos.exchanges import Exchanges, Loss
 from dxlrun_analysis.servos.foreign_writes import ForeignWrites
-from dxlrun_analysis.servos.requests import IDS, Flags, Numbers, instruction_of
+from dxlrun_analysis.servos.logged_requests import IDS, Flags, Numbers, instruction_of
 from dxlwire import BROADCAST_ID, protocol1, protocol2
 
 SPOILS, _FAILED = 1.5, 5.0
@@ -46,16 +46,16 @@ class OtherHosts:
         self._stray, self._lost, self._echoes, self._asked = np.zeros((4, buses), np.int64)
         self.writes = ForeignWrites()
 
-    def take(self, exchanges: Exchanges) -> None:
+    def add_exchanges(self, exchanges: Exchanges) -> None:
         """Add the foreign instructions, echoes, unrequested and missing replies in some exchanges."""
         others, due = exchanges.others, exchanges.due
-        self._sent.take(others.bus.astype(np.int64), instruction_of(others) * IDS + others.servo_id)
+        self._sent.count_values(others.bus.astype(np.int64), instruction_of(others) * IDS + others.servo_id)
         for packet in others:
-            self.writes.take(packet.bus, exchanges.buses[packet.bus], packet)
-        self._unasked.take(exchanges.unasked // IDS, exchanges.unasked % IDS)
+            self.writes.add_write(packet.bus, exchanges.buses[packet.bus], packet)
+        self._unasked.count_values(exchanges.unasked // IDS, exchanges.unasked % IDS)
         second = np.array([bus.protocol != protocol1.PROTOCOL for bus in exchanges.buses], np.bool_)
         stray = exchanges.stray
-        self._pieces.take(*_ends(stray, second[stray.bus]))
+        self._pieces.count_values(*_ends(stray, second[stray.bus]))
         for counts, buses in (
             (self._stray, stray.bus),
             (self._lost, due.servo[(due.loss == Loss.OWN) | (due.loss == Loss.LINE)] // IDS),
@@ -66,18 +66,18 @@ class OtherHosts:
 
     def _of(self, index: int) -> tuple[Numbers, Numbers]:
         """Return the foreign instructions on a bus: code times 256 plus ID of each kind, and its count."""
-        pieces = int(self._pieces.of(index)[1].sum())
+        pieces = int(self._pieces.counts_of(index)[1].sum())
         enough = pieces >= max(_FEWEST, _PIECES * self._stray[index])
         found = [self._sent, self._pieces] if enough else [self._sent]
         values, counts = (
-            np.concatenate(each) for each in zip(*(one.of(index) for one in found), strict=True)
+            np.concatenate(each) for each in zip(*(one.counts_of(index) for one in found), strict=True)
         )
         return values, counts
 
     def explains(self, index: int) -> bool:
         """Return whether foreign instructions or unrequested replies on the bus are so many that they
         explain its missing replies."""
-        sent, unasked = int(self._of(index)[1].sum()), int(self._unasked.of(index)[1].sum())
+        sent, unasked = int(self._of(index)[1].sum()), int(self._unasked.counts_of(index)[1].sum())
         seen = max(sent if sent >= _FEWEST else 0, unasked if unasked >= _FEWEST_UNASKED else 0)
         return seen > 0 and 2 * seen >= int(self._lost[index])
 
@@ -91,7 +91,7 @@ class OtherHosts:
             return (cause("another_host", bus.name, sentence, share=1.5),)
         values, counts = self._of(index)
         total = int(counts.sum())
-        written, failed = self.writes.of(index)
+        written, failed = self.writes.describe_writes(index)
         if total < _FEWEST and not written:
             return tuple(self._by_replies(index, bus))
         instructions = values // IDS
@@ -113,7 +113,7 @@ class OtherHosts:
 
     def _by_replies(self, index: int, bus: LoggedBus) -> Iterable[Finding]:
         """Report another host on a bus of which only the replies are visible."""
-        ids, counts = self._unasked.of(index)
+        ids, counts = self._unasked.counts_of(index)
         if (total := int(counts.sum())) >= _FEWEST_UNASKED:
             sentence = (
                 f"Another host uses bus {bus.name}, or its adapter: {total} replies came that this run did "
@@ -148,7 +148,11 @@ def _ends(stray: PacketColumns, second: Flags) -> tuple[Numbers, Numbers]:
 
 
 def _name(bus: LoggedBus, code: int) -> str:
-    known = protocol1.Instruction if bus.protocol == protocol1.PROTOCOL else protocol2.Instruction
+    known = (
+        protocol1.Protocol1Instruction
+        if bus.protocol == protocol1.PROTOCOL
+        else protocol2.Protocol2Instruction
+    )
     try:
         return known(code).name.lower().replace("_", " ")
     except ValueError:

@@ -25,10 +25,10 @@ import numpy as np
 from dxlrun.tooling.output import counted, late_replies
 from dxlrun_analysis.counts import Counts, median, quantile
 from dxlrun_analysis.finding import Finding, cause
-from dxlrun_analysis.plan import LoggedBus
+from dxlrun_analysis.plan_excerpt import LoggedBus
 from dxlrun_analysis.servos.exchanges import Exchanges
+from dxlrun_analysis.servos.logged_requests import IDS, Flags, Numbers
 from dxlrun_analysis.servos.losses import Losses
-from dxlrun_analysis.servos.requests import IDS, Flags, Numbers
 from dxlwire import BROADCAST_ID
 
 _KINDS = _CHAINED, _FIRST, _RESTED, _NEXT = range(4)
@@ -61,7 +61,7 @@ class ReplyTimes:
         """Counts by servo: late replies that were given up; exchanges with it alone; late ones of these."""
         self._exchanges = np.zeros(buses, np.int64)
 
-    def take(self, exchanges: Exchanges, losses: Losses) -> None:
+    def add_exchanges(self, exchanges: Exchanges, losses: Losses) -> None:
         """Add the replies of some exchanges; late exchanges are also added to `losses`."""
         replies, late = exchanges.replies, exchanges.late
         count, requests = len(replies.exchange), exchanges.requests
@@ -80,7 +80,7 @@ class ReplyTimes:
         in_turn = replies.answers & (replies.place == number)
         known = np.flatnonzero(in_turn & (asked[replies.exchange] > 0) & ~together & ~followed)
         kind = np.where(number[known] == 0, kinds[replies.exchange[known]], _CHAINED)
-        self._own_us.take(replies.servo[known] * len(_KINDS) + kind, own_ns[known] // 1000)
+        self._own_us.count_values(replies.servo[known] * len(_KINDS) + kind, own_ns[known] // 1000)
         # Replies that were given up count from the end of the preceding reply.
         rows = np.flatnonzero((late.exchange >= 0) & ~_in_time(exchanges))
         of, servo = late.exchange[rows], late.servo[rows]
@@ -91,7 +91,7 @@ class ReplyTimes:
         alone = np.flatnonzero(servo % IDS != BROADCAST_ID)
         kind = np.where(behind, _CHAINED, kinds[of])[alone]
         own_us = (late.at_ns[rows] - begun_ns[of])[alone] // 1000
-        self._own_us.take(servo[alone] * len(_KINDS) + kind, own_us)
+        self._own_us.count_values(servo[alone] * len(_KINDS) + kind, own_us)
         self._take_late(exchanges, own_ns, (of, servo, late.late_ns[rows]), losses)
 
     def _take_late(
@@ -128,7 +128,7 @@ class ReplyTimes:
         asked = exchanges.bus * IDS + exchanges.requests.ids[exchanges.request, -1]
         for counts, at in ((self._single, np.flatnonzero(single)), (self._single_late, rows[single[rows]])):
             np.add(counts, np.bincount(asked[at], minlength=len(counts)), out=counts)
-        self._late_us.take(servo, np.append(extra_ns, given_up[2][first]) // 1000)
+        self._late_us.count_values(servo, np.append(extra_ns, given_up[2][first]) // 1000)
         losses.late(servo // IDS, exchanges, rows)
 
     # Results
@@ -139,7 +139,9 @@ class ReplyTimes:
 
     def longest_ms(self) -> float:
         """Return the greatest lateness of any exchange of the run, ms."""
-        return max((self._late_us.of(group)[0][-1] / 1e3 for group in self._late_us.groups), default=0.0)
+        return max(
+            (self._late_us.counts_of(group)[0][-1] / 1e3 for group in self._late_us.groups), default=0.0
+        )
 
     def servos(self, index: int, bus: LoggedBus, *, now_and_then: bool) -> Iterator[Finding]:
         """Report servos of one bus that always answer later than its others; with `now_and_then`, also
@@ -148,7 +150,7 @@ class ReplyTimes:
         for group in self._own_us.groups:
             servo, kind = divmod(group, len(_KINDS))
             if servo // IDS == index and kind != _FIRST:
-                samples.setdefault(servo % IDS, {})[kind] = self._own_us.of(group)
+                samples.setdefault(servo % IDS, {})[kind] = self._own_us.counts_of(group)
         return _slow_servos(bus, samples, now_and_then=now_and_then)
 
     def line(self, index: int, bus: LoggedBus, slow: Iterable[str]) -> Iterator[Finding]:
@@ -174,7 +176,7 @@ class ReplyTimes:
     def _late(self, index: int, without: set[int]) -> _Values:
         """Return the lateness of a bus' exchanges, us, ascending, with counts."""
         parts = [
-            self._late_us.of(group)
+            self._late_us.counts_of(group)
             for group in self._late_us.groups
             if group // IDS == index and group % IDS not in without
         ]

@@ -13,14 +13,14 @@ import numpy as np
 from dxlrun import Log
 from dxlrun_analysis.counts import Counts, median, quantile
 from dxlrun_analysis.finding import Finding
-from dxlrun_analysis.plan import LoggedBus, plan_of
+from dxlrun_analysis.plan_excerpt import LoggedBus, plan_of
 from dxlrun_analysis.servos.broken_replies import BrokenReplies
 from dxlrun_analysis.servos.exchanges import Exchanges, Pairing
 from dxlrun_analysis.servos.joint_states import JointStates
+from dxlrun_analysis.servos.logged_requests import IDS, Numbers
 from dxlrun_analysis.servos.losses import Losses, ServoLosses
 from dxlrun_analysis.servos.other_host import OtherHosts
 from dxlrun_analysis.servos.reply_times import ReplyTimes
-from dxlrun_analysis.servos.requests import IDS, Numbers
 from dxlwire import BROADCAST_ID, PacketKind, protocol1, protocol2
 
 _BYTES = 256  # Values of an error byte
@@ -103,7 +103,7 @@ class Traffic:
         self._seen = np.zeros(servos, np.bool_)
         self._errors = np.zeros((servos, _BYTES), np.int64)  # By error byte
 
-    def take(self, log: Log) -> None:
+    def add_slice(self, log: Log) -> None:
         """Count the packets of the next slice of the log.
 
         Raises:
@@ -121,20 +121,20 @@ class Traffic:
             sent = packets.kind == PacketKind.INSTRUCTION
             servo = packets.bus[sent].astype(np.int64) * IDS + packets.servo_id[sent]
             self._instructions += np.bincount(servo, minlength=len(self._instructions))
-        exchanges = self._pairing.take(log)
-        self._states.take(log)
+        exchanges = self._pairing.pair_packets(log)
+        self._states.add_states(log)
         for event in log.events:
-            self._others.writes.failed(event)
+            self._others.writes.add_failure(event)
         self._count(exchanges)
 
-    def finish(self) -> tuple[tuple[ServoTraffic, ...], tuple[BusTraffic, ...]]:
+    def summarize_traffic(self) -> tuple[tuple[ServoTraffic, ...], tuple[BusTraffic, ...]]:
         """Return the traffic of each servo and of each bus, and complete `findings`."""
-        self._count(self._pairing.finish(), final=True)
+        self._count(self._pairing.pair_remaining(), final=True)
         addressed = self._instructions.copy()
         addressed[BROADCAST_ID::IDS] = 0
         servos = np.flatnonzero(self._seen | (addressed > 0)).tolist()
         plans = self._pairing.buses
-        losses = self._losses.finish()
+        losses = self._losses.count_losses()
         found = tuple(replace(self._servo(servo), losses=losses.get(divmod(servo, IDS))) for servo in servos)
         self.findings = tuple(self._findings(plans, losses))
         return found, tuple(self._bus(index, plan) for index, plan in enumerate(plans))
@@ -165,17 +165,17 @@ class Traffic:
             if "noise" not in {one.code for one in spoilt}:
                 named = {one.subject for one in (*slow, *spoilt)}
                 explained = {servo for servo, name in plan.names.items() if name in named}
-                yield from occasions.findings(index, plan, mine, explained)
+                yield from occasions.loss_findings(index, plan, mine, explained)
 
     def _count(self, exchanges: Exchanges | None, *, final: bool = False) -> None:
         if exchanges is None:
             return
         self._watch(exchanges)
         places = self._states.until(int(exchanges.cycle.max(initial=-1)), everything=final)
-        self._losses.take(exchanges, places)
-        self._reply_times.take(exchanges, self._losses)
-        self._broken.take(exchanges)
-        self._others.take(exchanges)
+        self._losses.add_exchanges(exchanges, places)
+        self._reply_times.add_exchanges(exchanges, self._losses)
+        self._broken.add_exchanges(exchanges)
+        self._others.add_exchanges(exchanges)
         count, due, replies = len(self._asked), exchanges.due, exchanges.replies
         # A request that is open at the end of the log may have been answered later.
         lost = (due.reply < 0) & exchanges.ended[due.exchange]
@@ -192,7 +192,7 @@ class Traffic:
         answers = np.flatnonzero(replies.answers)
         servo, of = replies.servo[answers], replies.exchange[answers]
         took_ns = replies.last_ns[answers] - exchanges.asked_ns[of]
-        self._reply_us.take(servo, took_ns // 1000)
+        self._reply_us.count_values(servo, took_ns // 1000)
         slower = took_ns > self._reply_max_ns[servo]
         np.maximum.at(self._reply_max_ns, servo[slower], took_ns[slower])
         self._extra(exchanges, of, answers)
@@ -206,14 +206,14 @@ class Traffic:
         last[of] = answers
         rows = last[complete]
         extra_ns = np.maximum(replies.last_ns[rows] - replies.due_ns[rows], 0)
-        self._extra_us.take(exchanges.bus[complete], extra_ns // 1000)
+        self._extra_us.count_values(exchanges.bus[complete], extra_ns // 1000)
 
     def _servo(self, index: int) -> ServoTraffic:
         bus, servo_id = self._pairing.buses[index // IDS], index % IDS
         names, devices = bus.names, {device.servo_id for device in bus.devices}
         errors = self._errors[index]
         found = {error for error in np.flatnonzero(errors).tolist() if error}
-        times = self._reply_us.of(index)
+        times = self._reply_us.counts_of(index)
         return ServoTraffic(
             bus=bus.name,
             servo_id=servo_id,
@@ -240,7 +240,7 @@ class Traffic:
             noise_bytes=size[PacketKind.NOISE],
             bytes_out=size[PacketKind.INSTRUCTION],
             bytes_in=size[PacketKind.STATUS] + size[PacketKind.NOISE],
-            extra_us=median(*self._extra_us.of(index)) if plan.baud_rate else None,
+            extra_us=median(*self._extra_us.counts_of(index)) if plan.baud_rate else None,
             planned_latency_us=plan.latency_ns / 1e3 if plan.baud_rate else None,
             port=plan.port,
         )

@@ -17,7 +17,7 @@ import msgspec
 import numpy as np
 
 from dxlrun import LINEAR, ROTARY, Floats, JointUnit
-from dxlrun_controllers.joints import finite_or
+from dxlrun_controllers.joint_parameters import finite_or
 
 if TYPE_CHECKING:
     from xml.etree.ElementTree import Element

@@ -71,7 +71,7 @@ class Repetition:
         self.rows = 0
         """Number of rows that were recorded in this repetition."""
 
-    def begin(self) -> None:
+    def start_recording(self) -> None:
         """Start the record of a new repetition."""
         self.rows = 0
         self._squares.fill(0.0)
@@ -107,7 +107,7 @@ class Repetition:
         delay = np.divide(slow, fast, out=np.zeros_like(slow), where=fast > 0) * self._period_s
         return np.asarray(np.clip(delay, 0.0, MOST_DELAY_S), np.float64)
 
-    def learn(
+    def learn_correction(
         self, old: Table | None, new: Table, gain: float, delay_s: Floats, most: Floats
     ) -> Iterator[None]:
         """Compute the next correction from this repetition, and yield after each small step.

@@ -34,7 +34,7 @@ class Madgwick:
             2.0 * (self.w * self.z + self.x * self.y), 1.0 - 2.0 * (self.y * self.y + self.z * self.z)
         )
 
-    def begin(self, acceleration: Vector, field: Vector | None, heading: float) -> None:
+    def initialize_orientation(self, acceleration: Vector, field: Vector | None, heading: float) -> None:
         """Set roll and pitch from the accelerometer, and the heading from the magnetic field.
 
         Without a field, the heading is `heading`, rad. An acceleration of zero leaves the orientation

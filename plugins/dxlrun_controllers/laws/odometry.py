@@ -26,13 +26,13 @@ FASTEST_WHEEL = 50.0
 """Highest speed of a wheel when its limit is unknown, rad/s: the MX-12W has 470 rpm at 12 V (e-Manual)."""
 
 
-class Pose:
+class BasePose:
     """Pose of a base in the frame in which it started: x and y (m), and heading (rad, counts whole turns)."""
 
     def __init__(self) -> None:
         self.x = self.y = self.heading = 0.0
 
-    def move(self, way: float, angle: float) -> None:
+    def move_along_arc(self, way: float, angle: float) -> None:
         """Move the pose along an arc of the length `way`, m, that turns by `angle`, rad (positive: to the
         left).
         """
@@ -71,11 +71,11 @@ class WheelAngles:
         self._before = np.zeros(wheels)
         self._known_ns = -1
 
-    def begin(self) -> None:
+    def restart_odometry(self) -> None:
         """Discard the last sample: the rotation until the next one is not used."""
         self._known_ns = -1
 
-    def take(self, states: States, time_ns: int) -> int | None:
+    def add_sample(self, states: States, time_ns: int) -> int | None:
         """Add the wheel positions of a cycle in which all wheels answered, and update `turned`.
 
         Returns:

@@ -17,7 +17,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from dxlrun import LIVE, Floats, ParametersModel
-from dxlrun_controllers.joints import NotNegative, PerJoint, clamped, row_of
+from dxlrun_controllers.joint_parameters import NotNegative, PerJoint, clamped, row_of
 
 
 class Gains(ParametersModel):
@@ -76,7 +76,7 @@ class Pid:
         """Results of the last update, in units of the command; `rate` is the filtered rate of the error."""
         self._elapsed_s = np.zeros(joints)
 
-    def take(self, gains: Gains, joints: tuple[str, ...]) -> None:
+    def set_gains(self, gains: Gains, joints: tuple[str, ...]) -> None:
         """Set the gains of the joints.
 
         A joint whose integral gain is 0 loses its integral, which would stay forever.

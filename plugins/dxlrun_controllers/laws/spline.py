@@ -266,7 +266,7 @@ class Trajectory:
         """Coefficients of the current piece, which is valid from `_begin_s` to `_end_s` of the points' time
         """
         self._begin_s = self._end_s = 0.0
-        self._tail = Stop(joints)
+        self._tail = StopTrajectory(joints)
         self._tail_s = 0.0
         """Time from `load` or `join` to the start of the stop after the last point, s."""
         self._joined = SplineSample(joints)
@@ -284,7 +284,7 @@ class Trajectory:
             now: Present desired state.
             waited_s: Part of `start_in` that has already passed, s.
         """
-        order = self._take(data, float(data[START_IN]) - waited_s)
+        order = self._set_views(data, float(data[START_IN]) - waited_s)
         self.bridge_s = self._start_in + float(self._times[0])
         self.duration_s = self._tail_s = self._start_in + float(self._times[-1])
         if self.bridge_s > 0:
@@ -294,7 +294,9 @@ class Trajectory:
             else:
                 solve(order, self.bridge_s, start, self._first, self._bridge[:order])
 
-    def join(self, data: Floats, now: SplineSample, late_s: float, blend_s: float, limits: Limits) -> bool:
+    def join(
+        self, data: Floats, now: SplineSample, late_s: float, blend_s: float, limits: SplineLimits
+    ) -> bool:
         """Start a flat trajectory in its middle.
 
         A quintic bridge leads into it. The bridge takes `blend_s`, or longer to keep the speed limits. After
@@ -310,7 +312,7 @@ class Trajectory:
         Returns:
             False if all points are in the past.
         """
-        self._take(data, -late_s)
+        self._set_views(data, -late_s)
         joined, end_s = self._joined, float(self._times[-1]) - late_s
         if end_s <= 0:
             return False
@@ -333,7 +335,7 @@ class Trajectory:
         self.duration_s = self._tail_s + self._tail.duration_s
         return True
 
-    def _take(self, data: Floats, start_in: float) -> int:
+    def _set_views(self, data: Floats, start_in: float) -> int:
         """Set the views of a flat trajectory, discard the last bridge, and return the order of the pieces."""
         count, joints, order = map(int, data[:START_IN].tolist())
         ends = _HEAD + count
@@ -356,7 +358,7 @@ class Trajectory:
         return self._first[0], velocity, acceleration
 
     @property
-    def end(self) -> Floats:
+    def end_position(self) -> Floats:
         """Position of the joints at the last point, rad."""
         position: Floats = self._last[0]
         return position
@@ -409,7 +411,7 @@ class Trajectory:
         evaluate(self._now, t - self._begin_s, sample)
 
 
-class Limits(NamedTuple):
+class SplineLimits(NamedTuple):
     """Limits of joints on the bridge into a trajectory and in the stop after it, each of shape (joints,)."""
 
     speed: Floats
@@ -421,7 +423,7 @@ class Limits(NamedTuple):
     """Upper position limit, rad; `lower` is the lower one."""
 
 
-class Stop:
+class StopTrajectory:
     """Stop of joints. Each decelerates at a constant rate from its own velocity.
 
     The stop takes |v| / a and the distance |v|**2 / (2 a), as in joint_trajectory_controller of

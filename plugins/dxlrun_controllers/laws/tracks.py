@@ -9,7 +9,7 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
-from dxlrun_controllers.laws.spline import Limits, SplineSample, Stop, Trajectory
+from dxlrun_controllers.laws.spline import SplineLimits, SplineSample, StopTrajectory, Trajectory
 
 
 class Track:
@@ -34,7 +34,7 @@ class Tracks:
         self.desired = SplineSample(joints)
         self.still = np.ones(joints, dtype=np.bool_)
         """True for each joint at rest: it follows neither a trajectory nor a stop."""
-        self.stop = Stop(joints)
+        self.stop = StopTrajectory(joints)
         self._stopping = np.zeros(joints, dtype=np.bool_)
         self._own = SplineSample(joints)
         self._pool = tuple(Track(joints) for _ in range(joints + 1))
@@ -49,7 +49,7 @@ class Tracks:
         """Return a track that no joint follows, for the next trajectory."""
         return next(track for track in self._pool if track not in self._playing)
 
-    def follow(self, track: Track, moved: NDArray[np.bool_], clock_s: float) -> None:
+    def start_track(self, track: Track, moved: NDArray[np.bool_], clock_s: float) -> None:
         """Move joints to a track that starts now.
 
         Args:
@@ -66,15 +66,15 @@ class Tracks:
         self._stopping &= ~moved
         self.still &= ~moved
 
-    def rest(self) -> None:
+    def end_tracks(self) -> None:
         """End all tracks and the stop at once: all joints count as at rest."""
         self._playing = ()
         self._stopping.fill(False)
         self.still.fill(True)
 
-    def come_to_rest(self, limits: Limits) -> None:
+    def come_to_rest(self, limits: SplineLimits) -> None:
         """End all tracks, and decelerate all joints to rest from the desired state."""
-        self.rest()
+        self.end_tracks()
         self.stop.load(self.desired, limits.deceleration, limits.lower, limits.upper)
         self._stopping.fill(True)
         self.still.fill(False)

@@ -15,7 +15,7 @@ from pydantic import Field
 
 from dxlrun import LIVE, Angle, CommandModel, Context, Duration, Floats, Goal
 from dxlrun.messages import Header
-from dxlrun_controllers.joints import PerJoint, Positive, clamped, row_of
+from dxlrun_controllers.joint_parameters import PerJoint, Positive, clamped, row_of
 from dxlrun_controllers.laws.learning import MOST_DELAY_S, Repetition
 from dxlrun_controllers.motions.joint_trajectory_controller import (
     JointTrajectoryController,
@@ -187,7 +187,7 @@ class IlcController(JointTrajectoryController):
                 f"motion {motion_name(self._key)} is not known: it is played without a correction"
             )
         else:
-            self._known.touch(known)
+            self._known.mark_played(known)
         self._play(known, time_ns)
         if self._rows > self._repetition.most_rows:
             self._spoil("it is longer than `longest`")
@@ -222,7 +222,7 @@ class IlcController(JointTrajectoryController):
         row = -1 if self._frozen else self._row(time_ns)
         super().update(time_ns, period_ns)
         if self._open and row >= 0:
-            self._look(row, time_ns)
+            self._check_repetition(row, time_ns)
         self._correct(time_ns, row)
         if self._open and row >= 0:
             self._record()
@@ -241,10 +241,10 @@ class IlcController(JointTrajectoryController):
             if self._pupil is not None:
                 self._spoil("the one before is still being learned")
             else:
-                self._repetition.begin()
+                self._repetition.start_recording()
         return round((time_ns - self._row_ns) / self.context.period_ns)
 
-    def _look(self, row: int, time_ns: int) -> None:
+    def _check_repetition(self, row: int, time_ns: int) -> None:
         """Discard the repetition if it is not usable for learning, such as at another speed."""
         if self._rate != 1.0 or self._speed != 1.0:
             self._spoil("it is played at another speed")
@@ -333,7 +333,7 @@ class IlcController(JointTrajectoryController):
             self._doubt(motion, error)
         elif self.parameters.gain:
             self._pupil = motion
-            self._learning = self._repetition.learn(
+            self._learning = self._repetition.learn_correction(
                 self._known.table(motion),
                 self._known.next_table(motion),
                 self.parameters.gain,
@@ -351,7 +351,7 @@ class IlcController(JointTrajectoryController):
         if motion.grown == 1:
             self.context.say(f"nothing is learned from this repetition of motion {motion.name}: {worse}")
             return
-        self._known.forget(motion)
+        self._known.forget_motion(motion)
         self._stay(motion)
         self.context.keep(self._known.packed())
         self.context.say(f"what was learned of motion {motion.name} is dropped: again {worse}")
@@ -386,5 +386,5 @@ class IlcController(JointTrajectoryController):
         try:
             self._known.unpack(data)
         except (ValueError, struct.error) as error:
-            self._known.clear()
+            self._known.clear_motions()
             self.context.say(f"what was learned before cannot be used: {error}")

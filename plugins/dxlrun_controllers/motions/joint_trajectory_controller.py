@@ -27,13 +27,13 @@ from dxlrun import (
     SpeedPeak,
     Tolerance,
 )
-from dxlrun_controllers.joints import (
+from dxlrun_controllers.joint_parameters import (
     JointsParameters,
     PerJoint,
     commanded_by,
     ends_unheard,
     finite_or,
-    hold,
+    hold_joints,
     row_of,
     take_where_heard,
 )
@@ -41,13 +41,13 @@ from dxlrun_controllers.laws.pid import feed_velocities_forward
 from dxlrun_controllers.laws.spline import (
     DECELERATION,
     START_IN,
-    Limits,
+    SplineLimits,
     SplineSample,
     Trajectory,
     flat_size,
     whole_turns,
 )
-from dxlrun_controllers.laws.tracking import CLOSING_SPEED, Tracking, TrackingGains
+from dxlrun_controllers.laws.tracking_law import CLOSING_SPEED, Tracking, TrackingGains
 from dxlrun_controllers.laws.tracks import Track, Tracks
 from dxlrun_controllers.motions.trajectory_command import (
     SPLICED,
@@ -117,7 +117,7 @@ class TrajectoryParameters(JointsParameters):
 
 
 @unique
-class _Phase(Enum):
+class _TrajectoryPhase(Enum):
     RESTING = auto()
     MOVING = auto()
     STOPPING = auto()
@@ -181,7 +181,7 @@ class JointTrajectoryController(Controller[TrajectoryParameters]):
         self._anchor_ns: int | None = None
         """Time at which the sender's clock of a stream of chunks was 0, ns; None without a stream."""
         self._moves = self._unknown = False
-        self._phase = _Phase.RESTING
+        self._phase = _TrajectoryPhase.RESTING
         self._goal: Goal | None = None
         self._start_ns = self._base_ns = self._stop_ns = self._feedback_ns = 0
         self._timeout_ns = np.inf
@@ -206,7 +206,7 @@ class JointTrajectoryController(Controller[TrajectoryParameters]):
         own = row_of(parameters.deceleration, joints, np.nan)
         deceleration = finite_or(np.fmin(own, limits.acceleration), DECELERATION)
         speed = self._speed_limit = finite_or(limits.velocity, np.inf)
-        self._limits = Limits(speed, deceleration, limits.lower, limits.upper)
+        self._limits = SplineLimits(speed, deceleration, limits.lower, limits.upper)
         self._closing = np.minimum(speed, CLOSING_SPEED)
         self._interface = parameters.command_interface
         self._tracking: Tracking | None = None
@@ -217,7 +217,7 @@ class JointTrajectoryController(Controller[TrajectoryParameters]):
         if parameters.gains is not None:
             tracked: Literal["velocity", "effort"] = "velocity" if self._interface == "velocity" else "effort"
             self._tracking = Tracking(context, tracked, parameters.derivative_filter * 1e-9)
-            self._tracking.take(parameters.gains, joints)
+            self._tracking.set_gains(parameters.gains, joints)
         self._to_servos = not context.into
 
     def on_parameters(self, time_ns: int) -> None:
@@ -226,22 +226,22 @@ class JointTrajectoryController(Controller[TrajectoryParameters]):
             self._base_s, self._base_ns = self._warped(time_ns), time_ns
         self._speed = self.parameters.speed
         if self._tracking is not None and self.parameters.gains is not None:
-            self._tracking.take(self.parameters.gains, self.context.joints)
+            self._tracking.set_gains(self.parameters.gains, self.context.joints)
 
     def on_activate(self, time_ns: int) -> None:
         """Hold the joints at their last goals, or where they are when a law tracks them."""
         commands, states = self.context.commands, self.context.states
-        self._phase, self._goal, self._spliced, self._anchor_ns = _Phase.RESTING, None, None, None
-        self._tracks.rest()
+        self._phase, self._goal, self._spliced, self._anchor_ns = _TrajectoryPhase.RESTING, None, None, None
+        self._tracks.end_tracks()
         if self._tracking is None:
-            hold(self.context)
+            hold_joints(self.context)
             self._desired.rest_at(commands.position)
             if not self._to_servos:
                 commands.velocity.fill(0.0)
         else:
             self._desired.rest_at(states.position)
             self._tracked.rest_at(states.position)
-            self._tracking.begin(self._desired)
+            self._tracking.start_tracking(self._desired)
         self._unknown = True
 
     def on_deactivate(self, time_ns: int) -> None:
@@ -260,14 +260,14 @@ class JointTrajectoryController(Controller[TrajectoryParameters]):
         if ends_unheard(goal, self._desired.position, self.context.joints):
             return
         self._goal, self._start_ns, self._feedback_ns = goal, time_ns, time_ns + FEEDBACK_NS
-        self._phase = _Phase.MOVING
+        self._phase = _TrajectoryPhase.MOVING
         self._timeout_ns = float(data[flat_size(data)]) * 1e9
         if self._tracks.playing and (data[-len(self._moved) :] == SPLICED).any():
             self._spliced, self._splice_s = data, self._warped(time_ns) + float(data[START_IN])
         else:
-            self._begin(data, time_ns, self._warped(time_ns))
+            self._begin_trajectory(data, time_ns, self._warped(time_ns))
 
-    def _begin(
+    def _begin_trajectory(
         self, data: NDArray[np.float64], time_ns: int, clock_s: float, *, waited_s: float = 0.0
     ) -> None:
         """Start a prepared trajectory on its joints; abort its goal if it is too fast.
@@ -285,11 +285,11 @@ class JointTrajectoryController(Controller[TrajectoryParameters]):
         track.trajectory.load(whole_turns(data, begin.position, self._wrap & moved), begin, waited_s)
         self._warn_of_turns(track.trajectory, begin, np.flatnonzero(self._turns & moved))
         self._within = self._own.replaced_by(more[1:], count)
-        self._take(track, moved)
+        self._set_track(track, moved)
         if self._refused_for_haste():
             self._brake(time_ns)
         else:
-            self._tracks.follow(track, moved, clock_s)
+            self._tracks.start_track(track, moved, clock_s)
             self._base_ns, self._base_s = time_ns, since_s
 
     def _warn_of_turns(self, trajectory: Trajectory, begin: SplineSample, rows: NDArray[np.intp]) -> None:
@@ -321,13 +321,13 @@ class JointTrajectoryController(Controller[TrajectoryParameters]):
         begin = self._path_of(moved)
         points = whole_turns(data[len(head) :], begin.position, self._wrap & moved)
         if track.trajectory.join(points, begin, late_s, blend_s, self._limits):
-            self._end(Outcome.PREEMPTED, time_ns, "a chunk of positions took its place")
-            self._tracks.follow(track, moved, self._warped(time_ns))
-            self._take(track, moved)
+            self._end_goal(Outcome.PREEMPTED, time_ns, "a chunk of positions took its place")
+            self._tracks.start_track(track, moved, self._warped(time_ns))
+            self._set_track(track, moved)
             self._base_ns, self._base_s = time_ns, 0.0
-            self._spliced, self._phase = None, _Phase.MOVING
+            self._spliced, self._phase = None, _TrajectoryPhase.MOVING
 
-    def _take(self, track: Track, moved: NDArray[np.bool_]) -> None:
+    def _set_track(self, track: Track, moved: NDArray[np.bool_]) -> None:
         self._trajectory, self._moved, self._unmoved = track.trajectory, moved, ~moved
 
     def on_cancel(self, goal: Goal, time_ns: int) -> None:
@@ -343,7 +343,7 @@ class JointTrajectoryController(Controller[TrajectoryParameters]):
     @property
     def _moving(self) -> bool:
         """True while a trajectory is played, not during a stop."""
-        return self._phase is _Phase.MOVING
+        return self._phase is _TrajectoryPhase.MOVING
 
     def _know_begin(self, time_ns: int) -> None:
         """Update the speed factor and the desired state from which a new trajectory starts now."""
@@ -358,8 +358,8 @@ class JointTrajectoryController(Controller[TrajectoryParameters]):
 
         The runtime holds the joints at their goals.
         """
-        self._anchor_ns, self._phase = None, _Phase.RESTING
-        self._tracks.rest()
+        self._anchor_ns, self._phase = None, _TrajectoryPhase.RESTING
+        self._tracks.end_tracks()
         held = self.context.goals if self._tracking is None else self.context.states
         self._desired.rest_at(finite_or(held.position, self._desired.position))
 
@@ -412,7 +412,7 @@ class JointTrajectoryController(Controller[TrajectoryParameters]):
             goal.end(Outcome.ABORTED, text, joint, float(way[row]))
         return True
 
-    def _end(self, outcome: Outcome, time_ns: int, text: str = "", row: int = -1) -> None:
+    def _end_goal(self, outcome: Outcome, time_ns: int, text: str = "", row: int = -1) -> None:
         """End the active goal with the error of a joint: that of index `row`, or the largest one if it is
         -1.
         """
@@ -439,29 +439,29 @@ class JointTrajectoryController(Controller[TrajectoryParameters]):
         if self._spliced is not None:
             self._splice(self._spliced, time_ns)
         elapsed = 0.0 if self._still.all() else self._sample(time_ns)
-        if self._phase is _Phase.MOVING:
+        if self._phase is _TrajectoryPhase.MOVING:
             self._move(time_ns, elapsed)
-        elif self._phase is _Phase.STOPPING:
+        elif self._phase is _TrajectoryPhase.STOPPING:
             self._come_to_rest(time_ns)
         elif self._unknown:
             self._unknown = take_where_heard(self._desired.position, self.context.states)
-        self._command(period_ns)
+        self._write_commands(period_ns)
 
     def _splice(self, data: NDArray[np.float64], time_ns: int) -> None:
         """Start the waiting trajectory once its start time has come, from the desired state of that time."""
         if self._warped(time_ns) >= self._splice_s:
             self._spliced = None
             self._sample_at(self._splice_s, time_ns)
-            self._begin(data, time_ns, self._splice_s, waited_s=float(data[START_IN]))
+            self._begin_trajectory(data, time_ns, self._splice_s, waited_s=float(data[START_IN]))
 
     def _move(self, time_ns: int, elapsed: float) -> None:
         if self._spliced is None and elapsed >= self._trajectory.duration_s:
-            self._phase = _Phase.RESTING
+            self._phase = _TrajectoryPhase.RESTING
             self._hand_over(time_ns)
         elif self._goal is None:
             return
         elif self._within.checks_path and (row := self._find_off_path()) >= 0:
-            self._end(Outcome.ABORTED, time_ns, f"{self._off_path_text(row)}, stopping", row)
+            self._end_goal(Outcome.ABORTED, time_ns, f"{self._off_path_text(row)}, stopping", row)
             self._stop_from(time_ns)
         elif time_ns - self._start_ns > self._timeout_ns:
             self._time_out(time_ns)
@@ -514,7 +514,7 @@ class JointTrajectoryController(Controller[TrajectoryParameters]):
             round(max(0.0, left_ns)) if math.isfinite(left_ns) else None,
         )
         joints = self._names_of(self._moved)
-        goal.judge(self._trajectory.end, joints=joints, tolerances=tolerances, text=text)
+        goal.judge(self._trajectory.end_position, joints=joints, tolerances=tolerances, text=text)
 
     def _time_out(self, time_ns: int) -> None:
         text = f"after {(time_ns - self._start_ns) * 1e-9:.3f} s, its time-out"
@@ -535,16 +535,16 @@ class JointTrajectoryController(Controller[TrajectoryParameters]):
     def _brake(self, time_ns: int) -> None:
         self._spliced = None
         self._tracks.come_to_rest(self._limits)
-        self._phase, self._stop_ns = _Phase.STOPPING, time_ns
+        self._phase, self._stop_ns = _TrajectoryPhase.STOPPING, time_ns
 
     def _come_to_rest(self, time_ns: int) -> None:
         if self._still.all():
-            self._phase = _Phase.RESTING
-            self._end(Outcome.CANCELLED, time_ns)  # other outcomes end the goal before the stop
+            self._phase = _TrajectoryPhase.RESTING
+            self._end_goal(Outcome.CANCELLED, time_ns)  # other outcomes end the goal before the stop
 
     # Commands
 
-    def _command(self, period_ns: int) -> None:
+    def _write_commands(self, period_ns: int) -> None:
         commands, desired = self.context.commands, self._desired
         if self._tracking is not None:
             self._tracked.rows[1:] = 0.0

@@ -32,12 +32,12 @@ from dxlrun import (
     Tolerance,
     nearest_turn,
 )
-from dxlrun_controllers.joints import (
+from dxlrun_controllers.joint_parameters import (
     JointNames,
     commanded_by,
     ends_unheard,
     finite_or,
-    hold,
+    hold_joints,
     not_one_of,
     row_of,
     take_shorter_way,
@@ -48,12 +48,12 @@ from dxlrun_controllers.laws.spline import (
     DECELERATION,
     LINEAR,
     SplineSample,
-    Stop,
+    StopTrajectory,
     evaluate,
     peak_velocities,
     solve,
 )
-from dxlrun_controllers.laws.tracking import CLOSING_SPEED
+from dxlrun_controllers.laws.tracking_law import CLOSING_SPEED
 
 HIGHEST_RATE = 10.0
 """Highest ratio of a motion's time to the loop's time, which bounds the number of steps in one period."""
@@ -290,7 +290,7 @@ class KeyframePlayer(Controller[KeyframeParameters]):
         self._piece = np.zeros((CUBIC, count))
         self._ends = np.zeros((2, 2, count))
         """Position and velocity at the start and at the end of the present step."""
-        self._stop = Stop(count)
+        self._stop = StopTrajectory(count)
         self._deceleration = finite_or(context.limits.acceleration, DECELERATION)
         self._order = CUBIC
         self._limp = np.zeros(count, dtype=np.bool_)
@@ -307,7 +307,7 @@ class KeyframePlayer(Controller[KeyframeParameters]):
 
     def on_activate(self, time_ns: int) -> None:
         """Hold the joints at their last goals; the motion `start` starts in the next update."""
-        hold(self.context)
+        hold_joints(self.context)
         self._now.rest_at(self.context.commands.position)
         self._limp.fill(False)
         self._out.fill(False)
@@ -332,9 +332,9 @@ class KeyframePlayer(Controller[KeyframeParameters]):
         if ends_unheard(goal, self._now.position, self.context.joints):
             return
         self._goal = goal
-        self._begin(list(self.parameters.motions)[int(data[0])], float(data[1]), int(data[2]))
+        self._begin_motion(list(self.parameters.motions)[int(data[0])], float(data[1]), int(data[2]))
 
-    def _begin(self, motion: str, speed: float, repeat: int) -> None:
+    def _begin_motion(self, motion: str, speed: float, repeat: int) -> None:
         """Start a motion by name from the present goals and velocities, first slowly to its first pose."""
         self._now.velocity *= self._rate if self._playing or self._stopping else 0.0
         self._playing, self._stopping, self._starting = True, False, False
@@ -386,7 +386,7 @@ class KeyframePlayer(Controller[KeyframeParameters]):
         self._out |= self._limp
         self._missed |= self._limp
         if not (self._playing or self._stopping) and self._out.any():
-            self._command()
+            self._write_commands()
             np.copyto(self._out, self._limp)
 
     def _stay_out(self) -> None:
@@ -398,7 +398,9 @@ class KeyframePlayer(Controller[KeyframeParameters]):
         if self._unknown:
             self._hold_where_heard()
         if not self._unknown and self.parameters.start is not None:
-            self._begin(self.parameters.start, 1.0, self.parameters.motions[self.parameters.start].repeat)
+            self._begin_motion(
+                self.parameters.start, 1.0, self.parameters.motions[self.parameters.start].repeat
+            )
 
     def _hold_where_heard(self) -> None:
         """Hold joints that had not answered at the activation at their first measured positions."""
@@ -423,14 +425,14 @@ class KeyframePlayer(Controller[KeyframeParameters]):
             self._reach()
             if not self._next_step():
                 self._playing = False
-                self._command()
+                self._write_commands()
                 self._hand_over()
                 return
         if self._time_s < self._step_s:
             evaluate(self._piece[: self._order], self._time_s, self._now)
         else:
             self._reach()
-        self._command()
+        self._write_commands()
         if self._goal is not None:
             self._goal.feedback(min(self._done_s / self._total_s, 1.0), self._worst()[0])
 
@@ -483,12 +485,12 @@ class KeyframePlayer(Controller[KeyframeParameters]):
     def _decelerate(self, dt: float) -> None:
         self._time_s += dt
         self._stop.sample(self._time_s, self._now)
-        self._command()
+        self._write_commands()
         if self._time_s >= self._stop.duration_s:
             self._stopping = False
             self._finish(Outcome.CANCELLED, f"stopped in step {self._number} of {self._name}")
 
-    def _command(self) -> None:
+    def _write_commands(self) -> None:
         commands, now = self.context.commands, self._now
         self._stay_out()
         np.copyto(commands.position, now.position)

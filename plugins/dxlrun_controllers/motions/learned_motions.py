@@ -85,9 +85,9 @@ class LearnedMotions:
         self._free: list[int] = []
         self._known: list[LearnedMotion] = []
         """Motions in the store, the least recently played one first."""
-        self.clear()
+        self.clear_motions()
 
-    def clear(self) -> None:
+    def clear_motions(self) -> None:
         """Forget all motions and their tables."""
         self._known = []
         self._free = list(range(len(self._tables)))
@@ -96,7 +96,7 @@ class LearnedMotions:
         """Return the motion with this key, or None."""
         return next((motion for motion in self._known if motion.key == key), None)
 
-    def touch(self, motion: LearnedMotion) -> None:
+    def mark_played(self, motion: LearnedMotion) -> None:
         """Mark a motion as played most recently; the least recently played one is replaced first."""
         self._known.remove(motion)
         self._known.append(motion)
@@ -127,13 +127,13 @@ class LearnedMotions:
         else:
             if len(self._known) == self._motions:
                 forgotten = self._known[0]
-                self.forget(forgotten)
+                self.forget_motion(forgotten)
             self._known.append(motion)
         motion.place = self._free.pop(0)
         motion.repetitions += 1
         return forgotten
 
-    def forget(self, motion: LearnedMotion) -> None:
+    def forget_motion(self, motion: LearnedMotion) -> None:
         """Remove a motion from the store and free its table."""
         self._known.remove(motion)
         self._free.append(motion.place)

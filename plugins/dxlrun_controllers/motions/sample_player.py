@@ -27,17 +27,17 @@ from dxlrun import (
     Outcome,
     ParametersModel,
 )
-from dxlrun_controllers.joints import (
+from dxlrun_controllers.joint_parameters import (
     JointsParameters,
     PerJoint,
     Positive,
     commanded_by,
     finite_or,
-    hold,
+    hold_joints,
     row_of,
     take_shorter_way,
 )
-from dxlrun_controllers.laws.spline import DECELERATION, SplineSample, Stop
+from dxlrun_controllers.laws.spline import DECELERATION, SplineSample, StopTrajectory
 from dxlrun_controllers.motions.trajectory_command import Near
 
 _HEAD: Final = 3
@@ -105,7 +105,7 @@ class SamplesCommand(CommandModel):
 
 
 @unique
-class _Phase(Enum):
+class _PlayerPhase(Enum):
     RESTING = auto()
     PLAYING = auto()
     STOPPING = auto()
@@ -157,7 +157,7 @@ class SamplePlayer(Controller[SampleParameters]):
         self._oldest_ns = np.int64(np.iinfo(np.int64).max if bounds.age is None else bounds.age)
         self._wrap = np.array(context.wrap)
         self._still = SplineSample(count)
-        self._stop = Stop(count)
+        self._stop = StopTrajectory(count)
         self._deceleration = finite_or(limits.acceleration, DECELERATION)
         self._by_position = self._interface in ("position", "posvel")
         self._rest_lower, self._rest_upper = np.full(count, -np.inf), np.full(count, np.inf)
@@ -174,7 +174,7 @@ class SamplePlayer(Controller[SampleParameters]):
         """Discard all rows, and hold the joints; velocities, efforts and PWM start at 0."""
         self._forget()
         if self._by_position:
-            hold(self.context)
+            hold_joints(self.context)
         else:
             self._primary.fill(0.0)
 
@@ -183,7 +183,7 @@ class SamplePlayer(Controller[SampleParameters]):
         self._forget()
 
     def _forget(self) -> None:
-        self._phase = _Phase.RESTING
+        self._phase = _PlayerPhase.RESTING
         self._goal: Goal | None = None
         self._pieces: list[Floats] = []
         """Pieces of the table, each a flat array of rows.
@@ -195,14 +195,14 @@ class SamplePlayer(Controller[SampleParameters]):
 
     def on_command(self, kind: str, data: NDArray[np.float64], time_ns: int) -> None:
         """Store rows for the next goal. A table that is being played is aborted."""
-        if self._phase is _Phase.PLAYING:
-            self._end(Outcome.ABORTED, "rows of another table came")
+        if self._phase is _PlayerPhase.PLAYING:
+            self._end_goal(Outcome.ABORTED, "rows of another table came")
             self._begin_stop(time_ns)
         self._keep(data)
 
     def on_goal(self, goal: Goal, data: NDArray[np.float64], time_ns: int) -> None:
         """Play the stored rows followed by those of the goal."""
-        if self._phase is _Phase.PLAYING:  # drop the rows of the goal that was preempted
+        if self._phase is _PlayerPhase.PLAYING:  # drop the rows of the goal that was preempted
             self._pieces = []
         self._keep(data[_HEAD:])
         if len(self._pieces) > MOST_PIECES:
@@ -212,7 +212,7 @@ class SamplePlayer(Controller[SampleParameters]):
             return
         self._total = sum(map(len, self._pieces)) // self._width
         self._piece = self._first = 0
-        self._goal, self._phase = goal, _Phase.PLAYING
+        self._goal, self._phase = goal, _PlayerPhase.PLAYING
         self._start_ns, self._period_ns = time_ns, float(data[0]) * 1e9
         self._tolerance = float(data[2])
         self._settled_ns = time_ns + round(self._total * self._period_ns + float(data[1]) * 1e9)
@@ -233,16 +233,16 @@ class SamplePlayer(Controller[SampleParameters]):
 
     def update(self, time_ns: int, period_ns: int) -> None:
         """Command the row of this cycle, or the stop; at rest, the last command stays."""
-        if self._phase is _Phase.PLAYING:
+        if self._phase is _PlayerPhase.PLAYING:
             self._play(time_ns, period_ns)
-        elif self._phase is _Phase.STOPPING:
+        elif self._phase is _PlayerPhase.STOPPING:
             self._slow_down(time_ns)
 
     def _play(self, time_ns: int, period_ns: int) -> None:
         breach = self._breach()
         if breach is not None:
             row, text = breach
-            self._end(Outcome.ABORTED, text, row)
+            self._end_goal(Outcome.ABORTED, text, row)
             self._begin_stop(time_ns)
             return
         elapsed_ns = time_ns - self._start_ns
@@ -276,8 +276,8 @@ class SamplePlayer(Controller[SampleParameters]):
             self._primary, self._still.velocity if self._interface == "velocity" else self._still.position
         )
         if elapsed >= self._stop.duration_s:
-            self._phase = _Phase.RESTING
-            self._end(Outcome.CANCELLED)  # other outcomes end the goal before the stop
+            self._phase = _PlayerPhase.RESTING
+            self._end_goal(Outcome.CANCELLED)  # other outcomes end the goal before the stop
 
     # The end
 
@@ -305,7 +305,7 @@ class SamplePlayer(Controller[SampleParameters]):
             return row, f"has not answered for {states.age_ns[row] * 1e-6:.0f} ms"
         return None
 
-    def _end(self, outcome: Outcome, text: str = "", row: int = -1) -> None:
+    def _end_goal(self, outcome: Outcome, text: str = "", row: int = -1) -> None:
         """End the goal, if there is one; the joint with the index `row`, if not -1, is named as the
         reason.
         """
@@ -336,9 +336,9 @@ class SamplePlayer(Controller[SampleParameters]):
 
     def _begin_stop(self, time_ns: int, *, over: bool = False) -> None:
         """Start to stop the joints; `over`: the table is complete, so positions are at rest already."""
-        if self._phase is _Phase.PLAYING:
+        if self._phase is _PlayerPhase.PLAYING:
             self._pieces = []
-        self._phase, self._stop_ns = _Phase.STOPPING, time_ns
+        self._phase, self._stop_ns = _PlayerPhase.STOPPING, time_ns
         still, states, goals = self._still, self.context.states, self.context.goals
         still.rows.fill(0.0)
         if self._interface == "velocity":

@@ -9,7 +9,7 @@ import numpy as np
 from pydantic import BeforeValidator, Field, TypeAdapter, model_validator
 
 from dxlrun import CommandModel, Duration, Floats, RestSpeed, SpeedPeak, Tolerance
-from dxlrun_controllers.joints import check_size, or_number, row_of
+from dxlrun_controllers.joint_parameters import check_size, or_number, row_of
 from dxlrun_controllers.laws.spline import (
     CUBIC,
     LINEAR,

@@ -28,7 +28,7 @@ from dxlrun import (
 )
 from dxlrun.messages import Header, Imu
 from dxlrun_controllers.laws.madgwick import Madgwick, Vector
-from dxlrun_controllers.sensing.samples import SampleTimes
+from dxlrun_controllers.sensing.sample_times import SampleTimes
 
 AXES = ("x", "y", "z")
 ORIENTATION = tuple(f"orientation.{axis}" for axis in (*AXES, "w"))
@@ -55,7 +55,7 @@ class ImuCovariance(ParametersModel):
     """Variances of the linear acceleration along x, y and z, (m/s^2)^2."""
 
 
-class ImuParameters(ParametersModel):
+class ImuBroadcasterParameters(ParametersModel):
     """Keys of an imu_sensor_broadcaster in the robot file."""
 
     sensor: str
@@ -90,7 +90,7 @@ class ImuParameters(ParametersModel):
             yield ("declination",), f"{what}; name a magnetometer, or remove it"
 
 
-class ImuSensorBroadcaster(Controller[ImuParameters]):
+class ImuSensorBroadcaster(Controller[ImuBroadcasterParameters]):
     """Controller that provides and publishes orientation, angular velocity and linear acceleration of a link.
 
     The orientation is that of the link in a frame whose z axis points up. With a magnetometer, the x axis of
@@ -105,11 +105,11 @@ class ImuSensorBroadcaster(Controller[ImuParameters]):
       accelerometer, and the heading from the magnetometer. Without a magnetometer the heading is kept.
     """
 
-    Parameters = ImuParameters
+    Parameters = ImuBroadcasterParameters
     Topics: ClassVar = {"imu": Imu}
 
     @classmethod
-    def interfaces(cls, parameters: ImuParameters, joints: tuple[str, ...]) -> Interfaces:
+    def interfaces(cls, parameters: ImuBroadcasterParameters, joints: tuple[str, ...]) -> Interfaces:
         """Read the states of the sensor and, with a magnetometer, its field; provide the states of the
         link.
         """
@@ -144,7 +144,7 @@ class ImuSensorBroadcaster(Controller[ImuParameters]):
 
     def on_activate(self, time_ns: int) -> None:
         """Restart the filter, because the motion since the last activation is unknown."""
-        self._times.forget()
+        self._times.discard_sample()
         self._silent = self._wrong = False
 
     def on_parameters(self, time_ns: int) -> None:
@@ -158,7 +158,7 @@ class ImuSensorBroadcaster(Controller[ImuParameters]):
         values = self.context.reads.tolist()
         own = 10 if self.parameters.orientation == "sensor" else 6
         # A discarded sample does not advance the time, so the next step starts at the last valid sample.
-        if not self._is_finite(values, own) or not self._times.take(time_ns, values[own]):
+        if not self._is_finite(values, own) or not self._times.accept_sample(time_ns, values[own]):
             self._look_for_silence(time_ns)
             return
         self._silent = self._wrong = False
@@ -196,7 +196,7 @@ class ImuSensorBroadcaster(Controller[ImuParameters]):
         if elapsed_s * 1e9 <= self.parameters.timeout:  # False for the first sample (NaN)
             law.update(self._unbiased(rate, elapsed_s), acceleration, field, elapsed_s)
         else:
-            law.begin(acceleration, field, law.heading)
+            law.initialize_orientation(acceleration, field, law.heading)
             self._resting_s = 0.0
         return _product(self._east, (law.x, law.y, law.z, law.w))
 

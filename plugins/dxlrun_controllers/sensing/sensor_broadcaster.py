@@ -28,7 +28,7 @@ from dxlrun.messages import (
     Temperature,
     WrenchStamped,
 )
-from dxlrun_controllers.sensing.samples import SampleTimes
+from dxlrun_controllers.sensing.sample_times import SampleTimes
 
 MessageName = Literal[
     "BatteryState", "FluidPressure", "MagneticField", "Range", "Temperature", "WrenchStamped"
@@ -152,7 +152,7 @@ class SensorBroadcaster(Controller[SensorParameters]):
     def on_activate(self, time_ns: int) -> None:
         """Discard all previous samples."""
         for times in self._times:
-            times.forget()
+            times.discard_sample()
         self._silent = False
 
     def update(self, time_ns: int, period_ns: int) -> None:
@@ -161,12 +161,12 @@ class SensorBroadcaster(Controller[SensorParameters]):
         ages = reads[self._count :].tolist()
         new = False
         for times, age_s in zip(self._times, ages, strict=True):
-            new |= times.take(time_ns, age_s)
+            new |= times.accept_sample(time_ns, age_s)
         if math.isnan(sum(ages)):  # a sensor has no sample yet
             return
         values = (self._matrix @ reads[: self._count]).tolist()
         if not all(map(math.isfinite, values)) or max(ages) * 1e9 > self.parameters.timeout:
-            self._report(ages)
+            self._report_silence(ages)
             return
         if not new:
             return
@@ -175,7 +175,7 @@ class SensorBroadcaster(Controller[SensorParameters]):
             setattr(owner, name, value)
         self.context.publish(self._topic, self._message)
 
-    def _report(self, ages: list[float]) -> None:
+    def _report_silence(self, ages: list[float]) -> None:
         if not self._silent:
             self._silent = True
             old = max(ages) * 1e9 > self.parameters.timeout

@@ -131,7 +131,7 @@ class SerialImu(Sensor[SerialImuParameters]):
         newest: list[float] | None = None
         for line in self._lines(data):
             newest = self._numbers(line) or newest
-        self._report(t_ns)
+        self._report_garbage(t_ns)
         if newest is None:
             return None
         for index, (number, scale) in enumerate(zip(newest, self._scales, strict=True)):
@@ -164,7 +164,7 @@ class SerialImu(Sensor[SerialImuParameters]):
         self._garbage, self._shown = self._garbage + 1, line
         return None
 
-    def _report(self, t_ns: int) -> None:
+    def _report_garbage(self, t_ns: int) -> None:
         if self._garbage and t_ns - self._reported_ns >= _REPORT_NS:
             shown = self._shown[:60].decode("ascii", "backslashreplace")
             count = "a line is" if self._garbage == 1 else f"{self._garbage} lines are"

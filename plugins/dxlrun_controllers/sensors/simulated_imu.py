@@ -67,7 +67,7 @@ class Magnetometer(ParametersModel):
     )
 
 
-class ImuParameters(ParametersModel):
+class SimulatedImuParameters(ParametersModel):
     """Link of the unit, and models of its sensors"""
 
     link: str = Field(
@@ -98,7 +98,7 @@ class _Noise:
         self._bias = np.array(bias)
         self._walk = walk / math.sqrt(rate)
 
-    def sample(self, generator: np.random.Generator) -> Floats:
+    def draw_errors(self, generator: np.random.Generator) -> Floats:
         """Return the errors of the next sample on the three axes, and move the bias by a random step."""
         draws = generator.standard_normal((2, 3))
         self._bias = self._bias + self._walk * draws[0]
@@ -106,19 +106,19 @@ class _Noise:
         return errors
 
 
-class SimulatedImu(Sensor[ImuParameters]):
+class SimulatedImu(Sensor[SimulatedImuParameters]):
     """Simulated unit that measures angular velocity, specific force and magnetic field in the frame of its
     link.
 
     At rest the accelerometer measures +9.81 m/s^2 upwards (sensor_msgs/Imu; REP 145).
     """
 
-    Parameters = ImuParameters
+    Parameters = SimulatedImuParameters
     simulated = True
     _body: Body
 
     @classmethod
-    def states(cls, parameters: ImuParameters) -> tuple[str, ...]:
+    def states(cls, parameters: SimulatedImuParameters) -> tuple[str, ...]:
         """Return the states: those of ros2_control's IMU sensors, and with a magnetometer the magnetic
         field.
         """
@@ -127,7 +127,7 @@ class SimulatedImu(Sensor[ImuParameters]):
         return tuple(f"{group}.{axis}" for group in groups for axis in _AXES)
 
     @classmethod
-    def noisy(cls, parameters: ImuParameters) -> tuple[str, ...]:
+    def noisy(cls, parameters: SimulatedImuParameters) -> tuple[str, ...]:
         """Return the states with noise; the others are constant while the link is at rest."""
         gyroscope, accelerometer = parameters.gyroscope, parameters.accelerometer
         groups = ["angular_velocity"] if gyroscope.noise_density or gyroscope.random_walk else []
@@ -135,7 +135,7 @@ class SimulatedImu(Sensor[ImuParameters]):
         return tuple(f"{group}.{axis}" for group in groups for axis in _AXES)
 
     @classmethod
-    def links(cls, parameters: ImuParameters) -> tuple[str, ...]:
+    def links(cls, parameters: SimulatedImuParameters) -> tuple[str, ...]:
         """Return the link that carries the unit, whose motion the simulation provides."""
         return (parameters.link,)
 
@@ -162,12 +162,12 @@ class SimulatedImu(Sensor[ImuParameters]):
         t_ns = self.context.now_ns()
         motion = self._body.motion(self.parameters.link)
         generator = self._generator
-        values[0:3] = motion.angular_velocity + self._rate_noise.sample(generator)
+        values[0:3] = motion.angular_velocity + self._rate_noise.draw_errors(generator)
         pull = turned_back(motion.orientation, GRAVITY)
-        values[3:6] = motion.linear_acceleration - pull + self._force_noise.sample(generator)
+        values[3:6] = motion.linear_acceleration - pull + self._force_noise.draw_errors(generator)
         if self._magnet_noise is not None and self.parameters.magnetometer is not None:
             field = turned_back(motion.orientation, np.array(self.parameters.magnetometer.field))
-            values[6:9] = field + self._magnet_noise.sample(generator)
+            values[6:9] = field + self._magnet_noise.draw_errors(generator)
         return t_ns
 
 

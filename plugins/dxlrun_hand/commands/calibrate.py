@@ -13,7 +13,7 @@ from dxlrun import InputError
 from dxlrun.tooling.verbs import Assignment, DebugFlag, RobotPath, compiled, parse_assignments, read_models
 
 if TYPE_CHECKING:
-    from dxlrun.tooling.robots import Compiled, CompiledJoint
+    from dxlrun.tooling.robots import CompiledJoint, CompiledRobot
     from dxlrun_hand.calibration import HandJoint
     from dxlrun_hand.dialogue import Dialogue
     from dxlrun_hand.lines import Opened
@@ -44,7 +44,11 @@ def calibrate(
 
 
 def calibrated(
-    result: Compiled, dialogue: Dialogue, opened: Opened, words: Sequence[str], assignments: Sequence[str]
+    result: CompiledRobot,
+    dialogue: Dialogue,
+    opened: Opened,
+    words: Sequence[str],
+    assignments: Sequence[str],
 ) -> int:
     """Calibrate joints in a dialogue, and write the robot file after confirmation; return the exit code.
 
@@ -58,7 +62,7 @@ def calibrated(
         assignments: Arguments of the robot file.
     """
     from dxlrun.tooling.robots import compile_robot, read_robot
-    from dxlrun_hand.calibration import HandJoint, keys_of, measure, replacements
+    from dxlrun_hand.calibration import HandJoint, keys_of, measure_joints, replacements
     from dxlrun_hand.dialogue import ending_with, yes
     from dxlrun_hand.lines import BusLines
     from dxlrun_hand.robot_text import RobotText
@@ -68,35 +72,39 @@ def calibrated(
     text = RobotText(robot)
     for name, one in joints.items():
         for path in keys_of(name, continuous=one.plan.continuous):
-            text.check(path)
+            text.check_path(path)
     servos = {name: plan.servos_by_joint[name][0] for name in joints}
     ports = {bus.name: bus.port for bus, _ in servos.values()}
     with ending_with(lambda: f"{robot} is unchanged"), ExitStack() as stack:
         lines = BusLines(ports, opened)
-        tools = {bus: stack.enter_context(lines.open(bus)) for bus in ports}
+        tools = {bus: stack.enter_context(lines.open_line(bus)) for bus in ports}
         hands = [HandJoint(tools[bus.name], bus, servo) for bus, servo in servos.values()]
         with ending_with(lambda: _limp(hands)):
-            found = measure(hands, dialogue)
+            found = measure_joints(hands, dialogue)
         changes = []
         for each in found:
             written = joints[each.joint].described.limits.position
             limits = None if written is None else (float(written[0]), float(written[1]))
             changes += replacements(text, servos[each.joint][1], limits, each)
         if not changes:
-            dialogue.say(f"All is as {robot} has it; nothing is to be written.")
+            dialogue.print_lines(f"All is as {robot} has it; nothing is to be written.")
             return 0
         for change in changes:
-            text.put(change.path, change.value if isinstance(change.value, list) else str(change.value))
-        dialogue.say(*text.diff())
+            text.plan_value(
+                change.path, change.value if isinstance(change.value, list) else str(change.value)
+            )
+        dialogue.print_lines(*text.diff())
         try:
             compile_robot(read_robot(robot, parse_assignments(assignments), changes), [])
         except InputError as error:
-            dialogue.say("With these values the robot file has other mistakes:", *error.sentences)
+            dialogue.print_lines("With these values the robot file has other mistakes:", *error.sentences)
         if not yes(dialogue, f"Write this into {robot}?"):
-            dialogue.say(f"{robot} is unchanged.")
+            dialogue.print_lines(f"{robot} is unchanged.")
             return 1
-        text.write()
-    dialogue.say(f"{robot} is written; the joints are limp. `dxlrun check {robot}` checks the whole file.")
+        text.write_files()
+    dialogue.print_lines(
+        f"{robot} is written; the joints are limp. `dxlrun check {robot}` checks the whole file."
+    )
     return 0
 
 
@@ -105,7 +113,7 @@ def _limp(hands: Sequence[HandJoint]) -> str:
     return names and f"limp now: {names}"
 
 
-def _joints(result: Compiled, words: Sequence[str], dialogue: Dialogue) -> dict[str, CompiledJoint]:
+def _joints(result: CompiledRobot, words: Sequence[str], dialogue: Dialogue) -> dict[str, CompiledJoint]:
     """Return the joints to calibrate: of those chosen, the ones with a servo of their own.
 
     The user is informed about the others.
@@ -119,7 +127,9 @@ def _joints(result: Compiled, words: Sequence[str], dialogue: Dialogue) -> dict[
     names = chosen_names(words, tuple(every), result.plan.groups)
     left = {name: every[name] for name in names if every[name].drive.own}
     if others := ", ".join(name for name in names if name not in left):
-        dialogue.say(f"Not calibrated, because several servos move them; measure them yourself: {others}")
+        dialogue.print_lines(
+            f"Not calibrated, because several servos move them; measure them yourself: {others}"
+        )
     if not left:
         raise InputError("no joint is left to be calibrated; choose one with a servo of its own")
     return left

@@ -12,7 +12,7 @@ from dxlrun_hand.commands.calibrate import Joints
 
 if TYPE_CHECKING:
     from dxlrun_hand.lines import Devices, Opened
-    from dxlrun_hand.servo_setup import SetUp
+    from dxlrun_hand.servo_setup import ServoSetup
     from dxlwire import BusPlan
 
 
@@ -40,17 +40,17 @@ def setup(
     from dxlrun.tooling.robots import load_plugins, read_robot
     from dxlrun.tooling.servos import TunablePort
     from dxlrun_hand.dialogue import Dialogue
-    from dxlrun_hand.servo_setup import SetUp
+    from dxlrun_hand.servo_setup import ServoSetup
     from dxlwire import serial_devices
 
     known_file(robot)
     load_plugins()  # they can add servo models
-    task = SetUp(read_robot(robot, parse_assignments(assignments)), Dialogue("setup"))
+    task = ServoSetup(read_robot(robot, parse_assignments(assignments)), Dialogue("setup"))
     return set_up(task, TunablePort, serial_devices, joint, search=find_port)
 
 
 def set_up(
-    task: SetUp, opened: Opened, devices: Devices, words: Sequence[str] = (), *, search: bool = False
+    task: ServoSetup, opened: Opened, devices: Devices, words: Sequence[str] = (), *, search: bool = False
 ) -> int:
     """Set up the chosen servos of a robot file in a dialogue, and compare all of them with the file.
 
@@ -87,7 +87,7 @@ def set_up(
     return 0 if equal else 1
 
 
-def _left(task: SetUp) -> str:
+def _left(task: ServoSetup) -> str:
     """Return a sentence for an early end of the dialogue: servos that were set up, and one half-changed."""
     done = f"set up: {', '.join(task.done)}" if task.done else "no servo was set up"
     if not task.changing:
@@ -95,7 +95,7 @@ def _left(task: SetUp) -> str:
     return f"{done}; the one for {task.changing} may have its new ID or rate already: set it up again"
 
 
-def _port(task: SetUp, plan: BusPlan, devices: Devices, *, search: bool) -> str:
+def _port(task: ServoSetup, plan: BusPlan, devices: Devices, *, search: bool) -> str:
     """Return the port of a bus: the one in the robot file if it exists, else the one that the user plugs in.
     The new port is written to the robot file after confirmation. `search` skips the port in the file."""
     from dxlrun.tooling.robots import SIMULATED
@@ -107,15 +107,15 @@ def _port(task: SetUp, plan: BusPlan, devices: Devices, *, search: bool) -> str:
     if not search:
         if plan.port == SIMULATED or os.path.exists(plan.port):
             return plan.port
-        dialogue.say(f"Bus {plan.name}: there is no {plan.port} now.")
+        dialogue.print_lines(f"Bus {plan.name}: there is no {plan.port} now.")
     found = find_port(plan.name, dialogue, devices)
     text = RobotText(robot)
     try:
-        text.put(("buses", plan.name, "port"), found)
+        text.plan_value(("buses", plan.name, "port"), found)
     except InputError:  # The port comes from an argument
-        dialogue.say(f"Give it to other commands, as argument of the robot file: {found}")
+        dialogue.print_lines(f"Give it to other commands, as argument of the robot file: {found}")
         return found
-    dialogue.say(*text.diff())
+    dialogue.print_lines(*text.diff())
     if yes(dialogue, f"Write this into {robot}?"):
-        text.write()
+        text.write_files()
     return found

@@ -15,7 +15,7 @@ import msgspec
 import numpy as np
 
 from dxlrun import Floats
-from dxlrun_lab.characterize.measured import Measured, mean_of, not_measured
+from dxlrun_lab.characterize.joint_figure import JointFigure, mean_of, not_measured
 from dxlrun_lab.characterize.trace import Trace, polynomial
 
 NAME, REVERSAL = "dead band", "smallest change that moves it"
@@ -127,7 +127,7 @@ def _reversal(trace: Trace, moves: int, sign: float, rest: float) -> float:
 
 def dead_band(
     found: Sequence[Approach], tick: float, registers: Mapping[str, int], unit: float
-) -> tuple[Measured, Measured]:
+) -> tuple[JointFigure, JointFigure]:
     """Return two figures: dead band to each side, and smallest change of the goal that moves the joint.
 
     Args:

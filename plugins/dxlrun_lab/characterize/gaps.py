@@ -16,7 +16,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from dxlrun import Floats
-from dxlrun_lab.characterize.measured import Measured, not_measured
+from dxlrun_lab.characterize.joint_figure import JointFigure, not_measured
 from dxlrun_lab.characterize.trace import Trace
 
 MOTION_S = math.pi
@@ -48,7 +48,7 @@ def motion(time: Floats, size: float) -> tuple[Floats, Floats]:
     return size * shape * position, size * (shape * speed + slope * position)
 
 
-class Gap(msgspec.Struct, frozen=True):
+class GapResult(msgspec.Struct, frozen=True):
     """Result of one motion that was sent with a gap between two commands"""
 
     gap_s: float
@@ -63,7 +63,7 @@ class Gap(msgspec.Struct, frozen=True):
         return self.deviation <= tolerance and not self.stood
 
 
-def judge(gap_s: float, trace: Trace, reference: Trace, size: float) -> Gap:
+def judge_gap(gap_s: float, trace: Trace, reference: Trace, size: float) -> GapResult:
     """Compare a motion that was sent with gaps to the same motion that was sent in each cycle.
 
     The times of both traces start with the first goal of the motion; `size` is that of `motion`, rad.
@@ -75,7 +75,7 @@ def judge(gap_s: float, trace: Trace, reference: Trace, size: float) -> Gap:
     # The joint lags behind its motion, so the speed of the motion is shifted by this lag.
     lag = _lag(reference, ideal)
     going = np.abs(np.interp(time - lag, reference.time, speed))
-    return Gap(gap_s, deviation, _stood(trace, going, since))
+    return GapResult(gap_s, deviation, _stood(trace, going, since))
 
 
 def _lag(trace: Trace, ideal: Floats) -> float:
@@ -101,7 +101,7 @@ def _stood(trace: Trace, going: Floats, since: NDArray[np.bool_]) -> bool:
 
 
 def following(
-    tried: Sequence[Gap], shortest: float, longest: float, step: float, tolerance: float
+    tried: Sequence[GapResult], shortest: float, longest: float, step: float, tolerance: float
 ) -> float | None:
     """Return the gap to try next, s, a multiple of `step`, or None at the end of the search.
 
@@ -120,14 +120,14 @@ def following(
 
 
 def longest_gap(
-    tried: list[Gap],
+    tried: list[GapResult],
     interface: Literal["position", "posvel"],
     tolerance: float,
     shortest: float,
     speed: float,
     *,
     tick: float = 0.0,
-) -> Measured:
+) -> JointFigure:
     """Return the figure of the longest gap with which the joint stays on its path, between two tried gaps.
 
     Args:
@@ -156,7 +156,7 @@ def longest_gap(
         why = f"the joint leaves its path at {first.gap_s * 1e3:.1f} ms already, the next gap after one cycle"
         return not_measured(name, "s", why, how)
     if first.stood and first.deviation <= tolerance:
-        return Measured(
+        return JointFigure(
             name, "s", below_s + half, half, None, len(tried), how, "it comes to rest between commands"
         )
     # Interpolate, because the deviation grows with the gap.
@@ -166,4 +166,4 @@ def longest_gap(
     coarse = tick * 2 * half / (first.deviation - below)
     # The deviation may grow anywhere between the two gaps.
     uncertainty = math.hypot(2 * half * max(part, 1 - part), coarse)
-    return Measured(name, "s", below_s + part * 2 * half, uncertainty, None, len(tried), how, limit)
+    return JointFigure(name, "s", below_s + part * 2 * half, uncertainty, None, len(tried), how, limit)

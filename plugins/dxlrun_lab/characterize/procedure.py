@@ -12,11 +12,11 @@ import numpy as np
 
 from dxlrun import Floats, Refused
 from dxlrun_lab.characterize import dead_band, gaps, rates, response, speeds
-from dxlrun_lab.characterize.measured import Measured, not_measured
+from dxlrun_lab.characterize.joint_figure import JointFigure, not_measured
 from dxlrun_lab.characterize.trace import Trace
 from dxlrun_lab.guided.choice import require_own_servos
-from dxlrun_lab.guided.experiment import Joint, Procedure, Situation
-from dxlrun_lab.guided.segment import Recorded, Segment
+from dxlrun_lab.guided.experiment import ExperimentJoint, Procedure, Situation
+from dxlrun_lab.guided.segment import Segment, SegmentRecording
 from dxlwire import find_table
 
 Measurement = Literal["rate", "response", "speed", "dead_band", "gap"]
@@ -49,19 +49,19 @@ _LONGEST_GAP_S: Final = 0.5
 _GAP_SPEED: Final = 0.7
 """Peak speed of the motion with gaps, as a fraction of the joint's highest speed"""
 _BURST_CYCLES, _RATE_S, _MOST_RATE_CYCLES = 6, 2.0, 1000
-Part = Generator[Segment, Recorded, None]
+Part = Generator[Segment, SegmentRecording, None]
 
 
 @dataclass(slots=True)
-class Found:
+class JointCharacteristics:
     """Result of one joint: figures, and the data of their plots as far as they were measured"""
 
-    joint: Joint
-    figures: list[Measured] = field(default_factory=list)
-    rates: list[rates.Rate] = field(default_factory=list)
-    steps: list[response.Step] = field(default_factory=list)
-    moves: list[response.Step] = field(default_factory=list)
-    gaps: dict[str, list[gaps.Gap]] = field(default_factory=dict)
+    joint: ExperimentJoint
+    figures: list[JointFigure] = field(default_factory=list)
+    rates: list[rates.RateResult] = field(default_factory=list)
+    steps: list[response.StepResponse] = field(default_factory=list)
+    moves: list[response.StepResponse] = field(default_factory=list)
+    gaps: dict[str, list[gaps.GapResult]] = field(default_factory=dict)
     """Tried gaps between commands, by command interface"""
     band: Trace | None = None
     """Last recording of the dead band measurement, with the slow approaches"""
@@ -71,18 +71,18 @@ class Found:
         return next((one.value for one in self.figures if one.name == name), None)
 
 
-class Characterized(msgspec.Struct, frozen=True):
+class CharacterizationResult(msgspec.Struct, frozen=True):
     """Result of `dxlrun characterize`: figures of all joints, also after an early end"""
 
     robot: str
-    joints: tuple[Found, ...]
+    joints: tuple[JointCharacteristics, ...]
     why: str
     """Reason for an early end, one sentence; empty on success"""
     tolerance: float
     """Largest deviation from the path during a gap, rad"""
 
 
-class Characterize:
+class CharacterizationExperiment:
     """Experiment (see guided.experiment.Experiment) that measures one joint at a time; all others hold.
 
     `tolerance` is the largest deviation from a path during a gap between commands, rad.
@@ -93,10 +93,10 @@ class Characterize:
     ) -> None:
         self._measurements = [one for one in MEASUREMENTS if one in measurements]
         self._tolerance = tolerance
-        self._found: dict[str, Found] = {}
+        self._found: dict[str, JointCharacteristics] = {}
         self._eased: set[str] = set()
 
-    def moves(self, situation: Situation) -> Sequence[str]:
+    def describe_motions(self, situation: Situation) -> Sequence[str]:
         """Describe measurements, speed and range of each joint, one sentence each.
 
         Raises InputError for a joint that is linear or has several servos.
@@ -122,7 +122,7 @@ class Characterize:
             "gap": self._gap,
         }
         for joint in situation.joints:
-            found = self._found[joint.name] = Found(joint)
+            found = self._found[joint.name] = JointCharacteristics(joint)
             for measurement in self._measurements:
                 try:
                     yield from parts[measurement](situation, joint, found)
@@ -133,11 +133,13 @@ class Characterize:
                         if found.value(name) is None
                     ]
 
-    def finish(self, situation: Situation, recorded: Sequence[Recorded], why: str) -> Characterized:
+    def evaluate_recordings(
+        self, situation: Situation, recorded: Sequence[SegmentRecording], why: str
+    ) -> CharacterizationResult:
         """Return the results of all joints. Each figure that was not measured has the reason `why`."""
         reason = f"the experiment ended before: {why}" if why else "nothing was recorded"
         for joint in situation.joints:
-            found = self._found.setdefault(joint.name, Found(joint))
+            found = self._found.setdefault(joint.name, JointCharacteristics(joint))
             known = {one.name for one in found.figures}
             if found.rates and rates.NAME not in known:
                 figure = rates.highest_rate(found.rates, situation.plan, joint.plan.label)
@@ -154,11 +156,11 @@ class Characterize:
                 for name, unit in _FIGURES[measurement]
                 if name not in known
             ]
-        return Characterized(situation.plan.robot, tuple(self._found.values()), why, self._tolerance)
+        return CharacterizationResult(situation.plan.robot, tuple(self._found.values()), why, self._tolerance)
 
     # Rates of the loop
 
-    def _sampling(self, situation: Situation, found: Found, wanted: float) -> float:
+    def _sampling(self, situation: Situation, found: JointCharacteristics, wanted: float) -> float:
         """Return a measurement's loop rate, Hz: `wanted`, or less if the joint's highest rate is low."""
         kept = found.value(rates.NAME) or rates.highest_by_bus(situation.plan)
         lowest = 1e9 / situation.plan.loop.slowest_period_ns if situation.plan.loop.slowest_period_ns else 0.0
@@ -174,7 +176,7 @@ class Characterize:
 
     # Measurements
 
-    def _rate(self, situation: Situation, joint: Joint, found: Found) -> Part:
+    def _rate(self, situation: Situation, joint: ExperimentJoint, found: JointCharacteristics) -> Part:
         """Measure the highest rate: toggle the goal by one tick in each cycle, at increasing loop rates."""
         column, label = situation.names.index(joint.name), joint.plan.label
         step, tick = rates.rate_step(situation.plan), joint.servo.position_per_tick
@@ -182,14 +184,14 @@ class Characterize:
         while (rate := rates.following(found.rates, situation.rate, highest, step)) is not None:
             burst = max(_BURST_CYCLES, round(rates.BURST_S * rate))
             whole = max(burst, min(_MOST_RATE_CYCLES, round(_RATE_S * rate)))
-            parts: list[Recorded] = []
+            parts: list[SegmentRecording] = []
             tried = rates.refused(rate, "")
             try:
                 for cycles in (burst, whole):
                     rows = joint.middle + tick * (np.arange(cycles) % 2).astype(np.float64)
                     title = f"{joint.name}: {rate:.4g} Hz"
                     parts.append((yield Segment(title, 1 / rate, {joint.name: rows}, loop_rate=rate)))
-                    tried = rates.judge(rate, parts, column)
+                    tried = rates.judge_rate(rate, parts, column)
                     if tried.fault:
                         break
             except Refused as refusal:
@@ -197,7 +199,7 @@ class Characterize:
             found.rates = sorted([*found.rates, tried], key=lambda one: one.rate)
         found.figures.append(rates.highest_rate(found.rates, situation.plan, label))
 
-    def _response(self, situation: Situation, joint: Joint, found: Found) -> Part:
+    def _response(self, situation: Situation, joint: ExperimentJoint, found: JointCharacteristics) -> Part:
         """Measure response times by small steps up and down at several loop rates, one packet per step."""
         low, high = joint.inner
         speed = joint.plan.highest_speed
@@ -221,7 +223,7 @@ class Characterize:
             found.steps += response.steps_of(self._trace(situation, joint, (yield segment)))
         found.figures += response.response(found.steps)
 
-    def _step_rates(self, situation: Situation, found: Found, wanted: float) -> list[float]:
+    def _step_rates(self, situation: Situation, found: JointCharacteristics, wanted: float) -> list[float]:
         """Return the loop rates of the steps, Hz, as many as controllers with rates of their own allow."""
         lowest, highest = _STEP_RATES
         fastest = self._sampling(situation, found, min(max(wanted, lowest), highest))
@@ -234,7 +236,7 @@ class Characterize:
             found_rates = [one for one in multiples if lowest <= one <= most] or found_rates
         return found_rates
 
-    def _speed(self, situation: Situation, joint: Joint, found: Found) -> Part:
+    def _speed(self, situation: Situation, joint: ExperimentJoint, found: JointCharacteristics) -> Part:
         """Measure speed and acceleration by moves from end to end of the range at full speed."""
         low, high = joint.inner
         rate = self._sampling(situation, found, _FASTEST_SAMPLING)
@@ -244,7 +246,7 @@ class Characterize:
         # step).
         profiled = bool(joint.servo.declared.get("profile_acceleration"))
         interface: Literal["position", "posvel"] = "posvel" if profiled else "position"
-        moves: list[response.Step] = []
+        moves: list[response.StepResponse] = []
         count, sixth = 2, (high - low) / 6
         ends = joint.middle - sixth, joint.middle + sixth
         farthest = 0.0
@@ -278,7 +280,7 @@ class Characterize:
         found.moves = moves
         found.figures += speeds.speeds(moves, joint.upper - joint.lower, speed)
 
-    def _dead_band(self, situation: Situation, joint: Joint, found: Found) -> Part:
+    def _dead_band(self, situation: Situation, joint: ExperimentJoint, found: JointCharacteristics) -> Part:
         """Measure the dead band: approach three places slowly from both sides, from a distance that grows."""
         low, high = joint.inner
         rate = self._sampling(situation, found, _SLOW_SAMPLING)
@@ -301,7 +303,7 @@ class Characterize:
             rests, joint.servo.position_per_tick, _margins(situation, joint), joint.servo.position_per_tick
         )
 
-    def _gap(self, situation: Situation, joint: Joint, found: Found) -> Part:
+    def _gap(self, situation: Situation, joint: ExperimentJoint, found: JointCharacteristics) -> Part:
         """Measure the longest gap: send a smooth motion with growing gaps, by position and by posvel."""
         low, high = joint.inner
         rate = self._sampling(situation, found, _SAMPLING)
@@ -310,12 +312,12 @@ class Characterize:
         for interface in interfaces:
             recorded = yield self._motion(joint, interface, 1 / rate, rate, size)
             reference = self._since_motion(situation, joint, recorded, 1 / rate)
-            tried: list[gaps.Gap] = []
+            tried: list[gaps.GapResult] = []
             least = 1 / rate
             while gap := gaps.following(tried, least, _LONGEST_GAP_S, least, self._tolerance):
                 recorded = yield self._motion(joint, interface, gap, rate, size)
                 trace = self._since_motion(situation, joint, recorded, gap)
-                tried.append(gaps.judge(gap, trace, reference, size))
+                tried.append(gaps.judge_gap(gap, trace, reference, size))
             found.gaps[interface] = sorted(tried, key=lambda one: one.gap_s)
             found.figures.append(
                 gaps.longest_gap(
@@ -329,7 +331,12 @@ class Characterize:
             )
 
     def _motion(
-        self, joint: Joint, interface: Literal["position", "posvel"], gap: float, rate: float, size: float
+        self,
+        joint: ExperimentJoint,
+        interface: Literal["position", "posvel"],
+        gap: float,
+        rate: float,
+        size: float,
     ) -> Segment:
         """Return the segment that sends the smooth motion with `gap` seconds between commands. The motion
         starts after `_lead_of` gaps; `size` is that of `gaps.motion`, `rate` the loop rate, Hz."""
@@ -344,7 +351,9 @@ class Characterize:
             speeds_of = {joint.name: np.abs(np.diff(position, prepend=position[:1])) / gap}
         return Segment(title, gap, rows, interface, speeds_of, settle_s=_REST_S, loop_rate=rate)
 
-    def _since_motion(self, situation: Situation, joint: Joint, recorded: Recorded, gap: float) -> Trace:
+    def _since_motion(
+        self, situation: Situation, joint: ExperimentJoint, recorded: SegmentRecording, gap: float
+    ) -> Trace:
         trace = self._trace(situation, joint, recorded)
         start = _lead_of(gap) * gap
         part = trace.time - start
@@ -357,8 +366,8 @@ class Characterize:
             trace.tick,
         )
 
-    def _trace(self, situation: Situation, joint: Joint, recorded: Recorded) -> Trace:
-        return Trace.of(recorded, joint, situation.plan.buses)
+    def _trace(self, situation: Situation, joint: ExperimentJoint, recorded: SegmentRecording) -> Trace:
+        return Trace.from_recording(recorded, joint, situation.plan.buses)
 
 
 _THERE: Final = 0.9
@@ -381,7 +390,7 @@ def _lead_of(gap: float) -> int:
     return math.ceil(_EASED_S / gap)
 
 
-def _margins(situation: Situation, joint: Joint) -> Mapping[str, int]:
+def _margins(situation: Situation, joint: ExperimentJoint) -> Mapping[str, int]:
     """Return the servo's compliance margins by register name, ticks: declared, or else factory default. A
     model without these registers has none."""
     protocol = next(bus.protocol for bus in situation.plan.buses if joint.servo in bus.servos)

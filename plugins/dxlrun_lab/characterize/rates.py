@@ -16,8 +16,8 @@ import msgspec
 import numpy as np
 
 from dxlrun.tooling.plans import Plan
-from dxlrun_lab.characterize.measured import Measured, not_measured
-from dxlrun_lab.guided.segment import Recorded
+from dxlrun_lab.characterize.joint_figure import JointFigure, not_measured
+from dxlrun_lab.guided.segment import SegmentRecording
 
 NAME = "highest rate"
 MOST_HZ = 2000.0
@@ -34,7 +34,7 @@ Fault = Literal["", "servo", "bus", "run"]
 """Reason why a rate fails: lost replies, exchanges longer than the period, or a refusal of the run"""
 
 
-class Rate(msgspec.Struct, frozen=True):
+class RateResult(msgspec.Struct, frozen=True):
     """Result of one loop rate that was tried"""
 
     rate: float
@@ -62,13 +62,13 @@ class Rate(msgspec.Struct, frozen=True):
         return "bus" if self.too_long > ALLOWED * self.cycles and self.exchange_s * self.rate > 1 else ""
 
 
-def judge(rate: float, recorded: Sequence[Recorded], column: int) -> Rate:
+def judge_rate(rate: float, recorded: Sequence[SegmentRecording], column: int) -> RateResult:
     """Evaluate the recordings at a loop rate, Hz; `column` is that of the joint in them."""
     period_ns = 1e9 / rate
     valid = np.concatenate([part.valid[:, column] for part in recorded])
     took = np.concatenate([part.of_cycles("written_ns") - part.of_cycles("woken_ns") for part in recorded])
     late = np.concatenate([part.of_cycles("woken_ns") - part.of_cycles("scheduled_ns") for part in recorded])
-    return Rate(
+    return RateResult(
         rate,
         len(valid),
         int(np.count_nonzero(~valid)),
@@ -79,9 +79,9 @@ def judge(rate: float, recorded: Sequence[Recorded], column: int) -> Rate:
     )
 
 
-def refused(rate: float, text: str) -> Rate:
+def refused(rate: float, text: str) -> RateResult:
     """Return the result of a loop rate, Hz, that the run refused with a text."""
-    return Rate(rate, 0, 0, 0, 0, math.nan, text)
+    return RateResult(rate, 0, 0, 0, 0, math.nan, text)
 
 
 def rate_step(plan: Plan) -> Fraction:
@@ -115,7 +115,7 @@ def highest_by_bus(plan: Plan) -> float:
     return 1e9 / plan.loop.least_period_ns if plan.loop.least_period_ns else math.inf
 
 
-def following(tried: Sequence[Rate], begin: float, highest: float, step: Fraction) -> float | None:
+def following(tried: Sequence[RateResult], begin: float, highest: float, step: Fraction) -> float | None:
     """Return the loop rate to try next, Hz, or None at the end of the search.
 
     Rates grow from `begin` up to `highest` until one fails. A bisection follows. All are multiples of `step`.
@@ -133,7 +133,7 @@ def following(tried: Sequence[Rate], begin: float, highest: float, step: Fractio
     return None if known or bad - good < NEAR * good else rate
 
 
-def highest_rate(tried: Sequence[Rate], plan: Plan, servo: str) -> Measured:
+def highest_rate(tried: Sequence[RateResult], plan: Plan, servo: str) -> JointFigure:
     """Return the figure of the highest rate without a fault, and what limits it.
 
     `servo` is the servo's name in sentences.
@@ -149,7 +149,7 @@ def highest_rate(tried: Sequence[Rate], plan: Plan, servo: str) -> Measured:
     step, by_bus = rate_step(plan), highest_by_bus(plan)
     if above:
         between = above[0].rate - best
-        return Measured(NAME, "Hz", best, between, None, len(tried), how, _reason(above[0], servo))
+        return JointFigure(NAME, "Hz", best, between, None, len(tried), how, _reason(above[0], servo))
     if best >= fitting(by_bus, step):
         budget = max((bus for bus in plan.buses), key=lambda bus: bus.budget.total_ns)
         limit = (
@@ -157,11 +157,11 @@ def highest_rate(tried: Sequence[Rate], plan: Plan, servo: str) -> Measured:
             f"its exchange takes {budget.budget.total_ns / 1e6:.2f} ms by computation; the run goes no faster"
         )
         between = min(by_bus - best, float(step)) if step else by_bus - best
-        return Measured(NAME, "Hz", best, max(between, 0.0), None, len(tried), how, limit)
-    return Measured(NAME, "Hz", best, None, None, len(tried), how, "nothing: no higher rate was tried")
+        return JointFigure(NAME, "Hz", best, max(between, 0.0), None, len(tried), how, limit)
+    return JointFigure(NAME, "Hz", best, None, None, len(tried), how, "nothing: no higher rate was tried")
 
 
-def _reason(rate: Rate, servo: str) -> str:
+def _reason(rate: RateResult, servo: str) -> str:
     at = f"at {rate.rate:.4g} Hz"
     if rate.fault == "servo":
         return f"the servo: {rate.lost} of {rate.cycles} replies of {servo} are lost {at}"

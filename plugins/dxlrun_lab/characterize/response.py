@@ -19,7 +19,7 @@ import msgspec
 import numpy as np
 
 from dxlrun import Floats
-from dxlrun_lab.characterize.measured import Measured, not_measured, student
+from dxlrun_lab.characterize.joint_figure import JointFigure, not_measured, student
 from dxlrun_lab.characterize.trace import Trace, polynomial
 
 PART = 1 - math.exp(-1)
@@ -44,7 +44,7 @@ _BEFORE_S = 0.03
 ONSET, RISE = "response to first motion", "response to 63 %"
 
 
-class Step(msgspec.Struct, frozen=True):
+class StepResponse(msgspec.Struct, frozen=True):
     """Recorded response of a resting joint to one step of its goal, until the next step"""
 
     time: Floats
@@ -63,7 +63,7 @@ class Step(msgspec.Struct, frozen=True):
     """Resolution of the position, rad"""
 
 
-def steps_of(trace: Trace) -> list[Step]:
+def steps_of(trace: Trace) -> list[StepResponse]:
     """Return the steps in a recording. A step starts when the goal changes after a rest of the joint."""
     changed = np.flatnonzero(np.diff(trace.goal) != 0) + 1
     if not len(changed):
@@ -78,7 +78,7 @@ def steps_of(trace: Trace) -> list[Step]:
     ]
 
 
-def _step(trace: Trace, start: int, end: int) -> Step | None:
+def _step(trace: Trace, start: int, end: int) -> StepResponse | None:
     """Return the step from row `start` to before row `end`, or None if the joint did not rest before it."""
     origin = float(trace.sent[start])
     before = trace.part((trace.time > trace.time[start] - _REST_S) & (np.arange(len(trace)) <= start))
@@ -93,7 +93,7 @@ def _step(trace: Trace, start: int, end: int) -> Step | None:
     last = trace.position[start:end][trace.time[start:end] > trace.time[end - 1] - _REST_S]
     rested = len(last) > 1 and np.ptp(last) <= still
     moving = np.flatnonzero(np.diff(trace.goal[start - 1 : end]) != 0)
-    return Step(
+    return StepResponse(
         trace.time[rows] - origin,
         sign * (trace.position[rows] - rest),
         sign * (trace.goal[rows] - trace.goal[start - 1]),
@@ -107,7 +107,7 @@ def _step(trace: Trace, start: int, end: int) -> Step | None:
 # Response
 
 
-def response(steps: Sequence[Step]) -> tuple[Measured, Measured]:
+def response(steps: Sequence[StepResponse]) -> tuple[JointFigure, JointFigure]:
     """Return two figures: the response times to the first motion and to 63 % of the way.
 
     The samples of all steps are pooled. Steps at different loop rates interleave, so the samples are dense.
@@ -125,11 +125,11 @@ def response(steps: Sequence[Step]) -> tuple[Measured, Measured]:
     )
 
 
-def _rested(step: Step) -> bool:
+def _rested(step: StepResponse) -> bool:
     return step.reached >= LEAST_TICKS * step.tick
 
 
-def _not_usable(steps: Sequence[Step]) -> str:
+def _not_usable(steps: Sequence[StepResponse]) -> str:
     """Return the reason why no response time can be found from the steps, one sentence; empty if it can."""
     if len(steps) < LEAST_STEPS:
         return f"{len(steps)} steps were recorded in which the joint rested before; {LEAST_STEPS} are needed"
@@ -164,7 +164,7 @@ def _pooled(
     ways: Sequence[Callable[[Sequence[_Pool]], float]],
     how: str,
     resolution: float = 0.0,
-) -> Measured:
+) -> JointFigure:
     """Return the figure of a response time that the first of the estimators `ways` finds in all steps.
 
     The scatter is estimated by the jackknife (B. Efron and C. Stein, Annals of Statistics 9, 1981).
@@ -183,7 +183,7 @@ def _pooled(
         found = f"it is {value * 1e3:.0f} ms, uncertain by {uncertainty * 1e3:.0f} ms"
         why = f"{found}: the positions scatter too much, or are too coarse"
         return not_measured(name, "s", why, how)
-    return Measured(name, "s", max(0.0, value), uncertainty, _spread(pools), count, how)
+    return JointFigure(name, "s", max(0.0, value), uncertainty, _spread(pools), count, how)
 
 
 def _curve(pools: Sequence[_Pool]) -> tuple[Floats, Floats]:

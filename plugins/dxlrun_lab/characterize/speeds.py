@@ -13,8 +13,8 @@ import msgspec
 import numpy as np
 
 from dxlrun import Floats
-from dxlrun_lab.characterize.measured import Measured, mean_of, not_measured
-from dxlrun_lab.characterize.response import LEAST_TICKS, Step
+from dxlrun_lab.characterize.joint_figure import JointFigure, mean_of, not_measured
+from dxlrun_lab.characterize.response import LEAST_TICKS, StepResponse
 from dxlrun_lab.characterize.trace import crossing, polynomial, slopes
 
 TOP, ACCELERATION, BRAKING = "top speed", "acceleration", "braking"
@@ -57,7 +57,7 @@ class Move(msgspec.Struct, frozen=True):
     """True if the joint was exactly as fast as its goal, so the servo may be faster"""
 
 
-def move_of(step: Step) -> Move | None:
+def move_of(step: StepResponse) -> Move | None:
     """Evaluate the recording of a long move. Return None if the joint hardly moved."""
     way, tick = step.way, step.tick
     total = float(np.max(way))
@@ -111,7 +111,9 @@ def _half_width(period: float, tick: float, speed: float) -> float:
     return _MOST_SAMPLES // 2 * period
 
 
-def speeds(steps: Sequence[Step], range_rad: float, own_speed: float) -> tuple[Measured, Measured, Measured]:
+def speeds(
+    steps: Sequence[StepResponse], range_rad: float, own_speed: float
+) -> tuple[JointFigure, JointFigure, JointFigure]:
     """Return three figures: top speed, acceleration and braking.
 
     Args:
@@ -134,7 +136,7 @@ def speeds(steps: Sequence[Step], range_rad: float, own_speed: float) -> tuple[M
     )
 
 
-def _top(moves: Sequence[Move], range_rad: float, own_speed: float, how: str) -> Measured:
+def _top(moves: Sequence[Move], range_rad: float, own_speed: float, how: str) -> JointFigure:
     cruising = [move for move in moves if move.cruised]
     if len(cruising) < max(2, len(moves) // 2):
         fastest = float(np.median([move.highest for move in moves]))
@@ -169,7 +171,7 @@ def _needed_range(moves: Sequence[Move], own_speed: float) -> float | None:
     return math.ceil(math.degrees(_ROOM * needed) / 10) * 10
 
 
-def _change(name: str, moves: Sequence[Move], times: Sequence[float], period: float, how: str) -> Measured:
+def _change(name: str, moves: Sequence[Move], times: Sequence[float], period: float, how: str) -> JointFigure:
     """Return the figure of acceleration or braking (`name`), rad/s^2, from each move's time (s) between the
     fractions `RISE` of its highest speed."""
     part = RISE[1] - RISE[0]

@@ -15,8 +15,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from dxlrun import Floats
-from dxlrun_lab.guided.experiment import Joint
-from dxlrun_lab.guided.segment import Recorded
+from dxlrun_lab.guided.experiment import ExperimentJoint
+from dxlrun_lab.guided.segment import SegmentRecording
 from dxlwire import BITS_PER_BYTE, BusPlan, ServoPlan
 
 
@@ -38,7 +38,9 @@ class Trace(msgspec.Struct, frozen=True):
     """Resolution of the position, rad"""
 
     @classmethod
-    def of(cls, recorded: Recorded, joint: Joint, buses: Sequence[BusPlan]) -> Self:
+    def from_recording(
+        cls, recorded: SegmentRecording, joint: ExperimentJoint, buses: Sequence[BusPlan]
+    ) -> Self:
         """Extract the trace of a joint from a recording. Cycles without an intact reply are omitted.
 
         The delays of the bus are those of the plan in `buses`.

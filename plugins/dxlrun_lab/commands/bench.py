@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING
 from cyclopts import App
 
 from dxlrun import InputError
-from dxlrun.tooling.output import counted, show, show_json
+from dxlrun.tooling.output import counted, show_json, show_parts
 from dxlrun.tooling.verbs import Assignment, DebugFlag, JsonFlag, RobotPath, Seconds, parse_assignments
 
 if TYPE_CHECKING:
@@ -49,13 +49,13 @@ def bench_rate(
             description,
             duration,
             run,
-            lambda rate: None if as_json else show(f"running at {rate:g} Hz"),
+            lambda rate: None if as_json else show_parts(f"running at {rate:g} Hz"),
         )
     code = 0 if result.kept_hz else 1
     if as_json:
         show_json(result, code=code, errors=[_highest(result)] * code)
     else:
-        show(_rates(result), _highest(result))
+        show_parts(_rates(result), _highest(result))
     return code
 
 
@@ -81,7 +81,7 @@ def _rates(result: HighestRate) -> Table:
         )
         for one in result.tries
     ]
-    return Table.of("", columns, rows)
+    return Table.from_rows("", columns, rows)
 
 
 def _highest(result: HighestRate) -> str:

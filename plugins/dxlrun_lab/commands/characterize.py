@@ -8,9 +8,9 @@ from typing import Annotated, Literal
 from cyclopts import Parameter
 
 from dxlrun import InputError
-from dxlrun.tooling.output import show, show_json
+from dxlrun.tooling.output import show_json, show_parts
 from dxlrun.tooling.verbs import check_report, write_report
-from dxlrun_lab.commands.on_robot import DEFAULTS, OnRobot, Words, run_on_robot
+from dxlrun_lab.commands.on_robot import DEFAULTS, ExperimentOptions, Words, run_on_robot
 
 
 def characterize(
@@ -20,7 +20,7 @@ def characterize(
         Parameter(negative=(), show_default=False),
     ] = (),
     tolerance: str = "1deg",
-    options: OnRobot = DEFAULTS,
+    options: ExperimentOptions = DEFAULTS,
 ) -> int:
     """Measure the performance of servos: response, speed, dead band, highest rate, longest gap of commands.
 
@@ -38,8 +38,8 @@ def characterize(
         Largest deviation of a joint from its path during a gap of commands.
     """
     from dxlrun.tooling.verbs import angle
-    from dxlrun_lab.characterize.procedure import MEASUREMENTS, Characterize
-    from dxlrun_lab.characterize.tables import parts, results
+    from dxlrun_lab.characterize.characterization_tables import parts, results
+    from dxlrun_lab.characterize.procedure import MEASUREMENTS, CharacterizationExperiment
 
     try:
         allowed = angle(tolerance)
@@ -49,23 +49,23 @@ def characterize(
         raise InputError(f"--tolerance {tolerance}: give an angle above 0 and up to {_MOST_DEG:g} deg")
     if options.report is not None:
         check_report(options.report)
-    ran = run_on_robot(Characterize(measure or MEASUREMENTS, allowed), words, options)
+    ran = run_on_robot(CharacterizationExperiment(measure or MEASUREMENTS, allowed), words, options)
     if ran.result is None:
         if options.as_json:
             show_json(None, code=ran.exit_code, errors=ran.failures)
         return ran.exit_code
     if options.report is not None:
-        from dxlrun_lab.characterize.page import page
+        from dxlrun_lab.characterize.characterization_page import page
 
         write_report(options.report, page(ran.result))
     if options.as_json:
         show_json(results(ran.result), code=ran.exit_code, errors=ran.failures)
     else:
-        show(*parts(ran.result))
+        show_parts(*parts(ran.result))
         if ran.log is not None:
-            show(f"log: {ran.log}")
+            show_parts(f"log: {ran.log}")
         if options.report is not None:
-            show(f"report: {options.report}")
+            show_parts(f"report: {options.report}")
     return ran.exit_code
 
 

@@ -9,9 +9,9 @@ from typing import TYPE_CHECKING, Annotated
 from cyclopts import Parameter
 
 from dxlrun import InputError
-from dxlrun.tooling.output import check_target, counted, show, show_json, write_target
+from dxlrun.tooling.output import check_target, counted, show_json, show_parts, write_target
 from dxlrun.tooling.verbs import DebugFlag, JsonFlag
-from dxlrun_lab.commands.recorded import ALL_OF_IT, RecordedPart
+from dxlrun_lab.commands.recorded_motions import ALL_OF_IT, RecordedPart
 
 if TYPE_CHECKING:
     from dxlrun_analysis.playback.recorded_motion import RecordedMotion
@@ -49,7 +49,7 @@ def convert(
     from dxlrun_analysis.playback.spline_path import tolerances
 
     check_target(motion)
-    recorded = part.read(log)
+    recorded = part.read_motion(log)
     allowed = tolerances(recorded, tolerance)
     nearest = f"at most {math.degrees(float(allowed.max())):.4g} deg from it"
     origin = f"Motion of {_where(recorded)}, {nearest}.\nWritten by `dxlrun convert`."
@@ -69,7 +69,7 @@ def convert(
         points = ", ".join(
             f"{counted(n, 'point', 'points')} for {name}" for name, n in written.points.items()
         )
-        show(f"{motion}: {recorded.duration_s:.1f} s of {log}, {nearest}: {points}")
+        show_parts(f"{motion}: {recorded.duration_s:.1f} s of {log}, {nearest}: {points}")
     return 0
 
 

@@ -12,13 +12,13 @@ from typing import TYPE_CHECKING, Annotated
 from cyclopts import Parameter
 
 from dxlrun import InputError
-from dxlrun.tooling.output import check_target, err, print_error, show, show_json, write_target
+from dxlrun.tooling.output import check_target, err, print_error, show_json, show_parts, write_target
 from dxlrun.tooling.verbs import Seconds, check_report, missing_extra, write_report
-from dxlrun_lab.commands.on_robot import DEFAULTS, OnRobot, Words
+from dxlrun_lab.commands.on_robot import DEFAULTS, ExperimentOptions, Words
 
 if TYPE_CHECKING:
-    from dxlrun_lab.identify.experiment import JointResult, Options
-    from dxlrun_lab.identify.result import Identified
+    from dxlrun_lab.identify.identification import JointResult, Options
+    from dxlrun_lab.identify.result import IdentifiedServo
 
 Number = Annotated[float | None, Parameter(show_default=False)]
 _LONGEST_S = 3600.0
@@ -32,7 +32,7 @@ def identify(
     load_gravity: Number = None,
     voltage: Number = None,
     output: Path | None = None,
-    options: OnRobot = DEFAULTS,
+    options: ExperimentOptions = DEFAULTS,
 ) -> int:
     """Identify the parameters of servos: torque constant, resistance, inertia, friction, gain, delay.
 
@@ -58,17 +58,17 @@ def identify(
     output
         Output file for the motor file of the joint, which the key `motor` in the robot file names.
     """
-    from dxlrun_lab.commands.on_robot import Chosen, run_on_robot
+    from dxlrun_lab.commands.on_robot import RobotFileArguments, run_on_robot
 
     _check(duration, load_inertia, load_gravity, voltage)
-    joints = Chosen.of(words).joints
+    joints = RobotFileArguments.parse_words(words).joints
     if output is not None:
         _check_output(output, joints)
     if options.report is not None:
         check_report(options.report)
     if missing := missing_extra("identify", "identify", "scipy"):
         raise InputError(missing)
-    from dxlrun_lab.identify.experiment import Identification, Options
+    from dxlrun_lab.identify.identification import Identification, Options
     from dxlrun_lab.identify.result import KnownLoad
 
     chosen = Options(duration, load=KnownLoad(load_inertia, load_gravity), voltage=voltage)
@@ -88,7 +88,7 @@ def identify(
             if each.identified is not None:
                 _write(output, each.joint, each.identified)
     if options.report is not None and found:
-        from dxlrun_lab.identify.page import page
+        from dxlrun_lab.identify.identification_page import page
 
         write_report(options.report, page(robot, found))
     code = 2 if recorded is not None and results and not found else code or bool(refusals)
@@ -99,9 +99,11 @@ def identify(
     return code
 
 
-def _of_log(log: Path, words: tuple[str, ...], chosen: Options, options: OnRobot) -> tuple[JointResult, ...]:
+def _of_log(
+    log: Path, words: tuple[str, ...], chosen: Options, options: ExperimentOptions
+) -> tuple[JointResult, ...]:
     from dxlrun.tooling.logs import read_log
-    from dxlrun_lab.identify.experiment import from_log
+    from dxlrun_lab.identify.identification import from_log
 
     if not log.exists():
         raise InputError(f"there is no log {log}; a run prints the path of its log when it ends")
@@ -134,22 +136,24 @@ def _check_output(target: Path, joints: tuple[str, ...]) -> None:
     check_target(target)
 
 
-def _write(target: Path, joint: str, found: Identified) -> None:
+def _write(target: Path, joint: str, found: IdentifiedServo) -> None:
     from dxlrun.tooling.robots import motor_text
 
     comment = "\n".join((f"{joint}, by dxlrun identify.", f"{found.scale_sentence}.", *found.notes))
     write_target(target, motor_text(found.motor, found.uncertainty, comment=comment))
 
 
-def _show(found: list[JointResult], options: OnRobot, log: Path | None, output: Path | None) -> None:
-    from dxlrun_lab.identify.tables import parts
+def _show(
+    found: list[JointResult], options: ExperimentOptions, log: Path | None, output: Path | None
+) -> None:
+    from dxlrun_lab.identify.identification_tables import parts
 
     for each in found:
         if each.identified is not None:
-            show(*parts(each.identified))
+            show_parts(*parts(each.identified))
     if log is not None:
-        show(f"\nlog: {log}")
+        show_parts(f"\nlog: {log}")
     if options.report is not None and found:
-        show(f"report: {options.report}")
+        show_parts(f"report: {options.report}")
     if output is not None and found:
-        show(f"motor file: {output}")
+        show_parts(f"motor file: {output}")

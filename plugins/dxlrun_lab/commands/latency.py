@@ -7,7 +7,15 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Literal
 
 from dxlrun import InputError
-from dxlrun.tooling.output import check_target, out, print_error, progress_bar, show, show_json, unwritable
+from dxlrun.tooling.output import (
+    check_target,
+    out,
+    print_error,
+    progress_bar,
+    show_json,
+    show_parts,
+    unwritable,
+)
 from dxlrun.tooling.verbs import (
     DebugFlag,
     Flag,
@@ -21,7 +29,7 @@ from dxlrun.tooling.verbs import (
 
 if TYPE_CHECKING:
     from dxlrun_analysis.latency.conditions import Settings
-    from dxlrun_lab.latency.measurement import Measured
+    from dxlrun_lab.latency.latency_measurement import LatencyMeasurement
 
 _INTERRUPTED = 130
 
@@ -95,7 +103,7 @@ def latency(
         polling_ns=None if polling == "auto" else _duration("--polling", polling),
         idle_latency=idle_latency,
     )
-    settings.check(frozenset(os.sched_getaffinity(0)))
+    settings.validate_settings(frozenset(os.sched_getaffinity(0)))
     if report is not None:
         check_report(report, "bokeh")
     if log is not None and not record:
@@ -108,27 +116,27 @@ def _measured(
 ) -> int:
     """Measure, then write log and report and show the results. Return the exit code. `place` is the file or
     directory of the log; None for no log."""
-    from dxlrun_lab.latency.measurement import (
-        Measured,
+    from dxlrun_lab.latency.latency_measurement import (
+        LatencyMeasurement,
         compiled_yardstick,
         keep_cores_awake,
-        measure,
+        measure_blocks,
         require_grants,
     )
     from dxlrun_lab.stress import Stress
 
     load = Stress(wanted=stress)
-    measured = Measured()
+    measured = LatencyMeasurement()
     with compiled_yardstick(settings) as yardstick:
         measured.remarks += require_grants(settings, yardstick)
         keep_cores_awake(settings)
         target = None if place is None else _new_log(place)
         if not as_json:
-            show(_announced(settings, load.text))
+            show_parts(_announced(settings, load.text))
         with progress_bar(hidden=as_json) as progress, terminated_as_interrupted():
             try:
                 with load:
-                    measure(settings, yardstick, load, progress, measured)
+                    measure_blocks(settings, yardstick, load, progress, measured)
             except KeyboardInterrupt:  # while the load was starting or ending
                 measured.interrupted = True
             except BaseException:
@@ -139,7 +147,7 @@ def _measured(
 
 def _show(
     settings: Settings,
-    measured: Measured,
+    measured: LatencyMeasurement,
     load: str,
     target: Path | None,
     report: Path | None,
@@ -148,9 +156,9 @@ def _show(
 ) -> int:
     import msgspec
 
-    from dxlrun_analysis.latency.latency_log import machine, write
+    from dxlrun_analysis.latency.latency_log import machine, write_log
+    from dxlrun_analysis.latency.latency_tables import parts
     from dxlrun_analysis.latency.statistics import figures
-    from dxlrun_analysis.latency.tables import parts
 
     code = _INTERRUPTED if measured.interrupted else 1 if measured.failure else 0
     why = (measured.failure, "interrupted" if measured.interrupted else "")
@@ -162,15 +170,15 @@ def _show(
             raise KeyboardInterrupt
         raise InputError(measured.failure or "nothing was measured")
     if not as_json:
-        show(*parts(result))  # writing the log takes long, and an interrupt must not lose the table
+        show_parts(*parts(result))  # writing the log takes long, and an interrupt must not lose the table
     with out().status("writing the log") if not as_json else nullcontext():
         if target is not None:
-            summary = write(target, settings, measured.blocks, load, measured.remarks)
+            summary = write_log(target, settings, measured.blocks, load, measured.remarks)
             if summary.error:
                 code = code or 1
                 failures.append(f"the log {target} is incomplete: {summary.error}")
         if report is not None:
-            from dxlrun_analysis.latency.page import page
+            from dxlrun_analysis.latency.latency_page import page
 
             write_report(report, page(result, measured.blocks, machine()))
     if as_json:
@@ -179,9 +187,9 @@ def _show(
         show_json(content, code=code, errors=failures)
         return code
     if target is not None:
-        show(f"\nlog: {target}")
+        show_parts(f"\nlog: {target}")
     if report is not None:
-        show(f"report: {report}")
+        show_parts(f"report: {report}")
     for failure in failures:
         print_error(failure if failure.startswith("interrupted") else f"dxlrun: {failure}")
     return code

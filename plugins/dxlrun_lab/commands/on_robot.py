@@ -29,7 +29,7 @@ from dxlrun.tooling.verbs import DebugFlag, Flag, JsonFlag, compiled
 
 if TYPE_CHECKING:
     from dxlrun.tooling.plans import Plan
-    from dxlrun_lab.guided.experiment import Experiment, Performed, Situation
+    from dxlrun_lab.guided.experiment import Experiment, ExperimentOutcome, Situation
     from dxlrun_lab.guided.rig import Rig
     from dxlrun_lab.guided.segment import Segment
 
@@ -45,7 +45,7 @@ Words = Annotated[str, Parameter(name="[ROBOT.yaml [arg:=value ...]] JOINT")]
 
 @Parameter(name="*")
 @dataclass(frozen=True, slots=True)
-class OnRobot:
+class ExperimentOptions:
     """Robot and ranges of its joints, confirmation, and form of the output.
 
     Parameters
@@ -72,10 +72,10 @@ class OnRobot:
     debug: DebugFlag = False
 
 
-DEFAULTS = OnRobot()
+DEFAULTS = ExperimentOptions()
 
 
-class Chosen(NamedTuple):
+class RobotFileArguments(NamedTuple):
     """Parsed arguments of a command: `[ROBOT.yaml [arg:=value ...]] JOINT ...`"""
 
     file: Path | None
@@ -85,7 +85,7 @@ class Chosen(NamedTuple):
     joints: tuple[str, ...]
 
     @classmethod
-    def of(cls, words: Sequence[str]) -> Chosen:
+    def parse_words(cls, words: Sequence[str]) -> RobotFileArguments:
         """Split the words of a command line. Raises InputError for `arg:=value` without a robot file."""
         rest = list(words)
         file = None
@@ -101,7 +101,7 @@ class Chosen(NamedTuple):
         return cls(file, assignments, joints)
 
 
-class Ran(msgspec.Struct, Generic[R], frozen=True):
+class ExperimentRun(msgspec.Struct, Generic[R], frozen=True):
     """Outcome of an experiment on a robot: its result, and how it ended"""
 
     result: R | None
@@ -140,18 +140,24 @@ class Course(msgspec.Struct, frozen=True):
     """Sentences that describe the motions before a run is started; None for joints and their ranges"""
 
 
-def run_on_robot(experiment: Experiment[R], words: Sequence[str], options: OnRobot = DEFAULTS) -> Ran[R]:
+def run_on_robot(
+    experiment: Experiment[R], words: Sequence[str], options: ExperimentOptions = DEFAULTS
+) -> ExperimentRun[R]:
     """Perform an experiment on the robot, the joints and the ranges of a command line. See perform_on."""
     from dxlrun_lab.guided.choice import parse_ranges
 
-    chosen = Chosen.of(words)
+    chosen = RobotFileArguments.parse_words(words)
     ranges = parse_ranges(options.range)
     return perform_on(experiment, chosen, _plan_of(chosen, ranges, options), options, Course(ranges=ranges))
 
 
 def perform_on(
-    experiment: Experiment[R], chosen: Chosen, plan: Plan | None, options: OnRobot, course: Course
-) -> Ran[R]:
+    experiment: Experiment[R],
+    chosen: RobotFileArguments,
+    plan: Plan | None,
+    options: ExperimentOptions,
+    course: Course,
+) -> ExperimentRun[R]:
     """Perform an experiment with confirmation, countdown and abort, and return its outcome.
 
     The run of `plan` is started for it; without a plan, the running robot is used.
@@ -163,15 +169,19 @@ def perform_on(
         InputError: The arguments are invalid. Nothing has moved.
     """
     from dxlrun_lab.guided.choice import situation_of, whole_situation
-    from dxlrun_lab.guided.experiment import Performed, perform
+    from dxlrun_lab.guided.experiment import ExperimentOutcome, perform_experiment
 
-    with Aborting() as aborting:
+    with AbortMonitor() as aborting:
         if plan is not None and not _start_confirmed(plan, chosen.joints, options, course, aborting):
-            nothing = Performed((), aborting() or NOTHING_MOVED)
-            return _ended(Ran(None, plan.robot, None, nothing.why, (), interrupted=True), nothing, course)
+            nothing = ExperimentOutcome((), aborting() or NOTHING_MOVED)
+            return _ended(
+                ExperimentRun(None, plan.robot, None, nothing.why, (), interrupted=True), nothing, course
+            )
         rig = _rig(chosen, plan, options, aborting)
         if rig is None:
-            return Ran(None, plan.robot if plan else "", None, aborting() or "", (), interrupted=True)
+            return ExperimentRun(
+                None, plan.robot if plan else "", None, aborting() or "", (), interrupted=True
+            )
         performed, result = None, None
         try:
             if course.ranges is None:
@@ -179,23 +189,25 @@ def perform_on(
             else:
                 situation = situation_of(rig, chosen.joints, course.ranges)
                 _announce(situation)
-            sys.stderr.write("".join(f"{line}\n" for line in experiment.moves(situation)))
+            sys.stderr.write("".join(f"{line}\n" for line in experiment.describe_motions(situation)))
             # A run that was started here has been confirmed already.
             if plan is not None or _confirmed(rig.plan, options, aborting):
                 with aborting.by_any_key():
                     if _counted_down(situation, options, aborting):
-                        performed = perform(rig, experiment, situation, aborting, _show, back=course.back)
+                        performed = perform_experiment(
+                            rig, experiment, situation, aborting, _show, back=course.back
+                        )
         finally:
             try:
                 ended = tuple(rig.close())
             except DxlrunError as error:
                 ended = error.sentences
     interrupted = aborting.reason is not None or performed is None
-    performed = performed or Performed((), aborting() or NOTHING_MOVED)
+    performed = performed or ExperimentOutcome((), aborting() or NOTHING_MOVED)
     if performed.recorded:
         try:
             with err().status("computing the result"):
-                result = experiment.finish(situation, performed.recorded, performed.why)
+                result = experiment.evaluate_recordings(situation, performed.recorded, performed.why)
         except KeyboardInterrupt:  # the computation can take long
             print_error(f"{rig.plan.robot}: what was measured is in {rig.log}")
             raise
@@ -204,11 +216,11 @@ def perform_on(
                 raise
             ended = (*error.sentences, *ended)  # an incomplete recording may have no result
     problems = (*performed.not_restored, *ended)
-    ran = Ran(result, rig.plan.robot, rig.log, performed.why, problems, interrupted)
+    ran = ExperimentRun(result, rig.plan.robot, rig.log, performed.why, problems, interrupted)
     return _ended(ran, performed, course)
 
 
-def _ended(ran: Ran[R], performed: Performed, course: Course) -> Ran[R]:
+def _ended(ran: ExperimentRun[R], performed: ExperimentOutcome, course: Course) -> ExperimentRun[R]:
     """Print to stderr why an experiment ended early, and what was not restored; return the outcome."""
     if ran.why:
         kept = len(performed.recorded) if course.ranges is not None else 0
@@ -219,7 +231,9 @@ def _ended(ran: Ran[R], performed: Performed, course: Course) -> Ran[R]:
     return ran
 
 
-def _plan_of(chosen: Chosen, ranges: Mapping[str, tuple[float, float]], options: OnRobot) -> Plan | None:
+def _plan_of(
+    chosen: RobotFileArguments, ranges: Mapping[str, tuple[float, float]], options: ExperimentOptions
+) -> Plan | None:
     """Compile the chosen robot file to a plan, or return None without a file. Raises InputError for mistakes
     in joints, ranges and options."""
     from dxlrun_lab.guided.choice import check_joints
@@ -235,7 +249,9 @@ def _plan_of(chosen: Chosen, ranges: Mapping[str, tuple[float, float]], options:
     return None
 
 
-def _rig(chosen: Chosen, plan: Plan | None, options: OnRobot, aborting: Aborting) -> Rig | None:
+def _rig(
+    chosen: RobotFileArguments, plan: Plan | None, options: ExperimentOptions, aborting: AbortMonitor
+) -> Rig | None:
     """Return access to the run: on virtual time, started as a child process, or already running (no plan).
     Returns None if the user aborted while it started."""
     from dxlrun_lab.guided.own_run import OwnRun
@@ -270,9 +286,9 @@ def _rig(chosen: Chosen, plan: Plan | None, options: OnRobot, aborting: Aborting
         if robot is not None:
             return live_rig(robot, run)
     except BaseException:
-        run.end()
+        run.end_run()
         raise
-    run.end()
+    run.end_run()
     print_error(f"{plan.robot}: {aborting()}; nothing was moved")
     return None
 
@@ -290,12 +306,12 @@ def _announce(situation: Situation) -> None:
     sys.stderr.write("".join(f"{line}\n" for line in lines))
 
 
-def _real(plan: Plan, options: OnRobot) -> bool:
+def _real(plan: Plan, options: ExperimentOptions) -> bool:
     return not options.virtual and any(bus.port != "sim" for bus in plan.buses)
 
 
 def _start_confirmed(
-    plan: Plan, names: Sequence[str], options: OnRobot, course: Course, aborting: Aborting
+    plan: Plan, names: Sequence[str], options: ExperimentOptions, course: Course, aborting: AbortMonitor
 ) -> bool:
     """Describe the motions and ask for confirmation before a run is started. Return True if confirmed. No
     question is asked if no real joint will move."""
@@ -314,7 +330,7 @@ def _start_confirmed(
     return _confirmed(plan, options, aborting)
 
 
-def _confirmed(plan: Plan, options: OnRobot, aborting: Aborting) -> bool:
+def _confirmed(plan: Plan, options: ExperimentOptions, aborting: AbortMonitor) -> bool:
     """Ask for confirmation before a real joint moves; return False if it is declined or aborted.
 
     Simulated servos and --yes need no confirmation.
@@ -337,7 +353,7 @@ def _confirmed(plan: Plan, options: OnRobot, aborting: Aborting) -> bool:
     return False
 
 
-def _counted_down(situation: Situation, options: OnRobot, aborting: Aborting) -> bool:
+def _counted_down(situation: Situation, options: ExperimentOptions, aborting: AbortMonitor) -> bool:
     """Count down before a real joint moves. Return False if the user aborted."""
     if aborting.has_keys:
         sys.stderr.write("any key ends it: the joints come to rest, and the run is left as it was\n")
@@ -364,7 +380,7 @@ def _show(segment: Segment, number: int) -> None:
 # What ends it
 
 
-class Aborting:
+class AbortMonitor:
     """Abort of an experiment by Ctrl-C, SIGTERM, SIGHUP, or any key if stdin is a terminal.
 
     It is polled ten times a second. A SIGHUP that is ignored (nohup) stays ignored.
@@ -375,12 +391,12 @@ class Aborting:
         self.has_keys = self._keys = False
         self._before: dict[int, object] = {}
 
-    def __enter__(self) -> Aborting:
+    def __enter__(self) -> AbortMonitor:
         """Install handlers of the signals that abort, which only note the reason."""
         self.has_keys = sys.stdin.isatty()
         for number in (signal.SIGINT, signal.SIGTERM, signal.SIGHUP):
             if number != signal.SIGHUP or signal.getsignal(number) != signal.SIG_IGN:
-                self._before[number] = signal.signal(number, self._take)
+                self._before[number] = signal.signal(number, self._handle_signal)
         return self
 
     def __exit__(self, *_: object) -> None:
@@ -388,7 +404,7 @@ class Aborting:
         for number, handler in self._before.items():
             signal.signal(number, handler)  # type: ignore[arg-type]  # what signal() returned
 
-    def _take(self, number: int, frame: FrameType | None) -> None:
+    def _handle_signal(self, number: int, frame: FrameType | None) -> None:
         # No import here, because the signal may interrupt an import of the same module.
         name = "Ctrl-C" if number == signal.SIGINT else signal.Signals(number).name
         self.reason = self.reason or f"aborted by {name}"

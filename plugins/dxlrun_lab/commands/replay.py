@@ -9,10 +9,16 @@ from typing import TYPE_CHECKING, Annotated, Literal
 from cyclopts import Parameter
 
 from dxlrun import InputError
-from dxlrun.tooling.output import counted, print_warning, show, show_json
+from dxlrun.tooling.output import counted, print_warning, show_json, show_parts
 from dxlrun.tooling.verbs import AssignmentOfItsOwn, DebugFlag, JsonFlag, parse_assignments
-from dxlrun_lab.commands.on_robot import Chosen
-from dxlrun_lab.commands.recorded import ALL_OF_IT, NOWHERE, PlayedOn, RecordedPart, play_recorded
+from dxlrun_lab.commands.on_robot import RobotFileArguments
+from dxlrun_lab.commands.recorded_motions import (
+    ALL_OF_IT,
+    NOWHERE,
+    PlaybackOptions,
+    RecordedPart,
+    play_recorded,
+)
 
 if TYPE_CHECKING:
     from dxlrun.tooling.output import Part
@@ -29,7 +35,7 @@ def replay(
     *assignments: AssignmentOfItsOwn,
     settings: Settings = (),
     code: Literal["current", "log"] | None = None,
-    played_on: PlayedOn = NOWHERE,
+    played_on: PlaybackOptions = NOWHERE,
     part: RecordedPart = ALL_OF_IT,
     as_json: JsonFlag = False,
     debug: DebugFlag = False,
@@ -57,7 +63,7 @@ def replay(
             raise InputError("--set is for the controllers of the log, and --on does not run them; omit one")
         if code:
             raise InputError("--code belongs to a replay without --on; omit one")
-        chosen = Chosen(played_on.on, assignments, ())
+        chosen = RobotFileArguments(played_on.on, assignments, ())
         return play_recorded(log, chosen, played_on, part, as_json=as_json)
     _refuse_playing(played_on, part)
     if not log.exists():
@@ -81,11 +87,11 @@ def replay(
         return exit_code
     for warning in warnings:
         print_warning(warning)
-    show(*_replayed(report))
+    show_parts(*_replayed(report))
     return exit_code
 
 
-def _refuse_playing(played_on: PlayedOn, part: RecordedPart) -> None:
+def _refuse_playing(played_on: PlaybackOptions, part: RecordedPart) -> None:
     given = [
         f"--{option.name.rstrip('_')}"
         for values, usual in ((played_on, NOWHERE), (part, ALL_OF_IT))
@@ -108,7 +114,7 @@ def _replayed(report: ReplayReport) -> tuple[Part, ...]:
         counts.insert(0, "references")
     columns = [Column("cycles that differ", "name"), *numbers(*counts)]
     rows = [(joint.joint, *(getattr(joint, count) for count in counts)) for joint in report.joints]
-    return report.sentence, _first(report.first), Table.of("", columns, rows)
+    return report.sentence, _first(report.first), Table.from_rows("", columns, rows)
 
 
 def _first(first: ReplayDifference) -> str:

@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING
 from cyclopts import App
 
 from dxlrun import InputError
-from dxlrun.tooling.output import err, out, print_error, print_warning, show, show_json, unblocked
+from dxlrun.tooling.output import err, out, print_error, print_warning, show_json, show_parts, unblocked
 from dxlrun.tooling.verbs import (
     Assignment,
     DebugFlag,
@@ -23,7 +23,7 @@ from dxlrun.tooling.verbs import (
 )
 
 if TYPE_CHECKING:
-    from dxlrun_lab.tracking.experiment import Experiment
+    from dxlrun_lab.tracking.tracking_experiment import TrackingExperiment
 
 experiment = App(name="experiment", help="Repeat an experiment of the thesis on this machine.")
 
@@ -83,8 +83,8 @@ def tracking(
     for warning in prepared.warnings:
         print_warning(str(warning))
     from dxlrun_lab.stress import Stress
-    from dxlrun_lab.tracking.experiment import run_experiment
-    from dxlrun_lab.tracking.motion import desired_motion
+    from dxlrun_lab.tracking.desired_motion import desired_motion
+    from dxlrun_lab.tracking.tracking_experiment import run_experiment
 
     desired = desired_motion(motion, prepared.plan)
     console = err() if as_json else out()
@@ -94,8 +94,8 @@ def tracking(
     return result.exit_code
 
 
-def _show(result: Experiment, report: Path | None, *, as_json: bool) -> None:
-    from dxlrun_lab.tracking import report as results
+def _show(result: TrackingExperiment, report: Path | None, *, as_json: bool) -> None:
+    from dxlrun_lab.tracking import tracking_report as results
 
     if report is not None and result.measured:
         write_report(report, results.page(result))
@@ -103,9 +103,9 @@ def _show(result: Experiment, report: Path | None, *, as_json: bool) -> None:
         interrupted = ["interrupted"] * result.interrupted
         show_json(results.result(result), code=result.exit_code, errors=[*result.failures, *interrupted])
         return
-    show(*results.parts(result))
+    show_parts(*results.parts(result))
     if report is not None and result.measured:
-        show(f"report: {report}")
+        show_parts(f"report: {report}")
     for sentence in result.failures:
         print_error(f"dxlrun: {sentence}")
     if result.interrupted:

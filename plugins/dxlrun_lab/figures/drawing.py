@@ -75,7 +75,7 @@ _NAMESPACE = re.compile(r"^\{.*\}")
 _REFERENCE = re.compile(r"(?<=url\(#)[\w.-]+|(?<=href=\"#)[\w.-]+")
 
 
-def draw(  # noqa: PLR0917  what the figure shows, from its name to its size
+def draw_figure(  # noqa: PLR0917  what the figure shows, from its name to its size
     name: str, title: str, alt: str, text: str, height: float, fill: Callable[[Figure], None]
 ) -> ET.Element:
     """Draw a figure with matplotlib, and return it as an element of an HTML report.

@@ -12,7 +12,7 @@ from dxlrun import LINEAR, InputError
 from dxlrun.tooling.files import suggestion
 from dxlrun.tooling.plans import JointPlan, Plan
 from dxlrun.tooling.verbs import angle
-from dxlrun_lab.guided.experiment import PLAYER, Joint, Situation
+from dxlrun_lab.guided.experiment import PLAYER, ExperimentJoint, Situation
 from dxlrun_lab.guided.rig import TORQUED, JointNow, Rig, RunningController
 
 DEFAULT_REACH = math.radians(30)
@@ -126,7 +126,7 @@ def situation_of(rig: Rig, names: Sequence[str], ranges: Mapping[str, tuple[floa
             mistakes.append(str(error))
             continue
         mine = tuple(servo for _, servo in servos[name])
-        joints.append(Joint(name, lower, upper, chosen, now[name].position, plans[name], mine))
+        joints.append(ExperimentJoint(name, lower, upper, chosen, now[name].position, plans[name], mine))
     if mistakes:
         raise InputError("\n".join(mistakes))
     return Situation(tuple(joints), rig.rate, rig.plan, rig.virtual)

@@ -17,7 +17,7 @@ from dxlrun import DxlrunError, Refused
 from dxlrun.tooling.live import RunGone
 from dxlrun.tooling.plans import JointPlan, Plan
 from dxlrun_lab.guided.rig import TORQUED, JointNow, Rig
-from dxlrun_lab.guided.segment import Guard, Interface, Recorded, Segment
+from dxlrun_lab.guided.segment import Guard, Interface, Segment, SegmentRecording
 from dxlwire import Mode, ServoPlan, mode_of
 
 APPROACH_RAD_S: Final = 0.5
@@ -33,13 +33,13 @@ PLAYER: Final = "experiment"
 """Prefix of the names of the sample_players that an experiment loads; the interface follows. Two experiments
 cannot run at once, because the names would be the same."""
 
-Procedure = Generator[Segment, Recorded, None]
+Procedure = Generator[Segment, SegmentRecording, None]
 Abort = Callable[[], str | None]
 """Function that returns the reason to abort an experiment, one sentence, or None"""
 R_co = TypeVar("R_co", covariant=True)
 
 
-class Joint(msgspec.Struct, frozen=True):
+class ExperimentJoint(msgspec.Struct, frozen=True):
     """Joint of an experiment, with its range and its start"""
 
     name: str
@@ -75,7 +75,7 @@ class Joint(msgspec.Struct, frozen=True):
 class Situation(msgspec.Struct, frozen=True):
     """Joints, loop rate and plan of a run before an experiment"""
 
-    joints: tuple[Joint, ...]
+    joints: tuple[ExperimentJoint, ...]
     """Joints of the experiment, in the order of the command line"""
     rate: float
     """Loop rate, Hz"""
@@ -96,7 +96,7 @@ class Experiment(Protocol[R_co]):
     procedure, which can then yield another segment. Any other refusal ends the experiment.
     """
 
-    def moves(self, situation: Situation) -> Sequence[str]:
+    def describe_motions(self, situation: Situation) -> Sequence[str]:
         """Describe distance and speed of each motion, one sentence each, for a printout before the start."""
         ...
 
@@ -104,7 +104,9 @@ class Experiment(Protocol[R_co]):
         """Yield segments. Each `yield` returns the complete recording of its segment."""
         ...
 
-    def finish(self, situation: Situation, recorded: Sequence[Recorded], why: str) -> R_co:
+    def evaluate_recordings(
+        self, situation: Situation, recorded: Sequence[SegmentRecording], why: str
+    ) -> R_co:
         """Evaluate the recordings of all segments, and return the result of the experiment.
 
         Args:
@@ -115,10 +117,10 @@ class Experiment(Protocol[R_co]):
         ...
 
 
-class Performed(msgspec.Struct, frozen=True):
+class ExperimentOutcome(msgspec.Struct, frozen=True):
     """Recordings of an experiment, before their evaluation"""
 
-    recorded: tuple[Recorded, ...]
+    recorded: tuple[SegmentRecording, ...]
     """Recording of each segment that was played; the last one may be incomplete"""
     why: str = ""
     """Reason for an early end, one sentence; empty on success"""
@@ -126,11 +128,11 @@ class Performed(msgspec.Struct, frozen=True):
     """State of the run that could not be restored, one sentence each"""
 
 
-class _Ended(Exception):
+class _EarlyEnd(Exception):
     """Early end of an experiment, with the reason as its text"""
 
 
-class _Unfit(Exception):
+class _UnfitSegment(Exception):
     """Error of a segment that the run cannot play, for the reason in `refusal`"""
 
     def __init__(self, refusal: Refused) -> None:
@@ -138,7 +140,7 @@ class _Unfit(Exception):
         self.refusal = refusal
 
 
-def perform(
+def perform_experiment(
     rig: Rig,
     experiment: Experiment[object],
     situation: Situation,
@@ -146,7 +148,7 @@ def perform(
     show: Callable[[Segment, int], None] = lambda segment, number: None,
     *,
     back: bool = True,
-) -> Performed:
+) -> ExperimentOutcome:
     """Play and record the segments of an experiment, and always restore the run. Nothing is evaluated.
 
     Args:
@@ -158,26 +160,26 @@ def perform(
         back: Move the joints back to their start at the end.
     """
     stage = _Stage(rig, situation, abort)
-    recorded: list[Recorded] = []
+    recorded: list[SegmentRecording] = []
     why = ""
     problems: tuple[str, ...] = ()
     try:
         _play_all(stage, experiment.procedure(situation), recorded, show)
         if back:
             stage.go_back()
-    except _Ended as ended:
+    except _EarlyEnd as ended:
         why = str(ended)
     except DxlrunError as error:
         why = " ".join(error.sentences)
     finally:
         problems = stage.restore()
-    return Performed(tuple(recorded), why, problems)
+    return ExperimentOutcome(tuple(recorded), why, problems)
 
 
 def _play_all(
     stage: _Stage,
     procedure: Procedure,
-    recorded: list[Recorded],
+    recorded: list[SegmentRecording],
     show: Callable[[Segment, int], None],
 ) -> None:
     segment = next(procedure, None)
@@ -185,14 +187,14 @@ def _play_all(
         show(segment, len(recorded) + 1)
         try:
             try:
-                stage.begin(segment)
-            except _Unfit as unfit:
+                stage.prepare_segment(segment)
+            except _UnfitSegment as unfit:
                 segment = procedure.throw(unfit.refusal)
                 continue
-            part = stage.play(segment)
+            part = stage.play_segment(segment)
             recorded.append(part)
             if not part.whole:
-                raise _Ended(part.text)
+                raise _EarlyEnd(part.text)
             segment = procedure.send(part)
         except StopIteration:
             return
@@ -215,7 +217,7 @@ class _Stage:
 
     # Forward
 
-    def begin(self, segment: Segment) -> None:
+    def prepare_segment(self, segment: Segment) -> None:
         """Prepare a segment: move the joints to its start, set the loop rate, and activate its sample_player.
 
         Raises:
@@ -234,25 +236,27 @@ class _Stage:
             try:
                 self.rig.change_rate(rate)
             except Refused as refusal:
-                raise _Unfit(refusal) from refusal
+                raise _UnfitSegment(refusal) from refusal
         self._activate(segment.interface, segment.guard)
 
-    def play(self, segment: Segment) -> Recorded:
+    def play_segment(self, segment: Segment) -> SegmentRecording:
         """Play a prepared segment to its end or an abort, and return its recording."""
         names = self.situation.names
         plan_joints = [joint.name for joint in self.situation.plan.loop.joints]
         goal = self._send(segment)
         outcome, text = "lost", ""
         try:
-            outcome, text = self.rig.wait(goal, self._look, segment.duration_s + _EXTRA_S)
+            outcome, text = self.rig.wait_for_goal(
+                goal, self._find_abort_reason, segment.duration_s + _EXTRA_S
+            )
             if outcome != "reached":
                 # A goal that the runtime ended has no text, but the state of its joint may have the reason.
-                text = self._look() or text or f"the samples were {outcome}"
+                text = self._find_abort_reason() or text or f"the samples were {outcome}"
         except RunGone as gone:
             text = str(gone)
         cycles = self.rig.recorded(goal)
         columns = tuple(plan_joints.index(name) for name in names)
-        return Recorded(names, cycles, columns, segment, outcome, text)
+        return SegmentRecording(names, cycles, columns, segment, outcome, text)
 
     def go_back(self) -> None:
         """Move the joints back to their positions before the experiment."""
@@ -276,9 +280,9 @@ class _Stage:
         rows = {name: _place(now, name) + (place - _place(now, name)) * shape for name, place in far.items()}
         segment = Segment("approach", _APPROACH_PERIOD_S, rows, settle_s=0.2)
         goal = self._send(segment)
-        outcome, text = self.rig.wait(goal, self._look, segment.duration_s + _EXTRA_S)
+        outcome, text = self.rig.wait_for_goal(goal, self._find_abort_reason, segment.duration_s + _EXTRA_S)
         if outcome != "reached":
-            raise _Ended(text or f"the way to the start was {outcome}")
+            raise _EarlyEnd(text or f"the way to the start was {outcome}")
 
     def _send(self, segment: Segment) -> int:
         """Send a segment's table to the active sample_player, in pieces that fit into a cycle. Returns the
@@ -298,7 +302,7 @@ class _Stage:
         size = max(1, _PIECE_NUMBERS // table.shape[1])
         pieces = [table[at : at + size].tolist() for at in range(0, len(table), size)]
         for piece in pieces[:-1]:
-            self.rig.send(self._player, "rows", {"rows": piece})
+            self.rig.send_command(self._player, "rows", {"rows": piece})
         # The motion of the joints is the measurement, so no distance from the last row is a failure.
         last = {
             "period": segment.period_s,
@@ -306,7 +310,7 @@ class _Stage:
             "tolerance": "inf",
             "rows": pieces[-1],
         }
-        return self.rig.send(self._player, "samples", last)
+        return self.rig.send_command(self._player, "samples", last)
 
     def _activate(self, interface: Interface, guard: Guard) -> None:
         """Activate the sample_player of an interface and a guard in place of the active controllers. It is
@@ -317,7 +321,7 @@ class _Stage:
         if name is None:
             number = len(self._players)
             name = f"{PLAYER}_{interface}" + (f"_{number}" if number else "")
-            self.rig.load(name, self._entry(interface, guard))
+            self.rig.load_controller(name, self._entry(interface, guard))
             self._players[interface, guard] = name
         leaving = [self._player] if self._player else self._active
         self.rig.switch([name], leaving)
@@ -345,16 +349,16 @@ class _Stage:
             without = [each for each in joint.servos if mode not in [plan.mode for plan in each.modes]]
             if without:
                 text = f"joint {joint.plan.label} has no {interface} mode, as an {without[0].model} has none"
-                raise _Unfit(Refused(text, code="no_mode"))
+                raise _UnfitSegment(Refused(text, code="no_mode"))
 
     # What ends it early
 
     def _check(self) -> None:
-        why = self._look()
+        why = self._find_abort_reason()
         if why is not None:
-            raise _Ended(why)
+            raise _EarlyEnd(why)
 
-    def _look(self) -> str | None:
+    def _find_abort_reason(self) -> str | None:
         """Return the reason to end the experiment: an abort, or a joint without torque."""
         why = self.abort()
         if why is not None:
@@ -397,7 +401,7 @@ class _Stage:
                 yield from (partial(self.rig.switch, [name], []) for name in missing)
         if not math.isclose(self.rig.rate, self._rate, rel_tol=1e-9):
             yield partial(self.rig.change_rate, self._rate)
-        yield from (partial(self.rig.unload, name) for name in self._players.values())
+        yield from (partial(self.rig.unload_controller, name) for name in self._players.values())
 
 
 def _place(now: Mapping[str, JointNow], name: str) -> float:

@@ -73,7 +73,7 @@ class OwnRun:
             time.sleep(_POLL_S)
         return None
 
-    def end(self) -> tuple[str, ...]:
+    def end_run(self) -> tuple[str, ...]:
         """End the run cleanly. Return its errors, one sentence each."""
         if self._process.poll() is None:
             self._stopping = True

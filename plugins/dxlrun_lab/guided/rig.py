@@ -136,12 +136,12 @@ class Rig:
         rows = zip(states.position.tolist(), states.goal_position.tolist(), states.torque, strict=True)
         return dict(zip(states.joints, starmap(JointNow, rows), strict=True))
 
-    def load(self, name: str, entry: Mapping[str, object]) -> None:
+    def load_controller(self, name: str, entry: Mapping[str, object]) -> None:
         """Load a controller by its robot file entry, while the run is paused."""
         with self._pause() as robot:
             robot.load(name, entry)
 
-    def unload(self, name: str) -> None:
+    def unload_controller(self, name: str) -> None:
         """Unload a controller while the run is paused."""
         with self._pause() as robot:
             robot.unload(name)
@@ -173,7 +173,7 @@ class Rig:
         with self._asking() as robot:
             robot.rate(rate)
 
-    def send(self, controller: str, kind: str, command: Mapping[str, object]) -> int:
+    def send_command(self, controller: str, kind: str, command: Mapping[str, object]) -> int:
         """Send a command to a controller; return the number of its goal, or 0 if it has none.
 
         The recording starts again: earlier cycles are dropped.
@@ -184,7 +184,7 @@ class Rig:
             goal = robot.send(controller, kind, command).goal
         return goal.number if goal else 0
 
-    def wait(self, goal: int, look: Callable[[], str | None], longest_s: float) -> tuple[str, str]:
+    def wait_for_goal(self, goal: int, look: Callable[[], str | None], longest_s: float) -> tuple[str, str]:
         """Wait for the end of a goal.
 
         The goal is cancelled after `longest_s`, or when `look` returns a reason. `look` is called ten times
@@ -266,11 +266,11 @@ def live_rig(robot: RemoteRobot, run: OwnRun | None = None) -> Rig:
     plan = from_json(follower.new().attachments["plan.json"])
     require_whole(plan.recording, robot.name)
 
-    def look() -> tuple[Cycles, Sequence[Event]]:
+    def read_cycles() -> tuple[Cycles, Sequence[Event]]:
         new = follower.new()
         return new.cycles, new.events
 
-    return Rig(robot, plan, look, log=Path(str(log)), end=run.end if run else None)
+    return Rig(robot, plan, read_cycles, log=Path(str(log)), end=run.end_run if run else None)
 
 
 def require_whole(recording: RecordingPlan, robot: str) -> None:

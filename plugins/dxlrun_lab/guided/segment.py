@@ -69,7 +69,7 @@ class Segment(msgspec.Struct, frozen=True):
         return self.count * self.period_s + self.settle_s
 
 
-class Recorded(msgspec.Struct, frozen=True):
+class SegmentRecording(msgspec.Struct, frozen=True):
     """Recording of a segment, one row per cycle from the acceptance to the end of its goal
 
     `cycles` has the complete record of each cycle (see channels/cycle.py), with times of the run's clock in

@@ -44,12 +44,12 @@ class Room(msgspec.Struct, frozen=True):
         return (self.lower + self.upper) / 2
 
     @property
-    def reach(self) -> float:
+    def largest_distance(self) -> float:
         """Largest distance of goals from the middle, rad"""
         return _MARGIN * (self.upper - self.lower) / 2
 
 
-class Part(NamedTuple):
+class ExcitationPart(NamedTuple):
     """Part of the excitation, such as the steps"""
 
     title: str
@@ -59,7 +59,7 @@ class Part(NamedTuple):
 
 def excitation(
     room: Room, seconds: float, period_s: float, *, start: float, seed: int = 0
-) -> tuple[Part, ...]:
+) -> tuple[ExcitationPart, ...]:
     """Return the parts of a joint's excitation, which stay within range and limits, from its start on.
 
     Args:
@@ -85,11 +85,13 @@ def excitation(
     counts = {name: round(share * seconds / period_s) for name, share in _SHARES.items()}
     steps = _steps(room, counts["steps"], period_s, random)
     return (
-        Part("to the middle", _glide(start, room.middle, room, period_s)),
-        Part("steps", np.concatenate((steps, _glide(float(steps[-1]), room.middle, room, period_s)))),
-        Part("sum of sines", _sines(room, counts["sines"], period_s, random)),
-        Part("rising sine", _chirp(room, counts["chirp"], period_s)),
-        Part("slow triangles", _triangles(room, counts["triangles"], period_s)),
+        ExcitationPart("to the middle", _glide(start, room.middle, room, period_s)),
+        ExcitationPart(
+            "steps", np.concatenate((steps, _glide(float(steps[-1]), room.middle, room, period_s)))
+        ),
+        ExcitationPart("sum of sines", _sines(room, counts["sines"], period_s, random)),
+        ExcitationPart("rising sine", _chirp(room, counts["chirp"], period_s)),
+        ExcitationPart("slow triangles", _triangles(room, counts["triangles"], period_s)),
     )
 
 
@@ -109,7 +111,7 @@ def _steps(room: Room, count: int, period_s: float, random: np.random.Generator)
     goals = np.empty(0)
     side, at = 1.0, room.middle
     while len(goals) < count:
-        to = room.middle + side * room.reach * random.uniform(0.4, 1.0)
+        to = room.middle + side * room.largest_distance * random.uniform(0.4, 1.0)
         way = _limited(at, to, room, period_s)
         held = np.full(round(random.uniform(0.15, 0.6) / period_s), to)
         goals, at = np.concatenate((goals, way, held)), to
@@ -138,7 +140,7 @@ def _fitted(shape: Floats, room: Room, period_s: float) -> Floats:
     """Scale a motion around 0 as far as range, velocity and acceleration allow; move it to the middle."""
     velocity = np.gradient(shape, period_s)
     factor = min(
-        room.reach / max(1e-9, float(np.abs(shape).max())),
+        room.largest_distance / max(1e-9, float(np.abs(shape).max())),
         _MARGIN * room.velocity / max(1e-9, float(np.abs(velocity).max())),
         _MARGIN * room.acceleration / max(1e-9, float(np.abs(np.gradient(velocity, period_s)).max())),
     )
@@ -173,7 +175,7 @@ def _triangles(room: Room, count: int, period_s: float) -> Floats:
     speeds, total = (0.15, 0.4, 0.8, 0.25, 0.6), 1
     while total < count:
         for speed in speeds:
-            to = room.middle + side * room.reach
+            to = room.middle + side * room.largest_distance
             steps = max(1, round(abs(to - at) / min(speed, _MARGIN * room.velocity) / period_s))
             goals.append(at + (to - at) * np.arange(1, steps + 1) / steps)
             at, side, total = to, -side, total + steps

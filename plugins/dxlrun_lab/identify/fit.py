@@ -21,8 +21,8 @@ from numpy.typing import NDArray
 from scipy import optimize, signal, stats
 
 from dxlrun import InputError
-from dxlrun_lab.identify.measured import Compared, Measured
-from dxlrun_lab.identify.model import ROWS, STEP_S, Floats, Numbers, Simulated, simulate
+from dxlrun_lab.identify.joint_recording import JointRecording, ModeComparison
+from dxlrun_lab.identify.model import ROWS, STEP_S, Floats, Numbers, SimulatedPieces, simulate
 
 _HELD_OUT = 5
 """Every fifth piece is held out of the fit for its validation"""
@@ -102,7 +102,7 @@ class Fit(msgspec.Struct, frozen=True):
         )
 
 
-class Curve(msgspec.Struct, frozen=True):
+class FitCurve(msgspec.Struct, frozen=True):
     """Measured and simulated positions (rad) or efforts (A, or fraction of full voltage); shape (samples,)"""
 
     time_s: Floats
@@ -113,7 +113,7 @@ class Curve(msgspec.Struct, frozen=True):
     """True for samples that validate the fit instead of determining it"""
 
 
-def fit_run(run: Measured) -> tuple[Fit, ...]:
+def fit_run(run: JointRecording) -> tuple[Fit, ...]:
     """Fit the servo model with three friction models to a run, and return the selected fit first.
 
     Raises:
@@ -134,7 +134,7 @@ def fit_run(run: Measured) -> tuple[Fit, ...]:
     return fits
 
 
-def curves(run: Measured, numbers: Numbers) -> tuple[Curve, Curve]:
+def curves(run: JointRecording, numbers: Numbers) -> tuple[FitCurve, FitCurve]:
     """Return two curves of a run: positions and efforts, measured and simulated with these parameters."""
     parts = [(group, _simulated(group, numbers.array()[:, None])) for group in run.groups]
     order = np.argsort(np.concatenate([group.time_s for group in run.groups]), kind="stable")
@@ -149,14 +149,14 @@ def curves(run: Measured, numbers: Numbers) -> tuple[Curve, Curve]:
                 for group, found in parts
             ]
         )[order]
-        both.append(Curve(time_s, measured, simulated, held))
+        both.append(FitCurve(time_s, measured, simulated, held))
     return both[0], both[1]
 
 
 # The start
 
 
-def _start(run: Measured) -> Numbers:
+def _start(run: JointRecording) -> Numbers:
     """Return the start values of the fit: those of the simulation's motor, or of a linear fit if better."""
     built_in = run.servo.built_in
     gain, _ = run.servo.expected_gain()
@@ -175,7 +175,7 @@ def _start(run: Measured) -> Numbers:
     return candidates[int(np.argmin(costs))]
 
 
-def _linear(run: Measured, known: Numbers, share: float) -> dict[str, float]:
+def _linear(run: JointRecording, known: Numbers, share: float) -> dict[str, float]:
     """Fit drive, back-EMF, friction and gravity by linear least squares to the smoothed motion of a run.
     Returns parameters by name, with the friction times `share`; none if the joint hardly moved."""
     period = float(np.median(np.diff(run.time_s)))
@@ -205,7 +205,7 @@ def _linear(run: Measured, known: Numbers, share: float) -> dict[str, float]:
     }
 
 
-def _cost(run: Measured, numbers: Numbers) -> float:
+def _cost(run: JointRecording, numbers: Numbers) -> float:
     values = numbers.array()[:, None]
     return float(
         sum(
@@ -217,7 +217,7 @@ def _cost(run: Measured, numbers: Numbers) -> float:
     )
 
 
-def _free(run: Measured, start: Numbers) -> tuple[str, ...]:
+def _free(run: JointRecording, start: Numbers) -> tuple[str, ...]:
     """Return the names of the parameters that the run determines and the fit varies. The gain needs a
     saturated duty, a measured duty or duty commands; resistance needs a measured current."""
     values = start.array()[:, None]
@@ -236,7 +236,7 @@ def _free(run: Measured, start: Numbers) -> tuple[str, ...]:
     return (*_COULOMB, *gain, *current)
 
 
-def _alike(run: Measured, numbers: Numbers) -> bool:
+def _alike(run: JointRecording, numbers: Numbers) -> bool:
     """Return True if the measured effort correlates with the simulated one, so that it can be fitted."""
     _, effort = curves(run, numbers)
     known = np.isfinite(effort.measured)
@@ -248,7 +248,9 @@ def _alike(run: Measured, numbers: Numbers) -> bool:
 # The fit itself
 
 
-def _fit(run: Measured, name: str, start: Numbers, free: Sequence[str], noise: tuple[float, float]) -> Fit:
+def _fit(
+    run: JointRecording, name: str, start: Numbers, free: Sequence[str], noise: tuple[float, float]
+) -> Fit:
     rows = [ROWS[each] for each in free]
     fixed = start.array()
     effort_used = "effort_delay" in free
@@ -301,7 +303,7 @@ def _fit(run: Measured, name: str, start: Numbers, free: Sequence[str], noise: t
     x = result.x
     values = fixed.copy()
     values[rows] = x
-    numbers = Numbers.of(values)
+    numbers = Numbers.from_array(values)
     slopes, left = jacobian(x), residuals(x)[:, 0]
     clusters = _clusters(run, twice=effort_used)
     position, effort = curves(run, numbers)
@@ -342,12 +344,16 @@ def _judged(fits: Sequence[Fit]) -> tuple[Fit, ...]:
     return (best, *(fit for fit in judged if fit is not best))
 
 
-def _simulated(group: Compared, values: Floats) -> Simulated:
+def _simulated(group: ModeComparison, values: Floats) -> SimulatedPieces:
     return simulate(values, group.pieces, group.control)
 
 
 def _sampled(
-    run: Measured, group: Compared, found: Simulated, quantity: str, delays: Floats | None = None
+    run: JointRecording,
+    group: ModeComparison,
+    found: SimulatedPieces,
+    quantity: str,
+    delays: Floats | None = None,
 ) -> Floats:
     """Return simulated positions or efforts (`quantity`) at the times of the samples, shape (samples, sets).
     A set is one set of parameters; `delays` is the age of its effort relative to the position, s."""
@@ -365,23 +371,23 @@ def _sampled(
     return sampled
 
 
-def _between(values: Floats, group: Compared, step: NDArray[np.intp], part: Floats) -> Floats:
+def _between(values: Floats, group: ModeComparison, step: NDArray[np.intp], part: Floats) -> Floats:
     before, after = values[step, :, group.piece], values[step + 1, :, group.piece]
     between: Floats = before + part[:, None] * (after - before)
     return between
 
 
-def _held_out(group: Compared) -> NDArray[np.bool_]:
+def _held_out(group: ModeComparison) -> NDArray[np.bool_]:
     held: NDArray[np.bool_] = group.piece % _HELD_OUT == _HELD_OUT - 1
     return held
 
 
-def _first_effort_noise(run: Measured) -> float:
+def _first_effort_noise(run: JointRecording) -> float:
     efforts = np.concatenate([group.effort for group in run.groups])
     return max(1e-3, 0.05 * float(np.nanstd(efforts)))
 
 
-def _noise(run: Measured, numbers: Numbers, before: tuple[float, float]) -> tuple[float, float]:
+def _noise(run: JointRecording, numbers: Numbers, before: tuple[float, float]) -> tuple[float, float]:
     """Return robust standard deviations of the residuals of positions (rad) and efforts, for the next fit.
     They are at least the quantisation noise of positions, and the initial noise of efforts."""
     found = []
@@ -391,7 +397,7 @@ def _noise(run: Measured, numbers: Numbers, before: tuple[float, float]) -> tupl
     return found[0], found[1]
 
 
-def _clusters(run: Measured, *, twice: bool) -> NDArray[np.intp]:
+def _clusters(run: JointRecording, *, twice: bool) -> NDArray[np.intp]:
     parts, first = [], 0
     for group in run.groups:
         mine = group.piece[~_held_out(group)] + first
@@ -452,7 +458,7 @@ def _rms(values: Floats) -> float:
     return float(np.sqrt(np.mean(np.square(values)))) if len(values) else float("nan")
 
 
-def _require_followed(run: Measured, fit: Fit) -> None:
+def _require_followed(run: JointRecording, fit: Fit) -> None:
     """Raise InputError if the simplest model fits so badly that the joint did not follow its goals."""
     if fit.position_rms > _FAR * run.moved:
         raise InputError(
@@ -462,7 +468,7 @@ def _require_followed(run: Measured, fit: Fit) -> None:
         )
 
 
-def _require_determined(run: Measured, fit: Fit) -> None:
+def _require_determined(run: JointRecording, fit: Fit) -> None:
     """Raise InputError if the 95 % interval of `drive` (acceleration per volt) is too wide."""
     name = run.servo.joint
     part = fit.student * np.sqrt(fit.variance("drive")) / fit.numbers.drive

@@ -64,7 +64,7 @@ class Numbers(msgspec.Struct, frozen=True):
         return np.array(msgspec.structs.astuple(self))
 
     @classmethod
-    def of(cls, values: Floats) -> Numbers:
+    def from_array(cls, values: Floats) -> Numbers:
         """Create the parameters from an array in the order of ROWS."""
         return cls(*(float(value) for value in values))
 
@@ -88,7 +88,7 @@ class Control(msgspec.Struct, frozen=True):
     """True if the command is a position, rad; False if it is the duty"""
 
 
-class Pieces(msgspec.Struct, frozen=True):
+class PieceBatch(msgspec.Struct, frozen=True):
     """Pieces of a run that are simulated in parallel, each from its initial state on a time grid of STEP_S"""
 
     start_s: Floats
@@ -122,7 +122,7 @@ class Pieces(msgspec.Struct, frozen=True):
         return mean
 
 
-class Simulated(msgspec.Struct, frozen=True):
+class SimulatedPieces(msgspec.Struct, frozen=True):
     """Simulated motion of pieces, at each grid point; shape (steps + 1, sets of parameters, pieces)"""
 
     position: Floats
@@ -135,7 +135,7 @@ class Simulated(msgspec.Struct, frozen=True):
     """Motor current, A, in the scale of `resistance`"""
 
 
-def simulate(values: Floats, pieces: Pieces, control: Control) -> Simulated:
+def simulate(values: Floats, pieces: PieceBatch, control: Control) -> SimulatedPieces:
     """Simulate all pieces with several sets of parameters, `values` of shape (parameters, sets).
 
     Damping uses the Crank-Nicolson rule, and the control uses the position in the middle of a step. Friction
@@ -178,7 +178,7 @@ def simulate(values: Floats, pieces: Pieces, control: Control) -> Simulated:
     position[-1], velocity[-1], duties[-1] = q, w, duties[-2]
     voltage = np.concatenate((pieces.voltage, pieces.voltage[-1:]))[:, None, :]
     current = (voltage * duties - back_emf * velocity) / column["resistance"]
-    return Simulated(position, velocity, duties, current)
+    return SimulatedPieces(position, velocity, duties, current)
 
 
 def _duty(error: Floats, w: Floats, gain: Floats, control: Control) -> Floats:

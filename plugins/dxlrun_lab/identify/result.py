@@ -15,9 +15,9 @@ import numpy as np
 
 from dxlrun import InputError, MotorLoad, MotorModel, Stribeck
 from dxlrun_lab.identify.fit import Fit
-from dxlrun_lab.identify.measured import Measured
+from dxlrun_lab.identify.joint_recording import JointRecording
+from dxlrun_lab.identify.known_servo import Servo
 from dxlrun_lab.identify.model import ROWS, Floats
-from dxlrun_lab.identify.servo import Servo
 
 Scale = Literal["load", "current", "manual"]
 
@@ -58,7 +58,7 @@ class KnownLoad(msgspec.Struct, frozen=True):
     """Torque of the weight in the horizontal position, Nm; None if unknown"""
 
 
-class Value(msgspec.Struct, frozen=True):
+class IdentifiedValue(msgspec.Struct, frozen=True):
     """Figure of the servo, such as its torque constant: a row of the result"""
 
     name: str
@@ -77,7 +77,7 @@ class Value(msgspec.Struct, frozen=True):
         return self.half is not None and self.half <= _UNKNOWN * abs(self.value)
 
 
-class Identified(msgspec.Struct, frozen=True):
+class IdentifiedServo(msgspec.Struct, frozen=True):
     """Result of the identification of one joint's servo"""
 
     joint: str
@@ -85,7 +85,7 @@ class Identified(msgspec.Struct, frozen=True):
     """Model name of the servo"""
     friction_model: str
     """Selected friction model: m1, m3 or m4 (see Fit)"""
-    values: tuple[Value, ...]
+    values: tuple[IdentifiedValue, ...]
     scale: Scale
     """Source of the scale of torques: known load, measured current, or stall torque of the manual"""
     scale_sentence: str
@@ -105,7 +105,7 @@ class Identified(msgspec.Struct, frozen=True):
     """Friction models with their BIC and their error in the held-out pieces, rad"""
 
 
-def identified(run: Measured, fits: tuple[Fit, ...], load: KnownLoad, source: str) -> Identified:
+def identified(run: JointRecording, fits: tuple[Fit, ...], load: KnownLoad, source: str) -> IdentifiedServo:
     """Convert the first of a run's fits to the figures of the servo. `source` is noted in the motor file.
 
     Raises:
@@ -113,8 +113,8 @@ def identified(run: Measured, fits: tuple[Fit, ...], load: KnownLoad, source: st
     """
     fit, servo = fits[0], run.servo
     scale, sentence = _scale_of(fit, servo, load)
-    physical = _Physical(servo, scale, load)
-    values = physical.of(fit.numbers.array())
+    physical = _PhysicalValues(servo, scale, load)
+    values = physical.figures_of(fit.numbers.array())
     covariance = _covariance(fit, physical, run)
     half = {name: fit.student * math.sqrt(max(0.0, covariance[i, i])) for i, name in enumerate(values)}
     _check_load(values, load, servo.joint)
@@ -126,7 +126,7 @@ def identified(run: Measured, fits: tuple[Fit, ...], load: KnownLoad, source: st
     share = 0.0 if "viscous_friction" in fit.free else _viscous_share(servo)
     expected = _expected(servo, share)
     rows = tuple(
-        Value(
+        IdentifiedValue(
             f"{name}_with_viscous_friction" if share and name == "torque_constant" else name,
             value,
             half[name] if name in fitted else None,
@@ -139,7 +139,7 @@ def identified(run: Measured, fits: tuple[Fit, ...], load: KnownLoad, source: st
     )
     half["torque_constant"] = math.hypot(half["torque_constant"], share * values["torque_constant"])
     motor, uncertainty = _motor(servo, fit, values, half, load, run, source)
-    return Identified(
+    return IdentifiedServo(
         joint=servo.joint,
         model=servo.table.model,
         friction_model=fit.friction_model,
@@ -179,14 +179,14 @@ def _scale_of(fit: Fit, servo: Servo, load: KnownLoad) -> tuple[Scale, str]:
     )
 
 
-class _Physical(msgspec.Struct, frozen=True):
+class _PhysicalValues(msgspec.Struct, frozen=True):
     """Conversion of the model's parameters, which are relative to the inertia, to figures in SI units"""
 
     servo: Servo
     scale: Scale
     load: KnownLoad
 
-    def of(self, numbers: Floats) -> dict[str, float]:
+    def figures_of(self, numbers: Floats) -> dict[str, float]:
         """Return the figures by name (see UNITS), from parameters in the order of ROWS."""
         at = {name: float(numbers[row]) for name, row in ROWS.items()}
         drive, constant = at["drive"], at["back_emf"]
@@ -231,14 +231,14 @@ def _check_load(values: Mapping[str, float], load: KnownLoad, joint: str) -> Non
         )
 
 
-def _covariance(fit: Fit, physical: _Physical, run: Measured) -> Floats:
+def _covariance(fit: Fit, physical: _PhysicalValues, run: JointRecording) -> Floats:
     """Return the covariance of the figures, from that of the parameters and the resolution of the voltage."""
     numbers = fit.numbers.array()
 
     def slopes(direction: Floats) -> Floats:
         step = 1e-4
-        up = physical.of(numbers + step * direction)
-        down = physical.of(numbers - step * direction)
+        up = physical.figures_of(numbers + step * direction)
+        down = physical.figures_of(numbers - step * direction)
         return np.array([(up[name] - down[name]) / (2 * step) for name in up])
 
     directions = np.zeros((len(fit.free), len(numbers)))
@@ -274,7 +274,7 @@ def _fitted_names(fit: Fit) -> set[str]:
 
 
 def _notes(  # noqa: PLR0917  all that a sentence may be about
-    run: Measured,
+    run: JointRecording,
     fit: Fit,
     scale: Scale,
     load: KnownLoad,
@@ -365,7 +365,7 @@ def _motor(  # noqa: PLR0917  all that a motor file has
     values: Mapping[str, float],
     half: Mapping[str, float],
     load: KnownLoad,
-    run: Measured,
+    run: JointRecording,
     source: str,
 ) -> tuple[MotorModel, dict[str, float]]:
     """Return the content of a motor file with all significant figures, and half-widths by name."""

@@ -15,7 +15,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 
-class Place(IntEnum):
+class BufferOffset(IntEnum):
     """Offsets in the shared memory, in 64-bit integers"""
 
     DONE = 0
@@ -60,24 +60,26 @@ class Buffer:
     def create(cls, iterations: int) -> Buffer:
         """Create a buffer for a number of wake-ups, with all pages allocated."""
         descriptor = os.memfd_create("wake_ups")
-        size = SIZE * (Place.WAKE_UPS + 2 * iterations)
+        size = SIZE * (BufferOffset.WAKE_UPS + 2 * iterations)
         os.posix_fallocate(descriptor, 0, size)
         return cls(descriptor)
 
-    def touch(self) -> None:
+    def touch_pages(self) -> None:
         """Access each page, so that no page fault occurs during the measurement."""
         for word in range(0, len(self.words), mmap.PAGESIZE // SIZE):
             self.words[word] = self.words[word]
 
     def wake_ups(self) -> NDArray[np.int64]:
         """Return a copy of the measurements so far: deadline and wake-up, ns; shape (wake-ups, 2)."""
-        done = self.words[Place.DONE]
-        times = np.frombuffer(self.words, np.int64, 2 * done, Place.WAKE_UPS * SIZE)
+        done = self.words[BufferOffset.DONE]
+        times = np.frombuffer(self.words, np.int64, 2 * done, BufferOffset.WAKE_UPS * SIZE)
         return times.reshape(-1, 2).copy()
 
     def worst_ns(self, begin: int, end: int) -> int:
         """Return the largest lateness of the wake-ups from `begin` to before `end`, ns; 0 without any."""
-        times = np.frombuffer(self.words, np.int64, 2 * (end - begin), (Place.WAKE_UPS + 2 * begin) * SIZE)
+        times = np.frombuffer(
+            self.words, np.int64, 2 * (end - begin), (BufferOffset.WAKE_UPS + 2 * begin) * SIZE
+        )
         return int((times[1::2] - times[::2]).max(initial=0))
 
     def close(self) -> None:

@@ -19,12 +19,12 @@ import msgspec
 from dxlrun.tooling import realtime
 from dxlrun.tooling.plans import SchedulerPlan
 from dxlrun.tooling.realtime import Deadlines, store
-from dxlrun_lab.latency.buffer import Buffer, Place
+from dxlrun_lab.latency.buffer import Buffer, BufferOffset
 
 _PR_SET_PDEATHSIG = 1  # linux/prctl.h
 
 
-class Job(msgspec.Struct, frozen=True):
+class WakeUpJob(msgspec.Struct, frozen=True):
     """Job of a measuring process, passed as JSON on its command line"""
 
     parent: int
@@ -41,50 +41,53 @@ class Job(msgspec.Struct, frozen=True):
     """Path of the C program; empty to wait as the loop does"""
 
 
-def measure(deadlines: Deadlines, iterations: int, buffer: Buffer) -> None:
+def measure_wake_ups(deadlines: Deadlines, iterations: int, buffer: Buffer) -> None:
     """Wait for `iterations` deadlines, and store deadline and wake-up time of each in the shared memory.
 
     Ends early if the front process requests it.
     """
     words = buffer.words
-    done, stop = int(Place.DONE), int(Place.STOP)  # plain integers: members of an enum are slower
-    place = int(Place.WAKE_UPS)
+    done, stop = (
+        int(BufferOffset.DONE),
+        int(BufferOffset.STOP),
+    )  # plain integers: members of an enum are slower
+    place = int(BufferOffset.WAKE_UPS)
     for number in range(1, iterations + 1):
-        words[place], words[place + 1] = deadlines.wait()
+        words[place], words[place + 1] = deadlines.wait_for_deadline()
         place += 2
         store(words, done, number)  # release store: readers see both times first
         if words[stop]:
             return
 
 
-def run(job: Job) -> None:
+def run(job: WakeUpJob) -> None:
     """Apply real-time settings, report the granted ones, and measure, or execute the C program instead.
 
     Wake-ups and used processor time are stored in the shared memory.
     """
     buffer = Buffer(job.buffer)
-    grants = realtime.apply(job.scheduler)
+    grants = realtime.apply_scheduler(job.scheduler)
     deadlines = Deadlines(job.period_ns)
     if job.iterations and not job.yardstick:
         grants = (*grants, deadlines.measure_margin(job.scheduler.polling_ns))
-        buffer.words[Place.MARGIN_NS] = deadlines.margin_ns
+        buffer.words[BufferOffset.MARGIN_NS] = deadlines.margin_ns
     os.pwrite(job.grants, msgspec.json.encode(grants), 0)
     if job.yardstick:
         words = (job.buffer, job.iterations, job.period_ns, int(job.scheduler.lock_memory))
         os.execv(job.yardstick, ("yardstick", *map(str, words)))  # noqa: S606  compiled a moment ago
     if not job.iterations:
         return
-    buffer.touch()
+    buffer.touch_pages()
     begin_cpu_ns, begin_ns = time.process_time_ns(), time.monotonic_ns()
-    measure(deadlines, job.iterations, buffer)
-    buffer.words[Place.CPU_NS] = time.process_time_ns() - begin_cpu_ns
-    buffer.words[Place.WALL_NS] = time.monotonic_ns() - begin_ns
+    measure_wake_ups(deadlines, job.iterations, buffer)
+    buffer.words[BufferOffset.CPU_NS] = time.process_time_ns() - begin_cpu_ns
+    buffer.words[BufferOffset.WALL_NS] = time.monotonic_ns() - begin_ns
 
 
 def main() -> None:
     """Run the job on the command line: `JOB-AS-JSON`."""
     ctypes.CDLL(None).prctl(_PR_SET_PDEATHSIG, signal.SIGKILL)
-    job = msgspec.json.decode(sys.argv[1], type=Job)
+    job = msgspec.json.decode(sys.argv[1], type=WakeUpJob)
     if os.getppid() != job.parent:
         sys.exit(1)  # the parent exited before prctl, so there will be no signal
     run(job)

@@ -25,11 +25,11 @@ from dxlrun_lab.figures.drawing import (
     GREEN,
     MUTED,
     ORANGE,
-    draw,
+    draw_figure,
     reduced,
 )
-from dxlrun_lab.tracking.measurement import LATE_NS, Curves, Measured
-from dxlrun_lab.tracking.motion import DesiredMotion
+from dxlrun_lab.tracking.desired_motion import DesiredMotion
+from dxlrun_lab.tracking.motion_evaluation import LATE_NS, MotionCurves, SetupResult
 
 _BEGIN_S = 5.0
 _AROUND_S = 0.25
@@ -47,7 +47,7 @@ class _Axes(msgspec.Struct, frozen=True):
     late_us: float
 
     @classmethod
-    def of(cls, measured: Sequence[Measured], motion: DesiredMotion) -> _Axes:
+    def from_measured(cls, measured: Sequence[SetupResult], motion: DesiredMotion) -> _Axes:
         """Return ranges of the axes into which the curves of all set-ups fit."""
         curves = [one.curves for one in measured]
         return cls(
@@ -71,16 +71,16 @@ def _span(arrays: Sequence[Floats]) -> tuple[float, float]:
     return low - margin, high + margin
 
 
-def drawings(measured: Sequence[Measured], motion: DesiredMotion) -> tuple[Element, ...]:
+def drawings(measured: Sequence[SetupResult], motion: DesiredMotion) -> tuple[Element, ...]:
     """Draw a figure for each of one or more set-ups, with equal axes. Needs matplotlib."""
-    axes = _Axes.of(measured, motion)
+    axes = _Axes.from_measured(measured, motion)
     return tuple(_SetupPlot(one, motion, axes).drawing() for one in measured)
 
 
 class _SetupPlot(msgspec.Struct, frozen=True):
     """Figure of one set-up"""
 
-    measured: Measured
+    measured: SetupResult
     motion: DesiredMotion
     axes: _Axes
 
@@ -92,7 +92,7 @@ class _SetupPlot(msgspec.Struct, frozen=True):
             f"{float(curves.woken_s[curves.worst]):.2f} s"
         )
         late = f"{counted(tracked.late_cycles, 'late cycle', 'late cycles')} of {tracked.cycles}, {latest}"
-        return draw(
+        return draw_figure(
             tracked.setup,
             f"{tracked.title[0].upper()}{tracked.title[1:]}",
             "Position in rad (desired, sent, read), velocity in rad/s and lateness of "
@@ -183,5 +183,5 @@ class _SetupPlot(msgspec.Struct, frozen=True):
         axes.set_xlabel("time since the motion began, s")
 
 
-def _late(curves: Curves) -> np.ndarray[tuple[int], np.dtype[np.bool_]]:
+def _late(curves: MotionCurves) -> np.ndarray[tuple[int], np.dtype[np.bool_]]:
     return curves.late_us > LATE_NS / 1e3

@@ -9,7 +9,7 @@ import pytest
 
 from dxlrun import InputError, RemoteRobot
 from dxlrun.testing import installed, plan_of, read_log, simulated_robot
-from dxlrun.tooling.output import show
+from dxlrun.tooling.output import show_parts
 from dxlrun.tooling.runs import VirtualLink
 from dxlrun_lights import table
 from dxlsim import SimulatedBus
@@ -42,7 +42,7 @@ class Run:
     def run(self, duration_s: float) -> None:
         end_s = self.link.now_s + duration_s
         while self.link.now_s < end_s:
-            self.link.turn()
+            self.link.run_cycle()
 
     def leds(self) -> list[int]:
         return [servo.registers["led"] for servo in self.bus.servos]
@@ -184,7 +184,7 @@ def test_check_lists_the_lights(capsys: pytest.CaptureFixture[str], monkeypatch:
     monkeypatch.setenv("COLUMNS", "120")
     rows = list(table.STAGE.rows(plan_of(ROBOT)))
     assert rows[0] == {"name": "left", "joint": "pan_joint", "bus": "main", "id": 1}
-    show(table.STAGE.table(rows))
+    show_parts(table.STAGE.table(rows))
     out = capsys.readouterr().out
     assert "Lights" in out
     assert "left   pan_joint   main   1" in out

@@ -1,8 +1,8 @@
 """Answers: results of client commands as data, and their texts.
 
 The loop's process answers each command by its number, with `Done` or `Refusal`. A command that takes longer
-is answered with `Waiting` first. The gateway forwards answers as JSON, and the Python client decodes them to
-objects. Programs should use `code` and `fields`: the wording of the text may change.
+is answered with `Acceptance` first. The gateway forwards answers as JSON, and the Python client decodes
+them to objects. Programs should use `code` and `fields`: the wording of the text may change.
 """
 
 from __future__ import annotations
@@ -160,7 +160,7 @@ class Halted(msgspec.Struct, frozen=True):
     """Speed of that joint, rad/s or m/s."""
 
 
-class Done(msgspec.Struct, frozen=True, tag="done"):
+class Completion(msgspec.Struct, frozen=True, tag="done"):
     """Answer: the command was executed."""
 
     cycle: int
@@ -177,7 +177,7 @@ class Done(msgspec.Struct, frozen=True, tag="done"):
     """Controllers that were deactivated because of a torque request or a reboot."""
 
 
-class Waiting(msgspec.Struct, frozen=True, tag="waiting"):
+class Acceptance(msgspec.Struct, frozen=True, tag="waiting"):
     """Answer: the command was accepted, but is not complete; another answer follows.
 
     Controllers may wait for the modes of their joints. Torque requests and reboots use idle time.
@@ -209,7 +209,7 @@ class Refusal(msgspec.Struct, frozen=True, tag="refused"):
         return f"{sentence}; {hint}" if hint else sentence
 
 
-Answer: TypeAlias = Done | Waiting | Refusal
+Answer: TypeAlias = Completion | Acceptance | Refusal
 
 
 class CommandOutcome(msgspec.Struct, frozen=True):
@@ -236,7 +236,7 @@ def _writable(value: Field) -> Field:
     return value.encode(errors="backslashreplace").decode() if isinstance(value, str) else value
 
 
-class Answered(msgspec.Struct, frozen=True, array_like=True, tag_field="is", tag=5):
+class AnswerMessage(msgspec.Struct, frozen=True, array_like=True, tag_field="is", tag=5):
     """Record by which the loop passes an answer to the gateway."""
 
     number: int
@@ -252,10 +252,10 @@ def encode_answer(number: int, answer: Answer, most: int) -> bytes:
         answer: The answer.
         most: Longest record, bytes.
     """
-    data = msgspec.msgpack.encode(Answered(number, answer))
+    data = msgspec.msgpack.encode(AnswerMessage(number, answer))
     while len(data) > most:
-        if isinstance(answer, Waiting):
-            answer = Waiting(answer.controllers[: len(answer.controllers) // 2])
+        if isinstance(answer, Acceptance):
+            answer = Acceptance(answer.controllers[: len(answer.controllers) // 2])
         elif isinstance(answer, Refusal):
             fields = dict(answer.fields)
             longest = max(fields, key=lambda name: len(str(fields[name])))
@@ -264,5 +264,5 @@ def encode_answer(number: int, answer: Answer, most: int) -> bytes:
             answer = Refusal(answer.code, fields)
         else:
             break
-        data = msgspec.msgpack.encode(Answered(number, answer))
+        data = msgspec.msgpack.encode(AnswerMessage(number, answer))
     return data

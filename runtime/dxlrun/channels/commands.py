@@ -31,7 +31,7 @@ _NUMBER = 8
 """Size of a float64, bytes."""
 
 
-class Command(msgspec.Struct, frozen=True, array_like=True, tag_field="is", tag=1):
+class CommandMessage(msgspec.Struct, frozen=True, array_like=True, tag_field="is", tag=1):
     """A client command for a controller or for the loop, as a record in the loop's inbox."""
 
     number: int
@@ -77,7 +77,7 @@ class TakenCommand(msgspec.Struct, frozen=True, array_like=True, tag_field="is",
         return not self.controller
 
     @property
-    def text(self) -> str:
+    def data_text(self) -> str:
         """Text in the command's data: JSON for the loop, hexadecimal if not an array, else empty.
 
         Invalid UTF-8 becomes escapes that are invalid in JSON, so a replay refuses the command again.
@@ -115,24 +115,24 @@ def data_of(controller: str, text: str, numbers: NDArray[np.float64]) -> bytes:
 class Inbox(Protocol):
     """Source of commands for the loop. Its methods never block and never raise."""
 
-    def take(self) -> Sequence[Command]:
+    def drain_commands(self) -> Sequence[CommandMessage]:
         """Return new commands in the order of arrival: at most MOST_PER_CYCLE, and the newest setpoint of
         each stream."""
         ...
 
-    def answer(self, number: int, answer: Answer) -> None:
-        """Send the answer to a command, by the command's number. After `Waiting`, another answer follows."""
+    def answer_command(self, number: int, answer: Answer) -> None:
+        """Send the answer to a command, by its number. After `Acceptance`, another answer follows."""
         ...
 
 
 class NoInbox:
     """Inbox of a loop without clients."""
 
-    def take(self) -> Sequence[Command]:
+    def drain_commands(self) -> Sequence[CommandMessage]:
         """Return no commands."""
         return ()
 
-    def answer(self, number: int, answer: Answer) -> None:
+    def answer_command(self, number: int, answer: Answer) -> None:
         """Do nothing."""
 
 
@@ -143,16 +143,16 @@ class QueueInbox:
     """
 
     def __init__(self) -> None:
-        self.waiting: deque[Command] = deque()
+        self.waiting: deque[CommandMessage] = deque()
         self.answers: dict[int, Answer] = {}
 
-    def take(self) -> Sequence[Command]:
+    def drain_commands(self) -> Sequence[CommandMessage]:
         """Return the commands that were put into `waiting`, at most MOST_PER_CYCLE, oldest first."""
         if not self.waiting:
             return ()
         return [self.waiting.popleft() for _ in range(min(len(self.waiting), MOST_PER_CYCLE))]
 
-    def answer(self, number: int, answer: Answer) -> None:
+    def answer_command(self, number: int, answer: Answer) -> None:
         """Store the answer in `answers`, in place of an earlier one."""
         self.answers[number] = answer
 
@@ -163,7 +163,7 @@ class CommandSink(Protocol):
     Never blocks or raises.
     """
 
-    def take(self, command: TakenCommand) -> None:
+    def record_command(self, command: TakenCommand) -> None:
         """Record one executed or refused command."""
         ...
 
@@ -171,7 +171,7 @@ class CommandSink(Protocol):
 class NoCommands:
     """Command sink that discards the records, for runs without a log."""
 
-    def take(self, command: TakenCommand) -> None:
+    def record_command(self, command: TakenCommand) -> None:
         """Do nothing."""
 
 
@@ -183,12 +183,12 @@ class CommandRing:
     def __init__(self, writer: Appender) -> None:
         self._writer = writer
 
-    def take(self, command: TakenCommand) -> None:
+    def record_command(self, command: TakenCommand) -> None:
         """Append one executed command to the ring."""
         self._writer.append(RecordKind.TAGGED, msgspec.msgpack.encode(command))
 
 
-def encode_command(command: Command, most: int = LONGEST_COMMAND) -> bytes:
+def encode_command(command: CommandMessage, most: int = LONGEST_COMMAND) -> bytes:
     """Encode a client command as a record; omit its `request` if the record were longer than `most` bytes."""
     record = msgspec.msgpack.encode(command)
     if command.request and len(record) > most:

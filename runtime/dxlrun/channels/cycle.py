@@ -359,7 +359,7 @@ class CycleLayout:
         """Size of a cycle record, bytes."""
         return self.dtype.itemsize
 
-    def place(self, name: str) -> int:
+    def float_index(self, name: str) -> int:
         """Return the index in `CycleRecord.floats` at which an array with 64-bit elements begins."""
         first: int = self.places[name].start
         return first // 8
@@ -473,7 +473,7 @@ class CycleRecord(_Scalars):
             for place in (layout.places["clamped"], layout.places["controller_ns"])
         )
 
-    def renew(self) -> None:
+    def reset_counts(self) -> None:
         """Reset marks, command count, clamps and controllers' durations at the begin of a cycle."""
         self.published = self.command_count = 0
         for part, nothing in self._renewed:

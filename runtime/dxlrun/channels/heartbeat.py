@@ -46,7 +46,7 @@ class Phase(IntEnum):
 
 
 @unique
-class Steering(IntEnum):
+class GatewayAvailability(IntEnum):
     """Ability of clients to command the run through the gateway process."""
 
     AWAITED = 0
@@ -114,7 +114,7 @@ class Heartbeat:
         """
         store(self._words, _CYCLE_NS, cycle_ns)
 
-    def enter(self, phase: Phase) -> None:
+    def enter_phase(self, phase: Phase) -> None:
         """Publish that the loop's process enters a phase."""
         store(self._words, _PHASE, phase)
 
@@ -127,7 +127,7 @@ class Heartbeat:
         """Publish index and method of the controller that is called from now on; step 0: no call."""
         self._words[_CALL] = place << _STEP_BITS | step
 
-    def look(self) -> None:
+    def mark_guardian_alive(self) -> None:
         """Count a check by the guardian, to show that it is alive. Only the guardian calls it."""
         self._words[_LOOKS] += 1
 
@@ -135,14 +135,14 @@ class Heartbeat:
         """Count a check by the supervisor, to show that it is alive. Only the supervisor calls it."""
         self._words[_SUPERVISOR_LOOKS] += 1
 
-    def set_steering(self, steering: Steering) -> None:
+    def set_steering(self, steering: GatewayAvailability) -> None:
         """Publish whether clients can command the run. Only the supervisor calls it."""
         self._words[_STEERING] = steering
 
     @property
-    def steering(self) -> Steering:
+    def steering(self) -> GatewayAvailability:
         """Ability of clients to command the run, from the supervisor."""
-        return Steering(self._words[_STEERING])
+        return GatewayAvailability(self._words[_STEERING])
 
     @property
     def activity(self) -> str:
@@ -220,7 +220,7 @@ class SimulationProgress:
         self._words[place], self._words[place + 1] = begin_ns, end_ns
         store(self._words, _STALLS, count + 1)
 
-    def stalled_ns(self, since_ns: int, until_ns: int) -> int:
+    def suspended_ns(self, since_ns: int, until_ns: int) -> int:
         """Return how long the simulation stalled between two times, ns. Only the last 16 stalls are known."""
         load(self._words, _STALLS)
         ends = self._words[_FIRST_STALL:_LINES]
@@ -246,15 +246,15 @@ class LineProgress:
 
     # The simulation's side
 
-    def serve(self, until_ns: int) -> None:
+    def publish_served(self, until_ns: int) -> None:
         """Publish that all simulated bytes due before `until_ns` were delivered to the loop."""
         store(self._words, _SERVED, until_ns)
 
-    def take(self, off_wire_ns: int) -> None:
+    def publish_received(self, off_wire_ns: int) -> None:
         """Publish when the last byte that the simulation has executed left the wire, ns."""
         store(self._words, _TAKEN, off_wire_ns)
 
-    def give(self, due_ns: int, now_ns: int) -> None:
+    def publish_delivery(self, due_ns: int, now_ns: int) -> None:
         """Publish that bytes for the loop are delivered now, and when the newest of them were due, ns."""
         self._words[_DUE] = due_ns
         store(self._words, _GIVEN, now_ns)
@@ -324,7 +324,7 @@ class ProcessorTime:
         self._folder = folder
         self._begin_ns: int | None = None
 
-    def look(self, still_ns: int) -> None:
+    def note_standstill(self, still_ns: int) -> None:
         """Store the processor time when a standstill begins, and forget it when the standstill ends.
 
         Args:

@@ -136,7 +136,7 @@ class Assembly:
         self._codec = codec
         self._parts: dict[str, tuple[int, list[bytes]]] = {}
 
-    def take(self, data: bytes) -> tuple[str, bytes] | None:
+    def add_piece(self, data: bytes) -> tuple[str, bytes] | None:
         """Add a message of /kept; return controller and file if it was the last piece of a file.
 
         A piece out of sequence drops its file.

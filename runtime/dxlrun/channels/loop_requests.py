@@ -39,7 +39,7 @@ class NewCommander(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     instead: str
 
 
-class Parameters(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
+class ParametersRequest(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     """Data of `parameters`: live parameters of a controller, already validated by its model."""
 
     controller: str

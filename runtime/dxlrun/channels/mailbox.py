@@ -19,11 +19,11 @@ import struct
 from collections.abc import Sequence
 
 from dxlrun.channels import ring, shared_memory
-from dxlrun.channels.answers import Answer, Answered, encode_answer
+from dxlrun.channels.answers import Answer, AnswerMessage, encode_answer
 from dxlrun.channels.commands import (
     LONGEST_COMMAND,
     MOST_PER_CYCLE,
-    Command,
+    CommandMessage,
     encode_command,
 )
 from dxlrun.channels.ring import Appender, Gap, Record, RecordKind, RingReader, RingWriter, record_size
@@ -102,7 +102,7 @@ class MailboxWriter:
         """True if the gateway, or an earlier one, has ever posted an operation."""
         return self._operations.head > 0
 
-    def post(self, command: Command) -> bool:
+    def post_command(self, command: CommandMessage) -> bool:
         """Pass a single command to the loop; return False if the mailbox is full or the command too long."""
         payload = encode_command(command)
         lane = self._operations
@@ -112,7 +112,7 @@ class MailboxWriter:
         lane.append(RecordKind.TAGGED, payload)
         return True
 
-    def set_point(self, place: int, command: Command) -> bool:
+    def set_point(self, place: int, command: CommandMessage) -> bool:
         """Pass the newest command of a stream to the loop, in place of an unread one.
 
         Returns False if too long.
@@ -137,7 +137,7 @@ class Mailbox:
         self._answers = answers
         self._generation = 0
 
-    def take(self) -> Sequence[Command]:
+    def drain_commands(self) -> Sequence[CommandMessage]:
         """Return new operations, oldest first, and the newest setpoint of each stream.
 
         There are at most MOST_PER_CYCLE operations, fewer if they are long (see MOST_BYTES).
@@ -145,10 +145,10 @@ class Mailbox:
         lane, generation = self._operations, self._words[_GENERATION]
         if lane.head <= lane.position and generation == self._generation:
             return ()
-        commands: list[Command] = []
+        commands: list[CommandMessage] = []
         begin = lane.position
         for _ in range(MOST_PER_CYCLE):
-            if lane.position - begin > MOST_BYTES or (record := lane.read()) is None:
+            if lane.position - begin > MOST_BYTES or (record := lane.read_record()) is None:
                 break
             _append_command(record, commands)
         lane.report_taken()
@@ -159,7 +159,7 @@ class Mailbox:
                     _append_command(place.newest(), commands)
         return commands
 
-    def answer(self, number: int, answer: Answer) -> None:
+    def answer_command(self, number: int, answer: Answer) -> None:
         """Send the answer to a command to the gateway. Long texts in a refusal's fields are cut."""
         self._answers.append(RecordKind.TAGGED, encode_answer(number, answer, LONGEST_ANSWER))
 
@@ -170,15 +170,15 @@ class Answers:
     def __init__(self, descriptor: int) -> None:
         self._ring = RingReader(descriptor)
 
-    def new(self) -> list[Answered]:
+    def new(self) -> list[AnswerMessage]:
         """Return the loop's answers since the last call."""
-        found = [_found(one) for one in iter(self._ring.read, None) if isinstance(one, Record)]
-        return [one for one in found if isinstance(one, Answered)]
+        found = [_found(one) for one in iter(self._ring.read_record, None) if isinstance(one, Record)]
+        return [one for one in found if isinstance(one, AnswerMessage)]
 
 
-def _append_command(record: Record | Gap | None, commands: list[Command]) -> None:
+def _append_command(record: Record | Gap | None, commands: list[CommandMessage]) -> None:
     """Decode a record and append its command to the list; ignore a gap or invalid record."""
-    if isinstance(record, Record) and isinstance(found := _found(record), Command):
+    if isinstance(record, Record) and isinstance(found := _found(record), CommandMessage):
         commands.append(found)
 
 

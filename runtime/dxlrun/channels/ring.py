@@ -86,7 +86,7 @@ class Appender(Protocol):
         """Append a record; return its end position."""
         ...
 
-    def repeat(self, kind: RecordKind, memory: memoryview) -> Callable[[], object]:
+    def make_appender(self, kind: RecordKind, memory: memoryview) -> Callable[[], object]:
         """Return a function that appends the current content of a memoryview at each call."""
         ...
 
@@ -175,7 +175,7 @@ class RingWriter(_Ring):
         end: int = self._append(kind, bytes(payload), len(payload))
         return end
 
-    def repeat(self, kind: RecordKind, memory: memoryview) -> Callable[[], object]:
+    def make_appender(self, kind: RecordKind, memory: memoryview) -> Callable[[], object]:
         """Return a function that appends the current content of a memoryview at each call."""
         self._require(len(memory))
         return partial(self._append, kind, array_of(memory), len(memory))
@@ -243,7 +243,7 @@ class RingReader(_Ring):
         """Number of records ever appended before `position`, modulo 2^32."""
         return self._reader[_PASSED]
 
-    def read(self) -> Record | Gap | None:
+    def read_record(self) -> Record | Gap | None:
         """Return the next record, a Gap if records were lost, or None if nothing is new."""
         found = self._next()
         return Gap(self._reader[_LOST]) if found == _GAP else self._record(found)
@@ -279,6 +279,6 @@ class Handover:
         self.head += 1
         return self.head
 
-    def repeat(self, kind: RecordKind, memory: memoryview) -> Callable[[], object]:
+    def make_appender(self, kind: RecordKind, memory: memoryview) -> Callable[[], object]:
         """Return a function that passes the current content of a memoryview at each call."""
         return partial(self.append, kind, memory)

@@ -88,7 +88,7 @@ class SlotWriter(_Slot):
         self._floats: Floats = self._sample[2:-1].view(np.float64)
         self._bytes = memoryview(self._sample.data).cast("B")[:-_WORD]
 
-    def write(self, t_ns: int, values: Floats) -> None:
+    def write_sample(self, t_ns: int, values: Floats) -> None:
         """Write a sample, measured at `t_ns` of the run's clock, in place of the older one. Never waits."""
         number = (self._words[_SAMPLES] + 1 & _LAST) or 1
         sample = self._sample
@@ -98,7 +98,7 @@ class SlotWriter(_Slot):
         np.copyto(self._places[number & 1], sample)
         store(self._words, _SAMPLES, number)  # release: the sample becomes visible before its number
 
-    def say(self, state: SlotState, text: str) -> None:
+    def write_state(self, state: SlotState, text: str) -> None:
         """Publish the writer's state and a text for an event, in place of the previous ones."""
         data = text.encode(errors="replace")[:LONGEST_TEXT]
         words, number = self._text_words, (self._words[_TEXTS] + 1 & _LAST) or 1
@@ -132,7 +132,7 @@ class SlotReader(_Slot):
         word = self._words[_STATE]
         return SlotState(word) if word < len(SlotState) else SlotState.FAILED
 
-    def read(self) -> int | None:
+    def read_sample(self) -> int | None:
         """Copy the newest sample; return its time, ns, or None if it is not new or was torn."""
         if self._words[_SAMPLES] == self._seen:
             return None
@@ -143,7 +143,7 @@ class SlotReader(_Slot):
         self._seen = number
         return sample.item(1)
 
-    def hear(self) -> str:
+    def read_text(self) -> str:
         """Return the writer's newest text if it was not returned before, else an empty string."""
         number, words = load(self._words, _TEXTS), self._text_words
         if number == self._spoken:

@@ -10,12 +10,12 @@ from typing import TypeAlias
 
 import msgspec
 
-from dxlrun.channels.answers import Answered
-from dxlrun.channels.commands import Command, TakenCommand
-from dxlrun.channels.events import Event
-from dxlrun.channels.messages import OpenedTopic, TopicMessage
+from dxlrun.channels.answers import AnswerMessage
+from dxlrun.channels.commands import CommandMessage, TakenCommand
+from dxlrun.channels.event_records import Event
+from dxlrun.channels.topic_messages import OpenedTopic, TopicRecord
 
-Tagged: TypeAlias = Event | TakenCommand | OpenedTopic | TopicMessage | Command | Answered
+Tagged: TypeAlias = Event | TakenCommand | OpenedTopic | TopicRecord | CommandMessage | AnswerMessage
 
 _DECODER: msgspec.msgpack.Decoder[Tagged] = msgspec.msgpack.Decoder(Tagged)
 decode = _DECODER.decode

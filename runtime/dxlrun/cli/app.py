@@ -23,11 +23,11 @@ from cyclopts import (
     UnusedCliTokensError,
 )
 
-from dxlrun.cli import verbs
+from dxlrun.cli import verb_registry
 from dxlrun.cli.run import run
 from dxlrun.errors import DxlrunError, InputError, Problem, Refused, near
-from dxlrun.output.table import Table
-from dxlrun.output.terminal import out, print_error, print_warning, show, show_json
+from dxlrun.output.terminal import out, print_error, print_warning, show_json, show_parts
+from dxlrun.output.text_table import Table
 
 if TYPE_CHECKING:
     from cyclopts.help import HelpEntry, HelpPanel
@@ -74,20 +74,24 @@ def build(verb: str = "", *, listed: bool = False) -> App:
         group_parameters=_PARAMETERS,
     )
     app.default(run)
-    found = {name: (place, group) for group, places in verbs.GROUPS.items() for name, place in places.items()}
+    found = {
+        name: (place, group)
+        for group, places in verb_registry.GROUPS.items()
+        for name, place in places.items()
+    }
     if verb in found and not listed:
         # Each other command costs time in every step of the parser.
         found = {verb: found[verb]}
-    if listed or (verbs.is_verb(verb) and verb not in found):
-        for added in verbs.packaged().values():
-            if not listed or verbs.is_importable(added):
+    if listed or (verb_registry.is_verb(verb) and verb not in found):
+        for added in verb_registry.packaged().values():
+            if not listed or verb_registry.is_importable(added):
                 found[added.name] = added.place, added.group
-    headings = {group: Group(group, sort_key=order) for order, group in enumerate(verbs.GROUPS)}
-    first = [*verbs.GROUPS[verbs.EVERY_DAY], *found]
+    headings = {group: Group(group, sort_key=order) for order, group in enumerate(verb_registry.GROUPS)}
+    first = [*verb_registry.GROUPS[verb_registry.EVERY_DAY], *found]
     for name, (place, group) in found.items():
         heading = headings.setdefault(group, Group(group, sort_key=len(headings)))
         # The commands of every day have a fixed order; all others are alphabetical.
-        order = first.index(name) if group == verbs.EVERY_DAY else 0
+        order = first.index(name) if group == verb_registry.EVERY_DAY else 0
         app.command(place, name=name, group=heading, sort_key=order)
     if listed:
         # Imported here because only a list of all commands needs it.
@@ -122,15 +126,15 @@ class _Help:
     def __call__(self, console: Console, options: ConsoleOptions, panel: HelpPanel) -> None:
         """Print the commands or the options of one group as a table."""
         facts = ((" ".join(entry.display_labels_with_metavar), _about(entry)) for entry in panel.entries)
-        show(Table.facts(str(panel.title), facts), console=out(_PIPED_HELP))
+        show_parts(Table.facts(str(panel.title), facts), console=out(_PIPED_HELP))
 
     def render_usage(self, console: Console, options: ConsoleOptions, usage: object) -> None:
         """Print the usage line of a command."""
-        show(str(usage) if str(usage).startswith("Usage") else f"Usage: {usage}")
+        show_parts(str(usage) if str(usage).startswith("Usage") else f"Usage: {usage}")
 
     def render_description(self, console: Console, options: ConsoleOptions, description: object) -> None:
         """Print the description of a command, folded to the width."""
-        show(_filled(description), console=out(_PIPED_HELP), folded=True)
+        show_parts(_filled(description), console=out(_PIPED_HELP), folded=True)
 
 
 def _about(entry: HelpEntry) -> str:
@@ -206,8 +210,8 @@ def _refuse(
 def _refuse_other_words(tokens: Sequence[str]) -> None:
     """Raise InputError, with the right command line, when the first word is a command of another program."""
     word = tokens[0] if tokens else ""
-    verb = verbs.verb_for(word)
-    if verb is None or word in verbs.names() or Path(word).exists():
+    verb = verb_registry.verb_for(word)
+    if verb is None or word in verb_registry.names() or Path(word).exists():
         return
     given = [*verb.split(), *_without_output(tokens[1:])]
     line = shlex.join(("dxlrun", *given)) if given else "dxlrun ROBOT.yaml"
@@ -303,7 +307,7 @@ def _usage_error(error: CycloptsError, tokens: Sequence[str]) -> str:
         letter = option.lstrip("-") if len(option.lstrip("-")) == 1 else ""
         short = [name for name in long if letter and name.startswith(letter)]
         verb = " ".join(error.command_chain or ())
-        if new := verbs.RENAMED.get(verb, {}).get(option):
+        if new := verb_registry.RENAMED.get(verb, {}).get(option):
             return f"{option} is {new} now; {fix}"
         if meant := near(option.lstrip("-"), long) or short:
             fix = f"did you mean {' or '.join(f'--{name}' for name in meant)}?"
@@ -325,8 +329,8 @@ def _explained(error: Exception, tokens: Sequence[str]) -> tuple[tuple[str, ...]
     what = " ".join(f"{type(error).__name__}: {error}".split())
     if sys.platform != "linux" and isinstance(error, ImportError | AttributeError):
         return (f"`dxlrun {verb}` needs Linux, and this is {sys.platform}: {what}",), InputError.exit_code
-    if verb in verbs.packaged() and not verbs.package_of(verb):
-        place = verbs.packaged()[verb].place
+    if verb in verb_registry.packaged() and not verb_registry.package_of(verb):
+        place = verb_registry.packaged()[verb].place
         return (
             f"command {verb} ({place}) failed: {what}; reinstall its package, or report it to its author",
         ), 1

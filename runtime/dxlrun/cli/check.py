@@ -22,19 +22,19 @@ from dxlrun.cli.inputs import (
 )
 from dxlrun.cli.tools.tool_log import BusesLog
 from dxlrun.errors import InputError, counted
-from dxlrun.output.table import Column, Columns, Kind, Table, Value, numbers
-from dxlrun.output.terminal import print_error, print_warning, show, show_json
+from dxlrun.output.terminal import print_error, print_warning, show_json, show_parts
+from dxlrun.output.text_table import Column, Columns, Kind, Table, Value, numbers
 from dxlwire.joint_unit import LINEAR, ROTARY
 
 if TYPE_CHECKING:
-    from dxlrun.compile.report import PolicyRow, Row
-    from dxlrun.compile.robot import Compiled
-    from dxlrun.dynamixel.tools.inspection import DeviationRow, Found, RegisterRow
+    from dxlrun.compile.check_report import PolicyRow, Row
+    from dxlrun.compile.robot_compiler import CompiledRobot
+    from dxlrun.dynamixel.tools.inspection import DeviationRow, InspectionResult, RegisterRow
     from dxlrun.plan.loop_plan import JointProperty
     from dxlwire.bus_plan import BusPlan
 
 
-def check(
+def check_robot(
     robot: RobotPath,
     /,
     *assignments: Assignment,
@@ -83,13 +83,13 @@ def check(
         show_json(_as_json(result, found), code=code, errors=problems, warnings=[*result.warnings, *remarks])
         return code
     if graph is None:
-        show(_verdict(result), *_tables(result))
+        show_parts(_verdict(result), *_tables(result))
     else:
-        show(_verdict(result), *(f"the controller graph is in {file}" for file in graph))
+        show_parts(_verdict(result), *(f"the controller graph is in {file}" for file in graph))
         if not graph:
-            show(result.drawing)
+            show_parts(result.drawing)
     if found is not None:
-        show(_registers(found.registers), _deviations(found.deviations), _compared(found))
+        show_parts(_registers(found.registers), _deviations(found.deviations), _compared(found))
     for warning in result.warnings:
         print_warning(str(warning))
     if found is None:
@@ -108,7 +108,7 @@ def _check_picture(file: Path) -> None:
     check_picture(file)
 
 
-def _write(result: Compiled, file: Path) -> None:
+def _write(result: CompiledRobot, file: Path) -> None:
     # Imported here because most checks draw nothing.
     from dxlrun.output.graph_picture import write_picture
 
@@ -116,16 +116,16 @@ def _write(result: Compiled, file: Path) -> None:
 
 
 def _asked(packets: BusesLog, buses: Sequence[BusPlan], joints: Sequence[str]) -> Mapping[str, str]:
-    return read_models(buses, joints, packets.of(buses))
+    return read_models(buses, joints, packets.open_sinks(buses))
 
 
-def _look(result: Compiled, packets: BusesLog) -> Found:
+def _look(result: CompiledRobot, packets: BusesLog) -> InspectionResult:
     """Read the servos on the robot's real ports and compare their registers with the file.
 
     Raises InputError when all buses are simulated.
     """
     from dxlrun.description.bus import SIMULATED
-    from dxlrun.dynamixel.tools.inspection import look
+    from dxlrun.dynamixel.tools.inspection import inspect_buses
 
     buses = [bus for bus in result.plan.buses if bus.port != SIMULATED]
     if not buses:
@@ -135,10 +135,10 @@ def _look(result: Compiled, packets: BusesLog) -> Found:
         )
     joints = result.plan.loop.joints
     moved = {servo: joints[joint] for joint, servo in result.plan.mechanics.own_servos(len(joints))}
-    return look(buses, packets.of(result.plan.buses), moved)
+    return inspect_buses(buses, packets.open_sinks(result.plan.buses), moved)
 
 
-def _as_json(result: Compiled, found: Found | None) -> dict[str, object]:
+def _as_json(result: CompiledRobot, found: InspectionResult | None) -> dict[str, object]:
     from msgspec import to_builtins
 
     report: dict[str, object] = to_builtins(result.report)
@@ -147,7 +147,7 @@ def _as_json(result: Compiled, found: Found | None) -> dict[str, object]:
     return report
 
 
-def _verdict(result: Compiled) -> str:
+def _verdict(result: CompiledRobot) -> str:
     """Return the line that a valid file gets: numbers of joints, controllers and warnings, and the rate."""
     loop, warnings = result.plan.loop, len(result.warnings)
     active = sum(controller.active for controller in loop.controllers)
@@ -159,9 +159,9 @@ def _verdict(result: Compiled) -> str:
     )
 
 
-def _tables(result: Compiled) -> Iterator[Table]:
+def _tables(result: CompiledRobot) -> Iterator[Table]:
     # Imported here because the help of the verb does not need it.
-    from dxlrun.compile.report import TableStage
+    from dxlrun.compile.check_report import TableStage
     from dxlrun.features import stages
 
     report = result.report
@@ -171,7 +171,7 @@ def _tables(result: Compiled) -> Iterator[Table]:
     if len(servos) > len(joints) or any(servo["ratio"] != 1.0 for servo in servos):
         yield _servos({(servo["bus"], servo["id"]): servo for servo in servos}.values())
     groups = ((name, ", ".join(joints)) for name, joints in report["groups"].items())
-    yield Table.of("Groups", (Column("group", "name"), Column("joints", "text")), groups)
+    yield Table.from_rows("Groups", (Column("group", "name"), Column("joints", "text")), groups)
     for feature, stage in stages(TableStage, result.plan.features):
         yield stage.table(report[feature.name])
     yield _controllers(report["controllers"], len(joints))
@@ -201,8 +201,8 @@ _MOTIONS: Columns[Row] = [
 
 
 def _joints(joints: Sequence[Row]) -> Table:
+    from dxlrun.compile.check_report import shown_properties
     from dxlrun.compile.joints.limits import degrees
-    from dxlrun.compile.report import shown_properties
 
     properties = shown_properties()
 
@@ -214,7 +214,7 @@ def _joints(joints: Sequence[Row]) -> Table:
     def own(text: str, source: str) -> str:
         return f"{text} (servo)" if source == "servo" and text != "none" else text
 
-    def measure(row: Row, one: JointProperty) -> str:
+    def format_property(row: Row, one: JointProperty) -> str:
         value = row[one.name]
         if value is None:
             return "none"
@@ -242,7 +242,7 @@ def _joints(joints: Sequence[Row]) -> Table:
             Column("reach", detail=True),
             lambda row: interval(row, "reach_lower", "reach_upper") if row["bounded"] else "continuous",
         ),
-        *[(Column(one.name), partial(measure, one=one)) for one in properties],
+        *[(Column(one.name), partial(format_property, one=one)) for one in properties],
         (Column("effort limit"), effort),
         (Column("motor file", "text", missing="none", detail=True), "motor"),
     ]
@@ -315,7 +315,7 @@ def _buses(buses: Sequence[Row], rate: float) -> Table:
     return Table.listing(title, columns, buses)
 
 
-def _compared(found: Found) -> str:
+def _compared(found: InspectionResult) -> str:
     """Return the line after a comparison with the servos: numbers of servos and differences."""
     differing = sum(row.found not in (None, row.declared) for row in found.registers)
     count = differing + len(found.deviations) + len(found.remarks)
@@ -337,7 +337,7 @@ def _registers(registers: Sequence[RegisterRow]) -> Table:
         (row.joint, row.item, row.area, row.address, row.declared, row.found, action[row.action])
         for row in registers
     ]
-    return Table.of("Registers", columns, rows)
+    return Table.from_rows("Registers", columns, rows)
 
 
 def _deviations(deviations: Sequence[DeviationRow]) -> Table:

@@ -5,13 +5,13 @@ from __future__ import annotations
 from typing import TYPE_CHECKING
 
 from dxlrun.cli.inputs import DebugFlag, JsonFlag
-from dxlrun.output.terminal import show, show_json
+from dxlrun.output.terminal import show_json, show_parts
 
 if TYPE_CHECKING:
     from collections.abc import Iterator, Mapping, Sequence
 
-    from dxlrun.output.table import Part, Tone
-    from dxlrun.run.doctor import Finding
+    from dxlrun.output.text_table import Part, Tone
+    from dxlrun.run.machine_checks import CheckResult
 
 _TONES: Mapping[str, Tone] = {"good": "good", "worse": "warning", "missing": "error"}
 
@@ -22,7 +22,7 @@ def doctor(*, as_json: JsonFlag = False, debug: DebugFlag = False) -> int:
     Nothing is changed. Each possible improvement is printed with the command for it. Exit code: 0, or 1 if
     something is missing without which no robot runs.
     """
-    from dxlrun.run.doctor import Machine, diagnose
+    from dxlrun.run.machine_checks import Machine, diagnose
 
     findings = diagnose(Machine.this())
     missing = sum(finding.state == "missing" for finding in findings)
@@ -30,17 +30,17 @@ def doctor(*, as_json: JsonFlag = False, debug: DebugFlag = False) -> int:
         wrong = [f"{one.what}: {one.why}; {one.fix}" for one in findings if one.state == "missing"]
         show_json({"checks": findings}, code=1 if missing else 0, errors=wrong)
     else:
-        show(*_findings(findings, missing))
+        show_parts(*_findings(findings, missing))
     return 1 if missing else 0
 
 
-def _findings(findings: Sequence[Finding], missing: int) -> Iterator[Part]:
+def _findings(findings: Sequence[CheckResult], missing: int) -> Iterator[Part]:
     """Yield the output of `doctor`: a table of all checks, then the fixes, then the verdict."""
-    from dxlrun.output.table import Cell, Column, Sentence, Table
+    from dxlrun.output.text_table import Cell, Column, Sentence, Table
 
     columns = (Column("", "name"), Column("", "name"), Column("", "text"))
     rows = ((one.what, Cell(one.state, _TONES[one.state]), one.found) for one in findings)
-    yield Table.of("", columns, rows)
+    yield Table.from_rows("", columns, rows)
     for one in findings:
         if one.fix:
             yield Sentence(f"{one.what}: {one.why}", _TONES[one.state])

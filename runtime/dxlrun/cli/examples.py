@@ -14,7 +14,7 @@ from typing import TYPE_CHECKING, Literal
 from dxlrun.cli.inputs import DebugFlag, JsonFlag, examples_directory
 from dxlrun.errors import InputError
 from dxlrun.output.target import make_folder_of, write_target
-from dxlrun.output.terminal import show, show_json
+from dxlrun.output.terminal import show_json, show_parts
 
 if TYPE_CHECKING:
     from dxlrun.description.motion import MotionDescription
@@ -76,7 +76,7 @@ def examples(
         show_json({"robot": copied[0], "files": copied})
         return 0
     motion = f" --play {directory / 'motions' / example.motions[0]}.yaml" if example.playable else ""
-    show(*copied, f"next: dxlrun {copied[0]}{motion}")
+    show_parts(*copied, f"next: dxlrun {copied[0]}{motion}")
     return 0
 
 
@@ -84,7 +84,7 @@ def _list(found: Sequence[Example], *, as_json: bool) -> None:
     if as_json:
         show_json(found)
         return
-    from dxlrun.output.table import Column, Table
+    from dxlrun.output.text_table import Column, Table
 
     columns = [
         Column("example", "name"),
@@ -93,8 +93,8 @@ def _list(found: Sequence[Example], *, as_json: bool) -> None:
         Column("about", "text"),
     ]
     rows = [(one.name, one.servos, ", ".join(one.motions), one.about) for one in found]
-    show(
-        Table.of("", columns, rows),
+    show_parts(
+        Table.from_rows("", columns, rows),
         f"`dxlrun examples NAME [DIR]` copies one and its motions into DIR, without it {_HERE}",
     )
 
@@ -223,7 +223,7 @@ def schema_text(kind: Literal["robot", "motion", "motor", "fragment"], *, only: 
         made = motor_schema()
     else:
         from dxlrun.control.controllers.offers import OfferStage
-        from dxlrun.control.controllers.plugins import load_plugins
+        from dxlrun.control.controllers.plugin_loading import load_plugins
         from dxlrun.features import FEATURES, stages
 
         # A controller whose class cannot be imported has no parameters to show.

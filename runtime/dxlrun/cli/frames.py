@@ -11,7 +11,7 @@ from cyclopts import Parameter
 
 from dxlrun.cli.inputs import Assignment, DebugFlag, GraphFile, JsonFlag, RobotPath, compiled, parse_pair
 from dxlrun.errors import InputError, counted
-from dxlrun.output.terminal import ascii_only, out, print_warning, show, show_json
+from dxlrun.output.terminal import ascii_only, out, print_warning, show_json, show_parts
 
 if TYPE_CHECKING:
     from dxlrun.description.frames.tree import Frame, FrameTree
@@ -73,7 +73,7 @@ def frames(
     for file in graph or ():
         _draw(result.plan, tree, file)
         if not as_json:
-            show(f"the tree is in {file}")
+            show_parts(f"the tree is in {file}")
     for warning in result.warnings:
         if not as_json and "URDF" in warning.what:
             print_warning(str(warning))
@@ -86,7 +86,7 @@ def _tree(plan: Plan, robot: Path) -> FrameTree:
 
     if plan.urdf is None or plan.frames is None:
         raise InputError(f"{robot} names no URDF, so there are no frames; write `model: {{urdf: NAME.urdf}}`")
-    return FrameTree.of(plan.urdf, plan.frames)
+    return FrameTree.from_urdf(plan.urdf, plan.frames)
 
 
 def _show_tree(plan: Plan, tree: FrameTree, *, as_json: bool) -> None:
@@ -100,7 +100,7 @@ def _show_tree(plan: Plan, tree: FrameTree, *, as_json: bool) -> None:
         if plan.frames is None or not plan.frames.rate
         else f"{plan.frames.rate:g} Hz in the log"
     )
-    show(
+    show_parts(
         f"{plan.robot}: {counted(len(tree.frames), 'frame', 'frames')}, {moving} of them "
         f"{'moves' if moving == 1 else 'move'}; {logged}",
         *_lines(plan, tree, _ASCII if ascii_only(out()) else _LINES),
@@ -195,7 +195,7 @@ def _show_pose(
             }
         )
     else:
-        show(f"{of} in {relative}", *_pose_lines(pose))
+        show_parts(f"{of} in {relative}", *_pose_lines(pose))
 
 
 def _pose_lines(pose: Transform) -> Iterator[str]:

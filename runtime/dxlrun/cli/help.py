@@ -30,7 +30,7 @@ def print_help() -> None:
     publishers = {distribution_name(each.publisher) for each in installed_plugins()}
     # Only then import the code of packages.
     if publishers - {"dxlrun"}:
-        from dxlrun.cli.verbs import packaged
+        from dxlrun.cli.verb_registry import packaged
 
         for command in packaged().values():
             if not re.search(rf"^{command.name} ", text, re.MULTILINE):
@@ -71,7 +71,7 @@ def version() -> str:
     """Return the version of dxlrun, followed by whether its compiled parts can be used."""
     from importlib import metadata  # not above: only --version needs it
 
-    from dxlrun.channels.compiled import missing
+    from dxlrun.channels.c_sources import missing
 
     why = missing()
     return f"{metadata.version('dxlrun')}, {f'but {why}' if why else 'with the compiled kernel'}"

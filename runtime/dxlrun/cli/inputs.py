@@ -11,14 +11,14 @@ from typing import TYPE_CHECKING, Annotated
 
 from cyclopts import Parameter
 
-from dxlrun.cli import verbs
+from dxlrun.cli import verb_registry
 from dxlrun.errors import DxlrunError, InputError, missing_extra, suggestion
 from dxlrun.output.target import check_target, write_target
 
 if TYPE_CHECKING:
     from cyclopts import Token
 
-    from dxlrun.compile.robot import Ask, Compiled
+    from dxlrun.compile.robot_compiler import Ask, CompiledRobot
     from dxlwire.bus_plan import BusPlan
     from dxlwire.packets import PacketSink
 
@@ -63,7 +63,7 @@ Assignment = Annotated[
 def _of(quantity: str) -> Parameter:
     """Return an option's parser for a quantity of `description.units`; a number without unit is SI."""
 
-    def read(_: object, tokens: Sequence[Token]) -> float:
+    def parse_token(_: object, tokens: Sequence[Token]) -> float:
         # Imported here because help and completion need no pydantic.
         from dxlrun.description import units
 
@@ -74,7 +74,7 @@ def _of(quantity: str) -> Parameter:
             raise ValueError(str(error)) from None
         return value
 
-    return Parameter(converter=read)
+    return Parameter(converter=parse_token)
 
 
 Seconds = Annotated[float, _of("seconds")]
@@ -94,7 +94,7 @@ def compiled(
     play: Sequence[Path],
     duration: float | None,
     ask: Ask | None = None,
-) -> Compiled:
+) -> CompiledRobot:
     """Read and compile a robot file with arguments and motion files; `duration` is that of the run, s.
 
     `ask`: function that reads the models of joints with `model: auto` from their servos. Raises InputError
@@ -113,7 +113,7 @@ def compiled(
             )
         duration_ns = round(duration * 1e9)
     # Imported here because a wrong argument needs neither numpy nor pydantic.
-    from dxlrun.compile.robot import compile_files
+    from dxlrun.compile.robot_compiler import compile_files
 
     return compile_files(robot, arguments, play, duration_ns, ask)
 
@@ -218,10 +218,10 @@ def known_file(robot: Path) -> None:
         raise InputError(f"{word} is a directory; give the robot file in it")
     if robot.suffix in (".yaml", ".yml") or len(robot.parts) > 1:
         raise InputError(f"there is no robot file {word}; {_other_file(robot)}")
-    if package := verbs.package_of(word):
+    if package := verb_registry.package_of(word):
         raise InputError(
             f"`dxlrun {word}` is a command of the package {package}, which cannot be imported here; "
-            f"`dxlrun plugins` may say why, and `pip install {verbs.source_of(package)}` "
+            f"`dxlrun plugins` may say why, and `pip install {verb_registry.source_of(package)}` "
             "in the source folder of dxlrun installs it"
         )
     if (named := robot.with_suffix(".yaml")).is_file():
@@ -229,7 +229,7 @@ def known_file(robot: Path) -> None:
     if is_example(robot.name):
         raise InputError(f"there is no file {word}; `dxlrun examples {word}` copies the robot of this name")
     otherwise = "a robot is run by `dxlrun ROBOT.yaml`, `dxlrun help` lists the commands"
-    hint = suggestion(word, verbs.names(), otherwise)
+    hint = suggestion(word, verb_registry.names(), otherwise)
     raise InputError(f"{word!r} is neither a command nor a robot file; {hint}")
 
 

@@ -12,15 +12,15 @@ from typing import TYPE_CHECKING, Any
 
 from dxlrun.cli.inputs import DebugFlag, JsonFlag
 from dxlrun.errors import DxlrunError, InputError
-from dxlrun.output.table import Column, Columns, Table, Value
 from dxlrun.output.target import make_folder_of, new_target
-from dxlrun.output.terminal import show, show_json
+from dxlrun.output.terminal import show_json, show_parts
+from dxlrun.output.text_table import Column, Columns, Table, Value
 
 if TYPE_CHECKING:
     from pydantic import BaseModel
 
     from dxlrun.control.controllers.offers import OfferStage
-    from dxlrun.control.controllers.plugins import LoadedPlugIn, Offer, PlugIns
+    from dxlrun.control.controllers.plugin_loading import LoadedPlugIn, Offer, PlugIns
     from dxlrun.features.feature import Feature
 
 _NAME = re.compile(r"[a-z][a-z0-9]*([-_][a-z0-9]+)*")
@@ -37,7 +37,7 @@ Row = dict[str, Any]
 
 def plugins(*, as_json: JsonFlag = False, debug: DebugFlag = False) -> int:
     """List the installed plug-ins: controllers, servo models, drivers and commands of each."""
-    from dxlrun.control.controllers.plugins import load_plugins
+    from dxlrun.control.controllers.plugin_loading import load_plugins
 
     found = load_plugins()
     rows = [_shown(one, found) for one in found.loaded]
@@ -45,7 +45,7 @@ def plugins(*, as_json: JsonFlag = False, debug: DebugFlag = False) -> int:
     if as_json:
         show_json(rows)
     else:
-        show(
+        show_parts(
             *(_table(row) for row in rows if not row["broken"]),
             *(f"broken: {row['broken']}" for row in rows if row["broken"]),
         )
@@ -182,7 +182,7 @@ def new_plugin(
     if as_json:
         show_json({"directory": str(place), "files": made})
         return 0
-    show(
+    show_parts(
         *made,
         f"next: cd {place} && pip install -e '.[test]' && python -m pytest",
     )

@@ -24,7 +24,7 @@ from dxlrun.cli.inputs import (
 )
 from dxlrun.errors import InputError, counted
 from dxlrun.output.target import check_target
-from dxlrun.output.terminal import out, print_error, print_warning, show
+from dxlrun.output.terminal import out, print_error, print_warning, show_parts
 from dxlrun.output.unblocked import leave_real_time, unblocked
 
 if TYPE_CHECKING:
@@ -160,13 +160,13 @@ def demo(*, page: PageFlag = True, virtual: Flag = False, debug: DebugFlag = Fal
 @contextmanager
 def _page_beside(*, shown: bool) -> Iterator[None]:
     """Start `dxlrun view` in another process for the next robot that starts; end it with the block."""
-    from dxlrun.cli.verbs import packaged
+    from dxlrun.cli.verb_registry import packaged
 
     if not shown:
         yield
         return
     if "view" not in packaged():
-        show("to see the robot in 3-D install dxlrun-view, the page of `dxlrun view`")
+        show_parts("to see the robot in 3-D install dxlrun-view, the page of `dxlrun view`")
         yield
         return
     # Imported here because the import takes 5 ms.
@@ -229,7 +229,7 @@ def show_summary(summary: RunSummary, plan: Plan, console: Console) -> int:
         lines.append(_log_line(Path(summary.log), summary.messages))
         lines += [f"next: dxlrun analyze {summary.log}"] * bool(summary.cycles)
         lines += _disk_lines(Path(summary.log), plan.recording)
-    show(*lines, console=console)
+    show_parts(*lines, console=console)
     return verdict.exit_code
 
 

@@ -8,7 +8,7 @@ from dxlrun.cli.app import build
 from dxlrun.cli.help import print_help
 from dxlrun.cli.inputs import known_file
 from dxlrun.errors import InputError
-from dxlrun.output.terminal import show
+from dxlrun.output.terminal import show_parts
 
 EXAMPLES = Path(__file__).with_name("examples.txt")
 """File with example command lines, one a line; a test parses them."""
@@ -34,5 +34,5 @@ def show_help(*verb: str) -> int:
     app.help_print(list(verb))
     words = ["dxlrun", *verb]
     examples = [line for line in EXAMPLES.read_text().splitlines() if line.split()[: len(words)] == words]
-    show(*["", "Examples", *examples] if examples else ())
+    show_parts(*["", "Examples", *examples] if examples else ())
     return 0

@@ -9,10 +9,10 @@ from functools import reduce
 from msgspec.structs import replace
 
 from dxlrun.compile.contribution import Contribution
+from dxlrun.compile.joints.compiled_joints import CompiledJoint, moving_servos
+from dxlrun.compile.joints.compiled_servos import CompiledServo, SettingsStage
 from dxlrun.compile.joints.described_servos import described_servos, first_joints, used_features
-from dxlrun.compile.joints.joints import CompiledJoint, moving_servos
 from dxlrun.compile.joints.limits import Interval, limits_of
-from dxlrun.compile.joints.servos import CompiledServo, SettingsStage
 from dxlrun.compile.problems import RobotFile
 from dxlrun.description.bus import HIGHEST_BAUD_RATE, SIMULATED
 from dxlrun.description.reading import Description

@@ -7,14 +7,14 @@ from typing import ClassVar
 
 import msgspec
 
-from dxlrun.compile.joints.joints import CompiledJoint
-from dxlrun.compile.joints.urdf import CompiledUrdf
+from dxlrun.compile.joints.compiled_joints import CompiledJoint
+from dxlrun.compile.joints.compiled_urdf import CompiledUrdf
 from dxlrun.compile.problems import RobotFile
-from dxlrun.control.controllers.plugins import PlugIns
+from dxlrun.control.controllers.plugin_loading import PlugIns
 from dxlrun.plan.loop_plan import ControllerPlan, SourcePlan
 from dxlrun.plan.mechanics_plan import MechanicsPlan
 from dxlrun.plan.recording_plan import RecordingPlan
-from dxlsim.simulation_plan import Shown
+from dxlsim.simulation_plan import DeviceReadings
 from dxlwire.bus_plan import DevicePlan
 from dxlwire.control_table.device_table import DeviceTable
 
@@ -37,7 +37,7 @@ class BusDevice(msgspec.Struct, frozen=True):
     bus: str
     plan: DevicePlan
     table: DeviceTable
-    simulated: Shown
+    simulated: DeviceReadings
     """States that the device has if its bus is simulated."""
 
 

@@ -15,13 +15,13 @@ import msgspec
 from msgspec.structs import replace
 from pydantic import ValidationError
 
-from dxlrun.compile.graph import Mistake
+from dxlrun.compile.controller_graph import Mistake
 from dxlrun.control.controllers.offers import Breach
-from dxlrun.control.controllers.plugins import Offer, PlugIns, interfaces_breach, mismatches
+from dxlrun.control.controllers.plugin_loading import Offer, PlugIns, interfaces_breach, mismatches
 from dxlrun.control.controllers.single_files import is_of_file
+from dxlrun.description.base_form import ParametersModel
 from dxlrun.description.document import KeyPath
-from dxlrun.description.form import ParametersModel
-from dxlrun.description.mistakes.foreign import ros_type
+from dxlrun.description.mistakes.foreign_files import ros_type
 from dxlrun.description.robot import ControllerEntry
 from dxlrun.errors import suggestion
 from dxlrun.plan.loop_plan import ControllerPlan, JointPlan

@@ -18,19 +18,19 @@ from dxlrun.compile.controller_entry import (
     plan_entry,
     require_fit,
 )
-from dxlrun.compile.graph import ControllerGraph
-from dxlrun.compile.joints.joints import CompiledJoint
+from dxlrun.compile.controller_graph import ControllerGraph
+from dxlrun.compile.joints.compiled_joints import CompiledJoint
 from dxlrun.compile.joints.limits import report_speed
 from dxlrun.compile.problems import RobotFile, into_mark, joint_mark
 from dxlrun.contract.controller import SpeedPeak
 from dxlrun.control.controllers.claims import claimed_modes, start_modes
-from dxlrun.control.controllers.graph import below, rate_divider, rate_fits
-from dxlrun.control.controllers.plugins import Offer, PlugIns
+from dxlrun.control.controllers.plugin_loading import Offer, PlugIns
 from dxlrun.control.controllers.single_files import file_of, is_of_file
+from dxlrun.control.controllers.update_order import below, rate_divider, rate_fits
+from dxlrun.description.base_form import ParametersModel, PlugInEntry
 from dxlrun.description.document import KeyPath, read_file
-from dxlrun.description.form import ParametersModel, PlugInEntry
-from dxlrun.description.mistakes.foreign import ros_type
-from dxlrun.description.problems import errors_between_keys, problems_of
+from dxlrun.description.form_problems import errors_between_keys, problems_of
+from dxlrun.description.mistakes.foreign_files import ros_type
 from dxlrun.description.reading import Description
 from dxlrun.errors import Mark
 from dxlrun.plan.loop_plan import ControllerPlan
@@ -107,11 +107,13 @@ def _compiled(file: RobotFile, plan: ControllerPlan, plugins: PlugIns) -> Compil
         return None
     wrapping = {joint for joint, described in robot.joints.items() if described.wrap}
 
-    def make() -> CompiledController:
+    def make_compiled() -> CompiledController:
         groups = file.description.groups
         return compile_entry(plan, offer, tuple(robot.joints), wrapping=wrapping, groups=groups)
 
-    found = report_entry(file, "controller", name, robot.controllers[name], offer.controller.Parameters, make)
+    found = report_entry(
+        file, "controller", name, robot.controllers[name], offer.controller.Parameters, make_compiled
+    )
     buses = {f"/bus/{bus}" for bus in robot.buses}
     if found is not None and (taken := buses.intersection(found.plan.topics)):
         mark = file.key("controllers", name)
@@ -179,7 +181,7 @@ def _check_graph(
     named = {*(plan.name for plan in plans), *(name for each in contributions for name in each.names)}
     by_name = {plan.name: plan for plan in plans}
     graph = ControllerGraph(tuple(file.robot.joints), plans, sources, frozenset(named - known))
-    for mistake in graph.mistakes():
+    for mistake in graph.find_mistakes():
         file.error(_graph_mark(file.description, by_name, mistake.at), mistake.what, mistake.fix)
     for mistake in graph.warnings():
         file.warning(_graph_mark(file.description, by_name, mistake.at), mistake.what, mistake.fix)
@@ -294,10 +296,11 @@ def compile_modes(
     """
     able = {name: joint.modes for name, joint in joints.items()}
     for name, joint in joints.items():
-        if joint.plan.rest not in able[name]:
+        if joint.plan.rest_mode not in able[name]:
             file.error(
                 file.at("joints", name, "continuous"),
-                f"{joint.table.model} of {name} {LACKS[joint.plan.rest]}, so {name} cannot be continuous",
+                f"{joint.table.model} of {name} {LACKS[joint.plan.rest_mode]}, "
+                f"so {name} cannot be continuous",
                 "remove `continuous`, or use another model",
             )
     for name, controller in controllers.items():

@@ -9,10 +9,10 @@ from pathlib import Path
 from pydantic import ValidationError
 
 from dxlrun.compile.controller_entry import WrongEntry, compile_entry, require_fit
-from dxlrun.compile.robot import Compiled, compile_robot
-from dxlrun.control.controllers.plugins import PlugIns
+from dxlrun.compile.robot_compiler import CompiledRobot, compile_robot
+from dxlrun.control.controllers.plugin_loading import PlugIns
 from dxlrun.description.document import confined
-from dxlrun.description.problems import sentences_of
+from dxlrun.description.form_problems import sentences_of
 from dxlrun.description.reading import read_robot
 from dxlrun.errors import InputError
 from dxlrun.plan.loop_plan import ControllerPlan, JointPlan
@@ -20,7 +20,7 @@ from dxlrun.plan.loop_plan import ControllerPlan, JointPlan
 _MOST_SENTENCES = 20
 
 
-def compile_texts(files: Mapping[str, str], arguments: Mapping[str, str], urdf: str | None) -> Compiled:
+def compile_texts(files: Mapping[str, str], arguments: Mapping[str, str], urdf: str | None) -> CompiledRobot:
     """Compile a robot from the texts of its files, written into a temporary directory.
 
     Args:

@@ -24,22 +24,22 @@ from msgspec import structs
 from pydantic import ValidationError
 
 from dxlrun.compile.controller_entry import CompiledController
-from dxlrun.compile.joints.joints import CompiledJoint
+from dxlrun.compile.joints.compiled_joints import CompiledJoint
 from dxlrun.compile.joints.limits import check_samples
-from dxlrun.compile.problems import Problems
-from dxlrun.compile.samples import (
+from dxlrun.compile.motion_samples import (
     QUANTITIES,
+    MotionSample,
     Quantity,
-    Sample,
     SampledTarget,
     formula_samples,
     formula_texts,
     listed_samples,
 )
+from dxlrun.compile.problems import Problems
 from dxlrun.contract.controller import Controller, SpeedPeak
 from dxlrun.description.document import refusal
+from dxlrun.description.form_problems import sentences_of
 from dxlrun.description.motion import FormulaPart, MotionDescription, PointsPart
-from dxlrun.description.problems import sentences_of
 from dxlrun.errors import InputError, Mark, suggestion
 from dxlrun.plan.loop_plan import SETTLE_NS, JointPlan, ScheduledCommand, ScheduledGoal
 from dxlrun.plan.robot_plan import MotionPart
@@ -169,7 +169,7 @@ def affordable(motion: MotionDescription, problems: Problems) -> bool:
     return good
 
 
-def samples_of(motion: MotionDescription, index: int, problems: Problems) -> tuple[Sample, ...]:
+def samples_of(motion: MotionDescription, index: int, problems: Problems) -> tuple[MotionSample, ...]:
     """Return the samples of one part of a motion, from its points or from its formulas."""
     part = motion.motion.motions[index]
     if isinstance(part, PointsPart):
@@ -207,7 +207,7 @@ def playable(
     controller: CompiledController | None,
     joints: Mapping[str, JointPlan],
     problems: Problems,
-) -> tuple[str, tuple[Sample, ...]]:
+) -> tuple[str, tuple[MotionSample, ...]]:
     """Return the name of the command that plays a part, and the part's samples; empty if it has mistakes."""
     samples = samples_of(motion, index, problems)
     if controller is None or not _names_own_joints(motion, index, controller, problems):
@@ -282,7 +282,7 @@ def _settle_ns(controller: CompiledController, joints: Mapping[str, JointPlan]) 
 
 
 def warn_of_turns(
-    samples: Sequence[Sample],
+    samples: Sequence[MotionSample],
     joints: Mapping[str, JointPlan],
     wrap: Collection[str],
     problems: Problems,
@@ -313,7 +313,7 @@ def warn_of_turns(
             )
 
 
-def warn_of_last_velocities(samples: Sequence[Sample], problems: Problems) -> None:
+def warn_of_last_velocities(samples: Sequence[MotionSample], problems: Problems) -> None:
     """Warn of joints with a velocity but no position whose last velocity is not 0."""
     last: dict[str, SampledTarget] = {}
     for sample in samples:
@@ -327,7 +327,7 @@ def warn_of_last_velocities(samples: Sequence[Sample], problems: Problems) -> No
             )
 
 
-def last_positions(joints: Sequence[str], samples: Sequence[Sample]) -> tuple[float | None, ...]:
+def last_positions(joints: Sequence[str], samples: Sequence[MotionSample]) -> tuple[float | None, ...]:
     """Return the last position of each joint, rad or m; None for a joint that only has velocities."""
     held: dict[str, float] = {}
     for sample in samples:
@@ -337,7 +337,7 @@ def last_positions(joints: Sequence[str], samples: Sequence[Sample]) -> tuple[fl
     return tuple(held.get(joint) for joint in joints)
 
 
-def last_arrival_ns(samples: Sequence[Sample], joints: Mapping[str, JointPlan]) -> int:
+def last_arrival_ns(samples: Sequence[MotionSample], joints: Mapping[str, JointPlan]) -> int:
     """Return when the joints reach their last positions at the earliest, ns since the part's start.
 
     A joint moves to a position at the speed commanded with it, else at its highest speed.
@@ -359,7 +359,7 @@ def last_arrival_ns(samples: Sequence[Sample], joints: Mapping[str, JointPlan]) 
 
 
 def commands_of(
-    controller: CompiledController, kind: str, samples: tuple[Sample, ...], start_ns: int, lead_ns: int
+    controller: CompiledController, kind: str, samples: tuple[MotionSample, ...], start_ns: int, lead_ns: int
 ) -> tuple[ScheduledCommand, ...]:
     """Return a part's commands with their times: one trajectory, or one command per sample for a group."""
     joints = controller.plan.joints
@@ -369,7 +369,7 @@ def commands_of(
     commands: list[ScheduledCommand] = []
     held = samples[0]
     for sample in samples:
-        held = Sample(sample.t_ns, {**held.targets, **sample.targets}, sample.mark)
+        held = MotionSample(sample.t_ns, {**held.targets, **sample.targets}, sample.mark)
         payload = group_command(controller.offer.controller, kind, joints, held)
         commands.append(prepared(controller, kind, payload, start_ns + sample.t_ns, sample.mark))
     return tuple(commands)
@@ -429,7 +429,7 @@ def command_kind(controller: type[Controller[Any]]) -> str | None:
 
 
 def group_command(
-    controller: type[Controller[Any]], kind: str, joints: Sequence[str], sample: Sample
+    controller: type[Controller[Any]], kind: str, joints: Sequence[str], sample: MotionSample
 ) -> dict[str, object]:
     """Return the fields of a group command for one sample, with one value per joint.
 
@@ -440,7 +440,7 @@ def group_command(
     quantities = [quantity for quantity, name in _FIELDS.items() if name in fields]
     for joint, target in sample.targets.items():
         for quantity in _FIELDS:
-            if quantity not in quantities and target.get(quantity) is not None:
+            if quantity not in quantities and target.value_of(quantity) is not None:
                 raise refusal(
                     target.mark,
                     f"{joint} has a target {quantity}, which this controller does not take",
@@ -451,12 +451,16 @@ def group_command(
     }
 
 
-def trajectory_command(joints: Sequence[str], samples: Sequence[Sample], lead_ns: int) -> dict[str, object]:
+def trajectory_command(
+    joints: Sequence[str], samples: Sequence[MotionSample], lead_ns: int
+) -> dict[str, object]:
     """Return the fields of a trajectory command through all samples; raise InputError for a missing value."""
     quantities: list[Quantity] = ["position"]
     derivatives: tuple[Quantity, ...] = ("velocity", "acceleration")
     for quantity in derivatives:
-        if any(target.get(quantity) is not None for sample in samples for target in sample.targets.values()):
+        if any(
+            target.value_of(quantity) is not None for sample in samples for target in sample.targets.values()
+        ):
             quantities.append(quantity)
     points: list[dict[str, object]] = [
         {
@@ -471,10 +475,10 @@ def trajectory_command(joints: Sequence[str], samples: Sequence[Sample], lead_ns
     return {"points": points, "start_in": lead_ns * 1e-9}
 
 
-def _value(sample: Sample, joint: str, quantity: Quantity) -> float:
+def _value(sample: MotionSample, joint: str, quantity: Quantity) -> float:
     """Return one joint's target value in a sample; raise InputError if it is missing."""
     target = sample.targets.get(joint)
-    value = None if target is None else target.get(quantity)
+    value = None if target is None else target.value_of(quantity)
     if value is None:
         raise refusal(
             sample.mark if target is None else target.mark,

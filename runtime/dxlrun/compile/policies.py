@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 from collections.abc import Iterable, Mapping, Sequence
 
-from dxlrun.compile.joints.joints import CompiledJoint
+from dxlrun.compile.joints.compiled_joints import CompiledJoint
 from dxlrun.compile.joints.limits import Interval, degrees, limits_of
 from dxlrun.compile.problems import RobotFile
 from dxlrun.description.document import KeyPath
@@ -18,7 +18,7 @@ from dxlrun.plan.policy_plan import (
     Last,
     Policy,
     PolicyPlan,
-    Step,
+    PolicyStepPlan,
     longest_pose_ns,
 )
 from dxlwire.bus_plan import BusPlan
@@ -42,7 +42,7 @@ def compile_policies(
     robot = file.robot
     limit_ns = robot.policies.exit_timeout - _reserve_ns(buses, robot.loop.rate)
     written = {"on_exit": robot.policies.on_exit, "on_fault": robot.policies.on_fault}
-    written |= {each.name: each.of(robot.policies) for each in keys}
+    written |= {each.name: each.value_of(robot.policies) for each in keys}
     found: dict[str, Policy] = {}
     for name, steps in written.items():
         found[name] = _policy(file, name, steps, joints)
@@ -81,7 +81,7 @@ def _policy(
     if isinstance(written, str):
         return HOLD if written == "hold" else LIMP
     last: Last = "limp"
-    steps: list[Step] = []
+    steps: list[PolicyStepPlan] = []
     for index, step in enumerate(written):
         if isinstance(step, str):
             last = "hold" if step == "hold" else "limp"
@@ -108,7 +108,9 @@ def _policy(
     return Policy(tuple(steps), last)
 
 
-def _pose(step: PoseStep, positions: Mapping[str, float], joints: Mapping[str, CompiledJoint]) -> Step:
+def _pose(
+    step: PoseStep, positions: Mapping[str, float], joints: Mapping[str, CompiledJoint]
+) -> PolicyStepPlan:
     longest = 0
     for name, position in positions.items():
         if name in joints:
@@ -119,7 +121,7 @@ def _pose(step: PoseStep, positions: Mapping[str, float], joints: Mapping[str, C
             way = max(plan.upper - position, position - plan.lower)
             ramps = (math.inf, 0.0) if plan.acceleration is None else (plan.acceleration, plan.highest_speed)
             longest = max(longest, longest_pose_ns(way, speed, *ramps, plan.slow_speed))
-    return Step(
+    return PolicyStepPlan(
         text=f"pose {step.pose} at {degrees(step.speed)} deg/s",
         longest_ns=longest,
         targets=tuple(float(positions[name]) if name in positions else None for name in joints),
@@ -128,9 +130,9 @@ def _pose(step: PoseStep, positions: Mapping[str, float], joints: Mapping[str, C
     )
 
 
-def _less_torque(step: TorqueStep) -> Step:
+def _less_torque(step: TorqueStep) -> PolicyStepPlan:
     text = f"torque down to {step.reduce_torque:.0%} in {step.steps} steps over {step.over * 1e-9:g} s"
-    return Step(text=text, longest_ns=step.over, fraction=step.reduce_torque, levels=step.steps)
+    return PolicyStepPlan(text=text, longest_ns=step.over, fraction=step.reduce_torque, levels=step.steps)
 
 
 def _check_torque(file: RobotFile, name: str, steps: WrittenPolicy, buses: Sequence[BusPlan]) -> None:

@@ -49,7 +49,7 @@ class Problems:
         found = told_once((one for one in self._found if one.severity == severity), self._joints)
         return tuple(sorted(found, key=lambda problem: problem.mark))
 
-    def refuse(self) -> None:
+    def raise_errors(self) -> None:
         """Raise InputError with all errors and warnings if there is at least one error."""
         if self.errors:
             raise InputError(self.errors + self.warnings)

@@ -11,11 +11,11 @@ from collections.abc import Iterable, Mapping, Sequence
 from typing import TYPE_CHECKING
 
 from dxlrun.compile.contribution import BusDevice
-from dxlrun.compile.joints.joints import CompiledJoint
+from dxlrun.compile.joints.compiled_joints import CompiledJoint
+from dxlrun.compile.joints.compiled_urdf import TYPES
 from dxlrun.compile.joints.motors import Motors
-from dxlrun.compile.joints.urdf import TYPES
 from dxlrun.compile.problems import RobotFile
-from dxlrun.control.source_process import planned_processes
+from dxlrun.control.sampled_sources import planned_processes
 from dxlrun.description.bus import SIMULATED, Bus
 from dxlrun.errors import InputError
 from dxlrun.plan.robot_plan import Plan, SimulationPlan

@@ -13,8 +13,8 @@ from numpy.typing import NDArray
 from pydantic import BaseModel, ConfigDict
 
 from dxlrun.channels.cycle import Commands, Floats, States
-from dxlrun.description.form import ParametersModel
-from dxlrun.description.joints.servo import ServoModel
+from dxlrun.description.base_form import ParametersModel
+from dxlrun.description.joints.servo_model import ServoModel
 from dxlrun.errors import ControllerFault
 from dxlsim.motor_model import MotorModel
 from dxlwire.joint_unit import JointUnit

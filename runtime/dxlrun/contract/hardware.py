@@ -33,10 +33,10 @@ class Hardware(Protocol):
         """
         ...
 
-    def read(self) -> None:
+    def read_states(self) -> None:
         """Read the states. A lost packet makes its row invalid and does not raise."""
 
-    def write(self) -> None:
+    def write_goals(self) -> None:
         """Send the goals."""
 
     def set_modes(self, modes: NDArray[np.uint8]) -> None:
@@ -50,7 +50,9 @@ class Hardware(Protocol):
             modes: Mode of each joint (`dxlwire.modes.Mode`), shape (joints,); UNKNOWN: no change.
         """
 
-    def set_register(self, row: int, item: str, value: int, done: Callable[[str, int | None], None]) -> None:
+    def write_register(
+        self, row: int, item: str, value: int, done: Callable[[str, int | None], None]
+    ) -> None:
         """Write a RAM item of a joint's servo in idle time, and read it back. Returns at once.
 
         The value is written again if the servo is reset.
@@ -89,7 +91,7 @@ class Hardware(Protocol):
         They do not get goals before this call. The loop has set their goals to the measured positions.
         """
 
-    def reboot(self, row: int, done: Callable[[str], None]) -> None:
+    def reboot_servo(self, row: int, done: Callable[[str], None]) -> None:
         """Reboot a joint's servo in idle time. `done` is called after it has recovered or after a timeout."""
 
     def limit_torque(self, fraction: float) -> None:
@@ -106,5 +108,5 @@ class Hardware(Protocol):
     def stop(self) -> tuple[str, ...]:
         """Disable torque on all servos and read it back; return a sentence for each failure. Never raises."""
 
-    def release(self) -> None:
+    def leave_torque_on(self) -> None:
         """Leave the robot holding with torque on, instead of `stop`. Nothing is sent after this call."""

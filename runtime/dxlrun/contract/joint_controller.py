@@ -11,7 +11,7 @@ from pydantic.errors import PydanticUserError
 
 from dxlrun.channels.cycle import Floats
 from dxlrun.contract.controller import LIVE, Context, Controller, Interfaces
-from dxlrun.description.form import ParametersModel
+from dxlrun.description.base_form import ParametersModel
 from dxlrun.errors import ControllerFault, counted
 from dxlwire.modes import CommandName
 
@@ -140,11 +140,11 @@ class JointController(Controller[JointParameters]):
     def on_activate(self, time_ns: int) -> None:
         """Reset the time, and begin if all inputs are known."""
         self._began_ns = -1
-        self._begin(time_ns)
+        self._begin_when_known(time_ns)
 
     def update(self, time_ns: int, period_ns: int) -> None:
         """Command the values of its methods. Raises ControllerFault unless they are one number a joint."""
-        if self._began_ns < 0 and not self._begin(time_ns):
+        if self._began_ns < 0 and not self._begin_when_known(time_ns):
             return  # without commands, the joints hold
         time, dt = (time_ns - self._began_ns) * 1e-9, period_ns * 1e-9
         for name, law, command in self._laws:
@@ -155,7 +155,7 @@ class JointController(Controller[JointParameters]):
             command[:] = values
         self._first = False
 
-    def _begin(self, time_ns: int) -> bool:
+    def _begin_when_known(self, time_ns: int) -> bool:
         """Begin if the positions of its joints and all readings are known; return whether it has begun."""
         sent, measured = self.context.goals.position, self.context.states.position
         self.start = np.where(np.isnan(sent), measured, sent)
@@ -189,10 +189,10 @@ def _shown(name: str, place: int | None) -> property:
     def value(self: JointController) -> object:
         return getattr(self.parameters, name) if place is None else float(self.context.reads[place])
 
-    def refuse(self: JointController, value: object) -> None:
+    def refuse_assignment(self: JointController, value: object) -> None:
         raise AttributeError(f"{name} is a parameter; only the robot file and clients change it")
 
-    return property(value, refuse)
+    return property(value, refuse_assignment)
 
 
 def _fields(cls: type[JointController]) -> Iterator[tuple[str, tuple[Any, Any]]]:

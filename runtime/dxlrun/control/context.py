@@ -9,7 +9,7 @@ import msgspec
 
 from dxlrun.channels.commands import CommandSink, Inbox, NoCommands, NoInbox
 from dxlrun.channels.cycle import CycleRecord
-from dxlrun.channels.events import EventSink
+from dxlrun.channels.event_records import EventSink
 from dxlrun.contract.hardware import Hardware
 from dxlrun.control.schedule import Schedule, schedule_of
 from dxlrun.plan.loop_plan import LoopPlan

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dxlrun.control.realtime import Grant, Pacing
+from dxlrun.control.realtime_grants import Grant, Pacing
 from dxlrun.control.schedule import Schedule
 from dxlwire.clock import Clock, MonotonicClock
 
@@ -30,20 +30,20 @@ class Deadlines:
         Args:
             most_ns: Longest time, as `SchedulerPlan.polling_ns`; None: a share of the period.
         """
-        return Pacing(self._machine, most_ns).measure(self._schedule.period_ns, lambda: None)
+        return Pacing(self._machine, most_ns).measure_margin(self._schedule.period_ns, lambda: None)
 
     @property
     def margin_ns(self) -> int:
         """Time before a deadline for which the clock is polled instead of sleeping, ns."""
         return self._machine.spin_ns
 
-    def wait(self) -> tuple[int, int]:
+    def wait_for_deadline(self) -> tuple[int, int]:
         """Wait until the next deadline; return that deadline and the wake-up time, ns of the clock."""
         schedule, clock = self._schedule, self._clock
         if self._started:
-            schedule.advance(schedule.following(clock.now_ns(), "skip"))
+            schedule.advance_to_cycle(schedule.following(clock.now_ns(), "skip"))
         else:
-            schedule.start(clock.now_ns())
+            schedule.start_at(clock.now_ns())
             self._started = True
         deadline_ns = schedule.due_ns
         return deadline_ns, clock.wait_until(deadline_ns)

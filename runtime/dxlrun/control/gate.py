@@ -17,7 +17,7 @@ from msgspec.structs import replace
 from numpy.typing import NDArray
 
 from dxlrun.channels.cycle import Clamp, CycleRecord, Floats
-from dxlrun.channels.events import EventSink
+from dxlrun.channels.event_records import EventSink
 from dxlrun.control import texts
 from dxlrun.plan.loop_plan import JointPlan, LimitedInterface, LoopPlan, ServoLimit
 from dxlrun.plan.policy_plan import SLOW_SPEED, SLOW_START_NS
@@ -61,7 +61,7 @@ _NEUTRAL = {Mode.VELOCITY: "velocity", Mode.EFFORT: "effort", Mode.PWM: "pwm"}
 
 
 @dataclass(slots=True)
-class _Clamped:
+class _ReportedClamp:
     """A clamp of one joint whose begin was reported in an event and whose end was not."""
 
     what: str
@@ -123,7 +123,7 @@ class Gate:
         self.counts: NDArray[np.int64] = self._joints["counts"]
         self._begun, self._before = np.zeros((2, count), dtype=np.uint8)
         self._now_ns = 0  # Sum of the times between cycles
-        self._clamps: dict[tuple[Clamp, int], _Clamped] = {}
+        self._clamps: dict[tuple[Clamp, int], _ReportedClamp] = {}
         """Clamps whose begin was reported and whose end was not, by clamp bit and row of the joint."""
         states, commands, goals = record.states, record.commands, record.goals
         self._gate = STRUCTS["Gate"](
@@ -167,12 +167,12 @@ class Gate:
             text = texts.servo_limits_tighter_than_file if warns else texts.servo_limits_found
             described = "; ".join(joint.describe_servo_limit(own) for own in binding)
             event = text(joint.label, described) if binding else texts.servo_limits_gone(joint.label)
-            self._events.emit(joint.name, event, msgspec.json.encode(joint.servo_limits))
+            self._events.emit_event(joint.name, event, msgspec.json.encode(joint.servo_limits))
         self._limited = tuple(joints)
         for name, values in _speeds_and_efforts(joints).items():
             self._joints[name] = values
 
-    def begin(self) -> None:
+    def initialize_goals(self) -> None:
         """Take over the modes and goals in the record as the starting point, before the first cycle.
 
         The goals must match the modes and be at rest.
@@ -230,7 +230,7 @@ class Gate:
         """
         self._joints["slow_ns"][slice(None) if rows is None else list(rows)] = SLOW_START_NS
 
-    def apply(self, dt_ns: int) -> None:
+    def move_goals(self, dt_ns: int) -> None:
         """Move the goals in the record toward the commands, within all limits, and report clamps.
 
         Called each cycle.
@@ -244,7 +244,7 @@ class Gate:
         if self._clamps:
             self._report_ended()
         if self._sources.commands.size:
-            self._sources.apply()
+            self._sources.clamp_commands()
 
     def _report_begun(self) -> None:
         for bit, what in _WHAT.items():
@@ -256,8 +256,8 @@ class Gate:
                 owner = "" if bit is Clamp.NOT_FINITE else self._owner(name)
                 own = self._limited[row].find_servo_limit(_LIMITED[bit]) if bit in _LIMITED else None
                 what_by = f"clamped by register {own.text}" if own else what
-                self._clamps[bit, row] = _Clamped(what_by, self._now_ns, self._now_ns)
-                self._events.emit(name, texts.goal_clamped(name, owner, what_by))
+                self._clamps[bit, row] = _ReportedClamp(what_by, self._now_ns, self._now_ns)
+                self._events.emit_event(name, texts.goal_clamped(name, owner, what_by))
 
     def _report_ended(self) -> None:
         for (bit, row), clamped in tuple(self._clamps.items()):
@@ -266,7 +266,7 @@ class Gate:
             elif self._now_ns - clamped.last_ns >= CLAMP_ENDS_NS:
                 del self._clamps[bit, row]
                 name, lasted_ns = self._plan.joints[row].name, clamped.last_ns - clamped.begun_ns
-                self._events.emit(name, texts.clamp_ended(name, clamped.what, lasted_ns))
+                self._events.emit_event(name, texts.clamp_ended(name, clamped.what, lasted_ns))
 
     def _owner(self, joint: str) -> str:
         """Return text that names the active controller that commands a joint, and those above it."""
@@ -332,7 +332,7 @@ class SourceGate:
         self._held = np.zeros(len(ranges), dtype=np.bool_)
         """Mask of the commands that are at an end of their range because they were clamped."""
 
-    def apply(self) -> None:
+    def clamp_commands(self) -> None:
         """Clamp the source commands in the record to their ranges.
 
         An event reports the begin of each clamp.
@@ -345,7 +345,7 @@ class SourceGate:
                 source, name = self._names[index]
                 value, lowest, highest = commands[index], self._lowest[index], self._highest[index]
                 event = texts.source_command_clamped(source.label, name, value, lowest, highest)
-                self._events.emit(source.name, event)
+                self._events.emit_event(source.name, event)
             np.copyto(commands, np.clip(commands, self._lowest, self._highest), where=outside)
         # The clamped value stays in the array until the next command, so it still counts as clamped.
         np.logical_or(outside, held & at_end, out=held)

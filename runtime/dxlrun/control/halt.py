@@ -6,7 +6,7 @@ from collections.abc import Callable, Mapping
 
 import numpy as np
 
-from dxlrun.channels.answers import Answer, Code, Done, Halted, Refusal, Waiting
+from dxlrun.channels.answers import Acceptance, Answer, Code, Completion, Halted, Refusal
 from dxlrun.channels.cycle import LIMP, OFFLINE
 from dxlrun.control.context import ControlContext
 from dxlrun.control.controllers.switching import Switching
@@ -56,10 +56,10 @@ class Halt:
         self._began_ns = self._still_ns = 0
         self._before = b""
 
-    def halt_joints(self, number: int) -> Refusal | Waiting:
+    def halt_joints(self, number: int) -> Refusal | Acceptance:
         """Deactivate all controllers that command joints, and watch until the joints are at rest.
 
-        Returns `Waiting`, or the refusal.
+        Returns `Acceptance`, or the refusal.
         """
         refusal = self._switching.switch_controllers((), self._switching.commanding(self._joints))
         if isinstance(refusal, Refusal):
@@ -67,10 +67,10 @@ class Halt:
         self.waiting.append(number)
         self._began_ns = self._still_ns = self._record.woken_ns
         self._before = b""
-        self.watch()
-        return Waiting(())
+        self.check_rest()
+        return Acceptance(())
 
-    def watch(self) -> None:
+    def check_rest(self) -> None:
         """Check if all joints are at rest, and answer the waiting commands when they are or at the timeout.
 
         Called after a read while commands wait. Rest must last STILL_NS.
@@ -92,10 +92,10 @@ class Halt:
         row = int(np.argmax(speed / self._still))
         measured = Halted((now_ns - self._began_ns) * 1e-9, self._joints[row], float(speed[row]))
         if now_ns - self._still_ns >= STILL_NS:
-            self._end(Done(record.cycle, halted=measured))
+            self._answer_waiting(Completion(record.cycle, halted=measured))
         elif now_ns - self._began_ns >= HALT_NS:
             late = tuple(self._joints[index] for index in np.flatnonzero(count & ~ready).tolist())
-            self._end(
+            self._answer_waiting(
                 Refusal(
                     Code.STILL_MOVING,
                     {
@@ -106,11 +106,11 @@ class Halt:
                 )
             )
 
-    def end(self) -> None:
+    def refuse_waiting(self) -> None:
         """Refuse the waiting `halt` commands because the run ends."""
-        self._end(Refusal(Code.RUN_ENDING))
+        self._answer_waiting(Refusal(Code.RUN_ENDING))
 
-    def _end(self, answer: Answer) -> None:
+    def _answer_waiting(self, answer: Answer) -> None:
         for number in self.waiting:
             self._answer(number, answer)
         self.waiting.clear()

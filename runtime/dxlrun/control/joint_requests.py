@@ -11,7 +11,7 @@ from functools import partial
 
 import msgspec
 
-from dxlrun.channels.answers import Answer, Code, Done, Refusal, Waiting
+from dxlrun.channels.answers import Acceptance, Answer, Code, Completion, Refusal
 from dxlrun.channels.cycle import LIMP, OFFLINE, Torque
 from dxlrun.channels.loop_requests import RebootRequest, Register, RegisterReading, TorqueRequest
 from dxlrun.control import texts
@@ -19,7 +19,7 @@ from dxlrun.control.context import ControlContext
 from dxlrun.control.controllers.switching import Switching
 
 
-class _Pending(msgspec.Struct):
+class _PendingRequest(msgspec.Struct):
     """A torque or reboot request that waits for the results of its joints."""
 
     code: Code
@@ -50,7 +50,7 @@ class JointRequests:
         self._record = context.record
         self._switching = switching
         self._answer = answer
-        self._pending: dict[int, _Pending] = {}
+        self._pending: dict[int, _PendingRequest] = {}
 
     def execute_request(
         self, number: int, request: TorqueRequest | RebootRequest | Register | RegisterReading
@@ -79,7 +79,7 @@ class JointRequests:
             row = rows[request.joint]
         if isinstance(request, Register):
             done = partial(self._answer_register, number, Code.REGISTER_NOT_WRITTEN)
-            self._hardware.set_register(row, request.item, request.value, done)
+            self._hardware.write_register(row, request.item, request.value, done)
         else:
             done = partial(self._answer_register, number, Code.REGISTER_NOT_READ)
             self._hardware.read_register(row, request.item, done)
@@ -115,18 +115,18 @@ class JointRequests:
         if isinstance(released, Refusal):
             return released
         for row, done in self._await(number, Code.NOT_REBOOTED, rows, released):
-            self._hardware.reboot(row, done)
+            self._hardware.reboot_servo(row, done)
         return None
 
     def _await(
         self, number: int, code: Code, rows: dict[str, int], released: tuple[str, ...]
     ) -> list[tuple[int, Callable[[str], None]]]:
-        """Answer `Waiting` to a request; return each joint's row with the callback for its result."""
-        pending = self._pending[number] = _Pending(code, len(rows), deactivated=released)
-        self._answer(number, Waiting(()))
+        """Answer `Acceptance` to a request; return each joint's row with the callback for its result."""
+        pending = self._pending[number] = _PendingRequest(code, len(rows), deactivated=released)
+        self._answer(number, Acceptance(()))
         return [(row, partial(self._done, number, pending, joint)) for joint, row in rows.items()]
 
-    def end(self) -> None:
+    def refuse_pending(self) -> None:
         """Refuse the pending torque and reboot requests because the run ends."""
         for number in self._pending:
             self._answer(number, Refusal(Code.RUN_ENDING))
@@ -192,7 +192,7 @@ class JointRequests:
         )
         return Refusal(Code.JOINT_COMMANDED, {"joint": joints, "controller": names})
 
-    def _done(self, number: int, pending: _Pending, joint: str, problem: str) -> None:
+    def _done(self, number: int, pending: _PendingRequest, joint: str, problem: str) -> None:
         """Store the result for one joint; an empty problem is a success.
 
         The last result answers the request.
@@ -204,10 +204,10 @@ class JointRequests:
         if self._pending.get(number) is not pending:
             return  # answered by the end of the run
         if pending.left:
-            self._answer(number, Waiting(()))
+            self._answer(number, Acceptance(()))
             return
         del self._pending[number]
-        answer: Answer = Done(self._record.cycle, deactivated=pending.deactivated)
+        answer: Answer = Completion(self._record.cycle, deactivated=pending.deactivated)
         if pending.problems:
             # Joints of one transmission report the same problem, which is named once.
             problems = "; ".join(dict.fromkeys(pending.problems))
@@ -217,4 +217,4 @@ class JointRequests:
     def _answer_register(self, number: int, code: Code, problem: str, found: int | None) -> None:
         """Answer a register request with the value read, None after a write, or with the problem."""
         refusal = Refusal(code, {"problem": problem}) if problem else None
-        self._answer(number, refusal or Done(self._record.cycle, value=found))
+        self._answer(number, refusal or Completion(self._record.cycle, value=found))

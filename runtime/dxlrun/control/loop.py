@@ -11,18 +11,18 @@ from numpy.typing import NDArray
 
 from dxlrun.channels.commands import LOOP, TakenCommand
 from dxlrun.channels.cycle import CycleRecord, Torque
-from dxlrun.channels.events import EventSink
+from dxlrun.channels.event_records import EventSink
 from dxlrun.control import texts
 from dxlrun.control.context import ControlContext
 from dxlrun.control.controllers.activity import is_interrupt
 from dxlrun.control.controllers.managed import PERIOD_CAP
 from dxlrun.control.controllers.manager import Manager
-from dxlrun.control.controllers.plugins import OverrunHook
+from dxlrun.control.controllers.plugin_loading import OverrunHook
 from dxlrun.control.gate import Gate
 from dxlrun.control.monitors import build_monitors
 from dxlrun.control.monitors.policy_actions import PolicyActions
 from dxlrun.control.safe_motion import SafeMotion
-from dxlrun.control.source_process import SourceReader
+from dxlrun.control.sampled_sources import SourceReader
 from dxlrun.control.steering import Steering
 from dxlrun.errors import PortError
 from dxlrun.plan.loop_plan import OverrunPolicy, ServoLimit
@@ -35,10 +35,10 @@ class CycleSink(Protocol):
     def wake(self, cycle: int) -> None:
         """Note that a cycle starts: bus packets from now on belong to the period of this cycle."""
 
-    def append(self, record: CycleRecord) -> None:
+    def append_cycle(self, record: CycleRecord) -> None:
         """Store a copy of a finished cycle's record, whose memory the next cycle overwrites."""
 
-    def begin(self, record: CycleRecord) -> None:
+    def append_activation(self, record: CycleRecord) -> None:
         """Store a copy of the record before the first cycle: states and goals of the activation."""
 
 
@@ -58,7 +58,7 @@ class LoopResult(msgspec.Struct, frozen=True):
     count."""
 
 
-class Loop:
+class ControlLoop:
     """Control loop of one robot.
 
     The code that builds the loop starts the hardware before and stops it after the loop. The Schedule decides
@@ -122,7 +122,7 @@ class Loop:
         policy follow, and leave the robot limp or holding. Exceptions of controllers and PortError of the
         hardware become the result; other exceptions pass through.
         """
-        self._begin()
+        self._activate_controllers()
         try:
             reason, detail = self._cycle_until_end()
         except PortError as error:
@@ -131,7 +131,7 @@ class Loop:
             # The schedule already excludes the period that follows the last cycle of a pause.
             self.schedule.end_cycles(self.clock.now_ns())
             self.manager.deactivate()
-            self.steering.end()
+            self.steering.answer_remaining()
         if reason != "fault" and self.manager.switching.fault is not None:
             reason, detail = "fault", self.manager.switching.fault
         policy = "on_fault" if reason == "fault" else "on_exit"
@@ -144,15 +144,15 @@ class Loop:
 
     # Inside
 
-    def _begin(self) -> None:
+    def _activate_controllers(self) -> None:
         """Start the schedule, log the start and activate controllers a period before the first deadline."""
         self._woken_ns = self.clock.now_ns()
-        self.schedule.start(self._woken_ns)
-        self.context.events.emit("loop", texts.loop_started(self.plan.period_ns))
+        self.schedule.start_at(self._woken_ns)
+        self.context.events.emit_event("loop", texts.loop_started(self.plan.period_ns))
         for reader in self.readers:
-            reader.read()
+            reader.read_sources()
         self._take_servo_limits()
-        self.gate.begin()
+        self.gate.initialize_goals()
         self.gate.ease_in()
         self._log_start()
         self.manager.switching.start_controllers()
@@ -192,14 +192,14 @@ class Loop:
         steering.stood = steering.paused_until_ns > 0
         if not manager.switching.modes_requested:
             manager.switching.request_modes()
-        record.renew()
+        record.reset_counts()
         for provided in manager.providers:
             provided.grow_old(dt_ns)
         if self._motion:
-            self._motion.begin()
-        self.hardware.read()
+            self._motion.request_modes()
+        self.hardware.read_states()
         for reader in self.readers:
-            reader.read()
+            reader.read_sources()
         read_ns = now_ns()
         if self.hardware.servo_limits is not self._servo_limits:
             self._take_servo_limits()
@@ -211,15 +211,15 @@ class Loop:
         valid = record.states.valid
         all_valid = valid.tobytes() == self._all_valid
         if self._motion:
-            steering.refuse()
+            steering.refuse_commands()
             self._motion.command()
         else:
             self._update(cycle, behind_ns)
-        self.gate.apply(dt_ns)
+        self.gate.move_goals(dt_ns)
         updated_ns = now_ns()
-        self.hardware.write()
+        self.hardware.write_goals()
         record.set_times(read_ns, updated_ns, now_ns())
-        self.sink.append(record)
+        self.sink.append_cycle(record)
         self._cycles += 1
         if not all_valid:
             self._invalid += ~valid & (record.states.torque != Torque.REBOOTING)
@@ -233,12 +233,12 @@ class Loop:
         time_ns = self.schedule.time_ns
         for monitor in self._monitors:
             try:
-                monitor.check(time_ns)
+                monitor.check_cycle(time_ns)
             except PortError:
                 raise
             except (Exception, SystemExit) as error:  # foreign code: the run ends by the steps of its policy
                 self._actions.end_run("on_fault", texts.monitor_failed(type(monitor), error))
-        commands = steering.inbox.take()
+        commands = steering.inbox.drain_commands()
         if commands or steering.paused_until_ns or steering.halt.waiting or manager.streams:
             record.command_count = steering.execute_commands(commands)
         if steering.paused_until_ns:
@@ -255,7 +255,7 @@ class Loop:
         if not motion.over:
             self._log_policy(name, policy.text)
             if self.steering.paused_until_ns:
-                self.steering.resume()
+                self.steering.resume_controllers()
             self._motion = motion
             try:
                 while not motion.over:
@@ -265,16 +265,16 @@ class Loop:
                 motion.give_up(str(error))
             if motion.unfinished:
                 unfinished = texts.policy_unfinished(name, motion.unfinished, policy.last)
-                self.context.events.emit("loop", unfinished)
+                self.context.events.emit_event("loop", unfinished)
         if policy.last == "hold":
-            self.context.events.emit("loop", texts.policy_keeps_torque(name))
+            self.context.events.emit_event("loop", texts.policy_keeps_torque(name))
         return policy.last
 
     def _log_policy(self, name: str, text: str) -> None:
-        self.context.events.emit("loop", texts.policy_begins(name, text))
+        self.context.events.emit_event("loop", texts.policy_begins(name, text))
         data = f'{{"policy":"{name}"}}'.encode()
         begun = TakenCommand(self.record.woken_ns, self.schedule.cycle, -1, LOOP, "policy", "loop", data)
-        self.context.command_log.take(begun)
+        self.context.command_log.record_command(begun)
 
     def _next(self) -> bool:
         """Advance the schedule past skipped periods to the next cycle.
@@ -286,11 +286,11 @@ class Loop:
         if self.steering.stood:
             policy = "skip" if policy == "stop" else policy  # cycles of a pause may be long
         elif now_ns <= next_ns:
-            schedule.advance(cycle + 1)
+            schedule.advance_to_cycle(cycle + 1)
             self.record.skipped, self._late = 0, False
             return False
         else:
-            policy = self._overruns.decide(cycle + 1, next_ns, now_ns)
+            policy = self._overruns.choose_policy(cycle + 1, next_ns, now_ns)
         following = schedule.following(now_ns, policy)
         if self.plan.end_ns is not None and not self._motion and not self.steering.stood:
             # Periods after the end of the plan do not count as skipped.
@@ -301,13 +301,13 @@ class Loop:
             still = following - cycle if self.steering.paused_until_ns else skipped
             self._paused_cycles += still
             schedule.grid_ns -= still * schedule.period_ns
-        schedule.advance(following)
+        schedule.advance_to_cycle(following)
         self.record.skipped = skipped
         self._skipped += skipped
         late = bool(skipped) or (policy == "catch_up" and now_ns > next_ns)
         if late and not self._late:
             overrun = texts.cycle_overran(cycle, now_ns - due_ns, skipped, policy == "catch_up")
-            self.context.events.emit("loop", overrun)
+            self.context.events.emit_event("loop", overrun)
         self._late = late
         return bool(skipped) and policy == "stop"
 
@@ -317,14 +317,14 @@ class Loop:
         record.scheduled_ns = self.schedule.due_ns
         record.read_ns = record.updated_ns = record.written_ns = self.clock.now_ns()
         record.woken_ns = self._woken_ns  # a replay derives the first deadline from this time
-        self.sink.begin(record)
+        self.sink.append_activation(record)
 
     def _log_end(self, reason: str, detail: str) -> None:
         if reason == "fault":
             event = texts.loop_failed(self._cycles, self._skipped, detail)
         else:
             event = texts.loop_stopped(reason, self._cycles, self._skipped, detail)
-        self.context.events.emit("loop", event)
+        self.context.events.emit_event("loop", event)
 
 
 class Overruns:
@@ -338,7 +338,7 @@ class Overruns:
         self._hooks = list(hooks)
         self._events = events
 
-    def decide(self, cycle: int, scheduled_ns: int, actual_ns: int) -> OverrunPolicy:
+    def choose_policy(self, cycle: int, scheduled_ns: int, actual_ns: int) -> OverrunPolicy:
         """Return the policy for a cycle that was due at `scheduled_ns` but can begin only at `actual_ns`."""
         for hook in tuple(self._hooks):
             try:
@@ -357,4 +357,4 @@ class Overruns:
 
     def _dismiss(self, hook: OverrunHook, why: str) -> None:
         self._hooks.remove(hook)
-        self._events.emit(hook.plugin, texts.overrun_hook_dismissed(why))
+        self._events.emit_event(hook.plugin, texts.overrun_hook_dismissed(why))

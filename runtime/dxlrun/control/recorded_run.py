@@ -17,20 +17,20 @@ from msgspec.structs import replace
 from numpy.typing import NDArray
 
 from dxlrun.channels.answers import Answer, Refusal
-from dxlrun.channels.commands import ClientCommand, Command, TakenCommand
+from dxlrun.channels.commands import ClientCommand, CommandMessage, TakenCommand
 from dxlrun.channels.cycle import CycleRecord, States
-from dxlrun.channels.events import EventBody, EventCode
+from dxlrun.channels.event_records import EventBody, EventCode
 from dxlrun.channels.kept import KeptStates
-from dxlrun.channels.messages import MessageSink
+from dxlrun.channels.topic_messages import MessageSink
 from dxlrun.contract.controller import Controller
 from dxlrun.control.context import ControlContext, StopFlag, Unsupervised
 from dxlrun.control.controllers.manager import Manager
-from dxlrun.control.controllers.plugins import PlugIns
-from dxlrun.control.controllers.topics import TopicLog
-from dxlrun.control.loop import Loop, LoopResult
+from dxlrun.control.controllers.plugin_loading import PlugIns
+from dxlrun.control.controllers.published_topics import TopicLog
+from dxlrun.control.loop import ControlLoop, LoopResult
 from dxlrun.errors import LogError, PortError
 from dxlrun.features import find_installed
-from dxlrun.log.reader import UNREADABLE, Log
+from dxlrun.log.log_reader import UNREADABLE, Log
 from dxlrun.log.schemas import KEPT_ATTACHMENT
 from dxlrun.plan.loop_plan import ControllerPlan, LoopPlan, ServoLimit
 from dxlwire.modes import COMMAND_INTERFACES
@@ -83,7 +83,7 @@ class RecordedClock:
         self._now_ns = self.wake_ns
         return self._now_ns
 
-    def move(self, now_ns: int) -> None:
+    def set_time(self, now_ns: int) -> None:
         """Set the recorded time that `now_ns` returns, ns."""
         self._now_ns = now_ns
 
@@ -154,26 +154,26 @@ class RecordedHardware:
             raise PortError("the log ends")
         self._clock.wake_ns = int(self._inputs.log.cycles["woken_ns"][self.index])
 
-    def read(self) -> None:
+    def read_states(self) -> None:
         """Copy the recorded states of this cycle into the record."""
         row = self.recorded()
         for name in _STATES:
             np.copyto(getattr(self._record.states, name), row[name])
         self._take_sources(row)
-        self._clock.move(int(row["read_ns"]))
+        self._clock.set_time(int(row["read_ns"]))
         self._take_limits(int(row["updated_ns"]))
 
     def recorded(self) -> np.void:
         """Return the log's row of the current cycle."""
         return self._row(self.index)
 
-    def write(self) -> None:
+    def write_goals(self) -> None:
         """Ignore the goals, and move the clock to the deadline of the next recorded cycle."""
         following, cycles = self.index + 1, self._inputs.log.cycles
         if following < self._inputs.end:
-            self._clock.move(int(cycles["scheduled_ns"][following]))
+            self._clock.set_time(int(cycles["scheduled_ns"][following]))
         else:
-            self._clock.move(int(cycles["written_ns"][self.index]))
+            self._clock.set_time(int(cycles["written_ns"][self.index]))
         if following == self._inputs.ends:
             self._stop.request()
 
@@ -184,7 +184,9 @@ class RecordedHardware:
     def set_modes(self, modes: NDArray[np.uint8]) -> None:
         """Do nothing: the recorded states have the modes."""
 
-    def set_register(self, row: int, item: str, value: int, done: Callable[[str, int | None], None]) -> None:
+    def write_register(
+        self, row: int, item: str, value: int, done: Callable[[str, int | None], None]
+    ) -> None:
         """Do nothing: the recorded states have the result."""
 
     def read_register(self, row: int, item: str, done: Callable[[str, int | None], None]) -> None:
@@ -196,7 +198,7 @@ class RecordedHardware:
     def follow_goals(self, rows: Sequence[int]) -> None:
         """Do nothing: the recorded states have the positions."""
 
-    def reboot(self, row: int, done: Callable[[str], None]) -> None:
+    def reboot_servo(self, row: int, done: Callable[[str], None]) -> None:
         """Do nothing: the recorded states have the result of the reboot."""
 
     def limit_torque(self, fraction: float) -> None:
@@ -206,7 +208,7 @@ class RecordedHardware:
         """Do nothing: no servo has torque."""
         return ()
 
-    def release(self) -> None:
+    def leave_torque_on(self) -> None:
         """Do nothing: no servo holds."""
 
 
@@ -246,14 +248,16 @@ class RecordedInbox:
         for number, one in enumerate(self._steered):
             self._by_cycle.setdefault(one.command.cycle, []).append((number, one.command))
 
-    def take(self) -> Sequence[Command]:
+    def drain_commands(self) -> Sequence[CommandMessage]:
         """Return the commands that this cycle executed in the recorded run."""
         return [
-            Command(number, then.controller, then.kind, self._prepared(then), then.origin, then.lease_ns)
+            CommandMessage(
+                number, then.controller, then.kind, self._prepared(then), then.origin, then.lease_ns
+            )
             for number, then in self._by_cycle.get(self._record.cycle, ())
         ]
 
-    def answer(self, number: int, answer: Answer) -> None:
+    def answer_command(self, number: int, answer: Answer) -> None:
         """Note a remark if the first answer accepts a command that was refused in the run, or vice versa."""
         if number in self._answered:
             return  # the late answer of a switch follows from states, which are compared anyway
@@ -282,7 +286,7 @@ class PlannedCommands:
             (one.cycle, one.controller, one.kind) for one in commands if one.planned >= 0
         }
 
-    def take(self, command: TakenCommand) -> None:
+    def record_command(self, command: TakenCommand) -> None:
         """Check one executed command. Raises LogError if the run did not execute it in this cycle."""
         if command.planned >= 0 and (command.cycle, command.controller, command.kind) not in self._then:
             raise LogError(
@@ -294,7 +298,7 @@ class PlannedCommands:
 class _NoEvents:
     """Event sink that drops the events of a replay; the log has the original ones."""
 
-    def emit(self, source: str, event: EventBody, data: bytes = b"") -> None:
+    def emit_event(self, source: str, event: EventBody, data: bytes = b"") -> None:
         """Drop an event."""
 
 
@@ -312,10 +316,10 @@ class _ComparingSink:
     def wake(self, cycle: int) -> None:
         """Do nothing: no packets are exchanged."""
 
-    def begin(self, record: CycleRecord) -> None:
+    def append_activation(self, record: CycleRecord) -> None:
         """Do nothing: commands follow in the first cycle."""
 
-    def append(self, record: CycleRecord) -> None:
+    def append_cycle(self, record: CycleRecord) -> None:
         """Compare a finished cycle with the recorded one, and advance the hardware to the next."""
         self.compare(record, self.hardware.recorded(), self.hardware.index)
         self.hardware.next()
@@ -389,7 +393,7 @@ class RecordedRun:
             LogError: The log is damaged.
             ControllerFault: A controller cannot be configured.
         """
-        loop = Loop(self._context, self._manager, _ComparingSink(self._hardware, compare))
+        loop = ControlLoop(self._context, self._manager, _ComparingSink(self._hardware, compare))
         self._row(0)  # position the log, so that messages before the first cycle are found
         self._manager.configure()
         self._hardware.start()

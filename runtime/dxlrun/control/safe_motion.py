@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 from dxlrun.channels.cycle import LIMP, CycleRecord, Floats
 from dxlrun.control.context import ControlContext
 from dxlrun.plan.loop_plan import JointPlan
-from dxlrun.plan.policy_plan import SETTLE_NS, Policy, Step
+from dxlrun.plan.policy_plan import SETTLE_NS, Policy, PolicyStepPlan
 from dxlwire.joint_unit import LINEAR, ROTARY, JointUnit
 from dxlwire.modes import Mode
 
@@ -90,7 +90,7 @@ class SafeMotion:
         self._arrived = np.array([ARRIVED[joint.unit] for joint in self.joints])
         self.over = not self.policy.steps and not self._wait_ns
 
-    def begin(self) -> None:
+    def request_modes(self) -> None:
         """Request the modes that the steps need, in the first cycle only.
 
         Called before the states are read.
@@ -127,7 +127,7 @@ class SafeMotion:
             return Mode.UNKNOWN
         if any(step.targets and step.targets[row] is not None for step in self.policy.steps):
             return Mode.UNKNOWN if mode == Mode.POSITION else Mode.POSITION
-        return Mode.UNKNOWN if mode in {Mode.POSITION, Mode.VELOCITY} else self.joints[row].rest
+        return Mode.UNKNOWN if mode in {Mode.POSITION, Mode.VELOCITY} else self.joints[row].rest_mode
 
     def _changing(self, now_ns: int) -> bool:
         """Return whether the steps must still wait for mode changes.
@@ -144,10 +144,10 @@ class SafeMotion:
         self.over = self.over or not self.policy.steps
         return self.over
 
-    def _ended(self, step: Step, now_ns: int) -> bool:
+    def _ended(self, step: PolicyStepPlan, now_ns: int) -> bool:
         return self._reached(step, now_ns) if step.targets else self._weakened(step, now_ns)
 
-    def _reached(self, step: Step, now_ns: int) -> bool:
+    def _reached(self, step: PolicyStepPlan, now_ns: int) -> bool:
         record = self.record
         goal, commands = record.goals.position, record.commands
         target: Floats = np.array([np.nan if one is None else one for one in step.targets])
@@ -169,7 +169,7 @@ class SafeMotion:
         commands.velocity[named] = speed[named]
         return False
 
-    def _judge(self, step: Step, posed: list[int], target: Floats, away: NDArray[np.bool_]) -> None:
+    def _judge(self, step: PolicyStepPlan, posed: list[int], target: Floats, away: NDArray[np.bool_]) -> None:
         """Store in `unfinished` which joint did not reach its pose, and why. The worst joint is named."""
         states = self.record.states
         found = states.unable(posed) or states.doubtful(np.flatnonzero(away).tolist())
@@ -183,7 +183,7 @@ class SafeMotion:
                 self.unfinished or f"{step.text} is not reached: joint {self.joints[row].name} {why}"
             )
 
-    def _weakened(self, step: Step, now_ns: int) -> bool:
+    def _weakened(self, step: PolicyStepPlan, now_ns: int) -> bool:
         passed_ns = now_ns - self._step_ns
         level = min(step.levels, 1 + passed_ns * step.levels // max(step.longest_ns, 1))
         if level != self._level:

@@ -40,7 +40,7 @@ class Schedule:
     """Controllers' time in the running cycle: ns since the first deadline, without pauses. It never goes
     back."""
 
-    def start(self, now_ns: int) -> None:
+    def start_at(self, now_ns: int) -> None:
         """Reset cycle and controllers' time to 0, and set the first deadline to one period after `now_ns`."""
         self.cycle = self.grid_ns = self.time_ns = 0
         self.due_ns = now_ns + self.period_ns
@@ -65,7 +65,7 @@ class Schedule:
         passed_ns = 0 if self.sequential else now_ns - self.due_ns
         self.time_ns = max(self.time_ns, self.grid_ns + passed_ns)
 
-    def advance(self, cycle: int) -> None:
+    def advance_to_cycle(self, cycle: int) -> None:
         """Make a later cycle the next one, and move the deadline by its periods."""
         passed_ns = (cycle - self.cycle) * self.period_ns
         self.cycle = cycle

@@ -10,12 +10,12 @@ from collections.abc import Mapping, Sequence
 
 import msgspec
 
-from dxlrun.channels.answers import Answer, Code, CommandOutcome, Done, Refusal
-from dxlrun.channels.commands import LOOP, Command, TakenCommand
+from dxlrun.channels.answers import Answer, Code, CommandOutcome, Completion, Refusal
+from dxlrun.channels.commands import LOOP, CommandMessage, TakenCommand
 from dxlrun.channels.loop_requests import (
     Cancel,
     NewCommander,
-    Parameters,
+    ParametersRequest,
     Rate,
     RebootRequest,
     Register,
@@ -27,7 +27,7 @@ from dxlrun.channels.loop_requests import (
 from dxlrun.control import texts
 from dxlrun.control.anchoring import Anchoring
 from dxlrun.control.context import ControlContext
-from dxlrun.control.controllers.goals import PlayedPart
+from dxlrun.control.controllers.goal_registry import PlayedPart
 from dxlrun.control.controllers.manager import Manager
 from dxlrun.control.gate import Gate
 from dxlrun.control.halt import Halt
@@ -64,7 +64,7 @@ FORMS: Mapping[str, type[msgspec.Struct] | None] = {
     "halt": None,
     "cancel": Cancel,
     "play": Play,
-    "parameters": Parameters,
+    "parameters": ParametersRequest,
     "rate": Rate,
     "pause": None,
     "resume": None,
@@ -84,7 +84,7 @@ class Steering:
     """Executes, logs and answers the commands of an inbox, and controls the loop's rate and pauses.
 
     Most commands are answered in the cycle that executes them. A switch that waits for modes is first
-    answered with `Waiting`, and again when its controllers are active or dropped. Torque requests, reboots
+    answered with `Acceptance`, and again when its controllers are active or dropped. Torque requests, reboots
     and halts are answered twice in the same way. A register is answered when the servo has responded.
     """
 
@@ -113,9 +113,9 @@ class Steering:
         self._actions = actions
 
     def _answer(self, number: int, answer: Answer) -> None:
-        self.inbox.answer(number, answer)
+        self.inbox.answer_command(number, answer)
 
-    def execute_commands(self, commands: Sequence[Command]) -> int:
+    def execute_commands(self, commands: Sequence[CommandMessage]) -> int:
         """Execute and answer client commands, and end streams and pauses whose lease expired.
 
         The loop calls it only if there are commands, streams, a pause or a halt.
@@ -129,11 +129,11 @@ class Steering:
         count = 0
         record, manager = self._record, self._manager
         if self.halt.waiting:
-            self.halt.watch()
+            self.halt.check_rest()
         if self.paused:
             self.anchoring.watch_pause()
         for place, command in enumerate(commands, 1):
-            self._context.command_log.take(
+            self._context.command_log.record_command(
                 TakenCommand(
                     t_ns=record.woken_ns,
                     cycle=record.cycle,
@@ -152,46 +152,46 @@ class Steering:
             else:
                 found = manager.dispatch_command(command)
                 goals = (found,) if isinstance(found, int) and found else ()
-                answer = found if isinstance(found, Refusal) else Done(record.cycle, goals=goals)
+                answer = found if isinstance(found, Refusal) else Completion(record.cycle, goals=goals)
             if for_loop or isinstance(answer, Refusal):
-                self._report(command, answer, place)
+                self._report_command(command, answer, place)
             if for_loop and self.paused:
                 self.paused_until_ns = record.woken_ns + PAUSE_LEASE_NS
             count += not (for_loop or isinstance(answer, Refusal))
             if answer is not None:
-                self.inbox.answer(command.number, answer)
+                self.inbox.answer_command(command.number, answer)
         if 0 < self.paused_until_ns < record.woken_ns:
-            self.resume()
+            self.resume_controllers()
             what = texts.PAUSE_ENDED
             if not (ends := self._stale("no client ended the pause")):
                 commanding = manager.switching.commanding(record.layout.joints)
                 manager.switching.switch_controllers((), commanding)
-            self._context.events.emit("loop", texts.pause_expired(ends or what))
+            self._context.events.emit_event("loop", texts.pause_expired(ends or what))
         for name in manager.stale(record.woken_ns) if manager.streams else ():
             if not (ends := self._stale(f"the stream of commands for {name} ended")):
                 manager.hold_controller(name)
-            self._context.events.emit(name, texts.stream_expired(ends or texts.JOINTS_HELD))
+            self._context.events.emit_event(name, texts.stream_expired(ends or texts.JOINTS_HELD))
         return count
 
-    def refuse(self) -> None:
+    def refuse_commands(self) -> None:
         """Refuse new client commands because the run is ending.
 
         They are not logged, as they have no effect.
         """
-        for command in self.inbox.take():
-            self.inbox.answer(command.number, Refusal(Code.RUN_ENDING))
+        for command in self.inbox.drain_commands():
+            self.inbox.answer_command(command.number, Refusal(Code.RUN_ENDING))
 
-    def end(self) -> None:
+    def answer_remaining(self) -> None:
         """Answer all client commands that still wait, after the last deactivation of controllers."""
         self.answer_late()
-        self.joints.end()
-        self.halt.end()
+        self.joints.refuse_pending()
+        self.halt.refuse_waiting()
 
     def answer_late(self) -> None:
         """Answer the `switch` commands whose wait for joint modes has ended."""
         ended = self._manager.switching.ended
         for number, refusal in ended:
-            self.inbox.answer(number, refusal or Done(self._record.cycle))
+            self.inbox.answer_command(number, refusal or Completion(self._record.cycle))
         ended.clear()
 
     # Rate and pause
@@ -241,7 +241,7 @@ class Steering:
         self._set_cycle_limit()
         return None
 
-    def resume(self) -> Refusal | None:
+    def resume_controllers(self) -> Refusal | None:
         """End the pause, with a slow start toward commands that differ from the goals.
 
         Returns: The refusal if the loop is not paused, else None.
@@ -273,7 +273,7 @@ class Steering:
 
     # Commands
 
-    def _for_loop(self, command: Command) -> Answer | None:
+    def _for_loop(self, command: CommandMessage) -> Answer | None:
         """Decode and execute a command for the loop itself; return its answer, None if that comes later."""
         kind, data, numbers = command.kind, command.data, b""
         if kind not in FORMS:
@@ -290,9 +290,11 @@ class Steering:
             return Refusal(Code.INVALID, {"problem": texts.wrong_command_data(kind, error)})
         if isinstance(request, TorqueRequest | RebootRequest | Register | RegisterReading):
             return self.joints.execute_request(command.number, request)
-        return self._execute(command, request, numbers) or Done(self._record.cycle)
+        return self._execute(command, request, numbers) or Completion(self._record.cycle)
 
-    def _execute(self, command: Command, request: msgspec.Struct | None, numbers: bytes) -> Answer | None:
+    def _execute(
+        self, command: CommandMessage, request: msgspec.Struct | None, numbers: bytes
+    ) -> Answer | None:
         """Execute a decoded command for the loop; return its answer, or None on success without a result."""
         manager = self._manager
         found: Answer | None = None
@@ -304,17 +306,17 @@ class Steering:
                 found = manager.cancel_goal(request.goal, request.controller)
             case Play():
                 goals = manager.play_motion(request.parts, numbers, command.origin)
-                found = goals if isinstance(goals, Refusal) else Done(self._record.cycle, goals=goals)
-            case Parameters():
+                found = goals if isinstance(goals, Refusal) else Completion(self._record.cycle, goals=goals)
+            case ParametersRequest():
                 found = manager.change_parameters(request.controller, request.values)
             case Rate():
                 found = self.change_rate(request.rate)
             case ControllerPlan():
-                place = manager.load(request)
+                place = manager.load_controller(request)
                 self._supervision.beat()  # loading takes long: the guardian's timeout applies to each load
-                found = place if isinstance(place, Refusal) else Done(self._record.cycle, place)
+                found = place if isinstance(place, Refusal) else Completion(self._record.cycle, place)
             case Unload():
-                found = manager.unload(request.controller)
+                found = manager.unload_controller(request.controller)
             case NewCommander():
                 pass
             case _ if command.kind == "halt":
@@ -322,14 +324,14 @@ class Steering:
             case _ if command.kind == "pause":
                 found = self.pause()
             case _ if command.kind == "resume":
-                found = self.resume()
+                found = self.resume_controllers()
             case _:
                 self._supervision.stop.request()
         return found
 
     # Reports
 
-    def _report(self, command: Command, answer: Answer | None, place: int) -> None:
+    def _report_command(self, command: CommandMessage, answer: Answer | None, place: int) -> None:
         """Emit an event for a refused command or a command for the loop.
 
         `Manager` reports accepted ones for controllers.
@@ -345,4 +347,4 @@ class Steering:
                 shown = f"{shown[:LONGEST_SHOWN]} ..."  # the log of commands has all data
             event = texts.loop_steered(f"{command.kind} {shown}".strip(), command.origin)
         data = msgspec.json.encode(CommandOutcome(command.kind, command.origin, refusal, place))
-        self._context.events.emit(source, event, data)
+        self._context.events.emit_event(source, event, data)

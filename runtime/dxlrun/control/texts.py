@@ -7,7 +7,7 @@ from __future__ import annotations
 
 from collections.abc import Iterable, Sequence
 
-from dxlrun.channels.events import EventCode, Severity, event_text
+from dxlrun.channels.event_records import EventCode, Severity, event_text
 from dxlrun.errors import counted
 
 # Loop

@@ -12,9 +12,9 @@ from typing import Annotated
 
 from pydantic import AfterValidator, ValidationError
 
-from dxlrun.description.document import Filled, KeyPath, Marks, literal, plain_value, text_of
-from dxlrun.description.form import Form, key, refuse
-from dxlrun.description.problems import problems_of
+from dxlrun.description.base_form import Form, key, validation_error
+from dxlrun.description.document import FilledScalar, KeyPath, Marks, literal, plain_value, text_of
+from dxlrun.description.form_problems import problems_of
 from dxlrun.errors import Mark, Problem, suggestion
 
 COMMAND_LINE = "command line"  # file name in the mark of a problem of `name:=value`
@@ -25,7 +25,9 @@ _USE = re.compile(r"\$\$\{|\$\{([^{}]*)(\}?)")
 
 def _scalar(value: object) -> object:
     if isinstance(value, dict | list):
-        raise refuse("the default of an argument is one value", "write text, a number, true or false")
+        raise validation_error(
+            "the default of an argument is one value", "write text, a number, true or false"
+        )
     return value
 
 
@@ -98,7 +100,7 @@ class Arguments:
     def _problem(self, path: KeyPath, what: str, fix: str) -> None:
         self.problems.append(Problem(self._marks.key(*path), what, fix))
 
-    def fill(self, path: KeyPath, text: str, quoted: bool) -> Filled:
+    def insert_arguments(self, path: KeyPath, text: str, quoted: bool) -> FilledScalar:
         """Insert the arguments into a scalar of the file, at a path; return its value and its origin."""
         if "${" not in text:
             return literal(path, text, quoted)
@@ -110,12 +112,12 @@ class Arguments:
         wrong = tuple(problem for use in uses for problem in self._wrong(use))
         names = [use[1].strip() for use in uses]
         if wrong or not all(name in self._values for name in names):
-            return Filled(None, problems=wrong, unknown=True)
+            return FilledScalar(None, problems=wrong, unknown=True)
         origin = ", ".join(f"{name}:={self.texts[name]}" for name in dict.fromkeys(names)) or None
         if len(uses) == 1 and uses[0][0] == text.strip():
-            return Filled(self._values[names[0]], origin)
+            return FilledScalar(self._values[names[0]], origin)
         filled = _USE.sub(lambda use: "${" if use[0] == "$${" else self.texts[use[1].strip()], text)
-        return Filled(filled if quoted else plain_value(filled), origin)
+        return FilledScalar(filled if quoted else plain_value(filled), origin)
 
     def _wrong(self, use: re.Match[str]) -> list[tuple[str, str]]:
         name = use[1].strip()
@@ -126,15 +128,15 @@ class Arguments:
         return [(f"there is no argument {name!r}", _suggestion(name, self._names))]
 
 
-def refuse_arguments(path: KeyPath, text: str, quoted: bool) -> Filled:
+def refuse_arguments(path: KeyPath, text: str, quoted: bool) -> FilledScalar:
     """Return the value of a scalar in a file without arguments, as a motion file: `${` is a problem."""
     if "${" in text:
         return _unusable("this file takes no arguments", "write the value itself")
     return literal(path, text, quoted)
 
 
-def _unusable(what: str, fix: str) -> Filled:
-    return Filled(None, problems=((what, fix),), unknown=True)
+def _unusable(what: str, fix: str) -> FilledScalar:
+    return FilledScalar(None, problems=((what, fix),), unknown=True)
 
 
 def _suggestion(name: str, known: Sequence[str]) -> str:

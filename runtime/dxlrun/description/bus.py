@@ -8,7 +8,7 @@ from typing import Annotated, Literal
 
 from pydantic import AfterValidator, Field
 
-from dxlrun.description.form import Form, ItemName, key, refuse
+from dxlrun.description.base_form import Form, ItemName, key, validation_error
 from dxlrun.description.units import AutoDuration, Duration, Rate
 
 HIGHEST_BAUD_RATE = 10_500_000
@@ -22,19 +22,19 @@ _LONGEST_BOOT_NS = 10_000_000_000
 
 def _protocol(value: float) -> float:
     if value not in (1.0, 2.0):
-        raise refuse(f"there is no Protocol {value:g}", "write 1.0 or 2.0")
+        raise validation_error(f"there is no Protocol {value:g}", "write 1.0 or 2.0")
     return value
 
 
 def _timer(value: int) -> int:
     if value > _LONGEST_TIMER_NS:
-        raise refuse("an adapter does not buffer bytes for that long", "write 255 ms at most")
+        raise validation_error("an adapter does not buffer bytes for that long", "write 255 ms at most")
     return value
 
 
 def _boot_time(value: int) -> int:
     if value > _LONGEST_BOOT_NS:
-        raise refuse("a board does not boot for that long", "write 10 s at most")
+        raise validation_error("a board does not boot for that long", "write 10 s at most")
     return value
 
 

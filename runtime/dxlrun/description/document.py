@@ -22,7 +22,7 @@ import msgspec
 import yaml
 from yaml.reader import Reader
 
-from dxlrun.description.mistakes.foreign import kind_of_bytes, kind_of_text
+from dxlrun.description.mistakes.foreign_files import kind_of_bytes, kind_of_text
 from dxlrun.description.mistakes.syntax import explain_syntax
 from dxlrun.errors import InputError, Mark, Problem
 
@@ -293,7 +293,7 @@ _WORDS = (
 )
 
 
-class Filled(msgspec.Struct, frozen=True):
+class FilledScalar(msgspec.Struct, frozen=True):
     """Value of one scalar of a file with its arguments `${name}` inserted, or the problems of that."""
 
     value: object
@@ -302,15 +302,15 @@ class Filled(msgspec.Struct, frozen=True):
     unknown: bool = False  # the value is not known; further checks must skip it
 
 
-Fill = Callable[[KeyPath, str, bool], Filled]  # Converts path, text and quoted or not into a value.
+Fill = Callable[[KeyPath, str, bool], FilledScalar]  # Converts path, text and quoted or not into a value.
 
 
-def literal(path: KeyPath, text: str, quoted: bool) -> Filled:
+def literal(path: KeyPath, text: str, quoted: bool) -> FilledScalar:
     """Return the value of a scalar as YAML reads it, without inserting arguments."""
-    return Filled(text if quoted else plain_value(text))
+    return FilledScalar(text if quoted else plain_value(text))
 
 
-class Grown(msgspec.Struct, frozen=True):
+class PlainDocument(msgspec.Struct, frozen=True):
     """All values of a file as dicts and lists, with their places and the problems found so far."""
 
     data: dict[str, object]
@@ -319,13 +319,13 @@ class Grown(msgspec.Struct, frozen=True):
     unknown: frozenset[KeyPath]  # places with a reported problem; their values mean nothing
 
 
-def grow(tree: Tree, file: str, fill: Fill) -> Grown:
+def grow(tree: Tree, file: str, fill: Fill) -> PlainDocument:
     """Convert parsed YAML into plain values; `fill` computes each scalar. Anchors must not be endless.
 
     Raises InputError for an endless or huge document.
     """
     grower = _Grower(tree, file, fill)
-    return Grown(
+    return PlainDocument(
         grower.mapping(tree.root, ()),
         Marks(file, grower.values, grower.keys, grower.origins),
         (*tree.problems, *grower.problems),

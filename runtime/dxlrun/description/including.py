@@ -16,16 +16,16 @@ import msgspec
 from dxlrun.description.document import (
     LARGEST_FILE,
     Fill,
-    Grown,
     KeyPath,
     Marks,
+    PlainDocument,
     Tree,
     grow,
     literal,
     parse,
     read_text,
 )
-from dxlrun.description.problems import shown
+from dxlrun.description.form_problems import format_value
 from dxlrun.errors import InputError, Mark, Problem
 
 KEY = "include"
@@ -39,9 +39,9 @@ class Source(msgspec.Struct, frozen=True):
     path: Path
     text: str
     tree: Tree
-    declared: Grown  # values before arguments are inserted
+    declared: PlainDocument  # values before arguments are inserted
 
-    def grown(self, fill: Fill) -> Grown:
+    def grown(self, fill: Fill) -> PlainDocument:
         """Return the values of the file after `fill` has inserted the arguments."""
         return grow(self.tree, str(self.path), fill)
 
@@ -54,7 +54,7 @@ def read_sources(path: Path) -> tuple[Source, ...]:
     """
     text = read_text(path)
     collector = _Collector()
-    collector.take(path, text, parse(text, str(path)), ())
+    collector.add_file(path, text, parse(text, str(path)), ())
     if collector.problems:
         raise InputError(collector.problems)
     return tuple(collector.sources)
@@ -69,7 +69,7 @@ class _Collector:
         self._done: set[Path] = set()
         self._characters = 0
 
-    def take(self, path: Path, text: str, tree: Tree, above: tuple[Path, ...]) -> None:
+    def add_file(self, path: Path, text: str, tree: Tree, above: tuple[Path, ...]) -> None:
         """Add all files that a file includes, then the file itself; `above` are the files that include it."""
         declared = grow(tree, str(path), literal)
         # Mark the file before its fragments, so that a second path to it does not read it again.
@@ -79,14 +79,16 @@ class _Collector:
             self._follow(path, entry, mark, (*above, path.resolve()))
         self.sources.append(Source(path, text, tree, declared))
 
-    def _entries(self, declared: Grown) -> list[tuple[str, Mark]]:
+    def _entries(self, declared: PlainDocument) -> list[tuple[str, Mark]]:
         """Return the file names under `include` with their places; add a problem for anything else."""
         if KEY not in declared.data:
             return []
         entries, marks = declared.data[KEY], declared.marks
         if not isinstance(entries, list):
             self._refuse(
-                marks.value(KEY), f"include is {shown(entries)}, but must be a list", "write [fragment.yaml]"
+                marks.value(KEY),
+                f"include is {format_value(entries)}, but must be a list",
+                "write [fragment.yaml]",
             )
             return []
         found: list[tuple[str, Mark]] = []
@@ -94,7 +96,7 @@ class _Collector:
             mark = marks.value(KEY, index)
             if not isinstance(entry, str) or not entry:
                 self._refuse(
-                    mark, f"include[{index}] is {shown(entry)}, but must be a file's name", "name it"
+                    mark, f"include[{index}] is {format_value(entry)}, but must be a file's name", "name it"
                 )
             elif "${" in entry:
                 self._refuse(mark, "arguments are not put into include", "write the file's name itself")
@@ -118,9 +120,9 @@ class _Collector:
             fix = "check the name; it is relative to the folder of this file"
             self._refuse(mark, f"there is no file {entry}", fix)
         else:
-            self._read(fragment, entry, mark, above)
+            self._read_fragment(fragment, entry, mark, above)
 
-    def _read(self, fragment: Path, entry: str, mark: Mark, above: tuple[Path, ...]) -> None:
+    def _read_fragment(self, fragment: Path, entry: str, mark: Mark, above: tuple[Path, ...]) -> None:
         try:
             text = read_text(fragment)
         except InputError as error:
@@ -134,7 +136,7 @@ class _Collector:
             self._refuse(mark, what, "shorten it")
             return
         try:
-            self.take(fragment, text, parse(text, str(fragment)), above)
+            self.add_file(fragment, text, parse(text, str(fragment)), above)
         except InputError as error:
             self.problems.extend(error.problems)
 
@@ -142,7 +144,7 @@ class _Collector:
         self.problems.append(Problem(mark, what, fix))
 
 
-def merged(documents: Iterable[Grown]) -> Grown:
+def merged(documents: Iterable[PlainDocument]) -> PlainDocument:
     """Merge documents into one, lowest precedence first; the problems of all are kept."""
     first, *others = documents
     for document in others:
@@ -150,7 +152,7 @@ def merged(documents: Iterable[Grown]) -> Grown:
     return first
 
 
-def _over(low: Grown, high: Grown) -> Grown:
+def _over(low: PlainDocument, high: PlainDocument) -> PlainDocument:
     """Merge two documents: mappings key by key, for anything else the value of `high` counts."""
     replaced: set[KeyPath] = set()
     data = _laid(low.data, high.data, (), replaced)
@@ -165,7 +167,7 @@ def _over(low: Grown, high: Grown) -> Grown:
         {**{path: text for path, text in low.marks.origins.items() if stays(path)}, **high.marks.origins},
     )
     unknown = high.unknown | {path for path in low.unknown if stays(path)}
-    return Grown(data, marks, (*low.problems, *high.problems), unknown)
+    return PlainDocument(data, marks, (*low.problems, *high.problems), unknown)
 
 
 def _laid(

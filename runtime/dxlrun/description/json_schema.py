@@ -27,9 +27,9 @@ from dxlrun.description.document import plain_value
 from dxlrun.description.including import KEY as INCLUDE
 from dxlrun.description.including import MOST_FILES
 from dxlrun.description.joints.groups import DEFAULTS, GROUPS
-from dxlrun.description.joints.joints import joint_conditions
+from dxlrun.description.joints.joint_forms import joint_conditions
 from dxlrun.description.joints.motor_file import MotorForm
-from dxlrun.description.motion import Motion
+from dxlrun.description.motion import MotionForm
 from dxlrun.description.robot import robot_form
 
 Schema = dict[str, Any]  # A JSON Schema. Its values can be any JSON, so no type narrower than Any is correct.
@@ -79,7 +79,7 @@ def fragment_schema(controllers: Models, entries: Entries) -> Schema:
 
 def motion_schema() -> Schema:
     """Return the JSON Schema of motion files."""
-    return _without_arguments(Motion, "dxlrun motion file")
+    return _without_arguments(MotionForm, "dxlrun motion file")
 
 
 def motor_schema() -> Schema:
@@ -117,7 +117,7 @@ def _robot(controllers: Models, entries: Entries) -> Schema:
         entry["properties"].pop("parameters")
         for kind, model in sorted(models.items()):
             named = f"#/$defs/{room}{kind}.{{model}}"
-            own = model.model_json_schema(ref_template=named, schema_generator=_Documented)
+            own = model.model_json_schema(ref_template=named, schema_generator=_DocumentedSchema)
             for name, node in own.pop("$defs", {}).items():
                 definitions[f"{room}{kind}.{name}"] = shaped.node(node)
             definitions[room + kind] = _entry_of(kind, entry, shaped.node(own))
@@ -209,7 +209,7 @@ def _and_none_of(condition: Schema, others: list[Schema]) -> Schema:
     return {**condition, "not": {"anyOf": [*others]}} if others else condition
 
 
-class _Documented(GenerateJsonSchema):
+class _DocumentedSchema(GenerateJsonSchema):
     """Generates pydantic's JSON Schema with the docstrings of fields as descriptions."""
 
     def model_schema(self, schema: ModelSchema) -> Schema:

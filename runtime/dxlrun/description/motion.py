@@ -10,11 +10,11 @@ import msgspec
 from pydantic import BeforeValidator, Discriminator, Field, Tag, model_validator
 
 from dxlrun.description.arguments import refuse_arguments
+from dxlrun.description.base_form import Form, Name, key, validation_error
 from dxlrun.description.document import Marks, grow, parse, read_text, refusal
-from dxlrun.description.form import Form, Name, key, refuse
+from dxlrun.description.form_problems import read_form
 from dxlrun.description.joints.groups import NO_GROUPS, Groups, put_in
-from dxlrun.description.mistakes.foreign import kind_of_data
-from dxlrun.description.problems import read_form
+from dxlrun.description.mistakes.foreign_files import kind_of_data
 from dxlrun.description.units import Acceleration, Duration, Measure, Position, Speed
 
 
@@ -41,7 +41,7 @@ class Target(Form):
     @model_validator(mode="after")
     def _says_something(self) -> Self:
         if self.position is None and self.velocity is None and self.acceleration is None:
-            raise refuse("the target is empty", "give it a position, as in {position: 30 deg}")
+            raise validation_error("the target is empty", "give it a position, as in {position: 30 deg}")
         return self
 
     @property
@@ -109,7 +109,7 @@ Part = Annotated[
 """Part of a motion file, with points or with formulas."""
 
 
-class Motion(Form):
+class MotionForm(Form):
     """Form of a motion file: a name, and parts for one or more controllers."""
 
     name: Name = key("Name of the motion.", "three_parts")
@@ -146,7 +146,7 @@ class Motion(Form):
 class MotionDescription(msgspec.Struct, frozen=True):
     """A motion file that was read: its contents, its text, and the places of its values."""
 
-    motion: Motion
+    motion: MotionForm
     marks: Marks
     path: Path
     text: str  # text as read
@@ -166,4 +166,4 @@ def parse_motion(text: str, path: Path, groups: Groups = NO_GROUPS) -> MotionDes
         raise refusal(grown.marks.value(), "this is a robot file, and no motion", fix)
     if "motions" not in grown.data and (kind := kind_of_data(grown.data, path)):
         raise refusal(grown.marks.value(), *kind)
-    return MotionDescription(read_form(grown, Motion), grown.marks, path, text)
+    return MotionDescription(read_form(grown, MotionForm), grown.marks, path, text)

@@ -9,13 +9,13 @@ import msgspec
 from msgspec.structs import replace
 
 from dxlrun.description.arguments import COMMAND_LINE, Arguments
-from dxlrun.description.document import Grown, KeyPath, Marks, refusal
+from dxlrun.description.document import KeyPath, Marks, PlainDocument, refusal
+from dxlrun.description.form_problems import path_text, read_form
 from dxlrun.description.including import KEY, Source, merged, read_sources
 from dxlrun.description.joints.groups import with_groups
-from dxlrun.description.joints.joints import misfits
-from dxlrun.description.mistakes.foreign import kind_of_data
+from dxlrun.description.joints.joint_forms import misfits
+from dxlrun.description.mistakes.foreign_files import kind_of_data
 from dxlrun.description.mistakes.words import misplaced_sections
-from dxlrun.description.problems import path_text, read_form
 from dxlrun.description.robot import Robot, robot_form
 from dxlrun.errors import InputError, Problem, told_once
 
@@ -56,7 +56,7 @@ def read_robot(
     # Without arguments first, to learn which arguments are declared.
     declared = merged(source.declared for source in sources)
     run = Arguments(declared.data.get("arguments"), arguments, declared.marks)
-    grown = merged(source.grown(run.fill) for source in sources)
+    grown = merged(source.grown(run.insert_arguments) for source in sources)
     grown = replace(grown, problems=(*run.problems, *grown.problems))
     for replacement in replacements:
         grown = _with(grown, replacement)
@@ -96,7 +96,7 @@ def _refuse_other_files(source: Source) -> None:
             raise refusal(marks.key(key), problem, fix.format(path=source.path))
 
 
-def _refuse_misplaced_sections(grown: Grown) -> None:
+def _refuse_misplaced_sections(grown: PlainDocument) -> None:
     """Raise InputError for sections that are misnamed or indented too far, before the rest is checked."""
     own = {key: value for key, value in grown.data.items() if key not in Robot.read_before}
     problems: dict[str, Problem] = {}
@@ -107,7 +107,7 @@ def _refuse_misplaced_sections(grown: Grown) -> None:
         raise InputError(_in_order([*grown.problems, *problems.values()]))
 
 
-def _with(grown: Grown, replacement: Replacement) -> Grown:
+def _with(grown: PlainDocument, replacement: Replacement) -> PlainDocument:
     """Return a document in which a value is replaced or added at a path.
 
     A place that the file does not have gets the mark of its nearest parent.

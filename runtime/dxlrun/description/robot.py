@@ -16,9 +16,9 @@ from pydantic import (
 )
 
 from dxlrun.description import units
+from dxlrun.description.base_form import Form, Name, PlugInEntry, key, validation_error, with_keys
 from dxlrun.description.bus import Bus
-from dxlrun.description.form import Form, Name, PlugInEntry, key, refuse, with_keys
-from dxlrun.description.joints.joints import JointEntry, joint_form
+from dxlrun.description.joints.joint_forms import JointEntry, joint_form
 from dxlrun.description.units import (
     AngularVelocity,
     AutoDuration,
@@ -35,7 +35,7 @@ from dxlrun.features.feature import PolicyKey, Section
 
 def _cores(value: tuple[int, ...]) -> tuple[int, ...]:
     if not value or len(set(value)) < len(value):
-        raise refuse("cores must be a list of different cores", "write for example [3]")
+        raise validation_error("cores must be a list of different cores", "write for example [3]")
     return value
 
 
@@ -43,7 +43,7 @@ def _one_or_more(value: object) -> object:
     if isinstance(value, str):
         return (value,)
     if not isinstance(value, list) or not value:
-        raise refuse("this names no controller", "write one name, or several: [a, b]")
+        raise validation_error("this names no controller", "write one name, or several: [a, b]")
     return tuple(value)
 
 
@@ -304,7 +304,7 @@ _POLICIES = ("Actions on faults and at the end of a run.", "{exit_timeout: 2 s}"
 class Robot(Form):
     """Form of a robot file without the sections of features, which `robot_form` adds.
 
-    `robot_form` adds the sections of features; `Section.of` returns one of them.
+    `robot_form` adds the sections of features; `Section.section_of` returns one of them.
     """
 
     read_before: ClassVar[tuple[str, ...]] = ("arguments", "include", "joint_defaults")

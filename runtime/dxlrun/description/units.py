@@ -24,7 +24,7 @@ from pydantic import (
 )
 from pydantic_core import CoreSchema, PydanticCustomError, core_schema
 
-from dxlrun.description.form import refuse
+from dxlrun.description.base_form import validation_error
 from dxlrun.description.mistakes.syntax import list_text
 from dxlsim.texts.duration import DURATION_NS, LONGEST_NS, LONGEST_QUANTITY, nanoseconds, split_quantity
 from dxlwire.joint_unit import JointUnit
@@ -89,22 +89,22 @@ class Quantity:
         number, unit = split(text, self.what, self.units, self.examples, bare=self.si if self._bare else "")
         value = float(number) * self.units[unit]
         if not math.isfinite(value):
-            raise refuse(f"{text!r} is too large", f"write {self.what} such as {self.examples}")
+            raise validation_error(f"{text!r} is too large", f"write {self.what} such as {self.examples}")
         if not self._least <= value <= self._most:
-            raise refuse(
+            raise validation_error(
                 f"{text!r} is not {self.what} from {self._least:.0%} to {self._most:.0%}",
                 f"write one such as {self.examples}",
             )
         return value
 
-    def text(self, value: float) -> str:
+    def format_value(self, value: float) -> str:
         """Write a number in SI as text that this quantity reads back to the same number."""
         return f"{value!r} {self.si}" if self.si in self.units else f"{value * 100:.12g} %"
 
     def __get_pydantic_core_schema__(self, source: Any, handler: GetCoreSchemaHandler) -> CoreSchema:  # noqa: ANN401 (pydantic's)
         """Return pydantic's schema, which makes a field of this type read and write text with a unit."""
         written = core_schema.plain_serializer_function_ser_schema(
-            self.text, return_schema=core_schema.str_schema(), when_used="json"
+            self.format_value, return_schema=core_schema.str_schema(), when_used="json"
         )
         return core_schema.no_info_before_validator_function(
             self, handler(source), serialization=None if self._bare else written
@@ -118,7 +118,7 @@ class Quantity:
         return {"anyOf": [handler(schema), text]} if self._bare else text
 
 
-class Either(Quantity):
+class AlternativeQuantity(Quantity):
     """A quantity that may be of different kinds, such as an angle or a length; a call returns a `Measure`."""
 
     def __init__(
@@ -136,12 +136,12 @@ class Either(Quantity):
         number, unit = split(text, self.what, self.units, self.examples)
         value = float(number) * self.units[unit]
         if self._above_zero and not 0 < value < math.inf:
-            raise refuse(f"{text!r} is not above 0", f"write one such as {self.examples}")
+            raise validation_error(f"{text!r} is not above 0", f"write one such as {self.examples}")
         if not math.isfinite(value):
-            raise refuse(f"{text!r} is too large", f"write {self.what} such as {self.examples}")
+            raise validation_error(f"{text!r} is too large", f"write {self.what} such as {self.examples}")
         return Measure(value, self._kinds[unit].si)
 
-    def text(self, value: float) -> str:
+    def format_value(self, value: float) -> str:
         """Write a `Measure` as text that is read back to the same value."""
         unit = value.unit if isinstance(value, Measure) else ""
         return f"{float(value) * 100!r} %" if unit == "1" else f"{float(value)!r} {unit}"
@@ -151,12 +151,12 @@ class Either(Quantity):
         return core_schema.no_info_plain_validator_function(
             self,
             serialization=core_schema.plain_serializer_function_ser_schema(
-                self.text, return_schema=core_schema.str_schema(), when_used="json"
+                self.format_value, return_schema=core_schema.str_schema(), when_used="json"
             ),
         )
 
 
-class Unlimited(Either):
+class UnlimitedQuantity(AlternativeQuantity):
     """A quantity that may be of different kinds and must be above 0, or is `inf`: no limit."""
 
     def __call__(self, text: object) -> Measure:
@@ -165,12 +165,12 @@ class Unlimited(Either):
             return text if isinstance(text, Measure) else Measure(math.inf, "")
         found = super().__call__(text)
         if not found > 0:
-            raise refuse(f"{text!r} is not above 0", f"write one such as {self.examples}, or inf")
+            raise validation_error(f"{text!r} is not above 0", f"write one such as {self.examples}, or inf")
         return found
 
-    def text(self, value: float) -> str:
+    def format_value(self, value: float) -> str:
         """Write a `Measure` as text that is read back to the same value."""
-        return "inf" if math.isinf(value) else super().text(value)
+        return "inf" if math.isinf(value) else super().format_value(value)
 
     def __get_pydantic_json_schema__(
         self, schema: CoreSchema, handler: GetJsonSchemaHandler
@@ -262,7 +262,9 @@ def duration(text: object, *, bare: str = "") -> int:
     number, unit = split(text, "a duration", DURATION_NS, written, bare=bare)
     value = nanoseconds(number, unit)
     if value is None:
-        raise refuse(f"{text!r} is not a duration from 0 s to 31 years", f"write one such as {written}")
+        raise validation_error(
+            f"{text!r} is not a duration from 0 s to 31 years", f"write one such as {written}"
+        )
     return value
 
 
@@ -284,19 +286,19 @@ def split(
 ) -> tuple[str, str]:
     """Split text into number and unit; `bare` is the unit if it has none. Raises an error with a fix."""
     if isinstance(text, int | float) and not isinstance(text, bool):
-        raise refuse(f"{text} has no unit", f"write {what} with its unit, such as {written}")
+        raise validation_error(f"{text} has no unit", f"write {what} with its unit, such as {written}")
     if not isinstance(text, str):
-        raise refuse(f"this is not {what}", f"write {what} such as {written}")
+        raise validation_error(f"this is not {what}", f"write {what} such as {written}")
     parts = split_quantity(text)
     if parts is None:
         fix = _meant(text[:LONGEST_QUANTITY], units) or f"write {what} such as {written}"
-        raise refuse(f"{text[:LONGEST_QUANTITY]!r} is not {what}", fix)
+        raise validation_error(f"{text[:LONGEST_QUANTITY]!r} is not {what}", fix)
     number, unit = parts[0], parts[1] or bare
     if not unit:
-        raise refuse(f"{text!r} has no unit", f"write {what} with its unit, such as {written}")
+        raise validation_error(f"{text!r} has no unit", f"write {what} with its unit, such as {written}")
     if unit not in units:
         fix = _meant(text, units) or f"write it as {written}"
-        raise refuse(f"{text!r} has the unit {unit}, which is not one of {what}", fix)
+        raise validation_error(f"{text!r} has the unit {unit}, which is not one of {what}", fix)
     return number, unit
 
 
@@ -385,17 +387,23 @@ def text_schema(example: str, units: Mapping[str, object]) -> dict[str, Any]:
     return {"type": "string", "pattern": pattern, "examples": [example]}
 
 
-effort = Either("an effort", (torque, force, current, fraction), "0.3 Nm, 800 mA or 40 %", above_zero=True)
-position = Either("an angle or a length", (angle, length), "60 deg, or 20 mm of a linear joint")
-speed = Either("a velocity", (angular_velocity, linear_velocity), "2 rad/s, or 50 mm/s of a linear joint")
-acceleration = Either(
+effort = AlternativeQuantity(
+    "an effort", (torque, force, current, fraction), "0.3 Nm, 800 mA or 40 %", above_zero=True
+)
+position = AlternativeQuantity("an angle or a length", (angle, length), "60 deg, or 20 mm of a linear joint")
+speed = AlternativeQuantity(
+    "a velocity", (angular_velocity, linear_velocity), "2 rad/s, or 50 mm/s of a linear joint"
+)
+acceleration = AlternativeQuantity(
     "an acceleration", (angular_acceleration, linear_acceleration), "10 rad/s^2, or 1 m/s^2 of a linear joint"
 )
-tolerance = Unlimited("a tolerance", (angle, length), "5 deg, or 5 mm of a linear joint")
-rest_speed = Unlimited(
+tolerance = UnlimitedQuantity("a tolerance", (angle, length), "5 deg, or 5 mm of a linear joint")
+rest_speed = UnlimitedQuantity(
     "a speed at rest", (angular_velocity, linear_velocity), "5 deg/s, or 5 mm/s of a linear joint"
 )
-torque_or_force = Either("a torque or a force", (torque, force), "0.3 Nm, or 2 N of a linear joint")
+torque_or_force = AlternativeQuantity(
+    "a torque or a force", (torque, force), "0.3 Nm, or 2 N of a linear joint"
+)
 
 Angle = Annotated[float, angle]
 AngularVelocity = Annotated[float, angular_velocity]
@@ -439,7 +447,7 @@ def _or_word(value: object, *words: str) -> int | str:
     except PydanticCustomError as error:
         context = error.context or {}
         more = " or ".join(words) if words[1:] else f"or {words[0]}"
-        raise refuse(str(context["what"]), f"{context['fix']}, {more}") from error
+        raise validation_error(str(context["what"]), f"{context['fix']}, {more}") from error
 
 
 def _nanoseconds(value: int | str) -> str:
@@ -485,7 +493,9 @@ def _part(value: object) -> object:
     number, unit = split(value, "a size or a duration", units, "100 MB or 10 min")
     amount = round(Fraction(number) * units[unit])
     if not 0 <= amount <= LONGEST_NS:
-        raise refuse(f"{value!r} is out of range", "write a size or a duration such as 100 MB or 10 min")
+        raise validation_error(
+            f"{value!r} is out of range", "write a size or a duration such as 100 MB or 10 min"
+        )
     return ("bytes" if unit in _SIZE_BYTES else "ns", amount)
 
 

@@ -6,7 +6,7 @@ from pathlib import Path
 
 from dxlrun.description.arguments import refuse_arguments
 from dxlrun.description.document import grow, parse, read_text
-from dxlrun.description.problems import Form, read_form
+from dxlrun.description.form_problems import Form, read_form
 
 
 def read_yaml(path: Path, model: type[Form]) -> Form:

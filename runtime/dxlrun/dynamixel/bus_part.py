@@ -13,12 +13,12 @@ from dxlrun.dynamixel.findings import Findings
 from dxlrun.features import stages
 from dxlrun.features.feature import Feature
 from dxlwire.bus_plan import BusPlan
-from dxlwire.exchange.bus import Lines
+from dxlwire.exchange.bus_engine import Lines
 from dxlwire.transaction import Program
 
 if TYPE_CHECKING:  # the guardian makes the robot safe without numpy
     from dxlrun.channels.cycle import Floats
-    from dxlrun.channels.events import EventSink
+    from dxlrun.channels.event_records import EventSink
     from dxlwire.exchange.cyclic_reads import CyclicReads
     from dxlwire.exchange.idle import IdleScheduler
     from dxlwire.exchange.samples import BusSamples
@@ -170,7 +170,7 @@ class SafeEnd(msgspec.Struct, frozen=True):
     stages: tuple[tuple[Feature, SafeStage, bytes], ...]
 
     @classmethod
-    def of(cls, features: Iterable[Feature], plans: Mapping[str, bytes]) -> SafeEnd:
+    def import_stages(cls, features: Iterable[Feature], plans: Mapping[str, bytes]) -> SafeEnd:
         """Import the `safe.py` of every feature now, because an import may be impossible at the end of a
         run."""
         found = stages(SafeStage, features)

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import msgspec
 
-from dxlrun.channels.events import EventBody, EventCode, EventSink
+from dxlrun.channels.event_records import EventBody, EventCode, EventSink
 from dxlrun.dynamixel import texts
 from dxlwire.control_table import FoundDeviation
 
@@ -21,7 +21,7 @@ class Findings(msgspec.Struct):
     deviations: list[tuple[str, str, FoundDeviation]] = []
     """Settings that differ from the factory's: joint, place such as `ID 4 on bus main`, and the deviation."""
 
-    def note(self, source: str, event: EventBody) -> None:
+    def add_event(self, source: str, event: EventBody) -> None:
         """Add an event for the log; `source` is the name of a joint or a device."""
         self.events.append((source, event))
 
@@ -57,4 +57,4 @@ class Findings(msgspec.Struct):
         factory's.
         """
         for source, event in (*self.events, *self._deviation_events()):
-            events.emit(source, event)
+            events.emit_event(source, event)

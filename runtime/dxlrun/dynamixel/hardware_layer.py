@@ -15,7 +15,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from dxlrun.channels.cycle import Commands, States
-from dxlrun.channels.events import EventSink
+from dxlrun.channels.event_records import EventSink
 from dxlrun.contract.hardware import Hardware
 from dxlrun.features import stages
 from dxlrun.plan.loop_plan import ServoLimit
@@ -43,21 +43,23 @@ class HardwareLayer:
         """Registers that limit the goals of each joint's servos, by row of the joint."""
         return self._hardware.servo_limits
 
-    def read(self) -> None:
+    def read_states(self) -> None:
         """Read the servos' states into the state arrays."""
-        self._hardware.read()
+        self._hardware.read_states()
 
-    def write(self) -> None:
+    def write_goals(self) -> None:
         """Send the goals in the goal arrays to the servos."""
-        self._hardware.write()
+        self._hardware.write_goals()
 
     def set_modes(self, modes: NDArray[np.uint8]) -> None:
         """Request operating modes for joints, shape (joints,); UNKNOWN keeps a joint's mode."""
         self._hardware.set_modes(modes)
 
-    def set_register(self, row: int, item: str, value: int, done: Callable[[str, int | None], None]) -> None:
+    def write_register(
+        self, row: int, item: str, value: int, done: Callable[[str, int | None], None]
+    ) -> None:
         """Write a RAM item of a joint's servo; `done` receives the problem and the previous value."""
-        self._hardware.set_register(row, item, value, done)
+        self._hardware.write_register(row, item, value, done)
 
     def read_register(self, row: int, item: str, done: Callable[[str, int | None], None]) -> None:
         """Read an item of a joint's servo; `done` receives the problem and the value."""
@@ -71,9 +73,9 @@ class HardwareLayer:
         """Start sending goals to the joints of these rows, which were just given torque."""
         self._hardware.follow_goals(rows)
 
-    def reboot(self, row: int, done: Callable[[str], None]) -> None:
+    def reboot_servo(self, row: int, done: Callable[[str], None]) -> None:
         """Reboot a joint's servo; `done` receives the problem, empty on success."""
-        self._hardware.reboot(row, done)
+        self._hardware.reboot_servo(row, done)
 
     def limit_torque(self, fraction: float) -> None:
         """Limit the torque of every servo to a fraction (0 to 1) of its own limit."""
@@ -87,9 +89,9 @@ class HardwareLayer:
         """Switch torque off on every servo; return a sentence for each failure."""
         return self._hardware.stop()
 
-    def release(self) -> None:
+    def leave_torque_on(self) -> None:
         """End the exchange but leave the servos' torque on."""
-        self._hardware.release()
+        self._hardware.leave_torque_on()
 
 
 class PreparedLayer(msgspec.Struct, frozen=True):

@@ -11,7 +11,7 @@ from collections.abc import Iterable, Sequence
 from pathlib import Path
 
 from dxlrun.plan.machine_load import MachineLoad
-from dxlwire.errors import counted
+from dxlwire.exceptions import counted
 from dxlwire.port.latency_timer import SYSTEM, fix, is_simulated, is_timer, latency_timer
 
 CHECK = "check its cable and power"

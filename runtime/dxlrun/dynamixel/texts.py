@@ -8,8 +8,8 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 
-from dxlrun.channels.events import EventCode, Severity, event_text
-from dxlwire.errors import counted
+from dxlrun.channels.event_records import EventCode, Severity, event_text
+from dxlwire.exceptions import counted
 
 # Start-up
 

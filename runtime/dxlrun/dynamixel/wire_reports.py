@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dxlrun.channels.events import EventSink
+from dxlrun.channels.event_records import EventSink
 from dxlrun.dynamixel import texts
 from dxlwire.exchange.reports import Reason
 
@@ -18,4 +18,4 @@ class WireReports:
 
     def report(self, reason: Reason, source: str, text: str) -> None:
         """Send a report to the log as the event of its reason."""
-        self._events.emit(source, _EVENTS[reason](text))
+        self._events.emit_event(source, _EVENTS[reason](text))

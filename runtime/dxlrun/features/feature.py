@@ -55,14 +55,14 @@ class Section(msgspec.Struct, Generic[T], frozen=True):
     """Type of the section's value for pydantic, such as `dict[Name, Device]`; or a function that returns the
     type, if other features add keys to it."""
     field: T
-    """Description and default of the section, as `dxlrun.description.form.key` returns them."""
+    """Description and default of the section, as `dxlrun.description.base_form.key` returns them."""
     before: str = ""
     """Section before which this one is listed; if it does not exist, this section is the last."""
     moved_joints: Callable[[object], Iterable[str]] = lambda section: ()
     """Yields the joints that this (not yet validated) section moves. They get no servo keys from groups and
     defaults."""
 
-    def of(self, robot: object) -> T:
+    def section_of(self, robot: object) -> T:
         """Return this section's value from a validated robot file."""
         section: T = getattr(robot, self.name)
         return section
@@ -90,7 +90,7 @@ class JointKey(msgspec.Struct, Generic[T], frozen=True):
     form: object
     """Type of the value in the robot file for pydantic: `Position | None`."""
     field: object
-    """Description and default of the key, as `dxlrun.description.form.key` returns them."""
+    """Description and default of the key, as `dxlrun.description.base_form.key` returns them."""
     value: type[T]
     """Type of the value in a joint's plan: `float`, or a msgspec struct for a form."""
     before: str = ""
@@ -99,7 +99,7 @@ class JointKey(msgspec.Struct, Generic[T], frozen=True):
     """Example value for rotary and for linear joints, which also fixes the unit that each accepts. Empty: the
     unit does not depend on the joint."""
 
-    def of(self, joint: KeyedJoint) -> T | None:
+    def value_of(self, joint: KeyedJoint) -> T | None:
         """Return this key's value from a joint's plan; None if the robot file does not set it."""
         return msgspec.convert(joint.keys[self.name], self.value) if self.name in joint.keys else None
 
@@ -126,7 +126,7 @@ class ServoKey(msgspec.Struct, Generic[T], frozen=True):
     form: object
     """Type of the value in the robot file, for pydantic."""
     field: object
-    """Description and default of the key in a joint, as `dxlrun.description.form.key` returns them."""
+    """Description and default of the key in a joint, as `dxlrun.description.base_form.key` returns them."""
     of_one: object
     """Description and default of the key in one entry of a joint's `servos`. The default None means the
     joint's value."""
@@ -135,7 +135,7 @@ class ServoKey(msgspec.Struct, Generic[T], frozen=True):
     before: str = ""
     """Key of servos before which this one is listed; if it does not exist, this key is the last."""
 
-    def of(self, servo: KeyedServo) -> T:
+    def value_of(self, servo: KeyedServo) -> T:
         """Return a servo's value of this key, which is that of its joint if the servo has none."""
         return cast("T", servo.keys[self.name])
 
@@ -150,7 +150,7 @@ class PolicyKey(msgspec.Struct, Generic[T], frozen=True):
     form: object
     """Type of the value for pydantic: `Literal["stop", "limp"] | None`."""
     field: T
-    """Description and default of the key, as `dxlrun.description.form.key` returns them."""
+    """Description and default of the key, as `dxlrun.description.base_form.key` returns them."""
     does: str = ""
     """Text for `dxlrun check` that says what `hold` does. If set, the value is `hold`, during which the run
     continues, or steps that end the run and are checked like those of `on_exit`."""
@@ -159,7 +159,7 @@ class PolicyKey(msgspec.Struct, Generic[T], frozen=True):
     group: PolicyKey[Any] | None = None
     """Key of the same name in `policies.groups.NAME`; None: groups do not have it."""
 
-    def of(self, policies: object) -> T:
+    def value_of(self, policies: object) -> T:
         """Return this key's value from the validated section `policies`, or from one of its groups."""
         value: T = getattr(policies, self.name)
         return value

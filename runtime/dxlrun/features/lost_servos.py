@@ -11,11 +11,11 @@ import msgspec
 import numpy as np
 
 from dxlrun.channels.cycle import LOST_AGE_NS, LOST_CYCLES, CycleRecord, States, Torque
-from dxlrun.channels.events import EventCode, Severity, event_text
+from dxlrun.channels.event_records import EventCode, Severity, event_text
 from dxlrun.compile.contribution import Compilation, CompileStage, Contribution
-from dxlrun.control.monitors.monitor import MonitorStage
+from dxlrun.control.monitors.monitor_stage import MonitorStage
 from dxlrun.control.monitors.policy_actions import PolicyActions
-from dxlrun.description.form import key
+from dxlrun.description.base_form import key
 from dxlrun.description.robot import WrittenPolicy
 from dxlrun.features.feature import PolicyKey
 from dxlrun.plan.loop_plan import LoopPlan
@@ -68,7 +68,7 @@ def compile_groups(compilation: Compilation) -> Contribution:
     groups = tuple(
         GroupPolicy(name, frozenset(rows[joint] for joint in group.joints if joint in rows), action)
         for name, group in compilation.file.robot.policies.groups.items()
-        if (action := OF_GROUP.of(group)) is not None
+        if (action := OF_GROUP.value_of(group)) is not None
     )
     return Contribution(
         policies={f"{NAME} of {one.name}": _ACTIONS[one.action] for one in groups},
@@ -106,7 +106,7 @@ class LostServos:
         groups = msgspec.json.decode(plan.feature_plans.get(NAME, b"[]"), type=tuple[GroupPolicy, ...])
         return cls(tuple(one.name for one in plan.joints), record.states, actions, groups)
 
-    def check(self, time_ns: int) -> None:
+    def check_cycle(self, time_ns: int) -> None:
         """Count the cycle's missed replies; apply the policies if a joint became lost or came back."""
         if self._missed.none and self._states.valid.tobytes() == self._all_valid:
             return

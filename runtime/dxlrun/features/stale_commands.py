@@ -5,7 +5,7 @@
 
 from __future__ import annotations
 
-from dxlrun.description.form import key
+from dxlrun.description.base_form import key
 from dxlrun.description.robot import WrittenPolicy
 from dxlrun.features.feature import PolicyKey
 

@@ -9,7 +9,7 @@ from typing import overload
 import numpy as np
 from numpy.typing import NDArray
 
-from dxlrun.channels.packets import BEFORE_FIRST_CYCLE, LoggedPacket
+from dxlrun.channels.logged_packets import BEFORE_FIRST_CYCLE, LoggedPacket
 from dxlrun.messages.cdr_columns import pieces
 from dxlwire.packets import PacketKind
 
@@ -44,7 +44,7 @@ class PacketColumns(Sequence[LoggedPacket]):
     def __getitem__(self, index: int | slice) -> LoggedPacket | PacketColumns:
         """Return one packet, or the columns of a slice of packets."""
         if isinstance(index, slice):
-            return self.take(np.arange(len(self))[index])
+            return self.select_rows(np.arange(len(self))[index])
         start = int(self.start[index])
         return LoggedPacket(
             int(self.bus[index]),
@@ -69,7 +69,7 @@ class PacketColumns(Sequence[LoggedPacket]):
             body = data[start : start + length]
             yield LoggedPacket(bus, PacketKind(kind), servo_id, first_ns, last_ns, body)
 
-    def take(self, rows: NDArray[np.int64] | NDArray[np.bool_]) -> PacketColumns:
+    def select_rows(self, rows: NDArray[np.int64] | NDArray[np.bool_]) -> PacketColumns:
         """Return the columns of selected packets, by indices or boolean mask; `data` is not copied."""
         return replace(self, **{name: getattr(self, name)[rows] for name in _OF_EACH})
 
@@ -91,7 +91,7 @@ class PacketColumns(Sequence[LoggedPacket]):
         if len(parts) == 1:
             return parts[0]
         if not parts:
-            return cls.of(())
+            return cls.from_packets(())
         before = np.cumsum([0, *(len(part.data) for part in parts[:-1])])
         columns = {
             name: np.concatenate([getattr(part, name) for part in parts]) for name in (*_OF_EACH, "data")
@@ -100,7 +100,9 @@ class PacketColumns(Sequence[LoggedPacket]):
         return cls(**columns)
 
     @classmethod
-    def of(cls, packets: Iterable[LoggedPacket], cycle: NDArray[np.int64] | None = None) -> PacketColumns:
+    def from_packets(
+        cls, packets: Iterable[LoggedPacket], cycle: NDArray[np.int64] | None = None
+    ) -> PacketColumns:
         """Convert packets to columns; `cycle` has their cycle numbers, None means before the first cycle."""
         rows = list(packets)
         length = np.array([len(packet.data) for packet in rows], np.int64)

@@ -13,9 +13,9 @@ import msgspec
 import zstandard
 from mcap.writer import CompressionType, Writer
 
-from dxlrun.channels.events import Event, EventCode, LostRecords, Severity, event_text
-from dxlrun.channels.messages import MessageRing, PublishedTopic
+from dxlrun.channels.event_records import Event, EventCode, LostRecords, Severity, event_text
 from dxlrun.channels.ring import Handover, Payload
+from dxlrun.channels.topic_messages import MessageRing, PublishedTopic
 from dxlrun.errors import counted
 from dxlrun.log import schemas
 from dxlrun.log.log_file import LogFile
@@ -73,7 +73,7 @@ class LogWriter(RunMessages):
         self._known: dict[str, int] = {}
         """Number of each message type in the file, by the type's name."""
         try:
-            self._begin()
+            self._write_header()
         except BaseException:
             self._file.close()
             raise
@@ -83,7 +83,7 @@ class LogWriter(RunMessages):
         """Size of the file so far, bytes, without messages that are still collected for the next chunk."""
         return self._file.tell()
 
-    def _begin(self) -> None:
+    def _write_header(self) -> None:
         header = self.header
         self._writer.start(profile=schemas.PROFILE, library=_LIBRARY)
         self._writer.add_metadata(schemas.METADATA_NAME, to_metadata(header))
@@ -150,13 +150,13 @@ class LogWriter(RunMessages):
         if self.span.last_ns is not None and self._file.tell() == self._whole_bytes:
             self.error += f"; {self.span.last_cycle_text}"
 
-    def take(self, kind: int, payload: Payload) -> None:
+    def write_record(self, kind: int, payload: Payload) -> None:
         """Write one record from a ring as a message. Raises ValueError for a kind that logs do not have."""
         if kind not in self._takers:
             raise ValueError(f"a record of kind {kind} does not belong in a log")
         self._guarded(self._takers[kind], payload)
         if self._chunk_bytes > CHUNK_BYTES:
-            self.flush()
+            self.finish_chunk()
 
     def machine(self, t_ns: int, data: bytes) -> None:
         """Write an encoded message about the machine's load to /machine; the first one opens the topic."""
@@ -170,7 +170,7 @@ class LogWriter(RunMessages):
         event = Event(self.last_ns, code, severity, "recorder", text, data)
         self._guarded(self.event, event)
 
-    def flush(self) -> None:
+    def finish_chunk(self) -> None:
         """Write the collected messages, so that a reader finds them even after this process was killed."""
         if self.error is None:
             try:
@@ -251,7 +251,7 @@ class TopicWriter:
             },
         )
         self._log = LogWriter(path, header)
-        self._ring = MessageRing(Handover(self._log.take))
+        self._ring = MessageRing(Handover(self._log.write_record))
         self._codecs: list[Codec] = []
 
     def open_topic(self, name: str, message: type) -> int:

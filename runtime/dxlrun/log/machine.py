@@ -61,7 +61,7 @@ class MachineSampler:
         self._before: _Counters | None = None
         self._codec = Codec(MACHINE)
 
-    def sample(self, t_ns: int) -> bytes | None:
+    def sample_machine(self, t_ns: int) -> bytes | None:
         """Return an encoded message of /machine about the time since the last call; None at the first call.
 
         `t_ns`: time of the run's clock.

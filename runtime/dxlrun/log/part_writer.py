@@ -73,14 +73,14 @@ class PartWriter:
             self._path.unlink(missing_ok=True)
             raise
         for topic in topics:
-            log.take(RecordKind.TAGGED, topic)
+            log.write_record(RecordKind.TAGGED, topic)
         return log
 
     def _next(self, began: str) -> None:
         """Finish this part and open the next; `began` is the reason. If that fails, the log ends here."""
         if self.error is not None:
             return
-        summary = self._end(last=False)
+        summary = self._close_part(last=False)
         if summary.error is not None:
             self._error = summary.error
             return
@@ -95,15 +95,15 @@ class PartWriter:
         self._kept.append((ended, self._log.last_ns))
         self._log = log
 
-    def _end(self, *, last: bool) -> LogSummary:
+    def _close_part(self, *, last: bool) -> LogSummary:
         end = {PART_END_NAME: {"last": "yes" if last else "no"}}
         self._log.late_metadata |= self.late_metadata | end
         return self._log.close()
 
-    def take(self, kind: int, payload: Payload) -> None:
+    def write_record(self, kind: int, payload: Payload) -> None:
         """Write one record from a ring. Raises ValueError for a kind that logs do not have."""
         if self._error is None:
-            self._log.take(kind, payload)
+            self._log.write_record(kind, payload)
         else:
             self._unwritten += 1
 
@@ -114,7 +114,7 @@ class PartWriter:
         else:
             self._unwritten += 1
 
-    def settle(self) -> None:
+    def split_if_due(self) -> None:
         """Start a new part if this one is full or old; delete expired parts. Call it after a whole cycle."""
         size, age_ns, keep_ns = self._plan.split_bytes, self._plan.split_ns, self._plan.keep_ns
         now_ns = self._log.last_ns
@@ -135,10 +135,10 @@ class PartWriter:
         if self._error is None:
             self._log.gap(source, lost)
 
-    def flush(self) -> None:
+    def finish_chunk(self) -> None:
         """Write the collected messages, so that a reader finds them even after this process was killed."""
         if self._error is None:
-            self._log.flush()
+            self._log.finish_chunk()
 
     def sync(self) -> None:
         """Block until the disk has stored all written chunks."""
@@ -148,7 +148,7 @@ class PartWriter:
     def close(self) -> LogSummary:
         """Finish the last part; return message count, size and error of all parts together."""
         if self._summary is None:
-            last = self._end(last=True)
+            last = self._close_part(last=True)
             every = [*self._closed, last]
             self._summary = LogSummary(
                 messages=sum(one.messages for one in every),

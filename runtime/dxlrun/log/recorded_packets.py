@@ -6,7 +6,7 @@ from pathlib import Path
 
 from dxlrun.errors import LogError
 from dxlrun.log.columns import PacketColumns
-from dxlrun.log.reader import open_log
+from dxlrun.log.log_reader import open_log
 from dxlsim.bus.recording import RecordedPackets
 from dxlwire.packets import PacketKind
 
@@ -17,7 +17,7 @@ def read_recorded_packets(path: Path, bus: str) -> RecordedPackets:
     for piece in open_log(path).slices():
         if bus not in piece.buses:
             raise LogError(f"{path}: the log has no bus {bus}")
-        pieces.append(piece.packets.take(piece.packets.bus == piece.buses.index(bus)).compact())
+        pieces.append(piece.packets.select_rows(piece.packets.bus == piece.buses.index(bus)).compact())
     packets = PacketColumns.joined(pieces)
     asked = packets.kind == PacketKind.INSTRUCTION
     if not asked.any():

@@ -16,8 +16,8 @@ from pathlib import Path
 import numpy as np
 from msgspec.json import Decoder
 
-from dxlrun.channels import process
-from dxlrun.channels.process import (
+from dxlrun.channels import child_processes
+from dxlrun.channels.child_processes import (
     Draining,
     Failed,
     Finish,
@@ -66,23 +66,25 @@ class Recorder:
         self._next_sample_ns = 0
         self._next_flush = self._next_sync = time.monotonic() + FLUSH_S
 
-    def run(self, asked_to_stop: Callable[[], bool]) -> LogClosed:
+    def record_until_stopped(self, asked_to_stop: Callable[[], bool]) -> LogClosed:
         """Record until the supervisor or a signal stops it; then empty the rings and finish the log.
 
         Returns the log's summary and the machine's load.
         """
-        self._supervisor.send(Ready())
+        self._supervisor.send_message(Ready())
         while True:
             more = self._turn()
             if self._requested_to_finish(0 if more else POLL_S) or asked_to_stop():
                 break
         while self._turn():
-            self._supervisor.send(Draining())
+            self._supervisor.send_message(Draining())
         self._next_sample_ns = 0
         self._sample_machine()
         summary = self._log.close()
-        self._report()
-        loads = (MachineLoad() if meter is None else meter.load() for meter in (self._start_up, self._run))
+        self._report_error()
+        loads = (
+            MachineLoad() if meter is None else meter.compute_load() for meter in (self._start_up, self._run)
+        )
         return LogClosed(summary, *loads)
 
     def _requested_to_finish(self, seconds: float) -> bool:
@@ -90,7 +92,7 @@ class Recorder:
         if not select.select([self._supervisor], [], [], seconds)[0]:
             return False
         finish = False
-        for request in self._supervisor.receive():
+        for request in self._supervisor.receive_messages():
             if isinstance(request, LateMetadata):
                 self._log.late_metadata |= request.records
             elif isinstance(request, LoopRuns):
@@ -109,10 +111,10 @@ class Recorder:
         """
         full = [self._drain(name, ring) for name, ring in self._rings]
         if isinstance(self._log, PartWriter):
-            self._log.settle()
+            self._log.split_if_due()
         self._flush_when_due()
         self._sample_machine()
-        self._report()
+        self._report_error()
         return any(full)
 
     def _flush_when_due(self) -> None:
@@ -122,7 +124,7 @@ class Recorder:
         """
         if time.monotonic() < self._next_flush:
             return
-        self._log.flush()
+        self._log.finish_chunk()
         if self._span >= 0 and self._log.error is None:
             self._log.span.store(self._span)
         if time.monotonic() >= self._next_sync:
@@ -136,13 +138,13 @@ class Recorder:
         if self._machine is None or now_ns < self._next_sample_ns:
             return
         self._next_sample_ns = now_ns + SAMPLE_PERIOD_NS
-        data = self._machine.sample(now_ns)
+        data = self._machine.sample_machine(now_ns)
         if data is not None:
             self._log.machine(now_ns, data)
             sample = load_sample(self._codec.unpack(data))
             for meter in (self._start_up, self._run):
                 if meter is not None:
-                    meter.add(sample)
+                    meter.add_sample(sample)
 
     def _drain(self, name: str, ring: RingReader) -> bool:
         """Write up to _MOST_PER_TURN records of one ring into the log; return True if more may be left.
@@ -153,7 +155,7 @@ class Recorder:
         lost, record = 0, None
         for _ in range(_MOST_PER_TURN):
             self._flush_when_due()
-            record = ring.read()
+            record = ring.read_record()
             if record is None:
                 break
             if isinstance(record, Gap):
@@ -162,7 +164,7 @@ class Recorder:
             if self._run is None and record.kind == RecordKind.CYCLE:
                 self._begin_run(record.payload)
             try:
-                self._log.take(record.kind, record.payload)
+                self._log.write_record(record.kind, record.payload)
             except (ValueError, IndexError, OverflowError):
                 # An intact record that does not fit into a log is reported as lost.
                 lost += 1
@@ -181,24 +183,24 @@ class Recorder:
         if self._start_up is not None:
             self._start_up.end_ns = int(cycle["scheduled_ns"])
 
-    def _report(self) -> None:
+    def _report_error(self) -> None:
         if self._log.error is not None and not self._reported:
             self._reported = True
-            self._supervisor.send(Failed(self._log.error))
+            self._supervisor.send_message(Failed(self._log.error))
 
 
 def main() -> int:
     """Entry point of the recorder process: `--job-fd N --control-fd M`; returns 1 for an incomplete log."""
     stop: list[int] = []
     signal.signal(signal.SIGTERM, lambda number, frame: stop.append(number))
-    job, supervisor = process.begun(RecorderJob, REQUESTS)
+    job, supervisor = child_processes.begun(RecorderJob, REQUESTS)
     try:
         recorder = Recorder(job, supervisor)
     except OSError as error:
-        supervisor.send(Failed(f"the log cannot be written: {error.strerror or error} ({job.path})"))
+        supervisor.send_message(Failed(f"the log cannot be written: {error.strerror or error} ({job.path})"))
         return 1
-    closed = recorder.run(lambda: bool(stop))
-    supervisor.send(closed)
+    closed = recorder.record_until_stopped(lambda: bool(stop))
+    supervisor.send_message(closed)
     return 1 if closed.summary.error or closed.summary.gaps else 0
 
 

@@ -9,11 +9,11 @@ import numpy as np
 from numpy.typing import NDArray
 
 from dxlrun.channels.commands import TakenCommand
-from dxlrun.channels.events import Event
-from dxlrun.channels.messages import OpenedTopic, TopicMessage
-from dxlrun.channels.packets import BatchedPacket, split_packets
+from dxlrun.channels.event_records import Event
+from dxlrun.channels.logged_packets import BatchedPacket, split_packets
 from dxlrun.channels.ring import Payload, RecordKind
 from dxlrun.channels.tagged import decode
+from dxlrun.channels.topic_messages import OpenedTopic, TopicRecord
 from dxlrun.log import schemas
 from dxlrun.log.packing.bus_messages import pack_packets
 from dxlrun.log.packing.diagnostics import Diagnostics
@@ -115,7 +115,7 @@ class RunMessages(ABC):
         """
         data = bytes(payload)
         record = np.frombuffer(data, dtype=self._layout.dtype)[0]
-        self.span.add(record, self.header.period_ns)
+        self.span.extend_span(record, self.header.period_ns)
         written_ns, read_ns = int(record["written_ns"]), int(record["read_ns"])
         if int(record["cycle"]) < 0:
             self._add(self._activation_channel, written_ns, ENCAPSULATION + data)
@@ -125,14 +125,14 @@ class RunMessages(ABC):
         for bit, joints, rows in self._publishers:
             if published & bit:
                 self._joint_states(read_ns, joints, record, rows)
-        frames = None if self._frames is None else self._frames.of(record, self._stamp(read_ns))
+        frames = None if self._frames is None else self._frames.pack_frames(record, self._stamp(read_ns))
         if frames is not None:
             self._add(self._frames_channel, read_ns, frames)
         slot = int(record["scheduled_ns"]) // JOINT_COMMANDS_NS
         if slot != self._commands_slot:
             self._commands_slot = slot
             self._joint_commands(written_ns, record)
-        diagnostics = self._diagnostics.of(record, written_ns, self._stamp(written_ns))
+        diagnostics = self._diagnostics.pack_diagnostics(record, written_ns, self._stamp(written_ns))
         if diagnostics is not None:
             self._add(self._diagnostics_channel, written_ns, diagnostics)
 
@@ -184,7 +184,7 @@ class RunMessages(ABC):
             case OpenedTopic(number, topic=topic):
                 self.topics[bytes(payload)] = None
                 self._topic_channels[number] = self._channel(topic.name, topic.type)
-            case TopicMessage(t_ns, number, data=data) if number in self._topic_channels:
+            case TopicRecord(t_ns, number, data=data) if number in self._topic_channels:
                 self._add(self._topic_channels[number], t_ns, data)
             case other:
                 raise ValueError(
@@ -200,7 +200,7 @@ class RunMessages(ABC):
             command.controller,
             command.kind,
             command.origin,
-            command.text,
+            command.data_text,
             command.numbers,
             command.request.decode(errors="replace"),
         )

@@ -301,7 +301,7 @@ class LogHeader(msgspec.Struct, frozen=True):
     """Plan of the moved frames and their logging; None without a URDF."""
 
     @classmethod
-    def of(cls, plan: Plan, epoch_offset_ns: int) -> LogHeader:
+    def from_plan(cls, plan: Plan, epoch_offset_ns: int) -> LogHeader:
         """Return the header of a run, without attachments and metadata."""
         loop = plan.loop
         return cls(
@@ -351,7 +351,7 @@ class CycleSpan:
         if self.begin_ns is not None and self.last_ns is not None:
             os.pwrite(descriptor, _SPAN.pack(self.begin_ns, self.last_ns), 0)
 
-    def add(self, record: np.void, period_ns: int) -> None:
+    def extend_span(self, record: np.void, period_ns: int) -> None:
         """Extend the span by a record of /cycle or /activation, which has number -1 and the first deadline.
 
         In a later part, the first record is not the first of the run; its number gives the first deadline.

@@ -120,7 +120,7 @@ def _row_writer(name: str, definitions: Definitions) -> Callable[[bytearray, Seq
     """Return a function that encodes the flattened values of a message, in the order of `_leaves`."""
     steps = tuple(_steps([field for _, field in _leaves(name, definitions, "")], definitions))
 
-    def write(buffer: bytearray, row: Sequence[Value]) -> None:
+    def write_row(buffer: bytearray, row: Sequence[Value]) -> None:
         at = 0
         for write_one, count in steps:
             if count:
@@ -130,7 +130,7 @@ def _row_writer(name: str, definitions: Definitions) -> Callable[[bytearray, Seq
                 write_one(buffer, row[at])
                 at += 1
 
-    return write
+    return write_row
 
 
 def _steps(fields: Sequence[MessageField], definitions: Definitions) -> Iterator[tuple[Write, int]]:
@@ -159,10 +159,10 @@ def _run(codes: str) -> Write:
             at += -at % size + size
         layouts.append(struct.Struct(form).pack)
 
-    def write(buffer: bytearray, values: Value) -> None:
+    def write_run(buffer: bytearray, values: Value) -> None:
         buffer += layouts[(len(buffer) - _HEAD) % _WIDEST](*cast("Sequence[Value]", values))
 
-    return write
+    return write_run
 
 
 def _align(buffer: bytearray, size: int) -> None:
@@ -178,15 +178,15 @@ def _aligned(at: int, size: int) -> int:
 def _number(kind: str) -> tuple[Write, Read]:
     form = struct.Struct("<" + PRIMITIVES[kind])
 
-    def write(buffer: bytearray, value: Value) -> None:
+    def write_number(buffer: bytearray, value: Value) -> None:
         _align(buffer, form.size)
         buffer += form.pack(value)
 
-    def read(data: memoryview, at: int) -> tuple[Value, int]:
+    def read_number(data: memoryview, at: int) -> tuple[Value, int]:
         at = _aligned(at, form.size)
         return form.unpack_from(data, at)[0], at + form.size
 
-    return write, read
+    return write_number, read_number
 
 
 def _row(value: Value, element: np.dtype[np.generic]) -> bytes | bytearray | memoryview:
@@ -209,7 +209,7 @@ def _numbers(kind: str, fixed: int) -> tuple[Write, Read]:
     """
     element = np.dtype(PRIMITIVES[kind]).newbyteorder("<")
 
-    def write(buffer: bytearray, value: Value) -> None:
+    def write_numbers(buffer: bytearray, value: Value) -> None:
         row = _row(value, element)
         count = len(row) // element.itemsize
         if not fixed:
@@ -221,7 +221,7 @@ def _numbers(kind: str, fixed: int) -> tuple[Write, Read]:
             _align(buffer, element.itemsize)
             buffer += row
 
-    def read(data: memoryview, at: int) -> tuple[Value, int]:
+    def read_numbers(data: memoryview, at: int) -> tuple[Value, int]:
         count = fixed
         if not fixed:
             at = _aligned(at, 4)
@@ -234,11 +234,11 @@ def _numbers(kind: str, fixed: int) -> tuple[Write, Read]:
             raise ValueError("a sequence is longer than its message")
         return np.frombuffer(data[at:end], dtype=element), end
 
-    return write, read
+    return write_numbers, read_numbers
 
 
 def _text() -> tuple[Write, Read]:
-    def write(buffer: bytearray, value: Value) -> None:
+    def write_text(buffer: bytearray, value: Value) -> None:
         if not isinstance(value, str):
             raise ValueError(f"{type(value).__name__} is given where text is asked")
         data = value.encode(errors="replace") + b"\0"
@@ -246,7 +246,7 @@ def _text() -> tuple[Write, Read]:
         buffer += _LENGTH.pack(len(data))
         buffer += data
 
-    def read(data: memoryview, at: int) -> tuple[Value, int]:
+    def read_text(data: memoryview, at: int) -> tuple[Value, int]:
         at = _aligned(at, 4)
         (length,) = _LENGTH.unpack_from(data, at)
         at += 4
@@ -254,13 +254,13 @@ def _text() -> tuple[Write, Read]:
             raise ValueError("a text is longer than its message, or has no end")
         return bytes(data[at : at + length - 1]).decode(errors="replace"), at + length
 
-    return write, read
+    return write_text, read_text
 
 
 def _many(one: tuple[Write, Read]) -> tuple[Write, Read]:
     write_one, read_one = one
 
-    def write(buffer: bytearray, value: Value) -> None:
+    def write_sequence(buffer: bytearray, value: Value) -> None:
         if not isinstance(value, Sequence) or isinstance(value, str | bytes):
             raise ValueError(f"{type(value).__name__} is given where a sequence is asked")
         _align(buffer, 4)
@@ -268,7 +268,7 @@ def _many(one: tuple[Write, Read]) -> tuple[Write, Read]:
         for item in value:
             write_one(buffer, item)
 
-    def read(data: memoryview, at: int) -> tuple[Value, int]:
+    def read_sequence(data: memoryview, at: int) -> tuple[Value, int]:
         at = _aligned(at, 4)
         (count,) = _LENGTH.unpack_from(data, at)
         at += 4
@@ -278,7 +278,7 @@ def _many(one: tuple[Write, Read]) -> tuple[Write, Read]:
             items.append(item)
         return items, at
 
-    return write, read
+    return write_sequence, read_sequence
 
 
 def _texts() -> tuple[Write, Read]:
@@ -294,32 +294,32 @@ def _texts() -> tuple[Write, Read]:
         write_each(buffer, texts)
         return bytes(buffer[_HEAD + at :])
 
-    def write(buffer: bytearray, value: Value) -> None:
+    def write_texts(buffer: bytearray, value: Value) -> None:
         if isinstance(value, tuple):
             # The bytes depend on the offset modulo 4 only, the largest alignment of texts.
             buffer += packed(value, (len(buffer) - _HEAD) % 4)
         else:
             write_each(buffer, value)
 
-    return write, read
+    return write_texts, read
 
 
 def _nested(name: str, definitions: Definitions) -> tuple[Write, Read]:
     write_row = _row_writer(name, definitions)
     readers = [(field.name, _field(field, definitions)[1]) for field in definitions[name]]
 
-    def write(buffer: bytearray, value: Value) -> None:
+    def write_struct(buffer: bytearray, value: Value) -> None:
         row: list[Value] = []
         _flatten(value, name, definitions, row)
         write_row(buffer, row)
 
-    def read(data: memoryview, at: int) -> tuple[Value, int]:
+    def read_struct(data: memoryview, at: int) -> tuple[Value, int]:
         values: dict[str, Value] = {}
         for key, read_one in readers:
             values[key], at = read_one(data, at)
         return values, at
 
-    return write, read
+    return write_struct, read_struct
 
 
 def _field(field: MessageField, definitions: Definitions) -> tuple[Write, Read]:

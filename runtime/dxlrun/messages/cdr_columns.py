@@ -33,7 +33,7 @@ _DEEPEST = 32
 
 
 @dataclass(slots=True)
-class Column:
+class FieldColumn:
     """One field of many messages: values, sequences of elements, or the fields of nested messages."""
 
     values: NDArray[np.generic] | None = None
@@ -42,9 +42,9 @@ class Column:
     counts: Indices | None = None
     """Number of elements of each message's sequence, shape (messages,); None unless the field is a sequence.
     """
-    elements: Column | None = None
+    elements: FieldColumn | None = None
     """Elements of all messages' sequences, concatenated; None unless the field is a sequence."""
-    fields: dict[str, Column] = field(default_factory=dict)
+    fields: dict[str, FieldColumn] = field(default_factory=dict)
 
     @property
     def leaves(self) -> tuple[str, ...]:
@@ -56,7 +56,7 @@ class Column:
             for leaf in column.leaves or ("",)
         )
 
-    def leaf(self, place: str) -> Column:
+    def leaf(self, place: str) -> FieldColumn:
         """Return the column of a value inside this one by its dotted name.
 
         Raises KeyError for an unknown name.
@@ -64,7 +64,7 @@ class Column:
         if not place:
             return self
         if self.elements is not None:
-            return Column(counts=self.counts, elements=self.elements.leaf(place))
+            return FieldColumn(counts=self.counts, elements=self.elements.leaf(place))
         name, _, rest = place.partition(".")
         return self.fields[name].leaf(rest)
 
@@ -95,22 +95,22 @@ class Column:
             return np.zeros(0, np.int64), np.zeros(0)
         return self.counts, inside
 
-    def take(self, rows: Indices) -> Column:
+    def select_rows(self, rows: Indices) -> FieldColumn:
         """Return a column with these rows (messages) only."""
         if self.values is not None:
-            return Column(values=self.values[rows])
+            return FieldColumn(values=self.values[rows])
         if self.counts is not None and self.elements is not None:
             begin = np.cumsum(self.counts) - self.counts
             counts = self.counts[rows]
             shift = begin[rows] - (np.cumsum(counts) - counts)
-            return Column(
+            return FieldColumn(
                 counts=counts,
-                elements=self.elements.take(np.repeat(shift, counts) + np.arange(int(counts.sum()))),
+                elements=self.elements.select_rows(np.repeat(shift, counts) + np.arange(int(counts.sum()))),
             )
-        return Column(fields={name: column.take(rows) for name, column in self.fields.items()})
+        return FieldColumn(fields={name: column.select_rows(rows) for name, column in self.fields.items()})
 
     @classmethod
-    def joined(cls, parts: Sequence[Column]) -> Column:
+    def joined(cls, parts: Sequence[FieldColumn]) -> FieldColumn:
         """Concatenate the rows of columns of the same field."""
         first = parts[0]
         if first.values is not None:
@@ -168,7 +168,7 @@ class _Cursors:
         return _Cursors(self.data, self.at[rows], self.end[rows], self.origin[rows], self.good[rows])
 
 
-Read = Callable[[_Cursors, bool], Column]
+Read = Callable[[_Cursors, bool], FieldColumn]
 """Function that reads one field of all messages. If it is to skip the field, the column is empty."""
 
 
@@ -198,17 +198,17 @@ class ColumnReader:
                 found.append(one.name)
         return found
 
-    def check(self, fields: Sequence[str]) -> str | None:
+    def find_unknown(self, fields: Sequence[str]) -> str | None:
         """Return the first unknown path; None when all exist."""
         return next((place for place in fields if place not in self.leaves), None)
 
-    def read(
+    def read_columns(
         self,
         data: NDArray[np.uint8],
         start: Indices,
         size: Indices,
         fields: Sequence[str] | None = None,
-    ) -> tuple[Indices, Column]:
+    ) -> tuple[Indices, FieldColumn]:
         """Return the indices of intact messages in `data`, and their columns.
 
         Args:
@@ -236,19 +236,21 @@ class ColumnReader:
             # Rare: read again without the damaged messages.
             rows = rows[cursors.good]
 
-    def _message(self, name: str, cursors: _Cursors, place: str, wanted: frozenset[str] | None) -> Column:
+    def _message(
+        self, name: str, cursors: _Cursors, place: str, wanted: frozenset[str] | None
+    ) -> FieldColumn:
         fields = self.definitions[name]
         if not fields:
             # ROS 2 gives a message without fields one byte.
             cursors.ahead(1)
-        found: dict[str, Column] = {}
+        found: dict[str, FieldColumn] = {}
         for one in fields:
             inner = f"{place}{one.name}"
             asked = wanted is None or any(other == inner or other.startswith(f"{inner}.") for other in wanted)
             column = self._field(one, cursors, inner, wanted, asked=asked)
             if asked:
                 found[one.name] = column
-        return Column(fields=found)
+        return FieldColumn(fields=found)
 
     def _field(
         self,
@@ -258,12 +260,12 @@ class ColumnReader:
         wanted: frozenset[str] | None,
         *,
         asked: bool,
-    ) -> Column:
+    ) -> FieldColumn:
         many = one.sequence or one.length
         if one.kind in PRIMITIVES:
             return _many_numbers(one, cursors, asked=asked) if many else _numbers(one.kind, cursors)
 
-        def element(sub: _Cursors) -> Column:
+        def element(sub: _Cursors) -> FieldColumn:
             if one.kind == "string":
                 return _texts(sub, asked=asked)
             return self._message(one.kind, sub, f"{place}.", wanted if asked else frozenset())
@@ -277,23 +279,23 @@ class ColumnReader:
         return _elements(cursors, counts, element)
 
 
-def _numbers(kind: str, cursors: _Cursors) -> Column:
+def _numbers(kind: str, cursors: _Cursors) -> FieldColumn:
     size = np.dtype(PRIMITIVES[kind]).itemsize
     cursors.align(size)
-    return Column(values=cursors.numbers(cursors.ahead(size), kind))
+    return FieldColumn(values=cursors.numbers(cursors.ahead(size), kind))
 
 
-def _many_numbers(one: MessageField, cursors: _Cursors, *, asked: bool) -> Column:
+def _many_numbers(one: MessageField, cursors: _Cursors, *, asked: bool) -> FieldColumn:
     size = np.dtype(PRIMITIVES[one.kind]).itemsize
     counts = np.full(len(cursors.at), one.length, np.int64) if one.length else cursors.counted(size)
     cursors.at += np.where(counts > 0, (cursors.origin - cursors.at) % size, 0)
     begin = cursors.ahead(counts * size)
     if not asked:
-        return Column()
+        return FieldColumn()
     counts = np.where(cursors.good, counts, 0)
     kind = np.dtype(PRIMITIVES[one.kind]).newbyteorder("<")
     values = pieces(cursors.data, begin, counts * size).view(kind)
-    return Column(counts=counts, elements=Column(values=values))
+    return FieldColumn(counts=counts, elements=FieldColumn(values=values))
 
 
 def pieces(data: NDArray[np.uint8], begin: Indices, size: Indices) -> NDArray[np.uint8]:
@@ -310,7 +312,7 @@ def _windows(data: NDArray[np.uint8], size: int) -> NDArray[np.void]:
     return np.ndarray((len(data) - size + 1,), f"V{size}", data, 0, (1,))
 
 
-def _texts(cursors: _Cursors, *, asked: bool) -> Column:
+def _texts(cursors: _Cursors, *, asked: bool) -> FieldColumn:
     lengths = cursors.counted(1)
     begin = cursors.ahead(lengths)
     texts = np.empty(len(lengths), object)
@@ -323,13 +325,13 @@ def _texts(cursors: _Cursors, *, asked: bool) -> Column:
             if text is None:
                 text = known[raw] = raw.decode(errors="replace")
             texts[row] = text
-    return Column(values=texts)
+    return FieldColumn(values=texts)
 
 
-def _elements(cursors: _Cursors, counts: Indices, element: Callable[[_Cursors], Column]) -> Column:
+def _elements(cursors: _Cursors, counts: Indices, element: Callable[[_Cursors], FieldColumn]) -> FieldColumn:
     """Read the first element of all rows, then the second of those that have one, and so on."""
     order: list[Indices] = []
-    parts: list[Column] = []
+    parts: list[FieldColumn] = []
     live, number = np.flatnonzero(counts > 0), 0
     while len(live):
         sub = cursors.some(live)
@@ -343,5 +345,5 @@ def _elements(cursors: _Cursors, counts: Indices, element: Callable[[_Cursors], 
         # No row has an element; only the column's kind is needed.
         parts.append(element(cursors.some(live)))
         order.append(live)
-    inside = Column.joined(parts).take(np.argsort(np.concatenate(order), kind="stable"))
-    return Column(counts=counts, elements=inside)
+    inside = FieldColumn.joined(parts).select_rows(np.argsort(np.concatenate(order), kind="stable"))
+    return FieldColumn(counts=counts, elements=inside)

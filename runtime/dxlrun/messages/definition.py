@@ -80,7 +80,7 @@ class MessageField(msgspec.Struct, frozen=True):
     """Length of a fixed-length array; 0 otherwise."""
 
     @property
-    def text(self) -> str:
+    def definition_line(self) -> str:
         """Line of the field in the definition."""
         many = f"[{self.length}]" if self.length else "[]" if self.sequence else ""
         return f"{self.kind}{many} {self.name}"
@@ -133,10 +133,10 @@ def _full_kind(kind: str, inside: str) -> str:
 def message_type(name: str, definitions: Definitions) -> MessageType:
     """Return the message type of this full name."""
     top = short_name(name)
-    blocks = ["".join(f"{field.text}\n" for field in definitions[top])]
+    blocks = ["".join(f"{field.definition_line}\n" for field in definitions[top])]
     for other, fields in definitions.items():
         if other != top:
-            lines = "".join(f"{field.text}\n" for field in fields)
+            lines = "".join(f"{field.definition_line}\n" for field in fields)
             blocks.append(f"{RULE}\nMSG: {other}\n{lines}")
     return MessageType(name, "".join(blocks))
 

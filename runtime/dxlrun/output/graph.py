@@ -44,7 +44,7 @@ class Graph(msgspec.Struct, frozen=True):
     edges: tuple[Edge, ...]
 
 
-class Placed(msgspec.Struct, frozen=True):
+class LayeredGraph(msgspec.Struct, frozen=True):
     """A graph whose nodes are arranged in layers; long edges have a placeholder in each layer they cross."""
 
     layers: tuple[tuple[str, ...], ...]
@@ -66,7 +66,7 @@ def listed(names: Sequence[str]) -> tuple[str, ...]:
     return tuple(lines)
 
 
-def placed(graph: Graph) -> Placed:
+def placed(graph: Graph) -> LayeredGraph:
     """Arrange a graph in layers, after Sugiyama, Tagawa and Toda (IEEE Trans. SMC 11, 1981).
 
     Sources are on the left, joints on the right, and each controller as far right as the nodes that it
@@ -84,7 +84,7 @@ def placed(graph: Graph) -> Placed:
             layers[passed].append(way[-1])
         steps += [Edge(*pair) for pair in pairwise([*way, edge.target])]
     _ordered(layers, steps)
-    return Placed(tuple(map(tuple, layers)), tuple(steps), {node.name: node for node in graph.nodes})
+    return LayeredGraph(tuple(map(tuple, layers)), tuple(steps), {node.name: node for node in graph.nodes})
 
 
 def _columns(graph: Graph) -> dict[str, int]:

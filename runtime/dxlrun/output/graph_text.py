@@ -7,7 +7,7 @@ from collections.abc import Iterator, Sequence
 from functools import reduce
 from operator import or_
 
-from dxlrun.output.graph import Graph, Node, Placed, placed
+from dxlrun.output.graph import Graph, LayeredGraph, Node, placed
 
 _UP, _DOWN, _LEFT, _RIGHT = 1, 2, 4, 8
 _LINES = " ╵╷│╴┘┐┤╶└┌├─┴┬┼"
@@ -43,7 +43,7 @@ class _Drawing:
     never share a row. Each node has its own column for outgoing lines.
     """
 
-    def __init__(self, graph: Placed) -> None:
+    def __init__(self, graph: LayeredGraph) -> None:
         self._graph = graph
         self._lines: dict[tuple[int, int], dict[str, int]] = {}
         """For each (row, column), the directions of the lines there, by the node that each line leaves."""

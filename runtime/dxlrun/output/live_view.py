@@ -10,8 +10,8 @@ from contextlib import contextmanager, suppress
 from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
-from dxlrun.output.table import Table
 from dxlrun.output.terminal import STYLES, out
+from dxlrun.output.text_table import Table
 
 if TYPE_CHECKING:
     from rich.console import RenderableType
@@ -38,13 +38,13 @@ def show_live(table: Callable[[], Table], every_s: float) -> None:
 
 
 @contextmanager
-def keys_pressed() -> Iterator[Pressed]:
+def keys_pressed() -> Iterator[QuitKey]:
     """Context manager that reads single keys from the terminal; yields a function that waits for q.
 
     Without a terminal on stdin, the function only waits.
     """
     if not sys.stdin.isatty():
-        yield Pressed(None)
+        yield QuitKey(None)
         return
     import termios
     import tty
@@ -53,13 +53,13 @@ def keys_pressed() -> Iterator[Pressed]:
     before = termios.tcgetattr(keyboard)
     try:
         tty.setcbreak(keyboard)
-        yield Pressed(keyboard)
+        yield QuitKey(keyboard)
     finally:
         termios.tcsetattr(keyboard, termios.TCSADRAIN, before)
 
 
 @dataclass(frozen=True, slots=True)
-class Pressed:
+class QuitKey:
     """Waits for the key q on a keyboard; None: there is no terminal."""
 
     keyboard: int | None

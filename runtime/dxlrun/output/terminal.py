@@ -16,7 +16,7 @@ from typing import IO, TYPE_CHECKING, TypeAlias, cast
 
 from dxlrun.output.escaping import escaped
 from dxlrun.output.json import NO_REASON, Report, answer_text
-from dxlrun.output.table import Part, Sentence, Table, Tone
+from dxlrun.output.text_table import Part, Sentence, Table, Tone
 
 if TYPE_CHECKING:
     from rich.console import Console
@@ -53,7 +53,7 @@ def err(pipe: int = _PIPE) -> Console:
     return _console(sys.stderr.isatty(), pipe, stderr=True)
 
 
-def show(*parts: Part, console: Console | None = None, folded: bool = False) -> None:
+def show_parts(*parts: Part, console: Console | None = None, folded: bool = False) -> None:
     """Print lines, tables and graphs to stdout or a console; tables without rows are omitted.
 
     Lines are wrapped only if `folded`, so that a command in them can be copied.
@@ -150,13 +150,13 @@ def progress_bar(*, hidden: bool) -> Iterator[Callable[[str, float], None]]:
         task = progress.add_task("", total=1.0)
         drawn = 0.0
 
-        def draw(text: str, share: float) -> None:
+        def draw_progress(text: str, share: float) -> None:
             nonlocal drawn
             if time.monotonic() - drawn > _REFRESH_S:
                 drawn = time.monotonic()
                 progress.update(task, description=escaped(text), completed=share, refresh=True)
 
-        yield draw
+        yield draw_progress
 
 
 def live_line(text: str, more: str) -> str:

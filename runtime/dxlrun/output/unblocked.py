@@ -44,7 +44,7 @@ def unblocked() -> Iterator[None]:
         # Ctrl-C ends the wait for a reader.
         with suppress(KeyboardInterrupt):
             for writer in writers.values():
-                writer.settle()
+                writer.wait_until_written()
 
 
 def _stream(stream: TextIO, writers: dict[tuple[int, int], _Writer]) -> TextIO:
@@ -55,10 +55,10 @@ def _stream(stream: TextIO, writers: dict[tuple[int, int], _Writer]) -> TextIO:
         return stream
     # Both streams of one terminal share a writer, which keeps the sequence of lines.
     writer = writers.setdefault((found.st_dev, found.st_ino), _Writer())
-    return cast("TextIO", _Unblocked(stream, writer))
+    return cast("TextIO", _UnblockedStream(stream, writer))
 
 
-class _Unblocked:
+class _UnblockedStream:
     """Replaces stdout or stderr: passes all text to a writer thread."""
 
     def __init__(self, stream: TextIO, writer: _Writer) -> None:
@@ -66,7 +66,9 @@ class _Unblocked:
 
     def write(self, text: str) -> int:
         """Queue text for the writer thread and return its length."""
-        self._writer.write(self._stream.fileno(), text.encode(self._stream.encoding or "utf-8", "replace"))
+        self._writer.queue_bytes(
+            self._stream.fileno(), text.encode(self._stream.encoding or "utf-8", "replace")
+        )
         return len(text)
 
     def flush(self) -> None:
@@ -90,13 +92,13 @@ class _Writer:
         self._idle = True
         threading.Thread(target=self._write_for_ever, daemon=True).start()
 
-    def write(self, descriptor: int, data: bytes) -> None:
+    def queue_bytes(self, descriptor: int, data: bytes) -> None:
         """Queue bytes for a file descriptor and return at once."""
         with self._changed:
             self._waiting.append((descriptor, data))
             self._changed.notify_all()
 
-    def settle(self) -> None:
+    def wait_until_written(self) -> None:
         """Wait until all queued bytes are written, at most LAST_WRITE_S."""
         with self._changed:
             self._changed.wait_for(lambda: self._idle and not self._waiting, LAST_WRITE_S)

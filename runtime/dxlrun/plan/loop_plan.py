@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Literal, TypeAlias
 
 import msgspec
 
-from dxlrun.description.joints.servo import ServoModel
+from dxlrun.description.joints.servo_model import ServoModel
 from dxlrun.description.joints.turns import nearest_turn
 from dxlrun.description.source_names import SOURCE_COMMANDS
 from dxlrun.features import FEATURES
@@ -110,7 +110,7 @@ class JointPlan(msgspec.Struct, frozen=True):
     servo_limits: tuple[ServoLimit, ...] = ()
     """Limits in registers of its servos; empty in the plan, because they are read at start-up."""
     keys: dict[str, object] = {}
-    """Keys of features with their values in SI units; `JointKey.of` returns a value with its type."""
+    """Keys of features with their values in SI units; `JointKey.value_of` returns a value with its type."""
 
     @property
     def label(self) -> str:
@@ -204,7 +204,7 @@ class JointPlan(msgspec.Struct, frozen=True):
         return SLOW_SPEEDS[self.unit]
 
     @property
-    def rest(self) -> Mode:
+    def rest_mode(self) -> Mode:
         """Mode that the joint enters without a command if it would not hold still in its current mode."""
         return Mode.VELOCITY if self.continuous else Mode.POSITION
 
@@ -250,7 +250,7 @@ class JointValues:
     """Values of the keys of features in the robot file, by key and joint."""
 
     @classmethod
-    def collect(cls, joints: Sequence[JointPlan], effort_units: dict[str, str]) -> JointValues:
+    def from_joints(cls, joints: Sequence[JointPlan], effort_units: dict[str, str]) -> JointValues:
         """Return the properties of joints. Units of effort depend on the servo models."""
         values: dict[str, object] = {
             one.listed: {joint.name: value for joint in joints if (value := one.value(joint)) is not None}
@@ -327,7 +327,7 @@ class ControllerPlan(msgspec.Struct, frozen=True):
         mode = mode_of(self.command)
         for joint in joints:
             others = tuple(name for name in joint.coupled if name not in self.joints)
-            if others and joint.name in self.joints and mode is not joint.rest:
+            if others and joint.name in self.joints and mode is not joint.rest_mode:
                 return joint.name, others
         return None
 

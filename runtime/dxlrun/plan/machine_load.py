@@ -69,7 +69,7 @@ class MachineLoad(msgspec.Struct, frozen=True):
         return self.busy_s > 0 and lasting and self.busy_s >= _BUSY_PART * self.seconds
 
     @property
-    def text(self) -> str:
+    def clause(self) -> str:
         """Clause that says how long the machine was busy, and how; empty if it never was."""
         observed = (
             (self.no_idle_core_s, "no core was idle in"),
@@ -88,7 +88,7 @@ class SimulationWait(msgspec.Struct, frozen=True):
     times: int = 0
 
     @property
-    def text(self) -> str:
+    def clause(self) -> str:
         """Clause that says how often and how long the loop waited; empty without a wait."""
         if not self.times:
             return ""
@@ -104,7 +104,7 @@ NO_WAIT = SimulationWait()
 
 def describe_busy_machine(load: MachineLoad, wait: SimulationWait = NO_WAIT) -> str:
     """Return a sentence if the machine was too busy or the simulation stalled; else an empty string."""
-    observed = ", ".join(filter(None, (load.text if load.too_busy else "", wait.text)))
+    observed = ", ".join(filter(None, (load.clause if load.too_busy else "", wait.clause)))
     return f"The machine was too busy: {observed}." if observed else ""
 
 
@@ -123,7 +123,7 @@ class LoadMeter:
         self._last_ns = begin_ns
         self._ns = dict.fromkeys(("sampled", "busy", "no_idle_core", "waited", "stolen", "silent"), 0)
 
-    def add(self, sample: LoadSample) -> None:
+    def add_sample(self, sample: LoadSample) -> None:
         """Add the part of a sample that overlaps the interval. Samples must be sorted by time."""
         end_ns = sample.end_ns if self.end_ns is None else min(sample.end_ns, self.end_ns)
         begin_ns = max(sample.begin_ns, self._begin_ns)
@@ -145,7 +145,7 @@ class LoadMeter:
         for name, is_true in found.items():
             self._ns[name] += is_true * (end_ns - begin_ns)
 
-    def load(self) -> MachineLoad:
+    def compute_load(self) -> MachineLoad:
         """Return the sums of the samples so far.
 
         Gaps of 2 s or longer before the first and after the last sample count as busy. An interval without

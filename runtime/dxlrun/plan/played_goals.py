@@ -7,7 +7,7 @@ from collections.abc import Iterator
 from pathlib import Path
 from typing import NamedTuple
 
-from dxlrun.channels.events import GoalReport, GoalTotals
+from dxlrun.channels.event_records import GoalReport, GoalTotals
 from dxlrun.plan.loop_plan import LoopPlan, ScheduledCommand
 
 

@@ -59,7 +59,7 @@ def longest_pose_ns(
     return round(min(needed_s, _NEVER_S) * 1e9) + SETTLE_NS
 
 
-class Step(msgspec.Struct, frozen=True):
+class PolicyStepPlan(msgspec.Struct, frozen=True):
     """Step of a policy: a pose, or a reduction of torque."""
 
     text: str  # Text for people: `pose home at 60 deg/s`
@@ -80,7 +80,7 @@ class Step(msgspec.Struct, frozen=True):
 class Policy(msgspec.Struct, frozen=True):
     """Steps that a robot executes, such as at the end of a run, and its final state: limp or hold."""
 
-    steps: tuple[Step, ...] = ()
+    steps: tuple[PolicyStepPlan, ...] = ()
     last: Last = "limp"
 
     @property

@@ -15,7 +15,7 @@ from dxlrun.plan.loop_plan import LoopPlan, ScheduledCommand
 from dxlrun.plan.mechanics_plan import MechanicsPlan
 from dxlrun.plan.recording_plan import RecordingPlan
 from dxlsim.motor_model import MotorModel
-from dxlsim.simulation_plan import AdapterConfig, Load, ServoTimes, Shown
+from dxlsim.simulation_plan import AdapterConfig, DeviceReadings, Load, ServoTimes
 from dxlwire.bus_plan import BusPlan, ServoPlan
 
 Parts = TypeVar("Parts")
@@ -31,7 +31,7 @@ class SimulationPlan(msgspec.Struct, frozen=True):
     physics: Literal["independent", "mujoco"] = "independent"
     motors: dict[str, MotorModel] = {}
     """Motors by servo (`own_name`); default: the simulation's motor for the model."""
-    devices: dict[str, Shown] = {}  # Simulated states by device
+    devices: dict[str, DeviceReadings] = {}  # Simulated states by device
 
 
 class Plan(msgspec.Struct, frozen=True):

@@ -16,7 +16,7 @@ from dxlrun.channels.answers import Code
 from dxlrun.remote import texts
 from dxlrun.remote.network.commander import HERE, Client
 from dxlrun.remote.preparation import invalid, refused
-from dxlrun.remote.requests.table import EXAMPLES, Answer, Body, Request, Role
+from dxlrun.remote.requests.request_table import EXAMPLES, Answer, Body, Request, Role
 from dxlrun.remote.sockets import MOST_BYTES
 
 MOST_PEERS = 256
@@ -33,7 +33,7 @@ LONGEST_ORIGIN = 64
 
 
 @dataclass(frozen=True, slots=True)
-class Asked(Generic[Body]):
+class ClientRequest(Generic[Body]):
     """A client's HTTP request with its decoded body."""
 
     http: starlette.requests.Request
@@ -127,18 +127,18 @@ class Allowance:
 
 async def received(
     request: Request[Body, Answer], http: starlette.requests.Request, allowance: Allowance | None
-) -> Asked[Body]:
+) -> ClientRequest[Body]:
     """Read and decode the body of a request; a long one costs tokens of `allowance`.
 
     Raises RefusedRequest.
     """
     if request.body is NoneType:
-        return Asked(http, cast("Body", None))
+        return ClientRequest(http, cast("Body", None))
     content = await _content(http, allowance)
     if request.body is bytes:
-        return Asked(http, cast("Body", content))
+        return ClientRequest(http, cast("Body", content))
     try:
-        return Asked(http, msgspec.json.decode(content, type=request.body))
+        return ClientRequest(http, msgspec.json.decode(content, type=request.body))
     except (msgspec.MsgspecError, RecursionError) as error:
         raise invalid(texts.no_body(error, EXAMPLES[request.body])) from error
 

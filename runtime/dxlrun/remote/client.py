@@ -26,12 +26,12 @@ from msgspec.structs import asdict
 from dxlrun.channels.loop_requests import Rate, RebootRequest, Switch, TorqueRequest
 from dxlrun.errors import DxlrunError, GoalTimeout, Refused
 from dxlrun.remote import texts
-from dxlrun.remote.live.listening import Listening, TopicMessage
+from dxlrun.remote.live.listening import MessageIterator, TopicMessage
 from dxlrun.remote.network.network_link import NetworkLink, known_robots
 from dxlrun.remote.requests import replies
-from dxlrun.remote.requests import table as requests
+from dxlrun.remote.requests import request_table as requests
 from dxlrun.remote.requests.replies import GoalState, NotDone, Parameter, TopicState
-from dxlrun.remote.requests.table import Answer, Body, NewMotion, NewValues, Request, Row, Value
+from dxlrun.remote.requests.request_table import Answer, Body, NewMotion, NewValues, Request, Row, Value
 from dxlrun.remote.sockets import MOST_BYTES, Address, RobotLink, SocketLink, sockets
 
 if TYPE_CHECKING:
@@ -223,7 +223,7 @@ class RemoteRobot:
         with self._listen((topic,), "&once=true") as found:
             return next(iter(found), None)
 
-    def listen(self, *topics: str, newest: bool | None = None, rate: float | None = None) -> Listening:
+    def listen(self, *topics: str, newest: bool | None = None, rate: float | None = None) -> MessageIterator:
         """Listen to topics: receive the newest message and all later ones until the run ends.
 
             for message in robot.listen("/joint_states"):
@@ -245,7 +245,7 @@ class RemoteRobot:
         query = "&newest=true" * only_newest + ("" if rate is None else f"&rate={rate:g}")
         return self._listen(topics, query)
 
-    def _listen(self, topics: Sequence[str], query: str) -> Listening:
+    def _listen(self, topics: Sequence[str], query: str) -> MessageIterator:
         names = "&".join(f"topic={quote('/' + topic.lstrip('/'))}" for topic in topics)
         try:
             status, first, end = self.link.stream(f"{requests.STREAM.path}?{names}{query}")
@@ -254,7 +254,7 @@ class RemoteRobot:
         if status >= 400:
             end.close()
             raise self._refused(status, first)
-        return Listening(self.name, self.link, end, first, newest="newest" in query)
+        return MessageIterator(self.name, self.link, end, first, newest="newest" in query)
 
     # Goals
 

@@ -42,13 +42,13 @@ async def computed(work: Callable[[], bytes], seconds: float) -> bytes | None:
     loop, content = asyncio.get_running_loop(), bytearray()
     ended: asyncio.Future[None] = loop.create_future()
 
-    def receive() -> None:
+    def receive_chunk() -> None:
         content.extend(chunk := os.read(reading, _CHUNK))
         if not chunk and not ended.done():
             loop.remove_reader(reading)
             ended.set_result(None)
 
-    loop.add_reader(reading, receive)
+    loop.add_reader(reading, receive_chunk)
     timer = loop.call_later(seconds, os.kill, child, signal.SIGKILL)
     try:
         await ended

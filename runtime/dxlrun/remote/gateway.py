@@ -27,7 +27,7 @@ from starlette.requests import ClientDisconnect
 from starlette.responses import Response, StreamingResponse
 from starlette.routing import Route
 
-from dxlrun.channels.answers import Code, Done, Field, Refusal
+from dxlrun.channels.answers import Code, Completion, Field, Refusal
 from dxlrun.channels.commands import LOOP
 from dxlrun.channels.cycle import LIMP, CycleRecord
 from dxlrun.channels.heartbeat import Phase
@@ -47,14 +47,22 @@ from dxlrun.errors import InputError
 from dxlrun.log.schemas import LogHeader
 from dxlrun.plan.loop_plan import ControllerPlan, JointValues
 from dxlrun.remote import texts
-from dxlrun.remote.asked import Allowance, Asked, client_of, peer, received
+from dxlrun.remote.asked import Allowance, ClientRequest, client_of, peer, received
 from dxlrun.remote.computation import computed
-from dxlrun.remote.goals import LOST
-from dxlrun.remote.link import Link, Loaded
+from dxlrun.remote.goal_book import LOST
+from dxlrun.remote.link import Link, LoadedController
+from dxlrun.remote.live.live_topics import TopicStream, framed
 from dxlrun.remote.live.states import RobotStates, encoded
-from dxlrun.remote.live.topics import TopicStream, framed
-from dxlrun.remote.motions import LEAST_SPEED, MOST_SPEED, Played, Running, goal_of, play
-from dxlrun.remote.named.joints import (
+from dxlrun.remote.motion_requests import (
+    LEAST_SPEED,
+    MOST_SPEED,
+    PreparedMotion,
+    RunSnapshot,
+    goal_of,
+    schedule_motion,
+)
+from dxlrun.remote.named.named_commands import INTERFACES, joint_command, source_command
+from dxlrun.remote.named.named_joints import (
     effort_units,
     joint_row,
     named_joints,
@@ -65,8 +73,7 @@ from dxlrun.remote.named.joints import (
     require_reboots,
     states_of,
 )
-from dxlrun.remote.named.named_commands import INTERFACES, joint_command, source_command
-from dxlrun.remote.named.parameters import Change, changed, parameters_of
+from dxlrun.remote.named.parameter_changes import PreparedChange, changed, parameters_of
 from dxlrun.remote.network.commander import Commander
 from dxlrun.remote.network.openapi import openapi
 from dxlrun.remote.preparation import (
@@ -76,7 +83,7 @@ from dxlrun.remote.preparation import (
     refused,
     unknown_controllers,
 )
-from dxlrun.remote.requests import table as requests
+from dxlrun.remote.requests import request_table as requests
 from dxlrun.remote.requests.replies import (
     FRAME_LENGTH,
     Changed,
@@ -94,7 +101,16 @@ from dxlrun.remote.requests.replies import (
     RunEnded,
     Topics,
 )
-from dxlrun.remote.requests.table import REQUESTS, Answer, Body, NewMotion, NewValues, Request, Row, Value
+from dxlrun.remote.requests.request_table import (
+    REQUESTS,
+    Answer,
+    Body,
+    NewMotion,
+    NewValues,
+    Request,
+    Row,
+    Value,
+)
 
 LEASE_S = (0.01, 0.2, 60.0)
 """Shortest, default and longest lease of a streamed set-point, s; without a newer one, it expires after that
@@ -150,7 +166,7 @@ _CONFLICT = 409
 request.
 """
 
-_Handler: TypeAlias = Callable[["GatewayApp", Asked[Body]], Awaitable[Answer | Response]]
+_Handler: TypeAlias = Callable[["GatewayApp", ClientRequest[Body]], Awaitable[Answer | Response]]
 _HANDLERS: dict[Request[Any, Any], _Handler[Any, Any]] = {}
 
 
@@ -159,11 +175,11 @@ def _answers(
 ) -> Callable[[_Handler[Body, Answer]], _Handler[Body, Answer]]:
     """Return a decorator that registers a method of GatewayApp as the handler of a request."""
 
-    def note(handler: _Handler[Body, Answer]) -> _Handler[Body, Answer]:
+    def register_handler(handler: _Handler[Body, Answer]) -> _Handler[Body, Answer]:
         _HANDLERS[request] = handler
         return handler
 
-    return note
+    return register_handler
 
 
 class GatewayApp:
@@ -208,7 +224,7 @@ class GatewayApp:
         """
         allowance, handler = self._allowances.get(request.rate), _HANDLERS[request]
 
-        async def answer(http: starlette.requests.Request) -> Response:
+        async def answer_request(http: starlette.requests.Request) -> Response:
             try:
                 if allowance is not None:
                     allowance.spend(peer(http))
@@ -229,12 +245,12 @@ class GatewayApp:
                 traceback.print_exc()
                 return _refused(Refusal(Code.GATEWAY_FAILED, {"problem": f"{type(error).__name__}: {error}"}))
 
-        return answer
+        return answer_request
 
     # State
 
     @_answers(requests.ROBOT)
-    async def robot(self, asked: Asked[None]) -> RobotInfo:
+    async def robot(self, asked: ClientRequest[None]) -> RobotInfo:
         """Return the robot's name, rate, joints, sources, files, and controllers with their commands."""
         link, plan = self._link, self._link.plan
         joints, began_ns = plan.loop.joints, link.began_ns
@@ -247,14 +263,14 @@ class GatewayApp:
             skipped=link.heartbeat.skipped,
             joints=tuple(joint.name for joint in joints),
             groups=dict(plan.groups),
-            **vars(JointValues.collect(joints, effort_units(plan))),
+            **vars(JointValues.from_joints(joints, effort_units(plan))),
             controllers=tuple(self._shown(one) for one in link.controllers.values()),
             sources=plan.loop.sources,
             file=str(Path(plan.source_file).absolute()),
             log=self._log,
         )
 
-    def _shown(self, loaded: Loaded) -> ControllerInfo:
+    def _shown(self, loaded: LoadedController) -> ControllerInfo:
         plan = loaded.plan
         return ControllerInfo(
             name=plan.name,
@@ -274,7 +290,7 @@ class GatewayApp:
         )
 
     @_answers(requests.STATES)
-    async def states(self, asked: Asked[None]) -> Response:
+    async def list_states(self, asked: ClientRequest[None]) -> Response:
         """Return the joint and source states of the newest cycle; numbers that are not known are null."""
         return Response(encoded(self._states()), media_type="application/json")
 
@@ -290,19 +306,19 @@ class GatewayApp:
         return record
 
     @_answers(requests.FRAMES)
-    async def frames(self, asked: Asked[None]) -> Frames:
+    async def frames(self, asked: ClientRequest[None]) -> Frames:
         """Return the text of the URDF, and the joints that move its links, to compute poses of frames."""
         plan = self._link.plan
         return Frames(plan.urdf, plan.frames)
 
     @_answers(requests.LOG_HEADER)
-    async def log_header(self, asked: Asked[None]) -> Response:
+    async def log_header(self, asked: ClientRequest[None]) -> Response:
         """Return the header (joints, controllers, layout of a cycle) to decode log messages with."""
-        header = LogHeader.of(self._link.plan, self._link.topics.epoch_offset_ns)
+        header = LogHeader.from_plan(self._link.plan, self._link.topics.epoch_offset_ns)
         return Response(msgspec.json.encode(header), media_type="application/json")
 
     @_answers(requests.EVENTS)
-    async def events(self, asked: Asked[None]) -> Events:
+    async def list_events(self, asked: ClientRequest[None]) -> Events:
         """Return the stored events with a number above `after`; `last` is the newest event's number."""
         after, kept = asked.number("after", 0.0), self._link.events
         rows = (
@@ -313,18 +329,18 @@ class GatewayApp:
         return Events(tuple(rows), kept[-1][0] if kept else 0)
 
     @_answers(requests.TOPICS)
-    async def topics(self, asked: Asked[None]) -> Topics:
+    async def topics(self, asked: ClientRequest[None]) -> Topics:
         """Return all topics that can be streamed, with message type, rate and count."""
         return Topics((*self._link.topic_states(),))
 
     @_answers(requests.STREAM)
-    async def stream(self, asked: Asked[None]) -> Response:
+    async def stream_topics(self, asked: ClientRequest[None]) -> Response:
         """Stream the messages of topics as frames, see `Frame`, until the run ends; `once`: one batch."""
         query, rate = asked.http.query_params, asked.number("rate", requests.MOST_LOOKS)
         topics = query.getlist("topic")
         if not topics or rate <= 0:
             raise invalid(texts.NO_TOPIC)
-        stream = self._link.listen(topics, newest="newest" in query)
+        stream = self._link.open_stream(topics, newest="newest" in query)
         frames = self._frames(stream, rate, once="once" in query)
         return StreamingResponse(frames, media_type="application/octet-stream")
 
@@ -347,28 +363,28 @@ class GatewayApp:
         yield framed(RunEnded())
 
     @_answers(requests.GOALS)
-    async def goals(self, asked: Asked[None]) -> Goals:
+    async def goals(self, asked: ClientRequest[None]) -> Goals:
         """Return the state of the running goals and of the last ended goals."""
         book = self._link.goals
         return Goals((*book.running.values(),), (*book.ended.values(),))
 
     @_answers(requests.GOAL)
-    async def goal(self, asked: Asked[None]) -> GoalState:
+    async def goal(self, asked: ClientRequest[None]) -> GoalState:
         """Return one goal's state; with `wait`, reply when the goal ends, after `wait` s at the latest."""
         wait_s, chosen, goals = asked.wait_s, asked.goal, self._link.goals
         running = self._link.heartbeat.phase is Phase.RUNNING
-        if goals.status(chosen).ended is None and not running:
-            await goals.wait(chosen, _ENDING_S)
-            if goals.status(chosen).ended is None:
+        if goals.goal_state(chosen).ended is None and not running:
+            await goals.wait_for_end(chosen, _ENDING_S)
+            if goals.goal_state(chosen).ended is None:
                 raise refused(Code.RUN_ENDING, {})
-        await goals.wait(chosen, wait_s)
-        return goals.status(chosen)
+        await goals.wait_for_end(chosen, wait_s)
+        return goals.goal_state(chosen)
 
     # Steering
 
     @_answers(requests.CANCEL)
     @_answers(requests.CANCEL_OF)
-    async def cancel(self, asked: Asked[None]) -> Executed[int]:
+    async def cancel(self, asked: ClientRequest[None]) -> Executed[int]:
         """Cancel a goal by number, or the running goals of a controller; reply with their numbers."""
         if "number" in asked.http.path_params:
             wanted = Cancel(goal=asked.goal)
@@ -391,10 +407,10 @@ class GatewayApp:
             outcome = refusal.fields.get("outcome", Outcome.ABORTED)
             known = outcome if outcome in tuple(Outcome) else Outcome.ABORTED
             for goal in goals:
-                self._link.goals.end(goal, str(known), LOST, record.woken_ns * 1e-9)
+                self._link.goals.record_end(goal, str(known), LOST, record.woken_ns * 1e-9)
 
     @_answers(requests.PLAY)
-    async def play(self, asked: Asked[NewMotion]) -> Executed[int]:
+    async def play_motion(self, asked: ClientRequest[NewMotion]) -> Executed[int]:
         """Play a motion file: all its controllers begin in one cycle; reply with their goals."""
         given = asked.body
         if not LEAST_SPEED <= given.speed <= MOST_SPEED:
@@ -408,7 +424,7 @@ class GatewayApp:
             found = await computed(partial(self._played, given, file), MOTION_S)
         if found is None:
             raise refused(Code.TOO_SLOW, {"controller": file, "seconds": MOTION_S})
-        played = msgspec.msgpack.decode(found, type=Played | Refusal)
+        played = msgspec.msgpack.decode(found, type=PreparedMotion | Refusal)
         if isinstance(played, Refusal):
             raise RefusedRequest(played)
         # A client that is gone could not cancel the motion by its number.
@@ -425,7 +441,7 @@ class GatewayApp:
         """Check a motion file against the newest cycle, in a forked process; return a Played, or a Refusal,
         as MessagePack.
         """
-        answer: Played | Refusal
+        answer: PreparedMotion | Refusal
         try:
             motion = parse_motion(given.text, Path(file), self._link.plan.groups)
             # Read after parsing, which may have taken long: the motion begins where the joints are now.
@@ -434,7 +450,9 @@ class GatewayApp:
                 name: self._preparation.compiled(replace(one.plan, active=self._link.active(one)))
                 for name, one in self._link.controllers.items()
             }
-            answer = play(motion, Running(controllers, self._preparation.joints, record), given.speed)
+            answer = schedule_motion(
+                motion, RunSnapshot(controllers, self._preparation.joints, record), given.speed
+            )
         except InputError as error:
             answer = Refusal(Code.WRONG_MOTION, _mistaken(error))
         except RefusedRequest as error:
@@ -446,13 +464,13 @@ class GatewayApp:
         return msgspec.msgpack.encode(answer)
 
     @_answers(requests.PARAMETERS)
-    async def parameters(self, asked: Asked[None]) -> Parameters:
+    async def parameters(self, asked: ClientRequest[None]) -> Parameters:
         """Return name, present value, range and description of each parameter of a controller."""
         now = self._preparation.parameters(self._known(asked).plan)
         return Parameters((*parameters_of(now),))
 
     @_answers(requests.CHANGE)
-    async def change(self, asked: Asked[NewValues]) -> Changed:
+    async def change(self, asked: ClientRequest[NewValues]) -> Changed:
         """Change live parameters of a controller, all in one cycle; reply with their old and new values."""
         # One change at a time: values that were checked against the present ones must meet these in the loop.
         async with self._changing:
@@ -463,11 +481,11 @@ class GatewayApp:
             done = await self._link.for_loop("parameters", change.request, asked.origin, noted)
         return Changed(done.cycle, change.shown)
 
-    def _note_parameters(self, loaded: Loaded, change: Change, _: Done) -> None:
+    def _note_parameters(self, loaded: LoadedController, change: PreparedChange, _: Completion) -> None:
         loaded.plan = change.plan
 
     @_answers(requests.COMMAND)
-    async def command(self, asked: Asked[bytes]) -> Executed[int]:
+    async def command(self, asked: ClientRequest[bytes]) -> Executed[int]:
         """Check a typed command, also against joint limits; reply once the loop has executed it."""
         kind, content = asked.part("kind"), asked.body
         query, source = asked.http.query_params, self._commanded.get(asked.part())
@@ -483,7 +501,7 @@ class GatewayApp:
         if seconds is not None and not 0 < seconds <= LONGEST_WAY_S:
             raise invalid(texts.duration_out_of_range(seconds, LONGEST_WAY_S))
         if kind in INTERFACES and loaded.plan.joints and (newest := self._link.newest()) is not None:
-            known = self._preparation.known(loaded.plan)
+            known = self._preparation.parse_controller(loaded.plan)
             found = joint_command(
                 known, kind, content, newest, units=units, seconds=seconds, groups=self._link.plan.groups
             )
@@ -495,7 +513,7 @@ class GatewayApp:
         prepared.require_within_limits()
         goal = None
         if query.get("goal") == "true" and kind not in self._preparation.goals(loaded.plan):
-            goal = goal_of(prepared, self._preparation.known(loaded.plan), self._newest())
+            goal = goal_of(prepared, self._preparation.parse_controller(loaded.plan), self._newest())
         if goal is not None:
             done = await self._link.command(LOOP, "play", goal.data, asked.origin, request=goal.request)
         else:
@@ -505,7 +523,7 @@ class GatewayApp:
         return Executed(done.cycle, done.goals)
 
     @_answers(requests.SET_POINT)
-    async def set_point(self, asked: Asked[bytes]) -> Clamped:
+    async def set_point(self, asked: ClientRequest[bytes]) -> Clamped:
         """Replace the set-point of a stream that the loop reads next; its refusal is an event, not a reply.
 
         The loop clamps values beyond their joints' limits; the reply counts them.
@@ -526,7 +544,7 @@ class GatewayApp:
         return Clamped(len(prepared.beyond), prepared.joints_beyond)
 
     @_answers(requests.SWITCH)
-    async def switch(self, asked: Asked[Switch]) -> Executed[int]:
+    async def switch(self, asked: ClientRequest[Switch]) -> Executed[int]:
         """Activate and deactivate controllers in one cycle; reply after servos have changed their modes."""
         switch, known = asked.body, tuple(self._link.controllers)
         if unknown := [name for name in (*switch.activate, *switch.deactivate) if name not in known]:
@@ -559,7 +577,7 @@ class GatewayApp:
         return found
 
     @_answers(requests.REGISTER)
-    async def register(self, asked: Asked[Value]) -> Executed[int]:
+    async def register(self, asked: ClientRequest[Value]) -> Executed[int]:
         """Write a RAM item of a joint's servo; reply with old and new value once it was read back."""
         joint, item = asked.part(), asked.part("item")
         register = prepared_register(self._link.plan, joint, item, asked.body.value)
@@ -567,7 +585,7 @@ class GatewayApp:
         return Executed(done.cycle, old=done.value, value=register.value)
 
     @_answers(requests.READ_REGISTER)
-    async def read_register(self, asked: Asked[None]) -> Row:
+    async def read_joint_register(self, asked: ClientRequest[None]) -> Row:
         """Read a control table item of a joint's servo in idle time; reply with value and unit."""
         plan, joint, item = self._link.plan, asked.part(), asked.part("item")
         reading = prepared_reading(plan, joint, item)
@@ -575,7 +593,7 @@ class GatewayApp:
         return {"done": True, "cycle": done.cycle, **read_register(plan, joint, item, done.value)}
 
     @_answers(requests.JOINT)
-    async def joint(self, asked: Asked[None]) -> Row:
+    async def joint(self, asked: ClientRequest[None]) -> Row:
         """Return the newest state of a joint, a device, a sensor, or a controller that provides states."""
         plan, joint, states = self._link.plan, asked.part(), self._states()
         if (source := states.source(joint)) is not None:
@@ -585,13 +603,13 @@ class GatewayApp:
         return {"joint": joint, "cycle": states.cycle, **states.joint(joint), **units}
 
     @_answers(requests.TORQUE)
-    async def torque(self, asked: Asked[TorqueRequest]) -> Executed[int]:
+    async def torque(self, asked: ClientRequest[TorqueRequest]) -> Executed[int]:
         """Switch the torque of joints on or off, and reply when the new state was read back."""
         joints = named_joints(self._link.plan, self._plans(), asked.body.joints)
         return await self._joints_done("torque", replace(asked.body, joints=joints), asked.origin)
 
     @_answers(requests.REBOOT)
-    async def reboot(self, asked: Asked[RebootRequest]) -> Executed[int]:
+    async def reboot(self, asked: ClientRequest[RebootRequest]) -> Executed[int]:
         """Reboot the servos of joints, and reply when they are operational again."""
         joints = named_joints(self._link.plan, self._plans(), asked.body.joints)
         require_reboots(self._link.plan, joints)
@@ -619,34 +637,34 @@ class GatewayApp:
         return tuple(name for name in self._released if limp.isdisjoint(known[name].plan.joints))
 
     @_answers(requests.RATE)
-    async def rate(self, asked: Asked[Rate]) -> Executed[int]:
+    async def rate(self, asked: ClientRequest[Rate]) -> Executed[int]:
         """Change the loop's rate, Hz."""
         return await self._for_loop(
             "rate", asked.body, asked.origin, partial(self._link.note_rate, asked.body.rate)
         )
 
     @_answers(requests.HALT)
-    async def halt(self, asked: Asked[None]) -> Executed[int]:
+    async def halt(self, asked: ClientRequest[None]) -> Executed[int]:
         """Stop every joint and deactivate its controllers; reply when all joints are at rest."""
         return await self._for_loop("halt", None, asked.origin)
 
     @_answers(requests.PAUSE)
-    async def pause(self, asked: Asked[None]) -> Executed[int]:
+    async def pause(self, asked: ClientRequest[None]) -> Executed[int]:
         """Hold the joints at their goals and stop the clock of the controllers until `resume`."""
         return await self._for_loop("pause", None, asked.origin, partial(self._link.note_paused, True))
 
     @_answers(requests.RESUME)
-    async def resume(self, asked: Asked[None]) -> Executed[int]:
+    async def resume_run(self, asked: ClientRequest[None]) -> Executed[int]:
         """Resume the clock of the controllers after a pause."""
         return await self._for_loop("resume", None, asked.origin, partial(self._link.note_paused, False))
 
     @_answers(requests.STOP)
-    async def stop(self, asked: Asked[None]) -> Executed[int]:
+    async def stop_run(self, asked: ClientRequest[None]) -> Executed[int]:
         """End the run normally, with the steps of `on_exit`."""
         return await self._for_loop("stop", None, asked.origin)
 
     async def _for_loop(
-        self, kind: str, data: object, origin: str, noted: Callable[[Done], object] | None = None
+        self, kind: str, data: object, origin: str, noted: Callable[[Completion], object] | None = None
     ) -> Executed[int]:
         """Send the loop a command that is not for a controller; `noted` is called once the loop has executed
         it.
@@ -655,12 +673,12 @@ class GatewayApp:
         return Executed(done.cycle, halted=done.halted)
 
     @_answers(requests.TAKE_OVER)
-    async def take_over(self, asked: Asked[None]) -> Executed[int]:
+    async def take_over(self, asked: ClientRequest[None]) -> Executed[int]:
         """Make this client the commander, the only client that may command, in place of another one."""
         before = self._commander.become(client_of(asked.http))
         return await self._note_commander(before or self._commander.name, asked.origin)
 
-    async def _admit(self, asked: Asked[Body], request: Request[Body, Answer]) -> None:
+    async def _admit(self, asked: ClientRequest[Body], request: Request[Body, Answer]) -> None:
         """Require that a client may make a request as commander; log when it became commander.
 
         Raises RefusedRequest.
@@ -677,20 +695,20 @@ class GatewayApp:
         return await self._for_loop("commander", NewCommander(self._commander.name, before), origin)
 
     @_answers(requests.LOAD)
-    async def load(self, asked: Asked[Row]) -> Executed[int]:
+    async def load_controller(self, asked: ClientRequest[Row]) -> Executed[int]:
         """Check a controller's entry as in the robot file, and load it into a paused loop."""
         others = {name: loaded.plan for name, loaded in self._link.controllers.items()}
         plan = self._preparation.controller(asked.body, others, self._link.rate)
         return await self._for_loop("load", plan, asked.origin, partial(self._link.loaded, plan))
 
     @_answers(requests.UNLOAD)
-    async def unload(self, asked: Asked[None]) -> Executed[int]:
+    async def unload_controller(self, asked: ClientRequest[None]) -> Executed[int]:
         """Unload an inactive controller from a paused loop."""
         name = self._known(asked).plan.name
         return await self._for_loop("unload", Unload(name), asked.origin, partial(self._link.unloaded, name))
 
     @_answers(requests.DESCRIPTION)
-    async def description(self, asked: Asked[None]) -> Row:
+    async def description(self, asked: ClientRequest[None]) -> Row:
         """Return the OpenAPI description of all requests."""
         return openapi({request: (handler.__doc__ or "").strip() for request, handler in _HANDLERS.items()})
 
@@ -700,7 +718,7 @@ class GatewayApp:
     def _active(self, plan: ControllerPlan) -> bool:
         return self._link.active(self._link.controllers[plan.name])
 
-    def _known(self, asked: Asked[Body]) -> Loaded:
+    def _known(self, asked: ClientRequest[Body]) -> LoadedController:
         name = asked.part()
         loaded = self._link.controllers.get(name)
         if loaded is None:

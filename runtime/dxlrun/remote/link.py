@@ -12,23 +12,23 @@ from functools import lru_cache
 
 import msgspec
 
-from dxlrun.channels.answers import Answer, Code, Done, Refusal, Waiting
-from dxlrun.channels.commands import LONGEST_COMMAND, LOOP, Command
+from dxlrun.channels.answers import Acceptance, Answer, Code, Completion, Refusal
+from dxlrun.channels.commands import LONGEST_COMMAND, LOOP, CommandMessage
 from dxlrun.channels.cycle import CycleRecord
-from dxlrun.channels.events import Event, EventCode
+from dxlrun.channels.event_records import Event, EventCode
 from dxlrun.channels.heartbeat import Heartbeat, Phase
 from dxlrun.channels.mailbox import LONGEST_SET_POINT, Answers, MailboxWriter
 from dxlrun.channels.ring import Gap, RecordKind, RingReader
 from dxlrun.channels.tagged import decode
 from dxlrun.contract.controller import Outcome
-from dxlrun.control.controllers.goals import GOALS_TOPIC
+from dxlrun.control.controllers.goal_registry import GOALS_TOPIC
 from dxlrun.messages.cdr import Codec
 from dxlrun.plan.loop_plan import ControllerPlan, ServoLimit
 from dxlrun.plan.robot_plan import Plan
 from dxlrun.remote import texts
-from dxlrun.remote.goals import LOST, GoalBook
+from dxlrun.remote.goal_book import LOST, GoalBook
 from dxlrun.remote.job import Descriptors
-from dxlrun.remote.live.topics import LiveTopics, TopicStream
+from dxlrun.remote.live.live_topics import LiveTopics, TopicStream
 from dxlrun.remote.preparation import RefusedRequest
 from dxlrun.remote.requests.replies import TopicState
 
@@ -55,14 +55,14 @@ _HELD = {
     EventCode.CONTROLLER_ACTIVATED: False,
     EventCode.CONTROLLER_DEACTIVATED: False,
 }
-"""Event about a controller -> new value of `Loaded.held`."""
+"""Event about a controller -> new value of `LoadedController.held`."""
 
 
 _codec = lru_cache(Codec)
 
 
 @dataclass(slots=True)
-class Loaded:
+class LoadedController:
     """A controller in the loop, as the gateway records it: plan, and index of its bit in a cycle record's
     `active` mask.
     """
@@ -73,12 +73,12 @@ class Loaded:
 
 
 @dataclass(slots=True)
-class _Pending:
+class _PendingCommand:
     """A command that was sent to the loop and is not answered yet."""
 
     size: int
     answer: asyncio.Future[Answer]
-    done: Callable[[Done], object] | None
+    done: Callable[[Completion], object] | None
     """Called with the loop's answer once the command is executed, even after the client stopped waiting."""
 
 
@@ -94,7 +94,9 @@ class Link:
         self.paused = False
         self._began_ns: int | None = None
         self.heartbeat = Heartbeat(memory.heartbeat)
-        self.controllers = {one.name: Loaded(one, place) for place, one in enumerate(plan.loop.controllers)}
+        self.controllers = {
+            one.name: LoadedController(one, place) for place, one in enumerate(plan.loop.controllers)
+        }
         self.events: deque[tuple[int, Event]] = deque()
         self.topics = LiveTopics(
             memory.messages, memory.cycles, plan.loop.layout, self.events, epoch_offset_ns
@@ -108,7 +110,7 @@ class Link:
         self._numbers = itertools.count(1)
         self._event_numbers = itertools.count(1)
         self._text = 0
-        self._pending: dict[int, _Pending] = {}
+        self._pending: dict[int, _PendingCommand] = {}
         self._pending_bytes = 0
         self.take_servo_limits: Callable[[str, tuple[ServoLimit, ...]], object] = lambda joint, limits: None
         """Called with a joint's name and the registers of its servo that limit it, which the loop reads at
@@ -120,7 +122,7 @@ class Link:
         stop it.
         """
         if self._mailbox.used:
-            self._mailbox.post(Command(0, LOOP, "resume", b"", "loop"))
+            self._mailbox.post_command(CommandMessage(0, LOOP, "resume", b"", "loop"))
 
     # State
 
@@ -143,7 +145,7 @@ class Link:
         self.newest()
         return self._began_ns
 
-    def active(self, loaded: Loaded) -> bool:
+    def active(self, loaded: LoadedController) -> bool:
         """Return whether a controller is active in the newest cycle."""
         record = self.newest()
         return record is not None and bool(record.active >> loaded.place & 1)
@@ -158,9 +160,9 @@ class Link:
         cycles.
         """
         self.newest()
-        return self.topics.states(max(0, self._cycles.passed - 1))
+        return self.topics.topic_states(max(0, self._cycles.passed - 1))
 
-    def listen(self, topics: Sequence[str], *, newest: bool) -> TopicStream:
+    def open_stream(self, topics: Sequence[str], *, newest: bool) -> TopicStream:
         """Return a stream of the messages of the named topics; raises RefusedRequest for an unknown topic."""
         known = [one.name for one in self.topic_states()]
         for topic in topics:
@@ -178,10 +180,10 @@ class Link:
         kind: str,
         data: bytes,
         origin: str,
-        done: Callable[[Done], object] | None = None,
+        done: Callable[[Completion], object] | None = None,
         *,
         request: bytes = b"",
-    ) -> Done:
+    ) -> Completion:
         """Send a command to the loop and wait until the loop has executed it.
 
         `stop` is accepted however many commands wait.
@@ -200,25 +202,25 @@ class Link:
         self._require_running()
         if len(data) > LONGEST_DATA:
             raise RefusedRequest(Refusal(Code.TOO_LONG, {"size": len(data), "most": LONGEST_DATA}))
-        command = Command(next(self._numbers), controller, kind, data, origin, request=request)
+        command = CommandMessage(next(self._numbers), controller, kind, data, origin, request=request)
         size = len(data) + len(request) + 1024
         stop = controller == LOOP and kind == "stop"
         full = len(self._pending) >= MOST_WAITING or self._pending_bytes + size > MOST_WAITING_BYTES
-        if (full and not stop) or not self._mailbox.post(command):
+        if (full and not stop) or not self._mailbox.post_command(command):
             raise RefusedRequest(Refusal(Code.QUEUE_FULL))
-        pending = _Pending(size, asyncio.get_running_loop().create_future(), done)
+        pending = _PendingCommand(size, asyncio.get_running_loop().create_future(), done)
         self._pending[command.number] = pending
         self._pending_bytes += size
-        answer = await self._answer(pending, ANSWER_S + min(2 / self.rate, ANSWER_S))
-        while isinstance(answer, Waiting):
-            answer = await self._answer(pending, ENTER_S)
+        answer = await self._await_answer(pending, ANSWER_S + min(2 / self.rate, ANSWER_S))
+        while isinstance(answer, Acceptance):
+            answer = await self._await_answer(pending, ENTER_S)
         if isinstance(answer, Refusal):
             raise RefusedRequest(answer)
         return answer
 
     async def for_loop(
-        self, kind: str, data: object, origin: str, done: Callable[[Done], object] | None = None
-    ) -> Done:
+        self, kind: str, data: object, origin: str, done: Callable[[Completion], object] | None = None
+    ) -> Completion:
         """Send a command that is not for a controller, as JSON, and wait until the loop executed it; raises
         RefusedRequest.
         """
@@ -227,7 +229,13 @@ class Link:
         )
 
     def set_point(  # noqa: PLR0917  a command's parts, as they come
-        self, loaded: Loaded, kind: str, data: bytes, origin: str, lease_ns: int, request: bytes = b""
+        self,
+        loaded: LoadedController,
+        kind: str,
+        data: bytes,
+        origin: str,
+        lease_ns: int,
+        request: bytes = b"",
     ) -> None:
         """Put a controller's set-point into the mailbox in place of one that the loop has not read; no answer
         is awaited.
@@ -236,7 +244,7 @@ class Link:
         """
         self._require_running()
         number = next(self._numbers)
-        command = Command(number, loaded.plan.name, kind, data, origin, lease_ns, request)
+        command = CommandMessage(number, loaded.plan.name, kind, data, origin, lease_ns, request)
         if not self._mailbox.set_point(loaded.place, command):
             hint = texts.SEND_AS_COMMAND
             raise RefusedRequest(
@@ -255,7 +263,7 @@ class Link:
         if self.heartbeat.phase is not Phase.RUNNING:
             raise RefusedRequest(Refusal(Code.RUN_ENDING))
 
-    async def _answer(self, pending: _Pending, timeout_s: float) -> Answer:
+    async def _await_answer(self, pending: _PendingCommand, timeout_s: float) -> Answer:
         try:
             return await asyncio.wait_for(asyncio.shield(pending.answer), timeout_s)
         except TimeoutError:
@@ -263,42 +271,42 @@ class Link:
 
     # Reports of the loop
 
-    def loaded(self, plan: ControllerPlan, done: Done) -> None:
+    def loaded(self, plan: ControllerPlan, done: Completion) -> None:
         """Add a controller to `controllers` after the loop loaded it at the place that its answer names."""
         if done.place is not None:
-            self.controllers[plan.name] = Loaded(plan, done.place)
+            self.controllers[plan.name] = LoadedController(plan, done.place)
 
-    def unloaded(self, name: str, _: Done) -> None:
+    def unloaded(self, name: str, _: Completion) -> None:
         """Remove a controller from `controllers` after the loop unloaded it."""
         self.controllers.pop(name, None)
 
-    def note_rate(self, rate: float, _: Done) -> None:
+    def note_rate(self, rate: float, _: Completion) -> None:
         """Store the loop's new rate, Hz, after the loop changed it."""
         self.rate = rate
 
-    def note_paused(self, paused: bool, _: Done) -> None:
+    def note_paused(self, paused: bool, _: Completion) -> None:
         """Store that the loop was paused or resumed."""
         self.paused = paused
 
-    async def watch(self) -> None:
+    async def collect_until_cancelled(self) -> None:
         """Poll the shared memory for answers, events and topics until the task is cancelled."""
         while True:
             if self._began_ns is None:
                 self.newest()
-            self.collect()
+            self.collect_messages()
             await asyncio.sleep(_LOOK_S if self._pending else 10 * _LOOK_S)
 
-    def collect(self) -> None:
+    def collect_messages(self) -> None:
         """Read the new answers, events and goal reports; abort goals whose reports were lost."""
         for answered in self._answers.new():
             # Other answers belong to set-points of a stream, for which no client waits.
             if answered.number in self._pending:
                 self._resolve(answered.number, answered.answer)
-        reports = [one for one in self.topics.collect() if one[0].name == GOALS_TOPIC]
+        reports = [one for one in self.topics.collect_messages() if one[0].name == GOALS_TOPIC]
         idle: frozenset[str] = frozenset()
         idle_s = 0.0
         for ring in self._event_rings:
-            while (record := ring.read()) is not None:
+            while (record := ring.read_record()) is not None:
                 # The log reports the gap.
                 if isinstance(record, Gap):
                     if ring is self._event_rings[0]:
@@ -316,7 +324,7 @@ class Link:
                 self.goals.take_message(_codec(topic.type).unpack(message.data), message.t_ns * 1e-9)
         for goal in [one for one in self.goals.running.values() if one.controller in idle]:
             if goal.accepted < idle_s:
-                self.goals.end(goal.number, Outcome.ABORTED, LOST, idle_s)
+                self.goals.record_end(goal.number, Outcome.ABORTED, LOST, idle_s)
 
     def _idle(self) -> tuple[float, frozenset[str]]:
         """Return the newest cycle's time, s, and the names of its inactive controllers, which cannot have a
@@ -330,12 +338,12 @@ class Link:
         pending = self._pending[number]
         if not pending.answer.done():
             pending.answer.set_result(answer)
-        if isinstance(answer, Waiting):
+        if isinstance(answer, Acceptance):
             pending.answer = pending.answer.get_loop().create_future()
             return
         del self._pending[number]
         self._pending_bytes -= pending.size
-        if isinstance(answer, Done) and pending.done is not None:
+        if isinstance(answer, Completion) and pending.done is not None:
             pending.done(answer)
 
     def _keep(self, event: Event) -> None:
@@ -346,7 +354,7 @@ class Link:
         while self.events and (self._text > KEPT_TEXT or len(self.events) >= KEPT_EVENTS):
             self._text -= len(self.events.popleft()[1].text)
         self.events.append((next(self._event_numbers), event))
-        self.goals.take(event)
+        self.goals.record_event(event)
         if event.code == EventCode.SERVO_LIMITS:
             limits = msgspec.json.decode(event.data, type=tuple[ServoLimit, ...])
             self.take_servo_limits(event.source, limits)

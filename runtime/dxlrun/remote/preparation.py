@@ -24,14 +24,14 @@ from dxlrun.compile.controller_entry import (
     plan_entry,
     require_fit,
 )
-from dxlrun.compile.graph import ControllerGraph, Mistake
-from dxlrun.compile.joints.limits import BeyondLimit, beyond_limits
+from dxlrun.compile.controller_graph import ControllerGraph, Mistake
+from dxlrun.compile.joints.limits import LimitViolation, beyond_limits
 from dxlrun.compile.motions import TRAJECTORY
-from dxlrun.control.controllers.graph import rate_divider, rate_fits
-from dxlrun.control.controllers.plugins import ControllerClass, PlugIns
-from dxlrun.description.form import Name, ParametersModel
+from dxlrun.control.controllers.plugin_loading import ControllerClass, PlugIns
+from dxlrun.control.controllers.update_order import rate_divider, rate_fits
+from dxlrun.description.base_form import Name, ParametersModel
+from dxlrun.description.form_problems import sentences_of
 from dxlrun.description.joints.groups import Groups, without_groups
-from dxlrun.description.problems import sentences_of
 from dxlrun.description.robot import ControllerEntry
 from dxlrun.description.units import (
     angle,
@@ -96,7 +96,7 @@ def invalid(problem: str) -> RefusedRequest:
     return refused(Code.INVALID, {"problem": problem})
 
 
-class _TooLong(BaseException):
+class _PlugInTimeout(BaseException):
     """A plug-in's code exceeded BUDGET_S; not an Exception, which the plug-in could catch."""
 
 
@@ -109,13 +109,13 @@ def bounded(controller: str) -> Iterator[None]:
     """
 
     def interrupt(*_: object) -> None:
-        raise _TooLong
+        raise _PlugInTimeout
 
     before = signal.signal(signal.SIGALRM, interrupt)
     signal.setitimer(signal.ITIMER_REAL, BUDGET_S)
     try:
         yield
-    except _TooLong:
+    except _PlugInTimeout:
         raise refused(Code.TOO_SLOW, {"controller": controller, "seconds": BUDGET_S}) from None
     finally:
         signal.setitimer(signal.ITIMER_REAL, 0)
@@ -145,14 +145,14 @@ def plugin_code(controller: str, where: str, model: type[BaseModel] | None = Non
 
 
 @dataclass(frozen=True, slots=True)
-class Prepared:
+class PreparedCommand:
     """A controller's command in the form that the loop reads, with the result of the check of limits."""
 
     controller: str
     kind: str
     data: bytes
     """Array that the controller's class prepared, little-endian float64."""
-    beyond: tuple[BeyondLimit, ...]
+    beyond: tuple[LimitViolation, ...]
     """Values of the command that are beyond the limits of their joints."""
     request: bytes = b""
     """The command as JSON in SI units, for the log."""
@@ -173,7 +173,7 @@ class Prepared:
 
 
 @dataclass(frozen=True, slots=True)
-class Known:
+class ResolvedController:
     """A controller's plan with its class, parameters and joints, kept for its next commands."""
 
     plan: ControllerPlan
@@ -195,7 +195,7 @@ class Preparation:
     """Text of the robot's URDF."""
     groups: Groups = field(default_factory=dict)
     """Names of groups of joints in the robot file, with their joints."""
-    _known: dict[str, Known] = field(default_factory=dict, init=False)
+    _known: dict[str, ResolvedController] = field(default_factory=dict, init=False)
     """Cache of `known`, by controller name; not used when a controller of that name has another plan now."""
     _schemas: dict[str, dict[str, object]] = field(default_factory=dict, init=False)
     """Cache of `takes`: controller type -> command -> JSON Schema."""
@@ -227,7 +227,9 @@ class Preparation:
         """
         known = self._known.get(plan.name)
         same = known is not None and known.plan.parameters == plan.parameters and known.plan.type == plan.type
-        parameters = known.parameters if known is not None and same else self.known(plan).parameters
+        parameters = (
+            known.parameters if known is not None and same else self.parse_controller(plan).parameters
+        )
         return CompiledController(plan, self.plugins.controllers[plan.type], parameters)
 
     def goals(self, plan: ControllerPlan) -> list[str]:
@@ -240,7 +242,7 @@ class Preparation:
     def motions(self, plan: ControllerPlan) -> dict[str, float]:
         """Return a controller's motions with durations, s, by name; empty when the plug-in's code fails."""
         try:
-            known = self.known(plan)
+            known = self.parse_controller(plan)
             with bounded(plan.name):
                 return dict(known.controller.motions(known.parameters))
         # The plug-in's code failed; other controllers are still shown.
@@ -249,9 +251,11 @@ class Preparation:
 
     def parameters(self, plan: ControllerPlan) -> ParametersModel:
         """Return the parsed parameters in a controller's plan; raises RefusedRequest."""
-        return self.known(plan).parameters
+        return self.parse_controller(plan).parameters
 
-    def command(self, plan: ControllerPlan, kind: str, body: bytes, *, units: bool = False) -> Prepared:
+    def command(
+        self, plan: ControllerPlan, kind: str, body: bytes, *, units: bool = False
+    ) -> PreparedCommand:
         """Check a controller's command in JSON and convert it for the loop (`true` and "1" are not numbers
         there).
 
@@ -267,7 +271,7 @@ class Preparation:
         Raises:
             RefusedRequest: The command is unknown, or its values are invalid.
         """
-        known = self.known(plan)
+        known = self.parse_controller(plan)
         controller = known.controller
         model = controller.Commands.get(kind)
         if model is None:
@@ -283,9 +287,9 @@ class Preparation:
             data = np.ascontiguousarray(prepared, dtype="<f8").tobytes()
             peaks = controller.speed_peaks(kind, np.frombuffer(data, "<f8"), known.parameters)
             beyond = tuple(beyond_limits(known.joints, command, peaks))
-        return Prepared(plan.name, kind, data, beyond, body)
+        return PreparedCommand(plan.name, kind, data, beyond, body)
 
-    def known(self, plan: ControllerPlan) -> Known:
+    def parse_controller(self, plan: ControllerPlan) -> ResolvedController:
         """Return a controller's class, parsed parameters and joints, from the cache if the plan is the same.
 
         Raises RefusedRequest for a type without a plug-in, or wrong parameters.
@@ -299,7 +303,7 @@ class Preparation:
         with plugin_code(plan.name, f"the parameters of {plan.name}"):
             parameters = offer.controller.Parameters.model_validate_json(plan.parameters)
         joints = tuple(self.joints[joint] for joint in plan.joints)
-        known = self._known[plan.name] = Known(plan, offer.controller, parameters, joints)
+        known = self._known[plan.name] = ResolvedController(plan, offer.controller, parameters, joints)
         return known
 
     def controller(
@@ -361,7 +365,7 @@ class Preparation:
             replace(plan, every=rate_divider(plan.rate, period_ns) if rate_fits(plan.rate, period_ns) else 0)
             for plan in plans
         ]
-        return list(ControllerGraph(tuple(self.joints), now, self.sources).mistakes())
+        return list(ControllerGraph(tuple(self.joints), now, self.sources).find_mistakes())
 
 
 # Quantities with units

@@ -29,9 +29,9 @@ from starlette.types import ASGIApp
 from uvicorn.protocols.http.h11_impl import H11Protocol
 from uvicorn.server import ServerState
 
-from dxlrun.channels import process
-from dxlrun.channels.process import Failed, Finish, Listening, MessageChannel
-from dxlrun.control.controllers.plugins import load_plugins
+from dxlrun.channels import child_processes
+from dxlrun.channels.child_processes import Failed, Finish, Listening, MessageChannel
+from dxlrun.control.controllers.plugin_loading import load_plugins
 from dxlrun.errors import DxlrunError
 from dxlrun.plan.robot_plan import Plan, from_json
 from dxlrun.remote.computation import PR_SET_PDEATHSIG
@@ -42,8 +42,8 @@ from dxlrun.remote.network.certificates import Certificate, counts
 from dxlrun.remote.network.commander import Client
 from dxlrun.remote.network.listener import Listener
 from dxlrun.remote.preparation import Preparation
-from dxlrun.remote.requests.table import Role
-from dxlrun.remote.sockets import Address, listen
+from dxlrun.remote.requests.request_table import Role
+from dxlrun.remote.sockets import Address, create_listener
 
 MOST_CONNECTIONS = 64
 MOST_OF_PROCESS = 16
@@ -61,14 +61,14 @@ def main() -> None:
     closes.
     """
     signal.signal(signal.SIGINT, signal.SIG_IGN)
-    sys.stdout = sys.stderr = process.Printed(sys.stderr.fileno())
+    sys.stdout = sys.stderr = child_processes.LimitedTextStream(sys.stderr.fileno())
     # An endless `prepare` of a plug-in must not outlive the run.
     ctypes.CDLL(None).prctl(PR_SET_PDEATHSIG, signal.SIGKILL)
-    job = msgspec.json.decode(process.whole(int(sys.argv[2])), type=GatewayJob)
+    job = msgspec.json.decode(child_processes.whole(int(sys.argv[2])), type=GatewayJob)
     control = socket.socket(fileno=int(sys.argv[4]))
     # The channel carries no message to the gateway, which ends when the socket closes.
     channel = MessageChannel(control, Decoder(Finish))
-    plan: Plan = from_json(process.whole(job.plan))
+    plan: Plan = from_json(child_processes.whole(job.plan))
     try:
         link = Link(plan, job.memory, job.epoch_offset_ns)
         joints = {joint.name: joint for joint in plan.loop.joints}
@@ -76,15 +76,15 @@ def main() -> None:
         preparation = Preparation(joints, plugins, plan.loop.sources, plan.urdf, plan.groups)
         gateway = GatewayApp(link, preparation, job.log)
         network = Listener.secured(Address.parse(job.listen, plan.robot)) if job.listen else None
-        listener, path = listen(plan.robot)
+        listener, path = create_listener(plan.robot)
     except (DxlrunError, OSError) as error:
-        channel.send(Failed(str(error)))
+        channel.send_message(Failed(str(error)))
         sys.exit(1)
-    channel.send(Listening(str(path)))
+    channel.send_message(Listening(str(path)))
     link.let_begin()
     try:
         with asyncio.Runner(loop_factory=_event_loop) as runner:
-            runner.run(serve(link, gateway, listener, control, network))
+            runner.run(serve_gateway(link, gateway, listener, control, network))
     finally:
         path.unlink(missing_ok=True)
 
@@ -94,7 +94,7 @@ def _event_loop() -> asyncio.AbstractEventLoop:
     return asyncio.SelectorEventLoop(selectors.SelectSelector())
 
 
-async def serve(
+async def serve_gateway(
     link: Link,
     gateway: GatewayApp,
     listener: socket.socket,
@@ -112,18 +112,18 @@ async def serve(
     if network is not None:
         await serve_clients(network, config, server.server_state)
 
-    def end(*_: object) -> None:
+    def request_exit(*_: object) -> None:
         server.should_exit = True
 
     def hung_up() -> None:
         with suppress(OSError):
             if control.recv(4096):
                 return
-        end()
+        request_exit()
 
     asyncio.get_running_loop().add_reader(control.fileno(), hung_up)
-    watching = asyncio.create_task(link.watch())
-    watching.add_done_callback(end)
+    watching = asyncio.create_task(link.collect_until_cancelled())
+    watching.add_done_callback(request_exit)
     await server.serve(sockets=[listener])
     watching.cancel()
     with suppress(asyncio.CancelledError):
@@ -148,7 +148,9 @@ async def serve_clients(
     else:
         config = config_of(app)
         config.load()
-    await listener.serve(partial(Connection, config, state or ServerState(), {"listener": listener}))
+    await listener.serve_connections(
+        partial(Connection, config, state or ServerState(), {"listener": listener})
+    )
 
 
 def config_of(app: ASGIApp) -> uvicorn.Config:

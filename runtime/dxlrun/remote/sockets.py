@@ -40,7 +40,7 @@ LONGEST_PATH = 107
 """Longest path of a Unix socket on Linux, bytes without the terminating zero (unix(7))."""
 
 
-def place(runtime_directory: str | None = None) -> Path:
+def sockets_directory(runtime_directory: str | None = None) -> Path:
     """Return the directory for the sockets of this user's robots; it may not exist yet.
 
     `runtime_directory`: XDG_RUNTIME_DIR of another process, empty when unset there; None: of this process.
@@ -65,13 +65,13 @@ def owned(directory: Path) -> bool:
     return stat.S_ISDIR(found.st_mode) and found.st_uid == os.getuid() and not found.st_mode & 0o077
 
 
-def listen(robot: str) -> tuple[socket.socket, Path]:
+def create_listener(robot: str) -> tuple[socket.socket, Path]:
     """Create the listening socket of a robot's gateway (mode 0600); return the socket and its path.
 
     The path of a second run of the same robot contains its process ID. Raises DxlrunError when the directory
     is not safe.
     """
-    directory = place()
+    directory = sockets_directory()
     with suppress(OSError):
         directory.mkdir(mode=0o700)
     if not owned(directory):
@@ -146,7 +146,7 @@ def running() -> tuple[str, ...]:
 def sockets() -> dict[str, Path]:
     """Return the socket files of this user's running robots by name; stale socket files are removed."""
     found: dict[str, Path] = {}
-    directory = place()
+    directory = sockets_directory()
     if not owned(directory):
         return found
     with _locked(directory):

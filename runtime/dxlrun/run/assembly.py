@@ -10,26 +10,26 @@ import msgspec
 
 from dxlrun.channels.commands import CommandSink, Inbox, NoInbox
 from dxlrun.channels.cycle import CycleRecord
-from dxlrun.channels.events import EventSink
+from dxlrun.channels.event_records import EventSink
 from dxlrun.channels.heartbeat import Phase
 from dxlrun.channels.kept import KeptStates
-from dxlrun.channels.messages import MessageSink
 from dxlrun.channels.ring import Appender, RecordKind
+from dxlrun.channels.topic_messages import MessageSink
 from dxlrun.contract.hardware import Hardware
 from dxlrun.control.context import ControlContext, Supervision, Unsupervised
 from dxlrun.control.controllers.activity import Activity
 from dxlrun.control.controllers.manager import Manager
-from dxlrun.control.controllers.plugins import PlugIns
-from dxlrun.control.controllers.topics import TopicLog
-from dxlrun.control.loop import Loop, LoopResult
-from dxlrun.control.source_process import Slots, build_readers
+from dxlrun.control.controllers.plugin_loading import PlugIns
+from dxlrun.control.controllers.published_topics import TopicLog
+from dxlrun.control.loop import ControlLoop, LoopResult
+from dxlrun.control.sampled_sources import Slots, build_readers
 from dxlrun.dynamixel.bus_part import FeatureParts
-from dxlrun.dynamixel.hardware import DynamixelHardware, ServoArrays
+from dxlrun.dynamixel.dynamixel_hardware import DynamixelHardware, ServoArrays
 from dxlrun.dynamixel.hardware_layer import HardwareLayers
 from dxlrun.plan.policy_plan import Last
 from dxlrun.plan.robot_plan import Plan
 from dxlwire.clock import Clock
-from dxlwire.exchange.bus import Lines
+from dxlwire.exchange.bus_engine import Lines
 from dxlwire.packets import PacketLog
 from dxlwire.port.ports import Ports
 
@@ -63,14 +63,14 @@ class Sinks:
         """Bind `wake` directly to the packet log, which saves a call in each cycle."""
         self.wake = self.packets.wake
 
-    def begin(self, record: CycleRecord) -> None:
+    def append_activation(self, record: CycleRecord) -> None:
         """Record the packets of the start-up, and the cycle record in which controllers are activated."""
-        self._commit = self.packets.commit
-        self._keep = self.cycles.repeat(RecordKind.CYCLE, record.raw)
+        self._commit = self.packets.commit_packets
+        self._keep = self.cycles.make_appender(RecordKind.CYCLE, record.raw)
         self._commit()
         self._keep()
 
-    def append(self, record: CycleRecord) -> None:
+    def append_cycle(self, record: CycleRecord) -> None:
         """Append a finished cycle's record and its packets, and report the progress."""
         self._commit()
         self._keep()
@@ -85,7 +85,7 @@ class AssembledRobot:
 
     hardware: Hardware
     manager: Manager
-    loop: Loop
+    loop: ControlLoop
     record: CycleRecord
     failures: tuple[str, ...] = ()
     """Sentences about servos and devices that could not be switched off at the end."""
@@ -111,7 +111,7 @@ class AssembledRobot:
                 enter(Phase.STOPPING)
                 self.failures = self.hardware.stop()
             else:
-                self.hardware.release()
+                self.hardware.leave_torque_on()
         return result
 
 
@@ -172,6 +172,6 @@ def assemble(
     topics = TopicLog(record, sinks.messages, sinks.epoch_offset_ns)
     manager = Manager(context, plugins, activity=host.activity, topics=topics, kept=kept)
     readers = build_readers(plan.loop, host.slots, record, host.clock.now_ns, sinks.events)
-    loop = Loop(context, manager, sinks, overrun_hooks=plugins.overrun_hooks, readers=readers)
+    loop = ControlLoop(context, manager, sinks, overrun_hooks=plugins.overrun_hooks, readers=readers)
     manager.configure()
     return AssembledRobot(context.hardware, manager, loop, record)

@@ -23,14 +23,22 @@ from typing import Literal, TypeAlias
 import msgspec
 from msgspec.json import Decoder
 
-from dxlrun.channels import process
-from dxlrun.channels.events import EventBody, EventRing, EventText
+from dxlrun.channels import child_processes
+from dxlrun.channels.child_processes import (
+    Cut,
+    Failed,
+    LineLost,
+    LineReturned,
+    MessageChannel,
+    RunMemory,
+    Stop,
+)
+from dxlrun.channels.event_records import EventBody, EventRing, EventText
 from dxlrun.channels.heartbeat import Heartbeat, Phase, ProcessorTime, SimulationProgress
-from dxlrun.channels.packets import PacketBatch, salvage
-from dxlrun.channels.process import Cut, Failed, LineLost, LineReturned, MessageChannel, RunMemory, Stop
+from dxlrun.channels.logged_packets import PacketBatch, salvage
 from dxlrun.channels.ring import RingReader, RingWriter
 from dxlrun.channels.shared_memory import mapped
-from dxlrun.control import realtime
+from dxlrun.control import realtime_grants
 from dxlrun.description.bus import SIMULATED
 from dxlrun.dynamixel.bus_part import SafeEnd
 from dxlrun.dynamixel.servo.torque_off import limp, stand
@@ -39,12 +47,12 @@ from dxlrun.features.feature import Feature
 from dxlrun.plan.policy_plan import TORQUE_STAYS, Last
 from dxlrun.process_table import describe_run
 from dxlrun.run import texts
-from dxlrun.run.watch import Duty, SignsOfLife, Watched, duty_of, loop_timeout_ns
+from dxlrun.run.process_watch import Duty, SignsOfLife, WatchedProcess, duty_of, loop_timeout_ns
 from dxlwire.bus_plan import BusPlan
 from dxlwire.clock import MonotonicClock
-from dxlwire.exchange.bus import Lines
+from dxlwire.exchange.bus_engine import Lines
 from dxlwire.port.ports import SerialPort, SerialPorts, SimulatedPort, StallCounter
-from dxlwire.port.reopening import KeptLines, Wanted
+from dxlwire.port.reopening import KeptLines, LineSettings
 
 _NEVER = 1 << 62
 
@@ -118,7 +126,7 @@ class Started(msgspec.Struct, frozen=True, tag=True):
 
     loop: int
     """Process ID of the loop."""
-    grants: tuple[realtime.Grant, ...]
+    grants: tuple[realtime_grants.Grant, ...]
     """Results of the guardian's real-time requests."""
 
 
@@ -176,9 +184,9 @@ class SafeStop:
         self._heartbeat = Heartbeat(job.memory.heartbeat)
         self._ring = RingWriter(job.memory.guardian)
         self._events = EventRing(self._ring, self._clock)
-        self._safe_end = SafeEnd.of(job.plan.features, job.plan.feature_plans)
+        self._safe_end = SafeEnd.import_stages(job.plan.features, job.plan.feature_plans)
 
-    def end(self, descriptors: Sequence[int], how: str, text: EndText) -> list[str]:
+    def apply_final_state(self, descriptors: Sequence[int], how: str, text: EndText) -> list[str]:
         """Leave the robot limp or holding, as the fault policy's final state says; return sentences about it.
 
         The steps of the policy are skipped. The robot holds only when the loop was running: during set-up,
@@ -194,14 +202,14 @@ class SafeStop:
         """Stop joints that would continue to move with torque on; return a sentence for each failure."""
         lines, packets = self._take_over(descriptors)
         sentences = (*stand(lines), *self._safe_end.make_safe(lines))
-        packets.commit()
+        packets.commit_packets()
         return sentences
 
     def limp(self, descriptors: Sequence[int], how: str, text: EndText) -> list[str]:
         """Send torque off to every servo; return `how` (the cause) and the result as sentences."""
         lines, packets = self._take_over(descriptors)
         outcome, unsafe = limp(lines), self._safe_end.make_safe(lines)
-        packets.commit()
+        packets.commit_packets()
         silent = [str(one) for one in outcome if not one.confirmed]
         servos = "the servo" if len(outcome) == 1 else f"all {len(outcome)} servos"
         result = (
@@ -219,15 +227,17 @@ class SafeStop:
         cycle = salvage(mapped(memory.desk), RingReader(memory.packets).head, self._ring)
         ports = SerialPorts(make_ports(job.plan.buses, job.ports, descriptors, memory, StallCounter()))
         packets = PacketBatch(self._ring, cycle=cycle)
-        return Lines(job.plan.buses, ports, self._clock, packets, self._heartbeat.look), packets
+        return Lines(
+            job.plan.buses, ports, self._clock, packets, self._heartbeat.mark_guardian_alive
+        ), packets
 
-    def report_grants(self, grants: Sequence[realtime.Grant]) -> None:
+    def report_grants(self, grants: Sequence[realtime_grants.Grant]) -> None:
         """Log the results of the guardian's real-time requests."""
-        realtime.log_grants(grants, "guardian", self._events)
+        realtime_grants.log_grants(grants, "guardian", self._events)
 
     def report(self, event: EventBody) -> None:
         """Log an event with the guardian as its source."""
-        self._events.emit("guardian", event)
+        self._events.emit_event("guardian", event)
 
 
 class Guardian:
@@ -251,27 +261,27 @@ class Guardian:
         self._halted = False
         """True when the loop was killed because a signal had stopped it."""
 
-    def run(self) -> None:
+    def guard_loop(self) -> None:
         """Open the ports, execute and watch the loop, and make the robot safe after the loop has exited."""
         lines = KeptLines(
             [
-                Wanted(path, bus.baud_rate, bus.latency_ns, bus.rs485, bus.boot_ns)
+                LineSettings(path, bus.baud_rate, bus.latency_ns, bus.rs485, bus.boot_ns)
                 for path, bus in zip(self._job.ports, self._job.plan.buses, strict=True)
             ],
             describe_holder=describe_run,
         )
         # The grants apply to this process only: the loop is executed later and inherits none of them.
-        grants = realtime.apply_to_guardian(self._job.plan.priority, self._job.plan.lock_memory)
+        grants = realtime_grants.apply_to_guardian(self._job.plan.priority, self._job.plan.lock_memory)
         self._safe_stop.report_grants(grants)
         for sentence in lines.done:
             self._safe_stop.report(texts.line_adjusted(sentence))
         for sentence in lines.remarks:
             self._safe_stop.report(texts.line_remark(sentence))
-        loop_channel, theirs = process.message_channel(_LINES_LOST)
-        loop = self._execute(lines.descriptors, theirs.fileno())
+        loop_channel, theirs = child_processes.message_channel(_LINES_LOST)
+        loop = self._start_loop(lines.descriptors, theirs.fileno())
         theirs.close()
         # The supervisor receives the ports too. They stay open and locked if the guardian dies.
-        self._control.send(Started(loop.pid, grants), lines.descriptors)
+        self._control.send_message(Started(loop.pid, grants), lines.descriptors)
         ending = self._watch(loop, lines, loop_channel)
         outcome = [self._unsupervised] if self._unsupervised else []
         how = self._how(ending, loop)
@@ -284,11 +294,11 @@ class Guardian:
             if ending == "cut":
                 outcome += self._safe_stop.limp(lines.descriptors, how, texts.run_cut)
             else:
-                outcome += self._safe_stop.end(lines.descriptors, how, texts.loop_failed)
+                outcome += self._safe_stop.apply_final_state(lines.descriptors, how, texts.loop_failed)
         lines.close()
-        self._control.send(Ended(ending, tuple(outcome)))
+        self._control.send_message(Ended(ending, tuple(outcome)))
 
-    def _execute(self, descriptors: list[int], channel: int) -> subprocess.Popen[bytes]:
+    def _start_loop(self, descriptors: list[int], channel: int) -> subprocess.Popen[bytes]:
         given = self._job
         job = LoopJob(
             given.memory,
@@ -299,7 +309,7 @@ class Guardian:
             os.getpid(),
             given.epoch_offset_ns,
         )
-        return process.start_module(
+        return child_processes.start_module(
             "dxlrun.run.loop_process",
             ["--job", msgspec.json.encode(job).decode()],
             [*job.memory.of_loop, *descriptors, channel],
@@ -318,16 +328,16 @@ class Guardian:
             # A closed channel is always readable and would cause a busy wait.
             channels = [one for one in (self._control, channel) if not one.closed]
             ready, _, _ = select.select([watched, lines, *channels], [], [], nap)
-            self._heartbeat.look()
+            self._heartbeat.mark_guardian_alive()
             if watched in ready:
                 return self._ending(loop.wait())
             if channel in ready:
                 self._lose(lines, channel)
             if lines in ready:
-                self._hand_over(lines, channel)
+                self._pass_on_lines(lines, channel)
             request = self._request() if self._control in ready else None
-            duty = duty_of(Watched.GUARDIAN, self._silent())
-            processor.look(self._loop_signs.still_ns)
+            duty = duty_of(WatchedProcess.GUARDIAN, self._silent())
+            processor.note_standstill(self._loop_signs.still_ns)
             if duty is Duty.STOP_LOOP and not self._unsupervised:
                 self._report_unsupervised()
             if request == "stop" or (duty is Duty.STOP_LOOP and self._stop_by_ns == _NEVER):
@@ -356,12 +366,12 @@ class Guardian:
 
     def _lose(self, lines: KeptLines, channel: MessageChannel[LineLost]) -> None:
         """Start to reopen the lines that the loop has reported as lost, and inform the supervisor."""
-        for message in channel.receive():
-            self._control.send(message)
+        for message in channel.receive_messages():
+            self._control.send_message(message)
             if not lines.lost(message.bus):
                 self._safe_stop.report(texts.line_gone())
 
-    def _hand_over(self, lines: KeptLines, channel: MessageChannel[LineLost]) -> None:
+    def _pass_on_lines(self, lines: KeptLines, channel: MessageChannel[LineLost]) -> None:
         """Pass the ports of lines that are open again to the loop and to the supervisor."""
         for opened in lines.returned():
             if opened.done:
@@ -371,9 +381,9 @@ class Guardian:
             if opened.wrong:
                 self._safe_stop.report(texts.line_problem(opened.wrong))
             for each in (channel, self._control):
-                each.send(LineReturned(opened.index), [lines.descriptors[opened.index]])
+                each.send_message(LineReturned(opened.index), [lines.descriptors[opened.index]])
 
-    def _silent(self) -> frozenset[Watched]:
+    def _silent(self) -> frozenset[WatchedProcess]:
         """Check the heartbeats of loop and supervisor; return which of them do not respond.
 
         A dead supervisor has closed its channel.
@@ -381,11 +391,11 @@ class Guardian:
         now_ns, phase = self._clock.now_ns(), self._heartbeat.phase
         # Read before the heartbeat: the loop beats first, and shortens its timeout afterwards.
         timeout_ns = self._timeout_ns()
-        self._loop_signs.look((phase, self._heartbeat.beats), now_ns)
-        self._supervisor_signs.look(self._heartbeat.supervisor_looks, now_ns)
+        self._loop_signs.record_beat((phase, self._heartbeat.beats), now_ns)
+        self._supervisor_signs.record_beat(self._heartbeat.supervisor_looks, now_ns)
         silent = {
-            Watched.LOOP: self._loop_signs.is_silent(timeout_ns),
-            Watched.SUPERVISOR: self._control.closed or self._supervisor_signs.is_halted(),
+            WatchedProcess.LOOP: self._loop_signs.is_silent(timeout_ns),
+            WatchedProcess.SUPERVISOR: self._control.closed or self._supervisor_signs.is_halted(),
         }
         return frozenset(which for which, is_silent in silent.items() if is_silent)
 
@@ -418,7 +428,7 @@ class Guardian:
 
     def _request(self) -> Literal["stop", "cut"] | None:
         """Read the supervisor's messages; return `cut`, `stop` or None."""
-        messages = self._control.receive()
+        messages = self._control.receive_messages()
         if any(isinstance(message, Cut) for message in messages):
             return "cut"
         return "stop" if messages else None
@@ -462,11 +472,11 @@ def _manner(code: int | None) -> str:
 
 def main() -> None:
     """Run the guardian's process: `--job-fd N --control-fd M`."""
-    job, control = process.begun(GuardianJob, _REQUESTS)
+    job, control = child_processes.begun(GuardianJob, _REQUESTS)
     try:
-        Guardian(job, control).run()
+        Guardian(job, control).guard_loop()
     except PortError as error:
-        control.send(Failed(str(error)))
+        control.send_message(Failed(str(error)))
         sys.exit(error.exit_code)
 
 

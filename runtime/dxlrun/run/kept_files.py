@@ -23,9 +23,9 @@ from dxlrun.channels.kept import (
     KeptStates,
     opened_file,
 )
-from dxlrun.channels.messages import OpenedTopic, TopicMessage
 from dxlrun.channels.ring import Gap, Payload, RecordKind, RingReader
 from dxlrun.channels.tagged import decode
+from dxlrun.channels.topic_messages import OpenedTopic, TopicRecord
 from dxlrun.messages.cdr import Codec
 from dxlrun.plan.loop_plan import JointPlan
 from dxlrun.plan.robot_plan import Plan
@@ -142,7 +142,7 @@ class KeptFiles:
         self.problems: dict[str, str] = {}
         """Reasons why the newest state of a controller is not in its file, by controller."""
 
-    def take(self, kind: int, payload: Payload) -> None:
+    def process_record(self, kind: int, payload: Payload) -> None:
         """Process a record of the loop's message ring. Other topics are ignored. Never raises."""
         # The recorder reports damaged records.
         with suppress(ValueError):
@@ -150,14 +150,14 @@ class KeptFiles:
             if isinstance(found, OpenedTopic) and found.topic.name == TOPIC:
                 self._topic, self._assembly = found.number, Assembly(Codec(found.topic.type))
             elif (
-                isinstance(found, TopicMessage)
+                isinstance(found, TopicRecord)
                 and found.topic == self._topic
                 and self._assembly
-                and (whole := self._assembly.take(found.data))
+                and (whole := self._assembly.add_piece(found.data))
             ):
-                self._write(*whole)
+                self._write_file(*whole)
 
-    def _write(self, controller: str, data: bytes) -> None:
+    def _write_file(self, controller: str, data: bytes) -> None:
         try:
             opened_file(data, controller)
             if self._directory is None:
@@ -232,12 +232,12 @@ class KeptStateWriter(threading.Thread):
         self._drain()
 
     def _drain(self) -> None:
-        while (record := self._ring.read()) is not None:
+        while (record := self._ring.read_record()) is not None:
             # Pieces after a gap do not fit together and are ignored later.
             if not isinstance(record, Gap):
-                self._files.take(record.kind, record.payload)
+                self._files.process_record(record.kind, record.payload)
 
-    def finish(self) -> tuple[str, ...]:
+    def write_remaining(self) -> tuple[str, ...]:
         """Write the remaining states after the end of the loop; return sentences about problems."""
         self._ended.set()
         self.join(_WRITING_TIMEOUT_S)

@@ -21,23 +21,23 @@ import msgspec
 from msgspec import structs
 from msgspec.json import Decoder
 
-from dxlrun.channels import process
+from dxlrun.channels import child_processes
+from dxlrun.channels.child_processes import LineLost, LineReturned, MessageChannel
 from dxlrun.channels.commands import CommandRing
-from dxlrun.channels.events import EventRing, EventSink, EventTotals, Waited
+from dxlrun.channels.event_records import EventRing, EventSink, EventTotals, SimulationStall
 from dxlrun.channels.heartbeat import Heartbeat, Phase
 from dxlrun.channels.kept import KeptStates
+from dxlrun.channels.logged_packets import PacketBatch
 from dxlrun.channels.mailbox import Mailbox
-from dxlrun.channels.messages import MessageRing
-from dxlrun.channels.packets import PacketBatch
-from dxlrun.channels.process import LineLost, LineReturned, MessageChannel
 from dxlrun.channels.ring import RingWriter
 from dxlrun.channels.shared_memory import mapped
-from dxlrun.control import realtime
+from dxlrun.channels.topic_messages import MessageRing
+from dxlrun.control import realtime_grants
 from dxlrun.control.context import StopFlag
 from dxlrun.control.controllers.activity import Activity
-from dxlrun.control.controllers.plugins import load_plugins
-from dxlrun.control.realtime import Pacing
-from dxlrun.dynamixel.hardware import TAKEN_BACK
+from dxlrun.control.controllers.plugin_loading import load_plugins
+from dxlrun.control.realtime_grants import Pacing
+from dxlrun.dynamixel.dynamixel_hardware import TAKEN_BACK
 from dxlrun.errors import DxlrunError, PlugInError, StartUpError, counted
 from dxlrun.plan.loop_plan import SchedulerPlan
 from dxlrun.plan.machine_load import SimulationWait
@@ -46,7 +46,7 @@ from dxlrun.plan.robot_plan import Plan, from_json
 from dxlrun.run import texts
 from dxlrun.run.assembly import LoopHost, Sinks, assemble
 from dxlrun.run.guardian import LoopJob, make_ports
-from dxlrun.run.watch import Duty, LoopWatch
+from dxlrun.run.process_watch import Duty, LoopWatch
 from dxlwire.clock import MonotonicClock
 from dxlwire.port.ports import (
     MOST_SHARE,
@@ -102,15 +102,15 @@ def _looked_at(heartbeat: Heartbeat) -> Callable[[str], None]:
     plug-in left a thread, and exits a forked child that returned from the import, which would run a second
     loop.
     """
-    before, own = realtime.thread_count(), os.getpid()
+    before, own = realtime_grants.thread_count(), os.getpid()
 
-    def check(name: str) -> None:
+    def check_import(name: str) -> None:
         nonlocal before
         if os.getpid() != own:
             # A child that was forked during an import has returned.
             os._exit(0)
         heartbeat.beat()
-        more, before = realtime.thread_count() - before, max(before, realtime.thread_count())
+        more, before = realtime_grants.thread_count() - before, max(before, realtime_grants.thread_count())
         if more > 0:
             raise PlugInError(
                 f"plug-in {name} started {counted(more, 'more thread', 'more threads')} in the loop's "
@@ -119,7 +119,7 @@ def _looked_at(heartbeat: Heartbeat) -> Callable[[str], None]:
                 "let it work in on_configure without threads, or in a process of its own"
             )
 
-    return check
+    return check_import
 
 
 # No reply was late for this time, so the simulation responds again.
@@ -140,9 +140,9 @@ class LineReopener:
         """Return the file descriptor of a line that is open again, once; None until then. Does not block."""
         if index not in self._asked:
             self._asked.add(index)
-            self._channel.send(LineLost(index))
+            self._channel.send_message(LineLost(index))
         if not self._channel.closed and select.select([self._channel], [], [], 0)[0]:
-            for message in self._channel.receive():
+            for message in self._channel.receive_messages():
                 self._came[message.bus] = self._channel.descriptors.pop(0)
         descriptor = self._came.pop(index, None)
         if descriptor is not None:
@@ -150,7 +150,7 @@ class LineReopener:
         return descriptor
 
 
-class AskedToStop(Exception):
+class StopRequest(Exception):
     """Raised during set-up after a stop request: torque must not be switched on any more."""
 
 
@@ -172,7 +172,7 @@ class StallReport:
         """Duration and number of all waits since the start."""
         return SimulationWait(self._stalls.waited_ns, self._stalls.times)
 
-    def look(self, now_ns: int) -> None:
+    def report_waits(self, now_ns: int) -> None:
         """Emit an event about new waits when they are over. Called at each heartbeat."""
         if self._stalls.times == self._reported_times and self._stalls.waited_ns == self._reported_ns:
             return
@@ -180,16 +180,16 @@ class StallReport:
             self._seen_ns, self._grew_ns = self._stalls.waited_ns, now_ns
         if now_ns - self._grew_ns >= _WAIT_OVER_NS and now_ns - self._emitted_ns >= _WAITS_EVENT_NS:
             self._emitted_ns = now_ns
-            self.emit()
+            self.emit_waits()
 
-    def emit(self) -> None:
+    def emit_waits(self) -> None:
         """Emit an event with the waits since the last event, if there were any."""
         total = self.total
         since = SimulationWait(total.waited_ns - self._reported_ns, total.times - self._reported_times)
         if since.waited_ns or since.times:
             self._reported_ns, self._reported_times = total.waited_ns, total.times
-            data = msgspec.json.encode(Waited(since.waited_ns, since.times))
-            self._events.emit("machine", texts.simulation_stalled(since.text), data)
+            data = msgspec.json.encode(SimulationStall(since.waited_ns, since.times))
+            self._events.emit_event("machine", texts.simulation_stalled(since.clause), data)
 
 
 @dataclass(slots=True)
@@ -216,13 +216,13 @@ class Pulse:
         """
         self.heartbeat.beat()
         now_ns = self.now_ns()
-        self.stalls.look(now_ns)
+        self.stalls.report_waits(now_ns)
         if not self.stop.requested and self.watch.duty(now_ns) is Duty.END:
             self.stop.request()
-            self.events.emit("loop", texts.loop_unwatched())
+            self.events.emit_event("loop", texts.loop_unwatched())
         if self.stop.requested and self.heartbeat.phase in (Phase.SETUP, Phase.ENGAGING):
-            self.heartbeat.enter(Phase.STOPPING)
-            raise AskedToStop
+            self.heartbeat.enter_phase(Phase.STOPPING)
+            raise StopRequest
 
     def limit_cycle(self, limit_ns: int) -> None:
         """Set the guardian's timeout for each cycle, ns."""
@@ -243,7 +243,7 @@ def _reply_polling(longest_ns: int | None) -> ReplyPolling | None:
 def beside_simulation(plan: Plan) -> SchedulerPlan:
     """Return the scheduler plan of the loop without the core that simulated servos use."""
     scheduler = plan.loop.scheduler
-    others = os.sched_getaffinity(0) - {process.spare_core(())}
+    others = os.sched_getaffinity(0) - {child_processes.spare_core(())}
     if scheduler.policy == "other" or scheduler.cores or not others:
         return scheduler
     simulated = any(bus.port == "sim" for bus in plan.buses)
@@ -271,13 +271,13 @@ def _run(plan: Plan, job: LoopJob, heartbeat: Heartbeat, sinks: Sinks, stalls: S
         sinks=sinks,
         supervision=Pulse(heartbeat, stop, watch, sinks.events, report, clock.now_ns, pacing),
         inbox=Mailbox(job.memory.mailbox, RingWriter(job.memory.answers)),
-        activity=Activity(heartbeat, realtime.thread_count),
+        activity=Activity(heartbeat, realtime_grants.thread_count),
         slots={name: [mapped(one) for one in slots] for name, slots in job.memory.slots.items()},
     )
-    kept = msgspec.json.decode(process.whole(job.memory.kept), type=KeptStates)
+    kept = msgspec.json.decode(child_processes.whole(job.memory.kept), type=KeptStates)
     robot = assemble(plan, plugins, host, take_over=job.take_over, kept=kept)
     # Servos that are taken over may have torque already.
-    heartbeat.enter(Phase.ENGAGING if job.take_over else Phase.SETUP)
+    heartbeat.enter_phase(Phase.ENGAGING if job.take_over else Phase.SETUP)
     # Before any servo has torque, because it takes a while, and a Bus Watchdog expects the first cycle in
     # time.
     _prepare(plan, job, heartbeat, sinks.events, pacing)
@@ -285,11 +285,11 @@ def _run(plan: Plan, job: LoopJob, heartbeat: Heartbeat, sinks: Sinks, stalls: S
         ports.polling.margin_ns = pacing.measured_ns
     try:
         try:
-            result = robot.run(heartbeat.enter)
+            result = robot.run(heartbeat.enter_phase)
         finally:
-            report.emit()
-    except AskedToStop as asked:
-        sinks.events.emit("loop", texts.set_up_aborted())
+            report.emit_waits()
+    except StopRequest as asked:
+        sinks.events.emit_event("loop", texts.set_up_aborted())
         notes: list[str] = getattr(asked, "__notes__", [])
         return LoopOutcome("stopped", sentences=tuple(note for note in notes if note != TAKEN_BACK))
     detail = (result.detail,) if result.detail else ()
@@ -306,10 +306,10 @@ def _run(plan: Plan, job: LoopJob, heartbeat: Heartbeat, sinks: Sinks, stalls: S
 
 def _prepare(plan: Plan, job: LoopJob, heartbeat: Heartbeat, events: EventSink, pacing: Pacing) -> None:
     """Apply real-time settings, measure the wake-up delay of sleeps, and log the results."""
-    grants = realtime.apply(beside_simulation(plan))
+    grants = realtime_grants.apply_scheduler(beside_simulation(plan))
     heartbeat.beat()
-    grants = (*grants, pacing.measure(plan.loop.period_ns, heartbeat.beat))
-    realtime.log_grants(grants, "loop", events)
+    grants = (*grants, pacing.measure_margin(plan.loop.period_ns, heartbeat.beat))
+    realtime_grants.log_grants(grants, "loop", events)
     os.pwrite(job.memory.grants, msgspec.json.encode(grants), 0)
     heartbeat.beat()
 
@@ -317,7 +317,7 @@ def _prepare(plan: Plan, job: LoopJob, heartbeat: Heartbeat, events: EventSink, 
 def main() -> None:
     """Run the loop's process: `--job JSON`."""
     signal.signal(signal.SIGINT, signal.SIG_IGN)
-    process.hold_foreign_code(signal.SIGTERM)
+    child_processes.hold_foreign_code(signal.SIGTERM)
     job = msgspec.json.decode(sys.argv[2], type=LoopJob)
     _keep_to_this_process((*job.memory.of_loop, *job.ports, job.channel))
     clock = MonotonicClock()
@@ -339,25 +339,25 @@ def main() -> None:
         if os.getppid() != job.guardian:
             # The guardian exited before its death could be signalled.
             sys.exit(1)
-        plan = from_json(process.whole(job.memory.plan))
+        plan = from_json(child_processes.whole(job.memory.plan))
         events.goals.planned = plan.loop.origins
         outcome = _run(plan, job, heartbeat, sinks, stalls)
         outcome = structs.replace(outcome, events=events.totals)
     except DxlrunError as error:
         for_replies = isinstance(error, StartUpError) and error.for_replies
         outcome = LoopOutcome("start-up", sentences=error.sentences, refused_for_replies=for_replies)
-        events.emit("loop", texts.start_refused(error.sentences))
+        events.emit_event("loop", texts.start_refused(error.sentences))
     # Last resort: the run ends with a sentence, and the log has the traceback.
     except Exception as error:
         sentence = f"dxlrun itself failed: {type(error).__name__}: {error}; --debug shows where"
         outcome = LoopOutcome("fault", sentences=(sentence,), traceback=traceback.format_exc())
         sys.stderr.write(outcome.traceback)
-        events.emit("loop", texts.loop_crashed(outcome.traceback))
+        events.emit_event("loop", texts.loop_crashed(outcome.traceback))
     outcome = structs.replace(outcome, simulation_wait=SimulationWait(stalls.waited_ns, stalls.times))
-    sinks.packets.commit()
+    sinks.packets.commit_packets()
     os.pwrite(job.memory.result, msgspec.json.encode(outcome), 0)
     if not outcome.traceback:
-        heartbeat.enter(Phase.DONE)
+        heartbeat.enter_phase(Phase.DONE)
     sys.exit(0 if outcome.reason in ("ended", "stopped") and not outcome.sentences else 1)
 
 

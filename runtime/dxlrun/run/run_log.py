@@ -36,7 +36,7 @@ def log_header(
     scheduler = plan.loop.scheduler
     machine = platform.uname()
     return replace(
-        LogHeader.of(plan, epoch_offset_ns),
+        LogHeader.from_plan(plan, epoch_offset_ns),
         attachments={
             "robot.yaml": plan.source_text.encode(),
             "plan.json": to_json(plan),

@@ -11,17 +11,17 @@ from typing import NamedTuple, TypeVar
 import msgspec
 from msgspec.json import Decoder
 
-from dxlrun.channels import heartbeat, mailbox, process, ring, shared_memory, slot
+from dxlrun.channels import child_processes, heartbeat, mailbox, ring, shared_memory, slot
+from dxlrun.channels.child_processes import Child, Draining, Failed, Listening, Ready, RunMemory
 from dxlrun.channels.commands import LONGEST_COMMAND, command_capacity
 from dxlrun.channels.cycle import MOST_CONTROLLERS, cycle_capacity
-from dxlrun.channels.events import LONGEST_EVENT, event_capacity
+from dxlrun.channels.event_records import LONGEST_EVENT, event_capacity
 from dxlrun.channels.kept import LONGEST_FILE, KeptStates
-from dxlrun.channels.messages import LONGEST_RECORD, message_capacity, usual_message
-from dxlrun.channels.packets import DESK_SIZE, LONGEST_BATCH, packet_capacity
-from dxlrun.channels.process import Child, Draining, Failed, Listening, Ready, RunMemory
+from dxlrun.channels.logged_packets import DESK_SIZE, LONGEST_BATCH, packet_capacity
+from dxlrun.channels.topic_messages import LONGEST_RECORD, message_capacity, usual_message
 from dxlrun.compile.simulation import sensed_bodies, simulation_of
-from dxlrun.control.realtime import Grant, guardian_priority, raise_share
-from dxlrun.control.source_process import PlannedProcess, planned_processes
+from dxlrun.control.realtime_grants import Grant, guardian_priority, raise_share
+from dxlrun.control.sampled_sources import PlannedProcess, planned_processes
 from dxlrun.description.bus import SIMULATED
 from dxlrun.log.schemas import LogClosed, LogHeader, RecorderJob
 from dxlrun.plan.robot_plan import Plan, to_json
@@ -63,23 +63,23 @@ def create_memory(plan: Plan, kept: KeptStates | None = None) -> RunMemory:
         period, len(plan.loop.controllers), mailbox.capacity(MOST_CONTROLLERS)
     )
     return RunMemory(
-        plan=process.memory_file("dxlrun-plan", to_json(plan)),
+        plan=child_processes.memory_file("dxlrun-plan", to_json(plan)),
         heartbeat=heartbeat.create(),
         cycles=ring.create("cycles", cycle_capacity(period, cycle), cycle),
         packets=ring.create("packets", packet_capacity(period, servos), LONGEST_BATCH),
-        desk=process.memory_file("dxlrun-desk", bytes(DESK_SIZE)),
+        desk=child_processes.memory_file("dxlrun-desk", bytes(DESK_SIZE)),
         events=ring.create("events", events, max(_LONGEST_TAKEN, LONGEST_EVENT)),
         messages=ring.create(
             "messages", message_capacity(_published(plan)) + 2 * LONGEST_FILE, LONGEST_RECORD
         ),
         guardian=ring.create("guardian", _GUARDIAN_CAPACITY, max(LONGEST_BATCH, LONGEST_EVENT)),
-        result=process.memory_file("dxlrun-result"),
+        result=child_processes.memory_file("dxlrun-result"),
         mailbox=mailbox.create(MOST_CONTROLLERS),
         answers=ring.create("answers", mailbox.ANSWERS_CAPACITY, mailbox.LONGEST_ANSWER),
-        grants=process.memory_file("dxlrun-grants"),
-        stderr=process.memory_file("dxlrun-stderr"),
-        kept=process.memory_file("dxlrun-kept", msgspec.json.encode(kept or KeptStates())),
-        span=process.memory_file("dxlrun-span"),
+        grants=child_processes.memory_file("dxlrun-grants"),
+        stderr=child_processes.memory_file("dxlrun-stderr"),
+        kept=child_processes.memory_file("dxlrun-kept", msgspec.json.encode(kept or KeptStates())),
+        span=child_processes.memory_file("dxlrun-span"),
         slots=_create_slots(plan),
         shafts=slot.create("shafts", 3 * sensed.servos) if sensed is not None else -1,
         simulation=heartbeat.create_progress(simulated) if simulated else -1,
@@ -106,7 +106,7 @@ def _published(plan: Plan) -> float:
 def loop_outcome(memory: RunMemory) -> LoopOutcome | None:
     """Read the result of the loop's process from the run's memory; None when it wrote none."""
     try:
-        return msgspec.json.decode(process.whole(memory.result), type=LoopOutcome)
+        return msgspec.json.decode(child_processes.whole(memory.result), type=LoopOutcome)
     # The result is missing or truncated.
     except msgspec.MsgspecError:
         return None
@@ -115,7 +115,7 @@ def loop_outcome(memory: RunMemory) -> LoopOutcome | None:
 def loop_grants(memory: RunMemory) -> tuple[Grant, ...]:
     """Read the results of the loop's real-time requests; empty before the loop runs."""
     try:
-        return msgspec.json.decode(process.whole(memory.grants), type=tuple[Grant, ...])
+        return msgspec.json.decode(child_processes.whole(memory.grants), type=tuple[Grant, ...])
     except msgspec.MsgspecError:
         return ()
 
@@ -130,7 +130,7 @@ def start_simulated_buses(
     """
     scheduler = plan.loop.scheduler
     real_time = (
-        (min(scheduler.priority + 2, 99), process.spare_core(scheduler.cores))
+        (min(scheduler.priority + 2, 99), child_processes.spare_core(scheduler.cores))
         if scheduler.policy != "other"
         else (0, -1)
     )
@@ -154,7 +154,7 @@ def start_source(
     job = SourceJob(planned.feature, planned.process, slot_of, os.getpid(), restarted, bodies, memory.shafts)
     inherited = [job.slot, *([job.shafts] if bodies is not None else [])]
     role = (KIND, planned.process.kind)
-    program = Program(planned.process.title, "dxlrun.run.source_process", role)
+    program = ProcessModule(planned.process.title, "dxlrun.run.source_process", role)
     return _executed(program, job, inherited, memory, Decoder(SourceMessage))
 
 
@@ -166,7 +166,7 @@ def start_recorder(log: Path, header: LogHeader, memory: RunMemory, plan: Plan) 
     """
     job = RecorderJob(str(log), header, memory.recorded, plan.recording, memory.span)
     child: Child[RecorderMessage] = _executed(
-        Program("recorder", "dxlrun.log.recorder"),
+        ProcessModule("recorder", "dxlrun.log.recorder"),
         job,
         (*memory.recorded.values(), memory.span),
         memory,
@@ -200,7 +200,9 @@ def start_gateway(
     )
     job = GatewayJob(memory.plan, shared, str(log.absolute()) if log else None, epoch_offset_ns, listen)
     inherited = [memory.plan, *astuple(shared)]
-    return _executed(Program("gateway", "dxlrun.remote"), job, inherited, memory, Decoder(GatewayMessage))
+    return _executed(
+        ProcessModule("gateway", "dxlrun.remote"), job, inherited, memory, Decoder(GatewayMessage)
+    )
 
 
 def guardian_job(
@@ -230,11 +232,11 @@ def start_guardian(job: GuardianJob, others: Iterable[int]) -> Child[GuardianMes
     """
     memory = job.memory
     inherited = [memory.guardian, memory.stderr, *memory.of_loop, *others]
-    program = Program("guardian", "dxlrun.run.guardian")
+    program = ProcessModule("guardian", "dxlrun.run.guardian")
     return _executed(program, job, inherited, memory, Decoder(GuardianMessage))
 
 
-class Program(NamedTuple):
+class ProcessModule(NamedTuple):
     """Module that a process of a run executes."""
 
     name: str
@@ -244,14 +246,14 @@ class Program(NamedTuple):
 
 
 def _executed(
-    program: Program,
+    program: ProcessModule,
     job: object,
     inherited: Iterable[int],
     memory: RunMemory,
     messages: Decoder[Message],
 ) -> Child[Message]:
     """Start a process of a run, which reads its job as JSON from an inherited descriptor."""
-    descriptor = process.memory_file(f"dxlrun-{program.name}", msgspec.json.encode(job))
+    descriptor = child_processes.memory_file(f"dxlrun-{program.name}", msgspec.json.encode(job))
     arguments = ["--job-fd", str(descriptor), *program.arguments]
     try:
         # Each process inherits the plan's memory, by which the process table finds the processes of a run.

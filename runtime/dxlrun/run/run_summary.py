@@ -10,11 +10,11 @@ from typing import TYPE_CHECKING, NamedTuple
 
 import msgspec
 
-from dxlrun.channels.events import EventCode, EventGroup, EventTotals
+from dxlrun.channels.event_records import EventCode, EventGroup, EventTotals
 from dxlrun.dynamixel.remedies import free_machine
 from dxlrun.errors import counted
-from dxlrun.output.table import Cell, Column, Sentence, Table
-from dxlrun.output.terminal import live_line, show
+from dxlrun.output.terminal import live_line, show_parts
+from dxlrun.output.text_table import Cell, Column, Sentence, Table
 from dxlrun.plan.machine_load import MachineLoad, SimulationWait, describe_busy_machine
 from dxlrun.plan.played_goals import find_unreached_goals
 
@@ -24,7 +24,7 @@ if TYPE_CHECKING:
     from rich.console import Console
     from rich.status import Status
 
-    from dxlrun.control.realtime import Grant
+    from dxlrun.control.realtime_grants import Grant
     from dxlrun.plan.robot_plan import Plan
 
 _REFRESH_S = 0.1
@@ -206,7 +206,7 @@ def _rate(run: RunSummary, plan: Plan) -> tuple[bool, str]:
     return kept, f"The loop {verb} {rate}: {run.skipped} of {elapsed} periods skipped{shares}{time}."
 
 
-class Progress:
+class RunStatusLine:
     """Status line of a run: its time, and in virtual time the factor of its speed over real time.
 
     A console that is not a terminal gets a line every few seconds instead.
@@ -253,24 +253,26 @@ def show_grants(grants: Sequence[Grant], out: Console, *, verbose: bool = False)
     if not out.is_terminal:
         return
     if not verbose and all(one.granted for one in grants):
-        show("real time: all granted", console=out)
+        show_parts("real time: all granted", console=out)
         return
     columns = [Column("real time", "name"), Column("granted", "name"), Column("", "text")]
     rows = [
-        (one.name, Cell("yes", "good") if one.granted else Cell("no", "warning"), one.sentence)
+        (one.full_request, Cell("yes", "good") if one.granted else Cell("no", "warning"), one.sentence)
         for one in grants
     ]
     fixes = dict.fromkeys(one.fix for one in grants if one.fix)
-    show(Table.of("", columns, rows), *(Sentence(f"  {fix}", "warning") for fix in fixes), console=out)
+    show_parts(
+        Table.from_rows("", columns, rows), *(Sentence(f"  {fix}", "warning") for fix in fixes), console=out
+    )
 
 
 def refusals(grants: Sequence[Grant], out: Console) -> tuple[str, ...]:
     """Return refused real-time requests, one sentence each; empty on a terminal, where a table shows them."""
     if out.is_terminal:
         return ()
-    return tuple(one.text for one in grants if not one.granted)
+    return tuple(one.full_sentence for one in grants if not one.granted)
 
 
 def granted_text(grants: Sequence[Grant]) -> dict[str, str]:
     """Return the results of real-time requests for the log's metadata, by name of the request."""
-    return {one.name: f"{'yes' if one.granted else 'no'}: {one.sentence}" for one in grants}
+    return {one.full_request: f"{'yes' if one.granted else 'no'}: {one.sentence}" for one in grants}

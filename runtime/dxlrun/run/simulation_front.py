@@ -18,10 +18,10 @@ from typing import Protocol
 
 import msgspec
 
-from dxlrun.channels import process
-from dxlrun.channels.process import Child, MessageChannel
+from dxlrun.channels import child_processes
+from dxlrun.channels.child_processes import Child, MessageChannel
 from dxlrun.errors import PortError
-from dxlsim.messages import Request, SimulationJob, SimulationMessage
+from dxlsim.messages import SimulationJob, SimulationMessage, SimulationRequest
 
 _LAST_LOOK_S = 1.0
 """Timeout for the last snapshot; without an answer, the simulation ends without it."""
@@ -37,7 +37,7 @@ Messages = MessageChannel[SimulationMessage]
 
 def start_simulation(job: SimulationJob, errors: int) -> Child[SimulationMessage]:
     """Start the process of simulated buses; its output goes to `errors`."""
-    descriptor = process.memory_file("dxlrun-simulation", msgspec.json.encode(job))
+    descriptor = child_processes.memory_file("dxlrun-simulation", msgspec.json.encode(job))
     arguments = ["--job-fd", str(descriptor)]
     inherited = [descriptor, *(one for one in (job.shafts, job.progress) if one >= 0)]
     messages = msgspec.json.Decoder(SimulationMessage)
@@ -64,17 +64,17 @@ class Audience(Protocol):
     def opened(self, ports: Mapping[str, str], real_time: str) -> None:
         """Show the device of each bus, and the granted real-time properties; called once."""
 
-    def take(self, message: SimulationMessage) -> None:
+    def show_message(self, message: SimulationMessage) -> None:
         """Show a message other than a snapshot; one with ports has only the changed ones."""
 
     def help(self) -> None:
         """Show the available faults."""
 
-    def look(self, look: SimulationMessage, typed: str) -> None:
+    def show_snapshot(self, look: SimulationMessage, typed: str) -> None:
         """Show the newest snapshot, and the pending input of the next line."""
 
 
-class Served(msgspec.Struct, frozen=True):
+class SimulationResult(msgspec.Struct, frozen=True):
     """Result of a simulation."""
 
     elapsed_s: float
@@ -111,7 +111,7 @@ class TypedLines:
         except OSError:
             return True
 
-    def receive(self) -> list[str]:
+    def read_lines(self) -> list[str]:
         """Return the completed lines after one read, which may block."""
         try:
             data = os.read(self._descriptor, 4096)
@@ -121,10 +121,10 @@ class TypedLines:
             self.ended = True
             lines, self.pending = [self.pending], ""
         else:
-            lines = self._take(data.decode(errors="replace"))
+            lines = self._process_text(data.decode(errors="replace"))
         return [stripped for line in lines if (stripped := line.strip())]
 
-    def _take(self, text: str) -> list[str]:
+    def _process_text(self, text: str) -> list[str]:
         lines = []
         for character in _ESCAPE.sub("", text):
             if character in "\r\n":
@@ -140,24 +140,24 @@ class TypedLines:
         return lines
 
 
-def serve(job: SimulationJob, audience: Audience, typed: TypedLines | None) -> Served:
+def serve_simulation(job: SimulationJob, audience: Audience, typed: TypedLines | None) -> SimulationResult:
     """Serve simulated buses until SIGINT or SIGTERM; their process has exited on return.
 
     Raises PortError when the process refuses its configuration, ProcessFault when it does not start.
     """
-    errors = process.memory_file("dxlrun-stderr")
+    errors = child_processes.memory_file("dxlrun-stderr")
     with _stop_signals() as stop:
         began = time.monotonic()
         child = start_simulation(job, errors)
         front = _Front(child, audience, typed, stop)
         try:
-            front.run()
+            front.show_until_stopped()
         finally:
-            child.end()
-    printed = process.whole(errors).decode(errors="replace")
+            child.end_process()
+    printed = child_processes.whole(errors).decode(errors="replace")
     os.close(errors)
     sentences = _sentences(front.sentences, child.process.returncode, printed)
-    return Served(time.monotonic() - began, front.newest, sentences, printed)
+    return SimulationResult(time.monotonic() - began, front.newest, sentences, printed)
 
 
 def _sentences(before: Sequence[str], code: int, printed: str) -> tuple[str, ...]:
@@ -186,7 +186,7 @@ class _Front:
         self.newest = SimulationMessage(servos=())
         self.sentences: list[str] = []
 
-    def run(self) -> None:
+    def show_until_stopped(self) -> None:
         """Show the ports, then pass on messages and input until a stop signal."""
         first = first_message(self._child)
         self._ports = first.ports or {}
@@ -194,7 +194,7 @@ class _Front:
         look_s = time.monotonic()
         while not self._child.channel.closed:
             if self._audience.look_every_s is not None and time.monotonic() >= look_s:
-                self._child.channel.send(Request(look=True))
+                self._child.channel.send_message(SimulationRequest(look=True))
                 look_s = time.monotonic() + self._audience.look_every_s
             ready = select.select(self._sources(), [], [], self._timeout_s(look_s))[0]
             if self._stop in ready and _STOPS.intersection(self._stop.recv(64)):
@@ -219,33 +219,33 @@ class _Front:
         return _BACKGROUND_S if waiting else None
 
     def _type(self, typed: TypedLines) -> None:
-        for line in typed.receive():
+        for line in typed.read_lines():
             if line in ("help", "?"):
                 self._audience.help()
             else:
-                self._child.channel.send(Request(fault=line))
+                self._child.channel.send_message(SimulationRequest(fault=line))
         if self._audience.look_every_s is not None:
             # Echo each typed character at once.
-            self._audience.look(self.newest, typed.pending)
+            self._audience.show_snapshot(self.newest, typed.pending)
 
     def _listen(self) -> None:
-        while (message := self._child.poll(0)) is not None:
+        while (message := self._child.poll_message(0)) is not None:
             if message.servos is not None:
                 self.newest = message
                 if self._audience.look_every_s is not None:
-                    self._audience.look(message, self._typed.pending if self._typed else "")
+                    self._audience.show_snapshot(message, self._typed.pending if self._typed else "")
             elif message.ports is not None:
                 moved = {bus: port for bus, port in message.ports.items() if port != self._ports.get(bus)}
                 self._ports = message.ports
                 if moved:
-                    self._audience.take(SimulationMessage(moved))
+                    self._audience.show_message(SimulationMessage(moved))
             else:
-                self._audience.take(message)
+                self._audience.show_message(message)
 
     def _last_look(self) -> None:
         """Request the last counts of the servos and show pending messages."""
         before = self.newest
-        self._child.channel.send(Request(look=True))
+        self._child.channel.send_message(SimulationRequest(look=True))
         deadline = time.monotonic() + _LAST_LOOK_S
         while self.newest is before and not self._child.channel.closed:
             left = deadline - time.monotonic()

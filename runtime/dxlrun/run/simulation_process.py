@@ -13,16 +13,16 @@ from pathlib import Path
 
 from msgspec.json import Decoder
 
-from dxlrun.channels import process
+from dxlrun.channels import child_processes
 from dxlrun.channels.heartbeat import SimulationProgress
 from dxlrun.channels.shared_memory import mapped
 from dxlrun.channels.slot import SlotWriter
 from dxlrun.errors import DxlrunError
 from dxlrun.log.ledger_file import open_ledger
 from dxlsim.bus.recording import RecordedPackets
-from dxlsim.messages import Request, SimulationJob, SimulationMessage
-from dxlsim.serving import realtime
-from dxlsim.serving.server import Server, wake_on_signals
+from dxlsim.messages import SimulationJob, SimulationMessage, SimulationRequest
+from dxlsim.serving import realtime_serving
+from dxlsim.serving.simulation_server import Server, wake_on_signals
 from dxlsim.simulation_plan import BusConfig
 from dxlwire.control_table import add_control_table
 
@@ -32,7 +32,7 @@ def main() -> int:
 
     Return 0, 1 when the ledger could not be written, 2 when the configuration cannot be served.
     """
-    job, starter = process.begun(SimulationJob, Decoder(Request))
+    job, starter = child_processes.begun(SimulationJob, Decoder(SimulationRequest))
     for text in dict.fromkeys(text for bus in job.config.buses for text in bus.control_tables):
         add_control_table(text)
     with open_ledger(Path(job.ledger) if job.ledger else None) as ledger:
@@ -44,13 +44,13 @@ def main() -> int:
                 job.config, ledger, starter, shafts=shafts, progress=progress, recordings=recordings
             )
         except (DxlrunError, OSError, LookupError, ValueError) as error:
-            starter.send(SimulationMessage(error=str(error)))
+            starter.send_message(SimulationMessage(error=str(error)))
             return 2
-        granted = realtime.prepare(job.priority, job.core)
+        granted = realtime_serving.prepare_process(job.priority, job.core)
         if job.priority or job.core >= 0:
             ledger.add(server.start_ns, "", "note", note=f"real time: {granted}")
         with wake_on_signals(signal.SIGTERM) as wake:
-            server.run(granted, wake.fileno())
+            server.serve_ports(granted, wake.fileno())
     if ledger.error is None:
         return 0
     print(ledger.error, file=sys.stderr)

@@ -16,12 +16,12 @@ from typing import NoReturn
 import msgspec
 import numpy as np
 
-from dxlrun.channels import process
-from dxlrun.channels.process import Failed, MessageChannel, Ready
+from dxlrun.channels import child_processes
+from dxlrun.channels.child_processes import Failed, MessageChannel, Ready
 from dxlrun.channels.shared_memory import mapped
 from dxlrun.channels.slot import SlotReader, SlotState, SlotWriter
-from dxlrun.control.controllers.plugins import load_plugins
-from dxlrun.control.source_process import (
+from dxlrun.control.controllers.plugin_loading import load_plugins
+from dxlrun.control.sampled_sources import (
     ProcessStage,
     SampledSource,
     SourceContext,
@@ -71,7 +71,7 @@ class RemoteBody:
 
     def motion(self, link: str) -> LinkMotion:
         """Return the present motion of a link. Raises KeyError for a link that the URDF does not have."""
-        t_ns = self._reader.read()
+        t_ns = self._reader.read_sample()
         if t_ns is not None:
             angle, velocity, acceleration = self._reader.sample.copy().reshape(3, -1)
             self._shafts = Shafts(t_ns, angle, velocity, acceleration)
@@ -80,7 +80,7 @@ class RemoteBody:
         now = Shafts(
             shafts.t_ns, shafts.angle + shafts.velocity * ahead_s, shafts.velocity, shafts.acceleration
         )
-        self._body.move(now)
+        self._body.set_shafts(now)
         return self._body.motion(link)
 
 
@@ -97,9 +97,9 @@ def _stop(*_: object) -> None:
 
 def main() -> int:
     """Run the process of a source: `--job-fd N --kind KIND --control-fd M`."""
-    job, channel = process.begun(SourceJob, msgspec.json.Decoder(msgspec.Struct))
+    job, channel = child_processes.begun(SourceJob, msgspec.json.Decoder(msgspec.Struct))
     signal.signal(signal.SIGTERM, _stop)
-    process.hold_foreign_code(signal.SIGTERM)
+    child_processes.hold_foreign_code(signal.SIGTERM)
     if os.getppid() != job.supervisor:
         # The supervisor exited before its death could be signalled.
         return 1
@@ -122,7 +122,7 @@ def _run(job: SourceJob, channel: MessageChannel[msgspec.Struct]) -> int:
     try:
         sampled = stage.build(process.plan, SourceContext(load_plugins(), writer, time.monotonic_ns, body))
     except PlugInError as error:
-        channel.send(Failed(str(error)))
+        channel.send_message(Failed(str(error)))
         return 1
     try:
         sampled.open_first()
@@ -131,17 +131,17 @@ def _run(job: SourceJob, channel: MessageChannel[msgspec.Struct]) -> int:
     # Any error of a driver becomes a sentence.
     except Exception as error:
         if not job.restarted:
-            channel.send(Failed(f"{process.title} cannot be opened: {describe_error(error)}"))
+            channel.send_message(Failed(f"{process.title} cannot be opened: {describe_error(error)}"))
             return 1
-        sampled.fail(error)
+        sampled.close_after_error(error)
     try:
-        channel.send(Ready())
+        channel.send_message(Ready())
         _sample_for_ever(sampled, process.period_ns)
     finally:
         # The process is already stopping.
         signal.signal(signal.SIGTERM, signal.SIG_IGN)
         sampled.close()
-        writer.say(SlotState.ENDED, "")
+        writer.write_state(SlotState.ENDED, "")
 
 
 def _sample_for_ever(sampled: SampledSource, period_ns: int) -> NoReturn:
@@ -149,7 +149,7 @@ def _sample_for_ever(sampled: SampledSource, period_ns: int) -> NoReturn:
     while True:
         came = sampled.sample()
         now_ns = time.monotonic_ns()
-        if not sampled.open:
+        if not sampled.is_open:
             time.sleep(max(_SHORTEST_NAP_S, (sampled.reopen_ns - now_ns) * 1e-9))
         elif sampled.driver.waits:
             if not came:

@@ -15,12 +15,8 @@ from typing import TYPE_CHECKING, Literal
 
 from msgspec.structs import replace
 
-from dxlrun.channels import process
-from dxlrun.channels.commands import LOOP, Command
-from dxlrun.channels.heartbeat import Heartbeat, Phase, Steering
-from dxlrun.channels.kept import KeptStates
-from dxlrun.channels.mailbox import MailboxWriter
-from dxlrun.channels.process import (
+from dxlrun.channels import child_processes
+from dxlrun.channels.child_processes import (
     END_TIMEOUT_S,
     Child,
     Cut,
@@ -34,10 +30,14 @@ from dxlrun.channels.process import (
     RunMemory,
     Stop,
 )
+from dxlrun.channels.commands import LOOP, CommandMessage
+from dxlrun.channels.heartbeat import GatewayAvailability, Heartbeat, Phase
+from dxlrun.channels.kept import KeptStates
+from dxlrun.channels.mailbox import MailboxWriter
 from dxlrun.channels.shared_memory import mapped
 from dxlrun.channels.slot import SlotState, SlotWriter
-from dxlrun.control.realtime import Grant
-from dxlrun.control.source_process import PlannedProcess, planned_processes
+from dxlrun.control.realtime_grants import Grant
+from dxlrun.control.sampled_sources import PlannedProcess, planned_processes
 from dxlrun.errors import ProcessFault, counted
 from dxlrun.log.schemas import FAILURES_NAME, CycleSpan, LogClosed, epoch_offset_ns
 from dxlrun.plan.machine_load import MachineLoad
@@ -46,6 +46,15 @@ from dxlrun.run import source_process, texts
 from dxlrun.run.guardian import Ended, GuardianJob, GuardianMessage, SafeStop, Started
 from dxlrun.run.kept_files import KeptFiles, KeptStateWriter, read_states, state_directory
 from dxlrun.run.loop_process import LoopOutcome
+from dxlrun.run.process_watch import (
+    GUARDIAN_TIMEOUT_NS,
+    URGENT_TIMEOUT_NS,
+    Duty,
+    SignsOfLife,
+    WatchedProcess,
+    duty_of,
+    loop_timeout_ns,
+)
 from dxlrun.run.run_log import discard_log, incomplete_log, log_header, new_log
 from dxlrun.run.run_processes import (
     GatewayMessage,
@@ -62,22 +71,13 @@ from dxlrun.run.run_processes import (
     start_source,
 )
 from dxlrun.run.run_summary import (
-    Progress,
     RunOptions,
+    RunStatusLine,
     RunSummary,
     caught_signals,
     granted_text,
     refusals,
     show_grants,
-)
-from dxlrun.run.watch import (
-    GUARDIAN_TIMEOUT_NS,
-    URGENT_TIMEOUT_NS,
-    Duty,
-    SignsOfLife,
-    Watched,
-    duty_of,
-    loop_timeout_ns,
 )
 from dxlsim.messages import SimulationMessage
 from dxlwire.port.ports import put_in_place, set_aside
@@ -109,7 +109,7 @@ class _SourceProcess:
     restart_s: float = 0.0
     """Time of the restart; valid only without a running process."""
 
-    def look(self) -> None:
+    def supervise_process(self) -> None:
         """Report the exit of the process in its slot, for the loop; restart the process when due."""
         if self.child is None:
             if time.monotonic() >= self.restart_s:
@@ -125,9 +125,9 @@ class _SourceProcess:
             how = f"signal {signal.Signals(-code).name}" if code < 0 else f"exit code {code}"
             slots = self.memory.slots[self.planned.feature.name]
             writer = SlotWriter(mapped(slots[self.planned.index]))
-            writer.say(SlotState.ENDED, f"its process ended ({how}), another one is started")
+            writer.write_state(SlotState.ENDED, f"its process ended ({how}), another one is started")
 
-    def end(self) -> None:
+    def end_process(self) -> None:
         """Give the process time to close its device, then kill it."""
         if self.child is None:
             return
@@ -189,17 +189,17 @@ class _Run:
         before it moves."""
 
     @property
-    def steering(self) -> Steering:
+    def steering(self) -> GatewayAvailability:
         """State of the gateway, as other processes see it."""
         if not self.steerable:
-            return Steering.IMPOSSIBLE
-        return Steering.AWAITED if self.socket is None else Steering.POSSIBLE
+            return GatewayAvailability.IMPOSSIBLE
+        return GatewayAvailability.AWAITED if self.socket is None else GatewayAvailability.POSSIBLE
 
     def count_signal(self) -> None:
         """Count a signal."""
         self.signals += 1
 
-    def start(self) -> Child[GuardianMessage]:
+    def start_processes(self) -> Child[GuardianMessage]:
         """Start all processes in sequence, and return the guardian; raises PortError or ProcessFault."""
         if self.options.record:
             self.log = new_log(self.plan.recording, self.plan.robot)
@@ -217,7 +217,7 @@ class _Run:
         for each in self.sources:
             if each.child is not None:
                 each.child.ready()
-        self.hold()
+        self.post_pause()
         others = [child.channel.fileno() for child in (self.simulation, self.recorder) if child]
         self.job = guardian_job(
             self.plan, ports, self.memory, take_over=self.options.take_over, epoch_offset_ns=self.offset_ns
@@ -227,18 +227,18 @@ class _Run:
         if isinstance(started, Started):
             self.guardian_grants = started.grants
             if self.recorder:
-                self.recorder.channel.send(LoopRuns(started.loop))
+                self.recorder.channel.send_message(LoopRuns(started.loop))
             # The guardian has already reaped the loop, and handles its end.
             with suppress(ProcessLookupError):
                 self.loop = os.pidfd_open(started.loop)
                 self.loop_signs = SignsOfLife(started.loop, _LOOK_NS, time.monotonic_ns())
         return self.guardian
 
-    def hold(self) -> None:
+    def post_pause(self) -> None:
         """Post a pause, with which a loop that waits for the gateway begins; the gateway ends it."""
         # Nothing else writes into the mailbox before the gateway.
         if self.held:
-            MailboxWriter(self.memory.mailbox).post(Command(0, LOOP, "pause", b"", "loop"))
+            MailboxWriter(self.memory.mailbox).post_command(CommandMessage(0, LOOP, "pause", b"", "loop"))
 
     def discard(self) -> None:
         """Remove the log of a run that sent nothing to the robot."""
@@ -246,7 +246,7 @@ class _Run:
             discard_log(self.log)
             self.log = None
 
-    def watch(self, guardian: Child[GuardianMessage], show: Callable[[Heartbeat], None]) -> None:
+    def watch_guardian(self, guardian: Child[GuardianMessage], show: Callable[[Heartbeat], None]) -> None:
         """Wait for the guardian's last message; pass on stop requests by signals.
 
         Also returns when the guardian has exited, or was killed because it did not respond.
@@ -258,24 +258,24 @@ class _Run:
             heartbeat.supervisor_look()
             if self.signals > asked:
                 asked = self.signals
-                guardian.channel.send(Stop() if asked == 1 else Cut())
+                guardian.channel.send_message(Stop() if asked == 1 else Cut())
             show(heartbeat)
             self._look_at_grants()
             self._look_after_gateway(heartbeat)
             heartbeat.set_steering(self.steering)
             self._look_after_simulation(guardian)
             for source in self.sources:
-                source.look()
+                source.supervise_process()
             loop = () if gone or self.loop is None else (self.loop,)
-            message = guardian.poll(_GONE_POLL_S if gone else _POLL_S, *loop)
+            message = guardian.poll_message(_GONE_POLL_S if gone else _POLL_S, *loop)
             gone = gone or bool(select.select(loop, [], [], 0)[0])
-            signs.look(heartbeat.looks, time.monotonic_ns())
+            signs.record_beat(heartbeat.looks, time.monotonic_ns())
             torque = heartbeat.phase not in (Phase.LOADING, Phase.DONE)
             urgent = torque and (gone or asked > 1)
             guardian_silent = signs.is_silent(URGENT_TIMEOUT_NS if urgent else GUARDIAN_TIMEOUT_NS)
             duty = self._duty(heartbeat, guardian_silent=guardian_silent, loop_gone=gone)
             if message:
-                self._take(message, guardian.channel.descriptors)
+                self._handle_message(message, guardian.channel.descriptors)
             elif duty is not Duty.NONE and not guardian.channel.closed:
                 self.sentences.append("the guardian stopped watching the loop, and was killed")
                 guardian.kill()
@@ -283,25 +283,25 @@ class _Run:
 
     def _duty(self, heartbeat: Heartbeat, *, guardian_silent: bool, loop_gone: bool = False) -> Duty:
         """Check the loop, and return this process' duty. A loop that is done does not count as silent."""
-        silent = {Watched.GUARDIAN} if guardian_silent else set()
+        silent = {WatchedProcess.GUARDIAN} if guardian_silent else set()
         phase, signs = heartbeat.phase, self.loop_signs
         if signs is not None and phase is not Phase.DONE:
             # Read before the heartbeat, as in the guardian.
             timeout_ns = loop_timeout_ns(heartbeat, self.plan.loop.period_ns)
-            signs.look((phase, heartbeat.beats), time.monotonic_ns())
+            signs.record_beat((phase, heartbeat.beats), time.monotonic_ns())
             if loop_gone or signs.is_silent(timeout_ns):
-                silent.add(Watched.LOOP)
-        return duty_of(Watched.SUPERVISOR, silent)
+                silent.add(WatchedProcess.LOOP)
+        return duty_of(WatchedProcess.SUPERVISOR, silent)
 
     def _look_after_simulation(self, guardian: Child[GuardianMessage]) -> None:
         """Stop the run after the simulated servos have exited: unlike an adapter, they do not come back."""
         if self.simulation and self.simulation.process.poll() is not None:
             self.sentences.append("the simulated bus ended before the run did")
-            self.simulation.end()
+            self.simulation.end_process()
             self.simulation = None
-            guardian.channel.send(Stop())
+            guardian.channel.send_message(Stop())
 
-    def _take(self, message: GuardianMessage, descriptors: list[int]) -> None:
+    def _handle_message(self, message: GuardianMessage, descriptors: list[int]) -> None:
         """Record the end of the loop; release a lost line, and hold a returned one."""
         match message:
             case Ended():
@@ -313,8 +313,8 @@ class _Run:
 
     def _take_last_messages(self, guardian: Child[GuardianMessage]) -> None:
         """Process the last messages of an exited guardian. A guardian that was killed here leaves none."""
-        while guardian.channel.fileno() >= 0 and (message := guardian.poll(0)):
-            self._take(message, guardian.channel.descriptors)
+        while guardian.channel.fileno() >= 0 and (message := guardian.poll_message(0)):
+            self._handle_message(message, guardian.channel.descriptors)
 
     def _look_at_grants(self) -> None:
         """Show and record the grants of the operating system, once the loop has reported them."""
@@ -323,7 +323,7 @@ class _Run:
             self.grants = (*loop, *(replace(one, process="guardian") for one in self.guardian_grants))
             show_grants(self.grants, self.out, verbose=self.options.verbose)
             if self.recorder:
-                self.recorder.channel.send(LateMetadata({"granted": granted_text(self.grants)}))
+                self.recorder.channel.send_message(LateMetadata({"granted": granted_text(self.grants)}))
 
     def _look_after_gateway(self, heartbeat: Heartbeat) -> None:
         """Start the gateway when the loop runs, and process its messages."""
@@ -333,7 +333,7 @@ class _Run:
                     self.gateway = start_gateway(self.log, self.memory, self.offset_ns, self.options.listen)
                 except OSError as error:
                     self._without_gateway(f"did not start ({error.strerror or error})")
-        elif message := self.gateway.poll(0):
+        elif message := self.gateway.poll_message(0):
             if isinstance(message, Listening):
                 self.socket = Path(message.socket)
                 self.held = False
@@ -348,7 +348,7 @@ class _Run:
         if self.held and self.guardian is not None:
             fix = "without --listen it would" if self.options.listen else "--no-gateway runs without"
             self.sentences.append(f"the gateway {what}, so the robot did not move; {fix}")
-            self.guardian.channel.send(Stop())
+            self.guardian.channel.send_message(Stop())
         else:
             self.remarks.append(f"the gateway {what}: the run continues, but cannot be steered")
         self._end_gateway()
@@ -356,7 +356,7 @@ class _Run:
     def _end_gateway(self) -> None:
         """Kill the gateway, which has no state to save, and remove its socket."""
         if self.gateway:
-            message = self.gateway.poll(0)
+            message = self.gateway.poll_message(0)
             self.gateway.kill()
             self.gateway = None
             if isinstance(message, Listening):
@@ -388,28 +388,28 @@ class _Run:
             where = f" in {called}" if called else ""
             how = f"the loop ended too{where}" if gone else f"the loop did not stop{where} and was killed"
             safe_stop = SafeStop(job)
-            leave = safe_stop.limp if cut else safe_stop.end
+            leave = safe_stop.limp if cut else safe_stop.apply_final_state
             self.sentences += leave(guardian.channel.descriptors, how, texts.loop_failed)
 
-    def end(self) -> None:
+    def end_processes(self) -> None:
         """End the remaining processes in sequence: guardian, sources, recorder, simulated bus, gateway."""
         self._look_at_grants()
         if self.guardian:
             self._take_last_messages(self.guardian)
-            self.guardian.end()
+            self.guardian.end_process()
             if self.loop is not None and self.ended is None and self.job is not None:
                 self._without_guardian(self.loop, self.guardian, self.job)
             self.loop = None
             let_go(self.guardian.channel.descriptors)
             self.guardian.channel.descriptors.clear()
         for source in self.sources:
-            source.end()
+            source.end_process()
         if self.recorder:
             self._end_recorder(self.recorder)
         if self.writer:
-            self.remarks += self.writer.finish()
+            self.remarks += self.writer.write_remaining()
         if self.simulation:
-            self.simulation.end()
+            self.simulation.end_process()
         # The gateway is the last: when its socket is gone, the log is closed.
         self._end_gateway()
 
@@ -418,11 +418,11 @@ class _Run:
         # No ring has these sentences, and the verdict in the log must be that of the run.
         if self.sentences:
             failures = {str(number): sentence for number, sentence in enumerate(self.sentences)}
-            recorder.channel.send(LateMetadata({FAILURES_NAME: failures}))
-        recorder.channel.send(Finish())
+            recorder.channel.send_message(LateMetadata({FAILURES_NAME: failures}))
+        recorder.channel.send_message(Finish())
         closed = False
         try:
-            while (message := recorder.message(END_TIMEOUT_S)) is not None:
+            while (message := recorder.next_message(END_TIMEOUT_S)) is not None:
                 if isinstance(message, Failed):
                     self.sentences.append(incomplete_log(message.sentence))
                 elif isinstance(message, LogClosed):
@@ -434,7 +434,7 @@ class _Run:
                             f"the log lacks {counted(gaps, 'record', 'records')}, and declares that: "
                             "the recorder was too slow"
                         )
-            recorder.end()
+            recorder.end_process()
         except ProcessFault as fault:
             self.sentences.append(f"{fault} and was killed")
             recorder.kill()
@@ -454,28 +454,28 @@ def run_robot(plan: Plan, options: RunOptions, out: Console) -> RunSummary:
     with caught_signals(run.count_signal):
         try:
             with out.status(f"{plan.robot}: starting") as status:
-                guardian = run.start()
+                guardian = run.start_processes()
                 began = time.monotonic()
-                run.watch(guardian, _watching(Progress(plan, status)))
+                run.watch_guardian(guardian, _watching(RunStatusLine(plan, status)))
         finally:
-            run.end()
+            run.end_processes()
             if run.guardian is None or Heartbeat(run.memory.heartbeat).phase is Phase.LOADING:
                 run.discard()
             if options.debug:
-                sys.stderr.write(process.whole(run.memory.stderr).decode(errors="replace"))
+                sys.stderr.write(child_processes.whole(run.memory.stderr).decode(errors="replace"))
     return _summary(run, time.monotonic() - began)
 
 
-def _watching(progress: Progress) -> Callable[[Heartbeat], None]:
+def _watching(progress: RunStatusLine) -> Callable[[Heartbeat], None]:
     """Return a function that updates the terminal's status line."""
 
-    def show(heartbeat: Heartbeat) -> None:
+    def show_phase(heartbeat: Heartbeat) -> None:
         if heartbeat.phase in (Phase.SETUP, Phase.ENGAGING):
             progress.setting_up()
         elif heartbeat.phase is Phase.RUNNING:
             progress.ran(heartbeat.cycles, heartbeat.skipped)
 
-    return show
+    return show_phase
 
 
 def _summary(run: _Run, elapsed_s: float) -> RunSummary:
@@ -516,5 +516,5 @@ def _summary(run: _Run, elapsed_s: float) -> RunSummary:
 
 def _last_words(memory: RunMemory) -> tuple[str, ...]:
     """Return the last output of the run's processes, the probable reason of an early end."""
-    lines = process.whole(memory.stderr).decode(errors="replace").strip().splitlines()
+    lines = child_processes.whole(memory.stderr).decode(errors="replace").strip().splitlines()
     return (f"the run's processes printed last: {lines[-1]} (--debug shows all)",) if lines else ()

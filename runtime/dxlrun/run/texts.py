@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 
-from dxlrun.channels.events import EventCode, Severity, event_text
+from dxlrun.channels.event_records import EventCode, Severity, event_text
 
 # Guardian
 

@@ -12,10 +12,10 @@ import time
 from contextlib import suppress
 from dataclasses import dataclass
 
-from dxlrun.channels.heartbeat import Heartbeat, Phase, Steering
+from dxlrun.channels.heartbeat import GatewayAvailability, Heartbeat, Phase
 from dxlrun.errors import DxlrunError
 from dxlrun.process_table import SUPERVISOR, FoundRun, RunProcess, found_runs, is_alive
-from dxlrun.remote.sockets import listener, place, sockets
+from dxlrun.remote.sockets import listener, sockets, sockets_directory
 
 _END_S = 30.0
 """Timeout for the steps of on_exit and the recorder on a slow disk."""
@@ -64,7 +64,7 @@ def unsteered_runs() -> list[UnsteeredRun]:
     return unsteered
 
 
-def describe(run: UnsteeredRun) -> str:
+def describe_run(run: UnsteeredRun) -> str:
     """Return a sentence for a person who tries to steer the run."""
     if run.problem:
         fix = f"`dxlrun stop --robot {run.name}` ends it"
@@ -111,7 +111,7 @@ def _problem(run: FoundRun) -> str:
         heartbeat = _heartbeat(run)
         if heartbeat is None or heartbeat.phase is not Phase.RUNNING:
             return ""
-        return "it has no gateway" if heartbeat.steering is Steering.IMPOSSIBLE else ""
+        return "it has no gateway" if heartbeat.steering is GatewayAvailability.IMPOSSIBLE else ""
     steering = (SUPERVISOR, "guardian", "loop", "gateway")
     gone = [role for role in steering if run.process(role) is None]
     stopped = [str(one) for one in run.processes if one.stat.is_stopped and one.role in steering]
@@ -126,7 +126,7 @@ def _is_steerable(run: FoundRun) -> bool:
     heartbeat = _heartbeat(run)
     if heartbeat is None or run.process("gateway") is None:
         return False
-    return heartbeat.phase is Phase.RUNNING and heartbeat.steering is Steering.POSSIBLE
+    return heartbeat.phase is Phase.RUNNING and heartbeat.steering is GatewayAvailability.POSSIBLE
 
 
 def _is_ending(run: FoundRun) -> bool:
@@ -151,7 +151,7 @@ def _heartbeat(run: FoundRun) -> Heartbeat | None:
 
 
 def _is_ours(run: FoundRun) -> bool:
-    return place(run.runtime_directory) == place()
+    return sockets_directory(run.runtime_directory) == sockets_directory()
 
 
 def _not_ended(name: str, left: list[RunProcess]) -> str:

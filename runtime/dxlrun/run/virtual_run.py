@@ -14,16 +14,16 @@ from typing import TYPE_CHECKING, Any
 from dxlrun.channels import slot
 from dxlrun.channels.commands import CommandRing, Inbox, NoCommands, QueueInbox
 from dxlrun.channels.cycle import CycleRecord
-from dxlrun.channels.events import EventRing, EventTotals
-from dxlrun.channels.messages import MessageRing, MessageSink
-from dxlrun.channels.packets import PacketBatch
+from dxlrun.channels.event_records import EventRing, EventTotals
+from dxlrun.channels.logged_packets import PacketBatch
 from dxlrun.channels.ring import Handover, Payload, RecordKind
 from dxlrun.channels.slot import SlotWriter
+from dxlrun.channels.topic_messages import MessageRing, MessageSink
 from dxlrun.compile.simulation import sensed_bodies, simulation_of
 from dxlrun.control.context import StopFlag, Unsupervised
-from dxlrun.control.controllers.plugins import PlugIns, load_plugins
+from dxlrun.control.controllers.plugin_loading import PlugIns, load_plugins
 from dxlrun.control.loop import LoopResult
-from dxlrun.control.source_process import (
+from dxlrun.control.sampled_sources import (
     ProcessStage,
     SampledSource,
     SourceContext,
@@ -40,7 +40,7 @@ from dxlrun.run import texts
 from dxlrun.run.assembly import LoopHost, Sinks, assemble
 from dxlrun.run.kept_files import KeptFiles, read_states, state_directory
 from dxlrun.run.run_log import discard_log, incomplete_log, log_header, new_log
-from dxlrun.run.run_summary import Progress, RunOptions, RunSummary, caught_signals
+from dxlrun.run.run_summary import RunOptions, RunStatusLine, RunSummary, caught_signals
 from dxlsim.bus.ledger import Ledger
 from dxlsim.bus.simulated_bus import SimulatedBus
 from dxlsim.device.on_links import fix_to_links
@@ -109,16 +109,16 @@ class VirtualRobot:
             self._writer = open_writer(log, header, plan.recording) if log and header else None
             self._kept = KeptFiles(kept) if kept else None
 
-            def take(kind: RecordKind, payload: Payload) -> None:
+            def handle_record(kind: RecordKind, payload: Payload) -> None:
                 if self._writer:
-                    self._writer.take(kind, payload)
+                    self._writer.write_record(kind, payload)
                     if kind == RecordKind.CYCLE and isinstance(self._writer, PartWriter):
-                        self._writer.settle()
+                        self._writer.split_if_due()
                 watch(kind, payload)
                 if self._kept:
-                    self._kept.take(kind, payload)
+                    self._kept.process_record(kind, payload)
 
-            to_log = Handover(take)
+            to_log = Handover(handle_record)
             self._events = EventRing(to_log, self.clock)
             self._events.goals.planned = plan.loop.origins
             self.sinks = Sinks(
@@ -171,7 +171,7 @@ class VirtualRobot:
         def sample() -> None:
             # Bytes on the wire must take effect at their own time, before the sample.
             for bus in self.buses:
-                bus.advance(due_ns)
+                bus.advance_to(due_ns)
             sampled.sample()
             self._sample(sampled, period_ns, due_ns + period_ns)
 
@@ -215,10 +215,10 @@ class VirtualRobot:
         try:
             self.result = self.robot.run()
         except DxlrunError as error:
-            self.sinks.events.emit("loop", texts.start_refused(error.sentences))
+            self.sinks.events.emit_event("loop", texts.start_refused(error.sentences))
             raise
         finally:
-            self.sinks.packets.commit()
+            self.sinks.packets.commit_packets()
             self._opened.close()
             if self._writer:
                 summary = self._writer.close()
@@ -262,7 +262,7 @@ def run_virtual(plan: Plan, options: RunOptions, out: Console) -> RunSummary:
     began = time.monotonic()
     refused: tuple[str, ...] = ()
     with caught_signals(partial(_stop, robot.stop)), out.status(f"{plan.robot}: starting") as status:
-        robot.sinks.progress = Progress(plan, status, virtual=True).ran
+        robot.sinks.progress = RunStatusLine(plan, status, virtual=True).ran
         try:
             result = robot.run()
         except DxlrunError as error:

@@ -18,13 +18,13 @@ from importlib import invalidate_caches
 from pathlib import Path
 from tempfile import TemporaryDirectory
 
-from dxlrun.compile.robot import compile_robot
+from dxlrun.compile.robot_compiler import compile_robot
 from dxlrun.description.frames.tree import FrameTree
 from dxlrun.description.motion import read_motion
 from dxlrun.description.reading import read_robot
 from dxlrun.description.robot import robot_form
 from dxlrun.errors import InputError
-from dxlrun.log.reader import Log, read_log
+from dxlrun.log.log_reader import Log, read_log
 from dxlrun.plan.robot_plan import Plan
 from dxlrun.run.virtual_run import VirtualRobot
 
@@ -88,7 +88,7 @@ def kinematics(robot: str | Path, *, arguments: Mapping[str, str] | None = None)
         raise InputError(
             f"{robot} names no URDF, so nothing is known of its frames; write `model: {{urdf: ...}}`"
         )
-    return FrameTree.of(plan.urdf, plan.frames)
+    return FrameTree.from_urdf(plan.urdf, plan.frames)
 
 
 @contextmanager

@@ -18,20 +18,20 @@ from starlette.types import Message
 
 from dxlrun.channels import heartbeat, mailbox, ring
 from dxlrun.channels.cycle import MOST_CONTROLLERS, cycle_capacity
-from dxlrun.channels.events import LONGEST_EVENT, Event
+from dxlrun.channels.event_records import LONGEST_EVENT, Event
 from dxlrun.channels.heartbeat import Heartbeat, Phase
 from dxlrun.channels.mailbox import Mailbox
-from dxlrun.channels.messages import LEAST_CAPACITY, LONGEST_RECORD, OpenedTopic, TopicMessage
 from dxlrun.channels.ring import Payload, RecordKind, RingWriter
 from dxlrun.channels.tagged import decode
-from dxlrun.control.controllers.plugins import load_plugins
+from dxlrun.channels.topic_messages import LEAST_CAPACITY, LONGEST_RECORD, OpenedTopic, TopicRecord
+from dxlrun.control.controllers.plugin_loading import load_plugins
 from dxlrun.errors import RunGone
 from dxlrun.plan.robot_plan import Plan
 from dxlrun.remote.gateway import GatewayApp
 from dxlrun.remote.job import Descriptors
 from dxlrun.remote.link import Link
 from dxlrun.remote.preparation import Preparation
-from dxlrun.remote.requests.table import Role
+from dxlrun.remote.requests.request_table import Role
 from dxlrun.run.virtual_run import VirtualRobot
 
 _EVENTS_CAPACITY = 1 << 20
@@ -79,7 +79,7 @@ class VirtualLink:
         self._heartbeat = Heartbeat(memory.heartbeat)
         messages = RingWriter(memory.messages)
         self._cycle_ring = RingWriter(memory.cycles)
-        self._rings = {Event: RingWriter(memory.events), OpenedTopic: messages, TopicMessage: messages}
+        self._rings = {Event: RingWriter(memory.events), OpenedTopic: messages, TopicRecord: messages}
         inbox = Mailbox(memory.mailbox, RingWriter(memory.answers))
         self.simulated = VirtualRobot(plan, log=log, watch=self._watch, inbox=inbox)
         self.gateways_link = Link(plan, memory)
@@ -93,7 +93,7 @@ class VirtualLink:
         # One second per request, so that no rate limit applies.
         seconds = itertools.count()
         self._gateway = GatewayApp(self.gateways_link, preparation, log_path, lambda: next(seconds)).app()
-        self._waiting = _VirtualTime(lambda: self.now_s, self.turn)
+        self._waiting = _VirtualTime(lambda: self.now_s, self.run_cycle)
         self._closing = False
         self._robots_turn, self._our_turn = threading.Semaphore(0), threading.Semaphore(0)
         self._error: BaseException | None = None
@@ -102,7 +102,7 @@ class VirtualLink:
         self._our_turn.acquire()
         if self._error is not None:
             raise self._error
-        self._heartbeat.enter(Phase.RUNNING)
+        self._heartbeat.enter_phase(Phase.RUNNING)
 
     # The robot's turn
 
@@ -142,7 +142,7 @@ class VirtualLink:
         """Time of the virtual run, s."""
         return self.simulated.clock.now_ns() * 1e-9
 
-    def turn(self) -> None:
+    def run_cycle(self) -> None:
         """Run a cycle of the robot, and pass its records to the gateway. Raises RunGone after the run."""
         if not self._thread.is_alive():
             result = self.simulated.result
@@ -152,7 +152,7 @@ class VirtualLink:
         self._our_turn.acquire()
         if self._error is not None or self.simulated.result is not None:
             self._thread.join()
-        self.gateways_link.collect()
+        self.gateways_link.collect_messages()
 
     def new(self) -> tuple[NDArray[np.void], Sequence[Event]]:
         """Return the cycles and events since the last call."""
@@ -164,10 +164,10 @@ class VirtualLink:
 
     def exchange(self, method: str, path: str, body: bytes | None) -> tuple[int, bytes]:
         """Pass a request to the gateway; raises RunGone if that needs a cycle after the end of the run."""
-        self.gateways_link.collect()
-        return self._waiting.run_until_complete(self._answer(method, path, body or b""))
+        self.gateways_link.collect_messages()
+        return self._waiting.run_until_complete(self._serve_request(method, path, body or b""))
 
-    async def _answer(self, method: str, path: str, body: bytes) -> tuple[int, bytes]:
+    async def _serve_request(self, method: str, path: str, body: bytes) -> tuple[int, bytes]:
         path, _, query = path.partition("?")
         scope = {
             "type": "http",

@@ -23,30 +23,30 @@ from typing import TYPE_CHECKING
 from dxlwire.faces import lazy_face
 
 if TYPE_CHECKING:
-    from dxlrun.channels.events import EventBody as EventBody
-    from dxlrun.channels.events import EventSink as EventSink
-    from dxlrun.channels.events import EventText as EventText
-    from dxlrun.channels.events import event_text as event_text
+    from dxlrun.channels.event_records import EventBody as EventBody
+    from dxlrun.channels.event_records import EventSink as EventSink
+    from dxlrun.channels.event_records import EventText as EventText
+    from dxlrun.channels.event_records import event_text as event_text
+    from dxlrun.compile.check_report import Row as Row
+    from dxlrun.compile.check_report import TableStage as TableStage
     from dxlrun.compile.contribution import BusDevice as BusDevice
     from dxlrun.compile.contribution import Compilation as Compilation
     from dxlrun.compile.contribution import CompileStage as CompileStage
     from dxlrun.compile.contribution import Contribution as Contribution
+    from dxlrun.compile.joints.compiled_servos import SettingsStage as SettingsStage
     from dxlrun.compile.joints.described_servos import DescribedServo as DescribedServo
-    from dxlrun.compile.joints.servos import SettingsStage as SettingsStage
     from dxlrun.compile.problems import RobotFile as RobotFile
-    from dxlrun.compile.report import Row as Row
-    from dxlrun.compile.report import TableStage as TableStage
     from dxlrun.contract.hardware import Hardware as Hardware
-    from dxlrun.control.monitors.monitor import Monitor as Monitor
-    from dxlrun.control.monitors.monitor import MonitorStage as MonitorStage
+    from dxlrun.control.monitors.monitor_stage import Monitor as Monitor
+    from dxlrun.control.monitors.monitor_stage import MonitorStage as MonitorStage
     from dxlrun.control.monitors.policy_actions import PolicyActions as PolicyActions
-    from dxlrun.control.source_process import ProcessStage as ProcessStage
-    from dxlrun.control.source_process import ReaderContext as ReaderContext
-    from dxlrun.control.source_process import ReaderStage as ReaderStage
-    from dxlrun.control.source_process import SampledSource as SampledSource
-    from dxlrun.control.source_process import SourceContext as SourceContext
-    from dxlrun.control.source_process import SourceProcess as SourceProcess
-    from dxlrun.control.source_process import SourceReader as SourceReader
+    from dxlrun.control.sampled_sources import ProcessStage as ProcessStage
+    from dxlrun.control.sampled_sources import ReaderContext as ReaderContext
+    from dxlrun.control.sampled_sources import ReaderStage as ReaderStage
+    from dxlrun.control.sampled_sources import SampledSource as SampledSource
+    from dxlrun.control.sampled_sources import SourceContext as SourceContext
+    from dxlrun.control.sampled_sources import SourceProcess as SourceProcess
+    from dxlrun.control.sampled_sources import SourceReader as SourceReader
     from dxlrun.description.robot import WrittenPolicy as WrittenPolicy
     from dxlrun.dynamixel.bus_part import BusContext as BusContext
     from dxlrun.dynamixel.bus_part import BusPart as BusPart
@@ -63,7 +63,7 @@ if TYPE_CHECKING:
     from dxlrun.features.feature import ServoKey as ServoKey
     from dxlrun.plan.loop_plan import SourcePlan as SourcePlan
     from dxlwire.bus_plan import RegisterValue as RegisterValue
-    from dxlwire.exchange.bus import Lines as Lines
+    from dxlwire.exchange.bus_engine import Lines as Lines
     from dxlwire.exchange.idle import Urgency as Urgency
     from dxlwire.plan.planning import plan_line as plan_line
     from dxlwire.plan.retry import limit_patience as limit_patience

@@ -20,11 +20,11 @@ from typing import TYPE_CHECKING
 from dxlwire.faces import lazy_face
 
 if TYPE_CHECKING:
+    from dxlrun.description.base_form import Form as Form
+    from dxlrun.description.base_form import Name as Name
+    from dxlrun.description.base_form import key as key
+    from dxlrun.description.base_form import validation_error as validation_error
     from dxlrun.description.document import KeyPath as KeyPath
-    from dxlrun.description.form import Form as Form
-    from dxlrun.description.form import Name as Name
-    from dxlrun.description.form import key as key
-    from dxlrun.description.form import refuse as refuse
     from dxlrun.description.units import Acceleration as Acceleration
     from dxlrun.description.units import Position as Position
     from dxlrun.description.units import Speed as Speed

@@ -16,15 +16,15 @@ from typing import TYPE_CHECKING
 from dxlwire.faces import lazy_face
 
 if TYPE_CHECKING:
-    from dxlrun.output.html import data as data
-    from dxlrun.output.html import document as document
-    from dxlrun.output.html import figure as figure
-    from dxlrun.output.html import folded as folded
-    from dxlrun.output.html import footer as footer
-    from dxlrun.output.html import header as header
-    from dxlrun.output.html import paragraph as paragraph
-    from dxlrun.output.html import script as script
-    from dxlrun.output.html import section as section
-    from dxlrun.output.html import table_element as table_element
+    from dxlrun.output.html_tree import data as data
+    from dxlrun.output.html_tree import document as document
+    from dxlrun.output.html_tree import figure as figure
+    from dxlrun.output.html_tree import folded as folded
+    from dxlrun.output.html_tree import footer as footer
+    from dxlrun.output.html_tree import header as header
+    from dxlrun.output.html_tree import paragraph as paragraph
+    from dxlrun.output.html_tree import script as script
+    from dxlrun.output.html_tree import section as section
+    from dxlrun.output.html_tree import table_element as table_element
 else:
     __getattr__, __dir__ = lazy_face(__name__, __file__)

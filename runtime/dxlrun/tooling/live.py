@@ -25,8 +25,8 @@ if TYPE_CHECKING:
     from dxlrun.remote.network.certificates import keys_place as keys_place
     from dxlrun.remote.network.certificates import revoked as revoked
     from dxlrun.remote.network.certificates import server_context as server_context
+    from dxlrun.remote.network.listener import ListenAddress as ListenAddress
     from dxlrun.remote.network.listener import Listener as Listener
-    from dxlrun.remote.network.listener import Place as Place
     from dxlrun.remote.network.listener import in_url as in_url
     from dxlrun.remote.network.network_link import NetworkLink as NetworkLink
     from dxlrun.remote.network.robots_file import ListedAddress as ListedAddress
@@ -34,7 +34,7 @@ if TYPE_CHECKING:
     from dxlrun.remote.requests.replies import Events as Events
     from dxlrun.remote.requests.replies import Parameter as Parameter
     from dxlrun.remote.requests.replies import RobotInfo as RobotInfo
-    from dxlrun.remote.requests.table import Role as Role
+    from dxlrun.remote.requests.request_table import Role as Role
     from dxlrun.remote.server import serve_clients as serve_clients
     from dxlrun.remote.sockets import Address as Address
     from dxlrun.remote.sockets import SocketLink as SocketLink

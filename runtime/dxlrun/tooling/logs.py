@@ -21,12 +21,12 @@ if TYPE_CHECKING:
     from dxlrun.log.identity import IDENTITY_NAME as IDENTITY_NAME
     from dxlrun.log.identity import changed_code as changed_code
     from dxlrun.log.identity import runtime_hash as runtime_hash
+    from dxlrun.log.log_reader import UNREADABLE as UNREADABLE
+    from dxlrun.log.log_reader import LogFollower as LogFollower
+    from dxlrun.log.log_reader import read_log as read_log
     from dxlrun.log.log_writer import TopicWriter as TopicWriter
     from dxlrun.log.parts import is_log_directory as is_log_directory
     from dxlrun.log.parts import log_files as log_files
-    from dxlrun.log.reader import UNREADABLE as UNREADABLE
-    from dxlrun.log.reader import LogFollower as LogFollower
-    from dxlrun.log.reader import read_log as read_log
     from dxlrun.log.reading.walk import LogWalk as LogWalk
     from dxlrun.log.schemas import FAILURES_NAME as FAILURES_NAME
     from dxlrun.log.schemas import SUMMARY_NAME as SUMMARY_NAME

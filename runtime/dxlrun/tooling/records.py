@@ -22,19 +22,19 @@ if TYPE_CHECKING:
     from dxlrun.channels.cycle import OFFLINE as OFFLINE
     from dxlrun.channels.cycle import CycleRecord as CycleRecord
     from dxlrun.channels.cycle import Torque as Torque
-    from dxlrun.channels.events import Event as Event
-    from dxlrun.channels.events import EventCode as EventCode
-    from dxlrun.channels.events import EventCounts as EventCounts
-    from dxlrun.channels.events import EventGroup as EventGroup
-    from dxlrun.channels.events import GoalHistory as GoalHistory
-    from dxlrun.channels.events import GoalReport as GoalReport
-    from dxlrun.channels.events import GoalTotals as GoalTotals
-    from dxlrun.channels.events import Granted as Granted
-    from dxlrun.channels.events import LostRecords as LostRecords
-    from dxlrun.channels.events import Severity as Severity
-    from dxlrun.channels.events import Waited as Waited
-    from dxlrun.channels.packets import BEFORE_FIRST_CYCLE as BEFORE_FIRST_CYCLE
-    from dxlrun.channels.packets import LoggedPacket as LoggedPacket
+    from dxlrun.channels.event_records import Event as Event
+    from dxlrun.channels.event_records import EventCode as EventCode
+    from dxlrun.channels.event_records import EventCounts as EventCounts
+    from dxlrun.channels.event_records import EventGroup as EventGroup
+    from dxlrun.channels.event_records import GoalHistory as GoalHistory
+    from dxlrun.channels.event_records import GoalReport as GoalReport
+    from dxlrun.channels.event_records import GoalTotals as GoalTotals
+    from dxlrun.channels.event_records import LostRecords as LostRecords
+    from dxlrun.channels.event_records import SchedulerGrant as SchedulerGrant
+    from dxlrun.channels.event_records import Severity as Severity
+    from dxlrun.channels.event_records import SimulationStall as SimulationStall
+    from dxlrun.channels.logged_packets import BEFORE_FIRST_CYCLE as BEFORE_FIRST_CYCLE
+    from dxlrun.channels.logged_packets import LoggedPacket as LoggedPacket
     from dxlrun.channels.ring import RING_SECONDS as RING_SECONDS
     from dxlrun.control.steering import Play as Play
     from dxlrun.description.source_names import SOURCE_COMMAND as SOURCE_COMMAND

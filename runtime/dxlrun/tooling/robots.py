@@ -17,16 +17,16 @@ from typing import TYPE_CHECKING
 from dxlwire.faces import lazy_face
 
 if TYPE_CHECKING:
+    from dxlrun.compile.joints.compiled_joints import CompiledJoint as CompiledJoint
     from dxlrun.compile.joints.described_servos import find_unknown_servos as find_unknown_servos
-    from dxlrun.compile.joints.joints import CompiledJoint as CompiledJoint
     from dxlrun.compile.logged_plan import compile_texts as compile_texts
     from dxlrun.compile.logged_plan import replan_controller as replan_controller
     from dxlrun.compile.motions import TRAJECTORY as TRAJECTORY
     from dxlrun.compile.motions import command_kind as command_kind
-    from dxlrun.compile.robot import Compiled as Compiled
-    from dxlrun.compile.robot import compile_robot as compile_robot
-    from dxlrun.control.controllers.plugins import PlugIns as PlugIns
-    from dxlrun.control.controllers.plugins import load_plugins as load_plugins
+    from dxlrun.compile.robot_compiler import CompiledRobot as CompiledRobot
+    from dxlrun.compile.robot_compiler import compile_robot as compile_robot
+    from dxlrun.control.controllers.plugin_loading import PlugIns as PlugIns
+    from dxlrun.control.controllers.plugin_loading import load_plugins as load_plugins
     from dxlrun.control.controllers.single_files import published_by as published_by
     from dxlrun.description.bus import SIMULATED as SIMULATED
     from dxlrun.description.document import read_file as read_file

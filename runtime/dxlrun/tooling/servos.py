@@ -8,7 +8,7 @@ A line is opened exclusively. Every write is read back.
         with TunablePort(path) as port:
             tool = ToolLine(port)
             found = [OneServo(tool, servo) for servo in scan(tool).servos]
-            return [servo.read(["present_position"])["present_position"] for servo in found]
+            return [servo.read_items(["present_position"])["present_position"] for servo in found]
 """
 
 from __future__ import annotations

@@ -16,10 +16,10 @@ from typing import TYPE_CHECKING
 from dxlwire.faces import lazy_face
 
 if TYPE_CHECKING:
-    from dxlrun.channels.messages import MessageSink as MessageSink
-    from dxlrun.channels.messages import PublishedTopic as PublishedTopic
+    from dxlrun.channels.topic_messages import MessageSink as MessageSink
+    from dxlrun.channels.topic_messages import PublishedTopic as PublishedTopic
     from dxlrun.log.reading.arrow import message_struct as message_struct
-    from dxlrun.log.reading.topics import LoggedTopic as LoggedTopic
+    from dxlrun.log.reading.logged_topics import LoggedTopic as LoggedTopic
     from dxlrun.log.schemas import BUS_PREFIX as BUS_PREFIX
     from dxlrun.log.schemas import LogTopic as LogTopic
     from dxlrun.log.schemas import bus_topic as bus_topic

@@ -10,7 +10,7 @@ import random
 from collections import deque
 from collections.abc import Sequence
 
-from dxlsim.bus.line import Transmission
+from dxlsim.bus.simulated_line import LineTransmission
 from dxlsim.simulation_plan import AdapterConfig
 
 BURST = 62
@@ -24,7 +24,7 @@ kernel's terminal buffer."""
 _LONGEST_PIECE = 8  # Longest piece with the split `random`, bytes
 
 
-HandOver = tuple[int, bytes, Sequence[Transmission]]
+HandOver = tuple[int, bytes, Sequence[LineTransmission]]
 """One delivery to the host: its planned time (ns), its bytes, and the transmissions that are complete with
 it."""
 
@@ -38,7 +38,7 @@ class SimulatedAdapter:
         self.immediate = config.latency_timer_ns == 0 and config.split == "whole"
         """True if the host receives a transmission at the moment at which it ends on the wire: no latency
         timer, no splitting."""
-        self._arrived: deque[Transmission] = deque()
+        self._arrived: deque[LineTransmission] = deque()
         """Transmissions that have ended on the wire and are not fully delivered to the host."""
         self._chance = random.Random(config.seed)
         self._piece = self._next_piece()  # Size of the next piece, bytes
@@ -52,7 +52,7 @@ class SimulatedAdapter:
         self.timer_ns, self._timed_ns = timer_ns, now_ns
         self.immediate = timer_ns == 0 and self._split == "whole"
 
-    def accept(self, new: Transmission) -> bool:
+    def accept_transmission(self, new: LineTransmission) -> bool:
         """Store a transmission that has ended on the wire; return False if the buffer is full and the
         bytes are lost."""
         if self._arrived and sum([len(each.data) for each in self._arrived]) + len(new.data) > UNREAD_LIMIT:
@@ -60,12 +60,12 @@ class SimulatedAdapter:
         self._arrived.append(new)
         return True
 
-    def forget(self) -> None:
+    def discard_bytes(self) -> None:
         """Discard all bytes that the host has not received."""
         self._arrived.clear()
         self._burst.clear()
 
-    def next_ns(self, passing: Sequence[Transmission]) -> int | None:
+    def next_ns(self, passing: Sequence[LineTransmission]) -> int | None:
         """Return the time (ns) of the next delivery to the host if nothing else happens; None without
         bytes. `passing` is still on the wire."""
         if self._burst:
@@ -77,7 +77,7 @@ class SimulatedAdapter:
         first = self._arrived[0] if self._arrived else passing[0]
         return first.passed_ns(min(len(first.data), first.given + self._piece) - 1)
 
-    def hand_over(self, now_ns: int, passing: Sequence[Transmission]) -> list[HandOver]:
+    def hand_over(self, now_ns: int, passing: Sequence[LineTransmission]) -> list[HandOver]:
         """Return the deliveries to the host that are due by `now_ns`, each once."""
         given: list[HandOver] = []
         while (due_ns := self.next_ns(passing)) is not None and due_ns <= now_ns:
@@ -93,7 +93,7 @@ class SimulatedAdapter:
                 self._piece = self._next_piece()
         return given
 
-    def _timer_end_ns(self, queue: Sequence[Transmission]) -> int:
+    def _timer_end_ns(self, queue: Sequence[LineTransmission]) -> int:
         """Return the time (ns) at which the latency timer expires with a byte waiting, or a full burst is
         complete.
 
@@ -110,7 +110,7 @@ class SimulatedAdapter:
             missing -= left
         return runs_out_ns
 
-    def _gather(self, now_ns: int, most: int, passing: Sequence[Transmission]) -> HandOver:
+    def _gather(self, now_ns: int, most: int, passing: Sequence[LineTransmission]) -> HandOver:
         """Take up to `most` bytes that have passed the wire, and return them as one delivery."""
         data, ended = b"", []
         for each in (*self._arrived, *passing):

@@ -10,7 +10,7 @@ from typing import IO, Annotated, Literal, NamedTuple
 
 import msgspec
 
-from dxlwire.errors import InputError
+from dxlwire.exceptions import InputError
 
 Direction = Literal["in", "out", "note"]
 

@@ -13,13 +13,13 @@ from __future__ import annotations
 from collections.abc import Iterator
 
 from dxlsim.bus.ledger import Ledger
-from dxlsim.bus.line import Transmission
-from dxlsim.bus.recording import Heard, RecordedPackets, Recording
+from dxlsim.bus.recording import BusRecording, RecordedPackets, RecordedReply
 from dxlsim.bus.simulated_bus import RATE_TOLERANCE, SimulatedBus
+from dxlsim.bus.simulated_line import LineTransmission
 from dxlsim.motion.mechanics import Mechanics
 from dxlsim.simulation_plan import BusConfig
-from dxlsim.wire import protocol2
-from dxlsim.wire.packets import (
+from dxlsim.wire import servo_protocol2
+from dxlsim.wire.servo_packets import (
     BROADCAST,
     Instruction,
     InstructionPacket,
@@ -50,36 +50,36 @@ class RecordedBus(SimulatedBus):
     ) -> None:
         super().__init__(config, ledger, start_ns, mechanics)
         self._recorded_rate = config.baud_rate
-        self._recording = Recording(packets, config.baud_rate)
+        self._recording = BusRecording(packets, config.baud_rate)
         self._reads = tuple(self._recorded_reads())
 
     def _execute(self, packet: InstructionPacket, end_ns: int) -> None:
         if abs(self.baud_rate - self._recorded_rate) < RATE_TOLERANCE * self.baud_rate:
-            heard = self._recording.take(packet.raw)
+            heard = self._recording.replay_answer(packet.raw)
             if heard is None:
                 heard = self._known(packet)
             if heard is None and (packet.servo_id != BROADCAST or self._codec.group_read(packet)):
-                self.note(f"not in the recording: {packet.raw.hex(' ')}")
+                self.add_note(f"not in the recording: {packet.raw.hex(' ')}")
             for reply in self._transmissions(heard or (), end_ns):
                 self._send_reply(packet.servo_id, reply)
         self._count_packet()
 
-    def _transmissions(self, heard: tuple[Heard, ...], end_ns: int) -> Iterator[Transmission]:
+    def _transmissions(self, heard: tuple[RecordedReply, ...], end_ns: int) -> Iterator[LineTransmission]:
         """Yield recorded bytes as transmissions after an instruction that ended at `end_ns`; bytes that
         overlap in time are joined."""
-        waiting: Transmission | None = None
+        waiting: LineTransmission | None = None
         for delay_ns, data in heard:
             wire_ns = self._line.duration_ns(len(data))
             # If a host sent into a reply, bytes of that reply arrived before the end of the host's own bytes.
             due_ns = max(end_ns + delay_ns, self.now_ns)
             if waiting is not None and due_ns <= waiting.due_ns:
-                waiting = Transmission(waiting.first_ns, waiting.due_ns, waiting.data + data)
+                waiting = LineTransmission(waiting.first_ns, waiting.due_ns, waiting.data + data)
                 continue
             first_ns = due_ns - wire_ns
             if waiting is not None:
                 yield waiting
                 first_ns = max(first_ns, waiting.due_ns)  # An adapter held the previous bytes back
-            waiting = Transmission(first_ns, due_ns, data)
+            waiting = LineTransmission(first_ns, due_ns, data)
         if waiting is not None:
             yield waiting
 
@@ -87,16 +87,16 @@ class RecordedBus(SimulatedBus):
 
     def _recorded_reads(self) -> Iterator[tuple[bytes, tuple[ReadEntry, ...]]]:
         for instruction in self._recording.instructions:
-            packet = InstructionReceiver(self._codec).feed(instruction)
+            packet = InstructionReceiver(self._codec).feed_bytes(instruction)
             if packet is None or not packet.intact:
                 continue
             group = self._codec.group_read(packet)
             if group is not None and not group.fast:
                 yield instruction, group.entries
-            elif (entry := self._read(packet)) is not None:
+            elif (entry := self._read_target(packet)) is not None:
                 yield instruction, (entry,)
 
-    def _read(self, packet: InstructionPacket) -> ReadEntry | None:
+    def _read_target(self, packet: InstructionPacket) -> ReadEntry | None:
         """Return ID, address and length that a read of one servo asks for, or None for another
         instruction."""
         if packet.instruction != Instruction.READ or packet.servo_id == BROADCAST:
@@ -104,16 +104,16 @@ class RecordedBus(SimulatedBus):
         place = self._codec.read(packet.parameters)
         return None if place is None else ReadEntry(packet.servo_id, *place)
 
-    def _known(self, packet: InstructionPacket) -> tuple[Heard, ...] | None:
+    def _known(self, packet: InstructionPacket) -> tuple[RecordedReply, ...] | None:
         """Return the answer to a ping or a read, composed of other recorded reads, or None if a byte is
         unknown."""
         if not packet.intact or packet.servo_id == BROADCAST:
             return None
-        entry = self._read(packet)
+        entry = self._read_target(packet)
         if entry is not None:
             addresses = tuple(range(entry.address, entry.address + entry.length))
         elif packet.instruction == Instruction.PING and not packet.parameters:
-            addresses = (*_MODEL, *_FIRMWARE) if self._codec is protocol2.CODEC else ()
+            addresses = (*_MODEL, *_FIRMWARE) if self._codec is servo_protocol2.CODEC else ()
         else:
             return None
         known = self._registers(packet.servo_id)
@@ -121,7 +121,7 @@ class RecordedBus(SimulatedBus):
             return None
         content = bytes(known[address] for address in addresses)
         data = self._codec.status_packet(packet.servo_id, 0, content)
-        return (Heard(_ANSWER_NS + self._line.duration_ns(len(data)), data),)
+        return (RecordedReply(_ANSWER_NS + self._line.duration_ns(len(data)), data),)
 
     def _registers(self, servo_id: int) -> dict[int, int]:
         """Return the bytes of a servo's control table that recorded reads show, by address."""
@@ -131,12 +131,12 @@ class RecordedBus(SimulatedBus):
             if servo_id not in asked:
                 continue
             for _, data in self._recording.newest(instruction):
-                status = InstructionReceiver(self._codec).feed(data)
+                status = InstructionReceiver(self._codec).feed_bytes(data)
                 if status is None or not status.intact or status.servo_id != servo_id:
                     continue
                 # A status packet has its error in place of the instruction code (Protocol 1.0), or after that
                 # code.
-                content = status.parameters[1:] if self._codec is protocol2.CODEC else status.parameters
+                content = status.parameters[1:] if self._codec is servo_protocol2.CODEC else status.parameters
                 entry = asked[servo_id]
                 if len(content) == entry.length:
                     known.update(

@@ -10,7 +10,7 @@ import msgspec
 import numpy as np
 from numpy.typing import NDArray
 
-from dxlwire.errors import InputError
+from dxlwire.exceptions import InputError
 
 
 class RecordedPackets(msgspec.Struct, frozen=True):
@@ -24,14 +24,14 @@ class RecordedPackets(msgspec.Struct, frozen=True):
     data: bytes  # Bytes of all packets, possibly with others between them
 
 
-class Heard(NamedTuple):
+class RecordedReply(NamedTuple):
     """One packet of a recorded answer, and its delay after the instruction."""
 
     delay_ns: int  # From the end of the instruction on the wire to the last byte's arrival at the host
     data: bytes
 
 
-class Recording:
+class BusRecording:
     """Instructions of a recorded bus, with the bytes that the host received after each.
 
     `take` returns the recorded answers of an instruction one after the other, and then repeats the last
@@ -67,12 +67,12 @@ class Recording:
         """The instructions in the recording, each once."""
         return tuple(self._exchanges)
 
-    def newest(self, instruction: bytes) -> tuple[Heard, ...]:
+    def newest(self, instruction: bytes) -> tuple[RecordedReply, ...]:
         """Return the answer to an instruction that `take` returned last, or the first recorded one if
         there was none."""
         return self._heard(self._exchanges[instruction][max(0, self._next[instruction] - 1)])
 
-    def take(self, instruction: bytes) -> tuple[Heard, ...] | None:
+    def replay_answer(self, instruction: bytes) -> tuple[RecordedReply, ...] | None:
         """Return the next recorded answer to an instruction, or None if the instruction is not in the
         recording."""
         exchanges = self._exchanges.get(instruction)
@@ -82,11 +82,11 @@ class Recording:
         self._next[instruction] = min(number + 1, len(exchanges))
         return self._heard(exchanges[min(number, len(exchanges) - 1)])
 
-    def _heard(self, exchange: int) -> tuple[Heard, ...]:
+    def _heard(self, exchange: int) -> tuple[RecordedReply, ...]:
         first = int(self._rows[exchange]) + 1
         end = int(self._rows[exchange + 1]) if exchange + 1 < len(self._rows) else len(self._start)
         return tuple(
-            Heard(delay_ns, self._data[start : start + length])
+            RecordedReply(delay_ns, self._data[start : start + length])
             for delay_ns, start, length in zip(
                 self._delay_ns[first:end].tolist(),
                 self._start[first:end].tolist(),

@@ -28,8 +28,8 @@ from msgspec.structs import replace
 
 from dxlsim.bus.adapter import SimulatedAdapter
 from dxlsim.bus.ledger import Ledger
-from dxlsim.bus.line import ECHO, GroupReply, SimulatedLine, Transmission, Turn
-from dxlsim.device.measured import Measured
+from dxlsim.bus.simulated_line import ECHO, GroupReply, LineTransmission, SimulatedLine, Turn
+from dxlsim.device.device_quantities import DeviceQuantities
 from dxlsim.device.simulated_device import SimulatedDevice, make_device
 from dxlsim.motion.mechanics import Mechanics
 from dxlsim.registers.access import ACCESS
@@ -37,8 +37,8 @@ from dxlsim.servo.making import make_servo
 from dxlsim.servo.node import Node, SimulatedNode
 from dxlsim.servo.simulated_servo import SimulatedServo
 from dxlsim.simulation_plan import BusConfig, DeviceConfig, ServoConfig
-from dxlsim.wire import protocol1, protocol2
-from dxlsim.wire.packets import GroupRead, InstructionPacket, InstructionReceiver, ServoReply
+from dxlsim.wire import servo_protocol1, servo_protocol2
+from dxlsim.wire.servo_packets import GroupRead, InstructionPacket, InstructionReceiver, ServoReply
 
 _STATUS_BYTES = 11
 """Size of a status packet of Protocol 2.0 without data, bytes: the slot of an absent servo has this length
@@ -88,9 +88,9 @@ class SimulatedBus:
         self.lateness_ns: deque[int] = deque(maxlen=1000)
         """Delays (ns) of the recent deliveries to the host, compared with their planned times; in real
         time only."""
-        self._codec = protocol2.CODEC if config.protocol == 2.0 else protocol1.CODEC
+        self._codec = servo_protocol2.CODEC if config.protocol == 2.0 else servo_protocol1.CODEC
         self._receiver = InstructionReceiver(self._codec)
-        self._line = SimulatedLine(config.baud_rate, self.note)
+        self._line = SimulatedLine(config.baud_rate, self.add_note)
         self._adapter = SimulatedAdapter(config.adapter, start_ns)
         self._wedged = False
         self._group: GroupReply | None = None  # The group read in progress
@@ -111,23 +111,23 @@ class SimulatedBus:
 
     # The line
 
-    def receive(self, data: bytes | bytearray | memoryview, at_ns: int) -> None:
+    def receive_bytes(self, data: bytes | bytearray | memoryview, at_ns: int) -> None:
         """Receive bytes that the host writes to its adapter at `at_ns`. They are sent after bytes
         written earlier."""
         sent = bytes(data)
         self._pass_time(at_ns)
         self.ledger.add(at_ns, self.name, "in", sent)
         if self._wedged or not self.plugged:
-            self.note(f"{len(sent)} bytes of the host do not reach the line")
+            self.add_note(f"{len(sent)} bytes of the host do not reach the line")
             return
         start_ns = max(at_ns, self.host_free_ns)
         if self._receiver.pending and start_ns - self.host_free_ns > self._codec.longest_pause_ns:
-            self.note(f"an instruction of {self._receiver.pending} bytes was broken off")
-            self._receiver.forget()
+            self.add_note(f"an instruction of {self._receiver.pending} bytes was broken off")
+            self._receiver.discard_packet()
         self.host_free_ns = start_ns + self._line.duration_ns(len(sent))
         self._transmit(sent, start_ns)
         if self.echo:
-            self._line.echo(Transmission(start_ns, self.host_free_ns, sent, ECHO))
+            self._line.echo(LineTransmission(start_ns, self.host_free_ns, sent, ECHO))
 
     @property
     def baud_rate(self) -> int:
@@ -142,7 +142,7 @@ class SimulatedBus:
 
     def change_rate(self, baud_rate: int) -> None:
         """Change the baud rate of the host's adapter, bit/s, and note it in the ledger."""
-        self.note(f"the host's rate is {baud_rate} bit/s")
+        self.add_note(f"the host's rate is {baud_rate} bit/s")
         self.baud_rate = baud_rate
 
     def next_due_ns(self) -> int | None:
@@ -168,7 +168,7 @@ class SimulatedBus:
             last_ns = max(due_ns, min(last_ns, self._planned[0][0] - 1))
         return passing[bisect_right(passing, last_ns, key=_due) - 1].due_ns
 
-    def take(self, now_ns: int, *, handed_ns: int | None = None) -> bytes:
+    def drain_bytes(self, now_ns: int, *, handed_ns: int | None = None) -> bytes:
         """Return the bytes that the host receives by `now_ns`, each once, and write them to the ledger.
 
         Args:
@@ -198,23 +198,23 @@ class SimulatedBus:
     def add_servo(self, config: ServoConfig) -> SimulatedServo:
         """Connect another servo to the line and return it."""
         servo = make_servo(
-            config, self.baud_rate, self.now_ns, self.note, self.protocol, mechanics=self.mechanics
+            config, self.baud_rate, self.now_ns, self.add_note, self.protocol, mechanics=self.mechanics
         )
         self.servos += (servo,)
         self.nodes = (*self.servos, *self.devices)
-        servo.registers.watch(ACCESS.identity, self._nodes_by_id.clear)
+        servo.registers.watch_items(ACCESS.identity, self._nodes_by_id.clear)
         return servo
 
     def add_device(self, config: DeviceConfig) -> SimulatedDevice:
         """Connect another device to the line and return it; it has the supply voltage of the first servo."""
-        world = Measured(self.servos[0].voltage if self.servos else SUPPLY_VOLTS)
+        world = DeviceQuantities(self.servos[0].voltage if self.servos else SUPPLY_VOLTS)
         device = make_device(
-            config, self.protocol, world, baud_rate=self.baud_rate, note=self.note, now_ns=self.now_ns
+            config, self.protocol, world, baud_rate=self.baud_rate, note=self.add_note, now_ns=self.now_ns
         )
         self.devices += (device,)
         self.nodes = (*self.servos, *self.devices)
         self._nodes_by_id.clear()
-        device.registers.watch(ACCESS.identity, self._nodes_by_id.clear)
+        device.registers.watch_items(ACCESS.identity, self._nodes_by_id.clear)
         return device
 
     def device(self, servo_id: int) -> SimulatedDevice:
@@ -227,11 +227,11 @@ class SimulatedBus:
                 return node
         raise LookupError(f"bus {self.name} has no {called} with ID {servo_id}")
 
-    def advance(self, now_ns: int) -> None:
+    def advance_to(self, now_ns: int) -> None:
         """Advance the line and every servo and device to a time, ns, so that a test can inspect them."""
         self._pass_time(now_ns)
         for node in self.nodes:
-            node.advance(now_ns)
+            node.advance_to(now_ns)
 
     def excuse(self, duration_ns: int) -> None:
         """Do not count a stall of this process, of `duration_ns`, toward the timeout of the servos' Bus
@@ -248,7 +248,7 @@ class SimulatedBus:
         heapq.heappush(self._planned_after, (self._packets + packets, next(self._order), action))
         self._act_after_packets()
 
-    def note(self, text: str) -> None:
+    def add_note(self, text: str) -> None:
         """Add a note to the ledger, at the present time of the bus."""
         self.ledger.add(self.now_ns, self.name, "note", note=text)
 
@@ -267,22 +267,22 @@ class SimulatedBus:
     def inject_noise(self, data: bytes, at_ns: int) -> None:
         """Send noise toward the host, beginning at `at_ns`."""
         self._withdraw_waiting()
-        self.note(f"noise of {len(data)} bytes at {at_ns} ns")
-        self._line.send(Transmission(at_ns, at_ns + self._line.duration_ns(len(data)), data, "noise"))
+        self.add_note(f"noise of {len(data)} bytes at {at_ns} ns")
+        self._line.send(LineTransmission(at_ns, at_ns + self._line.duration_ns(len(data)), data, "noise"))
 
     def unplug(self) -> None:
         """Unplug the adapter: bytes in its buffer are lost, and the host's port disappears."""
         if self.plugged:
-            self.note("adapter unplugged")
+            self.add_note("adapter unplugged")
             self.plugged = False
             self.times_unplugged += 1
-            self._adapter.forget()
-            self._receiver.forget()
+            self._adapter.discard_bytes()
+            self._receiver.discard_packet()
 
     def plug_in(self) -> None:
         """Plug the adapter in again; the host must then open its port again."""
         if not self.plugged:
-            self.note("adapter plugged in")
+            self.add_note("adapter plugged in")
             self.plugged = True
 
     @property
@@ -292,15 +292,15 @@ class SimulatedBus:
 
     def set_latency_timer(self, timer_ns: int) -> None:
         """Set the adapter's latency timer, ns; 0: none."""
-        self.note(f"adapter's latency timer {timer_ns} ns")
+        self.add_note(f"adapter's latency timer {timer_ns} ns")
         self._adapter.set_timer(timer_ns, self.now_ns)
 
     def wedge(self, on: bool = True) -> None:
         """Make the adapter discard all bytes in both directions, although the host can write; False ends
         this."""
-        self.note("adapter wedged" if on else "adapter works again")
+        self.add_note("adapter wedged" if on else "adapter works again")
         self._wedged = on
-        self._adapter.forget()
+        self._adapter.discard_bytes()
 
     # Inside: time
 
@@ -319,14 +319,14 @@ class SimulatedBus:
                 break
         self.now_ns = max(self.now_ns, now_ns)
 
-    def _arrive(self, each: Transmission) -> None:
+    def _arrive(self, each: LineTransmission) -> None:
         """Pass a transmission that has ended on the wire to the adapter, and send the next reply of a
         group read that waited for its end."""
         self.now_ns = max(self.now_ns, each.due_ns)
         if not self.plugged or self._wedged:
-            self.note(f"{len(each.data)} bytes to the host are lost: {each.data.hex(' ')}")
-        elif not self._adapter.accept(each):
-            self.note(f"{len(each.data)} bytes to the host are lost: it does not read")
+            self.add_note(f"{len(each.data)} bytes to the host are lost: {each.data.hex(' ')}")
+        elif not self._adapter.accept_transmission(each):
+            self.add_note(f"{len(each.data)} bytes to the host are lost: it does not read")
         if not each.note and not each.broken and each.data.startswith(self._codec.header):
             for device in self.devices:
                 device.overhear(each.data[len(self._codec.header)], each.due_ns)
@@ -338,7 +338,7 @@ class SimulatedBus:
         elif group.has_slots:
             self._send_turns(group, max(each.due_ns, each.turn_end_ns))
         else:
-            self.note("a broken reply: the servos after it wait for it in vain")
+            self.add_note("a broken reply: the servos after it wait for it in vain")
             self._group = None
 
     def _withdraw_waiting(self) -> None:
@@ -357,7 +357,7 @@ class SimulatedBus:
             if self._line.passing:
                 sent = bytearray(sent)
                 self._line.talk_over(sent, position, start_ns)
-            packet = self._receiver.feed(sent, position)
+            packet = self._receiver.feed_bytes(sent, position)
             if packet is None:
                 return
             position = packet.end
@@ -369,10 +369,10 @@ class SimulatedBus:
 
     def _execute_altered(self, packet: InstructionPacket, end_ns: int) -> None:
         fault = self._instruction_faults.popleft()
-        self.note(f"the servos receive another instruction: {fault.text}")
+        self.add_note(f"the servos receive another instruction: {fault.text}")
         received = fault.alter(packet.raw)
         position = 0
-        while (other := self._receiver.feed(received, position)) is not None:
+        while (other := self._receiver.feed_bytes(received, position)) is not None:
             position = other.end
             self._execute(other, end_ns)
         if not position:  # Even an unparsable instruction counts as a packet
@@ -390,13 +390,13 @@ class SimulatedBus:
         else:
             for node in self._nodes_of(packet.servo_id):
                 node.counts.received += packet.intact
-                reply = node.execute(packet, end_ns)
+                reply = node.execute_packet(packet, end_ns)
                 if reply is not None:
                     node.counts.reply(reply.error)
                     first_ns = end_ns + reply.delay_ns
                     data = self._status(reply)
                     due_ns = first_ns + self._line.duration_ns(len(data))
-                    self._send_reply(reply.servo_id, Transmission(first_ns, due_ns, data))
+                    self._send_reply(reply.servo_id, LineTransmission(first_ns, due_ns, data))
         self._count_packet()
 
     def _nodes_of(self, servo_id: int) -> tuple[SimulatedNode, ...]:
@@ -412,9 +412,9 @@ class SimulatedBus:
 
     def _turns(self, read: GroupRead, slots: bool, end_ns: int) -> Sequence[Turn]:
         """Return the turns of a group read with each servo's replies, which show the states at `end_ns`."""
-        self.mechanics.advance(end_ns)
+        self.mechanics.step_to(end_ns)
         turns: list[Turn] = []
-        shared = protocol2.FastStatusPacket(read.lengths) if read.fast else None
+        shared = servo_protocol2.FastStatusPacket(read.lengths) if read.fast else None
         for entry in read.entries:
             replies = []
             for node in self._nodes_of(entry.servo_id):
@@ -447,27 +447,27 @@ class SimulatedBus:
             for reply, data in turn.replies:  # Two servos with one ID send at once
                 first_ns = free_ns + reply.delay_ns
                 end_ns, due_ns = first_ns + slot_ns, first_ns + self._line.duration_ns(len(data))
-                each = Transmission(first_ns, due_ns, data, "", group, group.sent, end_ns)
+                each = LineTransmission(first_ns, due_ns, data, "", group, group.sent, end_ns)
                 sent = self._send_reply(reply.servo_id, each) or sent
             group.sent += 1
             if sent and not plain:
                 return
             if not sent and not group.has_slots:
-                self.note(f"servo {turn.servo_id} does not reply: those after it wait for it in vain")
+                self.add_note(f"servo {turn.servo_id} does not reply: those after it wait for it in vain")
                 break
             sent_any = sent_any or sent
             free_ns = due_ns if sent else end_ns
         if not sent_any:
             self._group = None
 
-    def _send_reply(self, servo_id: int, reply: Transmission) -> bool:
+    def _send_reply(self, servo_id: int, reply: LineTransmission) -> bool:
         """Send a servo's reply with the faults planned for it; return True if anything was sent."""
         faults = self._reply_faults.get(servo_id)
         if not faults:
             self._line.send(reply)
             return True
         fault = faults.popleft()
-        self.note(f"servo {servo_id}: {fault.text}")
+        self.add_note(f"servo {servo_id}: {fault.text}")
         data = fault.alter(reply.data)
         duration_ns = self._line.duration_ns(len(data))
         first_ns = reply.first_ns + fault.delay_ns

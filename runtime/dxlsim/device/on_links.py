@@ -7,7 +7,7 @@ from collections.abc import Callable, Iterable
 
 import numpy as np
 
-from dxlsim.device.measured import STANDARD_GRAVITY, Measured
+from dxlsim.device.device_quantities import STANDARD_GRAVITY, DeviceQuantities
 from dxlsim.device.simulated_device import SimulatedDevice
 from dxlsim.geometry.transform import rotated
 from dxlsim.motion.body import SimulatedBody
@@ -40,13 +40,13 @@ def _feeling(
         nonlocal at_ns
         if device.now_ns != at_ns:
             at_ns = device.now_ns
-            body.move(shafts(at_ns))
+            body.set_shafts(shafts(at_ns))
             feel(device.world, body.motion(device.link))
 
     return update
 
 
-def feel(world: Measured, motion: LinkMotion) -> None:
+def feel(world: DeviceQuantities, motion: LinkMotion) -> None:
     """Set a device's measurements to the motion of its link; a link at rest measures gravity upward."""
     x, y, z, w = motion.orientation.tolist()
     pull = np.array(rotated((-x, -y, -z, w), (0.0, 0.0, STANDARD_GRAVITY)))

@@ -13,15 +13,15 @@ from types import MappingProxyType
 
 from msgspec.structs import replace
 
-from dxlsim.device.measured import Measured, shown
+from dxlsim.device.device_quantities import DeviceQuantities, make_readers
 from dxlsim.registers.access import ACCESS, device_error
 from dxlsim.registers.memory import Memory
 from dxlsim.servo.node import Answer, SimulatedNode, baud_value
 from dxlsim.simulation_plan import DeviceConfig
-from dxlsim.wire.packets import GroupRead, Instruction, InstructionPacket
+from dxlsim.wire.servo_packets import GroupRead, Instruction, InstructionPacket
 from dxlwire.control_table import ControlItem, ControlTable
+from dxlwire.control_table.device_models import device_table
 from dxlwire.control_table.device_table import WAITS, DeviceTable, read_device_table
-from dxlwire.control_table.devices import device_table
 
 CHAIN_WAIT_NS = 50_000_000
 """Time (ns) for which a board with `waits_in_chain` waits for the status before its own (ROBOTIS' OpenCR
@@ -39,7 +39,7 @@ class SimulatedDevice(SimulatedNode):
         self,
         table: DeviceTable,
         config: DeviceConfig,
-        world: Measured,
+        world: DeviceQuantities,
         *,
         baud_rate: int,
         note: Callable[[str], None],
@@ -53,7 +53,7 @@ class SimulatedDevice(SimulatedNode):
         self.now_ns = now_ns
         self._bits = {name: (item.address, item.size, item.bit) for name, item in table.items.items()}
         random = Random(f"{config.servo_id} {table.model}")  # A seed of its own makes the noise repeatable
-        self._shown = shown(table.items, config.shown, world, random)
+        self._shown = make_readers(table.items, config.shown, world, random)
         self._awaited_id: int | None = None  # ID whose status it awaits in a group read
         self._waits_until_ns = 0
         registers = _registers(table)
@@ -65,7 +65,7 @@ class SimulatedDevice(SimulatedNode):
             memory["return_delay_time"] = min(254, round(config.return_delay_ns / 2000))
         if "baud_rate" in memory:
             memory["baud_rate"] = baud_value(registers, baud_rate)
-        memory.watch(ACCESS.identity, self._identify)
+        memory.watch_items(ACCESS.identity, self._identify)
 
     def _identify(self) -> None:
         self.servo_id = self.registers["id"]
@@ -77,7 +77,7 @@ class SimulatedDevice(SimulatedNode):
         """Baud rate of the device, bit/s: that of the line if the device has no item for it."""
         return super().baud_rate if "baud_rate" in self.registers else self._line_rate
 
-    def advance(self, now_ns: int) -> None:
+    def advance_to(self, now_ns: int) -> None:
         """Set the device's time for its measurements; an earlier time is ignored."""
         self.now_ns = max(self.now_ns, now_ns)
 
@@ -90,7 +90,7 @@ class SimulatedDevice(SimulatedNode):
             self.note(f"{self.called}: waits for the status of {self._awaited_id}, and obeys nothing")
             return False
         self._awaited_id = None
-        self.advance(now_ns)
+        self.advance_to(now_ns)
         return all(contact() for contact in self._contacts)
 
     def chain(self, read: GroupRead, now_ns: int) -> None:
@@ -136,7 +136,7 @@ class SimulatedDevice(SimulatedNode):
     def _manage(self, packet: InstructionPacket) -> int:
         if packet.instruction != Instruction.REBOOT:
             return super()._manage(packet)
-        self.reset()
+        self.power_cycle()
         self._receive_nothing_until(self.now_ns + BOOT_NS)
         return 0
 
@@ -177,10 +177,10 @@ class SimulatedDevice(SimulatedNode):
 
     # Interface for faults
 
-    def protect(self, refused: int = 0) -> None:
+    def apply_protection(self, refused: int = 0) -> None:
         """Do nothing: a device has no torque that a shutdown could cut."""
 
-    def reset(self) -> None:
+    def power_cycle(self) -> None:
         """Power-cycle the device: its RAM registers return to their initial values."""
         self.note(f"{self.called}: power cycle")
         self.registers.restore_ram()
@@ -251,7 +251,7 @@ def _registers(table: DeviceTable) -> ControlTable:
 def make_device(
     config: DeviceConfig,
     protocol: float,
-    world: Measured,
+    world: DeviceQuantities,
     *,
     baud_rate: int,
     note: Callable[[str], None],

@@ -9,7 +9,7 @@ import msgspec
 
 from dxlsim.faults.kinds import DEVICE, KINDS, Kind
 from dxlsim.faults.values import READERS, Value
-from dxlwire.errors import InputError, suggestion
+from dxlwire.exceptions import InputError, suggestion
 
 
 class Fault(msgspec.Struct, frozen=True):

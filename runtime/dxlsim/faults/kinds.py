@@ -17,8 +17,8 @@ from typing import NamedTuple, TypeVar
 import msgspec
 
 from dxlsim.bus.ledger import FAULT
-from dxlsim.bus.line import flipped
 from dxlsim.bus.simulated_bus import SimulatedBus
+from dxlsim.bus.simulated_line import flipped
 from dxlsim.faults.values import READERS, TURN, Reader, Value
 from dxlsim.servo.node import Node, SimulatedNode
 from dxlsim.servo.simulated_servo import SimulatedServo
@@ -136,7 +136,7 @@ class Happening:
     def _enter(self) -> None:
         if not self.happened:
             self.happened = True
-            self.bus.note(f"{FAULT}{self._text}")
+            self.bus.add_note(f"{FAULT}{self._text}")
 
     def _named(self, nodes: Sequence[Node], servo: int | None) -> list[Node]:
         """Return the unit with this ID, or all units if `servo` is None, advanced to now; note in the ledger
@@ -147,7 +147,7 @@ class Happening:
         if servo is not None:
             named = named[:1]  # If two units share the ID, the fault concerns the first
         for node in named:
-            node.advance(self.bus.now_ns)
+            node.advance_to(self.bus.now_ns)
         if named:
             self._enter()
         return named
@@ -168,13 +168,13 @@ class Happening:
         hold = self._holds.setdefault((self._kind, id(target)), Hold(restore))
         hold.faults += 1
 
-        def release() -> None:
+        def release_fault() -> None:
             hold.faults -= 1
             if not hold.faults:
                 del self._holds[self._kind, id(target)]
                 hold.restore()
 
-        self._after(for_ns, release)
+        self._after(for_ns, release_fault)
 
     def _alter(
         self,
@@ -292,8 +292,8 @@ class Happening:
         end_ns = self.bus.now_ns + for_
 
         def start_again(node: SimulatedNode) -> None:
-            node.advance(end_ns)
-            node.reset()  # Some models enable torque at power-up
+            node.advance_to(end_ns)
+            node.power_cycle()  # Some models enable torque at power-up
 
         for node in self._nodes(servo):
             node.cut_power(end_ns)
@@ -330,7 +330,7 @@ class Happening:
     def _turn(self, servo: int, by: float, for_: int = TURN_NS) -> None:
         """A hand turns the shaft of a servo in 1 s (for=), unless the servo holds or drives the shaft."""
         for each in self._servos(servo):
-            each.turn(math.radians(by), for_)
+            each.turn_shaft(math.radians(by), for_)
 
     @_kind(DEVICE)
     def _tip(self, servo: int, by: float, about: str = "y", for_: int = TURN_NS) -> None:
@@ -343,7 +343,7 @@ class Happening:
         """A second servo of the same model has this ID."""
         for each in self._servos(servo):
             table, delay = each.registers.table, each.registers["return_delay_time"]
-            self.bus.add_servo(ServoConfig(each.servo_id, table.model, each.position, delay * 2000))
+            self.bus.add_servo(ServoConfig(each.servo_id, table.model, each.shaft_angle, delay * 2000))
 
     @_kind(SERVO, _stretch)
     def _loose(
@@ -360,7 +360,7 @@ class Happening:
         for each in self._servos(servo):
 
             def contact(one: SimulatedServo = each) -> bool:
-                inside = math.radians(low) <= one.position <= math.radians(high)
+                inside = math.radians(low) <= one.shaft_angle <= math.radians(high)
                 return not (inside and self.random.random() < share)
 
             self._interrupt(each, contact, for_)
@@ -382,8 +382,8 @@ class Happening:
     def _jam(self, servo: int, for_: int | None = None) -> None:
         """The shaft of a servo is blocked."""
         for each in self._servos(servo):
-            self._hold(each, partial(each.jam, False), for_)
-            each.jam(True)
+            self._hold(each, partial(each.jam_shaft, False), for_)
+            each.jam_shaft(True)
 
     # The line's supply and adapter
 
@@ -397,11 +397,11 @@ class Happening:
         def supply() -> None:
             over = end_ns is not None and bus.now_ns >= end_ns
             for servo in servos:
-                servo.advance(bus.now_ns)
+                servo.advance_to(bus.now_ns)
             drawn = 0.0 if over else sum(abs(servo.shaft.duty * servo.shaft.current) for servo in servos)
             for servo, own in zip(servos, volts, strict=True):
                 servo.voltage = max(0.0, own - ohms * drawn)
-                servo.protect()
+                servo.apply_protection()
             if not over:
                 self._after(_SUPPLY_NS, supply)
 

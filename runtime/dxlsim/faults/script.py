@@ -11,7 +11,7 @@ from dxlsim.bus.simulated_bus import SimulatedBus
 from dxlsim.faults.fault import Fault
 from dxlsim.faults.kinds import DEVICE, KINDS, SERVO, WHEN, Happening, Holds
 from dxlsim.faults.values import Value
-from dxlwire.errors import InputError
+from dxlwire.exceptions import InputError
 
 
 class FaultScript:

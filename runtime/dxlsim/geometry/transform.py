@@ -24,10 +24,10 @@ class Transform(msgspec.Struct, frozen=True):
 
     def __matmul__(self, inner: Transform) -> Transform:
         """Return the pose of a frame, given in this frame as `inner`, in the outer frame."""
-        moved = self.apply(inner.translation)
+        moved = self.transform_point(inner.translation)
         return Transform(moved, product(self.rotation, inner.rotation))
 
-    def apply(self, point: Vector) -> Vector:
+    def transform_point(self, point: Vector) -> Vector:
         """Convert a point from this frame to the outer frame, m."""
         x, y, z = rotated(self.rotation, point)
         a, b, c = self.translation
@@ -87,7 +87,7 @@ def rotated(rotation: Quaternion, vector: Vector) -> Vector:
     return a + w * d + y * f - z * e, b + w * e + z * d - x * f, c + w * f + x * e - y * d
 
 
-def turn(axis: Vector, angle: float) -> Quaternion:
+def rotation_about(axis: Vector, angle: float) -> Quaternion:
     """Return the rotation by an angle, rad, about a unit axis. It is continuous in the angle."""
     x, y, z = axis
     sine = math.sin(angle / 2)
@@ -97,8 +97,8 @@ def turn(axis: Vector, angle: float) -> Quaternion:
 def from_rpy(rpy: Vector) -> Quaternion:
     """Return the rotation by roll, pitch and yaw, rad, about the fixed x, y and z axes, in this order."""
     roll, pitch, yaw = rpy
-    about_x, about_y = turn((1.0, 0.0, 0.0), roll), turn((0.0, 1.0, 0.0), pitch)
-    return product(turn((0.0, 0.0, 1.0), yaw), product(about_y, about_x))
+    about_x, about_y = rotation_about((1.0, 0.0, 0.0), roll), rotation_about((0.0, 1.0, 0.0), pitch)
+    return product(rotation_about((0.0, 0.0, 1.0), yaw), product(about_y, about_x))
 
 
 def unit(rotation: Quaternion) -> Quaternion | None:

@@ -13,7 +13,7 @@ from xml.parsers import expat
 
 import msgspec
 
-from dxlwire.errors import InputError, Mark, Problem, suggestion
+from dxlwire.exceptions import InputError, Mark, Problem, suggestion
 
 Vector: TypeAlias = "tuple[float, float, float]"
 JointType = Literal["revolute", "continuous", "prismatic", "fixed"]
@@ -100,7 +100,7 @@ def read_urdf(text: str, file: str = "the URDF") -> Urdf:
     Raises:
         InputError: The URDF is invalid; `problems` has all errors that can be detected at once.
     """
-    return _Reading(_parsed(text, file)).result()
+    return _UrdfReader(_parsed(text, file)).result()
 
 
 class _Element(msgspec.Struct):
@@ -130,7 +130,7 @@ def _parsed(text: str, file: str) -> _Element:
         inside[-1].children.append(element)
         inside.append(element)
 
-    def end(tag: str) -> None:
+    def close_element(tag: str) -> None:
         inside.pop()
 
     def doctype(*_: object) -> None:
@@ -138,7 +138,7 @@ def _parsed(text: str, file: str) -> _Element:
         mark = Mark(file, before.count("\n") + 1, len(before.rpartition("\n")[2]) + 1)
         raise InputError([Problem(mark, "a DOCTYPE is refused", "remove it")])
 
-    parser.StartElementHandler, parser.EndElementHandler = start, end
+    parser.StartElementHandler, parser.EndElementHandler = start, close_element
     parser.StartDoctypeDeclHandler = doctype
     try:
         parser.Parse(text, True)
@@ -153,7 +153,7 @@ def _parsed(text: str, file: str) -> _Element:
     return robot
 
 
-class _Reading:
+class _UrdfReader:
     """Reads the elements of a URDF and collects all errors in them."""
 
     def __init__(self, robot: _Element) -> None:
@@ -203,7 +203,7 @@ class _Reading:
             self._add(element.mark, f"there are two joints {name}", "give each a name of its own")
             return None
         kind = self._type(element, name)
-        parent, child = self._end(element, name, "parent"), self._end(element, name, "child")
+        parent, child = self._find_link(element, name, "parent"), self._find_link(element, name, "child")
         xyz, rpy = (self._vector(element, name, "origin", key, _NOWHERE) for key in ("xyz", "rpy"))
         axis = self._axis(element, name) if kind != "fixed" else (1.0, 0.0, 0.0)
         limits, mimic = self._limits(element, name), self._mimic(element, name)
@@ -221,7 +221,7 @@ class _Reading:
             self._add(element.mark, what, f"write one of {', '.join(_TYPES)}")
         return "fixed"
 
-    def _end(self, element: _Element, name: str, tag: str) -> str:
+    def _find_link(self, element: _Element, name: str, tag: str) -> str:
         """Return the name of a joint's parent or child link; report it if it is missing or unknown."""
         found = element.first(tag)
         link = "" if found is None else found.attributes.get("link", "")

@@ -23,7 +23,7 @@ from dxlsim.geometry.transform import (
     near,
     product,
     rotated,
-    turn,
+    rotation_about,
 )
 from dxlsim.geometry.urdf import read_urdf
 from dxlsim.motion.link_motion import Floats, LinkMotion, Shafts
@@ -56,9 +56,9 @@ class SimulatedBody:
         self._names, self._matrix, self._offset = _moved(bodies)
         self._chains: dict[str, tuple[_Step, ...]] = {}
         self._place = self._speed = self._gain = np.zeros(len(self._names))
-        self.move(Shafts(0, *(np.zeros(bodies.servos) for _ in range(3))))
+        self.set_shafts(Shafts(0, *(np.zeros(bodies.servos) for _ in range(3))))
 
-    def move(self, shafts: Shafts) -> None:
+    def set_shafts(self, shafts: Shafts) -> None:
         """Set angles, velocities and accelerations of all shafts, in the order in which the servos were
         added."""
         self._place = self._matrix @ shafts.angle + self._offset
@@ -96,7 +96,7 @@ class SimulatedBody:
                 gain = gain + 2 * dq * _cross(rate, axis) + ddq * axis
                 speed = speed + _cross(rate, way) + dq * axis
             else:
-                facing = product(facing, turn(step.axis, q))
+                facing = product(facing, rotation_about(step.axis, q))
                 spin = spin + ddq * axis + dq * _cross(rate, axis)
                 rate = rate + dq * axis
         facing = near(facing, NO_TURN)
@@ -153,12 +153,12 @@ class ShaftSink(Protocol):
     values: int
     """Length of the array that `write` receives: angle, velocity and acceleration of each shaft."""
 
-    def write(self, t_ns: int, values: Floats) -> None:
+    def write_sample(self, t_ns: int, values: Floats) -> None:
         """Write an array with the angles, rad, then the velocities, rad/s, then the accelerations,
         rad/s^2; never waits."""
 
 
-class ShaftsShown:
+class ShaftPublisher:
     """Publishes the motion of all shafts after each step of the mechanics, for sensors in other processes."""
 
     def __init__(self, mechanics: Mechanics, sink: ShaftSink) -> None:
@@ -167,7 +167,7 @@ class ShaftsShown:
         self._shown_ns = -1
         mechanics.sense()
 
-    def show(self) -> None:
+    def write_shafts(self) -> None:
         """Write the shafts' motion to the sink if the mechanics have advanced since the last call."""
         mechanics, values = self._mechanics, self._values
         if mechanics.grid_ns == self._shown_ns:
@@ -176,7 +176,7 @@ class ShaftsShown:
         values[0] = mechanics.plant.angle[:count]
         values[1] = mechanics.plant.velocity[:count]
         values[2] = mechanics.acceleration[:count]
-        self._sink.write(mechanics.grid_ns, values.ravel())
+        self._sink.write_sample(mechanics.grid_ns, values.ravel())
 
 
 class SensedBody:
@@ -195,7 +195,7 @@ class SensedBody:
         Raises:
             KeyError: The URDF does not have the link.
         """
-        self._body.move(self._mechanics.shafts(self._now_ns(), self._count))
+        self._body.set_shafts(self._mechanics.shafts(self._now_ns(), self._count))
         return self._body.motion(link)
 
 

@@ -96,7 +96,7 @@ class Profiles:
             return bool(self.velocity[index] == self._speed[index])
         return bool(abs(self._goal[index] - self.position[index]) < _ARRIVED)
 
-    def step(self) -> None:
+    def advance_trajectories(self) -> None:
         """Advance all trajectories by one step of `dt_s`."""
         if self.arrived:
             return
@@ -112,7 +112,7 @@ class Profiles:
         self.velocity += self.change
         self.position += self.velocity * self._dt_s
 
-    def look(self) -> None:
+    def check_arrival(self) -> None:
         """Check whether all trajectories have ended; if so, set them exactly to their goals and stop
         stepping them."""
         if self.arrived or self._turning.any():
@@ -167,7 +167,7 @@ class ControlLaw:
         held = self._turning & (rows["p_ccw"] > 0.0)
         self._longest = np.where(held, rows["limit"] / np.maximum(rows["p_ccw"], 1e-9), FREE)
 
-    def step(self, profiles: Profiles, angle: Floats, velocity: Floats) -> None:
+    def compute_drive(self, profiles: Profiles, angle: Floats, velocity: Floats) -> None:
         """Compute `drive` and `damping` of all servos for their setpoints and the shafts' angles, rad, and
         velocities, rad/s."""
         rows = self._rows

@@ -73,7 +73,7 @@ class CoupledJoints:
         self._rows: Floats = np.vstack([np.eye(len(joints)), self._matrix])
         self._take_braking(np.zeros(len(joints)), 0.0)
 
-    def step(self, drive: Floats, damping: Floats, dt_s: float) -> None:
+    def step_shafts(self, drive: Floats, damping: Floats, dt_s: float) -> None:
         """Advance by `dt_s` with servo torque `drive - damping * velocity` (Nm, Nm s/rad)."""
         scale = self._per_rad
         place, speed = scale * (self.angle - self._reference), scale * self.velocity
@@ -96,14 +96,14 @@ class CoupledJoints:
         """Block a servo's shaft at its present angle, or release it."""
         self._jammed[index] = JAMMED_NM if on else 0.0
 
-    def place(self, index: int, angle: float) -> None:
+    def place_shaft(self, index: int, angle: float) -> None:
         """Move a resting shaft to an angle, rad, together with the shafts on the same axis."""
         moved = coupled_motion(self._together, index)
         by = self._per_rad[index] * (angle - self.angle[index])
         self.angle += moved * by / self._per_rad
         self.velocity[moved != 0.0] = 0.0
 
-    def recount(self, index: int, by: float) -> None:
+    def shift_angle(self, index: int, by: float) -> None:
         """Add `by`, rad, to the angle count of a resting shaft, which does not move."""
         self.angle[index] += by
         self._reference[index] += by

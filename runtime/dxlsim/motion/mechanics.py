@@ -87,7 +87,7 @@ class Mechanics:
 
     # Servos
 
-    def add(self, motor: Motor, load: Load, angle: float) -> int:
+    def add_servo(self, motor: Motor, load: Load, angle: float) -> int:
         """Add a servo at rest and limp, with its shaft at `angle`, rad from its raw 0; return the index by
         which other methods address it."""
         plant, profiles, law, strain = self.plant, self.profiles, self.law, self.strain
@@ -106,7 +106,7 @@ class Mechanics:
         self._wake()
         return count
 
-    def jam(self, index: int, on: bool) -> None:
+    def jam_shaft(self, index: int, on: bool) -> None:
         """Block a servo's shaft at its present angle, or release it."""
         self.plant.jam(index, on)
         self._wake()
@@ -115,7 +115,7 @@ class Mechanics:
         """Return the motor of a servo."""
         return self._motors[index]
 
-    def watch(self, index: int, act: Callable[[], None]) -> None:
+    def watch_servo(self, index: int, act: Callable[[], None]) -> None:
         """Call `act` whenever a servo's temperature changes by a degree, and when it has been overloaded
         for too long."""
         self._watchers[index] = act
@@ -126,7 +126,7 @@ class Mechanics:
         self.law.stall[index] = motor.stall_torque * (volts / motor.voltage if motor.voltage else 1.0)
         self._wake()
 
-    def command(self, index: int, command: ServoCommand) -> None:
+    def command_servo(self, index: int, command: ServoCommand) -> None:
         """Give a servo's controller new parameters. Its trajectory continues from its setpoint, or from
         the shaft if it was limp."""
         was_limp = self._commands[ROWS["limit"], index] == 0.0
@@ -147,25 +147,25 @@ class Mechanics:
         self.strain.calm = False
         self.still = False
 
-    def place(self, index: int, angle: float) -> None:
+    def move_shaft(self, index: int, angle: float) -> None:
         """Move a resting shaft to an angle, rad, at once; its trajectory begins there."""
-        self.plant.place(index, angle)
+        self.plant.place_shaft(index, angle)
         self.profiles.position[index], self.profiles.velocity[index] = angle, 0.0
         if self._commands[ROWS["limit"], index] == 0.0:
             self._commands[ROWS["goal"], index] = angle
         self.profiles.arrived = False
         self.still = False
 
-    def recount(self, index: int, angle: float) -> None:
+    def recount_turns(self, index: int, angle: float) -> None:
         """Stop a shaft, and change its count of turns so that its angle becomes `angle`, rad; its
         trajectory begins there."""
         turns = math.tau * round((angle - self.plant.angle.item(index)) / math.tau)
         if turns:
             self._recounted[index] += turns
-            self.plant.recount(index, turns)
-        self.place(index, angle)
+            self.plant.shift_angle(index, turns)
+        self.move_shaft(index, angle)
 
-    def turn(self, index: int, by: float, duration_ns: int, gives_way: Callable[[float], None]) -> None:
+    def turn_shaft(self, index: int, by: float, duration_ns: int, gives_way: Callable[[float], None]) -> None:
         """Turn a servo's shaft as by hand, evenly by an angle, starting now.
 
         The hand lets go of a servo that drives or holds its shaft.
@@ -205,7 +205,7 @@ class Mechanics:
     def shafts(self, now_ns: int, count: int) -> Shafts:
         """Return the motion of the first `count` shafts at a time, extrapolated with their velocity
         between grid points."""
-        self.advance(now_ns)
+        self.step_to(now_ns)
         velocity = self.plant.velocity[:count].copy()
         angle = self.plant.angle[:count] + velocity * (max(0, now_ns - self.grid_ns) * 1e-9)
         return Shafts(now_ns, angle, velocity, self.acceleration[:count].copy())
@@ -229,7 +229,7 @@ class Mechanics:
         easy_ns = self.grid_ns + EASY_NS
         return easy_ns if agenda_ns is None else min(easy_ns, agenda_ns)
 
-    def advance(self, now_ns: int) -> None:
+    def step_to(self, now_ns: int) -> None:
         """Step all servos up to the last grid point at or before `now_ns`."""
         if self._busy or self.grid_ns + STEP_NS > now_ns:
             return
@@ -273,17 +273,17 @@ class Mechanics:
             self._commanded = False
             profiles.commanded()
             law.commanded()
-        profiles.step()
-        law.step(profiles, plant.angle, plant.velocity)
+        profiles.advance_trajectories()
+        law.compute_drive(profiles, plant.angle, plant.velocity)
         if self._before is not None:
             self._before = plant.velocity.copy()
         # A check for rest needs copies of the arrays, so it is not made in every step.
         if (self.grid_ns - self._start_ns) // STEP_NS % _STEPS_A_LOOK:
-            plant.step(law.drive, law.damping, STEP_NS * 1e-9)
+            plant.step_shafts(law.drive, law.damping, STEP_NS * 1e-9)
             return
         before = plant.velocity.copy()
-        plant.step(law.drive, law.damping, STEP_NS * 1e-9)
-        profiles.look()
+        plant.step_shafts(law.drive, law.damping, STEP_NS * 1e-9)
+        profiles.check_arrival()
         still = profiles.arrived and np.abs(plant.velocity).max() < _STILL and not law.winding
         if still and np.abs(before - plant.velocity).max() < _UNDRIVEN:
             plant.velocity.fill(0.0)
@@ -301,7 +301,7 @@ class Mechanics:
                 hand.gives_way(hand.turned)
                 continue
             hand.steps, hand.turned = hand.steps - 1, hand.turned + way
-            self.place(index, angle + way)
+            self.move_shaft(index, angle + way)
             if hand.steps:
                 self.plant.velocity[index] = hand.speed
             else:

@@ -74,7 +74,7 @@ class ModeShaft(Shaft):
         self._scale = {name: item.scale for name, item in items.items()}
         self._rad_per_tick = memory.table.rad_per_tick
         self._sign, self._offset = 1, 0
-        memory.watch(("drive_mode", "homing_offset"), self._orient)
+        memory.watch_items(("drive_mode", "homing_offset"), self._orient)
 
     def within_a_turn(self, angle: float) -> float:
         """Return the angle, rad, that the servo shows after power-up: within one turn of its encoder, 0 to

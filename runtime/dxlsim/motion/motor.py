@@ -67,14 +67,14 @@ class _Gain(msgspec.Struct, frozen=True):
     source: str
 
 
-class _Scaled(msgspec.Struct, frozen=True):
+class _ScaledMotor(msgspec.Struct, frozen=True):
     models: tuple[str, ...]  # Patterns
     like: str  # An identified model
 
 
 class _Motors(msgspec.Struct, frozen=True):
     identified: tuple[MotorModel, ...]
-    scaled: tuple[_Scaled, ...]
+    scaled: tuple[_ScaledMotor, ...]
     gain: tuple[_Gain, ...]
 
 
@@ -152,7 +152,7 @@ def _scaled(table: ControlTable, like: MotorModel) -> Motor:
     )
 
 
-def _among(model: str, those: _Scaled | _Gain) -> bool:
+def _among(model: str, those: _ScaledMotor | _Gain) -> bool:
     return any(fnmatch.fnmatchcase(model, pattern) for pattern in those.models)
 
 

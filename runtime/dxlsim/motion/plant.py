@@ -44,13 +44,13 @@ class Plant(Protocol):
     def velocity(self) -> Floats:
         """Speed of each shaft, rad/s, counter-clockwise positive; always the same array."""
 
-    def step(self, drive: Floats, damping: Floats, dt_s: float) -> None:
+    def step_shafts(self, drive: Floats, damping: Floats, dt_s: float) -> None:
         """Advance by `dt_s` with servo torque `drive - damping * velocity` (Nm, Nm s/rad)."""
 
-    def place(self, index: int, angle: float) -> None:
+    def place_shaft(self, index: int, angle: float) -> None:
         """Move a resting shaft to an angle, rad, at once."""
 
-    def recount(self, index: int, by: float) -> None:
+    def shift_angle(self, index: int, by: float) -> None:
         """Add `by`, rad, to the angle count of a resting shaft, as after a power cycle; the shaft does not
         move."""
 
@@ -89,7 +89,7 @@ class IndependentJoints:
         self._free_friction = self._friction.copy()
         self._dt_s = 0.0
 
-    def step(self, drive: Floats, damping: Floats, dt_s: float) -> None:
+    def step_shafts(self, drive: Floats, damping: Floats, dt_s: float) -> None:
         """Advance by `dt_s` with servo torque `drive - damping * velocity` (Nm, Nm s/rad)."""
         if dt_s != self._dt_s:
             self._set_step(dt_s)
@@ -110,12 +110,12 @@ class IndependentJoints:
         """Block a shaft at its present angle, or release it."""
         self._friction[index] = JAMMED_NM if on else self._free_friction[index]
 
-    def place(self, index: int, angle: float) -> None:
+    def place_shaft(self, index: int, angle: float) -> None:
         """Move a resting shaft to an angle, rad, at once."""
         self.angle[index] = angle
         self.velocity[index] = 0.0
 
-    def recount(self, index: int, by: float) -> None:
+    def shift_angle(self, index: int, by: float) -> None:
         """Add `by`, rad, to the angle count of a resting shaft, which does not move."""
         self.angle[index] += by
         self._down[index] += by
@@ -141,26 +141,26 @@ class SeveralPlants:
             for place, row in enumerate(rows.tolist())
         }
 
-    def step(self, drive: Floats, damping: Floats, dt_s: float) -> None:
+    def step_shafts(self, drive: Floats, damping: Floats, dt_s: float) -> None:
         """Advance by `dt_s` with servo torque `drive - damping * velocity` (Nm, Nm s/rad)."""
         for rows, plant in self._parts:
             self._hand(rows, plant)
-            plant.step(drive[rows], damping[rows], dt_s)
-            self._take(rows, plant)
+            plant.step_shafts(drive[rows], damping[rows], dt_s)
+            self._copy_states(rows, plant)
 
-    def place(self, index: int, angle: float) -> None:
+    def place_shaft(self, index: int, angle: float) -> None:
         """Move a resting shaft to an angle, rad, at once."""
         rows, plant, place = self._place_of[index]
         self._hand(rows, plant)
-        plant.place(place, angle)
-        self._take(rows, plant)
+        plant.place_shaft(place, angle)
+        self._copy_states(rows, plant)
 
-    def recount(self, index: int, by: float) -> None:
+    def shift_angle(self, index: int, by: float) -> None:
         """Add `by`, rad, to the angle count of a resting shaft, which does not move."""
         rows, plant, place = self._place_of[index]
         self._hand(rows, plant)
-        plant.recount(place, by)
-        self._take(rows, plant)
+        plant.shift_angle(place, by)
+        self._copy_states(rows, plant)
 
     def jam(self, index: int, on: bool) -> None:
         """Block a shaft at its present angle, or release it."""
@@ -173,7 +173,7 @@ class SeveralPlants:
         plant.angle[:] = self.angle[rows]
         plant.velocity[:] = self.velocity[rows]
 
-    def _take(self, rows: Rows, plant: Plant) -> None:
+    def _copy_states(self, rows: Rows, plant: Plant) -> None:
         self.angle[rows] = plant.angle
         self.velocity[rows] = plant.velocity
 

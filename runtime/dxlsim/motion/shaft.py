@@ -31,7 +31,7 @@ class Shaft(ABC):
         self.mechanics = mechanics
         self.motor = motor
         self._torque_per_ampere = self.motor.torque_per_ampere
-        self.index = mechanics.add(self.motor, load, angle)
+        self.index = mechanics.add_servo(self.motor, load, angle)
         self.now_ns = mechanics.grid_ns
         self._last: ServoCommand | None = None
         self._goes_to_goal = False
@@ -71,10 +71,10 @@ class Shaft(ABC):
         """True if the motor holds or moves the shaft: torque is enabled and Torque Limit is not 0."""
         return self.memory.get("torque_enable") == 1 and self.memory.get("torque_limit", 1) > 0
 
-    def recount(self, angle: float) -> None:
+    def recount_turns(self, angle: float) -> None:
         """Stop the shaft where it is, and change its count of turns so that its angle becomes `angle`,
         rad."""
-        self.mechanics.recount(self.index, angle)
+        self.mechanics.recount_turns(self.index, angle)
         self._forget()
 
     def _forget(self) -> None:
@@ -82,12 +82,12 @@ class Shaft(ABC):
         self._last = None
         self._goes_to_goal = False
 
-    def advance(self, now_ns: int) -> None:
+    def advance_to(self, now_ns: int) -> None:
         """Advance the shaft's time and the mechanics to `now_ns`; an earlier time is ignored."""
         if now_ns > self.now_ns:
             self.now_ns = now_ns
             if now_ns - self.mechanics.grid_ns >= STEP_NS:
-                self.mechanics.advance(now_ns)
+                self.mechanics.step_to(now_ns)
 
     def plan(self, written: Iterable[str]) -> None:
         """Command the motion that the registers ask for after these were written, unless it is the last
@@ -107,9 +107,9 @@ class Shaft(ABC):
             self._last = command
             if command.limit == 0.0:
                 self._withdrawn += 1
-                self.mechanics.command(self.index, command)
+                self.mechanics.command_servo(self.index, command)
             else:
-                self._act(partial(self.mechanics.command, self.index, command))
+                self._act(partial(self.mechanics.command_servo, self.index, command))
 
     def _act(self, action: Callable[[], None]) -> None:
         """Schedule an action on the mechanics after the response delay, at the next grid point.
@@ -118,16 +118,16 @@ class Shaft(ABC):
         updates its velocity first."""
         withdrawn = self._withdrawn
 
-        def act() -> None:
+        def act_if_current() -> None:
             if withdrawn == self._withdrawn:
                 action()
 
-        self.mechanics.call_at(self.now_ns + self.response_delay_ns, act)
+        self.mechanics.call_at(self.now_ns + self.response_delay_ns, act_if_current)
 
     def power_up(self) -> None:
         """Stop the shaft and count its angle within one turn, as a servo does at power-up; the goal
         becomes that angle [i]."""
-        self.recount(self.within_a_turn(self.angle))
+        self.recount_turns(self.within_a_turn(self.angle))
         self.memory["goal_position"] = self.position_tick(self.angle)
 
     @abstractmethod

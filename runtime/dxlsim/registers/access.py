@@ -14,8 +14,8 @@ from pathlib import Path
 import msgspec
 
 from dxlsim.registers.memory import Memory, Run, signed
-from dxlsim.wire.protocol1 import ErrorBit
-from dxlsim.wire.protocol2 import ErrorNumber
+from dxlsim.wire.servo_protocol1 import ErrorBit
+from dxlsim.wire.servo_protocol2 import StatusErrorNumber
 from dxlwire.control_table import SIGN_BIT, ControlItem, ControlTable
 
 ErrorOf = Callable[[Memory, ControlItem, int], int]
@@ -96,15 +96,15 @@ def refusal(memory: Memory, run: Run, error_of: ErrorOf) -> int:
             error |= each
         return error
     if not cells.items or cells.read_only or (cells.eeprom and memory.get("torque_enable")):
-        return ErrorNumber.ACCESS
-    return next(filter(None, errors), 0) if cells.whole else ErrorNumber.DATA_LENGTH
+        return StatusErrorNumber.ACCESS
+    return next(filter(None, errors), 0) if cells.whole else StatusErrorNumber.DATA_LENGTH
 
 
 def device_error(memory: Memory, item: ControlItem, value: int) -> int:
     """Return the error with which a device rejects a value: a range error outside the item's range; 0:
     accepted."""
     taken = item.access == "RW" and item.minimum <= value <= item.maximum
-    return 0 if taken else ErrorBit.RANGE if memory.table.protocol == 1.0 else ErrorNumber.DATA_RANGE
+    return 0 if taken else ErrorBit.RANGE if memory.table.protocol == 1.0 else StatusErrorNumber.DATA_RANGE
 
 
 def lock_error(memory: Memory, item: ControlItem, value: int) -> int:
@@ -142,7 +142,7 @@ def torque_error(memory: Memory, item: ControlItem, value: int) -> int:
     known = next((one.values for one in ACCESS.values.get(name, ()) if one.fit(item, table)), None)
     taken = lowest <= value <= highest if known is None else value in known
     if not taken or (name in ACCESS.goals and watchdog_expired(memory)):
-        return ErrorNumber.DATA_RANGE
+        return StatusErrorNumber.DATA_RANGE
     limit_name = ACCESS.limits.get(name, "")
     if name in ACCESS.limits_of_p and table.items["torque_enable"].address == TORQUE_ENABLE_OF_P:
         limit_name = ACCESS.limits_of_p[name]
@@ -152,7 +152,7 @@ def torque_error(memory: Memory, item: ControlItem, value: int) -> int:
         beyond = not memory.ticks("min_position_limit") <= value <= memory.ticks("max_position_limit")
     else:
         beyond = _outside_angle_limits(memory, item, value)
-    return ErrorNumber.DATA_LIMIT if beyond else 0
+    return StatusErrorNumber.DATA_LIMIT if beyond else 0
 
 
 def _outside_angle_limits(memory: Memory, item: ControlItem, value: int) -> bool:

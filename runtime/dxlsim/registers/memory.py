@@ -99,7 +99,7 @@ class Memory:
         if name in self._watchers:
             self._notify((name,))
 
-    def watch(self, names: Iterable[str], act: Callable[[], None]) -> None:
+    def watch_items(self, names: Iterable[str], act: Callable[[], None]) -> None:
         """Call `act` now, and whenever one of these items is changed, possibly also without a change."""
         for name in names:
             self._watchers.setdefault(name, []).append(act)
@@ -113,7 +113,7 @@ class Memory:
         """Return the integer of an item on the wire, or `otherwise` if the model lacks the item."""
         return self._values.get(name, otherwise)
 
-    def show(self, name: str, wire: int) -> None:
+    def show_value(self, name: str, wire: int) -> None:
         """Set an item from inside the unit, if the model has it; the value is clamped to the range of its
         bytes."""
         if name in self._places:
@@ -133,7 +133,7 @@ class Memory:
     def refresh(self) -> None:
         """Set all live items to their present values."""
         for name, show in self._live.items():
-            self.show(name, show())
+            self.show_value(name, show())
 
     def ticks(self, name: str) -> int:
         """Return the value of an item as a signed number of ticks."""
@@ -145,7 +145,7 @@ class Memory:
         item = self.table.items[name]
         return bytes(self._memory[item.address : item.address + item.size])
 
-    def read(self, address: int, length: int) -> bytes | None:
+    def read_bytes(self, address: int, length: int) -> bytes | None:
         """Return the present bytes of a range as a host reads them, or None if the range is unreadable.
 
         Cells between items are 0, and so are targets of Indirect Addresses beyond the table [i]."""
@@ -165,7 +165,7 @@ class Memory:
         for name, show in cells.live:
             wire = show()
             if wire != self._values[name]:
-                self.show(name, wire)
+                self.show_value(name, wire)
         return bytes(self._memory[address : address + length]).ljust(length, b"\0")
 
     def runs(self, address: int, data: bytes) -> tuple[Run, ...]:
@@ -236,7 +236,7 @@ class Memory:
         }
         return Run(address, data, cells, after)
 
-    def write(self, run: Run) -> None:
+    def write_run(self, run: Run) -> None:
         """Store one part of a write that has been accepted, and call the watchers of its items."""
         start, end = run.address, run.address + len(run.data)
         if self._memory[start:end] != run.data:

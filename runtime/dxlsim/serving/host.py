@@ -6,10 +6,10 @@ from __future__ import annotations
 from collections.abc import Sequence
 from typing import Protocol
 
-from dxlsim.messages import Request, SimulationMessage
+from dxlsim.messages import SimulationMessage, SimulationRequest
 
 ENDLESS_NS = 1 << 62
-"""Argument of `LineProgress.serve` while nothing is due to the host."""
+"""Argument of `LineProgress.publish_served` while nothing is due to the host."""
 
 
 class Starter(Protocol):
@@ -21,31 +21,31 @@ class Starter(Protocol):
     def fileno(self) -> int:
         """Return a descriptor that is readable after a request, and writable while messages are accepted."""
 
-    def receive(self) -> Sequence[Request]:
+    def receive_messages(self) -> Sequence[SimulationRequest]:
         """Return the new requests of the program; called when the descriptor is readable."""
 
-    def send(self, message: SimulationMessage) -> None:
+    def send_message(self, message: SimulationMessage) -> None:
         """Send a message to the program; never raises."""
 
 
-class LineProgress(Protocol):
+class LineProgressReceiver(Protocol):
     """Receiver of the server's progress on one line. Times are CLOCK_MONOTONIC, ns."""
 
-    def serve(self, until_ns: int) -> None:
+    def publish_served(self, until_ns: int) -> None:
         """Publish that all bytes due to the host before `until_ns` have been delivered."""
 
-    def take(self, off_wire_ns: int) -> None:
+    def publish_received(self, off_wire_ns: int) -> None:
         """Publish the time at which the newest byte received from the host is off the simulated wire."""
 
-    def give(self, due_ns: int, now_ns: int) -> None:
+    def publish_delivery(self, due_ns: int, now_ns: int) -> None:
         """Publish that bytes which were due at `due_ns` are delivered to the host at `now_ns`."""
 
 
-class Progress(Protocol):
+class ServerProgressReceiver(Protocol):
     """Receiver of the server's progress, so that a host can distinguish a late server from a silent servo."""
 
     def note_stall(self, begin_ns: int, end_ns: int) -> None:
         """Publish an interval in which the server was ready to run but had no processor core."""
 
-    def line(self, index: int) -> LineProgress:
+    def line(self, index: int) -> LineProgressReceiver:
         """Return the receiver of the progress on one line, by its index."""

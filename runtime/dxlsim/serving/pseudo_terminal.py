@@ -76,10 +76,10 @@ class PseudoTerminal:
             try:
                 self._publish()
             except OSError as error:
-                self.bus.note(f"the link does not follow the adapter: {error}")
+                self.bus.add_note(f"the link does not follow the adapter: {error}")
         return True
 
-    def read(self) -> None:
+    def read_chunk(self) -> None:
         """Read one chunk of bytes that the host has written, and keep it for `receive`."""
         data = b""
         with suppress(OSError):  # No data, or no host
@@ -87,7 +87,7 @@ class PseudoTerminal:
         self._taken += data
         self.may_have_more = len(data) == _CHUNK
 
-    def receive(self, now_ns: int) -> int:
+    def deliver_bytes(self, now_ns: int) -> int:
         """Pass the bytes that were read to the bus, as written at `now_ns`, with the host's baud rate.
 
         Returns:
@@ -102,7 +102,7 @@ class PseudoTerminal:
             rate = _rate(settings)
             if rate not in (0, self.bus.baud_rate):
                 self.bus.change_rate(rate)
-        self.bus.receive(data, now_ns)
+        self.bus.receive_bytes(data, now_ns)
         return len(data)
 
     def deliver(self, now_ns: int, announce: Callable[[int], None] | None = None) -> None:
@@ -114,7 +114,7 @@ class PseudoTerminal:
             announce: Called with the time before bytes are written.
         """
         handed_ns = time.monotonic_ns()
-        data = self.bus.take(now_ns, handed_ns=handed_ns)
+        data = self.bus.drain_bytes(now_ns, handed_ns=handed_ns)
         if not data:
             return
         if announce is not None:
@@ -124,7 +124,7 @@ class PseudoTerminal:
         except BlockingIOError:
             written = 0
         if written < len(data):
-            self.bus.note(f"{len(data) - written} bytes to the host are lost: it does not read")
+            self.bus.add_note(f"{len(data) - written} bytes to the host are lost: it does not read")
 
     def close(self) -> None:
         """Close the terminal and remove its link."""

@@ -12,11 +12,11 @@ from contextlib import suppress
 from pathlib import Path
 
 from dxlsim.bus.ledger import Ledger
-from dxlsim.messages import Request, ServoLook, SimulationMessage
-from dxlsim.serving.server import Server
+from dxlsim.messages import ServoLook, SimulationMessage, SimulationRequest
+from dxlsim.serving.simulation_server import Server
 from dxlsim.simulation_plan import SimulationConfig
 from dxlsim.texts.servo_words import bus_of_servos
-from dxlwire.errors import InputError
+from dxlwire.exceptions import InputError
 
 ANSWER_TIMEOUT_S = 10.0
 """Timeout for an answer of the server thread, s, which has to wait for the interpreter lock."""
@@ -29,7 +29,7 @@ class LocalStarter:
     def __init__(self, take: Callable[[SimulationMessage], None]) -> None:
         self.closed = False
         self._take = take
-        self._requests: deque[Request] = deque()
+        self._requests: deque[SimulationRequest] = deque()
         self._ending = False
         self._wake = os.eventfd(0, os.EFD_CLOEXEC | os.EFD_NONBLOCK)
 
@@ -37,21 +37,21 @@ class LocalStarter:
         """Return a descriptor that is readable after a request, and always writable."""
         return self._wake
 
-    def ask(self, request: Request) -> None:
+    def queue_request(self, request: SimulationRequest) -> None:
         """Send a request to the server; any thread may call this."""
         self._requests.append(request)
         os.eventfd_write(self._wake, 1)
 
-    def end(self) -> None:
+    def end_server(self) -> None:
         """End the server after it has answered its pending requests."""
         self._ending = True
         os.eventfd_write(self._wake, 1)
 
-    def send(self, message: SimulationMessage) -> None:
+    def send_message(self, message: SimulationMessage) -> None:
         """Pass a message of the server to the function."""
         self._take(message)
 
-    def receive(self) -> Sequence[Request]:
+    def receive_messages(self) -> Sequence[SimulationRequest]:
         """Return the new requests; called by the server."""
         with suppress(BlockingIOError):
             os.eventfd_read(self._wake)
@@ -91,7 +91,7 @@ class ServedBus:
         self._ready = threading.Event()  # Set when the terminal is open or the thread has failed
         self._failure: Exception | None = None
         self._closed = False
-        self._starter = LocalStarter(self._take)
+        self._starter = LocalStarter(self._handle_message)
         try:
             self._server = Server(config, self.ledger, self._starter)
         except BaseException:
@@ -104,21 +104,21 @@ class ServedBus:
 
     def _serve(self) -> None:
         try:
-            self._server.run()
+            self._server.serve_ports()
         except Exception as error:
             self._failure = error
             self._ready.set()
             self._answers.put(SimulationMessage(error=str(error)))
 
-    def _take(self, message: SimulationMessage) -> None:
+    def _handle_message(self, message: SimulationMessage) -> None:
         if message.ports is not None:
             self.path = message.ports[self._name]
             self._ready.set()
         elif message.happened is None:  # The ledger already has a note of the fault
             self._answers.put(message)
 
-    def _ask(self, request: Request) -> SimulationMessage:
-        self._starter.ask(request)
+    def _ask(self, request: SimulationRequest) -> SimulationMessage:
+        self._starter.queue_request(request)
         message = self._answers.get(timeout=ANSWER_TIMEOUT_S)
         self._check()
         return message
@@ -133,20 +133,20 @@ class ServedBus:
         Raises:
             InputError: The fault is unknown or can never happen; `dxlsim.fault_help` lists all faults.
         """
-        message = self._ask(Request(fault=fault))
+        message = self._ask(SimulationRequest(fault=fault))
         if message.error is not None:
             raise InputError(message.error)
 
-    def look(self) -> tuple[ServoLook, ...]:
+    def snapshot_servos(self) -> tuple[ServoLook, ...]:
         """Return the present state of each servo: position, torque, temperature, error, counts of packets."""
-        return self._ask(Request(look=True)).servos or ()
+        return self._ask(SimulationRequest(look=True)).servos or ()
 
     def close(self) -> None:
         """Close the pseudo-terminal; the ledger is kept. A second call does nothing."""
         if self._closed:
             return
         self._closed = True
-        self._starter.end()
+        self._starter.end_server()
         self._thread.join()
         self._starter.close()
         self._check()
@@ -182,7 +182,7 @@ def serve_bus(
 
     Example:
         >>> with serve_bus("XL430-W250:1,2") as bus:
-        ...     [(servo.id, servo.torque) for servo in bus.look()]
+        ...     [(servo.id, servo.torque) for servo in bus.snapshot_servos()]
         [(1, False), (2, False)]
     """
     bus = bus_of_servos(servos, baud_rate, protocol)

@@ -14,8 +14,8 @@ import msgspec
 
 from dxlsim.registers.access import ErrorOf, refusal
 from dxlsim.registers.memory import Memory, Run
-from dxlsim.wire import protocol1, protocol2
-from dxlsim.wire.packets import (
+from dxlsim.wire import servo_protocol1, servo_protocol2
+from dxlsim.wire.servo_packets import (
     BROADCAST,
     GroupRead,
     Instruction,
@@ -54,7 +54,7 @@ class SimulatedNode(ABC):
     [?]."""
 
     def __init__(self, memory: Memory, error_of: ErrorOf, note: Callable[[str], None], now_ns: int) -> None:
-        self._codec = protocol1.CODEC if memory.table.protocol == 1.0 else protocol2.CODEC
+        self._codec = servo_protocol1.CODEC if memory.table.protocol == 1.0 else servo_protocol2.CODEC
         self._error_of = error_of
         self.registers = memory  # Control items by name, as integers on the wire
         self.note = note
@@ -73,7 +73,7 @@ class SimulatedNode(ABC):
         """Time (ns) until which the node boots or processes a write, and receives nothing."""
         self._delay_ns = 0  # Return Delay Time (5, 9)
         memory.show_live(self._live_items())
-        memory.watch(("return_delay_time",), self._set_delay)
+        memory.watch_items(("return_delay_time",), self._set_delay)
 
     @property
     def called(self) -> str:
@@ -97,7 +97,7 @@ class SimulatedNode(ABC):
         value, rates = registers[baud_item(registers)], registers.table.baud_rates
         return rates.get(value, 2_000_000 // (value + 1) if registers.table.protocol == 1.0 else 0)
 
-    def execute(self, packet: InstructionPacket, now_ns: int) -> ServoReply | None:
+    def execute_packet(self, packet: InstructionPacket, now_ns: int) -> ServoReply | None:
         """Execute an instruction whose last byte arrived at `now_ns`; return the reply, or None if the
         node sends none."""
         servo_id = self.servo_id  # A write of ID is still answered with the old ID [i]
@@ -110,7 +110,7 @@ class SimulatedNode(ABC):
         if error:
             refused = f"{packet.instruction:#04x} {packet.parameters.hex(' ')}"
             self.note(f"{self.kind} {servo_id} refuses {refused}: {self._codec.error(error)!r}")
-            self.protect(error)
+            self.apply_protection(error)
         return ServoReply(servo_id, error | self._state(), parameters, delay_ns) if replies else None
 
     def reply_to_group_read(self, read: GroupRead, entry: ReadEntry, now_ns: int) -> ServoReply | None:
@@ -130,7 +130,7 @@ class SimulatedNode(ABC):
     # Differences between kinds of nodes
 
     @abstractmethod
-    def advance(self, now_ns: int) -> None:
+    def advance_to(self, now_ns: int) -> None:
         """Advance the node to `now_ns`; an earlier time is ignored."""
 
     @abstractmethod
@@ -147,12 +147,12 @@ class SimulatedNode(ABC):
     def _state(self) -> int: ...
 
     @abstractmethod
-    def protect(self, refused: int = 0) -> None:
+    def apply_protection(self, refused: int = 0) -> None:
         """Apply the node's protection, such as a shutdown; `refused` is the error of a refused
         instruction."""
 
     @abstractmethod
-    def reset(self) -> None:
+    def power_cycle(self) -> None:
         """Power-cycle the node: its RAM registers return to their initial values."""
 
     @property
@@ -215,7 +215,7 @@ class SimulatedNode(ABC):
             case Instruction.WRITE if (write := codec.write(parameters)) is not None:
                 answer = self._write_to(packet.servo_id, *write), b""
             case Instruction.PING:
-                shown = ("model_number", "firmware_version") if codec is protocol2.CODEC else ()
+                shown = ("model_number", "firmware_version") if codec is servo_protocol2.CODEC else ()
                 answer = 0, b"".join(self.registers.data(name) for name in shown)
         return (self._manage(packet), b"") if answer is None else answer
 
@@ -229,7 +229,7 @@ class SimulatedNode(ABC):
 
     def _answer_read(self, address: int, length: int) -> Answer:
         """Return error and bytes for a read; cells between items are 0 [i]."""
-        data = self.registers.read(address, length)
+        data = self.registers.read_bytes(address, length)
         return (self._codec.no_cells, b"") if data is None else (0, data)
 
     def _write_to(self, servo_id: int, address: int, data: bytes) -> int:
@@ -238,7 +238,7 @@ class SimulatedNode(ABC):
     def _beyond_shadow(self, servo_id: int, address: int, data: bytes) -> int:
         """Return the error for a write to the EEPROM through the Secondary ID, 0 for any other write."""
         shadow = servo_id == self.secondary_id and self.registers.reaches_eeprom(address, data)
-        return protocol2.ErrorNumber.ACCESS if shadow else 0
+        return servo_protocol2.StatusErrorNumber.ACCESS if shadow else 0
 
     def _write_listed(self, writes: ListedWrites | None) -> int:
         """Execute those writes of a sync or bulk write that are for this node, in list order; its
@@ -254,7 +254,7 @@ class SimulatedNode(ABC):
         if secondary is not None and secondary in writes:
             listed = sorted((*listed, *writes[secondary]))
         for _, servo_id, address, data in listed:
-            before = error if self._codec is protocol1.CODEC else 0
+            before = error if self._codec is servo_protocol1.CODEC else 0
             error = before | self._write_to(servo_id, address, data)
         return error
 
@@ -264,7 +264,7 @@ class SimulatedNode(ABC):
         if error := self._refused(runs):
             return error
         for run in runs:
-            self.registers.write(run)
+            self.registers.write_run(run)
             self._written(run.cells.names)
         return 0
 
@@ -300,7 +300,7 @@ class SimulatedNode(ABC):
 
     def cut_power(self, until_ns: int) -> None:
         """Cut the node's power until `until_ns`: RAM is lost, and the node receives nothing before."""
-        self.reset()
+        self.power_cycle()
         self._receive_nothing_until(max(self._deaf_until_ns, until_ns))
 
     def _receive_nothing_until(self, t_ns: int) -> None:

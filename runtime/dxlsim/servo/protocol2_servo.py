@@ -12,8 +12,8 @@ from dxlsim.motion.shaft import Shaft
 from dxlsim.registers.access import ACCESS, OperatingMode, torque_error, watchdog_expired
 from dxlsim.registers.memory import Memory, Run
 from dxlsim.servo.simulated_servo import SimulatedServo
-from dxlsim.wire.packets import BROADCAST, GroupRead, Instruction, InstructionPacket
-from dxlsim.wire.protocol2 import ALERT, ErrorNumber
+from dxlsim.wire.servo_packets import BROADCAST, GroupRead, Instruction, InstructionPacket
+from dxlsim.wire.servo_protocol2 import ALERT, StatusErrorNumber
 from dxlwire.control_table import ControlItem
 
 WATCHDOG_UNIT_NS = 20_000_000
@@ -51,7 +51,7 @@ class Protocol2Servo(SimulatedServo):
         self._check_ns: int | None = None  # Time of the next Bus Watchdog check; None: no check
         super().__init__(memory, torque_error, shaft, note)
         memory.has_gaps = False
-        memory.watch(("bus_watchdog", "torque_enable"), self._plan_watchdog)
+        memory.watch_items(("bus_watchdog", "torque_enable"), self._plan_watchdog)
 
     def _identify(self) -> None:
         super()._identify()
@@ -85,7 +85,7 @@ class Protocol2Servo(SimulatedServo):
                 error = self.back_up()
             case Instruction.CONTROL_TABLE_BACKUP, parameters if parameters == _RESTORE and self.keeps_backup:
                 shadow = packet.servo_id == self.secondary_id
-                error = ErrorNumber.ACCESS if shadow else self.restore_backup()
+                error = StatusErrorNumber.ACCESS if shadow else self.restore_backup()
         return super()._manage(packet) if error is None else error
 
     @property
@@ -98,11 +98,11 @@ class Protocol2Servo(SimulatedServo):
 
     def _reset(self, option: int, servo_id: int) -> int:
         if servo_id == self.secondary_id:
-            return ErrorNumber.ACCESS
+            return StatusErrorNumber.ACCESS
         kept = _KEPT_BY_RESET.get(option)
         # e-Manual, Factory Reset: a broadcast reset of everything "will NOT be activated".
         if kept is None or (option == 0xFF and servo_id == BROADCAST and self._clears):
-            return ErrorNumber.INSTRUCTION
+            return StatusErrorNumber.INSTRUCTION
         self.registers.restore_factory_values(keep=kept)
         self.reboot()
         return 0
@@ -146,14 +146,14 @@ class Protocol2Servo(SimulatedServo):
 
         After a shutdown torque stays off until a reboot: a result fail [i]."""
         torque = self._shut_down and run.after.get("torque_enable")
-        return super()._refusal(run) or (ErrorNumber.RESULT_FAIL if torque else 0)
+        return super()._refusal(run) or (StatusErrorNumber.RESULT_FAIL if torque else 0)
 
     def _state(self) -> int:
         """Return the error bits of every reply: the alert bit while Hardware Error Status or Error Code
         reports an error."""
         return ALERT if self.registers.get(self._errors.item) else 0
 
-    def protect(self, refused: int = 0) -> None:
+    def apply_protection(self, refused: int = 0) -> None:
         """Show active errors in the registers, and switch torque off until a reboot if Shutdown lists one
         of them."""
         registers = self.registers
@@ -162,7 +162,7 @@ class Protocol2Servo(SimulatedServo):
             self._show_error_code(wrong)
         latched = registers.get("hardware_error_status") if self._shut_down else 0
         shown = 0 if self._has_error_code else sum(wrong)
-        registers.show("hardware_error_status", shown | latched)
+        registers.show_value("hardware_error_status", shown | latched)
         listed = bool(wrong) if self._has_error_code else shown & registers.get("shutdown")
         if listed and not self._shut_down:
             self._shut_down = True
@@ -192,7 +192,7 @@ class Protocol2Servo(SimulatedServo):
         On the Y series torque must be off as well, and the servo reboots. The position becomes the goal
         [i]."""
         if self.shaft.moving or (self._has_error_code and self.registers.get("torque_enable")):
-            return ErrorNumber.RESULT_FAIL
+            return StatusErrorNumber.RESULT_FAIL
         self._recount(self.shaft.within_a_turn(self.shaft.angle))
         if self._has_error_code:
             self.reboot()
@@ -202,7 +202,7 @@ class Protocol2Servo(SimulatedServo):
         """Clear Error Code (instruction Clear); return an error while a cause is active (e-Manual, Y
         series), 0 on success."""
         if self._wrong():
-            return ErrorNumber.RESULT_FAIL
+            return StatusErrorNumber.RESULT_FAIL
         self.registers["error_code"] = 0
         self.registers.reset(f"error_code_history_{number}" for number in range(1, _HISTORY + 1))
         self._shut_down = False
@@ -223,11 +223,11 @@ class Protocol2Servo(SimulatedServo):
         P does not store indirect addresses; neither does Y [i]."""
         registers = self.registers
         if registers.get("torque_enable"):
-            return ErrorNumber.RESULT_FAIL
+            return StatusErrorNumber.RESULT_FAIL
         self._backup = {
             name: registers[name] for name, item in registers.table.items.items() if _is_kept(name, item)
         }
-        registers.show("backup_ready", 1)
+        registers.show_value("backup_ready", 1)
         return 0
 
     def restore_backup(self) -> int:
@@ -235,7 +235,7 @@ class Protocol2Servo(SimulatedServo):
         without a backup."""
         registers = self.registers
         if registers.get("torque_enable") or not self._backup:
-            return ErrorNumber.RESULT_FAIL
+            return StatusErrorNumber.RESULT_FAIL
         for name, wire in self._backup.items():
             if registers.table.items[name].area == "EEPROM":
                 registers[name] = wire
@@ -243,7 +243,7 @@ class Protocol2Servo(SimulatedServo):
         return 0
 
     def _recount(self, angle: float) -> None:
-        self.shaft.recount(angle)
+        self.shaft.recount_turns(angle)
         self.registers["goal_position"] = self.shaft.position_tick(angle)
         self.shaft.plan(("goal_position",))
 
@@ -278,7 +278,7 @@ class Protocol2Servo(SimulatedServo):
     def _show_controller_state(self) -> None:
         registers = self.registers
         state = _RUNNING if registers.get("torque_enable") else _INVERTER_OFF
-        registers.show("controller_state", _FAULT if self._shut_down else state)
+        registers.show_value("controller_state", _FAULT if self._shut_down else state)
 
     def _start_up(self) -> None:
         registers = self.registers
@@ -286,7 +286,7 @@ class Protocol2Servo(SimulatedServo):
         self._started_ns = self._received_ns = self.shaft.now_ns
         if "torque_limit" in registers and "max_torque" in registers:
             registers["torque_limit"] = registers["max_torque"]
-        registers.show("backup_ready", bool(self._backup))
+        registers.show_value("backup_ready", bool(self._backup))
         self._reset_goals()
         configuration = registers.get("startup_configuration")
         if configuration & RAM_FROM_BACKUP:
@@ -327,7 +327,7 @@ class Protocol2Servo(SimulatedServo):
         registers.reset((*ACCESS.gains, *ACCESS.profile))
         self._find_turn()
         registers["goal_position"] = self.shaft.position_tick(self.shaft.angle)
-        registers.show("goal_velocity", 0)
+        registers.show_value("goal_velocity", 0)
         self._reset_goals()
 
     def _find_turn(self) -> None:
@@ -339,7 +339,7 @@ class Protocol2Servo(SimulatedServo):
             return
         inside = shaft.within_a_turn(shaft.angle)
         if abs(inside - shaft.angle) > math.pi:
-            shaft.recount(inside)
+            shaft.recount_turns(inside)
 
     def _reset_goals(self) -> None:
         """Set Goal PWM and Goal Current to their limits, or to 0 in the mode that follows them [i]."""
@@ -350,7 +350,7 @@ class Protocol2Servo(SimulatedServo):
             ("goal_current", "current_limit", OperatingMode.CURRENT),
         ):
             if limit in registers:
-                registers.show(goal, 0 if mode == obeyed else registers[limit])
+                registers.show_value(goal, 0 if mode == obeyed else registers[limit])
 
 
 def _is_kept(name: str, item: ControlItem) -> bool:

@@ -19,8 +19,8 @@ from dxlsim.motion.shaft import Shaft
 from dxlsim.registers.access import ACCESS, ErrorOf, lock_error
 from dxlsim.registers.memory import Memory
 from dxlsim.servo.node import SimulatedNode
-from dxlsim.wire.packets import GroupRead, Instruction, InstructionPacket
-from dxlsim.wire.protocol1 import ErrorBit
+from dxlsim.wire.servo_packets import GroupRead, Instruction, InstructionPacket
+from dxlsim.wire.servo_protocol1 import ErrorBit
 
 BOOT_NS = 100_000_000  # Time without reception after a reboot; the manuals give no value [i]
 
@@ -48,8 +48,8 @@ class SimulatedServo(SimulatedNode):
         self._secondary_item = next((each for each in _SECONDARY_IDS if each in memory), None)
         self._voltage = 0.0
         self.voltage = _supply(memory)
-        shaft.mechanics.watch(shaft.index, self._strained)
-        memory.watch(ACCESS.identity, self._identify)
+        shaft.mechanics.watch_servo(shaft.index, self._strained)
+        memory.watch_items(ACCESS.identity, self._identify)
 
     def _identify(self) -> None:
         registers = self.registers
@@ -60,9 +60,9 @@ class SimulatedServo(SimulatedNode):
 
     # Interface to the bus
 
-    def advance(self, now_ns: int) -> None:
+    def advance_to(self, now_ns: int) -> None:
         """Advance the shaft and the registers that show it to `now_ns`; an earlier time is ignored."""
-        self.shaft.advance(now_ns)
+        self.shaft.advance_to(now_ns)
         self.registers.refresh()
 
     def receives(self, now_ns: int) -> bool:
@@ -70,7 +70,7 @@ class SimulatedServo(SimulatedNode):
         advanced and the Bus Watchdog's time restarts."""
         if self._silent or now_ns < self._deaf_until_ns or not self._speaks:
             return False
-        self.shaft.advance(now_ns)
+        self.shaft.advance_to(now_ns)
         if self._contacts and not all(contact() for contact in self._contacts):
             return False
         self._received_ns = self.shaft.now_ns
@@ -83,7 +83,7 @@ class SimulatedServo(SimulatedNode):
     # Differences between the protocols
 
     @abstractmethod
-    def protect(self, refused: int = 0) -> None:
+    def apply_protection(self, refused: int = 0) -> None:
         """Switch torque off if an error is active that the register Shutdown lists; `refused` has the
         error of a refused instruction."""
 
@@ -125,7 +125,7 @@ class SimulatedServo(SimulatedNode):
     def _keep_registered(self, write: tuple[int, bytes] | None) -> None:
         self._registered = write
         for name in ("registered", "registered_instruction"):
-            self.registers.show(name, write is not None)
+            self.registers.show_value(name, write is not None)
 
     def _set(self, name: str, wire: int) -> None:
         self.registers[name] = wire
@@ -153,7 +153,7 @@ class SimulatedServo(SimulatedNode):
         if not self.overload and self.shaft.mechanics.overloaded(self.shaft.index):
             self.overload = True
             self.note(f"servo {self.servo_id}: overload, it does not hold its load")
-        self.protect()
+        self.apply_protection()
 
     def power_up(self) -> None:
         """Start with RAM registers at their values for power-up; the shaft stays at its angle."""
@@ -162,13 +162,13 @@ class SimulatedServo(SimulatedNode):
         self.registers.restore_ram()
         self.shaft.power_up()
         self._start_up()
-        self.protect()
+        self.apply_protection()
         self.registers.refresh()
 
     # Interface for tests and faults
 
     @property
-    def position(self) -> float:
+    def shaft_angle(self) -> float:
         """Angle of the shaft, rad from raw 0, at the time of `advance` or of the last instruction."""
         return self.shaft.angle
 
@@ -201,12 +201,12 @@ class SimulatedServo(SimulatedNode):
     def temperature(self, celsius: float) -> None:
         self.shaft.mechanics.heat(self.shaft.index, celsius)
 
-    def jam(self, on: bool) -> None:
+    def jam_shaft(self, on: bool) -> None:
         """Block the shaft at its present angle, or release it."""
-        self.shaft.mechanics.jam(self.shaft.index, on)
+        self.shaft.mechanics.jam_shaft(self.shaft.index, on)
         self.note(f"servo {self.servo_id}: shaft {'blocked' if on else 'free'}")
 
-    def reset(self) -> None:
+    def power_cycle(self) -> None:
         """Power-cycle the servo: RAM is lost, the shaft stays at its angle."""
         self.note(f"servo {self.servo_id}: power cycle")
         self.power_up()
@@ -218,21 +218,21 @@ class SimulatedServo(SimulatedNode):
         Protocol 1.0)."""
         self.overload = True
         self.note(f"servo {self.servo_id}: overload")
-        self.protect()
+        self.apply_protection()
 
     def set_voltage(self, volts: float) -> None:
         """Change the servo's supply voltage, V, as a fault."""
         self.voltage = volts
         self.note(f"servo {self.servo_id}: voltage {volts} V")
-        self.protect()
+        self.apply_protection()
 
     def set_temperature(self, celsius: float) -> None:
         """Set the servo's temperature, degrees C, as a fault."""
         self.temperature = celsius
         self.note(f"servo {self.servo_id}: temperature {celsius} degC")
-        self.protect()
+        self.apply_protection()
 
-    def turn(self, by: float, duration_ns: int) -> None:
+    def turn_shaft(self, by: float, duration_ns: int) -> None:
         """Turn the shaft as by hand by an angle, rad, within a time. The hand lets go of a servo that has
         torque."""
 
@@ -240,7 +240,7 @@ class SimulatedServo(SimulatedNode):
             came = f"yields after {math.degrees(turned):.1f} of {math.degrees(by):g} deg"
             self.note(f"servo {self.servo_id}: holds or drives its shaft, so the hand that turns it {came}")
 
-        self.shaft.mechanics.turn(self.shaft.index, by, duration_ns, gives_way)
+        self.shaft.mechanics.turn_shaft(self.shaft.index, by, duration_ns, gives_way)
 
 
 class Protocol1Servo(SimulatedServo):
@@ -279,7 +279,7 @@ class Protocol1Servo(SimulatedServo):
             error |= errors.value_of("overheating")
         return error
 
-    def protect(self, refused: int = 0) -> None:
+    def apply_protection(self, refused: int = 0) -> None:
         """Set Torque Limit to 0 if Shutdown (18) lists an error; Torque Enable (24) does not change."""
         error = self._state() | refused
         if error & self.registers["shutdown"] and self.registers["torque_limit"]:

@@ -13,7 +13,7 @@ from dxlwire.control_table import (
     perhaps_meant,
     protocols_of,
 )
-from dxlwire.errors import InputError
+from dxlwire.exceptions import InputError
 
 BUS = "main"  # Name of the bus
 _SERVO = re.compile(r"(.+?):(\d+(?:-\d+)?(?:,\d+(?:-\d+)?)*)", re.ASCII)

@@ -43,7 +43,7 @@ class Deviation(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
         """True if some value of the item keeps a servo from getting torque."""
         return self.judgement == "refuse" or bool(self.refused)
 
-    def judge(self, value: int, factory: int) -> Judgement:
+    def judge_value(self, value: int, factory: int) -> Judgement:
         """Return the consequence of a value; `value` and `factory` are integers on the wire."""
         if value in self.refused:
             return "refuse"

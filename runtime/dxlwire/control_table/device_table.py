@@ -24,17 +24,17 @@ from types import MappingProxyType
 
 from msgspec.structs import replace
 
-from dxlwire.control_table.sources import (
+from dxlwire.control_table.control_items import CAPABILITIES as SERVO_CAPABILITIES
+from dxlwire.control_table.control_items import BaseControlTable, ControlItem
+from dxlwire.control_table.table_files import (
     Entry,
-    measure,
+    parse_quantity,
     protocol_in,
     read_item,
     section,
     whole,
     words,
 )
-from dxlwire.control_table.table import CAPABILITIES as SERVO_CAPABILITIES
-from dxlwire.control_table.table import ControlItem, Table
 
 WAITS = "waits_in_chain"
 """Capability of a board that must be read alone: in a chain of replies after a missing servo it would
@@ -74,7 +74,7 @@ STATE_NAME = re.compile(r"[A-Za-z][A-Za-z0-9_]*(\.[A-Za-z0-9_]+)*", re.ASCII)
 _KEYS = {*ControlItem.__struct_fields__, "tick"} - {"name", "unit", "scale", "firmware", "deviation"}
 
 
-class DeviceTable(Table, frozen=True, kw_only=True):
+class DeviceTable(BaseControlTable, frozen=True, kw_only=True):
     """Control table of one device model."""
 
     model_number: int | None
@@ -173,7 +173,7 @@ def _place(item: ControlItem) -> tuple[int, int]:
 def _item(name: str, entry: Entry, units: Collection[str]) -> ControlItem:
     if wrong := entry.keys() - _KEYS:
         raise ValueError(f"{name}: an item of a device has no {', '.join(sorted(wrong))}")
-    unit, offset = measure(name, entry, "offset", units) if "offset" in entry else ("", 0.0)
+    unit, offset = parse_quantity(name, entry, "offset", units) if "offset" in entry else ("", 0.0)
     defaults = {"access": "R", "area": "RAM", "encoding": "unsigned", "page": "", "state": name}
     ends = {key: entry.get(key, 0) for key in ("minimum", "maximum")}
     item = read_item(name, {**defaults, **ends, **entry, "offset": offset}, units)

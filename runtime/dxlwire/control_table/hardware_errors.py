@@ -41,7 +41,7 @@ class HardwareErrors(msgspec.Struct, frozen=True):
             return tuple(name for name, code in self.values.items() if code == value)
         return tuple(name for name, bit in self.values.items() if value & bit)
 
-    def describe(self, value: int) -> str:
+    def describe_errors(self, value: int) -> str:
         """Return a value of the item in the e-Manual's words, such as `overload error`; `no hardware
         error` for 0."""
         if not value:

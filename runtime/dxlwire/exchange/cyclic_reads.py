@@ -18,13 +18,13 @@ from msgspec import structs
 from msgspec.structs import replace
 
 from dxlwire.bus_plan import BusPlan
-from dxlwire.exchange.kernel import PlannedRead, Program
+from dxlwire.exchange.kernel import KernelProgram, PlannedRead
 from dxlwire.exchange.owed import OwedReplies
 from dxlwire.exchange.samples import BusSamples
 from dxlwire.plan.line import SHORT_TIMEOUT_MARGIN_NS, TIMEOUT_MARGIN_NS
 from dxlwire.plan.planning import plan_line
 from dxlwire.plan.reads import state_read
-from dxlwire.transaction import Outcome, Reply, Transaction
+from dxlwire.transaction import Reply, Transaction, TransactionOutcome
 
 MOST_CHAINS = 64
 """Size of the cache of requests, each for a chain that omits certain servos. On a line that loses a
@@ -42,7 +42,7 @@ MOST_BROKEN = 5
 plain form. Some servos answer a request of their own, but not in the shared status."""
 
 
-class Request(msgspec.Struct, frozen=True):
+class CyclicRequest(msgspec.Struct, frozen=True):
     """One read of some servos or devices of one group, in each reply length. `patient` has the long
     timeout, `short` the short one."""
 
@@ -56,8 +56,8 @@ class Cycle(msgspec.Struct, frozen=True):
     """The reads of one cycle on one bus, in the order of sending."""
 
     silent: tuple[bool, ...]  # Servos that missed their newest read; each is read separately
-    queue: tuple[Request, ...]
-    program: Program | None
+    queue: tuple[CyclicRequest, ...]
+    program: KernelProgram | None
     """The same reads laid out for the exchange kernel; None while a servo is silent or has just recovered."""
 
 
@@ -95,8 +95,8 @@ class CyclicReads:
         self._stale = True  # True when the next cycle must be planned again
         self._position = 0  # Index of the current read in the queue
         self._patient = True
-        self._made: dict[tuple[int, ...], Request] = {}
-        self._programs: dict[tuple[object, ...], Program] = {}
+        self._made: dict[tuple[int, ...], CyclicRequest] = {}
+        self._programs: dict[tuple[object, ...], KernelProgram] = {}
 
     # Planning
 
@@ -125,7 +125,7 @@ class CyclicReads:
             self.cycle = Cycle(silent, queue, program)
         return self.cycle
 
-    def end(self) -> None:
+    def end_cycle(self) -> None:
         """End a cycle that the parser read, or in which the line was lost; count calm cycles and
         incomplete fast reads."""
         self.begun = False
@@ -154,7 +154,7 @@ class CyclicReads:
                 return not arrived(member) and all(arrived(one) for one in before)
         return False
 
-    def leave(self, servo: int) -> None:
+    def stop_reading(self, servo: int) -> None:
         """Stop reading a lost servo: its timeout would cost the other servos their time."""
         self.away[servo] = True
         self._stale = True
@@ -165,7 +165,7 @@ class CyclicReads:
         self.missed[servo] = 0
         self._stale = True
 
-    def learn(self, return_delays: Mapping[int, int]) -> None:
+    def set_return_delays(self, return_delays: Mapping[int, int]) -> None:
         """Use the measured return delays of the servos, ns by ID, for the deadlines of replies."""
         self._line = replace(self._line, return_delays=dict(return_delays))
         self._forget()
@@ -181,7 +181,7 @@ class CyclicReads:
         self._programs.clear()
         self._stale = True
 
-    def _request(self, group: int, indices: tuple[int, ...]) -> Request:
+    def _request(self, group: int, indices: tuple[int, ...]) -> CyclicRequest:
         request = self._made.get(indices)
         if request is None:
             if len(self._made) >= MOST_CHAINS:
@@ -195,10 +195,10 @@ class CyclicReads:
             if servos:
                 less_ns = TIMEOUT_MARGIN_NS - SHORT_TIMEOUT_MARGIN_NS
                 short = tuple(structs.replace(read, timeout_ns=read.timeout_ns - less_ns) for read in patient)
-            request = self._made[indices] = Request(group, indices, patient, short)
+            request = self._made[indices] = CyclicRequest(group, indices, patient, short)
         return request
 
-    def _choose_length(self, group: int, requests: Sequence[Request]) -> None:
+    def _choose_length(self, group: int, requests: Sequence[CyclicRequest]) -> None:
         """Choose the reply length of a group's reads: one without owed replies, else the one whose owed
         replies are the oldest.
 
@@ -211,7 +211,7 @@ class CyclicReads:
             key=lambda shape: self._owed.newest_ns(one.patient[shape % len(one.patient)] for one in requests),
         )
 
-    def _program(self, queue: Sequence[Request]) -> Program | None:
+    def _program(self, queue: Sequence[CyclicRequest]) -> KernelProgram | None:
         """Return the reads of a cycle without losses as a program for the kernel.
 
         Returns None, so that the parser reads, in two cases: a servo reports more than an alert, or a late
@@ -234,7 +234,7 @@ class CyclicReads:
         if key not in self._programs:
             if len(self._programs) >= MOST_PROGRAMS:
                 self._programs.clear()
-            self._programs[key] = Program(self._plan, reads)
+            self._programs[key] = KernelProgram(self._plan, reads)
         return self._programs[key]
 
     def _in_length(self, reads: Sequence[Transaction], group: int) -> Transaction:
@@ -242,18 +242,18 @@ class CyclicReads:
 
     # Reading by the parser
 
-    def begin(self, done: int = 0) -> None:
+    def begin_cycle(self, done: int = 0) -> None:
         """Begin a cycle for the parser, after `done` reads that the kernel has completed."""
         if not done:
-            self.samples.clear()
+            self.samples.clear_fresh()
         self.begun = self._patient = True
         self._position = done
 
-    def advance(self, reply: Reply | None) -> Transaction | None:
+    def next_transaction(self, reply: Reply | None) -> Transaction | None:
         """Count a loss if the current read failed, and return the next read of the cycle; None at the end."""
         queue = self.cycle.queue
         if reply is not None:
-            if reply.outcome is not Outcome.OK:
+            if reply.outcome is not TransactionOutcome.OK:
                 self._count_loss(queue[self._position], reply.outcome)
             self._position += 1
         if self._position == len(queue):
@@ -267,17 +267,17 @@ class CyclicReads:
     def status(self, index: int, reply: Reply) -> None:
         """Store the state in the reply of one servo or device; `index` is its place in the current read."""
         servo = self.cycle.queue[self._position].indices[index]
-        self.samples.take(servo, reply.parameters, reply.last_ns)
+        self.samples.store_state(servo, reply.parameters, reply.last_ns)
         self.errors[servo] = reply.error
 
-    def _count_loss(self, request: Request, outcome: Outcome) -> None:
+    def _count_loss(self, request: CyclicRequest, outcome: TransactionOutcome) -> None:
         self._patient = False
         self._lossy.add(request.group)
         if request.patient[0].fast:
             self._broken[request.group] += 1
             if self._broken[request.group] == MOST_BROKEN:
                 self.given_up.append(request.group)
-        garbled = outcome is not Outcome.TIMEOUT
+        garbled = outcome is not TransactionOutcome.TIMEOUT
         for servo in request.indices:
             if not self.samples.arrived(servo):
                 self.garbled[servo] = garbled

@@ -48,14 +48,14 @@ class DeviceSamples:
             self._devices.append((device.name, plan.label(device), here, columns))
         self._reported_ns = [-REPORT_AGAIN_NS] * len(devices)
 
-    def judge(self, now_ns: int) -> None:
+    def reject_non_finite(self, now_ns: int) -> None:
         """Reject and report each device that sent a NaN or an infinite value in this cycle."""
         for number, (_, _, here, columns) in enumerate(self._devices):
             if self.fresh[here].all() and not np.isfinite(self.values[columns]).all():
-                self._report(number, now_ns)
+                self._report_device(number, now_ns)
                 self.doubted[number] = True
 
-    def _report(self, number: int, now_ns: int) -> None:
+    def _report_device(self, number: int, now_ns: int) -> None:
         if now_ns - self._reported_ns[number] >= REPORT_AGAIN_NS:
             self._reported_ns[number] = now_ns
             name, label, here, _ = self._devices[number]

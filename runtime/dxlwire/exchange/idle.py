@@ -12,10 +12,10 @@ from msgspec import structs
 from msgspec.structs import replace
 
 from dxlwire.exchange import reports
-from dxlwire.exchange.bus import NEVER, Bus
+from dxlwire.exchange.bus_engine import NEVER, BusEngine
 from dxlwire.exchange.reports import Reason, ReportSink
 from dxlwire.plan.line import SHORT_TIMEOUT_MARGIN_NS
-from dxlwire.transaction import Outcome, Program, Reply, Transaction
+from dxlwire.transaction import Program, Reply, Transaction, TransactionOutcome
 
 LEAST_MARGIN_NS = 100_000
 """Minimum time (ns) for which a reply is awaited after it is due; servos answer with less delay than this."""
@@ -56,7 +56,7 @@ class _Task:
         self.starved = 0  # Consecutive cycles without time for its next transaction
         self.reported = False
 
-    def resume(self, reply: Reply | None) -> bool:
+    def resume_program(self, reply: Reply | None) -> bool:
         """Run the program to its next transaction, with the reply to the last one, None at the start;
         return False if the program has ended."""
         self.begun = reply is not None
@@ -75,7 +75,7 @@ class IdleScheduler:
     transaction that sends nothing (`line.listen`) is a pause, and other programs use the line during it.
     Every program runs to completion: on a lost line its transactions time out (`abandon`)."""
 
-    def __init__(self, bus: Bus, reports: ReportSink) -> None:
+    def __init__(self, bus: BusEngine, reports: ReportSink) -> None:
         self.plan = bus.plan
         self.bus = bus
         self._reports = reports
@@ -123,7 +123,7 @@ class IdleScheduler:
             least_ns = min(least_ns, self._need_ns(task.next, 0))
         return least_ns
 
-    def begin(self, until_ns: int) -> bool:
+    def begin_idle(self, until_ns: int) -> bool:
         """Begin an idle time that ends at `until_ns`; return False if no program waits, so that the bus
         need not load this job."""
         if not self.tasks:
@@ -132,7 +132,7 @@ class IdleScheduler:
         self._current = None
         return True
 
-    def advance(self, reply: Reply | None) -> Transaction | None:
+    def next_transaction(self, reply: Reply | None) -> Transaction | None:
         """Pass the reply to the program that awaits it, and return the next transaction that fits into the
         idle time; None: none does."""
         if reply is not None and self._current is not None:
@@ -161,9 +161,9 @@ class IdleScheduler:
         Programs added during this call wait for the next idle time."""
         tasks, self.tasks, self._current = self.tasks, [], None
         for task in tasks:
-            more = task.next is not None or task.resume(None)
+            more = task.next is not None or task.resume_program(None)
             while more:
-                more = task.resume(_nothing())
+                more = task.resume_program(_nothing())
 
     def _ready(self) -> _Task | None:
         """Return the most urgent program that can continue now. A program that has begun precedes all
@@ -190,7 +190,7 @@ class IdleScheduler:
         return now_ns - task.held_ns < wanted.patience_ns
 
     def _resume(self, task: _Task, reply: Reply | None) -> None:
-        if not task.resume(reply):
+        if not task.resume_program(reply):
             self.tasks.remove(task)
 
     def _pause(self, task: _Task, pause: Transaction) -> None:
@@ -198,7 +198,7 @@ class IdleScheduler:
             task.paused, task.wake_ns = True, self.now_ns() + pause.due_ns
         else:
             task.paused = False
-            self._resume(task, _nothing(Outcome.SENT))
+            self._resume(task, _nothing(TransactionOutcome.SENT))
 
     def _timed(self, task: _Task, wanted: Transaction, first: bool) -> Transaction | None:
         """Return the transaction with a timeout that fits the idle time, or None if it must wait for a
@@ -239,5 +239,5 @@ def _turn(task: _Task) -> tuple[Urgency, int]:
     return task.turn
 
 
-def _nothing(outcome: Outcome = Outcome.TIMEOUT) -> Reply:
+def _nothing(outcome: TransactionOutcome = TransactionOutcome.TIMEOUT) -> Reply:
     return Reply(outcome, 0, b"", 0, 0, False)

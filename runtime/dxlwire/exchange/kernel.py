@@ -19,11 +19,11 @@ from numpy.typing import NDArray
 
 from dxlwire.bus_plan import BusPlan, Field
 from dxlwire.compiled import array_of, load_compiled, parse_structs
-from dxlwire.errors import PortError
+from dxlwire.exceptions import PortError
 from dxlwire.exchange.arrays import Floats
-from dxlwire.exchange.bus import BEAT_NS, LOST_LINE_STEP_NS, NEVER, Lines
+from dxlwire.exchange.bus_engine import BEAT_NS, LOST_LINE_STEP_NS, NEVER, Lines
 from dxlwire.exchange.device_samples import DeviceSamples
-from dxlwire.exchange.goals import GoalArrays, SyncWrite
+from dxlwire.exchange.goal_writes import GoalArrays, SyncWrite
 from dxlwire.exchange.samples import Samples
 from dxlwire.packets import RECORD_HEADER, PacketLog
 from dxlwire.plan.line import BITS_PER_BYTE
@@ -109,13 +109,13 @@ class PlannedRead(msgspec.Struct, frozen=True):
     errors: tuple[int, ...]
 
 
-class Program:
+class KernelProgram:
     """The reads of one bus in a cycle, laid out as C structs for the kernel."""
 
     def __init__(self, plan: BusPlan, reads: Sequence[PlannedRead]) -> None:
         self._kept: list[object] = []  # Keeps buffers alive: the kernel has only their addresses
         self.count = len(reads)
-        self.reads = _array(_Read, [self._read(plan, read) for read in reads])
+        self.reads = _array(_Read, [self._read_structure(plan, read) for read in reads])
         self.bytes = max((read.record_bytes for read in self.reads[: self.count]), default=0)
         """Space in the log that the largest read needs with its replies, bytes."""
 
@@ -124,7 +124,7 @@ class Program:
         self._kept.append(kept)
         return ctypes.addressof(kept)
 
-    def _read(self, plan: BusPlan, read: PlannedRead) -> ctypes.Structure:
+    def _read_structure(self, plan: BusPlan, read: PlannedRead) -> ctypes.Structure:
         transaction = read.transaction
         expected, known, packets, parts = (_fast_replies if transaction.fast else _replies)(plan, read)
         byte_ns = BITS_PER_BYTE * 1_000_000_000 // plan.baud_rate
@@ -232,7 +232,7 @@ class Kernel:
         self._raised: BaseException | None = None
         self._kept: list[object] = [samples, goals]
         self._buffers = [ctypes.create_string_buffer(_ROOM) for _ in shared]
-        self.programs: list[Program | None] = [None] * len(shared)  # The program that reads each bus
+        self.programs: list[KernelProgram | None] = [None] * len(shared)  # The program that reads each bus
         self._writes: list[tuple[SyncWrite, ...]] = [()] * len(shared)
         self._written: list[object] = [None] * len(shared)
         self._kernel = STRUCTS["Kernel"](beat_ns=BEAT_NS)
@@ -351,7 +351,7 @@ class Kernel:
 
     def _send(self, line: int, data: ctypes._Pointer[c_uint8], size: int) -> int:
         try:
-            self._ports.ports[line].write(bytes(data[:size]))
+            self._ports.ports[line].write_packet(bytes(data[:size]))
         except PortError:
             return -1
         except BaseException as error:
@@ -375,7 +375,7 @@ class Kernel:
         indices: Sequence[int] = range(len(self._buses))
         try:
             if self._raised is None:
-                heard = self._ports.wait(deadline_ns)
+                heard = self._ports.wait_for_bytes(deadline_ns)
                 indices = [index for index in heard if self._is_read(index)]
                 if heard and not indices:  # A lost line is always readable: let time pass
                     self._clock.wait_until(min(deadline_ns, self._now_ns() + LOST_LINE_STEP_NS))
@@ -403,7 +403,7 @@ class Kernel:
         before real-time scheduling starts."""
         self._kernel.polling = polling_state(self._ports.polling)
 
-    def plan(self, index: int, program: Program) -> bool:
+    def plan(self, index: int, program: KernelProgram) -> bool:
         """Use a program for the reads of a bus from the next cycle on.
 
         Returns:
@@ -427,7 +427,7 @@ class Kernel:
             if code == Answer.WAITING:
                 self._beat()
             elif code == Answer.FULL:
-                self._packets.commit()
+                self._packets.commit_packets()
             else:
                 return Answer(code)
             code = self.read()
@@ -443,7 +443,7 @@ class Kernel:
         """Continue a write that returned a code; return the failures of the lines since the last call, by
         index."""
         while code == Answer.FULL:
-            self._packets.commit()
+            self._packets.commit_packets()
             code = self.write()
         self._raise()
         if code == Answer.OK:

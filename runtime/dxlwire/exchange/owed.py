@@ -10,7 +10,7 @@ from __future__ import annotations
 from collections.abc import Callable, Iterable, Sequence
 from typing import NamedTuple
 
-from dxlwire.transaction import BROADCAST_ID, Awaited, Transaction
+from dxlwire.transaction import BROADCAST_ID, ExpectedReply, Transaction
 
 LEAST_WINDOW_NS = 750_000_000
 """Minimum time (ns) for which a reply is owed after its request [i]: stalled machines, virtual machines
@@ -82,7 +82,7 @@ class OwedReplies:
         entry.last_ns = sent_ns
         self.version += 1
 
-    def settle(self, servo_id: int, length: int, error: int) -> bool:
+    def charge_reply(self, servo_id: int, length: int, error: int) -> bool:
         """Remove the oldest owed reply that a received status may be; return True if there was one."""
         entries = self._entries.get(servo_id, [])
         found = next((one for one in entries if one.length == length), None)
@@ -97,7 +97,7 @@ class OwedReplies:
             entries.remove(found)
         return True
 
-    def note_answer(self, transaction: Transaction, awaited: Awaited, sent_ns: int) -> None:
+    def note_answer(self, transaction: Transaction, awaited: ExpectedReply, sent_ns: int) -> None:
         """Note that a request was answered. If a reply is owed to an older, identical request, its time
         now counts from this one."""
         servo_id, length, question = _shape(transaction, awaited)
@@ -125,7 +125,9 @@ class OwedReplies:
                     free_ns = max(free_ns, one.last_ns + window_ns)
         return free_ns if free_ns and free_ns > self._now_ns() else 0
 
-    def confuses(self, transaction: Transaction, awaited: Awaited, *, refusal: bool, any_age: bool) -> bool:
+    def confuses(
+        self, transaction: Transaction, awaited: ExpectedReply, *, refusal: bool, any_age: bool
+    ) -> bool:
         """Return True if a status that fits `awaited` may be the late reply to another request.
 
         A refusal has no data, so it may belong to a request of any length."""
@@ -181,7 +183,7 @@ class OwedReplies:
         return any_age or all(change is None or one.first_ns >= change.first_ns for change in changes)
 
 
-def _shape(transaction: Transaction, awaited: Awaited) -> tuple[int, int, Question]:
+def _shape(transaction: Transaction, awaited: ExpectedReply) -> tuple[int, int, Question]:
     question = awaited.address if awaited.address >= 0 else transaction.packet
     return awaited.servo_id, awaited.length, question
 

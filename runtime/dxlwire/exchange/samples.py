@@ -93,15 +93,15 @@ class Samples:
         turning = np.isin(self.states.mode[self.rows], _WHEEL_MODES)
         self.scale[1] = np.where(turning, self._wheel_speed, self._joint_speed)
 
-    def settle(self, now_ns: int) -> None:
+    def fill_states(self, now_ns: int) -> None:
         """Fill the states of all joints and devices from the replies of this cycle.
 
         The row of a servo without a reply, or with an implausible one, keeps its values, is marked
         invalid, and its age grows."""
         if self.settle_all(now_ns):
-            self.judge(now_ns)
+            self.accept_plausible(now_ns)
 
-    def judge(self, now_ns: int) -> None:
+    def accept_plausible(self, now_ns: int) -> None:
         """Check the positions and device values of this cycle, fill the states from the plausible ones,
         and report the others."""
         steps = self.values[0] - self.states.position[self.rows]
@@ -112,7 +112,7 @@ class Samples:
                 self.doubted[index] = True
                 # A rejected reply does not count: the age refers to the last sample that was shown.
                 self.at_ns[index] = self.shown_ns[index]
-        self.devices.judge(now_ns)
+        self.devices.reject_non_finite(now_ns)
         self.show(now_ns)
 
 
@@ -135,7 +135,7 @@ class BusSamples:
         self.at_ns = samples.at_ns[here]
         """Arrival time of each servo's newest plausible reply, ns; -1 before the first reply."""
 
-    def clear(self) -> None:
+    def clear_fresh(self) -> None:
         """Begin a cycle: mark the states of all servos and blocks as not received."""
         self.fresh[:] = False
         self.blocks_fresh[:] = False
@@ -150,7 +150,7 @@ class BusSamples:
         servos = len(self.fresh)
         return bool(self.fresh[member] if member < servos else self.blocks_fresh[member - servos])
 
-    def take(self, servo: int, data: bytes | memoryview, at_ns: int) -> None:
+    def store_state(self, servo: int, data: bytes | memoryview, at_ns: int) -> None:
         """Store the reply of a member of the plan, which arrived at `at_ns`."""
         self._samples.take(self._number, servo, bytes(data), at_ns)
 

@@ -8,7 +8,7 @@ from collections.abc import Mapping, Sequence
 import msgspec
 from msgspec.structs import replace
 
-from dxlwire.transaction import BROADCAST_ID, PRESENCE, Awaited, Transaction
+from dxlwire.transaction import BROADCAST_ID, PRESENCE, ExpectedReply, Transaction
 from dxlwire.wire import protocol1
 from dxlwire.wire.dialect import Dialect
 
@@ -59,13 +59,15 @@ class Line(msgspec.Struct, frozen=True):
     def ping(self, servo_id: int) -> Transaction:
         """Return a transaction that pings one servo."""
         length = self.dialect.PING_LENGTH
-        return self._answered(self.dialect.ping(servo_id), servo_id, Awaited(servo_id, length, PRESENCE))
+        return self._answered(
+            self.dialect.ping(servo_id), servo_id, ExpectedReply(servo_id, length, PRESENCE)
+        )
 
-    def read(self, servo_id: int, address: int, length: int, spare: int = 0) -> Transaction:
+    def read_range(self, servo_id: int, address: int, length: int, spare: int = 0) -> Transaction:
         """Return a transaction that reads `length` bytes from `address`, after which `spare` more bytes
         are readable."""
-        packet = self.dialect.read(servo_id, address, length)
-        read = self._answered(packet, servo_id, Awaited(servo_id, length, address))
+        packet = self.dialect.read_range(servo_id, address, length)
+        read = self._answered(packet, servo_id, ExpectedReply(servo_id, length, address))
         return replace(read, spare=spare) if spare else read
 
     def read_many(self, requests: Sequence[tuple[int, int, int]], *, fast: bool = False) -> Transaction:
@@ -79,8 +81,8 @@ class Line(msgspec.Struct, frozen=True):
             ValueError: The protocol has no fast form.
         """
         if len(requests) == 1:
-            return self.read(*requests[0])
-        awaited = tuple(Awaited(servo_id, length, address) for servo_id, address, length in requests)
+            return self.read_range(*requests[0])
+        awaited = tuple(ExpectedReply(servo_id, length, address) for servo_id, address, length in requests)
         packet = self.dialect.read_many(requests, fast=fast)
         if not fast:
             return self._answered(packet, BROADCAST_ID, *awaited)
@@ -91,24 +93,24 @@ class Line(msgspec.Struct, frozen=True):
         timeout_ns = due_ns + self.latency_ns + TIMEOUT_MARGIN_NS
         return Transaction(packet, BROADCAST_ID, awaited, due_ns, timeout_ns, size, fast=True)
 
-    def write(self, servo_id: int, address: int, data: bytes) -> Transaction:
+    def write_range(self, servo_id: int, address: int, data: bytes) -> Transaction:
         """Return a transaction that writes data and awaits the acknowledgement; a write to the broadcast
         ID has none."""
-        packet = self.dialect.write(servo_id, address, data)
+        packet = self.dialect.write_range(servo_id, address, data)
         if servo_id == BROADCAST_ID:
             return self.unanswered(packet)
-        return self._answered(packet, servo_id, Awaited(servo_id, 0))
+        return self._answered(packet, servo_id, ExpectedReply(servo_id, 0))
 
     def instruct(self, servo_id: int, packet: bytes) -> Transaction:
         """Return a transaction that sends an instruction packet to one servo, which acknowledges it
         without data."""
-        return self._answered(packet, servo_id, Awaited(servo_id, 0))
+        return self._answered(packet, servo_id, ExpectedReply(servo_id, 0))
 
     def unanswered(self, packet: bytes) -> Transaction:
         """Return a transaction that sends a packet to which no servo replies."""
         return Transaction(packet, BROADCAST_ID, (), self.wire_ns(len(packet)), 0)
 
-    def _answered(self, packet: bytes, servo_id: int, *awaited: Awaited) -> Transaction:
+    def _answered(self, packet: bytes, servo_id: int, *awaited: ExpectedReply) -> Transaction:
         """Return a transaction whose replies follow one another, each after the return delay of its servo."""
         replies = sum(self.dialect.OVERHEAD + one.length for one in awaited)
         due_ns = self.wire_ns(len(packet) + replies) + sum(self.delay_ns(one.servo_id) for one in awaited)
@@ -124,15 +126,15 @@ def lengthen(read: Transaction, more: int, dialect: Dialect, byte_ns: int) -> Tr
     length = awaited.length + more
     return replace(
         read,
-        packet=dialect.read(awaited.servo_id, awaited.address, length),
-        awaited=(Awaited(awaited.servo_id, length, awaited.address),),
+        packet=dialect.read_range(awaited.servo_id, awaited.address, length),
+        awaited=(ExpectedReply(awaited.servo_id, length, awaited.address),),
         due_ns=read.due_ns + more * byte_ns,
         timeout_ns=read.timeout_ns + more * byte_ns,
         widest=dialect.widest(length),
     )
 
 
-def listen(duration_ns: int) -> Transaction:
+def listen_transaction(duration_ns: int) -> Transaction:
     """Return a transaction that sends nothing for `duration_ns`, while bytes from the line are received
     and logged."""
     return Transaction(b"", BROADCAST_ID, (), duration_ns, 0)

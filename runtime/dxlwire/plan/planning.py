@@ -137,8 +137,8 @@ def torque_off_ns(plan: BusPlan) -> int:
     servo."""
     line, total_ns = plan_line(plan), sum(each.due_ns for each in plan.limp)
     for servo in plan.servos:
-        write = line.write(servo.servo_id, servo.torque_address, b"\0")
-        read = line.read(servo.servo_id, servo.torque_address, 1)
+        write = line.write_range(servo.servo_id, servo.torque_address, b"\0")
+        read = line.read_range(servo.servo_id, servo.torque_address, 1)
         total_ns += write.due_ns + read.due_ns + 2 * plan.latency_ns
     return total_ns
 
@@ -171,7 +171,7 @@ def _torque_off(line: Line, servos: Sequence[ServoPlan]) -> list[Transaction]:
     Each address of Torque Enable gets its own sync write if models differ in it."""
     addresses = dict.fromkeys(servo.torque_address for servo in servos)
     if len(addresses) == 1:
-        return [line.write(BROADCAST_ID, address, b"\0") for address in addresses]
+        return [line.write_range(BROADCAST_ID, address, b"\0") for address in addresses]
     writes = ((servo.servo_id, servo.torque_address, b"\0") for servo in servos)
     return [line.unanswered(packet) for packet in sync_writes(line.dialect, writes)]
 

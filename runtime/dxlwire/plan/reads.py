@@ -69,7 +69,7 @@ def state_read(line: Line, members: Sequence[Member], more: int = 0, *, fast: bo
 def servo_read(line: Line, servo: ServoPlan) -> Transaction:
     """Return a transaction that reads position, velocity and effort of one servo."""
     state = servo.state
-    return line.read(servo.servo_id, state.address, state.length, state.spare)
+    return line.read_range(servo.servo_id, state.address, state.length, state.spare)
 
 
 def slow_items(table: ControlTable) -> tuple[str, ...]:

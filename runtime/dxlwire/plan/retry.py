@@ -7,8 +7,8 @@ import msgspec
 from msgspec.structs import replace
 
 from dxlwire.bus_plan import BusPlan
-from dxlwire.plan.line import LONGEST_RETURN_DELAY_NS, Line, listen
-from dxlwire.transaction import Outcome, Program, Reply, Result, Transaction
+from dxlwire.plan.line import LONGEST_RETURN_DELAY_NS, Line, listen_transaction
+from dxlwire.transaction import Program, Reply, Result, Transaction, TransactionOutcome
 from dxlwire.wire.dialect import dialect_of
 
 ATTEMPTS = 3
@@ -20,7 +20,7 @@ MOST_SILENCE_NS = 960_000_000
 merely late."""
 
 
-class ReplyTimes(msgspec.Struct):
+class ReplyLateness(msgspec.Struct):
     """Lateness of the replies on one bus, collected by `extend_timeouts`."""
 
     late_ns: list[int] = []
@@ -48,7 +48,7 @@ def retry(transaction: Transaction) -> Program[Reply]:
 
 def pause(duration_ns: int) -> Program[None]:
     """Send nothing for `duration_ns`; bytes that still arrive are received and logged."""
-    yield listen(duration_ns)
+    yield listen_transaction(duration_ns)
 
 
 def limit_patience(
@@ -81,7 +81,7 @@ def limit_patience(
 
 
 def extend_timeouts(
-    program: Program[Result], most_ns: int = LONGER_NS, times: ReplyTimes | None = None
+    program: Program[Result], most_ns: int = LONGER_NS, times: ReplyLateness | None = None
 ) -> Program[Result]:
     """Run a program of one bus with longer timeouts, until MOST_SILENCE_NS has been spent on lost replies.
 
@@ -107,9 +107,9 @@ def extend_timeouts(
             certain = reply.answered and reply.asked_ns == reply.sent_ns
             if times is not None and request.awaited and certain:
                 times.late_ns.append(reply.last_ns - reply.sent_ns - request.due_ns - reply.stalled_ns)
-            if times is not None and reply.outcome == Outcome.TIMEOUT:
+            if times is not None and reply.outcome == TransactionOutcome.TIMEOUT:
                 times.missing += 1
-            if reply.outcome in (Outcome.TIMEOUT, Outcome.GARBLED):
+            if reply.outcome in (TransactionOutcome.TIMEOUT, TransactionOutcome.GARBLED):
                 left_ns -= longer_ns
             request = program.send(reply)
     except StopIteration as end:

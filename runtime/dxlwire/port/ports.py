@@ -13,7 +13,7 @@ from typing import Protocol
 
 import msgspec
 
-from dxlwire.errors import PortError
+from dxlwire.exceptions import PortError
 
 # Local names save attribute lookups: these are called some dozen times a cycle.
 _write, _now_ns = os.write, time.monotonic_ns
@@ -58,7 +58,7 @@ class Port(Protocol):
 
     Raises PortError when the adapter is gone."""
 
-    def write(self, data: bytes | bytearray | memoryview) -> None:
+    def write_packet(self, data: bytes | bytearray | memoryview) -> None:
         """Write one whole packet to the line."""
         ...
 
@@ -121,7 +121,7 @@ class Ports(Protocol):
         """The open ports, in the order of the plan's buses."""
         ...
 
-    def wait(self, deadline_ns: int) -> Sequence[int]:
+    def wait_for_bytes(self, deadline_ns: int) -> Sequence[int]:
         """Wait for bytes on any line until `deadline_ns`; return the indices of the readable lines.
 
         The result is empty after the deadline. On virtual time the wait advances the clock. A deadline in
@@ -171,7 +171,7 @@ class SerialPort(OwnProcessors):
         """True after a wait reported this line as readable. An empty read then means that the line is
         lost."""
 
-    def write(self, data: bytes | bytearray | memoryview) -> None:
+    def write_packet(self, data: bytes | bytearray | memoryview) -> None:
         """Write one whole packet to the line. Raises PortError when the adapter is gone or accepts no
         bytes."""
         try:
@@ -252,12 +252,12 @@ class StallCounter:
 class SimulatingProcess(Protocol):
     """Process that simulates servos, as seen by the ports of a run."""
 
-    def stalled_ns(self, since_ns: int, until_ns: int) -> int:
+    def suspended_ns(self, since_ns: int, until_ns: int) -> int:
         """Return how long the process did not run between two times of CLOCK_MONOTONIC, ns."""
         ...
 
 
-class LineProgress(Protocol):
+class SimulatingLineProgress(Protocol):
     """Progress of the simulating process on one line, from memory that it shares; times are
     CLOCK_MONOTONIC, ns."""
 
@@ -296,7 +296,9 @@ class SimulatedPort(SerialPort):
     kernel's buffer. The limit is LONGEST_STALL_NS after the request. The deadline is counted from the time
     at which the process read the request."""
 
-    def __init__(self, descriptor: int, name: str, progress: LineProgress, stalls: StallCounter) -> None:
+    def __init__(
+        self, descriptor: int, name: str, progress: SimulatingLineProgress, stalls: StallCounter
+    ) -> None:
         super().__init__(descriptor, name)
         self._progress = progress
         self._stalls = stalls
@@ -330,7 +332,7 @@ class SimulatedPort(SerialPort):
 
     def stalled_ns(self, since_ns: int, until_ns: int) -> int:
         """Return how long the process of the simulated servos did not run between two times, ns."""
-        return self._progress.process.stalled_ns(since_ns, until_ns)
+        return self._progress.process.suspended_ns(since_ns, until_ns)
 
     def late_ns(self, off_wire_ns: int, heard_ns: int) -> int:
         """Return for how long (ns) the newest reply was late because the simulating process read or sent
@@ -373,7 +375,7 @@ class SerialPorts:
         """File descriptors of the lines; a reopened line keeps its number."""
         return [port.descriptor for port in self._ports]
 
-    def wait(self, deadline_ns: int) -> Sequence[int]:
+    def wait_for_bytes(self, deadline_ns: int) -> Sequence[int]:
         """Wait for bytes on any line until `deadline_ns` of CLOCK_MONOTONIC; return the indices of the
         readable lines. A past deadline only checks them."""
         left_ns = deadline_ns - _now_ns()

@@ -13,7 +13,7 @@ from pathlib import Path
 
 import msgspec
 
-from dxlwire.errors import PortError
+from dxlwire.exceptions import PortError
 from dxlwire.port.latency_timer import SYSTEM, shorten
 from dxlwire.port.ports import put_in_place, set_aside
 from dxlwire.port.serial_open import DescribeProcess, describe_no_process, let_go, open_serial, rate_remark
@@ -42,7 +42,7 @@ def lasting_name(path: str, lasting: Path = _LASTING) -> str:
     return next((str(link) for link in links if os.path.realpath(link) == device), path)
 
 
-class Wanted(msgspec.Struct, frozen=True):
+class LineSettings(msgspec.Struct, frozen=True):
     """Device and settings with which a line is opened, from the robot file."""
 
     path: str
@@ -52,7 +52,7 @@ class Wanted(msgspec.Struct, frozen=True):
     boot_ns: int = 0  # Boot time of the adapter after it was plugged in and opened
 
 
-class Opened(msgspec.Struct, frozen=True):
+class OpenedLine(msgspec.Struct, frozen=True):
     """Result of opening one line."""
 
     index: int
@@ -71,7 +71,7 @@ class KeptLines:
 
     def __init__(
         self,
-        lines: Sequence[Wanted],
+        lines: Sequence[LineSettings],
         system: Path = SYSTEM,
         describe_holder: DescribeProcess = describe_no_process,
     ) -> None:
@@ -106,7 +106,7 @@ class KeptLines:
             raise
         threading.stack_size(_STACK)
         self._names = [lasting_name(line.path) for line in lines]
-        self._back: queue.SimpleQueue[Opened] = queue.SimpleQueue()
+        self._back: queue.SimpleQueue[OpenedLine] = queue.SimpleQueue()
         self._bell = os.eventfd(0, os.EFD_NONBLOCK | os.EFD_CLOEXEC)
 
     def fileno(self) -> int:
@@ -125,9 +125,9 @@ class KeptLines:
             return False
         return True
 
-    def returned(self) -> list[Opened]:
+    def returned(self) -> list[OpenedLine]:
         """Return the lines that were reopened since the last call. They have their old descriptors."""
-        found: list[Opened] = []
+        found: list[OpenedLine] = []
         if select.select([self._bell], [], [], 0)[0]:
             os.eventfd_read(self._bell)
         while not self._back.empty():
@@ -141,7 +141,7 @@ class KeptLines:
         let_go(self.descriptors)
         self.descriptors.clear()
 
-    def _open(self, index: int, path: str) -> Opened:
+    def _open(self, index: int, path: str) -> OpenedLine:
         line = self._lines[index]
         port = open_serial(
             path,
@@ -152,7 +152,7 @@ class KeptLines:
         )
         done, wrong = shorten(port.fileno(), path, line.latency_ns, self._system)
         remark = rate_remark(port, line.baud_rate)
-        return Opened(index, port.detach(), done, wrong, remark)
+        return OpenedLine(index, port.detach(), done, wrong, remark)
 
     def _keep_trying(self, index: int) -> None:
         pause_s = FIRST_PAUSE_S

@@ -11,7 +11,7 @@ from collections.abc import Callable, Iterable
 from contextlib import suppress
 from pathlib import Path
 
-from dxlwire.errors import PortError
+from dxlwire.exceptions import PortError
 from dxlwire.port.adapters import serial_devices
 from dxlwire.port.latency_timer import is_simulated
 from dxlwire.port.rights import command_for_access

@@ -66,11 +66,11 @@ class Dialect(Protocol):
         """Return the packet that asks a servo for a reply, to check its presence."""
         ...
 
-    def read(self, servo_id: int, address: int, length: int) -> bytes:
+    def read_range(self, servo_id: int, address: int, length: int) -> bytes:
         """Return the packet that reads `length` bytes of the control table from `address`."""
         ...
 
-    def write(self, servo_id: int, address: int, data: bytes) -> bytes:
+    def write_range(self, servo_id: int, address: int, data: bytes) -> bytes:
         """Return the packet that writes `data` into the control table from `address`."""
         ...
 

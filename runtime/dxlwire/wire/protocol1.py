@@ -29,7 +29,7 @@ _MOST_PARAMETERS = 0xFF - 2
 
 
 @unique
-class Instruction(IntEnum):
+class Protocol1Instruction(IntEnum):
     """Codes of the instructions that a host sends (e-Manual, "Instruction Details")."""
 
     PING = 0x01
@@ -59,12 +59,12 @@ REFUSALS = StatusError.RANGE | StatusError.CHECKSUM | StatusError.INSTRUCTION
 """Error bits that mean the servo did not execute the instruction."""
 
 _LENGTHS: Mapping[int, tuple[int, int]] = {
-    Instruction.PING: (2, 2),
-    Instruction.READ: (4, 4),
-    Instruction.WRITE: (4, 0xFF),
-    Instruction.REG_WRITE: (4, 0xFF),
-    Instruction.ACTION: (2, 2),
-    Instruction.FACTORY_RESET: (2, 2),
+    Protocol1Instruction.PING: (2, 2),
+    Protocol1Instruction.READ: (4, 4),
+    Protocol1Instruction.WRITE: (4, 0xFF),
+    Protocol1Instruction.REG_WRITE: (4, 0xFF),
+    Protocol1Instruction.ACTION: (2, 2),
+    Protocol1Instruction.FACTORY_RESET: (2, 2),
 }
 """Smallest and largest LEN of an instruction to one servo (e-Manual, "Instruction Details")."""
 _SENTENCES: Mapping[StatusError, str] = {
@@ -163,22 +163,22 @@ def status_packet(servo_id: int, error: int = 0, parameters: bytes = b"") -> byt
 
 def ping(servo_id: int) -> bytes:
     """Return the packet that asks a servo for an empty status, to check its presence."""
-    return instruction_packet(servo_id, Instruction.PING)
+    return instruction_packet(servo_id, Protocol1Instruction.PING)
 
 
-def read(servo_id: int, address: int, length: int) -> bytes:
+def read_range(servo_id: int, address: int, length: int) -> bytes:
     """Return the packet that reads `length` bytes of the control table from `address`."""
-    return instruction_packet(servo_id, Instruction.READ, bytes((address, length)))
+    return instruction_packet(servo_id, Protocol1Instruction.READ, bytes((address, length)))
 
 
-def write(servo_id: int, address: int, data: bytes) -> bytes:
+def write_range(servo_id: int, address: int, data: bytes) -> bytes:
     """Return the packet that writes `data` into the control table from `address`."""
-    return instruction_packet(servo_id, Instruction.WRITE, bytes((address,)) + data)
+    return instruction_packet(servo_id, Protocol1Instruction.WRITE, bytes((address,)) + data)
 
 
 def factory_reset(servo_id: int) -> bytes:
     """Return the packet that resets a servo's control table to factory values, including ID and baud rate."""
-    return instruction_packet(servo_id, Instruction.FACTORY_RESET)
+    return instruction_packet(servo_id, Protocol1Instruction.FACTORY_RESET)
 
 
 def bulk_read(requests: Sequence[tuple[int, int, int]], *, fast: bool = False) -> bytes:
@@ -192,7 +192,7 @@ def bulk_read(requests: Sequence[tuple[int, int, int]], *, fast: bool = False) -
     if fast:
         raise ValueError(NO_FAST_FORM)
     parameters = b"\0" + b"".join(bytes((length, one, address)) for one, address, length in requests)
-    return instruction_packet(BROADCAST_ID, Instruction.BULK_READ, parameters)
+    return instruction_packet(BROADCAST_ID, Protocol1Instruction.BULK_READ, parameters)
 
 
 read_many = bulk_read  # Common name in both dialects
@@ -219,4 +219,6 @@ def sync_write(address: int, length: int, data: Mapping[int, bytes]) -> bytes:
         if len(chunk) != length:
             raise ValueError(f"servo {one} gets {len(chunk)} bytes where {length} are announced")
     records = b"".join(bytes((one,)) + chunk for one, chunk in data.items())
-    return instruction_packet(BROADCAST_ID, Instruction.SYNC_WRITE, bytes((address, length)) + records)
+    return instruction_packet(
+        BROADCAST_ID, Protocol1Instruction.SYNC_WRITE, bytes((address, length)) + records
+    )

@@ -41,7 +41,7 @@ _BACKUP = b"\x43\x54\x52\x4c"
 
 
 @unique
-class Instruction(IntEnum):
+class Protocol2Instruction(IntEnum):
     """Codes of the instructions that a host sends (e-Manual, "Instruction")."""
 
     PING = 0x01
@@ -233,45 +233,45 @@ def status_packet(servo_id: int, error: int = 0, parameters: bytes = b"") -> byt
 
 def ping(servo_id: int = BROADCAST_ID) -> bytes:
     """Return the packet that asks one servo, or all, for model number and firmware version."""
-    return instruction_packet(servo_id, Instruction.PING)
+    return instruction_packet(servo_id, Protocol2Instruction.PING)
 
 
-def read(servo_id: int, address: int, length: int) -> bytes:
+def read_range(servo_id: int, address: int, length: int) -> bytes:
     """Return the packet that reads `length` bytes of the control table from `address`."""
-    return instruction_packet(servo_id, Instruction.READ, _word(address) + _word(length))
+    return instruction_packet(servo_id, Protocol2Instruction.READ, _word(address) + _word(length))
 
 
-def write(servo_id: int, address: int, data: bytes) -> bytes:
+def write_range(servo_id: int, address: int, data: bytes) -> bytes:
     """Return the packet that writes `data` into the control table from `address`."""
-    return instruction_packet(servo_id, Instruction.WRITE, _word(address) + data)
+    return instruction_packet(servo_id, Protocol2Instruction.WRITE, _word(address) + data)
 
 
 def factory_reset(servo_id: int, what: Reset) -> bytes:
     """Return the packet that resets a servo's control table to factory values; `what` decides about ID and
     baud rate."""
-    return instruction_packet(servo_id, Instruction.FACTORY_RESET, bytes((what,)))
+    return instruction_packet(servo_id, Protocol2Instruction.FACTORY_RESET, bytes((what,)))
 
 
 def reboot(servo_id: int) -> bytes:
     """Return the packet that restarts a servo; its RAM registers return to their defaults."""
-    return instruction_packet(servo_id, Instruction.REBOOT)
+    return instruction_packet(servo_id, Protocol2Instruction.REBOOT)
 
 
 def back_up(servo_id: int) -> bytes:
     """Return the packet that stores the control table in the backup inside the servo; refused while torque
     is on."""
-    return instruction_packet(servo_id, Instruction.CONTROL_TABLE_BACKUP, b"\x01" + _BACKUP)
+    return instruction_packet(servo_id, Protocol2Instruction.CONTROL_TABLE_BACKUP, b"\x01" + _BACKUP)
 
 
 def restore(servo_id: int) -> bytes:
     """Return the packet that restores the EEPROM from the backup inside the servo; the servo then reboots."""
-    return instruction_packet(servo_id, Instruction.CONTROL_TABLE_BACKUP, b"\x02" + _BACKUP)
+    return instruction_packet(servo_id, Protocol2Instruction.CONTROL_TABLE_BACKUP, b"\x02" + _BACKUP)
 
 
 def sync_read(address: int, length: int, servo_ids: Iterable[int], *, fast: bool = False) -> bytes:
     """Return the packet that reads `length` bytes from `address` of several servos; `fast`: they share one
     status."""
-    instruction = Instruction.FAST_SYNC_READ if fast else Instruction.SYNC_READ
+    instruction = Protocol2Instruction.FAST_SYNC_READ if fast else Protocol2Instruction.SYNC_READ
     parameters = _word(address) + _word(length) + bytes(servo_ids)
     return instruction_packet(BROADCAST_ID, instruction, parameters)
 
@@ -279,7 +279,7 @@ def sync_read(address: int, length: int, servo_ids: Iterable[int], *, fast: bool
 def bulk_read(requests: Iterable[tuple[int, int, int]], *, fast: bool = False) -> bytes:
     """Return the packet that reads different bytes from servos, given (ID, address, length) for each;
     `fast`: they share one status."""
-    instruction = Instruction.FAST_BULK_READ if fast else Instruction.BULK_READ
+    instruction = Protocol2Instruction.FAST_BULK_READ if fast else Protocol2Instruction.BULK_READ
     parameters = b"".join(
         bytes((servo_id,)) + _word(address) + _word(length) for servo_id, address, length in requests
     )
@@ -307,7 +307,7 @@ def sync_write(address: int, length: int, data: Mapping[int, bytes]) -> bytes:
             raise ValueError(f"servo {servo_id} gets {len(chunk)} bytes where {length} are announced")
     records = b"".join(bytes((servo_id,)) + chunk for servo_id, chunk in data.items())
     parameters = _word(address) + _word(length) + records
-    return instruction_packet(BROADCAST_ID, Instruction.SYNC_WRITE, parameters)
+    return instruction_packet(BROADCAST_ID, Protocol2Instruction.SYNC_WRITE, parameters)
 
 
 def _word(value: int) -> bytes:

@@ -50,7 +50,7 @@ class Receiver:
             self._accept(count, now_ns())
         return count
 
-    def feed(self, data: bytes, now_ns: int) -> None:
+    def feed_bytes(self, data: bytes, now_ns: int) -> None:
         """Add bytes that arrived at `now_ns`, and deliver the packets that are complete; keep an
         unfinished packet."""
         start = 0

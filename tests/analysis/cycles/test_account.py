@@ -8,10 +8,10 @@ import numpy as np
 import pytest
 from msgspec import structs
 
-from dxlrun.channels.packets import LoggedPacket
+from dxlrun.channels.logged_packets import LoggedPacket
 from dxlrun.log.columns import PacketColumns
 from dxlrun_analysis.causes.account import Account
-from dxlrun_analysis.plan import LoggedBus
+from dxlrun_analysis.plan_excerpt import LoggedBus
 from dxlrun_analysis.servos.exchanges import Pairing
 from dxlwire.packets import PacketKind
 
@@ -60,7 +60,7 @@ def split(took: int, packets: Sequence[LoggedPacket], *buses: LoggedBus) -> dict
     for name, us in zip(NAMES, times, strict=True):
         cycle[name] = us * 1000
     cycle["long"] = True
-    account = Account(cycle, None, PacketColumns.of(packets), Pairing(buses or (BUS,)), ("head",))
+    account = Account(cycle, None, PacketColumns.from_packets(packets), Pairing(buses or (BUS,)), ("head",))
     found = {(name.kind, name.bus, name.servo_id): ns / 1000 for name, ns in account.shares.items()}
     del found["own work", -1, -1]
     return found

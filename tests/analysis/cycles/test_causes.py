@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 from tests.kit.made_logs import Cycle, Wire
 
-from dxlrun.log.reader import Log, read_log
+from dxlrun.log.log_reader import Log, read_log
 from dxlrun_analysis.causes.causes import Causes, CycleCauses
 from dxlrun_analysis.counts import has_them_alone
 from dxlwire.packets import PacketKind
@@ -116,8 +116,8 @@ def run(write: Make) -> Run:
 def causes_of(log: Log, pieces: int = 1) -> Causes:
     found = CycleCauses()
     for part in sliced(log, pieces):
-        found.take(part)
-    return found.finish()
+        found.add_slice(part)
+    return found.find_causes()
 
 
 def sliced(log: Log, pieces: int) -> Iterator[Log]:
@@ -126,7 +126,7 @@ def sliced(log: Log, pieces: int) -> Iterator[Log]:
     begins = [0, *(int(log.cycles["woken_ns"][part[0]]) for part in parts[1:]), 1 << 62]
     for part, (begin, end) in zip(parts, itertools.pairwise(begins), strict=True):
         mine = (log.packets.first_ns >= begin) & (log.packets.first_ns < end)
-        yield replace(log, cycles=log.cycles[part], packets=log.packets.take(mine))
+        yield replace(log, cycles=log.cycles[part], packets=log.packets.select_rows(mine))
 
 
 def shares(found: Causes) -> dict[tuple[str, str], float]:

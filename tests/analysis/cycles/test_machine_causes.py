@@ -11,11 +11,11 @@ import pytest
 from tests.kit.made_logs import Cycle
 
 from dxlrun.log import schemas
-from dxlrun.log.reader import read_log
-from dxlrun.log.reading.topics import LoggedTopic
+from dxlrun.log.log_reader import read_log
+from dxlrun.log.reading.logged_topics import LoggedTopic
 from dxlrun.messages.cdr import Codec
 from dxlrun_analysis.causes.causes import Causes, CycleCauses
-from dxlrun_analysis.causes.machine import INTERRUPTS, OTHERS, STEAL
+from dxlrun_analysis.causes.machine_history import INTERRUPTS, OTHERS, STEAL
 
 Make = Callable[..., Any]
 SECOND = 10**9
@@ -52,8 +52,8 @@ def found(write: Make) -> Callable[..., Causes]:
         times = np.zeros(len(samples), np.int64)
         topics = {"/machine": LoggedTopic("/machine", kind, times, samples)}
         causes = CycleCauses()
-        causes.take(replace(log, topics=topics))
-        return causes.finish()
+        causes.add_slice(replace(log, topics=topics))
+        return causes.find_causes()
 
     return causes_of
 

@@ -7,13 +7,13 @@ from dataclasses import replace
 import pytest
 from tests.analysis.judged import totals
 
+from dxlrun_analysis.causes.cause_tables import causes_table
 from dxlrun_analysis.causes.causes import Causes
-from dxlrun_analysis.causes.machine import STEAL
-from dxlrun_analysis.causes.rules import own_work
-from dxlrun_analysis.causes.tables import causes_table
-from dxlrun_analysis.cycles.worst import Cause, CauseKind, CauseShare
+from dxlrun_analysis.causes.loop_rules import own_work
+from dxlrun_analysis.causes.machine_history import STEAL
+from dxlrun_analysis.cycles.worst_cycles import Cause, CauseKind, CauseShare
 from dxlrun_analysis.finding import Finding, Rank
-from dxlrun_analysis.verdict import judge
+from dxlrun_analysis.verdict import judge_run
 
 OTHER = Cause("unexplained", "", 20, 30_000_000, 2_000_000, 30_000_000)
 
@@ -69,7 +69,9 @@ def test_two_long_cycles_accuse_nothing() -> None:
 def test_machine_that_made_most_of_the_long_cycles_is_named(cycles: int, named: bool) -> None:
     stolen = replace(cause("machine", STEAL), cycles=cycles)
     causes = Causes(5, 10, 100_000_000, (stolen, OTHER), throttled=4)
-    machine = [one.sentence for one in judge(totals(causes=causes)).findings if one.code == "busy_machine"]
+    machine = [
+        one.sentence for one in judge_run(totals(causes=causes)).findings if one.code == "busy_machine"
+    ]
     assert len(machine) == named
     assert all("steal by the host took 70.00 ms of 100.00 ms" in one for one in machine)
     assert all("the processor was hot and slow for 4 seconds" in one for one in machine)
@@ -95,4 +97,4 @@ def test_a_cause_in_a_sentence_has_its_subject_and_what_the_machine_did_is_the_c
         CauseShare("controller", "arm", 4.0),
         CauseShare("own work", "", 1.0),
     )
-    assert [share.name for share in shares] == ["steal by the host", "controller of arm", "own work"]
+    assert [share.label for share in shares] == ["steal by the host", "controller of arm", "own work"]

@@ -69,7 +69,7 @@ def made(tmp_path: Path) -> Callable[..., Path]:
             record.states.age_ns[:] = np.where(np.isfinite(positions), 0, -1)
             record.goals.position[:] = goals
             record.goals.velocity[:] = speeds
-            log.take(RecordKind.CYCLE, record.raw)
+            log.write_record(RecordKind.CYCLE, record.raw)
         log.close()
         return path
 

@@ -16,7 +16,7 @@ from mcap.reader import make_reader
 from mcap.writer import Writer
 from tests.kit.answers import result_of
 
-from dxlrun.log.reader import read_log
+from dxlrun.log.log_reader import read_log
 from dxlrun_analysis.export.lerobot import write_dataset
 
 Export = Callable[..., tuple[int, str, list[str]]]

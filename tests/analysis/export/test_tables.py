@@ -14,10 +14,10 @@ from tests.kit.answers import result_of
 from tests.kit.pages import page_text
 
 from dxlrun.errors import InputError
-from dxlrun.log.reader import open_log, read_log
+from dxlrun.log.log_reader import open_log, read_log
 from dxlrun.output.target import new_target
 from dxlrun.testing import simulated_robot
-from dxlrun_analysis.export.tables import WITHOUT_TABLE
+from dxlrun_analysis.export.arrow_tables import WITHOUT_TABLE
 
 Export = Callable[..., tuple[int, str, list[str]]]
 NAN = float("nan")

@@ -14,7 +14,7 @@ from tests.kit.answers import result_of
 
 from dxlrun import ROTARY
 from dxlrun.description.motion import read_motion as read_motion_file
-from dxlrun.log.reader import Log, read_log
+from dxlrun.log.log_reader import Log, read_log
 from dxlrun.plan.loop_plan import ControllerPlan
 from dxlrun_analysis.playback.motion_file import motion_file
 from dxlrun_analysis.playback.recorded_motion import RecordedMotion

@@ -16,11 +16,11 @@ from tests.kit.answers import result_of
 
 from dxlrun import ROTARY
 from dxlrun.errors import InputError
-from dxlrun.log.reader import Log, read_log
+from dxlrun.log.log_reader import Log, read_log
 from dxlrun.plan.loop_plan import JointPlan
 from dxlrun.plan.robot_plan import Plan
 from dxlrun_analysis.playback.recorded_motion import RecordedMotion
-from dxlrun_analysis.playback.rows import Rows, rows_of
+from dxlrun_analysis.playback.rows import PlaybackRows, rows_of
 from dxlrun_analysis.playback.sources import read_motion
 from dxlrun_lab.commands import on_robot
 from dxlrun_lab.guided import virtual_rig
@@ -226,7 +226,7 @@ def motion(position: np.ndarray, seconds: float) -> RecordedMotion:
     return RecordedMotion(Path("a.mcap"), ("pan",), ("states",), times, position[:, None], 0.0, (ROTARY,))
 
 
-def rows(position: np.ndarray, seconds: float = 2.0, **limits: Any) -> Rows:
+def rows(position: np.ndarray, seconds: float = 2.0, **limits: Any) -> PlaybackRows:
     plan = JointPlan("pan", **{"lower": -1.0, "upper": 1.0, "velocity": 5.0, **limits})
     return rows_of(motion(position, seconds), {"pan": plan}, speed=1.0, tolerance=0.01, period_s=0.01)
 

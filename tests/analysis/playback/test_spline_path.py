@@ -38,11 +38,11 @@ def test_it_is_within_the_tolerance(moments: list[tuple[float, float, float]], t
     times = np.cumsum(widths) - widths[0]
     path = fit(motion(times, first, second), np.array([tolerance, 2 * tolerance]))
     recorded = np.stack([first, second], axis=1)
-    assert (np.abs(path.at(times) - recorded).max(axis=0) <= (tolerance, 2 * tolerance)).all()
+    assert (np.abs(path.positions_at(times) - recorded).max(axis=0) <= (tolerance, 2 * tolerance)).all()
     # between two moments it goes no farther than half the tolerance beyond both, here of the larger one
     dense = np.linspace(0.0, times[-1], 2000)
-    assert path.at(dense).max() <= recorded.max() + 2 * tolerance
-    assert path.at(dense).min() >= recorded.min() - 2 * tolerance
+    assert path.positions_at(dense).max() <= recorded.max() + 2 * tolerance
+    assert path.positions_at(dense).min() >= recorded.min() - 2 * tolerance
 
 
 def test_noise_below_the_tolerance_disappears() -> None:
@@ -52,7 +52,7 @@ def test_noise_below_the_tolerance_disappears() -> None:
     true = 0.8 * np.sin(times)
     path = fit(motion(times, np.round(true / tick) * tick), np.array([STATE_TOLERANCE]))
     assert len(path.time_s) < 60
-    played, measured = path.at(times)[:, 0], np.round(true / tick) * tick
+    played, measured = path.positions_at(times)[:, 0], np.round(true / tick) * tick
     worst = [np.abs(np.diff(each, 2)).max() / 0.02**2 for each in (played, measured)]
     assert worst[1] > 12  # rad/s^2
     assert worst[0] < 4
@@ -62,6 +62,6 @@ def test_a_step_is_not_swung_beyond() -> None:
     times = np.arange(0.0, 1.0, 0.01)
     step = np.where(times < 0.5, 0.0, 1.0)
     path = fit(motion(times, step), np.array([0.002]))
-    dense = path.at(np.linspace(0, times[-1], 5000))
+    dense = path.positions_at(np.linspace(0, times[-1], 5000))
     assert dense.min() == pytest.approx(0.0, abs=0.002)
     assert dense.max() == pytest.approx(1.0, abs=0.002)

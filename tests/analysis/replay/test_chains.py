@@ -21,10 +21,10 @@ from numpy.typing import NDArray
 from tests.kit.anew import flip, plan
 from tests.kit.stories import Asked, ask, differing, plugin_folder, replayed, send, silence, switch, tell
 
-from dxlrun.channels.commands import Command
-from dxlrun.channels.events import EventCode
+from dxlrun.channels.commands import CommandMessage
+from dxlrun.channels.event_records import EventCode
 from dxlrun.errors import InputError, LogError
-from dxlrun.log.reader import read_log
+from dxlrun.log.log_reader import read_log
 from dxlrun.testing import VirtualRobot
 from dxlrun_analysis.replay import Setting, replay_log
 
@@ -247,9 +247,9 @@ def test_other_references_than_those_of_the_log_are_refused(
 INTO = {"top": {"middle"}, "spare": {"middle"}, "middle": {"base"}, "beside": {"base"}}
 
 
-def random_commands(dice: random.Random) -> dict[int, list[Command]]:
+def random_commands(dice: random.Random) -> dict[int, list[CommandMessage]]:
     """Return what clients ask in a second: switches, goals, cancels, parameters, torque, rates, pauses."""
-    asked: dict[int, list[Command]] = {}
+    asked: dict[int, list[CommandMessage]] = {}
     for _ in range(dice.randint(4, 16)):
         joints = dice.sample(("pan", "tilt", "nod"), dice.randint(1, 2))
         release = dice.random() < 0.7

@@ -11,7 +11,7 @@ from tests.kit.anew import add, flip, plan, put
 from tests.kit.stories import differing
 
 from dxlrun.errors import ControllerFault, InputError
-from dxlrun.log.reader import read_log
+from dxlrun.log.log_reader import read_log
 from dxlrun.testing import simulated_robot
 from dxlrun_analysis.replay import Setting, replay_log
 

@@ -14,12 +14,12 @@ from numpy.typing import NDArray
 from tests.kit.anew import plan
 from tests.kit.stories import differing
 
-from dxlrun.channels.commands import Command, encode_command
+from dxlrun.channels.commands import CommandMessage, encode_command
 from dxlrun.channels.tagged import decode
-from dxlrun.control.controllers.plugins import load_plugins
+from dxlrun.control.controllers.plugin_loading import load_plugins
 from dxlrun.description.motion import read_motion
-from dxlrun.log.reader import read_log
-from dxlrun.remote.motions import Running, play
+from dxlrun.log.log_reader import read_log
+from dxlrun.remote.motion_requests import RunSnapshot, schedule_motion
 from dxlrun.remote.preparation import Preparation
 from dxlrun.testing import VirtualRobot
 from dxlrun_analysis.replay import replay_log
@@ -41,19 +41,19 @@ def asked(robot: VirtualRobot) -> None:
     preparation = Preparation({joint.name: joint for joint in robot.plan.loop.joints}, load_plugins())
     waiting, record = robot.inbox.waiting, robot.record
 
-    def take(original: Any = robot.inbox.take) -> Any:
+    def take(original: Any = robot.inbox.drain_commands) -> Any:
         if record.cycle % 5 == 3 and record.cycle < 30:
             body = msgspec.json.encode({"points": [{"time": 0.1, "positions": [0.01 * record.cycle]}]})
             made = preparation.command(plans["head"], "trajectory", body)
-            waiting.append(Command(0, "head", "trajectory", made.data, "anna", request=made.request))
+            waiting.append(CommandMessage(0, "head", "trajectory", made.data, "anna", request=made.request))
         if record.cycle == 40:
             compiled = {"head": preparation.compiled(structs.replace(plans["head"], active=True))}
             motion = read_motion(Path(robot.plan.source_file).with_name("look.yaml"))
-            played = play(motion, Running(compiled, preparation.joints, record), 1.0)
-            waiting.append(Command(0, "", "play", played.data, "anna", request=played.request))
+            played = schedule_motion(motion, RunSnapshot(compiled, preparation.joints, record), 1.0)
+            waiting.append(CommandMessage(0, "", "play", played.data, "anna", request=played.request))
         return original()
 
-    robot.inbox.take = take  # type: ignore[method-assign]
+    robot.inbox.drain_commands = take  # type: ignore[method-assign]
 
 
 def test_the_same_prepare_makes_the_same_arrays_and_another_one_is_found(
@@ -115,7 +115,7 @@ def test_a_request_that_the_log_does_not_have_is_reported(
 
 
 def test_a_request_is_left_out_where_there_is_no_room() -> None:
-    command = Command(7, "head", "positions", bytes(800), "anna", 5, b'{"positions":[1.0]}')
+    command = CommandMessage(7, "head", "positions", bytes(800), "anna", 5, b'{"positions":[1.0]}')
     assert decode(encode_command(command)) == command
     whole = len(encode_command(command))
     assert decode(encode_command(command, whole - 1)) == structs.replace(command, request=b"")

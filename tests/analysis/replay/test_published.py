@@ -13,8 +13,8 @@ from tests.kit.anew import Change, add, messages
 from tests.kit.stories import differing
 
 import dxlrun_lab.commands.replay
-from dxlrun.log.reader import read_log
-from dxlrun.output.terminal import show
+from dxlrun.log.log_reader import read_log
+from dxlrun.output.terminal import show_parts
 from dxlrun_analysis.replay import replay_log
 
 Changed = Callable[..., Path]
@@ -119,7 +119,7 @@ def test_what_is_shown_of_a_message_is_one_sentence(
     pair_log: Path, changed: Changed, capsys: pytest.CaptureFixture[str]
 ) -> None:
     report, _ = differing(changed(pair_log, flip(30, -1, 7)))
-    show(*dxlrun_lab.commands.replay._replayed(report))
+    show_parts(*dxlrun_lab.commands.replay._replayed(report))
     first = capsys.readouterr().out.splitlines()[1]
     value = struct.unpack("<d", read_log(pair_log).topics[TOPIC].data[30][-8:])[0]
     assert first == (

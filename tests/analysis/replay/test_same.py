@@ -14,12 +14,12 @@ from tests.kit.anew import command, edited
 from tests.kit.examples import as_parameters
 from tests.kit.stories import differing, replayed, silence
 
-from dxlrun.compile.robot import compile_files
+from dxlrun.compile.robot_compiler import compile_files
 from dxlrun.errors import InputError
-from dxlrun.log.reader import read_log
+from dxlrun.log.log_reader import read_log
 from dxlrun.testing import plan_of, simulated_robot
 from dxlrun_analysis.replay import replay_log
-from dxlrun_analysis.replay.recorded import recorded
+from dxlrun_analysis.replay.recorded_inputs import recorded
 
 ROBOTS = Path(__file__).parents[3] / "robots"
 DXLRUN = Path(sys.executable).with_name("dxlrun")

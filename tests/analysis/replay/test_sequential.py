@@ -11,13 +11,13 @@ import pytest
 from msgspec import structs
 from tests.kit.totals import totals_of
 
-from dxlrun.compile.robot import compile_files
+from dxlrun.compile.robot_compiler import compile_files
 from dxlrun.errors import LogError
-from dxlrun.log.reader import read_log
+from dxlrun.log.log_reader import read_log
 from dxlrun.testing import VirtualRobot
-from dxlrun_analysis.replay import recorded, replay_log
+from dxlrun_analysis.replay import recorded_inputs, replay_log
 from dxlrun_analysis.report import analyze, facts
-from dxlrun_analysis.verdict import judge
+from dxlrun_analysis.verdict import judge_run
 
 ROBOTS = Path(__file__).parents[3] / "robots"
 PERIOD_NS = 3_125_000
@@ -68,7 +68,7 @@ def test_its_analysis_finds_one_rate_and_every_period(log: Path) -> None:
     assert report.verdict.good
     sentence = "Cycles followed each other, not the clock: 320 periods of 320 Hz took 1."
     assert any(one.startswith(sentence) for one in report.verdict.sentences)
-    assert judge(totals_of(log)).sentences[1] == report.verdict.sentences[1]
+    assert judge_run(totals_of(log)).sentences[1] == report.verdict.sentences[1]
     assert report.totals.periods.rates_hz == (320.0,)
     assert (report.totals.periods.elapsed, report.totals.periods.skipped, report.totals.periods.agree) == (
         320,
@@ -85,12 +85,12 @@ def test_times_that_no_sequence_has_are_refused(log: Path) -> None:
     cycles = read.cycles.copy()
     cycles["scheduled_ns"][100] -= 1
     with pytest.raises(LogError, match="the times of cycle 100 contradict its number"):
-        recorded.recorded(replace(read, cycles=cycles))
+        recorded_inputs.recorded(replace(read, cycles=cycles))
 
 
 def test_an_absolute_schedule_would_not_have_such_times(log: Path) -> None:
     read = read_log(log)
     data = read.attachments["plan.json"].replace(b'"schedule":"sequential"', b'"schedule":"absolute"')
     with pytest.raises(LogError, match="contradict its number"):
-        recorded.recorded(replace(read, attachments={**read.attachments, "plan.json": data}))
+        recorded_inputs.recorded(replace(read, attachments={**read.attachments, "plan.json": data}))
     assert np.diff(read.cycles["scheduled_ns"]).max() > PERIOD_NS

@@ -21,10 +21,10 @@ from tests.kit.anew import Change, command, flip, no_commands, without
 from tests.kit.stories import Asked, ask, differing, rate, replayed, send, silence, switch, torque
 from tests.kit.stories import tell as tell_story
 
-from dxlrun.channels.commands import Command
-from dxlrun.channels.events import EventCode
+from dxlrun.channels.commands import CommandMessage
+from dxlrun.channels.event_records import EventCode
 from dxlrun.errors import LogError
-from dxlrun.log.reader import read_log
+from dxlrun.log.log_reader import read_log
 from dxlrun.plan.loop_plan import ControllerPlan
 from dxlrun.testing import VirtualRobot
 from dxlrun_analysis.conduct.client_commands import client_commands, policy_begun
@@ -45,7 +45,7 @@ LOADED = ControllerPlan(
 )  # fmt: skip
 
 
-def register(joint: str, item: str, value: int) -> Command:
+def register(joint: str, item: str, value: int) -> CommandMessage:
     return ask("register", {"joint": joint, "item": item, "value": value})
 
 
@@ -64,7 +64,10 @@ STORIES: dict[str, Asked] = {
         3: [switch(["direct"], ["all_inputs"])],
         **{n: [send("direct", "positions", 0.01 * n, 0.1, lease_ns=50 * MS)] for n in range(4, 15)},
         30: [send("direct", "positions", 0.2, 0.3)],
-        35: [Command(0, "direct", "positions", b"thirteen byte", "mallory"), ask("what", {"is": "this"})],
+        35: [
+            CommandMessage(0, "direct", "positions", b"thirteen byte", "mallory"),
+            ask("what", {"is": "this"}),
+        ],
     },
     "a controller that is loaded": {
         5: GUESTS,
@@ -91,7 +94,7 @@ STORIES: dict[str, Asked] = {
         9: [ask("get", {"joint": "nod", "item": "punch"}), ask("get", {"joint": "nobody", "item": "punch"})],
     },
     "a stop in a pause": {10: [ask("pause")], 20: [ask("stop")]},
-    "rubbish": {4: [Command(0, "", "switch", b'{"activate": ["\xff"]}', "mallory"), ask("policy")]},
+    "rubbish": {4: [CommandMessage(0, "", "switch", b'{"activate": ["\xff"]}', "mallory"), ask("policy")]},
 }
 
 
@@ -241,7 +244,7 @@ COMMANDS = st.one_of(
     suppress_health_check=[HealthCheck.function_scoped_fixture],
 )
 @given(st.dictionaries(st.integers(0, 45), st.lists(COMMANDS, min_size=1, max_size=4), max_size=15))
-def test_any_sequence_of_commands(steer: Callable[..., Path], asked: dict[int, list[Command]]) -> None:
+def test_any_sequence_of_commands(steer: Callable[..., Path], asked: dict[int, list[CommandMessage]]) -> None:
     replayed(steer({**asked, 60: [ask("stop")]}))  # a pause has no end
 
 

@@ -12,8 +12,8 @@ import pytest
 from tests.kit.browser import CHROMIUM, Browser
 from tests.kit.made_logs import Cycle, Said, made_log
 
-from dxlrun.log.reader import read_log
-from dxlrun_analysis.page.page import analyzed_page
+from dxlrun.log.log_reader import read_log
+from dxlrun_analysis.page.report_page import analyzed_page
 
 Make = Callable[..., Any]
 pytestmark = pytest.mark.skipif(CHROMIUM is None, reason="no Chromium is installed; apt install chromium")

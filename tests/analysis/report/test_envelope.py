@@ -7,7 +7,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from dxlrun_analysis.page.envelope import Envelope, Rows
+from dxlrun_analysis.page.envelope import Envelope, EnvelopeRows
 from dxlrun_lab.figures import drawing
 
 VALUES = st.lists(st.one_of(st.floats(-1e6, 1e6), st.just(float("nan"))), min_size=1, max_size=300)
@@ -43,7 +43,7 @@ SLICES = st.lists(
 
 def laid(
     slices: list[list[tuple[int, float]]], most: int, width_ns: int
-) -> tuple[Rows, np.ndarray, np.ndarray]:
+) -> tuple[EnvelopeRows, np.ndarray, np.ndarray]:
     """Return the rows of an envelope of two curves, and the times and values that it took."""
     envelope = Envelope(2, most, width_ns)
     times, values, now = [], [], 10**15
@@ -54,7 +54,7 @@ def laid(
             times.append(now)
             values.append((value, -value))
         part = np.array(values[begin:], np.float32).reshape(-1, 2)
-        envelope.take(np.array(times[begin:], np.int64), part)
+        envelope.add_samples(np.array(times[begin:], np.int64), part)
     return envelope.rows(), np.array(times, np.int64), np.array(values, np.float32).reshape(-1, 2)
 
 
@@ -89,7 +89,7 @@ def test_slices_make_the_same_bins_as_the_whole() -> None:
 def test_bins_of_one_period_hold_one_sample_each() -> None:
     envelope = Envelope(1, 100, 20)
     times = np.arange(100, dtype=np.int64) * 20 + 10**12
-    envelope.take(times, np.arange(100, dtype=np.float32)[:, None])
+    envelope.add_samples(times, np.arange(100, dtype=np.float32)[:, None])
     rows = envelope.rows()
     np.testing.assert_array_equal(rows.t_ns, times)
     np.testing.assert_array_equal(rows.low, rows.high)
@@ -97,17 +97,17 @@ def test_bins_of_one_period_hold_one_sample_each() -> None:
 
 def test_samples_that_come_late_go_into_the_bin_of_their_time() -> None:
     envelope = Envelope(1, 4, 10)
-    envelope.take(np.array([100, 110, 120]), np.array([[1.0], [2.0], [3.0]], np.float32))
-    envelope.take(np.array([125, 112]), np.array([[9.0], [-9.0]], np.float32))
+    envelope.add_samples(np.array([100, 110, 120]), np.array([[1.0], [2.0], [3.0]], np.float32))
+    envelope.add_samples(np.array([125, 112]), np.array([[9.0], [-9.0]], np.float32))
     rows = envelope.rows()
     assert rows.t_ns.tolist() == [100, 110, 120]
     assert rows.low.ravel().tolist() == [1.0, -9.0, 3.0]
     assert rows.high.ravel().tolist() == [1.0, 2.0, 9.0]
 
 
-def rows_of(times: list[int]) -> Rows:
+def rows_of(times: list[int]) -> EnvelopeRows:
     values = np.arange(len(times), dtype=np.float32)[:, None]
-    return Rows(np.array(times, np.int64), values, values + 0.5)
+    return EnvelopeRows(np.array(times, np.int64), values, values + 0.5)
 
 
 def test_in_a_window_each_sample_has_a_row_and_no_bin_hides_what_lies_behind_it() -> None:

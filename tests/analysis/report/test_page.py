@@ -16,10 +16,10 @@ import numpy as np
 import pytest
 from tests.kit.made_logs import Cycle, Said, Wire, made_log
 
-from dxlrun.channels.events import EventCode, Severity
-from dxlrun.log.reader import read_log
+from dxlrun.channels.event_records import EventCode, Severity
+from dxlrun.log.log_reader import read_log
 from dxlrun.output.json import json_text
-from dxlrun_analysis.page.page import analyzed_page
+from dxlrun_analysis.page.report_page import analyzed_page
 from dxlrun_analysis.report import analyze, tables
 from dxlwire.packets import PacketKind
 
@@ -228,8 +228,8 @@ def test_a_log_of_nothing_but_nan_and_one_that_is_cut_give_a_page(
 
 def test_no_display_is_needed_and_nothing_is_warned_of(run: Path) -> None:
     code = (
-        "import sys; from dxlrun_analysis.page.page import analyzed_page;"
-        "from dxlrun.log.reader import read_log; log = read_log(sys.argv[1]);"
+        "import sys; from dxlrun_analysis.page.report_page import analyzed_page;"
+        "from dxlrun.log.log_reader import read_log; log = read_log(sys.argv[1]);"
         "print(len(analyzed_page(log)[1])); assert 'matplotlib' not in sys.modules"
     )
     environment = {

@@ -11,17 +11,17 @@ import pytest
 from numpy.typing import NDArray
 from tests.kit.made_logs import Cycle, Said, Wire, made_log
 
-from dxlrun.channels.events import EventCode, Severity
-from dxlrun.log.reader import Log, read_log
-from dxlrun_analysis.cycles.latency import Punctuality
-from dxlrun_analysis.page import curves as curves_module
+from dxlrun.channels.event_records import EventCode, Severity
+from dxlrun.log.log_reader import Log, read_log
+from dxlrun_analysis.cycles.punctuality import Punctuality
+from dxlrun_analysis.page import run_curves as curves_module
 from dxlrun_analysis.page.canvas import Canvas, Plot
-from dxlrun_analysis.page.curves import CurveCollector, CurvesOfRun, joint_curve
-from dxlrun_analysis.page.events import EventCollector, events_plot
-from dxlrun_analysis.page.joints import joint_plots
-from dxlrun_analysis.page.loop import latency_plots
-from dxlrun_analysis.page.page import analyzed_page
-from dxlrun_analysis.page.replies import ReplyCollector
+from dxlrun_analysis.page.event_plots import EventCollector, events_plot
+from dxlrun_analysis.page.joint_plots import joint_plots
+from dxlrun_analysis.page.loop_plots import latency_plots
+from dxlrun_analysis.page.reply_collector import ReplyCollector
+from dxlrun_analysis.page.report_page import analyzed_page
+from dxlrun_analysis.page.run_curves import CurveCollector, CurvesOfRun, joint_curve
 from dxlrun_analysis.report import analyze
 from dxlwire.packets import PacketKind
 
@@ -60,8 +60,8 @@ def logs(tmp_path_factory: pytest.TempPathFactory) -> dict[int, Log]:
 def collected(log: Log, worst_ns: tuple[int, ...] = (), slices: int = 1) -> CurvesOfRun:
     collector = CurveCollector(worst_ns)
     for cycles in np.array_split(log.cycles, slices):
-        collector.take(replace(log, cycles=cycles))
-    return collector.finish()
+        collector.add_slice(replace(log, cycles=cycles))
+    return collector.build_curves()
 
 
 def canvas_of(run: CurvesOfRun) -> Canvas:
@@ -156,8 +156,8 @@ def test_the_distribution_of_the_wake_ups_counts_each(logs: dict[int, Log]) -> N
     late = (log.cycles["woken_ns"] - log.cycles["scheduled_ns"]) / 1e3
     run = collected(log, slices=9)
     punctuality = Punctuality()
-    punctuality.take(log)
-    _, statistics = punctuality.finish()
+    punctuality.add_slice(log)
+    _, statistics = punctuality.compute_latency()
     assert statistics is not None
     first, second, third = latency_plots(canvas_of(run), run, statistics)
     assert first.model.y_scale.__class__.__name__ == "LogScale"
@@ -186,8 +186,8 @@ def test_reply_times_and_lost_replies_are_those_of_the_packets(write: Make) -> N
     packets.append(Wire(PacketKind.INSTRUCTION, 5, 1000 + 20 * 20_000, ask))  # open where the log ends
     log = read_log(write([Cycle(number) for number in range(20)], packets))
     collector = ReplyCollector()
-    analyze(log, exchanges=collector.take)
-    replies = collector.finish()
+    analyze(log, exchanges=collector.add_exchanges)
+    replies = collector.build_curves()
     times = replies.low("reply main 5")
     known = np.isfinite(times)
     np.testing.assert_allclose(times[known], [400 + 10 * number for number in range(20) if number != 7])
@@ -205,8 +205,8 @@ def test_each_event_is_on_the_row_of_its_kind_with_its_text(write: Make) -> None
     log = read_log(write([Cycle(number) for number in range(3)], (), happened))
     collector = EventCollector()
     for event in log.events:
-        collector.take(replace(log, events=(event,)))
-    events = collector.finish()
+        collector.add_slice(replace(log, events=(event,)))
+    events = collector.sort_events()
     assert events == log.events
     plot = events_plot(Canvas(0, 0, 10**9), events, 3)
     drawn = [(dict(data)["text"], dict(data)["y"].tolist()) for data, _ in glyphs(plot, "Scatter")]

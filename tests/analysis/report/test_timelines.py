@@ -10,15 +10,15 @@ import numpy as np
 import pytest
 from tests.kit.made_logs import Cycle
 
-from dxlrun.log.reader import Log, read_log
+from dxlrun.log.log_reader import Log, read_log
 from dxlrun.log.schemas import LogTopic
-from dxlrun_analysis.cycles.worst import CauseShare, TimelinePacket, WorstCycle
+from dxlrun_analysis.cycles.worst_cycles import CauseShare, TimelinePacket, WorstCycle
 from dxlrun_analysis.page.canvas import Canvas, Plot
-from dxlrun_analysis.page.curves import CurveCollector
-from dxlrun_analysis.page.machine import MachineCollector, machine_plots
-from dxlrun_analysis.page.page import page
-from dxlrun_analysis.page.replies import ReplyCollector
-from dxlrun_analysis.page.worst import worst_plots
+from dxlrun_analysis.page.machine_plots import MachineCollector, machine_plots
+from dxlrun_analysis.page.reply_collector import ReplyCollector
+from dxlrun_analysis.page.report_page import page
+from dxlrun_analysis.page.run_curves import CurveCollector
+from dxlrun_analysis.page.worst_plots import worst_plots
 from dxlrun_analysis.report import analyze
 
 Make = Callable[..., Any]
@@ -121,8 +121,8 @@ def sample(second: int, cores: int, **values: object) -> dict[str, Any]:
 def collected(*slices: Any) -> tuple[Any, tuple[int, ...]]:
     collector = MachineCollector()
     for one in slices:
-        collector.take(one)
-    return collector.finish()
+        collector.add_slice(one)
+    return collector.build_curves()
 
 
 def test_the_machine_is_drawn_as_it_was_sampled() -> None:
@@ -153,26 +153,26 @@ def test_a_log_without_samples_has_no_plots_of_the_machine() -> None:
 def test_the_error_is_that_against_the_goal_of_the_cycle_before(
     write: Make, slices: int, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr("dxlrun_analysis.page.curves._AT_ONCE", 1)
+    monkeypatch.setattr("dxlrun_analysis.page.run_curves._AT_ONCE", 1)
     made = [Cycle(n, position=0.1 * n, goal=n * n, valid=n != 5) for n in range(12)]
     log: Log = read_log(write(made))
     collector = CurveCollector()
     for part in np.array_split(log.cycles, slices):
-        collector.take(replace(log, cycles=part))
-    error = collector.finish().cycles.low("error left_elbow_joint")
+        collector.add_slice(replace(log, cycles=part))
+    error = collector.build_curves().cycles.low("error left_elbow_joint")
     expected = [np.nan, *(0.1 * n - (n - 1) ** 2 if n != 5 else np.nan for n in range(1, 12))]
     np.testing.assert_allclose(error, expected, rtol=1e-5)
 
 
 def test_the_page_has_timelines_and_the_machine(write: Make, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(
-        MachineCollector, "take", lambda collector, _: collector._add(sample(1, 2, temperature=55.0))
+        MachineCollector, "add_slice", lambda collector, _: collector._add(sample(1, 2, temperature=55.0))
     )
     log = read_log(write([Cycle(0), Cycle(1)]))
     report = analyze(log)
     causes = replace(report.totals.causes, worst=(WORST,))
     report = replace(report, totals=replace(report.totals, causes=causes))
-    text = page(log, report, ReplyCollector().finish())
+    text = page(log, report, ReplyCollector().build_curves())
     for name in ("worst-0", "machine-busy", "machine-temperature", "joint-0-error"):
         assert f'id="plot-{name}"' in text
     assert "late reply of servo 21 (head) 27.60 ms" in text

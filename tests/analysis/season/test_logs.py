@@ -22,14 +22,14 @@ from tests.kit.commands import Dxlrun, Said
 from tests.kit.held_logs import being_written, cut_end
 from tests.kit.pages import page_text
 
+from dxlrun.log.log_reader import read_log
 from dxlrun.log.log_writer import LogWriter
-from dxlrun.log.reader import read_log
 from dxlrun.log.schemas import LogHeader
 from dxlrun.plan.recording_plan import RecordingPlan
 from dxlrun.testing import VirtualRobot, plan_of, simulated_robot
 from dxlrun_analysis.latency import latency_log
 from dxlrun_analysis.report import analyze_log
-from dxlrun_analysis.season import runs
+from dxlrun_analysis.season import season_runs
 from dxlrun_analysis.season.pools import processes
 
 ROBOTS = Path(__file__).parents[3] / "robots"
@@ -84,24 +84,24 @@ def here(monkeypatch: pytest.MonkeyPatch) -> Here:
     def pool(count: int) -> Iterator[Executor]:
         yield InThisProcess()
 
-    monkeypatch.setattr(runs, "processes", pool)
+    monkeypatch.setattr(season_runs, "processes", pool)
     return read
 
 
-ROWS: dict[str, runs.Row] = {}  # Of the logs in `made`
+ROWS: dict[str, season_runs.Row] = {}  # Of the logs in `made`
 
 
 @pytest.fixture
 def known(season: Path, here: Here, monkeypatch: pytest.MonkeyPatch) -> Path:
     """The same; each log is analyzed once for all tests."""
-    row_of = runs.row_of
+    row_of = season_runs.row_of
 
-    def known(log: runs.FoundLog) -> runs.Row:
+    def known(log: season_runs.FoundLog) -> season_runs.Row:
         if log.name not in ROWS:
             ROWS[log.name] = row_of(log)
         return ROWS[log.name]
 
-    monkeypatch.setattr(runs, "row_of", known)
+    monkeypatch.setattr(season_runs, "row_of", known)
     return season
 
 
@@ -166,10 +166,10 @@ def test_a_table_that_is_damaged_or_of_other_code_is_made_anew(
 ) -> None:
     first = rows(dxlrun("logs", known, "--json"))
     here.clear()
-    (file,) = runs.cache_directory().rglob("*.parquet")
+    (file,) = season_runs.cache_directory().rglob("*.parquet")
     data = file.read_bytes()
     if damage == "code":
-        monkeypatch.setattr(runs, "runtime_hash", lambda: "0" * 64)
+        monkeypatch.setattr(season_runs, "runtime_hash", lambda: "0" * 64)
     elif damage == "text":
         file.write_text("no table")
     else:
@@ -326,8 +326,8 @@ def test_a_fault_of_the_analysis_hides_no_other_log(
             raise ArithmeticError("a strange log\nand more")
         return opened(path)
 
-    opened = runs.open_log
-    monkeypatch.setattr(runs, "open_log", strange)
+    opened = season_runs.open_log
+    monkeypatch.setattr(season_runs, "open_log", strange)
     found = rows(dxlrun("logs", season, "--json"))
     assert found["may/third.mcap"]["unreadable"] == "internal error: ArithmeticError: a strange log"
     assert found["first.mcap"]["robot"] == "bioloid_torso"
@@ -340,7 +340,7 @@ def test_a_process_that_ends_costs_its_own_log_only(
     (season / "dies.mcap").write_bytes((season / "first.mcap").read_bytes()[:-9])
     (season.parent / "deadly.py").write_text(
         "import os\n"
-        "from dxlrun_analysis.season.runs import row_of as true_row_of\n"
+        "from dxlrun_analysis.season.season_runs import row_of as true_row_of\n"
         "def row_of(log):\n"
         "    if log.name == 'dies.mcap':\n"
         "        os._exit(9)\n"
@@ -349,7 +349,7 @@ def test_a_process_that_ends_costs_its_own_log_only(
     monkeypatch.syspath_prepend(str(season.parent))
     import deadly
 
-    monkeypatch.setattr(runs, "row_of", deadly.row_of)
+    monkeypatch.setattr(season_runs, "row_of", deadly.row_of)
     for name in NAMES[1:]:
         (season / name).unlink()
     found = rows(dxlrun("logs", season, "--json"))
@@ -358,4 +358,4 @@ def test_a_process_that_ends_costs_its_own_log_only(
         "dies.mcap": reason,
         "first.mcap": None,
     }
-    assert processes is runs.processes
+    assert processes is season_runs.processes

@@ -17,7 +17,7 @@ from tests.kit.held_logs import being_written
 
 from dxlrun.plan.recording_plan import RecordingPlan
 from dxlrun.testing import VirtualRobot, plan_of, simulated_robot
-from dxlrun_analysis.season import runs
+from dxlrun_analysis.season import season_runs
 from dxlrun_analysis.season import store as stores
 
 JOINT = Path(__file__).parents[3] / "robots" / "single_joint.yaml"
@@ -46,7 +46,9 @@ def made(tmp_path_factory: pytest.TempPathFactory) -> Path:
 @pytest.fixture
 def logs(made: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
     """The same in a directory of the test, which keeps its tables there too; this process reads the logs."""
-    monkeypatch.setattr(runs, "_together", lambda logs, *_: {log.name: runs.row_of(log) for log in logs})
+    monkeypatch.setattr(
+        season_runs, "_together", lambda logs, *_: {log.name: season_runs.row_of(log) for log in logs}
+    )
     monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path / "cache"))
     return Path(shutil.copytree(made, tmp_path / "logs"))
 

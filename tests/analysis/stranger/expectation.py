@@ -14,7 +14,7 @@ from typing import Any
 from tests.analysis.stranger.kit import JOINTS, ROBOTS, Spec, Story
 from tests.kit.totals import totals_of
 
-from dxlrun_analysis.verdict import judge
+from dxlrun_analysis.verdict import judge_run
 
 BUSES = ("bus:left_knee", "bus:right_knee", "bus:head_yaw")
 HARDWARE = (*JOINTS, *BUSES, "hardware")
@@ -147,7 +147,7 @@ def compared(case: Case, robot: str, log: Path) -> Judged:
     totals = totals_of(log)
     for bus in totals.plan.buses:
         bus.noted = False  # It is judged as the log of real servos, as which the kit names its ports
-    verdict = judge(totals)
+    verdict = judge_run(totals)
     spec = ROBOTS[robot].spec
     blamed = [finding for finding in verdict.findings if finding.rank < max(type(finding.rank))]
     candidates = [*verdict.findings[:2], *blamed[: case.first]] if case.first else verdict.findings[:1]

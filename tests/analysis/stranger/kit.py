@@ -23,16 +23,16 @@ import numpy as np
 import pytest
 from msgspec.structs import replace
 
-from dxlrun.channels.commands import Command, QueueInbox
+from dxlrun.channels.commands import CommandMessage, QueueInbox
 from dxlrun.channels.cycle import Torque
-from dxlrun.control.controllers.plugins import load_plugins
-from dxlrun.log.reader import Log, read_log
+from dxlrun.control.controllers.plugin_loading import load_plugins
+from dxlrun.log.log_reader import Log, read_log
 from dxlrun.remote.preparation import Preparation
 from dxlrun.run import virtual_run
 from dxlrun.run.virtual_run import VirtualRobot
 from dxlrun.testing import simulated_robot
-from dxlsim.bus.line import Transmission
 from dxlsim.bus.simulated_bus import SimulatedBus
+from dxlsim.bus.simulated_line import LineTransmission
 from dxlsim.faults.fault import parse_fault
 from dxlsim.faults.script import FaultScript
 from dxlsim.servo.simulated_servo import SimulatedServo
@@ -146,18 +146,18 @@ class Client(QueueInbox):
         preparation = Preparation({joint.name: joint for joint in loop.joints}, load_plugins())
         plans = {plan.name: plan for plan in loop.controllers}
         self._clock = robot.clock
-        self._asks: deque[tuple[float, Command]] = deque()
+        self._asks: deque[tuple[float, CommandMessage]] = deque()
         name = itertools.cycle(names)
         for number, (at_s, controller, kind, what) in enumerate(sorted(asks, key=lambda ask: ask[0]), 1):
             data = json.dumps(what).encode()
             if controller:
                 data = preparation.command(plans[controller], kind, data).data
-            self._asks.append((at_s, Command(number, controller, kind, data, next(name))))
+            self._asks.append((at_s, CommandMessage(number, controller, kind, data, next(name))))
 
-    def take(self) -> Sequence[Command]:
+    def drain_commands(self) -> Sequence[CommandMessage]:
         while self._asks and self._asks[0][0] * S <= self._clock.now_ns():
             self.waiting.append(self._asks.popleft()[1])
-        return super().take()
+        return super().drain_commands()
 
 
 class Story:
@@ -307,7 +307,7 @@ class Story:
         """Return where a joint really is, rad."""
         entry = self.joint(joint)
         reference = math.radians(float(entry["reference"].split()[0]))
-        return float(entry["direction"]) * (self.servo(joint).position - reference)
+        return float(entry["direction"]) * (self.servo(joint).shaft_angle - reference)
 
     # What another host sends
 
@@ -411,10 +411,10 @@ class Story:
     def on_arrival(self, joint: str | int, change: Callable[[int, bytes, float], bytes]) -> None:
         """Change bytes between line and host: `change` gets ID, bytes and time; the servos notice nothing."""
 
-        def watch(arrive: Callable[[Transmission], None]) -> Callable[[Transmission], None]:
+        def watch(arrive: Callable[[LineTransmission], None]) -> Callable[[LineTransmission], None]:
             at = 2 if self.kind.protocol < 2 else 4
 
-            def changed(each: Transmission) -> None:
+            def changed(each: LineTransmission) -> None:
                 if each.note != "noise":
                     servo_id = each.group.turns[each.turn].servo_id if each.group else each.data[at]
                     each.data = change(servo_id, each.data, each.due_ns / S)
@@ -583,7 +583,7 @@ def freeze(story: Story, joint: str, since_s: float, *items: str) -> None:
 
 def _hold_back(story: Story, bus: SimulatedBus, late_s: Callable[[float], float], kind: str) -> None:
     held: deque[tuple[int, bytes]] = deque()
-    take, due = bus.take, bus.next_due_ns
+    take, due = bus.drain_bytes, bus.next_due_ns
 
     def late(now_ns: int, *, handed_ns: int | None = None) -> bytes:
         data = take(now_ns, handed_ns=handed_ns)
@@ -600,7 +600,7 @@ def _hold_back(story: Story, bus: SimulatedBus, late_s: Callable[[float], float]
         inner = due()
         return inner if not held else min(held[0][0], inner if inner is not None else held[0][0])
 
-    instead(bus, "take", lambda _: late)
+    instead(bus, "drain_bytes", lambda _: late)
     instead(bus, "next_due_ns", lambda _: next_due_ns)
 
 

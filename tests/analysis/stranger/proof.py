@@ -9,7 +9,7 @@ import numpy as np
 from tests.analysis.stranger.kit import S, Story, instead
 
 from dxlrun.errors import StartUpError
-from dxlrun.log.reader import Log
+from dxlrun.log.log_reader import Log
 
 Column = np.ndarray[Any, Any]  # What the log has of one joint, by cycle
 

@@ -50,7 +50,7 @@ def supply(
             if given is not None:
                 story.evidence[kind] += 1
                 servo.voltage = given
-                servo.protect()
+                servo.apply_protection()
 
     story.every(0.02, give, joint, since_s)
 

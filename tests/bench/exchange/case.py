@@ -8,7 +8,7 @@ from pathlib import Path
 
 from msgspec import structs
 
-from dxlrun.compile.robot import compile_robot
+from dxlrun.compile.robot_compiler import compile_robot
 from dxlrun.compile.simulation import simulation_of
 from dxlrun.description.reading import Description, read_robot
 from dxlrun.plan.robot_plan import Plan

@@ -8,8 +8,8 @@ import sys
 from collections.abc import Sequence
 
 from dxlrun.errors import DxlrunError, InputError
-from dxlrun.output.table import Column, Table, Value, numbers
-from dxlrun.output.terminal import print_error, print_warning, progress_bar, show
+from dxlrun.output.terminal import print_error, print_warning, progress_bar, show_parts
+from dxlrun.output.text_table import Column, Table, Value, numbers
 from exchange.bus import Against, BusBench, Settings, bench_bus, chosen_hosts, to_json
 from exchange.case import Case
 from exchange.figures import HostFigures
@@ -77,7 +77,7 @@ def _measure(options: argparse.Namespace) -> int:
     if options.json:
         sys.stdout.write(to_json(result).decode() + "\n")
     else:
-        show(bus_table(result))
+        show_parts(bus_table(result))
     unmeasured = [
         f"{one.host} ({case.servos} x {case.model}, {case.against})"
         for case in result.cases
@@ -150,7 +150,7 @@ def bus_table(result: BusBench) -> Table:
                     *(_wire(one) if wired else ()),
                 )
             )
-    return Table.of("", columns, rows)
+    return Table.from_rows("", columns, rows)
 
 
 def _ratios(first: HostFigures, one: HostFigures) -> tuple[str, str]:

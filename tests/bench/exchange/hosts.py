@@ -15,10 +15,10 @@ import numpy as np
 
 from dxlrun.channels.commands import NoCommands
 from dxlrun.channels.cycle import Torque
-from dxlrun.channels.events import EventBody
-from dxlrun.channels.packets import LONGEST_BATCH, PacketBatch, packet_capacity, split_packets
+from dxlrun.channels.event_records import EventBody
+from dxlrun.channels.logged_packets import LONGEST_BATCH, PacketBatch, packet_capacity, split_packets
 from dxlrun.channels.ring import Gap, Handover, RingReader, RingWriter, create
-from dxlrun.control.controllers.plugins import load_plugins
+from dxlrun.control.controllers.plugin_loading import load_plugins
 from dxlrun.plan.robot_plan import Plan
 from dxlrun.run.assembly import LoopHost, Sinks, assemble
 from dxlrun_lab.late_servos import Sent
@@ -79,7 +79,7 @@ class HostKind:
 class _Events:
     """Takes events and forgets them."""
 
-    def emit(self, source: str, event: EventBody, data: bytes = b"") -> None:
+    def emit_event(self, source: str, event: EventBody, data: bytes = b"") -> None:
         """Forget it."""
 
 
@@ -97,7 +97,7 @@ class Ours:
             self._ring = create("bench", packet_capacity(1_000_000, servos), LONGEST_BATCH)
             packets = PacketBatch(RingWriter(self._ring))
             self._recorded = RingReader(self._ring)
-        self._commit = packets.commit
+        self._commit = packets.commit_packets
         host = LoopHost(
             # exchanges follow each other without a pause, so a share of the time would not be one of a period
             ports=SerialPorts(
@@ -124,10 +124,10 @@ class Ours:
 
     def exchange(self) -> bool:
         """Read, set other goals, write, and hand the packets on, as a cycle does."""
-        self._hardware.read()
+        self._hardware.read_states()
         self._turn = 1 - self._turn
         self._goal[:] = self._goals[self._turn]
-        self._hardware.write()
+        self._hardware.write_goals()
         self._commit()
         return self._valid.tobytes() == self._everybody  # as cheap as what the peers return
 
@@ -143,7 +143,7 @@ class Ours:
     def sent(self) -> Sent:
         """Return what the log would say of instructions; nothing when more was written than a ring holds."""
         found: list[tuple[int, int]] = []
-        while self._recorded is not None and (record := self._recorded.read()) is not None:
+        while self._recorded is not None and (record := self._recorded.read_record()) is not None:
             if isinstance(record, Gap):
                 return ()  # bytes are counted: without some of them there is no result
             found += [

@@ -95,10 +95,10 @@ class Terminal:
 
     def _rehearse(self, data: bytes) -> None:
         bus = self._bus
-        bus.receive(data, max(time.monotonic_ns(), bus.now_ns))
+        bus.receive_bytes(data, max(time.monotonic_ns(), bus.now_ns))
         reply = bytearray()
         while (due_ns := bus.next_due_ns()) is not None:
-            reply += bus.take(due_ns)
+            reply += bus.drain_bytes(due_ns)
         if reply:
             os.write(self._master, reply)
         if self._learning:

@@ -7,7 +7,7 @@ from collections.abc import Sequence
 from pathlib import Path
 from types import TracebackType
 
-from dxlrun.channels import process
+from dxlrun.channels import child_processes
 from dxlrun.errors import ProcessFault
 from dxlrun.run.simulation_front import first_message, start_simulation
 from dxlsim.messages import SimulationJob
@@ -21,7 +21,7 @@ class SimulatedServos:
     """The process of the simulated buses, one a host; its ledger is whole when it was left."""
 
     def __init__(self, buses: Sequence[BusConfig], core: int, ledger: Path) -> None:
-        self._errors = process.memory_file("dxlrun-bench-stderr")
+        self._errors = child_processes.memory_file("dxlrun-bench-stderr")
         self._child = start_simulation(
             SimulationJob(SimulationConfig(tuple(buses)), str(ledger), _PRIORITY, core), self._errors
         )
@@ -35,8 +35,8 @@ class SimulatedServos:
     def __exit__(
         self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
     ) -> None:
-        self._child.end()
-        printed = process.whole(self._errors).decode(errors="replace").strip()
+        self._child.end_process()
+        printed = child_processes.whole(self._errors).decode(errors="replace").strip()
         os.close(self._errors)
         if error is None and self._child.process.returncode:
             raise ProcessFault(

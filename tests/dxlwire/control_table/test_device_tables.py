@@ -8,14 +8,14 @@ import tomllib
 
 import pytest
 
-from dxlwire.control_table import devices
-from dxlwire.control_table.device_table import read_device_table
-from dxlwire.control_table.devices import (
+from dxlwire.control_table import device_models
+from dxlwire.control_table.device_models import (
     add_device_table,
     device_table,
     device_tables,
     devices_by_number,
 )
+from dxlwire.control_table.device_table import read_device_table
 
 BOARD = """\
 kind = "device"
@@ -38,7 +38,7 @@ yaw = {address = 36, size = 4, encoding = "float32", tick = "1 rad", state = "or
 
 @pytest.fixture(autouse=True)
 def _no_added_tables(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(devices, "_ADDED", [])
+    monkeypatch.setattr(device_models, "_ADDED", [])
 
 
 def test_items_have_units_offsets_bits_and_floats() -> None:
@@ -136,7 +136,7 @@ def test_our_own_tables_are_whole() -> None:
     assert len({table.model for table in tables}) == len(tables)
     for table in tables:
         others = [each for each in tables if each is not table]
-        devices._refuse_twins(table, others)
+        device_models._refuse_twins(table, others)
         assert table.cyclic, table.model
         states = [table.items[name].state for name in table.cyclic]
         assert len(set(states)) == len(states), table.model

@@ -4,16 +4,16 @@ from pathlib import Path
 
 import pytest
 
-import dxlwire.control_table.models
+import dxlwire.control_table.servo_models
 from dxlwire.control_table import add_control_table, find_table, model_names, models_by_number
-from dxlwire.control_table.sources import resolve
+from dxlwire.control_table.table_files import resolve
 
 MINE = {'model = "AX-12A"': 'model = "Mine-1"', 'aliases = ["AX-12", "AX-12+"]': "aliases = []"}
 
 
 @pytest.fixture
 def forgotten(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(dxlwire.control_table.models, "_ADDED", {1.0: [], 2.0: []})
+    monkeypatch.setattr(dxlwire.control_table.servo_models, "_ADDED", {1.0: [], 2.0: []})
 
 
 @pytest.fixture

@@ -8,10 +8,10 @@ from typing import Any
 
 import pytest
 
-from dxlrun_lab.characterize.measured import Measured
-from dxlrun_lab.characterize.procedure import TOLERANCE, Characterize
+from dxlrun_lab.characterize.joint_figure import JointFigure
+from dxlrun_lab.characterize.procedure import TOLERANCE, CharacterizationExperiment
 from dxlrun_lab.guided.choice import situation_of
-from dxlrun_lab.guided.experiment import perform
+from dxlrun_lab.guided.experiment import perform_experiment
 from dxlrun_lab.guided.rig import Rig
 
 REFERENCES = {"AX-12A": "150 deg"}
@@ -22,7 +22,7 @@ class Done:
     result: Any
     rig: Rig
 
-    def figure(self, name: str) -> Measured:
+    def figure(self, name: str) -> JointFigure:
         (found,) = [one for one in self.result.joints[0].figures if one.name == name]
         return found
 
@@ -62,10 +62,12 @@ def measures(stage):
         if each_cycle is not None:
             rig.robot.link.each_cycle = lambda cycle: each_cycle(rig, cycle)
         experiment = (
-            Characterize(measurements, tolerance) if isinstance(measurements, Sequence) else measurements
+            CharacterizationExperiment(measurements, tolerance)
+            if isinstance(measurements, Sequence)
+            else measurements
         )
         situation = situation_of(rig, ["joint"], {"joint": (-reach, reach)})
-        done = perform(rig, experiment, situation)
-        return Done(experiment.finish(situation, done.recorded, done.why), rig)
+        done = perform_experiment(rig, experiment, situation)
+        return Done(experiment.evaluate_recordings(situation, done.recorded, done.why), rig)
 
     return measure

@@ -16,7 +16,7 @@ import pytest
 from dxlrun_lab.characterize import dead_band, gaps, rates, response, speeds
 from dxlrun_lab.characterize.trace import Trace
 from dxlrun_lab.guided.experiment import Procedure, Situation
-from dxlrun_lab.guided.segment import Recorded, Segment
+from dxlrun_lab.guided.segment import Segment, SegmentRecording
 from dxlsim.bus.ledger import Ledger
 from dxlsim.bus.simulated_bus import SimulatedBus
 from dxlsim.motion.control_law import ROWS
@@ -42,7 +42,7 @@ def on_a_bench(model: str, load: Load | None = None, delay_ns: int = 0, **regist
     config = ServoConfig(1, model, 2.6, load=load or Load(), times=ServoTimes(response_delay_ns=delay_ns))
     bus = SimulatedBus(BusConfig("main", 1_000_000, (config,), PROTOCOLS[model]), Ledger(), 0)
     write(bus.servo(1), **registers, torque_enable=1)
-    bus.advance(100 * MS)
+    bus.advance_to(100 * MS)
     return bus
 
 
@@ -63,15 +63,17 @@ def go(bus: SimulatedBus, angle: float) -> None:
 class OneSegment:
     """An experiment of one segment; its result is the joint's trace, and the time from which that counts."""
 
-    def moves(self, situation: Situation) -> Sequence[str]:
+    def describe_motions(self, situation: Situation) -> Sequence[str]:
         return ()
 
     def procedure(self, situation: Situation) -> Procedure:
         (joint,) = situation.joints
         yield Segment("to and fro", 0.1, {joint.name: joint.middle + 0.1 * (np.arange(20) % 2)})
 
-    def finish(self, situation: Situation, recorded: Sequence[Recorded], why: str) -> tuple[Trace, int]:
-        trace = Trace.of(recorded[0], situation.joints[0], situation.plan.buses)
+    def evaluate_recordings(
+        self, situation: Situation, recorded: Sequence[SegmentRecording], why: str
+    ) -> tuple[Trace, int]:
+        trace = Trace.from_recording(recorded[0], situation.joints[0], situation.plan.buses)
         return trace, int(recorded[0].of_cycles("woken_ns")[0])
 
 
@@ -148,12 +150,12 @@ def risen_s(model: str, delay_ns: int, step: float) -> float:
     bus = on_a_bench(model, delay_ns=delay_ns)
     for angle in (2.6 - step, 2.6):
         go(bus, angle)
-        bus.advance(bus.now_ns + 1000 * MS)
-    rest, began_ns, way = bus.servo(1).position, bus.now_ns, []
+        bus.advance_to(bus.now_ns + 1000 * MS)
+    rest, began_ns, way = bus.servo(1).shaft_angle, bus.now_ns, []
     go(bus, 2.6 + step)
     for now_ns in range(began_ns, began_ns + 1000 * MS, MS // 10):
-        bus.advance(now_ns)
-        way.append(bus.servo(1).position - rest)
+        bus.advance_to(now_ns)
+        way.append(bus.servo(1).shaft_angle - rest)
     return next(number for number, one in enumerate(way) if one >= response.PART * way[-1]) * 1e-4
 
 
@@ -310,9 +312,9 @@ def deviation(model: str, gap_s: float, size: float, fastest: float, speeds_too:
             goal = min(max(last, goal - fastest * CYCLE_S), goal + fastest * CYCLE_S)
             go(bus, 2.6 + goal)
             for part in (0.0, 0.25, 0.5, 0.75):
-                bus.advance(began_ns + round((number + part) * CYCLE_S * 1e9))
+                bus.advance_to(began_ns + round((number + part) * CYCLE_S * 1e9))
                 if number * CYCLE_S > gaps.FADE_S:
-                    way.append(servo.position)
+                    way.append(servo.shaft_angle)
         ways.append(way)
     return max(abs(a - b) for a, b in zip(*ways, strict=True))
 

@@ -11,15 +11,15 @@ from typing import Any
 import numpy as np
 import pytest
 
-from dxlrun_lab.characterize import dead_band, gaps, rates, response, speeds, tables
-from dxlrun_lab.characterize.measured import Measured
+from dxlrun_lab.characterize import characterization_tables, dead_band, gaps, rates, response, speeds
+from dxlrun_lab.characterize.joint_figure import JointFigure
 from dxlrun_lab.characterize.trace import Trace
 
 TICK = math.radians(0.088)
 Measures = Callable[..., Any]
 
 
-def stepping(noise: float, *, lag_s: float = 0.03, delay_s: float = 0.02) -> list[response.Step]:
+def stepping(noise: float, *, lag_s: float = 0.03, delay_s: float = 0.02) -> list[response.StepResponse]:
     """Return steps that begin with the square of the time behind a delay; `noise`, rad, of positions."""
     random, found = np.random.default_rng(3), []
     for rate in (44, 47, 51, 53, 57, 61):
@@ -35,8 +35,10 @@ def stepping(noise: float, *, lag_s: float = 0.03, delay_s: float = 0.02) -> lis
     return found
 
 
-def step_of(way: float, height: float) -> response.Step:
-    return response.Step(np.arange(50) * 0.01, np.full(50, way), np.full(50, height), height, way, 0.0, TICK)
+def step_of(way: float, height: float) -> response.StepResponse:
+    return response.StepResponse(
+        np.arange(50) * 0.01, np.full(50, way), np.full(50, height), height, way, 0.0, TICK
+    )
 
 
 def test_the_response_of_clean_steps_is_found_by_the_estimator_alone():
@@ -62,8 +64,11 @@ def test_noise_widens_the_interval_until_nothing_is_told():
     ],
 )
 def test_a_figure_that_is_not_told_from_0_is_an_upper_bound(value, uncertainty, words):
-    one = Measured("response", "s", value, uncertainty)
-    assert (tables.shown(one), tables.shown_uncertainty(one)) == words
+    one = JointFigure("response", "s", value, uncertainty)
+    assert (
+        characterization_tables.format_figure(one),
+        characterization_tables.shown_uncertainty(one),
+    ) == words
 
 
 def test_estimators_refuse_nothing_and_motions_without_motion():
@@ -74,7 +79,7 @@ def test_estimators_refuse_nothing_and_motions_without_motion():
         assert (figure.value, figure.why) == (None, "the joint hardly moved")
     assert dead_band.dead_band([], TICK, {}, TICK)[0].value is None
     assert gaps.longest_gap([], "position", 0.02, 0.004, 1.0).value is None
-    kept = [gaps.Gap(gap / 100, 0.001, False) for gap in range(1, 5)]
+    kept = [gaps.GapResult(gap / 100, 0.001, False) for gap in range(1, 5)]
     assert "stayed within 1.1 deg at the longest gap that was tried, 40 ms" in (
         gaps.longest_gap(kept, "position", 0.02, 0.004, 1.0).why
     )
@@ -95,20 +100,20 @@ def test_a_joint_that_does_not_follow_its_goal_has_no_dead_band():
 
 
 def test_a_longest_gap_is_one_that_left_the_path_or_in_which_the_joint_rested():
-    kept = gaps.Gap(0.01, 0.001, False)
-    rested = gaps.longest_gap([kept, gaps.Gap(0.02, 0.002, True)], "posvel", 0.02, 0.004, 1.0)
+    kept = gaps.GapResult(0.01, 0.001, False)
+    rested = gaps.longest_gap([kept, gaps.GapResult(0.02, 0.002, True)], "posvel", 0.02, 0.004, 1.0)
     assert (rested.value, rested.limit) == (pytest.approx(0.015), "it comes to rest between commands")
-    left = gaps.longest_gap([kept, gaps.Gap(0.02, 0.021, False)], "position", 0.0191, 0.004, 1.0)
+    left = gaps.longest_gap([kept, gaps.GapResult(0.02, 0.021, False)], "position", 0.0191, 0.004, 1.0)
     assert left.value == pytest.approx(0.01905)
     assert left.value - left.uncertainty <= 0.01 + 1e-12, "all that lies between the gaps that were tried"
 
 
 def test_the_machines_lateness_does_not_count_against_a_rate():
-    late = rates.Rate(500.0, 1000, lost=0, too_long=20, late=400, exchange_s=0.0008)
+    late = rates.RateResult(500.0, 1000, lost=0, too_long=20, late=400, exchange_s=0.0008)
     assert late.fault == ""
-    slow = rates.Rate(500.0, 1000, lost=0, too_long=990, late=0, exchange_s=0.0021)
+    slow = rates.RateResult(500.0, 1000, lost=0, too_long=990, late=0, exchange_s=0.0021)
     assert slow.fault == "bus"
-    assert rates.Rate(500.0, 1000, lost=2, too_long=0, late=0, exchange_s=0.0008).fault == "servo"
+    assert rates.RateResult(500.0, 1000, lost=2, too_long=0, late=0, exchange_s=0.0008).fault == "servo"
 
 
 @pytest.mark.parametrize(
@@ -124,7 +129,7 @@ def test_the_search_goes_on_to_the_next_rate_that_controllers_allow(begin, step,
     """A controller of 50 Hz, as most robots have one, leaves multiples of it: less than GROWS allows."""
     judged = []
     while (rate := rates.following(judged, begin, 410.0, Fraction(step))) is not None:
-        judged.append(rates.Rate(rate, 100, 0 if rate <= keeps else 50, 0, 0, 0.001))
+        judged.append(rates.RateResult(rate, 100, 0 if rate <= keeps else 50, 0, 0, 0.001))
     tried = sorted(one.rate for one in judged)
     if expected is not None:
         assert tried == expected

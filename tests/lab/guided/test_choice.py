@@ -10,7 +10,7 @@ import pytest
 
 from dxlrun.errors import InputError
 from dxlrun.testing import plan_of
-from dxlrun_lab.commands.on_robot import Chosen
+from dxlrun_lab.commands.on_robot import RobotFileArguments
 from dxlrun_lab.guided.choice import check_joints, parse_ranges, situation_of
 from dxlrun_lab.guided.virtual_rig import virtual_rig
 
@@ -109,7 +109,9 @@ def test_wrong_names_are_refused(rig):
 
 
 def test_words_are_a_robot_file_its_arguments_and_joints():
-    assert Chosen.of(["a.yaml", "port:=sim", "x", "y"]) == Chosen(Path("a.yaml"), ("port:=sim",), ("x", "y"))
-    assert Chosen.of(["x", "y"]) == Chosen(None, (), ("x", "y"))
+    assert RobotFileArguments.parse_words(["a.yaml", "port:=sim", "x", "y"]) == RobotFileArguments(
+        Path("a.yaml"), ("port:=sim",), ("x", "y")
+    )
+    assert RobotFileArguments.parse_words(["x", "y"]) == RobotFileArguments(None, (), ("x", "y"))
     with pytest.raises(InputError, match="port:=sim is an argument of a robot file, and there is none"):
-        Chosen.of(["x", "port:=sim"])
+        RobotFileArguments.parse_words(["x", "port:=sim"])

@@ -11,12 +11,12 @@ import msgspec
 import numpy as np
 import pytest
 
-from dxlrun.channels.commands import LOOP, Command
+from dxlrun.channels.commands import LOOP, CommandMessage
 from dxlrun.errors import DxlrunError, Refused
 from dxlrun.tooling.live import RunGone
 from dxlrun_lab.guided import experiment
 from dxlrun_lab.guided.choice import situation_of
-from dxlrun_lab.guided.experiment import Joint, perform
+from dxlrun_lab.guided.experiment import ExperimentJoint, perform_experiment
 from dxlrun_lab.guided.rig import RunningController
 from dxlrun_lab.guided.segment import Guard, Segment
 from dxlsim.faults.fault import parse_fault
@@ -75,14 +75,16 @@ def test_a_joint_whose_torque_is_switched_off_ends_it(stage):
 
     def off():
         data = msgspec.json.encode({"joints": ["elbow"], "on": False, "release": True})
-        rig.robot.link.gateways_link._mailbox.post(Command(1_000_000, LOOP, "torque", data, "a person"))
+        rig.robot.link.gateways_link._mailbox.post_command(
+            CommandMessage(1_000_000, LOOP, "torque", data, "a person")
+        )
 
     def segments(joint):
         in_half_a_second(rig, off)
         yield stage.sine(joint, 400, 3.0)
 
     plays = stage.Plays(segments)
-    done = perform(rig, plays, situation_of(rig, ["elbow"], {}))
+    done = perform_experiment(rig, plays, situation_of(rig, ["elbow"], {}))
     assert done.why == "experiment_position was deactivated"
     assert [part.whole for part in done.recorded] == [False]
     # its controllers cannot be active without torque, and that is said
@@ -109,7 +111,7 @@ def test_what_cannot_be_put_back_keeps_nothing_else_from_it():
             if "arm_a" in activate:
                 raise Refused("joint a has no torque", code="no_torque")
 
-        def unload(self, name):
+        def unload_controller(self, name):
             calls.append(("unload", name))
             if name == "experiment_position":
                 raise Refused("the robot is busy", code="busy")
@@ -138,7 +140,7 @@ def test_a_run_that_ends_in_the_middle_ends_it(stage):
         in_half_a_second(rig, rig.robot.link.simulated.stop.request)
         yield stage.sine(joint, 400, 3.0)
 
-    done = perform(rig, stage.Plays(segments), situation_of(rig, ["elbow"], {}))
+    done = perform_experiment(rig, stage.Plays(segments), situation_of(rig, ["elbow"], {}))
     assert done.why == "the run ended"
     assert done.not_restored == ("the run of effort_arm ended, so nothing could be put back",)
     assert [part.outcome for part in done.recorded] == ["reached", "aborted"]
@@ -163,7 +165,7 @@ def test_a_procedure_that_fails_leaves_the_run_as_it_was(stage):
 
     before = stage.state(rig)
     with pytest.raises(ZeroDivisionError):
-        perform(rig, stage.Plays(breaks), situation_of(rig, ["elbow"], {}))
+        perform_experiment(rig, stage.Plays(breaks), situation_of(rig, ["elbow"], {}))
     assert stage.state(rig) == before
 
 
@@ -192,7 +194,7 @@ def test_what_is_only_looked_at_takes_no_cycle_and_a_run_that_ended_is_an_error(
     assert link.simulated.cycles == cycles + 1
     link.simulated.stop.request()
     while link.alive:
-        link.turn()
+        link.run_cycle()
     assert rig.joints()
     with pytest.raises(RunGone, match="the run of effort_arm ended"):
         rig.robot.rate(400)
@@ -214,7 +216,7 @@ def test_an_abort_in_a_motion_cancels_its_goal(stage):
 def many(stage: Any, rng: random.Random) -> Any:
     """Return segments in random order: each interface, rates, approaches."""
 
-    def segments(joint: Joint) -> Iterator[Segment]:
+    def segments(joint: ExperimentJoint) -> Iterator[Segment]:
         def rows(value: float) -> dict[str, np.ndarray]:
             return {joint.name: np.full(120, value)}
 
@@ -252,8 +254,8 @@ def test_an_abort_at_any_time_leaves_the_run_as_it_was(stage, seed):
     _, done = stage.perform(rig, "elbow", many(stage, rng), abort)
     assert done.why == "" or done.why.startswith(("aborted by a key", "the servo of", "joint elbow has not"))
     assert all(part.whole for part in done.recorded[:-1])
-    assert not rig.robot.link.simulated.robot.loop.steering.inbox.take()
+    assert not rig.robot.link.simulated.robot.loop.steering.inbox.drain_commands()
     limit_s = rig.now_s + 1.0
     while rig.now_s < limit_s:
-        rig.robot.link.turn()
+        rig.robot.link.run_cycle()
     assert abs(rig.robot.link.simulated.record.states.velocity[1]) < 0.05, "the controllers of before hold it"

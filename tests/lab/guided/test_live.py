@@ -23,13 +23,13 @@ from tests.kit.experiments import ROOT
 import dxlrun
 from dxlrun.cli import main
 from dxlrun.errors import DxlrunError, InputError
-from dxlrun.log.reader import read_log
+from dxlrun.log.log_reader import read_log
 from dxlrun.remote.sockets import sockets
 from dxlrun.testing import VirtualRobot, plan_of
 from dxlrun_lab.commands import on_robot
-from dxlrun_lab.commands.on_robot import Aborting, OnRobot, run_on_robot
+from dxlrun_lab.commands.on_robot import AbortMonitor, ExperimentOptions, run_on_robot
 from dxlrun_lab.guided.choice import situation_of
-from dxlrun_lab.guided.experiment import Joint, perform
+from dxlrun_lab.guided.experiment import ExperimentJoint, perform_experiment
 from dxlrun_lab.guided.own_run import OwnRun
 from dxlrun_lab.guided.rig import live_rig
 from dxlrun_lab.guided.segment import Segment
@@ -85,8 +85,8 @@ def rig(robot):
     assert rig.close() == ()
 
 
-def two(stage: Any) -> Callable[[Joint], Iterator[Segment]]:
-    def segments(joint: Joint) -> Iterator[Segment]:
+def two(stage: Any) -> Callable[[ExperimentJoint], Iterator[Segment]]:
+    def segments(joint: ExperimentJoint) -> Iterator[Segment]:
         yield stage.sine(joint, 100, 0.5, settle_s=0.1)
         yield stage.sine(joint, 50, 0.5, loop_rate=50)
 
@@ -124,25 +124,25 @@ def test_a_paused_robot_and_a_second_experiment_are_refused(rig, robot):
     try:
         with pytest.raises(InputError, match="pair is paused; resume it first: dxlrun resume"):
             situation_of(rig, ["tilt"], {})
-        rig.load("experiment_pwm", {"type": "sample_player", "joints": ["tilt"]})
+        rig.load_controller("experiment_pwm", {"type": "sample_player", "joints": ["tilt"]})
     finally:
         robot.resume()
     try:
         with pytest.raises(InputError, match=r"another experiment works on pair \(experiment_pwm is"):
             situation_of(rig, ["tilt"], {})
     finally:
-        rig.unload("experiment_pwm")
+        rig.unload_controller("experiment_pwm")
     assert not rig.paused
 
 
 def test_of_two_experiments_that_begin_at_once_one_is_refused(rig, robot, stage):
     situation = situation_of(rig, ["tilt"], {})
-    rig.load("experiment_position", {"type": "sample_player", "joints": ["tilt"]})
+    rig.load_controller("experiment_position", {"type": "sample_player", "joints": ["tilt"]})
     before = stage.state(rig)
-    done = perform(rig, stage.Plays(two(stage)), situation)
+    done = perform_experiment(rig, stage.Plays(two(stage)), situation)
     assert (done.recorded, done.not_restored, stage.state(rig)) == ((), (), before)
     assert "experiment_position" in done.why
-    rig.unload("experiment_position")
+    rig.unload_controller("experiment_position")
 
 
 def logging_to(log: Path | None) -> Any:
@@ -183,7 +183,7 @@ def test_a_key_is_an_abort_with_the_rest_kept(robot, stage, monkeypatch, capsys)
 
         looking = live_rig(dxlrun.connect("pair"))
         state = stage.state(looking)
-        ran = run_on_robot(stage.Plays(segments), ["tilt"], OnRobot(range=("tilt=-15deg..15deg",)))
+        ran = run_on_robot(stage.Plays(segments), ["tilt"], ExperimentOptions(range=("tilt=-15deg..15deg",)))
         assert stage.state(looking) == state
         looking.close()
     assert (ran.why, ran.result, ran.exit_code) == ("aborted by a key", 2, 130)
@@ -227,7 +227,7 @@ def test_a_run_that_cannot_begin_says_why(place, stage):
     )
     plays = stage.Plays(lambda joint: iter([stage.sine(joint)]))
     with pytest.raises(DxlrunError, match=r"^there is no /dev/no_such_port"):
-        run_on_robot(plays, ["gone.yaml", "pan"], OnRobot(yes=True))
+        run_on_robot(plays, ["gone.yaml", "pan"], ExperimentOptions(yes=True))
     (place / "wrong.yaml").write_text(ROBOT.replace("rate: 100", "rat: 100").replace("id: 7", "id: 3"))
     with pytest.raises(InputError) as caught:
         run_on_robot(plays, ["wrong.yaml", "pan"])
@@ -243,7 +243,7 @@ def test_a_part_without_a_result_is_one_more_sentence(place, stage, capsys):
         yield stage.sine(joint, 100, 0.1)
         raise DxlrunError("no two responses are alike")
 
-    ran = run_on_robot(Asks(gives_up), ["pair.yaml", "pan"], OnRobot(virtual=True))
+    ran = run_on_robot(Asks(gives_up), ["pair.yaml", "pan"], ExperimentOptions(virtual=True))
     assert (ran.result, ran.exit_code) == (None, 1)
     assert capsys.readouterr().err.splitlines()[-2:] == [
         "pair: the experiment ended early: no two responses are alike; 1 piece measured before that",
@@ -253,7 +253,7 @@ def test_a_part_without_a_result_is_one_more_sentence(place, stage, capsys):
         run_on_robot(
             Asks(lambda joint: iter([stage.sine(joint, 100, 0.1)])),
             ["pair.yaml", "pan"],
-            OnRobot(virtual=True),
+            ExperimentOptions(virtual=True),
         )
 
 
@@ -264,7 +264,7 @@ def test_real_servos_are_asked_for_and_counted_down(place, stage, monkeypatch, c
     plays = stage.Plays(lambda joint: iter([stage.sine(joint, 100, 0.1)]))
     with open(os.devnull) as nothing:
         monkeypatch.setattr(sys, "stdin", nothing)
-        ran = run_on_robot(plays, ["pair.yaml", "pan"], OnRobot(virtual=True, yes=True))
+        ran = run_on_robot(plays, ["pair.yaml", "pan"], ExperimentOptions(virtual=True, yes=True))
     assert (ran.exit_code, len(plays.got)) == (0, 1)
     assert (
         "pan will move in 3 ...\npan will move in 2 ...\npan will move in 1 ...\n" in capsys.readouterr().err
@@ -284,7 +284,7 @@ def test_without_a_yes_no_run_is_started(place, stage, monkeypatch, capsys, answ
             os.write(ours, answer)
         elif answer is not None:
             threading.Timer(0.3, os.kill, (os.getpid(), signal.SIGINT)).start()
-        words, options = ["pair.yaml", "tilt"], OnRobot(range=("tilt=-15deg..15deg",))
+        words, options = ["pair.yaml", "tilt"], ExperimentOptions(range=("tilt=-15deg..15deg",))
         if answer is None:
             with pytest.raises(InputError, match="this is not a terminal, which could ask before they move"):
                 run_on_robot(plays, words, options)
@@ -355,7 +355,7 @@ def whole(log: Path) -> bool:
 
 def test_a_signal_in_the_middle_of_an_import_is_taken(monkeypatch):
     """It comes wherever the program is, and the modules of a run are imported while signals are taken."""
-    with Aborting() as aborting:
+    with AbortMonitor() as aborting:
         monkeypatch.setitem(sys.modules, "dxlrun_lab.guided.own_run", ModuleType("half"))
         signal.raise_signal(signal.SIGINT)
         assert aborting() == "aborted by Ctrl-C"

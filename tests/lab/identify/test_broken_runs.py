@@ -12,9 +12,9 @@ import pytest
 from dxlrun.channels.cycle import Torque
 from dxlrun.errors import InputError
 from dxlrun_lab.identify.fit import fit_run
-from dxlrun_lab.identify.measured import measured
+from dxlrun_lab.identify.joint_recording import measured
+from dxlrun_lab.identify.known_servo import Servo, servos_in
 from dxlrun_lab.identify.result import KnownLoad, identified
-from dxlrun_lab.identify.servo import Servo, servos_in
 from dxlwire.modes import Mode
 
 LOAD = KnownLoad(0.005, 0.3)

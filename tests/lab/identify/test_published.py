@@ -25,9 +25,9 @@ from numpy.typing import NDArray
 from dxlrun.channels.cycle import CycleLayout, Torque
 from dxlrun_lab.identify.excitation import Room, excitation
 from dxlrun_lab.identify.fit import fit_run
-from dxlrun_lab.identify.measured import measured
-from dxlrun_lab.identify.result import Identified, KnownLoad, identified
-from dxlrun_lab.identify.servo import Servo
+from dxlrun_lab.identify.joint_recording import measured
+from dxlrun_lab.identify.known_servo import Servo
+from dxlrun_lab.identify.result import IdentifiedServo, KnownLoad, identified
 from dxlwire.control_table import find_table
 from dxlwire.modes import Mode
 
@@ -75,7 +75,7 @@ def moved(goals: NDArray[np.float64], rate: int) -> NDArray[np.void]:
     )
 
 
-def result_of(cycles: NDArray[np.void], servo: Servo) -> Identified:
+def result_of(cycles: NDArray[np.void], servo: Servo) -> IdentifiedServo:
     run = measured(cycles, 0, servo)
     return identified(run, fit_run(run), KnownLoad(MASS * LENGTH**2, MASS * G * LENGTH), "test")
 

@@ -17,8 +17,8 @@ import pytest
 
 from dxlrun.description.joints.motor_file import motor_text, read_motor
 from dxlrun_lab.identify.fit import fit_run
-from dxlrun_lab.identify.measured import measured
-from dxlrun_lab.identify.result import Identified, KnownLoad, identified
+from dxlrun_lab.identify.joint_recording import measured
+from dxlrun_lab.identify.result import IdentifiedServo, KnownLoad, identified
 from dxlsim.motion.motor import Motor
 
 GRAVITY, INERTIA = 0.3, 0.005
@@ -27,7 +27,7 @@ LOAD = KnownLoad(INERTIA, GRAVITY)
 Record = Callable[..., Any]
 
 
-def result_of(run: Any, cycles: Any, load: KnownLoad = LOAD) -> Identified:
+def result_of(run: Any, cycles: Any, load: KnownLoad = LOAD) -> IdentifiedServo:
     data = measured(cycles, 0, run.servo)
     return identified(data, fit_run(data), load, "test")
 
@@ -46,7 +46,7 @@ def true_figures(motor: Motor) -> dict[str, float]:
     }
 
 
-def check_constants(found: Identified, motor: Motor, within: float) -> None:
+def check_constants(found: IdentifiedServo, motor: Motor, within: float) -> None:
     true = true_figures(motor)
     wrong = {
         value.name: (value.value, true[value.name])

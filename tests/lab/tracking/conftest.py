@@ -11,12 +11,12 @@ from pathlib import Path
 
 import pytest
 
-from dxlrun.compile.robot import compile_files
-from dxlrun.log.reader import Log, read_log
+from dxlrun.compile.robot_compiler import compile_files
+from dxlrun.log.log_reader import Log, read_log
 from dxlrun.plan.robot_plan import Plan
 from dxlrun.testing import VirtualRobot
-from dxlrun_lab.tracking.measurement import Measured, measure
-from dxlrun_lab.tracking.motion import DesiredMotion, desired_motion
+from dxlrun_lab.tracking.desired_motion import DesiredMotion, desired_motion
+from dxlrun_lab.tracking.motion_evaluation import SetupResult, measure_tracking
 from dxlrun_lab.tracking.setups import Setup, chosen
 from dxlsim.bus.ledger import LedgerEntry
 
@@ -47,8 +47,8 @@ class Ran:
     """How late each wake-up was made."""
 
     @property
-    def measured(self) -> Measured | None:
-        return measure(self.log, self.setup, self.desired, self.ledger)
+    def measured(self) -> SetupResult | None:
+        return measure_tracking(self.log, self.setup, self.desired, self.ledger)
 
 
 def at_random() -> Iterator[int]:

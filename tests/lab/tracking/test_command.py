@@ -16,16 +16,16 @@ from msgspec.structs import replace
 from tests.kit.answers import result_of
 from tests.kit.experiments import ROBOTS, commands_of
 
-from dxlrun.control import realtime
+from dxlrun.control import realtime_grants
 from dxlrun.output.terminal import fitted
 from dxlrun.run.run_summary import RunSummary
 from dxlrun_analysis.replay import replay_log
 from dxlrun_lab.stress import Stress
-from dxlrun_lab.tracking import experiment, setups
-from dxlrun_lab.tracking.experiment import Experiment
+from dxlrun_lab.tracking import setups, tracking_experiment
 from dxlrun_lab.tracking.figures import drawings
-from dxlrun_lab.tracking.report import page, table
 from dxlrun_lab.tracking.setups import SETUPS, Setup
+from dxlrun_lab.tracking.tracking_experiment import TrackingExperiment
+from dxlrun_lab.tracking.tracking_report import page, table
 
 Make = Callable[..., Any]
 NORMAL = "sequential-normal,loop-normal"
@@ -65,7 +65,7 @@ def test_two_setups_are_run_measured_and_shown(dxlrun, motion_file):
 def test_the_page_has_the_table_and_a_figure_a_setup_with_the_same_axes(runs):
     measured = [runs(name, "random").measured for name in NORMAL.split(",")]
     desired = runs("loop-normal", "random").desired
-    result = Experiment("single_joint", 3_125_000, desired, "2 busy processes", measured)
+    result = TrackingExperiment("single_joint", 3_125_000, desired, "2 busy processes", measured)
     text = page(result)
     assert not re.findall(r"""(?:src|href)=["'](?!#)""", text)
     numbers = json.loads(
@@ -106,7 +106,7 @@ def pretend(monkeypatch):
             plans.append(plan)
             return next(left)
 
-        monkeypatch.setattr(experiment, "run_robot", run_robot)
+        monkeypatch.setattr(tracking_experiment, "run_robot", run_robot)
         monkeypatch.setattr(setups, "missing_priority", lambda scheduler: "")
         return plans
 
@@ -145,7 +145,7 @@ def test_every_setup_has_its_schedule_and_scheduler(dxlrun, runs, pretend):
 @pytest.mark.parametrize("page", ["experiments.md", "results.md"])
 def test_the_commands_of_the_pages_are_understood(dxlrun, runs, pretend, monkeypatch, page):
     monkeypatch.setattr("dxlrun_lab.stress.Stress", lambda *, wanted: Stress(wanted=False))
-    monkeypatch.setattr("dxlrun_lab.tracking.report.page", lambda result: "a page")
+    monkeypatch.setattr("dxlrun_lab.tracking.tracking_report.page", lambda result: "a page")
     for words in commands_of(page, "experiment tracking"):
         plans = pretend([summary(0, log_of(runs, one)) for one in SETUPS])
         named = words[words.index("--setups") + 1].split(",") if "--setups" in words else SETUPS
@@ -157,7 +157,7 @@ def test_the_commands_of_the_pages_are_understood(dxlrun, runs, pretend, monkeyp
 
 
 def test_an_interrupt_keeps_what_was_measured(dxlrun, runs, stopped, pretend, monkeypatch):
-    monkeypatch.setattr("dxlrun_lab.tracking.report.page", lambda result: "a page")
+    monkeypatch.setattr("dxlrun_lab.tracking.tracking_report.page", lambda result: "a page")
     whole, part = runs("sequential-normal", "none").log.path, stopped("loop-normal", 480).log.path
     plans = pretend([summary(0, whole), summary(130, part)])
     said = run_short(dxlrun, runs, "--report", "page.html")
@@ -172,14 +172,14 @@ def test_an_interrupt_keeps_what_was_measured(dxlrun, runs, stopped, pretend, mo
 def test_a_termination_between_two_runs_keeps_what_was_measured(dxlrun, runs, pretend, monkeypatch):
     logs = [runs(setup, "none").log.path for setup in ("sequential-normal", "loop-normal")]
     pretend([summary(0, log) for log in logs])
-    read = experiment.read_log
+    read = tracking_experiment.read_log
 
     def terminated(path):
         if path == str(logs[1]):
             os.kill(os.getpid(), signal.SIGTERM)
         return read(path)
 
-    monkeypatch.setattr(experiment, "read_log", terminated)
+    monkeypatch.setattr(tracking_experiment, "read_log", terminated)
     before = signal.getsignal(signal.SIGTERM)
     said = run_short(dxlrun, runs)
     assert (said.code, said.err.endswith("interrupted\n")) == (130, True)
@@ -218,8 +218,8 @@ def test_the_load_is_there_while_a_run_is_measured(runs, pretend, monkeypatch):
             return ("the load ended",)
 
     pretend([summary(0, ran.log.path)])
-    monkeypatch.setattr(experiment, "read_log", lambda path: steps.append("measured") or ran.log)
-    one = experiment.run_experiment(ran.plan, ran.desired, SETUPS[1:2], Load(), None)
+    monkeypatch.setattr(tracking_experiment, "read_log", lambda path: steps.append("measured") or ran.log)
+    one = tracking_experiment.run_experiment(ran.plan, ran.desired, SETUPS[1:2], Load(), None)
     assert steps == ["loaded", "free", "measured"]
     assert one.measured[0].tracked.remarks == ("the load ended",)
 
@@ -228,17 +228,17 @@ def test_the_load_is_there_while_a_run_is_measured(runs, pretend, monkeypatch):
 
 
 def test_without_the_right_to_real_time_one_sentence_says_so_beforehand(dxlrun, runs, monkeypatch):
-    monkeypatch.setattr(realtime, "highest_priority", lambda: 0)
+    monkeypatch.setattr(realtime_grants, "highest_priority", lambda: 0)
     said = run_short(dxlrun, runs)
     assert (said.code, said.out) == (2, "")
     assert said.err.startswith(
         "dxlrun: loop-realtime and sequential-realtime would run with real-time priority"
     )
-    assert realtime.allow("rtprio", 32) in said.err
+    assert realtime_grants.allow("rtprio", 32) in said.err
     assert f"--setups {NORMAL}" in said.err
 
 
 def test_without_that_right_the_normal_setups_are_measured(dxlrun, runs, pretend, monkeypatch):
     pretend([summary(0, runs(name, "none").log.path) for name in NORMAL.split(",")])
-    monkeypatch.setattr(realtime, "highest_priority", lambda: 0)
+    monkeypatch.setattr(realtime_grants, "highest_priority", lambda: 0)
     assert run_short(dxlrun, runs, "--setups", NORMAL).code == 0

@@ -11,11 +11,11 @@ from typing import Any
 import numpy as np
 import pytest
 
-from dxlrun.compile.robot import compile_files
+from dxlrun.compile.robot_compiler import compile_files
 from dxlrun.errors import InputError
-from dxlrun_lab.tracking import measurement
-from dxlrun_lab.tracking.measurement import measure
-from dxlrun_lab.tracking.motion import desired_motion
+from dxlrun_lab.tracking import motion_evaluation
+from dxlrun_lab.tracking.desired_motion import desired_motion
+from dxlrun_lab.tracking.motion_evaluation import measure_tracking
 
 ROBOT = Path(__file__).parents[3] / "robots" / "single_joint.yaml"
 ACTIVE = {"position_trajectory": "false", "posvel_trajectory": "true"}
@@ -110,7 +110,7 @@ def test_a_cycle_after_one_that_took_too_long_is_late(runs, monkeypatch):
     # a simulated servo may have caused what the cycle took beyond its period, not what was skipped besides
     in_read, in_idle = np.zeros((2, len(cycles)), np.int64)
     in_read[after - 1] = 3 * PERIOD_NS
-    monkeypatch.setattr(measurement, "waits_for_servos", lambda log, ledger: (in_read, in_idle))
+    monkeypatch.setattr(motion_evaluation, "waits_for_servos", lambda log, ledger: (in_read, in_idle))
     assert ran.measured.tracked.late_by_bus_us == 1.2 * PERIOD_NS / 1e3
 
 
@@ -118,7 +118,7 @@ def test_what_the_simulated_bus_was_late_is_taken_off(runs, monkeypatch):
     ran = runs(SEQUENTIAL, "once")
     in_read, in_idle = np.zeros((2, len(ran.log.cycles)), np.int64)
     in_read[350], in_idle[400], in_idle[500] = 900_000, 1_500_000, 7_000_000
-    monkeypatch.setattr(measurement, "waits_for_servos", lambda log, ledger: (in_read, in_idle))
+    monkeypatch.setattr(motion_evaluation, "waits_for_servos", lambda log, ledger: (in_read, in_idle))
     one = ran.measured.tracked
     assert one.drift_ns == 7_812_500
     assert one.drift_by_bus_ns == 1_500_000  # nothing of 350 and 500: no cycle was late by it
@@ -134,7 +134,7 @@ def test_what_the_bus_was_late_before_the_first_pose_is_no_drift(runs, monkeypat
     cycles["scheduled_ns"][320] -= PERIOD_NS
     ran = replace(ran, log=replace(ran.log, cycles=cycles))
     in_read, in_idle = np.zeros(len(cycles), np.int64), np.full(len(cycles), 10 * PERIOD_NS)
-    monkeypatch.setattr(measurement, "waits_for_servos", lambda log, ledger: (in_read, in_idle))
+    monkeypatch.setattr(motion_evaluation, "waits_for_servos", lambda log, ledger: (in_read, in_idle))
     one = ran.measured.tracked
     assert one.drift_by_bus_ns == one.drift_ns > 0
     assert (one.own_drift_ns, one.late_cycles) == (0, 0)
@@ -143,7 +143,7 @@ def test_what_the_bus_was_late_before_the_first_pose_is_no_drift(runs, monkeypat
 
 def test_a_real_bus_has_no_ledger(runs):
     ran = runs(LOOP, "none")
-    one = measure(ran.log, ran.setup, ran.desired, None).tracked
+    one = measure_tracking(ran.log, ran.setup, ran.desired, None).tracked
     assert (one.late_by_bus_us, one.drift_by_bus_ns) == (None, None)
 
 

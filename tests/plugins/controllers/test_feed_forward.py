@@ -12,7 +12,7 @@ from tests.kit.stages import Stage
 
 from dxlrun import MotorLoad, MotorModel, Stribeck
 from dxlrun_controllers.feed_forward import FeedForward, FeedForwardParameters
-from dxlrun_controllers.laws.feed_forward import InverseServo, MotionAhead
+from dxlrun_controllers.laws.inverse_model import InverseServo, MotionAhead
 from dxlsim.motion.motor import identified_motor
 from dxlsim.motion.plant import IndependentJoints, PlantJoint
 from dxlsim.simulation_plan import Load
@@ -39,7 +39,7 @@ def test_the_torque_gives_the_acceleration_on_the_simulated_plant(seed: int) -> 
     )
     plant, dt = IndependentJoints([joint]), 1e-6
     plant.velocity[:] = w
-    plant.step(inverse.torque.copy(), np.zeros(1), dt)
+    plant.step_shafts(inverse.torque.copy(), np.zeros(1), dt)
     assert (plant.velocity.item() - w) / dt == pytest.approx(a, abs=0.02)
     # and the duty gives that torque at that speed: stall torque and damping are the simulation's
     motor = joint.motor

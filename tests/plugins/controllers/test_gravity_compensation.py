@@ -14,7 +14,7 @@ from msgspec.structs import replace
 from tests.kit.stages import Stage
 
 from dxlrun import MotorLoad, MotorModel
-from dxlrun.compile.robot import compile_files
+from dxlrun.compile.robot_compiler import compile_files
 from dxlrun.errors import InputError
 from dxlrun_controllers.feed_forward import FeedForward
 from dxlrun_controllers.gravity_compensation import GravityCompensation

@@ -445,12 +445,12 @@ def test_the_steps_give_what_the_formula_gives_at_once(rows: int) -> None:
     desired, measured, applied = rng.normal(size=(3, joints, rows))
     most, delay_s = np.array([0.5, 9.0]), np.array([0.0, 0.0123])
     for again in range(2):  # a second one begins from nothing
-        law.begin()
+        law.start_recording()
         for row in range(rows - 2 * again):
             law.record(desired[:, row], measured[:, row], applied[:, row], judged=True)
     old = rng.normal(size=(joints, rows)).astype(np.float32)
     new = np.zeros((joints, rows), np.float32)
-    steps = sum(1 for _ in law.learn(old, new, gain, delay_s, most))
+    steps = sum(1 for _ in law.learn_correction(old, new, gain, delay_s, most))
     weights = gaussian(4.0, period)
     half = len(weights) // 2
     played = np.concatenate([applied[:, : rows - 2], old[:, rows - 2 :]], axis=1)

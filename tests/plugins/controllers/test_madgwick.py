@@ -113,14 +113,14 @@ def test_it_begins_where_accelerometer_and_magnetometer_say(heading: float) -> N
         up, field = vector(turned.T @ [0, 0, 9.81]), vector(turned.T @ [20.0, 0.0, -44.0])
         for measured_field, given in ((field, 0.3), (None, heading)):
             law = Madgwick(GAIN)
-            law.begin(up, measured_field, given)
+            law.initialize_orientation(up, measured_field, given)
             np.testing.assert_allclose(rotation(law), turned, atol=1e-9)
             assert law.heading == pytest.approx(heading)
 
 
 def test_free_fall_leaves_the_rates_alone() -> None:
     law = Madgwick(GAIN)
-    law.begin((0.0, 0.0, 0.0), None, 1.0)
+    law.initialize_orientation((0.0, 0.0, 0.0), None, 1.0)
     assert (law.w, law.x, law.y, law.z) == (1.0, 0.0, 0.0, 0.0)
     for _ in range(100):
         law.update((0.0, 0.0, 0.5), (0.0, 0.0, 0.0), (1.0, 0.0, 0.0), DT)

@@ -10,7 +10,7 @@ from dxlrun_controllers.laws.spline import (
     LINEAR,
     QUINTIC,
     SplineSample,
-    Stop,
+    StopTrajectory,
     Trajectory,
     evaluate,
     flatten,
@@ -193,7 +193,7 @@ def test_one_point_is_a_trajectory():
 @settings(max_examples=80, deadline=None)
 @given(state=boundary, most=st.floats(0.1, 50), share=st.floats(0, 1.2), room=st.floats(0, 30))
 def test_a_stop_is_a_constant_deceleration_that_ends_before_the_limit(state, most, share, room):
-    now, found, stop = SplineSample(1), SplineSample(1), Stop(1)
+    now, found, stop = SplineSample(1), SplineSample(1), StopTrajectory(1)
     position, velocity, _ = state
     now.position[:], now.velocity[:] = position, velocity
     lower, upper = (-np.inf, position + room) if velocity > 0 else (position - room, np.inf)

@@ -11,8 +11,8 @@ from msgspec.structs import replace
 from tests.kit.stages import Stage
 
 from dxlrun import MotorModel, ServoModel
-from dxlrun.compile.robot import compile_files
-from dxlrun.control.controllers.plugins import load_plugins
+from dxlrun.compile.robot_compiler import compile_files
+from dxlrun.control.controllers.plugin_loading import load_plugins
 from dxlrun.errors import InputError
 from dxlrun.remote.preparation import Preparation, RefusedRequest
 from dxlrun_analysis.replay.changes import Setting, with_settings

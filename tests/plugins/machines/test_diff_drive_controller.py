@@ -9,7 +9,7 @@ from hypothesis import strategies as st
 from tests.kit.stages import standing
 
 from dxlrun_controllers.diff_drive_controller import AngularLimits, DiffDriveController, LinearLimits, Ramp
-from dxlrun_controllers.laws.odometry import Pose, WheelAngles
+from dxlrun_controllers.laws.odometry import BasePose, WheelAngles
 
 SEPARATION, RADIUS = 0.16, 0.033
 BASE = {"left": ["l"], "right": ["r"], "separation": "160 mm", "radius": "33 mm"}
@@ -167,7 +167,7 @@ def test_a_ramp_keeps_its_limits_and_arrives(acceleration, deceleration, jerk, t
     velocity, slope = 0.0, 0.0
     for target, steps in [*targets, (0.7, round(60 / dt))]:
         for _ in range(steps):
-            ramp.set(ramp.next(target, dt), dt)
+            ramp.set_velocity(ramp.next(target, dt), dt)
             now = (ramp.velocity - velocity) / dt
             tolerance = 1e-7 + (
                 0 if jerk is None else jerk * dt
@@ -196,7 +196,7 @@ def test_a_ramp_takes_the_time_of_the_closed_form_and_does_not_overshoot(target,
     ramp = Ramp(LinearLimits.model_construct(acceleration=acceleration, jerk=jerk))
     dt, speeds = 0.01, []
     while not speeds or speeds[-1] < target - 1e-12:
-        ramp.set(ramp.next(target, dt), dt)
+        ramp.set_velocity(ramp.next(target, dt), dt)
         speeds.append(ramp.velocity)
     assert max(speeds) <= target * (1 + 1e-12)
     assert len(speeds) * dt == pytest.approx(wanted, abs=2.01 * dt)
@@ -207,7 +207,7 @@ def test_through_zero_a_ramp_brakes_with_one_limit_and_accelerates_with_the_othe
     ramp.velocity = 0.2
     speeds = []
     for _ in range(30):
-        ramp.set(ramp.next(-0.2, 0.02), 0.02)
+        ramp.set_velocity(ramp.next(-0.2, 0.02), 0.02)
         speeds.append(ramp.velocity)
     expected = [max(-0.2, 0.2 - 4 * t if t < 0.05 else -(t - 0.05)) for t in 0.02 * np.arange(1, 31)]
     np.testing.assert_allclose(speeds, expected, atol=1e-12)
@@ -250,8 +250,8 @@ def test_odometry_is_the_exact_arc_of_exact_wheel_angles(arcs):
 
 def test_small_and_large_angles_meet():
     for angle in (9.9e-5, 1.01e-4, -1.01e-4, 2e-4, 1e-9):
-        pose = Pose()
-        pose.move(1.0, angle)
+        pose = BasePose()
+        pose.move_along_arc(1.0, angle)
         exact = on_arc(1.0, angle) if abs(angle) > 1e-6 else (1.0, angle / 2)
         np.testing.assert_allclose([pose.x, pose.y], exact, rtol=0, atol=1e-12)
 

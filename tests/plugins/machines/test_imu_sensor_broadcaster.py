@@ -62,7 +62,7 @@ def test_it_is_the_filter_with_the_true_times_of_the_samples() -> None:
         bench.sample(rate, force, age_s=age_s, periods=float(periods))
         sampled_s = bench.stage.time_ns * 1e-9 - age_s
         if last is None:
-            law.begin(tuple(force), None, 0.0)
+            law.initialize_orientation(tuple(force), None, 0.0)
         else:
             law.update(tuple(rate), tuple(force), None, sampled_s - last)
         last = sampled_s

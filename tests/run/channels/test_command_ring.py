@@ -10,7 +10,7 @@ from hypothesis import strategies as st
 from dxlrun.channels import mailbox
 from dxlrun.channels.commands import (
     LONGEST_COMMAND,
-    Command,
+    CommandMessage,
     CommandRing,
     TakenCommand,
     command_capacity,
@@ -35,7 +35,7 @@ COMMANDS = st.builds(
 
 def record_of(command: TakenCommand) -> bytes:
     records: list[bytes] = []
-    CommandRing(Handover(lambda _, payload: records.append(bytes(payload)))).take(command)
+    CommandRing(Handover(lambda _, payload: records.append(bytes(payload)))).record_command(command)
     (record,) = records
     return record
 
@@ -44,7 +44,7 @@ def record_of(command: TakenCommand) -> bytes:
 @given(COMMANDS, st.integers(0, 2**62))
 def test_what_goes_in_comes_out(taken, lease_ns):
     assert decode(record_of(taken)) == taken
-    command = Command(taken.planned, taken.controller, taken.kind, taken.data, taken.origin, lease_ns)
+    command = CommandMessage(taken.planned, taken.controller, taken.kind, taken.data, taken.origin, lease_ns)
     assert decode(encode_command(command)) == command
 
 
@@ -53,7 +53,7 @@ COMMAND = TakenCommand(5, 1, -1, "left_arm", "trajectory", "process 12", np.aran
 
 @pytest.mark.parametrize("length", [0, 10, 39, 60])
 def test_bytes_that_are_no_command_are_refused(length):
-    record = encode_command(Command(1, "left_arm", "trajectory", b"", "process 12"))
+    record = encode_command(CommandMessage(1, "left_arm", "trajectory", b"", "process 12"))
     for data in (record_of(COMMAND), record):
         for cut in (data[:length][: len(data) - 1], data + b"\0", data[:5] + b"\xff" + data[6:]):
             with pytest.raises(ValueError, match=r"."):
@@ -62,7 +62,7 @@ def test_bytes_that_are_no_command_are_refused(length):
 
 def test_a_lease_below_zero_is_refused():
     with pytest.raises(ValueError, match=">= 0"):
-        decode(encode_command(Command(1, "arm", "position", b"", "process 12", -1)))
+        decode(encode_command(CommandMessage(1, "arm", "position", b"", "process 12", -1)))
 
 
 def test_what_a_full_mailbox_holds_comes_whole_into_the_log_though_no_reader_looks_meanwhile():
@@ -73,18 +73,22 @@ def test_what_a_full_mailbox_holds_comes_whole_into_the_log_though_no_reader_loo
     client = mailbox.MailboxWriter(box)
     origin = "o" * 64
     number = 0
-    while client.post(Command(number, "c" * 64, "k" * 64, bytes(LONGEST_COMMAND // 2), origin)):
+    while client.post_command(
+        CommandMessage(number, "c" * 64, "k" * 64, bytes(LONGEST_COMMAND // 2), origin)
+    ):
         number += 1
     for place in range(MOST_CONTROLLERS):
-        assert client.set_point(place, Command(place, "c" * 64, "k" * 64, bytes(1600), origin, 1))
+        assert client.set_point(place, CommandMessage(place, "c" * 64, "k" * 64, bytes(1600), origin, 1))
     ring = CommandRing(writer)
-    loop, taken = mailbox.Mailbox(box, Handover(lambda kind, payload: None)), list[Command]()
-    while part := loop.take():  # a cycle takes one of the long ones, and all set-points
+    loop, taken = mailbox.Mailbox(box, Handover(lambda kind, payload: None)), list[CommandMessage]()
+    while part := loop.drain_commands():  # a cycle takes one of the long ones, and all set-points
         taken += part
     assert len(taken) == number + MOST_CONTROLLERS
     for one in taken:
-        ring.take(TakenCommand(0, 0, -1, one.controller, one.kind, one.origin, one.data, one.lease_ns))
-    found = list(iter(reader.read, None))
+        ring.record_command(
+            TakenCommand(0, 0, -1, one.controller, one.kind, one.origin, one.data, one.lease_ns)
+        )
+    found = list(iter(reader.read_record, None))
     assert all(isinstance(one, Record) and one.kind == RecordKind.TAGGED for one in found)
     records = [decode(one.payload) for one in found if isinstance(one, Record)]
     assert [one.data for one in records if isinstance(one, TakenCommand)] == [one.data for one in taken]

@@ -7,7 +7,7 @@ import pytest
 from hypothesis import example, given, settings
 from hypothesis import strategies as st
 
-from dxlrun.channels.events import (
+from dxlrun.channels.event_records import (
     LONGEST_EVENT,
     LONGEST_TEXT,
     Event,
@@ -25,7 +25,7 @@ from dxlwire.clock import VirtualClock
 def emitted(code: EventCode, severity: Severity, source: str, text: str, at_ns: int = 5) -> bytes:
     records: list[bytes] = []
     ring = EventRing(Handover(lambda _, payload: records.append(bytes(payload))), VirtualClock(at_ns))
-    ring.emit(source, EventBody(code, severity, text))
+    ring.emit_event(source, EventBody(code, severity, text))
     (record,) = records
     assert len(record) <= LONGEST_EVENT
     return record

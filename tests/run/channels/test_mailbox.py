@@ -7,8 +7,8 @@ import struct
 import pytest
 
 from dxlrun.channels import mailbox, ring
-from dxlrun.channels.answers import Code, Done, Refusal, Waiting
-from dxlrun.channels.commands import LONGEST_COMMAND, MOST_PER_CYCLE, Command, encode_command
+from dxlrun.channels.answers import Acceptance, Code, Completion, Refusal
+from dxlrun.channels.commands import LONGEST_COMMAND, MOST_PER_CYCLE, CommandMessage, encode_command
 from dxlrun.channels.mailbox import LONGEST_SET_POINT, Answers, Mailbox, MailboxWriter
 from dxlrun.channels.ring import record_size
 
@@ -27,7 +27,7 @@ class Both:
 
     def take_all(self):
         found = []
-        while taken := self.reader.take():
+        while taken := self.reader.drain_commands():
             found += taken
         return found
 
@@ -38,47 +38,47 @@ def both():
 
 
 def command(number=1, data=b"", controller="head", lease_ns=0):
-    return Command(number, controller, "position", data, "anna", lease_ns)
+    return CommandMessage(number, controller, "position", data, "anna", lease_ns)
 
 
 def test_a_command_arrives_as_it_was_sent(both):
-    sent = Command(7, "linker_arm", "trajectory", bytes(range(200)), "änna", 200_000_000)
-    assert both.writer.post(sent)
-    assert both.reader.take() == [sent]
-    assert both.reader.take() == ()
+    sent = CommandMessage(7, "linker_arm", "trajectory", bytes(range(200)), "änna", 200_000_000)
+    assert both.writer.post_command(sent)
+    assert both.reader.drain_commands() == [sent]
+    assert both.reader.drain_commands() == ()
 
 
 def test_operations_keep_their_order_and_a_cycle_takes_only_so_many(both):
     for number in range(20):
-        both.writer.post(command(number))
-    first = both.reader.take()
+        both.writer.post_command(command(number))
+    first = both.reader.drain_commands()
     assert [one.number for one in first] == list(range(MOST_PER_CYCLE))
     assert [one.number for one in both.take_all()] == list(range(MOST_PER_CYCLE, 20))
 
 
 def test_of_long_operations_a_cycle_takes_one(both):
     for number in range(3):
-        assert both.writer.post(command(number, bytes(LONGEST_COMMAND - 100)))
-    both.writer.post(command(3))
-    assert [[one.number for one in both.reader.take()] for _ in range(4)] == [[0], [1], [2], [3]]
+        assert both.writer.post_command(command(number, bytes(LONGEST_COMMAND - 100)))
+    both.writer.post_command(command(3))
+    assert [[one.number for one in both.reader.drain_commands()] for _ in range(4)] == [[0], [1], [2], [3]]
 
 
 def test_of_a_stream_the_newest_set_point_wins(both):
     for number in range(50):
         both.writer.set_point(1, command(number, lease_ns=5))
     both.writer.set_point(2, command(99, controller="arm", lease_ns=5))
-    assert [one.number for one in both.reader.take()] == [49, 99]
-    assert both.reader.take() == ()
+    assert [one.number for one in both.reader.drain_commands()] == [49, 99]
+    assert both.reader.drain_commands() == ()
 
 
 def test_a_full_mailbox_refuses_and_loses_nothing(both):
     data = bytes(LONGEST_COMMAND // 2)
     sent = 0
-    while both.writer.post(command(sent, data)):
+    while both.writer.post_command(command(sent, data)):
         sent += 1
     assert sent >= 4
     assert [one.number for one in both.take_all()] == list(range(sent))
-    assert both.writer.post(command(sent, data))
+    assert both.writer.post_command(command(sent, data))
 
 
 @pytest.mark.parametrize("beyond", [0, 1, record_size(0)])
@@ -90,20 +90,20 @@ def test_mailbox_can_be_filled_to_its_last_byte_and_no_further(both, beyond):
     sizes = [LONGEST_COMMAND] * 3
     room = mailbox.capacity(0) - sum(map(record_size, sizes))
     sizes.append(room - record_size(0) + beyond)
-    posted = [both.writer.post(encoded_in(size, number)) for number, size in enumerate(sizes)]
+    posted = [both.writer.post_command(encoded_in(size, number)) for number, size in enumerate(sizes)]
     assert posted == [True, True, True, beyond == 0]
     assert [one.number for one in both.take_all()] == [0, 1, 2, 3][: sum(posted)]
 
 
 @pytest.mark.parametrize("size", [LONGEST_COMMAND + 1, 10_000_000])
 def test_what_is_too_long_is_refused(both, size):
-    assert not both.writer.post(command(1, bytes(size)))
-    assert both.reader.take() == ()
+    assert not both.writer.post_command(command(1, bytes(size)))
+    assert both.reader.drain_commands() == ()
 
 
 def test_a_set_point_that_is_too_long_is_refused(both):
     assert not both.writer.set_point(0, command(1, bytes(LONGEST_SET_POINT)))
-    assert both.reader.take() == ()
+    assert both.reader.drain_commands() == ()
 
 
 def test_records_of_all_lengths_go_round_the_ring_many_times(both):
@@ -111,11 +111,11 @@ def test_records_of_all_lengths_go_round_the_ring_many_times(both):
     waiting, number, bytes_put = [], 0, 0
     while bytes_put < 8 * LONGEST_COMMAND:
         one = command(number, bytes(chance.choice((0, 1, 7, 8, 9, 1000, 60_000))))
-        if both.writer.post(one):
+        if both.writer.post_command(one):
             waiting.append(one)
             number, bytes_put = number + 1, bytes_put + len(one.data)
         if chance.random() < 0.4:
-            taken = list(both.reader.take())
+            taken = list(both.reader.drain_commands())
             assert taken == waiting[: len(taken)]
             del waiting[: len(taken)]
     assert both.take_all() == waiting
@@ -129,30 +129,30 @@ INTENT = 32
 
 def test_a_writer_that_died_in_a_set_point_is_not_waited_for(both):
     both.writer.set_point(0, command(1, lease_ns=5))
-    both.reader.take()
+    both.reader.drain_commands()
     size = record_size(len(encode_command(command(2))))
     os.pwrite(both.descriptor, struct.pack("<Q", 2 * size), PLACE_0 + INTENT)  # begins the next, and dies
     os.pwrite(both.descriptor, b"half", PLACE_0 + 64 + size)
     both.writer.set_point(1, command(2, lease_ns=5))
-    assert [one.number for one in both.reader.take()] == [2]
-    assert list(both.reader.take()) == []
+    assert [one.number for one in both.reader.drain_commands()] == [2]
+    assert list(both.reader.drain_commands()) == []
 
 
 def test_a_set_point_that_is_damaged_is_dropped_and_the_next_one_taken(both):
     both.writer.set_point(0, command(1, lease_ns=5))
     os.pwrite(both.descriptor, b"damage", PLACE_0 + 64 + 30)
     for _ in range(3):
-        assert list(both.reader.take()) == []
+        assert list(both.reader.drain_commands()) == []
     both.writer.set_point(0, command(2, lease_ns=5))
-    assert [one.number for one in both.reader.take()] == [2]
+    assert [one.number for one in both.reader.drain_commands()] == [2]
 
 
 def test_an_operation_that_is_damaged_is_dropped_and_the_next_one_taken(both):
-    both.writer.post(command(1))
-    both.writer.post(command(2))
+    both.writer.post_command(command(1))
+    both.writer.post_command(command(2))
     os.pwrite(both.descriptor, b"damage", OPERATIONS + 64 + 30)
     assert [one.number for one in both.take_all()] == [2]
-    both.writer.post(command(3))
+    both.writer.post_command(command(3))
     assert [one.number for one in both.take_all()] == [3]
 
 
@@ -175,7 +175,7 @@ def test_a_set_point_is_whole_before_it_is_shown(both, monkeypatch):
         return words[index]
 
     monkeypatch.setattr(mailbox, "load", loaded)
-    assert [one.number for one in both.reader.take()] == [1]
+    assert [one.number for one in both.reader.drain_commands()] == [1]
 
 
 def test_a_writer_that_fills_it_with_rubbish_gets_no_exception_out_of_the_loop():
@@ -184,7 +184,7 @@ def test_a_writer_that_fills_it_with_rubbish_gets_no_exception_out_of_the_loop()
     for number in range(300):
         if number % 10 == 0:
             both = Both()
-        both.writer.post(command(1, bytes(100)))
+        both.writer.post_command(command(1, bytes(100)))
         at = OPERATIONS + 64 + both.reader._operations.position % (4 * LONGEST_COMMAND)
         os.pwrite(both.descriptor, chance.randbytes(chance.randrange(1, 40)), at + chance.randrange(160))
         if chance.random() < 0.3:
@@ -193,7 +193,7 @@ def test_a_writer_that_fills_it_with_rubbish_gets_no_exception_out_of_the_loop()
         both.writer.set_point(0, command(1, bytes(100), lease_ns=1))
         os.pwrite(both.descriptor, chance.randbytes(8), PLACE_0 + HEAD + chance.randrange(300))
         for _ in range(3):
-            commands = both.reader.take()
+            commands = both.reader.drain_commands()
             assert len(commands) <= MOST_PER_CYCLE + PLACES
             taken += len(commands)
     assert 0 < taken < 2 * 300 - 100, "more than 100 were damaged"
@@ -203,24 +203,24 @@ def test_a_writer_that_fills_it_with_rubbish_gets_no_exception_out_of_the_loop()
 def test_counts_at_the_end_of_their_words_get_no_exception_out_of_the_loop(both, last):
     os.pwrite(both.descriptor, struct.pack("<Q", last), OPERATIONS + HEAD)
     for _ in range(3):
-        assert list(both.reader.take()) == []
+        assert list(both.reader.drain_commands()) == []
 
 
 def test_answers_come_back_by_their_numbers_and_long_ones_are_cut(both):
     fields = {"controller": ("arm", "head"), "rate": 0.5}
     given = [
-        Done(7),
-        Done(7, 3),
-        Waiting(("arm",)),
+        Completion(7),
+        Completion(7, 3),
+        Acceptance(("arm",)),
         Refusal(Code.PAUSED_ALREADY),
         Refusal(Code.INVALID, fields),
     ]
     for number, answer in enumerate(given):
-        both.reader.answer(number, answer)
+        both.reader.answer_command(number, answer)
     long = Refusal(
         Code.CONTROLLER_FAULT, {"controller": "arm", "problem": '"ä\n' * 10_000, "seen": ("a",) * 999}
     )
-    both.reader.answer(5, long)
+    both.reader.answer_command(5, long)
     *found, last = both.answers.new()
     number, cut = last.number, last.answer
     assert [(one.number, one.answer) for one in found] == list(enumerate(given))
@@ -231,20 +231,20 @@ def test_answers_come_back_by_their_numbers_and_long_ones_are_cut(both):
 
 
 def test_an_answer_that_names_many_controllers_is_cut(both):
-    both.reader.answer(1, Waiting(tuple(f"controller_{index:060}" for index in range(63))))
+    both.reader.answer_command(1, Acceptance(tuple(f"controller_{index:060}" for index in range(63))))
     (found,) = both.answers.new()
     assert found.number == 1
-    assert isinstance(found.answer, Waiting)
+    assert isinstance(found.answer, Acceptance)
 
 
 def test_a_refusal_with_a_text_that_is_no_utf_8_is_answered(both):
-    both.reader.answer(1, Refusal(Code.CONTROLLER_FAULT, {"problem": "no file a\udcff"}))
+    both.reader.answer_command(1, Refusal(Code.CONTROLLER_FAULT, {"problem": "no file a\udcff"}))
     (found,) = both.answers.new()
     assert found.answer.text == "no file a\\udcff"
 
 
 def test_a_refusal_with_an_integer_that_no_record_can_hold_is_answered(both):
-    both.reader.answer(1, Refusal(Code.UNKNOWN_GOAL, {"goal": -(10**30), "last": 2**63 - 1}))
+    both.reader.answer_command(1, Refusal(Code.UNKNOWN_GOAL, {"goal": -(10**30), "last": 2**63 - 1}))
     (found,) = both.answers.new()
     assert found.answer.fields == {"goal": f"-1{'0' * 30}", "last": 2**63 - 1}
 

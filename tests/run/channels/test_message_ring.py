@@ -6,7 +6,9 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from dxlrun.channels import ring
-from dxlrun.channels.messages import (
+from dxlrun.channels.ring import Gap, Record, RecordKind, RingReader, RingWriter
+from dxlrun.channels.tagged import decode
+from dxlrun.channels.topic_messages import (
     LEAST_CAPACITY,
     LONGEST_MESSAGE,
     LONGEST_RECORD,
@@ -14,12 +16,10 @@ from dxlrun.channels.messages import (
     MessageRing,
     OpenedTopic,
     PublishedTopic,
-    TopicMessage,
+    TopicRecord,
     message_capacity,
     usual_message,
 )
-from dxlrun.channels.ring import Gap, Record, RecordKind, RingReader, RingWriter
-from dxlrun.channels.tagged import decode
 from dxlrun.messages.definition import MessageType
 
 TOPIC = PublishedTopic("/wave/state", MessageType("mine/msg/State", "float64 amount\n"), ("pan", "tilt"))
@@ -36,12 +36,12 @@ def test_a_message_comes_out_as_it_went_in(t_ns, data):
     messages, reader = made()
     number = messages.announce(TOPIC)
     messages.message(number, t_ns, data)
-    announced, message = reader.read(), reader.read()
+    announced, message = reader.read_record(), reader.read_record()
     assert isinstance(announced, Record)
     assert isinstance(message, Record)
     assert announced.kind == message.kind == RecordKind.TAGGED
     assert decode(announced.payload) == OpenedTopic(number, 0, TOPIC)
-    assert decode(message.payload) == TopicMessage(t_ns, number, 1, data)
+    assert decode(message.payload) == TopicRecord(t_ns, number, 1, data)
 
 
 def test_each_topic_gets_a_number_of_its_own():
@@ -56,13 +56,13 @@ def test_the_longest_message_fits_and_a_slow_reader_knows_what_it_missed():
     for index in range(sent):
         messages.message(0, index, bytes(LONGEST_MESSAGE))
     lost, found = 0, []
-    while (record := reader.read()) is not None:
+    while (record := reader.read_record()) is not None:
         if isinstance(record, Gap):
             lost += record.lost
         else:
             message = decode(record.payload)
-            assert isinstance(message, TopicMessage | OpenedTopic)
-            found += [message.t_ns] if isinstance(message, TopicMessage) else []
+            assert isinstance(message, TopicRecord | OpenedTopic)
+            found += [message.t_ns] if isinstance(message, TopicRecord) else []
     assert lost + len(found) == sent + 1
     assert found == list(range(sent - len(found), sent))
     assert len(found) >= LEAST_CAPACITY // LONGEST_MESSAGE - 2

@@ -10,7 +10,7 @@ from hypothesis import example, given, settings
 from hypothesis import strategies as st
 from tests.kit.decoded import decode_packets
 
-from dxlrun.channels.packets import (
+from dxlrun.channels.logged_packets import (
     DESK_SIZE,
     LONGEST_BATCH,
     LoggedPacket,
@@ -57,7 +57,7 @@ def test_packets_come_out_as_they_went_in(steps):
     batch = PacketBatch(writer, desk_of(128))
     for step in [*steps, None]:
         if step is None:
-            batch.commit()
+            batch.commit_packets()
         else:
             batch.packet(
                 step.bus, step.kind, step.servo_id, step.first_ns, step.last_ns, bytearray(step.data)
@@ -73,7 +73,7 @@ def test_noise_longer_than_the_desk_is_cut_and_nothing_of_it_lost(noise):
     slots, writer = collected()
     batch = PacketBatch(writer, desk_of(64))
     batch.packet(0, PacketKind.NOISE, 254, 5, 9, memoryview(noise))
-    batch.commit()
+    batch.commit_packets()
     pieces = [packet for slot in slots for packet in decode_packets(slot)]
     assert b"".join(piece.data for piece in pieces) == noise
     assert {(piece.kind, piece.first_ns, piece.last_ns) for piece in pieces} == {(PacketKind.NOISE, 5, 9)}
@@ -82,7 +82,7 @@ def test_noise_longer_than_the_desk_is_cut_and_nothing_of_it_lost(noise):
 def test_a_commit_without_packets_takes_no_slot():
     slots, writer = collected()
     batch = PacketBatch(writer)
-    batch.commit()
+    batch.commit_packets()
     assert slots == []
 
 
@@ -91,7 +91,7 @@ def test_a_cut_batch_is_refused(cut):
     slots, writer = collected()
     batch = PacketBatch(writer)
     batch.packet(0, PacketKind.STATUS, 1, 2, 3, b"abc")
-    batch.commit()
+    batch.commit_packets()
     with pytest.raises(ValueError, match="ends inside"):
         decode_packets(slots[0][:cut])
 
@@ -109,7 +109,7 @@ def test_the_ring_holds_ten_seconds_of_a_robot(rate, servos):
         batch.packet(0, PacketKind.INSTRUCTION, 1, 0, 0, bytes(8))
         batch.packet(0, PacketKind.STATUS, 1, 0, 0, bytes(14))
     batch.packet(0, PacketKind.INSTRUCTION, 254, 0, 0, bytes(8 + 5 * servos))
-    batch.commit()
+    batch.commit_packets()
     (cycle,) = slots  # nothing is committed in the middle
     assert len(cycle) <= LONGEST_BATCH
     assert record_size(len(cycle)) * rate * 10 <= packet_capacity(1_000_000_000 // rate, servos)
@@ -119,7 +119,7 @@ def test_without_a_log_packets_are_taken_and_forgotten():
     sink = PacketLog()
     sink.wake(0)
     sink.packet(0, PacketKind.NOISE, 1, 2, 3, b"abc")
-    sink.commit()
+    sink.commit_packets()
 
 
 def test_what_a_dead_process_left_on_its_desk_is_taken_up_once():
@@ -127,7 +127,7 @@ def test_what_a_dead_process_left_on_its_desk_is_taken_up_once():
     desk = desk_of(128)
     batch = PacketBatch(writer, desk)
     batch.packet(0, PacketKind.INSTRUCTION, 1, 2, 3, b"committed")
-    batch.commit()
+    batch.commit_packets()
     batch.packet(0, PacketKind.STATUS, 4, 5, 6, b"left")
     taken, guardian = collected()
     salvage(desk, writer.head, guardian)
@@ -149,22 +149,22 @@ def test_each_packet_has_the_cycle_in_whose_period_it_was():
             batch.packet(0, PacketKind.STATUS, 1, 2, 3, name)
 
     packets(b"set-up")
-    batch.commit()
+    batch.commit_packets()
     batch.wake(0)
     packets(b"0")
-    batch.commit()  # nothing in the idle time
+    batch.commit_packets()  # nothing in the idle time
     batch.wake(1)
     packets(b"1")
-    batch.commit()
+    batch.commit_packets()
     packets(b"idle of 1")
     batch.wake(5)  # cycles were skipped
-    batch.commit()
+    batch.commit_packets()
     batch.wake(6)  # no packet in its own time
-    batch.commit()
+    batch.commit_packets()
     packets(b"idle of 6", b"more", b"and more", b"which do not fit any more")
     batch.wake(9)
     packets(b"9")
-    batch.commit()
+    batch.commit_packets()
     assert cycles_of(slots) == [
         (-1, b"set-up"),
         (0, b"0"),
@@ -190,7 +190,7 @@ def test_the_kernel_commits_to_a_ring_what_is_handed_over_elsewhere(steps):
     for step in [*steps, None]:
         for batch in batches:
             if step is None:
-                batch.commit()
+                batch.commit_packets()
             elif isinstance(step, int):
                 batch.wake(step)
             else:
@@ -199,7 +199,7 @@ def test_the_kernel_commits_to_a_ring_what_is_handed_over_elsewhere(steps):
         position = struct.unpack_from("<Q", desks[1], 8)[0]
         assert position == ring.head
     os.close(descriptor)
-    found = list(iter(reader.read, None))
+    found = list(iter(reader.read_record, None))
     assert [record.payload for record in found] == slots
     assert {record.kind for record in found} <= {RecordKind.PACKETS}
 
@@ -210,7 +210,7 @@ def test_what_a_dead_process_left_keeps_its_cycles():
     batch = PacketBatch(writer, desk)
     assert salvage(desk, writer.head, writer) == -1
     batch.wake(7)
-    batch.commit()
+    batch.commit_packets()
     batch.packet(0, PacketKind.STATUS, 1, 2, 3, b"idle")
     batch.wake(8)
     batch.packet(0, PacketKind.STATUS, 1, 2, 3, b"last")
@@ -219,7 +219,7 @@ def test_what_a_dead_process_left_keeps_its_cycles():
     assert cycles_of(taken) == [(7, b"idle"), (8, b"last")]
     after = PacketBatch(guardian, cycle=8)
     after.packet(0, PacketKind.INSTRUCTION, 1, 2, 3, b"torque off")
-    after.commit()
+    after.commit_packets()
     assert cycles_of(taken)[2:] == [(8, b"torque off")]
 
 
@@ -242,7 +242,7 @@ def test_a_process_that_dies_between_append_and_clearing_leaves_nothing_twice():
     batch = PacketBatch(writer, desk)
     batch.packet(0, PacketKind.INSTRUCTION, 1, 2, 3, b"once")
     with pytest.raises(Killed):
-        batch.commit()
+        batch.commit_packets()
     taken, guardian = collected()
     salvage(desk, writer.head, guardian)
     assert (len(slots), len(taken)) == (1, 0)
@@ -251,7 +251,7 @@ def test_a_process_that_dies_between_append_and_clearing_leaves_nothing_twice():
 def test_an_empty_or_a_scribbled_desk_gives_nothing():
     taken, guardian = collected()
     desk = desk_of(128)
-    PacketBatch(guardian, desk).commit()
+    PacketBatch(guardian, desk).commit_packets()
     salvage(desk, guardian.head, guardian)
     desk[:8] = b"\xff" * 8
     salvage(desk, guardian.head, guardian)

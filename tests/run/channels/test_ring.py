@@ -23,7 +23,7 @@ from dxlrun.channels.ring import (
     RingWriter,
     record_size,
 )
-from dxlwire.errors import NotCompiled
+from dxlwire.exceptions import NotCompiled
 
 HEADER = 64
 HEAD, INTENT, LATEST, TAKEN, NUMBER = 24, 32, 40, 48, 56
@@ -53,7 +53,7 @@ def append(writer: RingWriter, *payloads: bytes) -> None:
 
 
 def all_of(reader: RingReader) -> list[Record | Gap]:
-    return list(iter(reader.read, None))
+    return list(iter(reader.read_record, None))
 
 
 @settings(max_examples=150, deadline=None)
@@ -75,7 +75,7 @@ def test_every_record_is_delivered_as_it_was_or_declared_lost(capacity, steps):
                 ends.append(writer.append(*step))
                 appended.append(step)
                 continue
-            got = reader.read()
+            got = reader.read_record()
             if isinstance(got, Gap):
                 # nothing is given up that was not overwritten, in whole or in part
                 assert all(start < ends[-1] - capacity for start in ends[seen : seen + got.lost])
@@ -84,7 +84,7 @@ def test_every_record_is_delivered_as_it_was_or_declared_lost(capacity, steps):
                 assert got == appended[seen]
                 seen += 1
         assert seen == len(appended)
-        assert reader.read() is None
+        assert reader.read_record() is None
     finally:
         os.close(descriptor)
 
@@ -259,9 +259,9 @@ def test_a_record_longer_than_the_longest_is_refused_and_leaves_the_ring_whole(m
     writer, reader = RingWriter(descriptor), RingReader(descriptor)
     with pytest.raises(ValueError, match="does not fit"):
         append(writer, bytes(11))
-    assert reader.read() is None
+    assert reader.read_record() is None
     append(writer, bytes(10))
-    assert reader.read() == event(bytes(10))
+    assert reader.read_record() == event(bytes(10))
 
 
 def test_a_ring_cannot_be_shrunk_under_its_readers(make):
@@ -296,7 +296,7 @@ def test_any_bytes_in_any_place_raise_nothing_and_end(make):
         if chance.random() < 0.5:
             os.pwrite(descriptor, chance.randbytes(chance.randrange(1, 9)), place)
         for _ in range(20):
-            if isinstance(reader.newest() if chance.random() < 0.1 else reader.read(), Record):
+            if isinstance(reader.newest() if chance.random() < 0.1 else reader.read_record(), Record):
                 delivered += 1
         if chance.random() < 0.1:  # the words that a writer owns, whole again
             os.pwrite(descriptor, struct.pack("<QQQ", 0, 0, 0), HEAD)
@@ -322,7 +322,7 @@ def test_a_reader_beside_a_writing_process_gets_or_misses_each_record_once(make)
         seen = gaps = 0
         while seen < count:
             ended = process.poll() is not None
-            got = reader.read()
+            got = reader.read_record()
             if isinstance(got, Gap):
                 seen, gaps = seen + got.lost, gaps + 1
             elif got is not None:
@@ -361,7 +361,7 @@ def test_a_queue_knows_how_far_its_reader_is(make):
     writer, reader = RingWriter(descriptor), RingReader(descriptor)
     append(writer, b"one", b"two")
     assert writer.taken == 0
-    assert reader.read() == event(b"one")
+    assert reader.read_record() == event(b"one")
     reader.report_taken()
     assert writer.taken == record_size(3)
     assert reader.newest() == event(b"two")

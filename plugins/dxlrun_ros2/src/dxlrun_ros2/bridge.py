@@ -13,8 +13,8 @@ from rclpy.signals import SignalHandlerOptions
 from std_srvs.srv import Trigger
 
 from dxlrun import RemoteRobot
+from dxlrun_ros2.controller_manager import ControllerManagerServices, info_of
 from dxlrun_ros2.controller_node import ControllerNode, offer, offer_torque
-from dxlrun_ros2.manager import Manager, info_of
 from dxlrun_ros2.published_run import PublishedRun
 from dxlrun_ros2.set_points import SetPoints
 
@@ -56,7 +56,7 @@ class Bridge:
                 "allow_undeclared_parameters": True,
                 "automatically_declare_parameters_from_overrides": True,
             }
-            Manager(self.node("controller_manager", **loads), address)
+            ControllerManagerServices(self.node("controller_manager", **loads), address)
         except BaseException:
             self.close()
             raise
@@ -77,8 +77,8 @@ class Bridge:
         while not (stopped.is_set() or self.run.ended.is_set()):
             if time.monotonic() > looked + LOOK_S:
                 looked = time.monotonic()
-                self.run.hear(self._robot)
-                self._look()
+                self.run.subscribe_new(self._robot)
+                self._update_nodes()
             self._serve(0.1)
         self.run.ended.set()
         until = time.monotonic() + LAST_S
@@ -93,7 +93,7 @@ class Bridge:
         except Exception as error:  # an error in one request must not end the bridge
             self._nodes["dxlrun"].get_logger().error(f"{type(error).__name__}: {error}")
 
-    def _look(self) -> None:
+    def _update_nodes(self) -> None:
         """Open a node for each new controller of the run, close the nodes of unloaded controllers, and update
         changed parameters. Raises DxlrunError."""
         found = {one.name: one for one in info_of(self._robot).controllers}

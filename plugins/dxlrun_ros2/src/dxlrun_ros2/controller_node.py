@@ -19,7 +19,7 @@ from trajectory_msgs.msg import JointTrajectory
 from dxlrun import DxlrunError, InputError, RemoteRobot, connect
 from dxlrun.tooling.live import ControllerInfo, Executed
 from dxlrun_ros2 import CLIENT
-from dxlrun_ros2.actions import FollowTrajectory, Gripper, stopped
+from dxlrun_ros2.action_servers import FollowTrajectory, Gripper, stopped
 from dxlrun_ros2.published_run import STATE, PublishedRun
 from dxlrun_ros2.set_points import LONGEST_S, SetPoints
 from dxlrun_ros2.trajectories import point, wanted
@@ -65,7 +65,7 @@ class ControllerNode:
             points.subscribe(node, Twist, f"{name}/cmd_vel_unstamped", self._twist)
         if kinds := [kind for kind in GROUP if kind in takes]:
             self._kind = kinds[0]
-            points.subscribe(node, Float64MultiArray, f"{name}/commands", self._command)
+            points.subscribe(node, Float64MultiArray, f"{name}/commands", self._send_command)
         self._live: dict[str, object] = {}
         self._declare(robot)
         if controller.command:
@@ -86,24 +86,26 @@ class ControllerNode:
             return
         plan = wanted(message, self._controller.joints, self.node.get_clock().now().nanoseconds * 1e-9)
         if "chunk" in self._controller.takes and self._points.lease + plan.seconds <= LONGEST_S:
-            self._points.send(robot, name, "chunk", plan.chunk(time.monotonic()), plan.seconds)
+            self._points.send_set_point(robot, name, "chunk", plan.chunk(time.monotonic()), plan.seconds)
         else:
-            robot.send(name, "trajectory", plan.command())
+            robot.send(name, "trajectory", plan.build_command())
 
-    def _command(self, message: Float64MultiArray, robot: RemoteRobot) -> None:
+    def _send_command(self, message: Float64MultiArray, robot: RemoteRobot) -> None:
         fields = fields_of(self._controller, self._kind)
         if len(message.data) != len(fields) * len(self._controller.joints):
             many = f"{len(message.data)} numbers for {' and '.join(fields)}"
             raise InputError(f"{many} of {len(self._controller.joints)} joints")
         values = np.split(np.array(message.data), len(fields))
-        self._points.send(robot, self._controller.name, self._kind, dict(zip(fields, values, strict=True)))
+        self._points.send_set_point(
+            robot, self._controller.name, self._kind, dict(zip(fields, values, strict=True))
+        )
 
     def _stamped(self, message: TwistStamped, robot: RemoteRobot) -> None:
         self._twist(message.twist, robot)
 
     def _twist(self, twist: Twist, robot: RemoteRobot) -> None:
         command = {"linear": twist.linear.x, "angular": twist.angular.z}
-        self._points.send(robot, self._controller.name, "velocity", command)
+        self._points.send_set_point(robot, self._controller.name, "velocity", command)
 
     def _show(self, record: np.void) -> None:
         """Publish controller_state from a cycle's record, at most every STATE_NS, if it has a subscriber."""

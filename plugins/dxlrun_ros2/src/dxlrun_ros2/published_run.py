@@ -85,7 +85,7 @@ class PublishedRun(LiveMessages):
         if (publisher := self._publishers_of[channel]) is not None:
             publisher.publish(data)
 
-    def hear(self, robot: RemoteRobot) -> None:
+    def subscribe_new(self, robot: RemoteRobot) -> None:
         """Receive and publish the run's topics that were opened since the last call. Raises DxlrunError."""
         if new := self.heard(robot.topics()) - self._heard:
             self._heard |= new
@@ -97,7 +97,7 @@ class PublishedRun(LiveMessages):
             with connect(self.address, CLIENT) as robot:
                 for message in robot.listen(*topics):
                     with self._lock:
-                        self.take(message)
+                        self.handle_message(message)
             self.why = f"the run of {self.header.robot} has ended"
         except DxlrunError as error:
             self.why = str(error)
@@ -106,9 +106,9 @@ class PublishedRun(LiveMessages):
                 self.why = f"{type(error).__name__}: {error}"
         self.ended.set()
 
-    def take(self, message: TopicMessage) -> None:
+    def handle_message(self, message: TopicMessage) -> None:
         """Publish a message of the run. Store the record of a cycle, and call the functions in `seen`."""
-        super().take(message)
+        super().handle_message(message)
         if message.topic == LogTopic.CYCLE:
             self.newest = self.read_cycle(message)
             for see in tuple(self.seen):

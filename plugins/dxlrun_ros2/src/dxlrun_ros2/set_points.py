@@ -67,7 +67,7 @@ class SetPoints:
 
         node.create_subscription(kind, topic, received, 10)
 
-    def send(
+    def send_set_point(
         self,
         robot: RemoteRobot,
         controller: str,

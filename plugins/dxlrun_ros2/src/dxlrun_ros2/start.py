@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import sys
 
-from dxlrun_ros2.versions import other_version
+from dxlrun_ros2.bridge_version import other_version
 
 
 def main() -> int:
@@ -13,6 +13,6 @@ def main() -> int:
         print(f"dxlrun-ros2: {wrong}", file=sys.stderr)
         return 2
     # This import must follow the check, because it fails with another version of dxlrun.
-    from dxlrun_ros2.command import main as bridge
+    from dxlrun_ros2.bridge_command import main as bridge
 
     return bridge()

@@ -16,7 +16,7 @@ from dxlrun_controllers.laws.spline import CUBIC, LINEAR, QUINTIC, SplineSample,
 
 
 @dataclass(frozen=True)
-class Wanted:
+class ValidatedTrajectory:
     """Validated ROS 2 trajectory of a controller's joints: rad, rad/s, rad/s^2 (m for linear joints), s"""
 
     joints: tuple[str, ...]
@@ -35,7 +35,7 @@ class Wanted:
         """Time from the conversion of the message until the last point, s"""
         return self.start_in + float(self.times[-1])
 
-    def command(self) -> dict[str, object]:
+    def build_command(self) -> dict[str, object]:
         """Return the fields of the command `trajectory` of a joint_trajectory_controller."""
         return {"points": self._points(0.0), "joints": list(self.joints), "start_in": self.start_in}
 
@@ -66,7 +66,7 @@ class Wanted:
         return min(int(np.searchsorted(self.times + self.start_in, seconds)), len(self.times) - 1)
 
 
-def wanted(message: JointTrajectory, joints: Sequence[str], now: float) -> Wanted:
+def wanted(message: JointTrajectory, joints: Sequence[str], now: float) -> ValidatedTrajectory:
     """Validate and convert a ROS 2 trajectory for some or all joints of a controller.
 
     Points in the past are omitted, and so is a first point at time 0 if more points follow, because the
@@ -111,7 +111,7 @@ def wanted(message: JointTrajectory, joints: Sequence[str], now: float) -> Wante
             raise InputError("all its points are in the past")
         ahead[-1] = True
     chosen = tuple(order for order, is_ahead in zip(orders, ahead, strict=True) if is_ahead)
-    return Wanted(named, times[ahead], points[ahead], chosen, start_in)
+    return ValidatedTrajectory(named, times[ahead], points[ahead], chosen, start_in)
 
 
 def tolerances(given: Sequence[JointTolerance], joints: Sequence[str]) -> dict[str, dict[str, float | str]]:

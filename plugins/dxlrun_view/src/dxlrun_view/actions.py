@@ -12,15 +12,15 @@ import msgspec
 
 from dxlrun import DxlrunError, InputError, RemoteRobot
 from dxlrun.tooling.live import Parameter
-from dxlrun_view.live import LiveRobot, info_of
-from dxlrun_view.shown import Source
+from dxlrun_view.live_robot import LiveRobot, info_of
+from dxlrun_view.shown import ViewSource
 
 LEAD_S = 0.3
 """Time in which a trajectory controller moves a joint to the position of its slider, s"""
 Names = Annotated[tuple[str, ...], msgspec.Meta(min_length=1)]
 
 
-class Done(msgspec.Struct, frozen=True):
+class ActionResult(msgspec.Struct, frozen=True):
     """Result of an action, as JSON for the page"""
 
     said: str
@@ -36,128 +36,141 @@ class _Message(msgspec.Struct, frozen=True, forbid_unknown_fields=True, tag_fiel
     """True if the page may perform the action without `dxlrun view --control`"""
 
 
-class Stop(_Message, frozen=True, tag="stop"):
+class StopAction(_Message, frozen=True, tag="stop"):
     """STOP button: disable the torque of all joints, so that they become limp."""
 
     always = True
 
-    def perform(self, robot: RemoteRobot) -> Done:
+    def perform_on(self, robot: RemoteRobot) -> ActionResult:
         """Disable the torque. If the run refuses that, end the run, whose policy then disables the torque."""
         try:
             robot.torque("all", on=False, release=True)
         except DxlrunError as error:
             robot.stop(wait=False)
-            return Done(f"The run ends, because torque off was refused ({error})")
-        return Done("STOP: all joints are limp")
+            return ActionResult(f"The run ends, because torque off was refused ({error})")
+        return ActionResult("STOP: all joints are limp")
 
 
-class Halt(_Message, frozen=True, tag="halt"):
+class HaltAction(_Message, frozen=True, tag="halt"):
     """Halt button: deactivate all controllers and bring the joints to rest, where they hold."""
 
-    def perform(self, robot: RemoteRobot) -> Done:
+    def perform_on(self, robot: RemoteRobot) -> ActionResult:
         """Halt the robot; return the time that the joints need to rest."""
         halted = robot.halt().halted
-        return Done("Halted" if halted is None else f"Halted in {halted.seconds:.2f} s")
+        return ActionResult("Halted" if halted is None else f"Halted in {halted.seconds:.2f} s")
 
 
-class Pause(_Message, frozen=True, tag="pause"):
+class PauseAction(_Message, frozen=True, tag="pause"):
     """Pause button: pause the run's controllers; the joints hold."""
 
-    def perform(self, robot: RemoteRobot) -> Done:
+    def perform_on(self, robot: RemoteRobot) -> ActionResult:
         """Pause the robot."""
         robot.pause()
-        return Done("Paused")
+        return ActionResult("Paused")
 
 
-class Resume(_Message, frozen=True, tag="resume"):
+class ResumeAction(_Message, frozen=True, tag="resume"):
     """Resume button: let the run's controllers continue after a pause."""
 
-    def perform(self, robot: RemoteRobot) -> Done:
+    def perform_on(self, robot: RemoteRobot) -> ActionResult:
         """Resume the robot."""
         robot.resume()
-        return Done("Resumed")
+        return ActionResult("Resumed")
 
 
-class SetTorque(_Message, frozen=True, tag="torque"):
+class TorqueAction(_Message, frozen=True, tag="torque"):
     """Enable or disable the torque of joints, groups or `all`."""
 
     joints: Names
     on: bool
 
-    def perform(self, robot: RemoteRobot) -> Done:
+    def perform_on(self, robot: RemoteRobot) -> ActionResult:
         """Enable the torque, or disable it and deactivate the controllers that command the joints."""
         robot.torque(self.joints, self.on, release=not self.on)
-        return Done(f"Torque {'on' if self.on else 'off'}: {', '.join(self.joints)}")
+        return ActionResult(f"Torque {'on' if self.on else 'off'}: {', '.join(self.joints)}")
 
 
-class Switch(_Message, frozen=True, tag="switch"):
+class SwitchAction(_Message, frozen=True, tag="switch"):
     """Activate (`on`) or deactivate a controller of the run."""
 
     controller: str
     on: bool
 
-    def perform(self, robot: RemoteRobot) -> Done:
+    def perform_on(self, robot: RemoteRobot) -> ActionResult:
         """Switch the controller."""
         names = (self.controller,)
         robot.switch(names if self.on else (), () if self.on else names)
-        return Done(f"{self.controller} is {'active' if self.on else 'not active'}")
+        return ActionResult(f"{self.controller} is {'active' if self.on else 'not active'}")
 
 
-class Goal(_Message, frozen=True, tag="goal"):
+class GoalAction(_Message, frozen=True, tag="goal"):
     """Slider of a joint: move it to a position, rad or m."""
 
     joint: str
     position: float
 
-    def perform(self, robot: RemoteRobot) -> Done:
+    def perform_on(self, robot: RemoteRobot) -> ActionResult:
         """Send the goal to the active controller that commands the joint's position."""
         for row in info_of(robot).controllers:
             if row.active and self.joint in row.joints and "position" in row.command:
                 seconds = LEAD_S if "trajectory" in row.goals else None
                 robot.send(row.name, "position", {self.joint: self.position}, seconds=seconds)
-                return Done(f"{self.joint} to {self.position:.3f} by {row.name}")
+                return ActionResult(f"{self.joint} to {self.position:.3f} by {row.name}")
         raise InputError(f"no active controller commands the position of {self.joint}; activate one")
 
 
-class Play(_Message, frozen=True, tag="play"):
+class PlayAction(_Message, frozen=True, tag="play"):
     """Play a motion file from the directory `motions` next to the robot file."""
 
     motion: str
 
-    def perform(self, robot: RemoteRobot) -> Done:
+    def perform_on(self, robot: RemoteRobot) -> ActionResult:
         """Start the motion, without waiting for its end."""
         goals = robot.play(self.motion).goals
-        return Done(f"Playing {self.motion}" + (f" (goal {goals[0].number})" if goals else ""))
+        return ActionResult(f"Playing {self.motion}" + (f" (goal {goals[0].number})" if goals else ""))
 
 
-class ListParameters(_Message, frozen=True, tag="parameters"):
+class ParameterListAction(_Message, frozen=True, tag="parameters"):
     """List the parameters of a controller."""
 
     always = True
     controller: str
 
-    def perform(self, robot: RemoteRobot) -> Done:
+    def perform_on(self, robot: RemoteRobot) -> ActionResult:
         """Return the table of the controller's parameters."""
-        return Done("", robot.parameter_table(self.controller))
+        return ActionResult("", robot.parameter_table(self.controller))
 
 
-class SetParameter(_Message, frozen=True, tag="set_parameter"):
+class ParameterAction(_Message, frozen=True, tag="set_parameter"):
     """Change a parameter of a controller in the run, to a value as in the robot file."""
 
     controller: str
     parameter: str
     value: float | bool | str
 
-    def perform(self, robot: RemoteRobot) -> Done:
+    def perform_on(self, robot: RemoteRobot) -> ActionResult:
         """Change the parameter; return the value that it has now."""
         changed = robot.set_parameters(self.controller, {self.parameter: self.value})
-        return Done(", ".join(f"{self.controller}: {name} is {new}" for name, (_, new) in changed.items()))
+        return ActionResult(
+            ", ".join(f"{self.controller}: {name} is {new}" for name, (_, new) in changed.items())
+        )
 
 
-Action = Stop | Halt | Pause | Resume | SetTorque | Switch | Goal | Play | ListParameters | SetParameter
+Action = (
+    StopAction
+    | HaltAction
+    | PauseAction
+    | ResumeAction
+    | TorqueAction
+    | SwitchAction
+    | GoalAction
+    | PlayAction
+    | ParameterListAction
+    | ParameterAction
+)
 
 
-def act(source: Source, action: Action) -> Done:
+def perform_action(source: ViewSource, action: Action) -> ActionResult:
     """Perform an action on the robot that the page shows.
 
     Raises:
@@ -165,7 +178,7 @@ def act(source: Source, action: Action) -> Done:
     """
     if not isinstance(source, LiveRobot):
         raise InputError("this is a log; start the robot to steer it")
-    if isinstance(action, Play) and action.motion not in source.shown().motions:
+    if isinstance(action, PlayAction) and action.motion not in source.describe_page().motions:
         raise InputError("the page plays only motions next to the robot file; use `dxlrun play`")
     with source.asking() as robot:
-        return action.perform(robot)
+        return action.perform_on(robot)

@@ -74,7 +74,7 @@ class History:
         self._values[place] = values
         self._count += 1
 
-    def fill(self, times: Values, name: str, values: Values) -> None:
+    def fill_column(self, times: Values, name: str, values: Values) -> None:
         """Write one column for all moments of a log at once. All columns must have the same times, s."""
         self._count = len(times)
         self._times[: len(times)] = times

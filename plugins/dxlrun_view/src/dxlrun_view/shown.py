@@ -14,7 +14,7 @@ import msgspec
 from dxlrun_view.curves import Curve, Moment
 
 
-class Controller(msgspec.Struct, frozen=True):
+class ViewedController(msgspec.Struct, frozen=True):
     """Controller of the robot, as a row of RobotInfo"""
 
     name: str
@@ -31,7 +31,7 @@ class Controller(msgspec.Struct, frozen=True):
     """Kinds of its commands that are goals, which end when they are reached"""
 
 
-class RobotInfo(msgspec.Struct, frozen=True):
+class ViewedRobot(msgspec.Struct, frozen=True):
     """Part of `RemoteRobot.info` that a page uses, also filled from logs"""
 
     robot: str
@@ -50,7 +50,7 @@ class RobotInfo(msgspec.Struct, frozen=True):
     """Units of efforts by joint; an empty text for the fraction of the servo's maximum"""
     limits: Mapping[str, tuple[float, float]] = {}
     """Lower and upper position limit by joint, rad or m. Continuous joints are not included."""
-    controllers: tuple[Controller, ...] = ()
+    controllers: tuple[ViewedController, ...] = ()
     file: str = ""
     """Path of the robot file"""
 
@@ -70,7 +70,7 @@ class LiveEvent(msgspec.Struct, frozen=True):
     """Time since the first cycle of the run, s; negative during the set-up of the servos"""
 
 
-class Mark(msgspec.Struct, frozen=True):
+class TimelineMark(msgspec.Struct, frozen=True):
     """Mark on the time line of a log, to which the user can jump"""
 
     time: float
@@ -78,10 +78,10 @@ class Mark(msgspec.Struct, frozen=True):
     """Label of the mark"""
 
 
-class Shown(msgspec.Struct, frozen=True, kw_only=True):
+class SourceProperties(msgspec.Struct, frozen=True, kw_only=True):
     """Properties of a robot or a log that rarely change, which the page requests in addition to the curves"""
 
-    info: RobotInfo
+    info: ViewedRobot
     live: bool
     """True for a running robot, False for a log"""
     columns: tuple[str, ...]
@@ -98,7 +98,7 @@ class Shown(msgspec.Struct, frozen=True, kw_only=True):
     """SI unit of each column that is a state of a source (sensor or device)"""
     fields: tuple[str, ...] = ()
     """Names of curves that are numbers in messages of topics, such as `/arm/state:error[0]`"""
-    marks: tuple[Mark, ...] = ()
+    marks: tuple[TimelineMark, ...] = ()
     """Cycles of a log with the latest wake-ups"""
     control: bool = False
     """True if the page may steer the robot"""
@@ -110,17 +110,17 @@ class Shown(msgspec.Struct, frozen=True, kw_only=True):
     """Link of the URDF to which this sensor is fixed"""
 
 
-class Source(Protocol):
+class ViewSource(Protocol):
     """Source of the page's data: a running robot (LiveRobot) or a log (RecordedRobot)"""
 
     @property
     def folder(self) -> Path | None:
         """Directory of the robot file, from which meshes are searched; None if unknown"""
 
-    def shown(self) -> Shown:
+    def describe_page(self) -> SourceProperties:
         """Return the properties of the robot or the log that rarely change."""
 
-    def at(self, time_s: float | None) -> Moment:
+    def moment_at(self, time_s: float | None) -> Moment:
         """Return all columns at a time. Without a time, poll a running robot and return the newest values."""
 
     def curve(self, name: str, begin: float, end: float, points: int) -> Curve:

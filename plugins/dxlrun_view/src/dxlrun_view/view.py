@@ -14,12 +14,12 @@ from cyclopts import Parameter
 
 from dxlrun import DxlrunError, InputError, running
 from dxlrun.tooling.files import suggestion
-from dxlrun.tooling.output import leave_real_time, print_warning, progress_bar, show
+from dxlrun.tooling.output import leave_real_time, print_warning, progress_bar, show_parts
 
 if TYPE_CHECKING:
     from types import FrameType
 
-    from dxlrun_view.shown import Source
+    from dxlrun_view.shown import ViewSource
 
 
 def view(
@@ -46,17 +46,17 @@ def view(
         with certificates of `dxlrun keys`. The role of the browser decides whether it may steer. Default
         port: 8765, or a free one if that is in use.
     """
-    from dxlrun.tooling.live import Place, in_url
+    from dxlrun.tooling.live import ListenAddress, in_url
 
-    place = Place.parse(listen)
+    place = ListenAddress.parse(listen)
     leave_real_time()
     from dxlrun.tooling.live import server_context
-    from dxlrun_view.server import PORT, Page, hosts_of, scheme_of, server_of
+    from dxlrun_view.page_server import PORT, Page, hosts_of, scheme_of, server_of
 
     source = _source(what)
     try:
         # Beyond this computer, a browser must use the name in the robot's certificate.
-        names = () if place.is_loopback else (source.shown().info.robot,)
+        names = () if place.is_loopback else (source.describe_page().info.robot,)
         tls = server_context(*names) if names else None
         with place.listener(PORT, tls) as listener:
             address, taken = listener.getsockname()[:2]
@@ -65,13 +65,13 @@ def view(
             url = f"{scheme_of(listener)}://{host}:{taken}/?token={page.token}"
             server = server_of(page)
 
-            def end(number: int, frame: FrameType | None) -> None:
+            def request_exit(number: int, frame: FrameType | None) -> None:
                 server.should_exit = True
 
-            signal.signal(signal.SIGINT, end)
-            signal.signal(signal.SIGTERM, end)
-            robot = source.shown().info.robot
-            show(f"{robot}: {url}", "Ctrl-C ends the page. A robot in another terminal continues.")
+            signal.signal(signal.SIGINT, request_exit)
+            signal.signal(signal.SIGTERM, request_exit)
+            robot = source.describe_page().info.robot
+            show_parts(f"{robot}: {url}", "Ctrl-C ends the page. A robot in another terminal continues.")
             sys.stdout.flush()
             if browser and not names:
                 threading.Thread(target=_open, args=(url,), daemon=True).start()
@@ -81,10 +81,10 @@ def view(
     return 0
 
 
-def _source(what: str | None) -> Source:
+def _source(what: str | None) -> ViewSource:
     """Open the robot or log that the argument of `dxlrun view` names, by default the only running robot.
     Raises DxlrunError if it does not run, does not exist or is ambiguous."""
-    from dxlrun_view.live import LiveRobot
+    from dxlrun_view.live_robot import LiveRobot
 
     if what is None:
         names = running()
@@ -95,7 +95,7 @@ def _source(what: str | None) -> Source:
         return LiveRobot(names[0])
     path = Path(what)
     if path.suffix == ".mcap" or path.is_dir():
-        from dxlrun_view.recorded import RecordedRobot
+        from dxlrun_view.recorded_robot import RecordedRobot
 
         if not path.exists():
             raise InputError(f"there is no log {path}; a run prints the path of its log when it ends")

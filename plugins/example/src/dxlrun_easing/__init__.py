@@ -3,6 +3,6 @@
 The package imports only the public package `dxlrun`.
 """
 
-from dxlrun_easing.controller import Easing, PositionsCommand
+from dxlrun_easing.easing import Easing, PositionsCommand
 
 __all__ = ["Easing", "PositionsCommand"]

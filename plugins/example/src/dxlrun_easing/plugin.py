@@ -6,7 +6,7 @@ from collections.abc import Mapping
 from typing import Any
 
 from dxlrun import Controller, hookimpl
-from dxlrun_easing.controller import Easing
+from dxlrun_easing.easing import Easing
 
 
 @hookimpl

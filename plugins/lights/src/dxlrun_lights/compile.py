@@ -7,7 +7,7 @@ import msgspec
 from dxlrun.tooling.features import Compilation, CompileStage, Contribution, SourcePlan
 from dxlrun.tooling.files import suggestion
 from dxlrun_lights import form
-from dxlrun_lights.plan import Light
+from dxlrun_lights.plan import LightPlan
 
 
 def compile_lights(compilation: Compilation) -> Contribution:
@@ -15,8 +15,8 @@ def compile_lights(compilation: Compilation) -> Contribution:
 
     Reports an error for each light whose joint or LED does not exist, or that another light has.
     """
-    file, found, owners = compilation.file, dict[str, Light](), dict[tuple[str, int], str]()
-    lights = form.STAGE.of(file.robot)
+    file, found, owners = compilation.file, dict[str, LightPlan](), dict[tuple[str, int], str]()
+    lights = form.STAGE.section_of(file.robot)
     for name, light in lights.items():
         mark = file.at("lights", name, "joint")
         if light.joint not in file.robot.joints:
@@ -34,7 +34,7 @@ def compile_lights(compilation: Compilation) -> Contribution:
                 what = f"light {name} is on {light.joint}, whose LED is light {other}"
                 file.error(mark, what, "name another joint, or remove one of the lights")
             else:
-                found[name] = Light(light.joint, *place, led.address)
+                found[name] = LightPlan(light.joint, *place, led.address)
     if len(found) < len(lights):  # without the source, controllers with these commands get no error
         return Contribution(names=("lights",))
     source = SourcePlan(

@@ -5,7 +5,7 @@ from __future__ import annotations
 import msgspec
 
 
-class Light(msgspec.Struct, frozen=True):
+class LightPlan(msgspec.Struct, frozen=True):
     """A light with the bus, ID and address at which its LED is written."""
 
     joint: str
@@ -14,6 +14,6 @@ class Light(msgspec.Struct, frozen=True):
     address: int  # LED item in the servo's control table
 
 
-def decode_lights(plan: bytes) -> dict[str, Light]:
+def decode_lights(plan: bytes) -> dict[str, LightPlan]:
     """Return the lights by name from the JSON of `Contribution.plan`."""
-    return msgspec.json.decode(plan, type=dict[str, Light])
+    return msgspec.json.decode(plan, type=dict[str, LightPlan])

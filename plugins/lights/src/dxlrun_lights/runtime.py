@@ -5,7 +5,7 @@ from __future__ import annotations
 import msgspec
 
 from dxlrun.tooling.features import BusContext, BusStage, Program, Urgency, plan_line
-from dxlrun_lights.plan import Light, decode_lights
+from dxlrun_lights.plan import LightPlan, decode_lights
 
 RETRY_NS = 1_000_000_000  # a servo that does not reply costs a timeout, so it is not written in every cycle
 
@@ -13,7 +13,7 @@ RETRY_NS = 1_000_000_000  # a servo that does not reply costs a timeout, so it i
 class Led(msgspec.Struct):
     """The LED of a light on a bus, with its last acknowledged state."""
 
-    light: Light
+    light: LightPlan
     servo: int  # Index in the servos of the bus
     column: int  # Its command in `BusContext.commands`
     shown: int | None = None  # last acknowledged value; None: not known
@@ -49,11 +49,11 @@ class Lights:
             if led.shown != lit and not led.writing and led.due_ns <= time_ns:
                 led.writing, led.due_ns = True, time_ns + RETRY_NS
                 name = self._context.command_names[led.column]
-                self._context.idle.add(self._write(led, lit), Urgency.STEERED, name, led.servo)
+                self._context.idle.add(self._write_led(led, lit), Urgency.STEERED, name, led.servo)
 
-    def _write(self, led: Led, lit: int) -> Program[None]:
+    def _write_led(self, led: Led, lit: int) -> Program[None]:
         line, light = plan_line(self._context.idle.plan), led.light
-        reply = yield line.write(light.servo_id, light.address, bytes([lit]))
+        reply = yield line.write_range(light.servo_id, light.address, bytes([lit]))
         led.writing = False
         if reply.answered:  # a lost write is repeated when it is due
             led.shown, led.due_ns = lit, 0

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from dxlrun.tooling.features import Lines, Program, SafeStage, limit_patience, plan_line, retry
-from dxlrun_lights.plan import Light, decode_lights
+from dxlrun_lights.plan import LightPlan, decode_lights
 from dxlwire import BusPlan
 
 
@@ -13,16 +13,16 @@ def switch_lights_off(lines: Lines, plan: bytes) -> tuple[str, ...]:
     on_buses = [
         {name: light for name, light in lights.items() if light.bus == bus.name} for bus in lines.plans
     ]
-    results = lines.run(
+    results = lines.run_programs(
         [limit_patience(_switch_off(bus, own)) for bus, own in zip(lines.plans, on_buses, strict=True)]
     )
     return tuple(sentence for sentences in results for sentence in sentences or ())
 
 
-def _switch_off(bus: BusPlan, lights: dict[str, Light]) -> Program[list[str]]:
+def _switch_off(bus: BusPlan, lights: dict[str, LightPlan]) -> Program[list[str]]:
     failures = []
     for name, light in lights.items():
-        reply = yield from retry(plan_line(bus).write(light.servo_id, light.address, b"\0"))
+        reply = yield from retry(plan_line(bus).write_range(light.servo_id, light.address, b"\0"))
         if not reply.answered:
             failures.append(
                 f"light {name} (ID {light.servo_id} on bus {bus.name}) did not confirm that it is off"

@@ -85,7 +85,7 @@ class PhidgetSpatial(Sensor[PhidgetSpatialParameters]):
                 channel.setDeviceSerialNumber(number)
             if (port := self.parameters.hub_port) is not None:
                 channel.setHubPort(port)
-            channel.setOnSpatialDataHandler(self._take)
+            channel.setOnSpatialDataHandler(self._store_event)
             channel.setOnDetachHandler(self._leave)
             channel.openWaitForAttachment(round(self.parameters.attach_timeout / 1e6))
             channel.setDataInterval(max(channel.getMinDataInterval(), round(context.period_ns / 1e6)))
@@ -115,7 +115,7 @@ class PhidgetSpatial(Sensor[PhidgetSpatialParameters]):
         if channel is not None:
             channel.close()
 
-    def _take(
+    def _store_event(
         self,
         _channel: object,
         acceleration: list[float],

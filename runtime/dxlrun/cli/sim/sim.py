@@ -14,7 +14,7 @@ from msgspec.structs import replace
 from dxlrun.cli.inputs import AssignmentOfItsOwn, Flag, JsonOfItsOwn, compiled
 from dxlrun.cli.sim.sim_inputs import (
     Absent,
-    Mistakes,
+    InputMistakes,
     Split,
     read_faults,
     read_latency,
@@ -23,14 +23,14 @@ from dxlrun.cli.sim.sim_inputs import (
 )
 from dxlrun.errors import InputError
 from dxlrun.output.target import check_target
-from dxlrun.output.terminal import out, print_error, print_warning, show
+from dxlrun.output.terminal import out, print_error, print_warning, show_parts
 from dxlrun.output.unblocked import leave_real_time, unblocked
 
 if TYPE_CHECKING:
     from collections.abc import Sequence
 
-    from dxlrun.cli.sim.sim_views import Shown
-    from dxlrun.run.simulation_front import Served
+    from dxlrun.cli.sim.sim_views import SimulationView
+    from dxlrun.run.simulation_front import SimulationResult
     from dxlsim.faults.fault import Fault
     from dxlsim.messages import SimulationJob
     from dxlsim.simulation_plan import BusConfig, SimulationConfig
@@ -110,7 +110,7 @@ def sim(
         Print the traceback of an error, and the output of the simulation process.
     """
     leave_real_time()
-    mistakes = Mistakes()
+    mistakes = InputMistakes()
     with mistakes.collected():
         planned = read_faults(fault, faults)
     with mistakes.collected():
@@ -125,12 +125,12 @@ def sim(
             others = {"a robot file": robot, "--servo": servo or None, "--baud": baud, "--protocol": protocol}
             simulated = _recorded(recorded, [name for name, value in others.items() if value is not None])
         links = link_of_each(simulated.config.buses, link)
-    mistakes.refuse()
+    mistakes.raise_errors()
     given = {"latency_timer_ns": latency_ns, "split": split, "echo": echo or None}
     buses = tuple(with_adapter(bus, given, absent, seed) for bus in simulated.config.buses)
     check_simulated(buses, planned, seed)
-    from dxlrun.channels.process import spare_core
-    from dxlrun.cli.sim.sim_views import Shown, ending
+    from dxlrun.channels.child_processes import spare_core
+    from dxlrun.cli.sim.sim_views import SimulationView, ending
     from dxlsim.messages import SimulationJob
 
     title = simulated.title
@@ -141,12 +141,14 @@ def sim(
         seed=seed,
         links={bus: str(path) for bus, path in links.items()},
     )
-    shown = Shown(title, buses, links, simulated.hint)
+    shown = SimulationView(title, buses, links, simulated.hint)
     core = spare_core(simulated.loop_cores)
     job = SimulationJob(config, str(ledger) if ledger else None, simulated.priority, core)
     served = _serve(job, shown, as_json=as_json)
     if not as_json:
-        show(ending(title, served.elapsed_s, served.look), *[f"ledger: {ledger}"] * (ledger is not None))
+        show_parts(
+            ending(title, served.elapsed_s, served.look), *[f"ledger: {ledger}"] * (ledger is not None)
+        )
     if debug:
         sys.stderr.write(served.printed)
     for sentence in served.sentences:
@@ -154,7 +156,7 @@ def sim(
     return 1 if served.sentences else 0
 
 
-class _Simulated(msgspec.Struct, frozen=True):
+class _SimulationSetup(msgspec.Struct, frozen=True):
     """Simulation to be served: its buses, from a robot file, `--servo` or `--recorded`, and its real-time
     settings.
     """
@@ -175,7 +177,7 @@ def _simulated(
     servo: Sequence[str],
     baud: int | None,
     protocol: float | None,
-) -> _Simulated:
+) -> _SimulationSetup:
     from dxlsim.simulation_plan import SimulationConfig
 
     if robot is None:
@@ -183,7 +185,7 @@ def _simulated(
             raise InputError(
                 "there is nothing to simulate; give a robot file, or servos such as --servo XL430-W250:1-3"
             )
-        return _Simulated("simulation", SimulationConfig((servo_bus(servo, baud, protocol),)))
+        return _SimulationSetup("simulation", SimulationConfig((servo_bus(servo, baud, protocol),)))
     options = {"--servo": servo or None, "--baud": baud, "--protocol": protocol}
     given = [name for name, value in options.items() if value is not None]
     if servo and not robot.is_file():
@@ -200,7 +202,7 @@ def _simulated(
     others = [word for word in assignments if not word.startswith("port:=")]
     hint = shlex.join(["dxlrun", str(robot), *others])
     takes_port = len(plan.buses) == 1 and "port" in plan.arguments
-    return _Simulated(
+    return _SimulationSetup(
         title=plan.robot,
         config=simulation,
         priority=min(plan.loop.scheduler.priority + _ABOVE_LOOP, 99),
@@ -209,7 +211,7 @@ def _simulated(
     )
 
 
-def _recorded(log: Path, others: Sequence[str]) -> _Simulated:
+def _recorded(log: Path, others: Sequence[str]) -> _SimulationSetup:
     """Return a simulation of the buses of a log, which answer as recorded; `others`: given options that
     exclude it.
 
@@ -219,7 +221,7 @@ def _recorded(log: Path, others: Sequence[str]) -> _Simulated:
         raise InputError(f"--recorded and {' and '.join(others)} exclude each other; omit one of them")
     if not log.exists():
         raise InputError(f"there is no log {log}; a run prints the path of its log when it ends")
-    from dxlrun.log.reader import open_log
+    from dxlrun.log.log_reader import open_log
     from dxlrun.plan.robot_plan import from_json
     from dxlsim.simulation_plan import BusConfig, SimulationConfig
 
@@ -231,7 +233,7 @@ def _recorded(log: Path, others: Sequence[str]) -> _Simulated:
     path = str(log.absolute())
     buses = tuple(BusConfig(bus.name, bus.baud_rate, (), bus.protocol, recorded=path) for bus in plan.buses)
     hint = "dxlrun ROBOT.yaml" if len(buses) == 1 else None
-    return _Simulated(f"{plan.robot}, recorded", SimulationConfig(buses), hint=hint)
+    return _SimulationSetup(f"{plan.robot}, recorded", SimulationConfig(buses), hint=hint)
 
 
 def check_simulated(buses: Sequence[BusConfig], faults: Sequence[Fault], seed: int) -> None:
@@ -282,17 +284,17 @@ def link_of_each(buses: Sequence[BusConfig], link: Path | None) -> dict[str, Pat
     return {name: path.absolute() for name, path in links.items()}
 
 
-def _serve(job: SimulationJob, shown: Shown, *, as_json: bool) -> Served:
+def _serve(job: SimulationJob, shown: SimulationView, *, as_json: bool) -> SimulationResult:
     from dxlrun.cli.sim.sim_views import JsonView, PlainView
-    from dxlrun.run.simulation_front import TypedLines, serve
+    from dxlrun.run.simulation_front import TypedLines, serve_simulation
 
     typed = TypedLines(sys.stdin.fileno())
     if as_json:
-        return serve(job, JsonView(shown), typed)
+        return serve_simulation(job, JsonView(shown), typed)
     if not sys.stdout.isatty() or not typed.in_foreground:
-        return serve(job, PlainView(shown), typed)
+        return serve_simulation(job, PlainView(shown), typed)
     from dxlrun.cli.sim.sim_views import TableView
 
     view = TableView(shown, out())
     with view.showing():
-        return serve(job, view, typed)
+        return serve_simulation(job, view, typed)

@@ -20,7 +20,7 @@ Split = Literal["whole", "byte", "random"]
 Absent = Literal["silent", "slot"]
 
 
-class Mistakes:
+class InputMistakes:
     """Collector of the InputErrors of independent options, which are reported together."""
 
     def __init__(self) -> None:
@@ -34,7 +34,7 @@ class Mistakes:
         except InputError as error:
             self._errors.append(error)
 
-    def refuse(self) -> None:
+    def raise_errors(self) -> None:
         """Raise the stored errors as one InputError; return when there are none."""
         if len(self._errors) == 1:
             raise self._errors[0]
@@ -47,7 +47,7 @@ def servo_bus(words: Sequence[str], baud_rate: int | None, protocol: float | Non
 
     Raises InputError.
     """
-    from dxlrun.control.controllers.plugins import load_plugins
+    from dxlrun.control.controllers.plugin_loading import load_plugins
     from dxlsim.texts.servo_words import bus_of_servos
 
     load_plugins()

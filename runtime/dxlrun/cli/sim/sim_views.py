@@ -15,8 +15,8 @@ from typing import TYPE_CHECKING
 import msgspec
 
 from dxlrun.errors import counted
-from dxlrun.output.table import Column, Sentence, Table, Tone, numbers
-from dxlrun.output.terminal import fitted, out, print_error, show, show_json
+from dxlrun.output.terminal import fitted, out, print_error, show_json, show_parts
+from dxlrun.output.text_table import Column, Sentence, Table, Tone, numbers
 
 if TYPE_CHECKING:
     from pathlib import Path
@@ -31,7 +31,7 @@ _AROUND = 7
 """Lines of the screen that are not servos: head and rule of the table, lateness, prompt and events."""
 
 
-class Shown(msgspec.Struct, frozen=True):
+class SimulationView(msgspec.Struct, frozen=True):
     """The simulated buses with the links to their ports, as text for the views."""
 
     title: str
@@ -89,7 +89,7 @@ class PlainView:
 
     look_every_s: float | None = None
 
-    def __init__(self, shown: Shown) -> None:
+    def __init__(self, shown: SimulationView) -> None:
         self._shown = shown
         self._console: Console = out()
 
@@ -98,7 +98,7 @@ class PlainView:
         for line in self._shown.lines(ports, real_time):
             self._print(line)
 
-    def take(self, message: SimulationMessage) -> None:
+    def show_message(self, message: SimulationMessage) -> None:
         """Print what a message of the simulation reports: moved ports, a fault that happened, or a typed
         line's result.
         """
@@ -120,11 +120,11 @@ class PlainView:
         for line in fault_lines():
             self._print(line)
 
-    def look(self, look: SimulationMessage, typed: str) -> None:
+    def show_snapshot(self, look: SimulationMessage, typed: str) -> None:
         """Print nothing, because a table among lines would scroll the faults away."""
 
     def _print(self, line: str, tone: Tone = "plain") -> None:
-        show(Sentence(line, tone), console=self._console)
+        show_parts(Sentence(line, tone), console=self._console)
 
 
 class TableView(PlainView):
@@ -134,7 +134,7 @@ class TableView(PlainView):
 
     look_every_s: float | None = _LOOK_S
 
-    def __init__(self, shown: Shown, console: Console) -> None:
+    def __init__(self, shown: SimulationView, console: Console) -> None:
         from rich.live import Live
 
         self._shown = shown
@@ -153,7 +153,7 @@ class TableView(PlainView):
     def _refuse(self, sentence: str) -> None:
         self._print(sentence, "error")
 
-    def look(self, look: SimulationMessage, typed: str) -> None:
+    def show_snapshot(self, look: SimulationMessage, typed: str) -> None:
         """Redraw the table with new states of the servos and the line that is being typed."""
         self._newest = look
         self._draw(typed)
@@ -179,7 +179,7 @@ class JsonView:
 
     look_every_s: float | None = None
 
-    def __init__(self, shown: Shown) -> None:
+    def __init__(self, shown: SimulationView) -> None:
         self._shown = shown
 
     def opened(self, ports: Mapping[str, str], real_time: str) -> None:
@@ -187,7 +187,7 @@ class JsonView:
         named = {bus: self._shown.port(bus, ports) for bus in ports}
         show_json({"ports": named, "devices": dict(ports), "real_time": real_time})
 
-    def take(self, message: SimulationMessage) -> None:
+    def show_message(self, message: SimulationMessage) -> None:
         """Print what a message of the simulation reports as JSON."""
         given = {
             "devices": message.ports,
@@ -202,7 +202,7 @@ class JsonView:
         """Print the lines that can be typed, one for each kind of fault, as JSON."""
         show_json({"faults": list(fault_lines())})
 
-    def look(self, look: SimulationMessage, typed: str) -> None:
+    def show_snapshot(self, look: SimulationMessage, typed: str) -> None:
         """Print nothing: states of servos are not part of this output."""
 
 
@@ -301,7 +301,7 @@ def servo_table(servos: Sequence[ServoLook], *, several: bool) -> Table:
         )
         for servo in servos
     ]
-    table = Table.of("", columns, rows)
+    table = Table.from_rows("", columns, rows)
     return table.marked([bool(servo.error) for servo in servos])
 
 

@@ -7,10 +7,10 @@ from collections.abc import Iterator, Mapping, Sequence
 from typing import TYPE_CHECKING
 
 from dxlrun.cli.inputs import Hertz
-from dxlrun.cli.steering.steer import ONLY_ONE, Chosen, connect_robot
+from dxlrun.cli.steering.steer import ONLY_ONE, RobotChoice, connect_robot
 from dxlrun.errors import InputError
-from dxlrun.output.table import Column, Columns, Table
-from dxlrun.output.terminal import show, show_json
+from dxlrun.output.terminal import show_json, show_parts
+from dxlrun.output.text_table import Column, Columns, Table
 
 if TYPE_CHECKING:
     from dxlrun.remote.live.listening import TopicMessage
@@ -26,7 +26,7 @@ def echo(
     *,
     count: int | None = None,
     rate: Hertz | None = None,
-    chosen: Chosen = ONLY_ONE,
+    chosen: RobotChoice = ONLY_ONE,
 ) -> int:
     """Print the messages of a topic as they arrive: `dxlrun echo /arm/state`.
 
@@ -52,7 +52,7 @@ def echo(
             if chosen.as_json:
                 show_json(states)
             else:
-                show(topics(states))
+                show_parts(topics(states))
             return 0
         try:
             for number, message in enumerate(robot.listen(topic, rate=rate), 1):
@@ -95,7 +95,7 @@ def print_message(message: TopicMessage, *, as_json: bool) -> None:
         return
     lost = f", {message.lost} missed before it" if message.lost else ""
     head = f"--- {message.topic} {message.number}, {time:.3f} s{lost}"
-    show("\n".join([head, *fields(plain, message.joints)]))
+    show_parts("\n".join([head, *fields(plain, message.joints)]))
 
 
 def fields(message: Mapping[str, object], joints: Sequence[str]) -> list[str]:

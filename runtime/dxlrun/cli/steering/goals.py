@@ -12,9 +12,9 @@ from cyclopts import Parameter
 from msgspec import to_builtins
 
 from dxlrun.cli.inputs import WaitFlag
-from dxlrun.cli.steering.steer import ONLY_ONE, Chosen, Words, connect_robot, report_done
+from dxlrun.cli.steering.steer import ONLY_ONE, RobotChoice, Words, connect_robot, report_done
 from dxlrun.errors import DxlrunError, InputError, Refused
-from dxlrun.output.terminal import print_error, print_warning, progress_bar, show, show_json
+from dxlrun.output.terminal import print_error, print_warning, progress_bar, show_json, show_parts
 
 if TYPE_CHECKING:
     from dxlrun.remote.client import Executed, RemoteRobot
@@ -37,7 +37,7 @@ def send(
     file: Path | None = None,
     in_: Annotated[str | None, Parameter(name="--in")] = None,
     wait: WaitFlag = False,
-    chosen: Chosen = ONLY_ONE,
+    chosen: RobotChoice = ONLY_ONE,
 ) -> int:
     """Send a command to a controller or a device: `dxlrun send arm position elbow=20deg wrist=0deg`.
 
@@ -63,14 +63,14 @@ def send(
         With --no-wait, return as soon as the controller has accepted the command.
     """
     from dxlrun.channels.answers import Code
-    from dxlrun.cli.steering.written import Written
+    from dxlrun.cli.steering.written import WrittenEntry
     from dxlrun.description.source_names import SOURCE_COMMANDS
     from dxlrun.description.units import duration
 
     for_device = "=" in kind
     if for_device:
         words, kind = (kind, *words), SOURCE_COMMANDS
-    written = Written.read(words, file)
+    written = WrittenEntry.from_words(words, file)
     try:
         seconds = None if in_ is None else duration(in_, bare="s") * 1e-9
     except ValueError as error:
@@ -95,10 +95,10 @@ def send(
             raise DxlrunError(
                 f"{controller} accepted {kind}, but it is not a goal, so nothing can be awaited"
             )
-        return follow(robot, chosen, done, [done.goal.number])
+        return show_goal_progress(robot, chosen, done, [done.goal.number])
 
 
-def cancel(goal: str = "", /, *, wait: WaitFlag = False, chosen: Chosen = ONLY_ONE) -> int:
+def cancel(goal: str = "", /, *, wait: WaitFlag = False, chosen: RobotChoice = ONLY_ONE) -> int:
     """Cancel goals of a running robot.
 
     Their controllers bring the joints to rest.
@@ -140,10 +140,10 @@ def cancel(goal: str = "", /, *, wait: WaitFlag = False, chosen: Chosen = ONLY_O
         if chosen.as_json:
             show_json({"robot": robot.name, "goals": cancelled})
         elif not cancelled:
-            show(f"{robot.name}: no goal runs")
+            show_parts(f"{robot.name}: no goal runs")
         else:
             shown = ", ".join(map(str, cancelled))
-            show(f"{robot.name}: goal{'s' if len(cancelled) > 1 else ''} {shown} cancelled")
+            show_parts(f"{robot.name}: goal{'s' if len(cancelled) > 1 else ''} {shown} cancelled")
     return 0
 
 
@@ -169,12 +169,12 @@ def begun_or_cancelled(robot: RemoteRobot, verb: str, *, waited: bool) -> Iterat
                     if state.number > last and state.origin.startswith(f"dxlrun {verb}")
                 ]
             for state in cancel_goals(robot, own):
-                print_warning(f"dxlrun: {state.describe()}")
+                print_warning(f"dxlrun: {state.describe_outcome()}")
         raise
 
 
-def follow(
-    robot: RemoteRobot, chosen: Chosen, done: Executed, numbers: Sequence[int], motion: str = ""
+def show_goal_progress(
+    robot: RemoteRobot, chosen: RobotChoice, done: Executed, numbers: Sequence[int], motion: str = ""
 ) -> int:
     """Show the progress of goals until all have ended, print their results, and return the exit code.
 
@@ -187,7 +187,7 @@ def follow(
         states = cancel_goals(robot, numbers)
         if not chosen.as_json:
             for state in states:
-                print_warning(f"dxlrun: {state.describe()}")
+                print_warning(f"dxlrun: {state.describe_outcome()}")
         raise
     reached = all(state.reached for state in states)
     if chosen.as_json:
@@ -195,16 +195,16 @@ def follow(
         result: dict[str, object] = {"robot": robot.name, "cycle": done.cycle}
         result |= {"motion": motion} if motion else {}
         result |= goals[0] if len(goals) == 1 else {"goals": goals}
-        missed = [state.describe() for state in states if not state.reached]
+        missed = [state.describe_outcome() for state in states if not state.reached]
         show_json(result, code=0 if reached else 1, errors=missed)
         return 0 if reached else 1
     joints = _joints(robot) if motion else {}
     for state in states:
         moved = joints.get(state.controller, ())
         played = f"{motion} ({', '.join(moved[:MOST_JOINTS])}{' ...' * (len(moved) > MOST_JOINTS)}): "
-        text = f"{played if motion else ''}{state.describe()}"
+        text = f"{played if motion else ''}{state.describe_outcome()}"
         if state.reached:
-            show(f"{robot.name}: {text}")
+            show_parts(f"{robot.name}: {text}")
         else:
             print_error(f"dxlrun: {text}")
     return 0 if reached else 1

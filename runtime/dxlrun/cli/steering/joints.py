@@ -10,11 +10,11 @@ from typing import TYPE_CHECKING, Annotated, Any, Literal
 from cyclopts import Parameter
 
 from dxlrun.cli.inputs import Flag, pose_text
-from dxlrun.cli.steering.steer import ONLY_ONE, Chosen, connect_robot, report_done
+from dxlrun.cli.steering.steer import ONLY_ONE, RobotChoice, connect_robot, report_done
 from dxlrun.errors import InputError
 from dxlrun.output.quantity import quantity_text
-from dxlrun.output.table import Table
-from dxlrun.output.terminal import show, show_json
+from dxlrun.output.terminal import show_json, show_parts
+from dxlrun.output.text_table import Table
 from dxlwire.joint_unit import JointUnit
 
 if TYPE_CHECKING:
@@ -39,7 +39,7 @@ _WRITTEN: Mapping[str, tuple[float, int, str]] = MappingProxyType(
 
 
 def torque(
-    state: Literal["on", "off"], /, *joints: Joints, release: Flag = False, chosen: Chosen = ONLY_ONE
+    state: Literal["on", "off"], /, *joints: Joints, release: Flag = False, chosen: RobotChoice = ONLY_ONE
 ) -> int:
     """Enable or disable the torque of joints of a running robot: `dxlrun torque off elbow_joint`.
 
@@ -64,7 +64,7 @@ def torque(
         return report_done(robot, chosen, done, f"{robot.name}: {', '.join(names)} {verb}{_others(done)}")
 
 
-def reboot(*joints: Joints, release: Flag = False, chosen: Chosen = ONLY_ONE) -> int:
+def reboot(*joints: Joints, release: Flag = False, chosen: RobotChoice = ONLY_ONE) -> int:
     """Reboot servos of a running robot to clear a hardware error: `dxlrun reboot elbow_joint`.
 
     Only servos with Protocol 2.0 can be rebooted. The command returns when they are operational again. Torque
@@ -85,7 +85,7 @@ def reboot(*joints: Joints, release: Flag = False, chosen: Chosen = ONLY_ONE) ->
         return report_done(robot, chosen, done, f"{robot.name}: {text}")
 
 
-def get(joint: str, item: str = "", /, *, chosen: Chosen = ONLY_ONE) -> int:
+def show_joint(joint: str, item: str = "", /, *, chosen: RobotChoice = ONLY_ONE) -> int:
     """Print the state of a joint, or an item of its servo's control table.
 
     For a group, a controller or `all`, the pose is printed in the notation of `dxlrun send`. For a device or
@@ -108,11 +108,11 @@ def get(joint: str, item: str = "", /, *, chosen: Chosen = ONLY_ONE) -> int:
             show_json({"robot": robot.name, **found})
         elif item:
             meaning = f" ({found['is']})" if found["is"] else ""
-            show(f"{robot.name}: {found['title']} of {joint} is {found['value']}{meaning}")
+            show_parts(f"{robot.name}: {found['title']} of {joint} is {found['value']}{meaning}")
         elif "source" in found:
-            show(f"{robot.name}: {joint}", Table.facts("", source_facts(found)))
+            show_parts(f"{robot.name}: {joint}", Table.facts("", source_facts(found)))
         else:
-            show(f"{robot.name}: {joint}", Table.facts("", facts(found)))
+            show_parts(f"{robot.name}: {joint}", Table.facts("", facts(found)))
     return 0
 
 
@@ -125,7 +125,7 @@ def _meant(info: Mapping[str, Any], name: str) -> Sequence[str]:
     return () if name in info["joints"] else known.get(name, ())
 
 
-def _show_pose(robot: RemoteRobot, names: Sequence[str], chosen: Chosen) -> int:
+def _show_pose(robot: RemoteRobot, names: Sequence[str], chosen: RobotChoice) -> int:
     """Print the present positions of joints as words for `send`, without joints that were never read;
     return 0.
     """
@@ -136,11 +136,11 @@ def _show_pose(robot: RemoteRobot, names: Sequence[str], chosen: Chosen) -> int:
     if chosen.as_json:
         show_json({"robot": robot.name, "pose": pose})
     else:
-        show(pose_text({name: written(position, ways[name]) for name, position in pose.items()}))
+        show_parts(pose_text({name: format_number(position, ways[name]) for name, position in pose.items()}))
     return 0
 
 
-def set_register(joint: str, item: str, value: str, /, *, chosen: Chosen = ONLY_ONE) -> int:
+def set_register(joint: str, item: str, value: str, /, *, chosen: RobotChoice = ONLY_ONE) -> int:
     """Write a register of a servo while the robot runs: `dxlrun set elbow_joint position_p_gain 900`.
 
     Only items in RAM that no controller commands can be written. The command returns when the servo has the
@@ -177,7 +177,7 @@ def source_facts(found: Mapping[str, Any]) -> list[tuple[str, str]]:
             (found["commands"], found.get("command_units", {})),
         )
     )
-    age = written(found["age"], "ms") or "none came yet"
+    age = format_number(found["age"], "ms") or "none came yet"
     of_states = [*states, ("age", age if found["valid"] else f"{age}, not valid")] if states else []
     return [*of_states, *((f"{name}, commanded", value) for name, value in commands)]
 
@@ -187,24 +187,24 @@ def facts(state: Mapping[str, object]) -> list[tuple[str, str]]:
     unit = state["effort_unit"]
     way = JointUnit(str(state["unit"])).shown
     found = [
-        ("position", written(state["position"], way)),
-        ("velocity", written(state["velocity"], f"{way}/s")),
-        ("effort", written(state["effort"], unit)),
-        ("goal position", written(state["goal_position"], way)),
-        ("goal velocity", written(state["goal_velocity"], f"{way}/s")),
-        ("goal effort", written(state["goal_effort"], unit)),
-        ("goal pwm", written(state["goal_pwm"], "")),
-        ("temperature", written(state["temperature"], "deg C")),
-        ("voltage", written(state["voltage"], "V")),
+        ("position", format_number(state["position"], way)),
+        ("velocity", format_number(state["velocity"], f"{way}/s")),
+        ("effort", format_number(state["effort"], unit)),
+        ("goal position", format_number(state["goal_position"], way)),
+        ("goal velocity", format_number(state["goal_velocity"], f"{way}/s")),
+        ("goal effort", format_number(state["goal_effort"], unit)),
+        ("goal pwm", format_number(state["goal_pwm"], "")),
+        ("temperature", format_number(state["temperature"], "deg C")),
+        ("voltage", format_number(state["voltage"], "V")),
         ("torque", str(state["torque"])),
         ("mode", str(state["mode"]).replace("_", " ")),
         ("hardware error", f"{state['hardware_error']:#04x}" if state["hardware_error"] else ""),
-        ("age", written(state["age"], "ms")),
+        ("age", format_number(state["age"], "ms")),
     ]
     return [(name, text) for name, text in found if text]
 
 
-def written(value: object, unit: object) -> str:
+def format_number(value: object, unit: object) -> str:
     """Return an SI number as text in the unit for people; empty when it is None.
 
     Unit "" is a fraction, shown in %.

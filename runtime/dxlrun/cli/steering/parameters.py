@@ -7,16 +7,16 @@ from collections.abc import Callable, Sequence
 from msgspec import to_builtins
 
 from dxlrun.cli.inputs import parse_pair
-from dxlrun.cli.steering.steer import ONLY_ONE, Chosen, Words, connect_robot
+from dxlrun.cli.steering.steer import ONLY_ONE, RobotChoice, Words, connect_robot
 from dxlrun.errors import InputError
-from dxlrun.output.table import Column, Table
-from dxlrun.output.terminal import show, show_json
+from dxlrun.output.terminal import show_json, show_parts
+from dxlrun.output.text_table import Column, Table
 from dxlrun.remote.requests.replies import Parameter
 
 _DURATIONS = ("s", 1e9), ("ms", 1e6), ("us", 1e3)
 
 
-def parameters(controller: str, /, *words: Words, chosen: Chosen = ONLY_ONE) -> int:
+def parameters(controller: str, /, *words: Words, chosen: RobotChoice = ONLY_ONE) -> int:
     """Show the parameters of a controller, or change live ones: `dxlrun parameters arm gains.p=4.0`.
 
     All given parameters change in the same cycle, or none does.
@@ -37,9 +37,9 @@ def parameters(controller: str, /, *words: Words, chosen: Chosen = ONLY_ONE) -> 
             if chosen.as_json:
                 show_json({"robot": robot.name, "controller": controller, "parameters": to_builtins(rows)})
             elif rows:
-                show(_table(rows))
+                show_parts(_table(rows))
             else:
-                show(f"{robot.name}: {controller} has no parameters")
+                show_parts(f"{robot.name}: {controller} has no parameters")
             return 0
         changed = robot.set_parameters(controller, values)
         if chosen.as_json:
@@ -47,7 +47,7 @@ def parameters(controller: str, /, *words: Words, chosen: Chosen = ONLY_ONE) -> 
             show_json({"robot": robot.name, "controller": controller, "changed": shown})
         else:
             for name, (old, new) in changed.items():
-                show(f"{robot.name}: {controller} {name}: {written(old)} -> {written(new)}")
+                show_parts(f"{robot.name}: {controller} {name}: {format_value(old)} -> {format_value(new)}")
     return 0
 
 
@@ -62,7 +62,7 @@ def _pair(word: str) -> tuple[str, bool | float | str]:
 def _table(rows: Sequence[Parameter]) -> Table:
     columns: list[tuple[Column, Callable[[Parameter], str]]] = [
         (Column("parameter", "name"), lambda row: row.name),
-        (Column("value", "text"), lambda row: written(row.value)),
+        (Column("value", "text"), lambda row: format_value(row.value)),
         (Column("in a run", "name"), lambda row: "live" if row.live else "fixed"),
         (Column("range", "text"), lambda row: row.range),
         (Column("description", "text", detail=True), lambda row: row.description),
@@ -71,14 +71,14 @@ def _table(rows: Sequence[Parameter]) -> Table:
     return Table.listing("", used, rows)
 
 
-def written(value: object) -> str:
+def format_value(value: object) -> str:
     """Return a parameter's value as text: numbers with six digits, times in a fitting unit."""
     if isinstance(value, bool):
         return "true" if value else "false"
     if isinstance(value, list):
-        return f"[{', '.join(map(written, value))}]"
+        return f"[{', '.join(map(format_value, value))}]"
     if isinstance(value, dict):
-        return f"{{{', '.join(f'{key}: {written(inner)}' for key, inner in value.items())}}}"
+        return f"{{{', '.join(f'{key}: {format_value(inner)}' for key, inner in value.items())}}}"
     if value is None:
         return ""
     number, _, unit = str(value).partition(" ")

@@ -9,10 +9,10 @@ from typing import TYPE_CHECKING, Annotated, NamedTuple, cast
 from cyclopts import Parameter
 
 from dxlrun.cli.inputs import Flag, WaitFlag
-from dxlrun.cli.steering.goals import MOST_JOINTS, begun_or_cancelled, follow
-from dxlrun.cli.steering.steer import ONLY_ONE, Chosen, connect_robot, report_done
+from dxlrun.cli.steering.goals import MOST_JOINTS, begun_or_cancelled, show_goal_progress
+from dxlrun.cli.steering.steer import ONLY_ONE, RobotChoice, connect_robot, report_done
 from dxlrun.errors import DxlrunError, InputError, Mark, Problem, Refused, suggestion
-from dxlrun.output.terminal import show, show_json
+from dxlrun.output.terminal import show_json, show_parts
 
 if TYPE_CHECKING:
     from dxlrun.description.joints.groups import Groups
@@ -25,7 +25,7 @@ _FOLDER = "motions"
 """Name of the folder next to the robot file in which motion files are searched."""
 
 
-class Found(NamedTuple):
+class MotionSource(NamedTuple):
     """A motion named on the command line, and where it was found."""
 
     motion: str
@@ -46,13 +46,13 @@ class Playable(NamedTuple):
     """Path of the motion file; empty when a controller has the motion."""
 
 
-def play(
+def play_motions(
     *motions: Annotated[str, Parameter(name="motion")],
     speed: float = 1.0,
     loop: int = 1,
     listed: Annotated[Flag, Parameter(name="--list")] = False,
     wait: WaitFlag = True,
-    chosen: Chosen = ONLY_ONE,
+    chosen: RobotChoice = ONLY_ONE,
 ) -> int:
     """Play motions on a running robot: `dxlrun play wave bow`.
 
@@ -103,7 +103,7 @@ def _check(motions: Sequence[str], loop: int, *, listed: bool, wait: bool) -> No
             raise InputError(f"there is no motion file {motion}; check the path")
 
 
-def _play(robot: RemoteRobot, found: Found, speed: float, chosen: Chosen, *, wait: bool) -> int:
+def _play(robot: RemoteRobot, found: MotionSource, speed: float, chosen: RobotChoice, *, wait: bool) -> int:
     """Play one motion; return the exit code after its end, or at once without `wait`."""
     motion, path, player = found
     try:
@@ -119,19 +119,19 @@ def _play(robot: RemoteRobot, found: Found, speed: float, chosen: Chosen, *, wai
         shown = ", ".join(map(str, numbers))
         goals = f"goal{'s' if len(numbers) > 1 else ''} {shown}"
         return report_done(robot, chosen, done, f"{robot.name}: plays {motion} as {goals}")
-    return follow(robot, chosen, done, numbers, motion)
+    return show_goal_progress(robot, chosen, done, numbers, motion)
 
 
 # Lookup of motions
 
 
-def _found(robot: RemoteRobot, name: str) -> Found:
+def _found(robot: RemoteRobot, name: str) -> MotionSource:
     """Return the motion file or the controller for a motion's name or path.
 
     Raises InputError for an unknown name, or one that several files or controllers have.
     """
     if (path := Path(name)).is_file():
-        return Found(name, path)
+        return MotionSource(name, path)
     info = robot.info()
     players = _players(info)
     files = _files(info)
@@ -144,7 +144,7 @@ def _found(robot: RemoteRobot, name: str) -> Found:
         ]
         raise InputError(f"there are {len(ways)} motions {name}; choose one: {', '.join(ways)}")
     if fitting or having:
-        return Found(name, fitting[0]) if fitting else Found(name, Path(name), having[0])
+        return MotionSource(name, fitting[0]) if fitting else MotionSource(name, Path(name), having[0])
     known = [each.motion for each in _playable(info)]
     raise InputError(
         f"{robot.name} has no motion {name}, and there is no file of that name; {suggestion(name, known)}"
@@ -185,22 +185,22 @@ def _check_forms(robot: RemoteRobot, files: Sequence[Path]) -> None:
         read_motion(file, groups)
 
 
-def _list(robot: RemoteRobot, chosen: Chosen) -> None:
-    from dxlrun.output.table import Column, Table
+def _list(robot: RemoteRobot, chosen: RobotChoice) -> None:
+    from dxlrun.output.text_table import Column, Table
 
     rows = sorted(_playable(robot.info()))
     if chosen.as_json:
         show_json([row._asdict() for row in rows])
         return
     if not rows:
-        show(f"{robot.name} has no motions; `dxlrun teach` records some")
+        show_parts(f"{robot.name} has no motions; `dxlrun teach` records some")
         return
     columns = [Column(name, "name") for name in ("motion", "controllers", "joints")]
     columns += [Column("length", form="{:.2f} s"), Column("file", "name")]
     cells = [
         (row.motion, ", ".join(row.controllers), _few(row.joints), row.seconds, row.file) for row in rows
     ]
-    show(Table.of("", columns, cells))
+    show_parts(Table.from_rows("", columns, cells))
 
 
 def _few(joints: Sequence[str]) -> str:

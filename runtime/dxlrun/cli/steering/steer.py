@@ -17,8 +17,8 @@ from cyclopts import Parameter
 from dxlrun.cli.inputs import DebugFlag, GraphFile, Hertz, JsonFlag, WaitFlag
 from dxlrun.errors import DxlrunError, InputError, suggestion
 from dxlrun.output.quantity import names_with_units, quantity_text
-from dxlrun.output.table import Column, Columns, Table
-from dxlrun.output.terminal import print_error, show, show_json
+from dxlrun.output.terminal import print_error, show_json, show_parts
+from dxlrun.output.text_table import Column, Columns, Table
 
 if TYPE_CHECKING:
     from dxlrun.output.graph import Graph
@@ -34,7 +34,7 @@ Row = Mapping[str, Any]
 
 @Parameter(name="*")
 @dataclass(frozen=True, slots=True)
-class Chosen:
+class RobotChoice:
     """Choice of the robot, and form of the output.
 
     Parameters
@@ -48,7 +48,7 @@ class Chosen:
     debug: DebugFlag = False
 
 
-ONLY_ONE = Chosen()
+ONLY_ONE = RobotChoice()
 """Default of `Chosen`: the only robot that runs."""
 
 
@@ -68,7 +68,7 @@ def list_robots(
     from dxlrun.remote.client import connect
     from dxlrun.remote.network.network_link import known_robots
     from dxlrun.remote.sockets import running
-    from dxlrun.run.unsteered import describe, unsteered_runs
+    from dxlrun.run.unsteered import describe_run, unsteered_runs
 
     here = running()
     unsteered = {run.name: run for run in unsteered_runs() if run.is_ours}
@@ -80,7 +80,7 @@ def list_robots(
     failures: list[str] = []
     for name in names if robot is None else (robot,):
         if name in unsteered:
-            failures.append(describe(unsteered[name]))
+            failures.append(describe_run(unsteered[name]))
             code |= robot is not None
             continue
         try:
@@ -100,7 +100,7 @@ def list_robots(
     for info in found:
         _show_robot(info, graph)
     if not found and not code and not unsteered:
-        show("no robot runs that can be steered; `dxlrun ROBOT.yaml` starts one")
+        show_parts("no robot runs that can be steered; `dxlrun ROBOT.yaml` starts one")
     return code
 
 
@@ -126,14 +126,14 @@ def _write_graphs(info: Row, files: Sequence[Path]) -> None:
 
 def _show_robot(info: Row, graph: Sequence[Path] | None) -> None:
     if graph is None:
-        show(headline(info), controllers(info), sources(info), groups(info))
+        show_parts(headline(info), controllers(info), sources(info), groups(info))
     elif graph:
-        show(headline(info), *(f"the controller graph is in {file}" for file in graph))
+        show_parts(headline(info), *(f"the controller graph is in {file}" for file in graph))
     else:
-        show(headline(info), drawing(info))
+        show_parts(headline(info), drawing(info))
 
 
-def switch(*, activate: Names = (), deactivate: Names = (), chosen: Chosen = ONLY_ONE) -> int:
+def switch(*, activate: Names = (), deactivate: Names = (), chosen: RobotChoice = ONLY_ONE) -> int:
     """Activate and deactivate controllers of a running robot.
 
     All of them change in the same cycle, or none does.
@@ -158,7 +158,7 @@ def switch(*, activate: Names = (), deactivate: Names = (), chosen: Chosen = ONL
         return report_done(robot, chosen, done, f"{robot.name}: {'; '.join(parts)}")
 
 
-def rate(hz: Hertz, /, *, chosen: Chosen = ONLY_ONE) -> int:
+def rate(hz: Hertz, /, *, chosen: RobotChoice = ONLY_ONE) -> int:
     """Change the loop rate of a running robot.
 
     Parameters
@@ -174,7 +174,7 @@ def rate(hz: Hertz, /, *, chosen: Chosen = ONLY_ONE) -> int:
         return report_done(robot, chosen, done, f"{robot.name} runs at {hz:g} Hz")
 
 
-def halt(*, chosen: Chosen = ONLY_ONE) -> int:
+def halt(*, chosen: RobotChoice = ONLY_ONE) -> int:
     """Stop all joints within their limits, and hold them.
 
     The run continues. All controllers that command joints are deactivated.
@@ -187,7 +187,7 @@ def halt(*, chosen: Chosen = ONLY_ONE) -> int:
         return report_done(robot, chosen, done, f"{text}; `dxlrun switch --activate NAME` lets it continue")
 
 
-def take_over(*, chosen: Chosen = ONLY_ONE) -> int:
+def take_over(*, chosen: RobotChoice = ONLY_ONE) -> int:
     """Take over a robot that a client on another computer commands.
 
     Commands of that client are refused from then on.
@@ -197,7 +197,7 @@ def take_over(*, chosen: Chosen = ONLY_ONE) -> int:
         return report_done(robot, chosen, done, f"{robot.name} is commanded from here")
 
 
-def pause(*, chosen: Chosen = ONLY_ONE) -> int:
+def pause(*, chosen: RobotChoice = ONLY_ONE) -> int:
     """Pause a running robot.
 
     Its joints hold their positions, and the time of its controllers stops.
@@ -208,14 +208,16 @@ def pause(*, chosen: Chosen = ONLY_ONE) -> int:
         return report_done(robot, chosen, done, f"{robot.name} {text}")
 
 
-def resume(*, chosen: Chosen = ONLY_ONE) -> int:
+def resume_robot(*, chosen: RobotChoice = ONLY_ONE) -> int:
     """Resume a paused robot: its controllers continue where they stopped."""
     with connect_robot(chosen.robot, "resume") as robot:
         done = robot.resume()
         return report_done(robot, chosen, done, f"{robot.name} runs again")
 
 
-def load(name: str, /, *words: Words, file: Path | None = None, chosen: Chosen = ONLY_ONE) -> int:
+def load_controller(
+    name: str, /, *words: Words, file: Path | None = None, chosen: RobotChoice = ONLY_ONE
+) -> int:
     """Load another controller into a paused robot.
 
     `dxlrun switch --activate NAME` starts the controller.
@@ -230,9 +232,9 @@ def load(name: str, /, *words: Words, file: Path | None = None, chosen: Chosen =
     file
         YAML file with the keys, in place of words on the command line.
     """
-    from dxlrun.cli.steering.written import Written
+    from dxlrun.cli.steering.written import WrittenEntry
 
-    entry = Written.read(words, file).data
+    entry = WrittenEntry.from_words(words, file).data
     if "type" not in entry:
         raise InputError(f"{name} has no type; give it one, such as type=joint_group_position_controller")
     with connect_robot(chosen.robot, "load") as robot:
@@ -241,7 +243,7 @@ def load(name: str, /, *words: Words, file: Path | None = None, chosen: Chosen =
         return report_done(robot, chosen, done, f"{robot.name}: {text}")
 
 
-def unload(name: str, /, *, chosen: Chosen = ONLY_ONE) -> int:
+def unload_controller(name: str, /, *, chosen: RobotChoice = ONLY_ONE) -> int:
     """Remove an inactive controller from a paused robot.
 
     Parameters
@@ -254,7 +256,7 @@ def unload(name: str, /, *, chosen: Chosen = ONLY_ONE) -> int:
         return report_done(robot, chosen, done, f"{robot.name}: {name} is unloaded")
 
 
-def stop(*, wait: WaitFlag = True, chosen: Chosen = ONLY_ONE) -> int:
+def stop(*, wait: WaitFlag = True, chosen: RobotChoice = ONLY_ONE) -> int:
     """Stop a running robot by its policy on_exit.
 
     Parameters
@@ -269,7 +271,7 @@ def stop(*, wait: WaitFlag = True, chosen: Chosen = ONLY_ONE) -> int:
         if chosen.as_json:
             show_json({"robot": run.name, "ended": sentence})
         else:
-            show(sentence)
+            show_parts(sentence)
         return 0
     with connect_robot(chosen.robot, "stop") as robot:
         robot.stop(wait=wait)
@@ -309,13 +311,13 @@ def connect_robot(name: str | None, verb: str) -> RemoteRobot:
     from dxlrun.remote.client import connect
     from dxlrun.remote.network.network_link import known_robots
     from dxlrun.remote.sockets import running
-    from dxlrun.run.unsteered import describe
+    from dxlrun.run.unsteered import describe_run
 
     names = running()
     known = names if name is None else (*names, *known_robots())
     missing = name not in known if name else not names
     if missing and (run := unsteered_of(name)) is not None:
-        raise DxlrunError(describe(run))
+        raise DxlrunError(describe_run(run))
     if name is not None:
         _require_known(name, known)
     elif not names:
@@ -338,7 +340,7 @@ def _require_known(robot: str | None, names: Collection[str]) -> None:
         raise InputError(f"no robot {robot} runs; {suggestion(robot, names)}")
 
 
-def report_done(robot: RemoteRobot, chosen: Chosen, done: Executed | None, sentence: str) -> int:
+def report_done(robot: RemoteRobot, chosen: RobotChoice, done: Executed | None, sentence: str) -> int:
     """Print `sentence`, or with --json the robot's reply, for an executed request; return exit code 0."""
     if chosen.as_json:
         cycle: dict[str, object] = {} if done is None else {"cycle": done.cycle}
@@ -353,7 +355,7 @@ def report_done(robot: RemoteRobot, chosen: Chosen, done: Executed | None, sente
         goals = {"goals": numbers} if len(numbers) > 1 else dict(zip(("goal",), numbers, strict=False))
         show_json({"robot": robot.name} | cycle | goals)
     else:
-        show(sentence)
+        show_parts(sentence)
     return 0
 
 
@@ -392,7 +394,7 @@ def sources(info: Row) -> Table:
 def groups(info: Row) -> Table:
     """Return a table of a robot's groups with their joints."""
     rows = [(name, ", ".join(joints)) for name, joints in info.get("groups", {}).items()]
-    return Table.of("", [Column("group", "name"), Column("joints", "text")], rows)
+    return Table.from_rows("", [Column("group", "name"), Column("joints", "text")], rows)
 
 
 def _source_commands(source: Row) -> str:
@@ -409,7 +411,7 @@ def drawing(info: Row) -> Graph:
     from msgspec import convert
 
     # Imported here because most commands draw nothing.
-    from dxlrun.compile.graph import ControllerGraph
+    from dxlrun.compile.controller_graph import ControllerGraph
     from dxlrun.plan.loop_plan import ControllerPlan
 
     unknown = {"distribution": "", "parameters": "{}", "publishes": (), "rate": None}

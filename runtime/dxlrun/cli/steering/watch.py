@@ -10,13 +10,13 @@ from dataclasses import dataclass, field
 from typing import TYPE_CHECKING, cast
 
 from dxlrun.cli.inputs import Flag
-from dxlrun.cli.steering.steer import ONLY_ONE, Chosen, Row, connect_robot, state
+from dxlrun.cli.steering.steer import ONLY_ONE, RobotChoice, Row, connect_robot, state
 from dxlrun.errors import DxlrunError, Refused
 from dxlrun.output.escaping import escaped
 from dxlrun.output.live_view import compact, keys_pressed
 from dxlrun.output.quantity import quantity_text
-from dxlrun.output.table import Cell, Column, Columns, Sentence, Table, Tone
-from dxlrun.output.terminal import STYLES, out, show, show_json
+from dxlrun.output.terminal import STYLES, out, show_json, show_parts
+from dxlrun.output.text_table import Cell, Column, Columns, Sentence, Table, Tone
 from dxlwire.joint_unit import JointUnit
 
 if TYPE_CHECKING:
@@ -34,7 +34,7 @@ _TONES: Mapping[str, Tone] = {"on": "good", "doubt": "warning", "lost": "error",
 
 
 @dataclass(slots=True)
-class Watched:
+class WatchedRobot:
     """Newest states, controllers and events of a running robot, as requested by `look`."""
 
     robot: RemoteRobot
@@ -48,7 +48,7 @@ class Watched:
     _last: int = 0
     _cycle: tuple[int, float] = (0, 0.0)
 
-    def look(self) -> None:
+    def poll_robot(self) -> None:
         """Request states, controllers and new events from the robot; raises DxlrunError when it is gone."""
         self.info = cast("Row", self.robot.info())
         self.states = self.robot.states()
@@ -85,7 +85,7 @@ class Watched:
         }
 
 
-def watch(*, once: Flag = False, chosen: Chosen = ONLY_ONE) -> int:
+def watch_robot(*, once: Flag = False, chosen: RobotChoice = ONLY_ONE) -> int:
     """Watch a running robot live: joints, controllers, rate and events.
 
     q or Ctrl-C ends the command. In a pipe, one snapshot is printed as tables. With --json, objects are
@@ -97,13 +97,13 @@ def watch(*, once: Flag = False, chosen: Chosen = ONLY_ONE) -> int:
         Print one snapshot and exit.
     """
     with connect_robot(chosen.robot, "watch") as robot:
-        watched = Watched(robot)
+        watched = WatchedRobot(robot)
         _first_look(watched)
         try:
             if chosen.as_json:
                 _print_lines(watched, once=once)
             elif once or not sys.stdout.isatty():
-                show(*snapshot(watched))
+                show_parts(*snapshot(watched))
             else:
                 _show_live(watched)
         except KeyboardInterrupt:
@@ -112,37 +112,37 @@ def watch(*, once: Flag = False, chosen: Chosen = ONLY_ONE) -> int:
             if robot.link.alive:
                 raise
             if not chosen.as_json:
-                show(
+                show_parts(
                     f"{robot.name} has ended" if not isinstance(error, Refused) else f"{robot.name} is ending"
                 )
     return 0
 
 
-def _first_look(watched: Watched) -> None:
+def _first_look(watched: WatchedRobot) -> None:
     """Request the first data, and wait up to about 2.5 s for the run's first cycle."""
     from dxlrun.channels.answers import Code
 
     for _ in range(50):
         try:
-            watched.look()
+            watched.poll_robot()
         except Refused as refused:
             if refused.code != Code.NO_CYCLE:
                 raise
             time.sleep(REFRESH_S / 4)
         else:
             return
-    watched.look()
+    watched.poll_robot()
 
 
-def _print_lines(watched: Watched, *, once: bool) -> None:
+def _print_lines(watched: WatchedRobot, *, once: bool) -> None:
     show_json(watched.json())
     while not once:
         time.sleep(REFRESH_S)
-        watched.look()
+        watched.poll_robot()
         show_json(watched.json())
 
 
-def _show_live(watched: Watched) -> None:
+def _show_live(watched: WatchedRobot) -> None:
     """Redraw the view until a key is pressed; raises DxlrunError when the robot is gone."""
     from rich.live import Live
 
@@ -154,13 +154,13 @@ def _show_live(watched: Watched) -> None:
             live.update(view(watched, width - 1, height), refresh=True)
             if pressed(REFRESH_S):
                 return
-            watched.look()
+            watched.poll_robot()
 
 
 # Tables and lines
 
 
-def headline(watched: Watched) -> Sentence:
+def headline(watched: WatchedRobot) -> Sentence:
     """Return a line about the run: rate, cycle, delay of the wake-up and skipped periods."""
     info, late = watched.info, watched.states.late_ns * 1e-9
     rate = "" if watched.rate is None else f" ({watched.rate:.1f})"
@@ -173,13 +173,13 @@ def headline(watched: Watched) -> Sentence:
     return Sentence(text, "warning" if skipped or paused else "plain")
 
 
-def joints(watched: Watched) -> Table:
+def joints(watched: WatchedRobot) -> Table:
     """Return a table of joints: goal, position, velocity, effort, temperature, voltage, torque or error."""
     numbers = (Column(name) for name in ("goal", "deg", "deg/s", "effort", "deg C", "V"))
     columns = [Column("joint", "name"), *numbers, Column("torque", "name")]
     states = watched.states
     rows = zip(states.joints, states.effort_units, states.units, strict=True)
-    return Table.of(
+    return Table.from_rows(
         "", columns, (_joint(name, states.joint(name), unit, JointUnit(way)) for name, unit, way in rows)
     )
 
@@ -212,7 +212,7 @@ def _number(value: object, factor: float, digits: int, unit: str = "") -> str:
     return f"{text.lstrip('-') if float(text) == 0 else text}{unit}"
 
 
-def sources(watched: Watched) -> Table:
+def sources(watched: WatchedRobot) -> Table:
     """Return a table of devices, sensors and controllers that provide states, with states and age."""
     columns = [Column("source", "name"), Column("age"), Column("states", "text")]
     rows = []
@@ -224,7 +224,7 @@ def sources(watched: Watched) -> Table:
             for key, one in row["states"].items()
         )
         rows.append((name, _age(row), ", ".join(said)))
-    return Table.of("", columns, rows)
+    return Table.from_rows("", columns, rows)
 
 
 def _age(row: Row) -> Cell:
@@ -236,7 +236,7 @@ def _age(row: Row) -> Cell:
     return Cell(text) if row["valid"] else Cell(f"{text}, not valid", "warning")
 
 
-def controllers(watched: Watched) -> Table:
+def controllers(watched: WatchedRobot) -> Table:
     """Return a table of controllers: state, rate, duration of the last update, and controllers they
     command.
     """
@@ -251,7 +251,7 @@ def controllers(watched: Watched) -> Table:
     return Table.listing("", columns, watched.info["controllers"])
 
 
-def event_lines(watched: Watched, most: int) -> list[Sentence]:
+def event_lines(watched: WatchedRobot, most: int) -> list[Sentence]:
     """Return lines for the last `most` events, the newest one last, with their age."""
     lines = []
     for event in watched.events[-most:] if most > 0 else []:
@@ -263,7 +263,7 @@ def event_lines(watched: Watched, most: int) -> list[Sentence]:
     return lines
 
 
-def snapshot(watched: Watched) -> tuple[Table | Sentence, ...]:
+def snapshot(watched: WatchedRobot) -> tuple[Table | Sentence, ...]:
     """Return the lines and tables of one snapshot, for a pipe."""
     others = sources(watched)
     between = (others,) if others.rows else ()
@@ -276,7 +276,7 @@ def snapshot(watched: Watched) -> tuple[Table | Sentence, ...]:
     )
 
 
-def view(watched: Watched, width: int, height: int) -> Group:
+def view(watched: WatchedRobot, width: int, height: int) -> Group:
     """Return the view for a terminal of this size, columns and lines: all joints, and what fits of the
     rest.
     """

@@ -11,21 +11,21 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from dxlrun.cli.inputs import parse_pair
-from dxlrun.description.document import Grown, grow, literal, parse, read_text
+from dxlrun.description.document import PlainDocument, grow, literal, parse, read_text
 from dxlrun.errors import DxlrunError, InputError, Problem, Refused
 
 _WORDS = "command line"
 
 
 @dataclass(frozen=True, slots=True)
-class Written:
+class WrittenEntry:
     """Keys and values of a command, or of a controller's entry, as the user wrote them."""
 
-    grown: Grown
+    grown: PlainDocument
     in_words: bool
 
     @classmethod
-    def read(cls, words: Sequence[str], file: Path | None) -> Written:
+    def from_words(cls, words: Sequence[str], file: Path | None) -> WrittenEntry:
         """Read `key=value` words, or a file; raises InputError if both are given, and for invalid YAML."""
         if file is not None and words:
             raise InputError(f"{words[0]!r} and --file exclude each other; give the words, or the file")

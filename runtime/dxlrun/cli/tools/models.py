@@ -12,8 +12,8 @@ from msgspec.structs import asdict
 
 from dxlrun.cli.inputs import DebugFlag, JsonFlag
 from dxlrun.errors import InputError
-from dxlrun.output.table import Column, Columns, Table
-from dxlrun.output.terminal import show, show_json
+from dxlrun.output.terminal import show_json, show_parts
+from dxlrun.output.text_table import Column, Columns, Table
 
 if TYPE_CHECKING:
     from dxlsim.motion.motor import Motor
@@ -52,7 +52,7 @@ def models(
     protocol
         Protocol, 1.0 or 2.0, of the models. Default: both.
     """
-    from dxlrun.control.controllers.plugins import load_plugins
+    from dxlrun.control.controllers.plugin_loading import load_plugins
 
     # Plug-ins may add servo models.
     load_plugins()
@@ -61,14 +61,14 @@ def models(
         found = [_as_json(table, items=name is not None) for table in tables]
         show_json(found + [_device_json(table, items=name is not None) for table in devices])
     elif name is None:
-        show(_overview(tables))
+        show_parts(_overview(tables))
         if devices:
-            show(_devices(devices))
+            show_parts(_devices(devices))
     else:
         for table in tables:
-            show(_title(table), _facts(table), _items(table))
+            show_parts(_title(table), _facts(table), _items(table))
         for device in devices:
-            show(_title(device), _device_facts(device), _device_items(device))
+            show_parts(_title(device), _device_facts(device), _device_items(device))
     return 0
 
 
@@ -78,7 +78,7 @@ def _tables(name: str | None, protocol: float | None) -> tuple[list[ControlTable
     Raises InputError when there is no such model.
     """
     from dxlwire.control_table import all_tables, find_table, perhaps_meant, protocols_of
-    from dxlwire.control_table.devices import device_table, device_tables, perhaps_meant_device
+    from dxlwire.control_table.device_models import device_table, device_tables, perhaps_meant_device
 
     if protocol not in (None, 1.0, 2.0):
         raise InputError(f"there is no Protocol {protocol:g}; --protocol is 1.0 or 2.0")

@@ -16,11 +16,11 @@ from dxlrun.cli.inputs import DebugFlag, JsonFlag
 from dxlrun.cli.tools.tool_log import tool_log
 from dxlrun.errors import InputError, ServoFault
 from dxlrun.output.target import check_target, write_target
-from dxlrun.output.terminal import print_error, print_warning, progress_bar, show, show_json
+from dxlrun.output.terminal import print_error, print_warning, progress_bar, show_json, show_parts
 
 if TYPE_CHECKING:
-    from dxlrun.dynamixel.tools.scanning import FoundServo, Scanned, Search
-    from dxlrun.output.table import Table
+    from dxlrun.dynamixel.tools.scanning import FoundServo, ScanResult, Search
+    from dxlrun.output.text_table import Table
     from dxlwire.control_table import ControlTable
 
 Rates = Annotated[tuple[int, ...], Parameter(negative=(), show_default=False)]
@@ -90,7 +90,7 @@ def scan(
     if output is not None and scanned.servos:
         draft_file(output, port, scanned.servos, latency_ns)
         if not as_json:
-            show(f"robot file: {output}; complete it, then `dxlrun check {output}`")
+            show_parts(f"robot file: {output}; complete it, then `dxlrun check {output}`")
     return 0 if scanned.servos else 1
 
 
@@ -134,12 +134,12 @@ def read_ids(text: str) -> tuple[int, ...]:
 
 def load_models() -> None:
     """Load all plug-ins, so that their servo models are known."""
-    from dxlrun.control.controllers.plugins import load_plugins
+    from dxlrun.control.controllers.plugin_loading import load_plugins
 
     load_plugins()
 
 
-def _show(port: str, scanned: Scanned, rates: Mapping[int, int], *, narrowed: bool, as_json: bool) -> None:
+def _show(port: str, scanned: ScanResult, rates: Mapping[int, int], *, narrowed: bool, as_json: bool) -> None:
     """Print what a scan found, with errors and warnings.
 
     `rates`: baud rate that the port does not support -> rate that the driver set; `narrowed`: options limited
@@ -170,7 +170,7 @@ def _show(port: str, scanned: Scanned, rates: Mapping[int, int], *, narrowed: bo
         show_json(found, code=len(errors), errors=errors, warnings=warnings)
         return
     if scanned.servos:
-        show(_table(scanned.servos))
+        show_parts(_table(scanned.servos))
     for warning in warnings:
         print_warning(warning)
     for error in errors:
@@ -178,7 +178,7 @@ def _show(port: str, scanned: Scanned, rates: Mapping[int, int], *, narrowed: bo
 
 
 def _table(servos: Sequence[FoundServo]) -> Table:
-    from dxlrun.output.table import Column, Table
+    from dxlrun.output.text_table import Column, Table
 
     columns = [
         Column("ID"),
@@ -203,7 +203,7 @@ def _table(servos: Sequence[FoundServo]) -> Table:
         )
         for servo in servos
     ]
-    return Table.of("", columns, rows)
+    return Table.from_rows("", columns, rows)
 
 
 # The draft of a robot file. Unknown properties (names of joints, zero positions, directions) are assumed, and
@@ -246,7 +246,7 @@ def draft(stem: str, port: str, servos: Sequence[FoundServo], latency_ns: int) -
             "brings one to another rate, two protocols need two ports; or scan one of them alone by "
             "--protocol and --baud"
         )
-    from dxlrun.compile.robot import compile_files
+    from dxlrun.compile.robot_compiler import compile_files
 
     text = _text(stem, port, known, latency_ns, rate=1)
     with tempfile.TemporaryDirectory() as folder:

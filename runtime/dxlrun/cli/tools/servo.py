@@ -16,16 +16,16 @@ from dxlrun.cli.tools.scan import HIGHEST_ID, load_models, read_search
 from dxlrun.cli.tools.tool_log import tool_log
 from dxlrun.errors import InputError, ServoFault
 from dxlrun.output.target import check_target
-from dxlrun.output.terminal import print_warning, show, show_json
+from dxlrun.output.terminal import print_warning, show_json, show_parts
 
 if TYPE_CHECKING:
     from dxlrun.dynamixel.tools.one_node import OneNode
     from dxlrun.dynamixel.tools.one_servo import OneServo
     from dxlrun.dynamixel.tools.scanning import FoundServo, Search
     from dxlrun.dynamixel.tools.tool_line import ToolLine
-    from dxlrun.output.table import Table
+    from dxlrun.output.text_table import Table
+    from dxlwire.control_table import BaseControlTable as ControlTable
     from dxlwire.control_table import FoundDeviation
-    from dxlwire.control_table import Table as ControlTable
 
 Keep = Literal["nothing", "id", "id-and-baud"]
 NOTHING_CHANGED = "nothing was changed"
@@ -79,7 +79,7 @@ def servo(
     from dxlrun.dynamixel.tools.tool_line import ToolLine, TunablePort
 
     search = read_search(protocol, () if baud is None else (baud,), None)
-    asked = Asked(words, keep, yes)
+    asked = VerbCall(words, keep, yes)
     _check(servo_id, verb, asked)
     load_models()
     with (
@@ -100,7 +100,7 @@ def servo(
     return 1 if asked.declined else 0
 
 
-def _check(servo_id: int, verb: str, asked: Asked) -> None:
+def _check(servo_id: int, verb: str, asked: VerbCall) -> None:
     """Raise InputError for an invalid ID, verb, words or option, before the port is opened."""
     if not 0 <= servo_id <= HIGHEST_ID:
         raise InputError(f"{servo_id} is not an ID of a servo; they are 0..{HIGHEST_ID}")
@@ -135,7 +135,7 @@ def _find(tool: ToolLine, servo_id: int, search: Search) -> FoundServo:
     return found[0]
 
 
-def _show(one: OneNode, verb: str, asked: Asked, *, as_json: bool) -> None:
+def _show(one: OneNode, verb: str, asked: VerbCall, *, as_json: bool) -> None:
     if as_json:
         identity = {
             "id": one.servo_id,
@@ -154,15 +154,15 @@ def _show(one: OneNode, verb: str, asked: Asked, *, as_json: bool) -> None:
         show_json(result, code=len(declined), errors=declined)
         return
     if verb == "get":
-        show(_registers(asked.registers, one.table, asked.deviations))
-    show(*(f"{one.called}: {sentence}" for sentence in asked.done))
+        show_parts(_registers(asked.registers, one.table, asked.deviations))
+    show_parts(*(f"{one.called}: {sentence}" for sentence in asked.done))
     if asked.declined:
-        show(NOTHING_CHANGED)
+        show_parts(NOTHING_CHANGED)
 
 
 def _registers(values: Mapping[str, int], table: ControlTable, deviations: Sequence[FoundDeviation]) -> Table:
     from dxlrun.dynamixel.servo.registers import meaning
-    from dxlrun.output.table import Column, Table
+    from dxlrun.output.text_table import Column, Table
 
     columns = [
         Column("item", "name"),
@@ -187,14 +187,14 @@ def _registers(values: Mapping[str, int], table: ControlTable, deviations: Seque
         for name, value in values.items()
         for item in (table.items[name],)
     ]
-    return Table.of("", columns, rows)
+    return Table.from_rows("", columns, rows)
 
 
 # The verbs. Each passes its words on, and returns its actions, one sentence each.
 
 
 @dataclass(slots=True)
-class Asked:
+class VerbCall:
     """Words and options that a verb was called with, and its results for the output."""
 
     words: tuple[str, ...]
@@ -233,12 +233,12 @@ class Verb:
     """Words of the verb, as the help shows them."""
     fewest: int
     most: int
-    do: Callable[[OneServo, Asked], Iterable[str]]
-    check: Callable[[Asked], None] = lambda _: None
+    do: Callable[[OneServo, VerbCall], Iterable[str]]
+    check: Callable[[VerbCall], None] = lambda _: None
     """Checks the words of the verb before the port is opened; raises InputError."""
 
 
-def _get(one: OneNode, asked: Asked) -> Iterable[str]:
+def _get(one: OneNode, asked: VerbCall) -> Iterable[str]:
     from dxlrun.errors import suggestion
 
     names = asked.words or tuple(name for name in one.table.items if not name.startswith("indirect_"))
@@ -248,12 +248,12 @@ def _get(one: OneNode, asked: Asked) -> Iterable[str]:
         raise InputError(
             "\n".join(f"an {one.table.model} has no {name}; {suggestion(name, known)}" for name in wrong)
         )
-    asked.registers |= one.read(names, refused=not asked.words)
+    asked.registers |= one.read_items(names, refused=not asked.words)
     asked.deviations = one.deviations(asked.registers)
     return ()
 
 
-def _set(one: OneNode, asked: Asked) -> Iterable[str]:
+def _set(one: OneNode, asked: VerbCall) -> Iterable[str]:
     from dxlrun.compile.joints.register_values import any_value
 
     name, text = asked.words
@@ -276,12 +276,12 @@ def _value(text: str) -> int | str:
         return text
 
 
-def _backup(one: OneServo, asked: Asked) -> Iterable[str]:
+def _backup(one: OneServo, asked: VerbCall) -> Iterable[str]:
     from dxlrun.dynamixel.tools import servo_backup
 
     if not asked.words:
         return (one.back_up(asked.confirmed),)
-    asked.registers |= one.read(servo_backup.kept_items(one.table), refused=True)
+    asked.registers |= one.read_items(servo_backup.kept_items(one.table), refused=True)
     address = one.servo_id, one.baud_rate
     path = Path(asked.words[0])
     backup = servo_backup.stamped(one.table, one.found.firmware, address, asked.registers)
@@ -289,12 +289,12 @@ def _backup(one: OneServo, asked: Asked) -> Iterable[str]:
     return (f"{len(asked.registers)} registers are in {path}",)
 
 
-def _new_file(asked: Asked) -> None:
+def _new_file(asked: VerbCall) -> None:
     if asked.words:
         check_target(Path(asked.words[0]))
 
 
-def _restore(one: OneServo, asked: Asked) -> Iterable[str]:
+def _restore(one: OneServo, asked: VerbCall) -> Iterable[str]:
     from dxlrun.dynamixel.tools import servo_backup
 
     if not asked.words:
@@ -307,37 +307,37 @@ def _restore(one: OneServo, asked: Asked) -> Iterable[str]:
     return one.restore(target, path, asked.confirmed)
 
 
-def _old_file(asked: Asked) -> None:
+def _old_file(asked: VerbCall) -> None:
     from dxlrun.dynamixel.tools.servo_backup import read_backup
 
     if asked.words:
         read_backup(Path(asked.words[0]))
 
 
-def _factory_reset(one: OneServo, asked: Asked) -> Iterable[str]:
+def _factory_reset(one: OneServo, asked: VerbCall) -> Iterable[str]:
     from dxlwire.wire.protocol2 import Reset
 
     keep = {"nothing": Reset.ALL, "id": Reset.KEEP_ID, "id-and-baud": Reset.KEEP_ID_AND_BAUD_RATE}
     return (one.factory_reset(None if asked.keep is None else keep[asked.keep], asked.confirmed),)
 
 
-def _whole(what: str, lowest: int, highest: int) -> Callable[[Asked], None]:
-    def check(asked: Asked) -> None:
+def _whole(what: str, lowest: int, highest: int) -> Callable[[VerbCall], None]:
+    def check_words(asked: VerbCall) -> None:
         for word in asked.words:
             if not word.isdecimal() or not lowest <= int(word) <= highest:
                 raise InputError(
                     f"{word!r} is not a possible {what}; give a whole number from {lowest} to {highest}"
                 )
 
-    return check
+    return check_words
 
 
-def _on_or_off(asked: Asked) -> None:
+def _on_or_off(asked: VerbCall) -> None:
     if asked.words[0] not in ("on", "off"):
         raise InputError(f"torque is switched on or off, not {asked.words[0]!r}")
 
 
-_OF_DEVICES: Mapping[str, Callable[[OneNode, Asked], Iterable[str]]] = {"get": _get, "set": _set}
+_OF_DEVICES: Mapping[str, Callable[[OneNode, VerbCall], Iterable[str]]] = {"get": _get, "set": _set}
 """Verb that devices other than servos have -> its action."""
 VERBS: Mapping[str, Verb] = MappingProxyType(
     {

@@ -30,7 +30,7 @@ def tool_log(
     if path is None:
         yield None
         return
-    from dxlrun.channels.packets import PacketBatch
+    from dxlrun.channels.logged_packets import PacketBatch
     from dxlrun.channels.ring import Handover
     from dxlrun.log.identity import HOST, IDENTITY_NAME, code_hashes
     from dxlrun.log.log_writer import LogWriter
@@ -44,11 +44,11 @@ def tool_log(
         writer = LogWriter(path, header)
     except OSError as error:
         raise unwritable(path, error) from error
-    packets = PacketBatch(Handover(writer.take))
+    packets = PacketBatch(Handover(writer.write_record))
     try:
         yield packets
     finally:
-        packets.commit()
+        packets.commit_packets()
         if (error_text := writer.close().error) is not None:
             print_warning(incomplete_log(error_text))
 
@@ -68,15 +68,15 @@ class BusesLog:
     def __exit__(self, *_: object) -> None:
         self._open.close()
 
-    def of(self, buses: Sequence[BusPlan]) -> Mapping[str, PacketSink]:
+    def open_sinks(self, buses: Sequence[BusPlan]) -> Mapping[str, PacketSink]:
         """Return the packet sink of each bus by name, empty without a log; the first call creates the log.
 
         `buses`: all buses of the robot. Raises InputError when the file exists or cannot be written.
         """
         if self._sinks is None:
-            from dxlrun.dynamixel.tools.tool_line import OnBus
+            from dxlrun.dynamixel.tools.tool_line import BusPacketSink
 
             names = [bus.name for bus in buses]
             log = self._open.enter_context(tool_log(self._path, self._command, names))
-            self._sinks = {name: OnBus(log, at) for at, name in enumerate(names)} if log else {}
+            self._sinks = {name: BusPacketSink(log, at) for at, name in enumerate(names)} if log else {}
         return self._sinks

@@ -11,7 +11,7 @@ from typing import ClassVar
 import msgspec
 
 from dxlrun.description.document import KeyPath, Marks
-from dxlrun.description.joints.joints import Joint, ServoJoint, SharedJoint, servo_values
+from dxlrun.description.joints.joint_forms import Joint, ServoJoint, SharedJoint, servo_values
 from dxlrun.description.reading import Description
 from dxlrun.errors import Mark
 from dxlrun.features import installed_features, stages
@@ -38,7 +38,7 @@ class DescribedServo(msgspec.Struct, frozen=True):
     unit: JointUnit  # unit of its load's positions
     continuous: bool
     torque: bool
-    keys: Mapping[str, object]  # keys of features; `ServoKey.of` returns one with its type
+    keys: Mapping[str, object]  # keys of features; `ServoKey.value_of` returns one with its type
     motor: str | None
 
     @property

@@ -16,7 +16,9 @@ from dxlrun.plan.loop_plan import JointPlan, LimitedInterface
 from dxlwire.joint_unit import ROTARY, JointUnit
 
 if TYPE_CHECKING:
-    from dxlrun.compile.samples import Sample  # not at run time: only motions need the parser of formulas
+    from dxlrun.compile.motion_samples import (
+        MotionSample,
+    )  # not at run time: only motions need the parser of formulas
 
 _TOLERANCE = 1e-6  # rad; far below a tick (5e-3 rad on an AX-12), far above the rounding of degrees
 
@@ -68,7 +70,7 @@ def degrees(angle: float) -> str:
 
 
 def check_samples(
-    samples: Sequence[Sample],
+    samples: Sequence[MotionSample],
     start_ns: int,
     joints: Mapping[str, JointPlan],
     problems: Problems,
@@ -138,13 +140,13 @@ def excess_speed(joint: JointPlan, speed: float, where: str) -> ExcessSpeed | No
 
 
 def _worst(
-    samples: Sequence[Sample], joints: Mapping[str, JointPlan], peaks: Iterable[SpeedPeak]
-) -> tuple[dict[str, tuple[float, Sample, float]], dict[str, tuple[float, int, Mark]]]:
+    samples: Sequence[MotionSample], joints: Mapping[str, JointPlan], peaks: Iterable[SpeedPeak]
+) -> tuple[dict[str, tuple[float, MotionSample, float]], dict[str, tuple[float, int, Mark]]]:
     """Return by joint the target farthest outside the limits, and the highest speed with its time."""
-    farthest: dict[str, tuple[float, Sample, float]] = {}
+    farthest: dict[str, tuple[float, MotionSample, float]] = {}
     fastest: dict[str, tuple[float, int, Mark]] = {}
 
-    def note(joint: str, speed: float, t_ns: int, mark: Mark) -> None:
+    def note_speed(joint: str, speed: float, t_ns: int, mark: Mark) -> None:
         if abs(speed) > fastest.get(joint, (0.0, 0, mark))[0]:
             fastest[joint] = abs(speed), t_ns, mark
 
@@ -153,7 +155,7 @@ def _worst(
             if joint not in joints:
                 continue
             if target.velocity is not None:
-                note(joint, target.velocity, sample.t_ns, target.mark)
+                note_speed(joint, target.velocity, sample.t_ns, target.mark)
             if target.position is None:
                 continue
             excess = max(joints[joint].lower - target.position, target.position - joints[joint].upper)
@@ -165,11 +167,11 @@ def _worst(
         # Report a peak at the target toward which the joint moves.
         aimed = samples[min(bisect_left(times, t_ns), len(times) - 1)].targets.get(peak.joint)
         if peak.joint in joints and aimed is not None:
-            note(peak.joint, peak.speed, t_ns, aimed.mark)
+            note_speed(peak.joint, peak.speed, t_ns, aimed.mark)
     return farthest, fastest
 
 
-class BeyondLimit(NamedTuple):
+class LimitViolation(NamedTuple):
     """Message for one value of a command that is beyond a limit of its joint."""
 
     joint: str
@@ -178,7 +180,7 @@ class BeyondLimit(NamedTuple):
 
 def beyond_limits(
     joints: Sequence[JointPlan], command: CommandModel, peaks: Iterable[SpeedPeak] = ()
-) -> list[BeyondLimit]:
+) -> list[LimitViolation]:
     """Return a message for each position, speed, effort or PWM of a command beyond its joint's limits.
 
     Positions (rad) are compared with the position limits. Velocities (rad/s), the `peaks` and efforts are
@@ -208,31 +210,33 @@ def beyond_limits(
         joint = known.get(peak.joint)
         where = f" at {peak.time:.3f} s, {peak.where}"
         if joint is not None and (excess := excess_speed(joint, peak.speed, where)) is not None:
-            found.append(BeyondLimit(joint.name, f"{excess.text}: {excess.fix}"))
+            found.append(LimitViolation(joint.name, f"{excess.text}: {excess.fix}"))
     return found
 
 
-def _beyond(joints: Sequence[JointPlan], values: Mapping[str, object], where: str) -> Iterator[BeyondLimit]:
+def _beyond(
+    joints: Sequence[JointPlan], values: Mapping[str, object], where: str
+) -> Iterator[LimitViolation]:
     for joint, position in zip(joints, _row(joints, values, "positions"), strict=False):
         if not joint.lower - _TOLERANCE <= position <= joint.upper + _TOLERANCE:
             sent = joint.unit.exact_text(position)
             text = f"{joint.name} is sent to {sent}{where}, outside its limits {limits_of(joint)}"
-            yield BeyondLimit(joint.name, text)
+            yield LimitViolation(joint.name, text)
     for joint, speed in zip(joints, _row(joints, values, "velocities"), strict=False):
         if (excess := excess_speed(joint, speed, where)) is not None:
-            yield BeyondLimit(joint.name, excess.text)
+            yield LimitViolation(joint.name, excess.text)
     for joint, effort in zip(joints, _row(joints, values, "efforts"), strict=False):
         if abs(effort) > joint.highest_effort:
             most, own = joint.highest_effort, joint.highest_effort != joint.effort
             limit = "the highest goal of its servo" if own else "its effort limit"
             limit = _register_limit(joint, "effort") or limit
             text = f"{joint.name} is asked for {effort:.6g}{where}, more than {most:.6g}, {limit}"
-            yield BeyondLimit(joint.name, text)
+            yield LimitViolation(joint.name, text)
     for joint, pwm in zip(joints, _row(joints, values, "pwm"), strict=False):
         if abs(pwm) > joint.highest_pwm:
             most, limit = joint.highest_pwm, _register_limit(joint, "pwm") or "the full voltage"
             text = f"{joint.name} is asked for {pwm:.6g}{where}, more than {most:.6g}, {limit}"
-            yield BeyondLimit(joint.name, text)
+            yield LimitViolation(joint.name, text)
 
 
 def _register_limit(joint: JointPlan, interface: LimitedInterface) -> str:

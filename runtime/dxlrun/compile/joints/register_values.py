@@ -8,7 +8,7 @@ import struct
 from dxlrun.description.units import quantity
 from dxlrun.errors import suggestion
 from dxlwire.bus_plan import RegisterValue
-from dxlwire.control_table import ControlItem, Table
+from dxlwire.control_table import BaseControlTable, ControlItem
 
 
 class UnfitRegister(ValueError):
@@ -20,7 +20,7 @@ class UnfitRegister(ValueError):
         self.fix = fix
 
 
-def any_value(table: Table, name: str, value: int | str) -> RegisterValue:
+def any_value(table: BaseControlTable, name: str, value: int | str) -> RegisterValue:
     """Convert a value for a writable item of a control table, and check its range.
 
     Args:

@@ -82,7 +82,7 @@ class Activity:
         if self._page is not None:
             self._page.name_controller(place, name)
 
-    def show(self, place: int, method: ControllerMethod) -> None:
+    def publish_method(self, place: int, method: ControllerMethod) -> None:
         """Publish the controller (by its index) and the method that run from now on, without calling them."""
         if self._page is not None:
             self._page.call(place, method)

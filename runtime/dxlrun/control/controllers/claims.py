@@ -12,7 +12,7 @@ import msgspec
 
 from dxlrun.channels.answers import Code, Field, Refusal
 from dxlrun.control import texts
-from dxlrun.control.controllers.graph import Plans, below, commander, lowers_first, uppers_first
+from dxlrun.control.controllers.update_order import Plans, below, commander, lowers_first, uppers_first
 from dxlrun.plan.loop_plan import ControllerPlan, JointPlan
 from dxlwire.modes import Mode, mode_of
 
@@ -107,17 +107,17 @@ def start_modes(joints: Iterable[JointPlan], controllers: Iterable[ControllerPla
     That is the mode that an initially active controller requires, otherwise the joint's rest mode.
     """
     claimed = claimed_modes(controller for controller in controllers if controller.active)
-    return {joint.name: claimed.get(joint.name, joint.rest) for joint in joints}
+    return {joint.name: claimed.get(joint.name, joint.rest_mode) for joint in joints}
 
 
-class Step(msgspec.Struct, frozen=True):
+class SwitchStep(msgspec.Struct, frozen=True):
     """One step of a switch: names of the controllers to deactivate and to activate, in execution order."""
 
     leave: tuple[str, ...]
     enter: tuple[str, ...]
 
 
-class Standing(msgspec.Struct, frozen=True):
+class ControllerSnapshot(msgspec.Struct, frozen=True):
     """Snapshot of all loaded controllers (`known`), and of the active and the waiting ones, by name.
 
     Its methods plan switches without executing them.
@@ -133,7 +133,7 @@ class Standing(msgspec.Struct, frozen=True):
         """Plans of the controllers that hold claims on joints: the active and the entering ones."""
         return {**self.active, **self.entering}
 
-    def switch(self, activate: Sequence[str], deactivate: Sequence[str]) -> Step | Refusal:
+    def switch(self, activate: Sequence[str], deactivate: Sequence[str]) -> SwitchStep | Refusal:
         """Return the step that activates and deactivates these controllers, or the refusal.
 
         Inactive controllers below the activated ones are activated too.
@@ -163,9 +163,9 @@ class Standing(msgspec.Struct, frozen=True):
                 return Refusal(Code.NOT_ACTIVE_YET, {"controller": lower})
         if found := conflicts([*staying.values(), *(known[name] for name in enter)]):
             return _clash(found)
-        return Step(uppers_first(deactivate, known), enter)
+        return SwitchStep(uppers_first(deactivate, known), enter)
 
-    def request(self, names: Sequence[str]) -> Step | Refusal:
+    def request(self, names: Sequence[str]) -> SwitchStep | Refusal:
         """Return the step by which the named controllers take over at a controller's request, or its refusal.
 
         Controllers leave if they hold a claim that the requested ones or those below them need, together with
@@ -189,7 +189,7 @@ class Standing(msgspec.Struct, frozen=True):
         # None of `needed` leaves: their claims are free of conflicts, and all controllers below are included.
         return self._step(self._displaced(enter), enter)
 
-    def fall_back(self, fallback: str, taken: Sequence[str], failed: Collection[str]) -> Step | None:
+    def fall_back(self, fallback: str, taken: Sequence[str], failed: Collection[str]) -> SwitchStep | None:
         """Return the step by which a fallback replaces controllers, or None if it cannot take over.
 
         Controllers below the replaced ones leave too if they hold a claim of the fallback. They must not be
@@ -233,8 +233,8 @@ class Standing(msgspec.Struct, frozen=True):
             leave |= more
         return leave
 
-    def _step(self, leave: Collection[str], enter: tuple[str, ...]) -> Step:
-        return Step(uppers_first([name for name in self.engaged if name in leave], self.known), enter)
+    def _step(self, leave: Collection[str], enter: tuple[str, ...]) -> SwitchStep:
+        return SwitchStep(uppers_first([name for name in self.engaged if name in leave], self.known), enter)
 
 
 def _clash(found: Sequence[Conflict]) -> Refusal:

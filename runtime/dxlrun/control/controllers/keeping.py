@@ -8,7 +8,7 @@ from zlib import crc32
 
 import numpy as np
 
-from dxlrun.channels.events import EventSink
+from dxlrun.channels.event_records import EventSink
 from dxlrun.channels.kept import (
     MOST_KEPT,
     TOPIC,
@@ -19,14 +19,14 @@ from dxlrun.channels.kept import (
     file_pieces,
 )
 from dxlrun.control import texts
-from dxlrun.control.controllers.graph import Plans
-from dxlrun.control.controllers.topics import Publisher, TopicLog
+from dxlrun.control.controllers.published_topics import Publisher, TopicLog
+from dxlrun.control.controllers.update_order import Plans
 from dxlrun.errors import ControllerFault
 from dxlrun.messages import Header
 from dxlrun.plan.loop_plan import ControllerPlan
 
 
-class Keeping:
+class StateKeeper:
     """Restores the state that a controller kept in an earlier run, and publishes new ones piece by piece.
 
     A state whose publication has begun is completed. Of the states that a controller keeps during that time,
@@ -49,7 +49,7 @@ class Keeping:
         self._number = -1
         self._message = KeptPiece(Header(), "", 0, 0, 0, np.empty(0, np.uint8))
 
-    def open(self, plan: ControllerPlan, plans: Plans) -> tuple[bytes, Callable[[bytes], None]]:
+    def open_state(self, plan: ControllerPlan, plans: Plans) -> tuple[bytes, Callable[[bytes], None]]:
         """Return the state that a controller kept before, and the function by which it keeps a new one.
 
         The state is empty if none was kept, or if it does not fit this robot. The first call announces the
@@ -71,9 +71,9 @@ class Keeping:
             return b"", keep
         problem = file.problem or difference(file.made_with, facts)
         if problem:
-            self._events.emit(plan.name, texts.kept_state_unusable(problem, file.place))
+            self._events.emit_event(plan.name, texts.kept_state_unusable(problem, file.place))
             return b"", keep
-        self._events.emit(plan.name, texts.kept_state_used(len(file.state), file.place))
+        self._events.emit_event(plan.name, texts.kept_state_used(len(file.state), file.place))
         return file.state, keep
 
     def _made_with(self, plan: ControllerPlan, plans: Plans) -> Facts:
@@ -97,7 +97,7 @@ class Keeping:
             raise ControllerFault(f"kept {len(state)} bytes; {MOST_KEPT} is the most")
         self._waiting[controller] = self._newest[controller] = state
 
-    def step(self) -> None:
+    def publish_next(self) -> None:
         """Publish the next piece of a kept state on /kept, if any. Called once a cycle."""
         if self._publisher is None:
             return
@@ -105,12 +105,12 @@ class Keeping:
         if data is None:
             if not self._waiting:
                 return
-            data = self._begin()
+            data = self._begin_message()
         self._message.data = np.frombuffer(data, np.uint8)
         self._publisher.publish(self._message)
         self._message.piece += 1
 
-    def _begin(self) -> bytes:
+    def _begin_message(self) -> bytes:
         controller = next(iter(self._waiting))
         state = self._waiting.pop(controller)
         self._number += 1
@@ -120,7 +120,7 @@ class Keeping:
         message.pieces, self._leaving = file_pieces(controller, state, self.controllers[controller])
         return next(self._leaving)
 
-    def finish(self) -> None:
+    def publish_remaining(self) -> None:
         """Publish all remaining pieces at the end of a run, after the controllers were deactivated."""
         while self._waiting or self._message.piece < self._message.pieces:
-            self.step()
+            self.publish_next()

@@ -24,19 +24,19 @@ from msgspec.structs import replace
 from numpy.typing import NDArray
 
 from dxlrun.channels.cycle import Floats
-from dxlrun.channels.events import EventSink, EventText
+from dxlrun.channels.event_records import EventSink, EventText
 from dxlrun.channels.heartbeat import ControllerMethod
 from dxlrun.contract.controller import Context, Controller, JointLimits, Outcome
 from dxlrun.control import texts
 from dxlrun.control.context import ControlContext
 from dxlrun.control.controllers.activity import Activity
-from dxlrun.control.controllers.goals import Commanded, RunningGoal
-from dxlrun.control.controllers.graph import Plans, rate_divider
-from dxlrun.control.controllers.keeping import Keeping
+from dxlrun.control.controllers.goal_registry import CurrentCommands, RunningGoal
+from dxlrun.control.controllers.keeping import StateKeeper
 from dxlrun.control.controllers.live_parameters import LiveValues, with_values
-from dxlrun.control.controllers.plugins import PlugIns
-from dxlrun.control.controllers.topics import TopicLog
-from dxlrun.control.controllers.wiring import Inputs, Outputs, Provided
+from dxlrun.control.controllers.plugin_loading import PlugIns
+from dxlrun.control.controllers.published_topics import TopicLog
+from dxlrun.control.controllers.update_order import Plans, rate_divider
+from dxlrun.control.controllers.wiring import Inputs, Outputs, ProvidedStates
 from dxlrun.errors import ControllerFault
 from dxlrun.plan.loop_plan import ControllerPlan, JointPlan
 
@@ -56,7 +56,7 @@ class State(Enum):
 
 
 @unique
-class Event(Enum):
+class ControllerEvent(Enum):
     """Event that changes the state of a controller."""
 
     AWAIT = "a wait for modes"  # Activation requested; its joints must change their modes first
@@ -66,12 +66,12 @@ class Event(Enum):
     FAULT = "fault"  # It broke its contract
 
 
-_OUT = {Event.LEAVE: State.INACTIVE, Event.FAULT: State.INACTIVE}
-TRANSITIONS: Mapping[State, Mapping[Event, State]] = MappingProxyType(
+_OUT = {ControllerEvent.LEAVE: State.INACTIVE, ControllerEvent.FAULT: State.INACTIVE}
+TRANSITIONS: Mapping[State, Mapping[ControllerEvent, State]] = MappingProxyType(
     {
-        State.INACTIVE: {Event.AWAIT: State.ENTERING, Event.ENTER: State.ACTIVE, **_OUT},
-        State.ENTERING: {Event.AWAIT: State.ENTERING, Event.ENTER: State.ACTIVE, **_OUT},
-        State.ACTIVE: {Event.AWAIT: State.ACTIVE, Event.COMMAND: State.ACTIVE, **_OUT},
+        State.INACTIVE: {ControllerEvent.AWAIT: State.ENTERING, ControllerEvent.ENTER: State.ACTIVE, **_OUT},
+        State.ENTERING: {ControllerEvent.AWAIT: State.ENTERING, ControllerEvent.ENTER: State.ACTIVE, **_OUT},
+        State.ACTIVE: {ControllerEvent.AWAIT: State.ACTIVE, ControllerEvent.COMMAND: State.ACTIVE, **_OUT},
     }
 )
 """Next state of a controller by its state and the event. A missing entry is a bug of dxlrun, which ends the
@@ -79,7 +79,7 @@ controller with a ControllerFault. Only `activate` and commands can cause one, a
 fault."""
 
 
-class Request(NamedTuple):
+class ControllerRequest(NamedTuple):
     """Request of a controller: another one takes over, or the run ends.
 
     Executed after all updates of the cycle.
@@ -100,12 +100,12 @@ class ControllersContext(msgspec.Struct, frozen=True, kw_only=True):
     """Publishes which controller's code runs, and refuses threads that it starts."""
     topics: TopicLog
     """Destination of the controllers' messages."""
-    keeping: Keeping
-    requests: list[Request]
+    keeping: StateKeeper
+    requests: list[ControllerRequest]
     """Takeovers and ends of the run that controllers requested in this cycle; not executed yet."""
 
 
-class Managed:
+class ManagedController:
     """A controller in a run, with its state, its rows of the robot's arrays and its calls.
 
     Inputs are gathered before an update; commands are checked and merged after it.
@@ -132,7 +132,7 @@ class Managed:
         self.withheld = False
         """True while its commands are not merged, because its command stream ended and it has no `on_hold`.
         Updates continue."""
-        self.uppers: tuple[Managed, ...] = ()
+        self.uppers: tuple[ManagedController, ...] = ()
         """Controllers that can command its references: they do so while active."""
         self.due_cycle = 0
         """Number of the cycle of the next update. If that cycle is skipped, the update happens in the
@@ -153,7 +153,7 @@ class Managed:
         self._call: Callable[..., None] = partial(context.activity.call, place)
         self._inputs = Inputs(plan, record, self.rows)
         self._outputs = Outputs(plan, record, self.rows)
-        self.provided = Provided(plan, record) if plan.provides else None
+        self.provided = ProvidedStates(plan, record) if plan.provides else None
         """States that the controller provides to others; None: it provides none."""
         self._topics = context.topics.of_controller(plan.name, self._bit)
         self._divider = plan.every
@@ -211,20 +211,20 @@ class Managed:
         """
         name, plugins, activity = self.plan.name, self._shared.plugins, self._shared.activity
         activity.name_controller(self.place, name)
-        activity.show(self.place, ControllerMethod.INIT)
+        activity.publish_method(self.place, ControllerMethod.INIT)
         try:
             self.controller = plugins.built(self.plan)
         finally:
-            activity.show(0, ControllerMethod.NONE)
+            activity.publish_method(0, ControllerMethod.NONE)
         topics = self.controller.topics(self.controller.parameters)
-        self._topics.open(topics, self.plan.distribution, self.plan.joints)
+        self._topics.open_topics(topics, self.plan.distribution, self.plan.joints)
         if type(self.controller).keeps:
-            kept, keep = self._shared.keeping.open(self.plan, plans)
+            kept, keep = self._shared.keeping.open_state(self.plan, plans)
             self._context = replace(self._context, kept=kept, keep=keep)
         self._call(ControllerMethod.ON_CONFIGURE, "", self.controller.on_configure, self._context)
         plugins.after_each(f"of controller {name}")
 
-    def on(self, event: Event) -> None:
+    def on(self, event: ControllerEvent) -> None:
         """Change the controller's state as TRANSITIONS has it for an event.
 
         An end of activity withdraws its commands. Raises ControllerFault if the state has no transition.
@@ -234,7 +234,7 @@ class Managed:
             text = f"is {self.state.value}, where {event.value} cannot happen"
             raise ControllerFault(f"controller {self.plan.name} {text}")
         self.state = after
-        self.failed |= event is Event.FAULT
+        self.failed |= event is ControllerEvent.FAULT
         if before and self.state is not State.ACTIVE:  # another controller may own the arrays otherwise
             self._outputs.withdraw()
         if self.active:
@@ -259,7 +259,7 @@ class Managed:
             self._call_without_commands(ControllerMethod.ON_ACTIVATE, self.controller.on_activate)
         self._last_ns = -1
         self.due_cycle = self.until_ns = 0
-        self.on(Event.ENTER)
+        self.on(ControllerEvent.ENTER)
 
     def _call_without_commands(self, method: ControllerMethod, call: Callable[[int], None]) -> None:
         """Clear the controller's commands, gather current states, and call one of its methods.
@@ -267,7 +267,7 @@ class Managed:
         Raises ControllerFault.
         """
         self.withheld = False
-        self._outputs.forget()
+        self._outputs.reset_commands()
         self._inputs.gather()
         self._call(method, "", call, self._schedule.time_ns)
 
@@ -280,11 +280,11 @@ class Managed:
         Raises:
             ControllerFault: The controller raised. Its joints are released anyway.
         """
-        self.release(Event.LEAVE, why or f"{self.plan.name} was deactivated")
+        self.release_commands(ControllerEvent.LEAVE, why or f"{self.plan.name} was deactivated")
         on_deactivate, time_ns = self.controller.on_deactivate, self._schedule.time_ns
         self._call(ControllerMethod.ON_DEACTIVATE, "", on_deactivate, time_ns)
 
-    def release(self, event: Event, why: str) -> None:
+    def release_commands(self, event: ControllerEvent, why: str) -> None:
         """Abort the controller's goal, and make it inactive by an event, LEAVE or FAULT.
 
         Its commands are withdrawn. The gate then holds the last goals of the joints.
@@ -308,7 +308,7 @@ class Managed:
 
         Withheld commands are outdated: the joints may have moved since. Raises ControllerFault.
         """
-        self.on(Event.COMMAND)
+        self.on(ControllerEvent.COMMAND)
         self.until_ns = 0
         if self.withheld:
             self._call_without_commands(ControllerMethod.ON_ACTIVATE, self.controller.on_activate)
@@ -321,11 +321,11 @@ class Managed:
         return self._goal
 
     @property
-    def commanded(self) -> Commanded:
+    def commanded(self) -> CurrentCommands:
         """Joints and current commands of the controller, before any limit."""
-        return Commanded.by_interfaces(self.plan.joints, self.plan.command, self._outputs.commands)
+        return CurrentCommands.by_interfaces(self.plan.joints, self.plan.command, self._outputs.commands)
 
-    def adopt(self, goal: RunningGoal) -> None:
+    def adopt_goal(self, goal: RunningGoal) -> None:
         """Assign a goal that the runtime, not the controller, pursues with plain commands."""
         self._goal = goal
 
@@ -416,9 +416,9 @@ class Managed:
         if self.withheld:
             return
         if self.held and not any(upper.active for upper in self.uppers):
-            self._outputs.hold()
+            self._outputs.hold_joints()
         else:
-            self._outputs.merge()
+            self._outputs.merge_commands()
 
     def change_period(self, period_ns: int) -> None:
         """Keep the controller's own rate by updating it every so many cycles of a new period, ns."""
@@ -442,13 +442,15 @@ class Managed:
         outputs = self._outputs
         # Unchanged commands were checked before. Comparing bytes is cheaper than the check.
         if outputs.own.tobytes() != outputs.taken:
-            outputs.check()
+            outputs.check_commands()
         self._merge()
         if self.provided is not None:
-            self.provided.take()
+            self.provided.publish_states()
 
 
-def _take_over(requests: list[Request], plan: ControllerPlan, controllers: Sequence[str], why: str) -> None:
+def _take_over(
+    requests: list[ControllerRequest], plan: ControllerPlan, controllers: Sequence[str], why: str
+) -> None:
     """Record a controller's request that others take over.
 
     Raises ControllerFault for one not in its `takeovers`.
@@ -456,15 +458,15 @@ def _take_over(requests: list[Request], plan: ControllerPlan, controllers: Seque
     if other := [name for name in controllers if name not in plan.takeovers]:
         raise ControllerFault(f"requested that {other[0]} takes over, but that is not one of its takeovers")
     if controllers:
-        requests.append(Request(plan.name, tuple(controllers), why))
+        requests.append(ControllerRequest(plan.name, tuple(controllers), why))
 
 
-def _end_run(requests: list[Request], plan: ControllerPlan, why: str) -> None:
-    requests.append(Request(plan.name, (), why))
+def _end_run(requests: list[ControllerRequest], plan: ControllerPlan, why: str) -> None:
+    requests.append(ControllerRequest(plan.name, (), why))
 
 
 def _emit(events: EventSink, controller: str, row: EventText[[str]], text: str) -> None:
-    events.emit(controller, row(text))
+    events.emit_event(controller, row(text))
 
 
 def _row(values: Sequence[float | None]) -> Floats:

@@ -10,7 +10,7 @@ from msgspec.structs import replace
 from numpy.typing import NDArray
 
 from dxlrun.channels.answers import Code, CommandOutcome, Field, Refusal
-from dxlrun.channels.commands import Command, TakenCommand
+from dxlrun.channels.commands import CommandMessage, TakenCommand
 from dxlrun.channels.cycle import MOST_CONTROLLERS
 from dxlrun.channels.kept import KeptStates
 from dxlrun.contract.controller import Controller, Outcome
@@ -18,15 +18,21 @@ from dxlrun.control import texts
 from dxlrun.control.context import ControlContext
 from dxlrun.control.controllers.activity import Activity
 from dxlrun.control.controllers.claims import conflicts
-from dxlrun.control.controllers.goals import Commanded, Goals, PlayedMotion, PlayedPart, RunningGoal
-from dxlrun.control.controllers.graph import Plans, commander, rate_divider, rate_fits, update_order
-from dxlrun.control.controllers.keeping import Keeping
+from dxlrun.control.controllers.goal_registry import (
+    CurrentCommands,
+    GoalRegistry,
+    PlayedMotion,
+    PlayedPart,
+    RunningGoal,
+)
+from dxlrun.control.controllers.keeping import StateKeeper
 from dxlrun.control.controllers.live_parameters import LiveValues
-from dxlrun.control.controllers.managed import ControllersContext, Managed, Request, State
-from dxlrun.control.controllers.plugins import PlugIns
+from dxlrun.control.controllers.managed import ControllerRequest, ControllersContext, ManagedController, State
+from dxlrun.control.controllers.plugin_loading import PlugIns
+from dxlrun.control.controllers.published_topics import TopicLog
 from dxlrun.control.controllers.switching import Switching, fault_of
-from dxlrun.control.controllers.topics import TopicLog
-from dxlrun.control.controllers.wiring import Provided
+from dxlrun.control.controllers.update_order import Plans, commander, rate_divider, rate_fits, update_order
+from dxlrun.control.controllers.wiring import ProvidedStates
 from dxlrun.errors import ControllerFault, PlugInError
 from dxlrun.plan.loop_plan import ControllerPlan, ScheduledCommand
 
@@ -62,8 +68,8 @@ class Manager:
         self._clock = context.clock
         self._command_log = context.command_log
         self._topics = topics or TopicLog(context.record)
-        self._keeping = Keeping(kept or KeptStates(), self._topics, context.events)
-        self._requests: list[Request] = []
+        self._keeping = StateKeeper(kept or KeptStates(), self._topics, context.events)
+        self._requests: list[ControllerRequest] = []
         """Takeovers and ends of the run that controllers requested in this cycle; not executed yet."""
         self._shared = ControllersContext(
             run=context,
@@ -74,20 +80,20 @@ class Manager:
             requests=self._requests,
         )
         self._schedule = context.schedule
-        self._managed: tuple[Managed, ...] = ()
+        self._managed: tuple[ManagedController, ...] = ()
         """All controllers by index (their bit in the record's masks). An unloaded one keeps its index until a
         new controller gets that."""
         self._named = self.switching.named
-        self._order: tuple[Managed, ...] = ()
+        self._order: tuple[ManagedController, ...] = ()
         """Loaded controllers in update order: upper controllers of a chain before lower ones."""
-        self.streams: dict[int, Managed] = {}
+        self.streams: dict[int, ManagedController] = {}
         """Controllers that receive a stream of commands with a lease, by index. `stale` removes those whose
         stream has ended."""
-        self.providers: tuple[Provided, ...] = ()
+        self.providers: tuple[ProvidedStates, ...] = ()
         """States that controllers provide; their age increases in each cycle."""
         self._next = 0  # index into the plan's commands
         self._lost: list[int] = []  # rows of lost joints
-        self._goals = Goals(context.record, context.events, context.plan.joints, self._commanded)
+        self._goals = GoalRegistry(context.record, context.events, context.plan.joints, self._commanded)
         self._motions: dict[str, PlayedMotion] = {}
         """Motions that the runtime plays with plain commands, by name of the controller."""
         self._pursued: dict[str, RunningGoal] = {}
@@ -142,14 +148,14 @@ class Manager:
         if self._lost:
             self._record.commands.values[:, self._lost] = np.nan
         if self._keeping.controllers:
-            self._keeping.step()
+            self._keeping.publish_next()
 
     def _dispatch_due(self) -> None:
         """Activate waiting controllers, dispatch due commands of plan and motions, and judge goals."""
         if self.switching.groups:
             self.switching.admit_groups()
         if self._next < len(self._plan.commands):
-            self._hand_over()
+            self._dispatch_due_commands()
         if self._goals.running:
             self._goals.judge_running()
         if self._motions:
@@ -172,7 +178,7 @@ class Manager:
         self._goals.time_ns = self._schedule.time_ns
         self._goals.judge_running()
         self.switching.deactivate_all()
-        self._keeping.finish()
+        self._keeping.publish_remaining()
 
     # Commands
 
@@ -181,7 +187,7 @@ class Manager:
         """True while the motion of any goal has ended but its outcome is still open."""
         return self._goals.are_settling
 
-    def dispatch_command(self, command: Command, pursued: RunningGoal | None = None) -> int | Refusal:
+    def dispatch_command(self, command: CommandMessage, pursued: RunningGoal | None = None) -> int | Refusal:
         """Pass a client's or the plan's command to its controller, which must be active.
 
         A command with a lease starts or continues a stream, which ends unless another command follows in time
@@ -215,21 +221,21 @@ class Manager:
         try:
             managed.give_command(kind, data)
         except ControllerFault as fault:
-            return self._end(managed, fault)
+            return self._end_controller(managed, fault)
         if command.lease_ns:
             managed.until_ns = self._record.woken_ns + command.lease_ns
             self.streams[managed.place] = managed
         if not streaming:
-            self._events.emit(managed.plan.name, texts.command_accepted(kind, command.origin))
+            self._events.emit_event(managed.plan.name, texts.command_accepted(kind, command.origin))
         return 0
 
-    def _end(self, managed: Managed, fault: ControllerFault) -> Refusal:
+    def _end_controller(self, managed: ManagedController, fault: ControllerFault) -> Refusal:
         self.switching.end_controller(managed, fault)
         return fault_of(managed, str(fault))
 
     def _attempt(
         self,
-        managed: Managed,
+        managed: ManagedController,
         call: Callable[P, None],
         *arguments: P.args,
         **named: P.kwargs,
@@ -238,14 +244,14 @@ class Manager:
         try:
             call(*arguments, **named)
         except ControllerFault as fault:
-            return self._end(managed, fault)
+            return self._end_controller(managed, fault)
         return None
 
-    def _known(self, controller: str) -> Managed | Refusal:
+    def _known(self, controller: str) -> ManagedController | Refusal:
         managed = self._named.get(controller)
         return managed or Refusal(Code.UNKNOWN_CONTROLLER, {"controller": controller})
 
-    def _commandable(self, controller: str) -> Managed | Refusal:
+    def _commandable(self, controller: str) -> ManagedController | Refusal:
         managed = self._named.get(controller)
         if managed is None:
             return Refusal(Code.UNKNOWN_CONTROLLER, {"controller": controller})
@@ -258,17 +264,17 @@ class Manager:
                 return _commanded_by(controller, upper.plan.name, hint)
         return managed
 
-    def _hand_over(self) -> None:
+    def _dispatch_due_commands(self) -> None:
         """Dispatch the commands of the plan that are due, and count the accepted ones in the record."""
         commands, record = self._plan.commands, self._record
         while self._next < len(commands) and commands[self._next].at_ns <= self._schedule.time_ns:
             place, command = self._next, commands[self._next]
             name, kind, origin = command.controller, command.kind, command.origin
             taken = TakenCommand(record.woken_ns, record.cycle, place, name, kind, origin, b"")
-            self._command_log.take(taken)
+            self._command_log.record_command(taken)
             self._next += 1
             pursued = self._pursue(command)
-            answer = self.dispatch_command(Command(place, name, kind, command.data, origin), pursued)
+            answer = self.dispatch_command(CommandMessage(place, name, kind, command.data, origin), pursued)
             if isinstance(answer, Refusal):
                 event = texts.command_refused(kind, origin, answer.text)
                 self.switching.report_refusal(name, event, CommandOutcome(kind, origin, answer))
@@ -282,9 +288,13 @@ class Manager:
         """
         name, planned = command.controller, command.goal
         managed = self._commandable(name) if planned is not None else None
-        if planned and isinstance(managed, Managed) and command.kind not in managed.controller.Goals:
+        if (
+            planned
+            and isinstance(managed, ManagedController)
+            and command.kind not in managed.controller.Goals
+        ):
             goal = self._pursued[name] = self._accept(managed, command.kind, command.origin)
-            managed.adopt(goal)
+            managed.adopt_goal(goal)
             part = PlayedPart(name, command.kind, (), (), planned.end_ns, planned.positions)
             self._motions[name] = PlayedMotion(goal, part, (), 0)
         return self._pursued.get(name)
@@ -303,7 +313,7 @@ class Manager:
             return Refusal(Code.INVALID, {"problem": f"{controller}: {error}"})
         if refusal is None:
             shown = ", ".join(f"{name} = {value:g}" for name, value in values.items())
-            self._events.emit(managed.plan.name, texts.parameters_changed(shown))
+            self._events.emit_event(managed.plan.name, texts.parameters_changed(shown))
         return refusal
 
     def stale(self, now_ns: int) -> list[str]:
@@ -352,21 +362,21 @@ class Manager:
             else:
                 event = texts.controller_resumes(until)
                 resumed += managed.rows.tolist()
-            self._events.emit(managed.plan.name, event)
+            self._events.emit_event(managed.plan.name, event)
         return tuple(resumed)
 
-    def _holds_below(self, managed: Managed) -> bool:
+    def _holds_below(self, managed: ManagedController) -> bool:
         return any(self._named[lower].held for lower in managed.plan.into)
 
     # Goals and motions
 
-    def _accept(self, managed: Managed, kind: str, origin: str) -> RunningGoal:
+    def _accept(self, managed: ManagedController, kind: str, origin: str) -> RunningGoal:
         if (before := managed.goal) is not None:
             before.end(Outcome.PREEMPTED, f"goal {self._goals.last + 1} took its place")
-        return self._goals.accept(managed.plan.name, kind, origin)
+        return self._goals.accept_goal(managed.plan.name, kind, origin)
 
     def _begin_goal(
-        self, managed: Managed, kind: str, data: NDArray[np.float64], origin: str
+        self, managed: ManagedController, kind: str, data: NDArray[np.float64], origin: str
     ) -> int | Refusal:
         goal = self._accept(managed, kind, origin)
         return self._attempt(managed, managed.begin_goal, goal, data) or goal.number
@@ -435,7 +445,7 @@ class Manager:
         if part.kind in managed.controller.Goals:
             return self._begin_goal(managed, part.kind, commands[0], origin)
         goal = self._accept(managed, part.kind, origin)
-        managed.adopt(goal)
+        managed.adopt_goal(goal)
         self._motions[part.controller] = PlayedMotion(goal, part, commands, self._schedule.time_ns)
         return goal.number
 
@@ -447,17 +457,17 @@ class Manager:
             while motion.goal.outcome is None and (data := motion.due(time_ns)) is not None:
                 self._attempt(managed, managed.give_command, kind, data)
             if motion.goal.outcome is None:
-                motion.report(time_ns)
+                motion.report_progress(time_ns)
             if motion.goal.outcome is not None:
                 del self._motions[name]
 
-    def _commanded(self, controller: str) -> Commanded:
+    def _commanded(self, controller: str) -> CurrentCommands:
         """Return the joints and current commands of a controller, before any limit."""
         return self._named[controller].commanded
 
     # Loading
 
-    def load(self, plan: ControllerPlan) -> int | Refusal:
+    def load_controller(self, plan: ControllerPlan) -> int | Refusal:
         """Configure a new controller, inactive at first; return its index, or the refusal.
 
         Requires a paused loop.
@@ -475,7 +485,7 @@ class Manager:
         self._managed = (*self._managed[:place], managed, *self._managed[place + 1 :])
         self._named[plan.name] = managed
         self._sort()
-        self._events.emit(plan.name, texts.controller_loaded(self._clock.now_ns() - begin_ns))
+        self._events.emit_event(plan.name, texts.controller_loaded(self._clock.now_ns() - begin_ns))
         return place
 
     def _refusals(self, plan: ControllerPlan, place: int) -> Iterator[Refusal]:
@@ -515,7 +525,7 @@ class Manager:
                 return place
         return len(self._managed)
 
-    def unload(self, name: str) -> Refusal | None:
+    def unload_controller(self, name: str) -> Refusal | None:
         """Remove an inactive controller from the run; return the refusal, None on success.
 
         Requires a paused loop.
@@ -530,7 +540,7 @@ class Manager:
         begin_ns = self._clock.now_ns()
         del self._named[name]
         self._sort()
-        self._events.emit(name, texts.controller_unloaded(self._clock.now_ns() - begin_ns))
+        self._events.emit_event(name, texts.controller_unloaded(self._clock.now_ns() - begin_ns))
         return None
 
     def change_period(self, period_ns: int) -> Refusal | None:
@@ -566,12 +576,12 @@ class Manager:
             one.uppers = tuple(upper for upper in self._named.values() if one.plan.name in upper.plan.into)
         self._order = tuple(self._named[name] for name in update_order([one.plan for one in loaded]))
 
-    def _configured(self, place: int, plan: ControllerPlan) -> Managed:
-        managed = Managed(plan, place, self._shared)
+    def _configured(self, place: int, plan: ControllerPlan) -> ManagedController:
+        managed = ManagedController(plan, place, self._shared)
         plans = {one.name: one for one in self._plan.controllers} | dict(self.switching.standing.known)
         managed.configure(plans)
         if managed.controller.Goals:
-            self._goals.open(self._topics)
+            self._goals.open_topic(self._topics)
         return managed
 
 

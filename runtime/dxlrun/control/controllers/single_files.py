@@ -88,7 +88,7 @@ def class_in_file(type_name: str, files: Mapping[str, str]) -> object:
     return found
 
 
-class _Text(ExecutionLoader):
+class _TextLoader(ExecutionLoader):
     """Module loader that executes the text of a single file, so that tracebacks show the file's name."""
 
     def __init__(self, file: str, text: str) -> None:
@@ -106,7 +106,7 @@ class _Text(ExecutionLoader):
 @cache
 def _executed(file: str, text: str) -> ModuleType:
     """Execute the text of a single file, once a process, and return the module."""
-    loader = _Text(file, text)
+    loader = _TextLoader(file, text)
     module = ModuleType(publisher_of(file, text).replace(".py ", "_"))
     module.__loader__ = loader
     sys.modules[module.__name__] = module  # annotations are resolved in this module

@@ -14,14 +14,14 @@ import msgspec
 import numpy as np
 from msgspec.structs import replace
 
-from dxlrun.channels.answers import MOST_NAMED, Code, CommandOutcome, Refusal, Waiting, list_names
+from dxlrun.channels.answers import MOST_NAMED, Acceptance, Code, CommandOutcome, Refusal, list_names
 from dxlrun.channels.cycle import LIMP
-from dxlrun.channels.events import RUN_ENDED, EventBody
+from dxlrun.channels.event_records import RUN_ENDED, EventBody
 from dxlrun.control import texts
 from dxlrun.control.context import ControlContext
-from dxlrun.control.controllers.claims import Standing, Step, claimed_modes
-from dxlrun.control.controllers.graph import above, lowers_first, uppers_first
-from dxlrun.control.controllers.managed import Event, Managed, Request, State
+from dxlrun.control.controllers.claims import ControllerSnapshot, SwitchStep, claimed_modes
+from dxlrun.control.controllers.managed import ControllerEvent, ControllerRequest, ManagedController, State
+from dxlrun.control.controllers.update_order import above, lowers_first, uppers_first
 from dxlrun.errors import ControllerFault
 from dxlwire.modes import Mode
 
@@ -31,15 +31,15 @@ short idle times, need less than one second; a servo after a reset needs somewha
 _STILL = (Mode.POSITION, Mode.VELOCITY)
 """Modes in which a joint without commands holds still, so it stays in them when no controller claims it."""
 
-_Failed = tuple[tuple[Managed, ...], str]
+_Failed = tuple[tuple[ManagedController, ...], str]
 """A controller that broke its contract, with the controllers that left with it, and the reason as text. The
 exception is not stored: it refers to a frame, and the loop has no collector for reference cycles."""
 
 
-class Group(msgspec.Struct, frozen=True):
+class ActivationGroup(msgspec.Struct, frozen=True):
     """Controllers that wait for their joints' modes and then become active together."""
 
-    entering: tuple[Managed, ...]
+    entering: tuple[ManagedController, ...]
     until_ns: int
     """Time, ns of the controllers' time, at which the group is dropped if joints are not in their modes."""
     number: int | None
@@ -55,13 +55,13 @@ class Switching:
         self.fault: str | None = None
         """Reason to end the run; None: it continues. Set by the first controller that requested the end or
         broke its contract without a fallback that took over."""
-        self.named: dict[str, Managed] = {}
+        self.named: dict[str, ManagedController] = {}
         """Loaded controllers by name."""
         self.ended: list[tuple[int, Refusal | None]] = []
         """Answers to `switch` commands that waited for modes: number of the command, and its refusal or None
         for success.
         """
-        self.groups: list[Group] = []
+        self.groups: list[ActivationGroup] = []
         """Controllers that wait for their joints' modes, grouped by switch."""
         self.released: set[int] = set()
         """Rows of joints whose torque clients disabled; the states show it only a cycle later."""
@@ -75,10 +75,10 @@ class Switching:
         self._schedule = context.schedule
 
     @property
-    def standing(self) -> Standing:
+    def standing(self) -> ControllerSnapshot:
         """Snapshot of the loaded controllers and their states."""
         named = self.named.items()
-        return Standing(
+        return ControllerSnapshot(
             {name: managed.plan for name, managed in named},
             {name: managed.plan for name, managed in named if managed.active},
             {name: managed.plan for name, managed in named if managed.state is State.ENTERING},
@@ -92,7 +92,7 @@ class Switching:
 
     def switch_controllers(
         self, activate: Sequence[str], deactivate: Sequence[str], number: int | None = None
-    ) -> Refusal | Waiting | None:
+    ) -> Refusal | Acceptance | None:
         """Deactivate and activate controllers in one step, or refuse the whole switch.
 
         Claims are checked for the controllers that are active afterwards. If joints must change their modes
@@ -104,14 +104,14 @@ class Switching:
             number: Number of the client's command, for the result in `ended`; None: no command.
 
         Returns:
-            None if the switch is complete, `Waiting` if it waits for modes, or the refusal.
+            None if the switch is complete, `Acceptance` if it waits for modes, or the refusal.
         """
         step = self.standing.switch(activate, deactivate)
         if isinstance(step, Refusal):
             return step
-        return self._refuse_limp(step.enter) or self._take(step, number)
+        return self._refuse_limp(step.enter) or self._execute_step(step, number)
 
-    def execute_request(self, request: Request) -> None:
+    def execute_request(self, request: ControllerRequest) -> None:
         """Execute the request of an active controller: a takeover, or the end of the run after this cycle.
 
         A refused takeover is reported as an event. The run ends by the policy for faults.
@@ -121,7 +121,7 @@ class Switching:
             self.fault = self.fault or texts.run_ended_by(requester, why)
             return
         step = self.standing.request(names)
-        if isinstance(step, Step) and not step.enter:
+        if isinstance(step, SwitchStep) and not step.enter:
             return
         refusal = step if isinstance(step, Refusal) else self._refuse_limp(step.enter)
         if isinstance(step, Refusal) or refusal is not None:
@@ -129,8 +129,8 @@ class Switching:
             event = texts.takeover_refused(" and ".join(names), reason, why)
             self._report_left_out(requester, event, refusal, requester)
             return
-        self._events.emit(requester, texts.controllers_take_over(names, step.leave, why))
-        self._take(step, None, f"{requester}: {why}")
+        self._events.emit_event(requester, texts.controllers_take_over(names, step.leave, why))
+        self._execute_step(step, None, f"{requester}: {why}")
 
     def restart_controllers(self, joints: Collection[str], why: str) -> None:
         """Restart the active controllers that command one of these joints, and the controllers above them.
@@ -148,7 +148,7 @@ class Switching:
             # A controller above others may command none of these joints itself.
             own = [joint for joint in managed.plan.joints if joint in joints] or list(joints)
             reason = f"{list_names(own)} {why}"
-            self._events.emit(managed.plan.name, texts.controller_restarted(reason))
+            self._events.emit_event(managed.plan.name, texts.controller_restarted(reason))
             self._deactivate(managed, reason)
         if self.fault is not None:
             return
@@ -161,7 +161,7 @@ class Switching:
             if managed.active:
                 managed.hold_joints()
 
-    def end_controller(self, managed: Managed, fault: ControllerFault) -> None:
+    def end_controller(self, managed: ManagedController, fault: ControllerFault) -> None:
         """Deactivate a controller that broke its contract, and activate a fallback in its place.
 
         The controllers above it leave too. Its own fallback is tried first, then theirs, the nearest first.
@@ -214,7 +214,7 @@ class Switching:
             or all(row in joints.values() for row in self._torqued(self.named[name]))
         )
 
-    def _torqued(self, managed: Managed) -> list[int]:
+    def _torqued(self, managed: ManagedController) -> list[int]:
         """Return the rows of those joints of a controller that have torque or are about to get it."""
         torque = self._states.torque
         return [row for row in managed.rows.tolist() if row not in self.released and torque[row] not in LIMP]
@@ -285,19 +285,19 @@ class Switching:
             now = self._states.mode[row]
             mode = claimed.get(joint.name)
             if mode is None:
-                mode = Mode(now) if now in _STILL else joint.rest
+                mode = Mode(now) if now in _STILL else joint.rest_mode
             if mode != now:
                 modes[row] = mode
         if modes.any():
             self._hardware.set_modes(modes)
 
-    def _missing(self, entering: Iterable[Managed]) -> dict[str, tuple[Mode, Mode]]:
+    def _missing(self, entering: Iterable[ManagedController]) -> dict[str, tuple[Mode, Mode]]:
         """Return required and current mode of each joint in a wrong mode for these controllers, by name."""
         claimed = claimed_modes(managed.plan for managed in entering)
         now = {joint: Mode(int(self._states.mode[self._rows[joint]])) for joint in claimed}
         return {joint: (mode, now[joint]) for joint, mode in claimed.items() if mode != now[joint]}
 
-    def _mode_problem(self, group: Group) -> str:
+    def _mode_problem(self, group: ActivationGroup) -> str:
         """Return a text that names a joint which did not enter its mode, and the number of further ones."""
         missing = self._missing(group.entering)
         stays = [
@@ -312,7 +312,7 @@ class Switching:
         ]
         return (stays or late)[0] + (f" (and {len(missing) - 1} more)" if len(missing) > 1 else "")
 
-    def _await_no_more(self, managed: Managed) -> Group | None:
+    def _await_no_more(self, managed: ManagedController) -> ActivationGroup | None:
         """Remove a controller from the group that waits for modes; return the rest of the group.
 
         None if the controller does not wait.
@@ -325,7 +325,7 @@ class Switching:
                 return replace(group, entering=left)
         return None
 
-    def _drop_group(self, managed: Managed, why: str) -> None:
+    def _drop_group(self, managed: ManagedController, why: str) -> None:
         """Drop the waiting group that includes this controller, which cannot be activated any more."""
         for group in self.groups:
             if managed in group.entering:
@@ -333,18 +333,20 @@ class Switching:
                 problem = texts.controller_not_activated(managed.plan.name, why).text
                 self._give_up(group, fault_of(managed, problem), why)
 
-    def _give_up(self, group: Group, refusal: Refusal, problem: str) -> None:
+    def _give_up(self, group: ActivationGroup, refusal: Refusal, problem: str) -> None:
         self.modes_requested = False
         self._end_switch(group.number, refusal)
         for managed in group.entering:
-            managed.on(Event.LEAVE)  # it may have left already
+            managed.on(ControllerEvent.LEAVE)  # it may have left already
             name = managed.plan.name
             self._report_left_out(name, texts.controller_not_activated(name, problem), refusal)
         self.fault = self.fault or group.why or None
 
     # Entering and leaving
 
-    def _take(self, step: Step, number: int | None, why: str = "") -> Refusal | Waiting | None:
+    def _execute_step(
+        self, step: SwitchStep, number: int | None, why: str = ""
+    ) -> Refusal | Acceptance | None:
         """Execute a step: deactivate and activate its controllers.
 
         Returns the same as `switch_controllers`.
@@ -359,7 +361,7 @@ class Switching:
                 self._deactivate(managed)
                 continue
             self.modes_requested = False
-            managed.on(Event.LEAVE)
+            managed.on(ControllerEvent.LEAVE)
             group = self._await_no_more(managed)
             if group is not None and not group.entering:
                 self._end_switch(
@@ -367,7 +369,7 @@ class Switching:
                 )
         return self._enter(step.enter, number, why)
 
-    def _enter(self, names: Sequence[str], number: int | None, why: str) -> Refusal | Waiting | None:
+    def _enter(self, names: Sequence[str], number: int | None, why: str) -> Refusal | Acceptance | None:
         """Activate controllers with checked claims, now or as soon as their joints are in their modes.
 
         Returns the same as `switch_controllers`.
@@ -380,14 +382,14 @@ class Switching:
             self._fall_back_all(failed)
             return refusal
         until_ns = self._schedule.time_ns + MODE_TIMEOUT_NS
-        self.groups.append(Group(tuple(entering), until_ns, number, why))
+        self.groups.append(ActivationGroup(tuple(entering), until_ns, number, why))
         for managed in entering:
-            managed.on(Event.AWAIT)
-            self._events.emit(managed.plan.name, texts.controller_waits_for_modes())
-        return Waiting(tuple(names))
+            managed.on(ControllerEvent.AWAIT)
+            self._events.emit_event(managed.plan.name, texts.controller_waits_for_modes())
+        return Acceptance(tuple(names))
 
     def _activate_all(
-        self, entering: Sequence[Managed], failed: list[_Failed], *, restarts: bool = False
+        self, entering: Sequence[ManagedController], failed: list[_Failed], *, restarts: bool = False
     ) -> Refusal | None:
         """Activate controllers with checked claims, and append those that raise to `failed`.
 
@@ -404,7 +406,7 @@ class Switching:
             lowers = [one for lower in into if (one := self.named.get(lower)) and one.active]
             active = {one.plan.name for one in lowers}
             if missing := [lower for lower in into if lower not in active]:
-                managed.on(Event.LEAVE)
+                managed.on(ControllerEvent.LEAVE)
                 problem = texts.lower_not_active(missing[0])
                 event = texts.controller_not_activated(name, problem)
                 self._report_left_out(name, event, fault_of(managed, problem))
@@ -416,7 +418,7 @@ class Switching:
                 uppers = above([one.plan for one in entering], name)
                 failed.append(((managed, *(self.named[upper] for upper in uppers)), str(fault)))
                 continue
-            self._events.emit(managed.plan.name, texts.controller_activated())
+            self._events.emit_event(managed.plan.name, texts.controller_activated())
             for lower in (one for one in lowers if one.active):  # commanded by this controller from now on
                 try:
                     lower.follow_upper()
@@ -427,7 +429,7 @@ class Switching:
         taken, why = failed[begun]
         return fault_of(taken[0], why)
 
-    def _deactivate(self, managed: Managed, why: str = "") -> None:
+    def _deactivate(self, managed: ManagedController, why: str = "") -> None:
         self.modes_requested = False
         try:
             managed.deactivate(why)
@@ -435,18 +437,18 @@ class Switching:
             self._take_out(managed, fault)  # no fallback: the controller was to leave anyway
             self.fault = self.fault or str(fault)
         else:
-            self._events.emit(managed.plan.name, texts.controller_deactivated())
+            self._events.emit_event(managed.plan.name, texts.controller_deactivated())
 
     # Faults
 
-    def _take_out(self, managed: Managed, fault: ControllerFault) -> None:
+    def _take_out(self, managed: ManagedController, fault: ControllerFault) -> None:
         """Deactivate a controller that broke its contract and report the fault. No fallback is activated."""
-        managed.release(Event.FAULT, str(fault))
+        managed.release_commands(ControllerEvent.FAULT, str(fault))
         self.modes_requested = False
         event = texts.controller_failed(str(fault), getattr(fault, "__notes__", ()))
-        self._events.emit(managed.plan.name, event)
+        self._events.emit_event(managed.plan.name, event)
 
-    def _take_out_with_uppers(self, managed: Managed, fault: ControllerFault) -> _Failed:
+    def _take_out_with_uppers(self, managed: ManagedController, fault: ControllerFault) -> _Failed:
         """Deactivate a controller that broke its contract and those above it.
 
         Returns all of them, nearest first, and the reason.
@@ -467,7 +469,7 @@ class Switching:
         for taken, why in failed:
             self._fall_back(taken, why)
 
-    def _fall_back(self, taken: Sequence[Managed], why: str) -> None:
+    def _fall_back(self, taken: Sequence[ManagedController], why: str) -> None:
         """Activate the first available fallback of these controllers.
 
         Without one, end the run with a fault.
@@ -483,7 +485,7 @@ class Switching:
                 continue
             refusal = self._refuse_limp(step.enter)
             if refusal is None:
-                self._take(step, None, why)
+                self._execute_step(step, None, why)
                 return
             self._report_left_out(fallback, texts.fallback_refused(fallback, refusal.text), refusal)
         self.fault = self.fault or why
@@ -496,7 +498,7 @@ class Switching:
 
     def report_refusal(self, controller: str, event: EventBody, outcome: CommandOutcome) -> None:
         """Emit the event of a refused command, with the command's outcome as JSON data."""
-        self._events.emit(controller, event, msgspec.json.encode(outcome))
+        self._events.emit_event(controller, event, msgspec.json.encode(outcome))
 
     def _report_left_out(
         self, name: str, event: EventBody, refusal: Refusal | None, requester: str = ""
@@ -504,7 +506,7 @@ class Switching:
         self.report_refusal(name, event, CommandOutcome("switch", requester, refusal))
 
 
-def fault_of(managed: Managed, problem: str) -> Refusal:
+def fault_of(managed: ManagedController, problem: str) -> Refusal:
     """Return the refusal for a command during which the controller broke its contract."""
     return Refusal(Code.CONTROLLER_FAULT, {"controller": managed.plan.name, "problem": problem})
 

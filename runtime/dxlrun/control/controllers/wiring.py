@@ -44,7 +44,7 @@ def _places(names: Sequence[str], known: Sequence[str]) -> NDArray[np.intp]:
     return np.array([known.index(name) for name in names], dtype=np.intp)
 
 
-class Provided:
+class ProvidedStates:
     """States that a controller provides to others, copied into the record after its updates."""
 
     def __init__(self, plan: ControllerPlan, record: CycleRecord) -> None:
@@ -62,7 +62,7 @@ class Provided:
         if age_ns[place] >= 0:
             age_ns[place] += period_ns
 
-    def take(self) -> None:
+    def publish_states(self) -> None:
         """Copy the controller's array into the record. It is valid if all values are finite.
 
         An array of NaN only means that there are no new values, and is not copied.
@@ -139,7 +139,7 @@ def _readable(layout: CycleLayout) -> Iterator[tuple[str, int]]:
         *((state, [f"{joint}/{state}" for joint in layout.joints]) for state in READABLE[:-1]),
         ("age_ns", [f"{joint}/age" for joint in layout.joints]),
     ):
-        begin = layout.place(sequence)
+        begin = layout.float_index(sequence)
         yield from ((name, begin + index) for index, name in enumerate(names))
 
 
@@ -147,7 +147,7 @@ _CARRYING = ("effort", "pwm")
 """Command interfaces that carry a joint's load: without these commands, the joint falls."""
 
 
-class _Part(NamedTuple):
+class _CommandInterface(NamedTuple):
     """Commands of a controller for one interface, and where they are written."""
 
     own: Floats
@@ -186,7 +186,7 @@ class Outputs:
         self.source_commands: Floats = own[sources:]
         self.taken = b""
         """Bytes of `own` when it was last checked."""
-        self._parts: list[_Part] = []
+        self._parts: list[_CommandInterface] = []
         self._owner = plan.name
         self._names = [""] * own.size
         """Name of each command in `own`: `shoulder/position`, `arm_pid/shoulder/position`, `light/led`;
@@ -222,20 +222,20 @@ class Outputs:
                 # Without a reference, the lower controller would hold the measured position. A joint that
                 # sags below its reference would sag by the same distance again.
                 held = {"position": None, "velocity": 0.0}.get(interface)
-            self._parts.append(_Part(self.own[begin:end], merged, _columns(rows), goes_on, held))
+            self._parts.append(_CommandInterface(self.own[begin:end], merged, _columns(rows), goes_on, held))
 
     @property
     def is_empty(self) -> bool:
         """True if the controller has nothing to command."""
         return not self._parts
 
-    def forget(self) -> None:
+    def reset_commands(self) -> None:
         """Reset the controller's own commands to NaN, as before the first command."""
         self.own.fill(np.nan)
         self._seen.fill(False)
         self.taken = b""
 
-    def check(self) -> None:
+    def check_commands(self) -> None:
         """Check that the controller's commands are finite. NaN is accepted before the first finite value.
 
         Raises:
@@ -256,12 +256,12 @@ class Outputs:
         np.logical_or(seen, self._finite, seen)
         self.taken = own.tobytes()
 
-    def merge(self) -> None:
+    def merge_commands(self) -> None:
         """Copy the controller's commands into the robot's arrays."""
         for own, merged, place, _, _ in self._parts:
             merged[place] = own
 
-    def hold(self) -> None:
+    def hold_joints(self) -> None:
         """Write commands into the robot's arrays that hold the joints: positions stay, velocities become 0.
 
         Efforts and PWM are still written because they carry the joints' load, and so are device commands.

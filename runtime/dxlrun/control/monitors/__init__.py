@@ -7,7 +7,7 @@ through `PolicyActions`. A new one changes neither the loop nor `check`.
 from __future__ import annotations
 
 from dxlrun.channels.cycle import CycleRecord
-from dxlrun.control.monitors.monitor import Monitor, MonitorStage
+from dxlrun.control.monitors.monitor_stage import Monitor, MonitorStage
 from dxlrun.control.monitors.policy_actions import PolicyActions
 from dxlrun.features import stages
 from dxlrun.plan.loop_plan import LoopPlan

@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Collection, Iterable
 from typing import TYPE_CHECKING
 
-from dxlrun.channels.events import EventBody
+from dxlrun.channels.event_records import EventBody
 from dxlrun.plan.policy_plan import PolicyPlan
 
 if TYPE_CHECKING:  # `check` shows the policies and needs nothing of the run
@@ -57,7 +57,7 @@ class PolicyActions:
 
     def report(self, event: EventBody, *, source: str = "loop") -> None:
         """Emit an event about an action of a policy."""
-        self._context.events.emit(source, event)
+        self._context.events.emit_event(source, event)
 
 
 def _ignore_answer(problem: str) -> None:

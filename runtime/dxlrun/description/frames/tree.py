@@ -21,7 +21,7 @@ from dxlsim.geometry.transform import (
     conjugate,
     from_rpy,
     product,
-    turn,
+    rotation_about,
     unit,
 )
 from dxlsim.geometry.urdf import SLIDING, Urdf, UrdfJoint, leader, read_urdf
@@ -95,7 +95,7 @@ class FrameTree:
         self._frames = {frame.name: frame for frame in frames}
 
     @classmethod
-    def of(cls, urdf: str, plan: FramesPlan) -> FrameTree:
+    def from_urdf(cls, urdf: str, plan: FramesPlan) -> FrameTree:
         """Build the tree from the text of a URDF and a plan; raise InputError as the constructor does."""
         return cls(read_urdf(urdf), plan.moved, plan.imu, plan.imu_link)
 
@@ -128,7 +128,7 @@ class FrameTree:
         """
         joint, scale, offset = leader(self._joints, self._joints[name], positions)
         known = positions.get(joint.name)
-        return scale * (rest(joint) if known is None else known) + offset
+        return scale * (rest_position(joint) if known is None else known) + offset
 
     def local(
         self, frame: Frame, positions: Mapping[str, float], orientation: Quaternion = NO_TURN
@@ -149,7 +149,7 @@ class FrameTree:
         x, y, z = frame.joint.axis
         if frame.joint.type == SLIDING:
             return base @ Transform((x * position, y * position, z * position))
-        return Transform(base.translation, product(base.rotation, turn(frame.joint.axis, position)))
+        return Transform(base.translation, product(base.rotation, rotation_about(frame.joint.axis, position)))
 
     def orientation(self, states: Mapping[str, float | None]) -> Quaternion:
         """Return the IMU's orientation from states such as `imu/orientation.x`; NaN if one is missing.
@@ -232,7 +232,7 @@ class FrameTree:
         return base.inverse @ found
 
 
-def rest(joint: UrdfJoint) -> float:
+def rest_position(joint: UrdfJoint) -> float:
     """Return the position at which a joint without a servo is shown: 0, or the middle of its limits."""
     lower, upper = joint.limits.lower, joint.limits.upper
     if lower is None or upper is None or joint.type == "continuous" or lower <= 0.0 <= upper:

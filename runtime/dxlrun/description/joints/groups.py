@@ -12,10 +12,10 @@ from typing import TypeVar
 
 from msgspec.structs import replace
 
-from dxlrun.description.document import Grown, KeyPath, Marks
+from dxlrun.description.document import KeyPath, Marks, PlainDocument
+from dxlrun.description.form_problems import format_value, path_text
 from dxlrun.description.including import merged
-from dxlrun.description.joints.joints import keys_of_servos
-from dxlrun.description.problems import path_text, shown
+from dxlrun.description.joints.joint_forms import keys_of_servos
 from dxlrun.errors import Problem, suggestion
 from dxlrun.features import installed_features, stages
 from dxlrun.features.feature import Section
@@ -31,7 +31,7 @@ Moves = dict[KeyPath, list[KeyPath]]
 _Value = TypeVar("_Value")
 
 
-def with_groups(grown: Grown) -> Grown:
+def with_groups(grown: PlainDocument) -> PlainDocument:
     """Return a robot file's document in which each joint has its keys from `joint_defaults` and groups.
 
     Groups keep only their joints, and their names elsewhere are replaced by the joints.
@@ -48,7 +48,7 @@ def with_groups(grown: Grown) -> Grown:
     return put_in(merged([*layers, _without_defaults(grown, groups)]), groups)
 
 
-def put_in(grown: Grown, groups: Groups) -> Grown:
+def put_in(grown: PlainDocument, groups: Groups) -> PlainDocument:
     """Replace names of groups in a document by their joints, in lists and in keys of mappings.
 
     In a mapping, a joint that is named directly keeps its own value; a joint in two groups is a problem.
@@ -61,7 +61,7 @@ def put_in(grown: Grown, groups: Groups) -> Grown:
 
 def without_groups(data: dict[str, object], groups: Groups) -> dict[str, object]:
     """Replace names of groups by their joints in data without a file, such as a client's request."""
-    return put_in(Grown(data, Marks("", {}, {}), (), frozenset()), groups).data
+    return put_in(PlainDocument(data, Marks("", {}, {}), (), frozenset()), groups).data
 
 
 class _Places:
@@ -146,11 +146,11 @@ def _mapping(value: object) -> dict[str, object]:
     return value if isinstance(value, dict) else {}
 
 
-def _mistakes(grown: Grown) -> Iterator[Problem]:
+def _mistakes(grown: PlainDocument) -> Iterator[Problem]:
     """Yield problems in `joint_defaults` and `groups`: unknown joints, ambiguous names, cycles."""
     joints, entries = _mapping(grown.data.get("joints")), _named(grown.data)
     if not isinstance(defaults := grown.data.get(DEFAULTS, {}), dict):
-        what = f"{DEFAULTS} is {shown(defaults)}, but must be a mapping"
+        what = f"{DEFAULTS} is {format_value(defaults)}, but must be a mapping"
         yield Problem(grown.marks.value(DEFAULTS), what, "write keys of a joint in it")
     for name, entry in _mapping(_mapping(grown.data.get("policies")).get(GROUPS)).items():
         if name in entries and "joints" in _mapping(entry):
@@ -183,7 +183,7 @@ def _circle(entries: Mapping[str, object], way: tuple[str, ...]) -> tuple[str, .
     return next((circle for circle in below if circle), ())
 
 
-def _layer(grown: Grown, source: KeyPath, joints: tuple[str, ...], groups: Groups) -> Grown:
+def _layer(grown: PlainDocument, source: KeyPath, joints: tuple[str, ...], groups: Groups) -> PlainDocument:
     """Return a document that has, for each of these joints, the keys of `joint_defaults` or of a group."""
     at: object = grown.data
     for step in source:
@@ -206,7 +206,7 @@ def _layer(grown: Grown, source: KeyPath, joints: tuple[str, ...], groups: Group
     return replace(moved(grown, moves, others=False), data=data, problems=())
 
 
-def _disagreements(grown: Grown, groups: Groups, layers: list[Grown]) -> Iterator[Problem]:
+def _disagreements(grown: PlainDocument, groups: Groups, layers: list[PlainDocument]) -> Iterator[Problem]:
     """Yield a problem for each joint that gets different values of a key from two groups."""
     own = {path for path, _ in _leaves(_mapping(grown.data.get("joints")))}
     before: dict[KeyPath, tuple[str, object]] = {}
@@ -215,7 +215,10 @@ def _disagreements(grown: Grown, groups: Groups, layers: list[Grown]) -> Iterato
             other, first = before.setdefault(path, (name, value))
             if first != value and path not in own:
                 joint, key = path[0], path_text(path[1:])
-                what = f"{joint} gets {key} {shown(value)} from group {name}, but {shown(first)} from {other}"
+                what = (
+                    f"{joint} gets {key} {format_value(value)} from group {name}, "
+                    f"but {format_value(first)} from {other}"
+                )
                 mark = layer.marks.value("joints", *path)
                 yield Problem(mark, what, f"give {joint} its own, or let one group alone give it")
 
@@ -228,7 +231,7 @@ def _leaves(value: dict[str, object], path: KeyPath = ()) -> Iterator[tuple[KeyP
             yield (*path, key), item
 
 
-def _without_defaults(grown: Grown, groups: Groups) -> Grown:
+def _without_defaults(grown: PlainDocument, groups: Groups) -> PlainDocument:
     """Return a document without `joint_defaults`, and with groups that have no key but `joints`."""
     data = {key: value for key, value in grown.data.items() if key != DEFAULTS}
     policies = _mapping(data.get("policies"))
@@ -247,7 +250,7 @@ def _without_defaults(grown: Grown, groups: Groups) -> Grown:
     return replace(grown, data=data)
 
 
-def moved(grown: Grown, moves: Moves, *, others: bool = True) -> Grown:
+def moved(grown: PlainDocument, moves: Moves, *, others: bool = True) -> PlainDocument:
     """Return a document whose places follow its moved values; `others`: keep the places of the others."""
 
     def placed(table: Mapping[KeyPath, _Value]) -> dict[KeyPath, _Value]:

@@ -10,9 +10,9 @@ import msgspec
 from pydantic import AfterValidator, Field, create_model
 
 from dxlrun.description.arguments import refuse_arguments
+from dxlrun.description.base_form import Form, key, validation_error
 from dxlrun.description.document import Marks, grow, parse, read_text, refusal
-from dxlrun.description.form import Form, key, refuse
-from dxlrun.description.problems import read_form
+from dxlrun.description.form_problems import read_form
 from dxlrun.description.units import (
     Angle,
     AngularVelocity,
@@ -37,7 +37,7 @@ _LONGEST_DELAY_NS = 100_000_000
 
 def _short(delay_ns: int) -> int:
     if delay_ns > _LONGEST_DELAY_NS:
-        raise refuse("no servo needs over 100 ms", "check its unit: some milliseconds are usual")
+        raise validation_error("no servo needs over 100 ms", "check its unit: some milliseconds are usual")
     return delay_ns
 
 

@@ -9,7 +9,7 @@ from typing import Annotated, Union, cast, get_args, get_origin
 
 from pydantic import BaseModel, TypeAdapter
 
-from dxlrun.description.form import PlugInEntry
+from dxlrun.description.base_form import PlugInEntry
 from dxlrun.errors import near
 
 Place = tuple[str, ...]

@@ -16,7 +16,7 @@ from typing import NamedTuple
 import msgspec
 from pydantic import BaseModel
 
-from dxlrun.description.form import folded
+from dxlrun.description.base_form import folded
 from dxlrun.description.mistakes.forms import (
     NAME,
     Place,
@@ -65,7 +65,7 @@ class _Meaning(NamedTuple):
     kind: str
 
 
-class Context(msgspec.Struct, frozen=True):
+class UnknownKeyContext(msgspec.Struct, frozen=True):
     """The mapping in a file that has unknown keys: its model, its path, and its other keys."""
 
     root: type[BaseModel]
@@ -238,7 +238,7 @@ def misplaced_sections(
     root: type[BaseModel], data: Mapping[str, object]
 ) -> Iterator[tuple[tuple[str, ...], str]]:
     """Yield path and fix of each section of a robot file that is misnamed or indented too far."""
-    context = Context(root, root, (), [*root.model_fields], [*data], {})
+    context = UnknownKeyContext(root, root, (), [*root.model_fields], [*data], {})
     for key, value in data.items():
         inner = value if isinstance(value, dict) else {}
         own = [name for name in inner if name in root.model_fields and name not in data]

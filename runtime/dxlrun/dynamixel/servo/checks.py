@@ -19,8 +19,8 @@ from dxlrun.description.bus import SIMULATED
 from dxlrun.dynamixel import texts
 from dxlrun.dynamixel.findings import Findings
 from dxlrun.dynamixel.remedies import CHECK, choose_remedy
-from dxlrun.dynamixel.servo.access import Access, first_reach
-from dxlrun.dynamixel.servo.registers import shown, tripped
+from dxlrun.dynamixel.servo.item_access import Access, first_reach
+from dxlrun.dynamixel.servo.registers import format_item, tripped
 from dxlwire.bus_plan import BusPlan, ServoPlan
 from dxlwire.control_table import (
     ControlItem,
@@ -30,11 +30,11 @@ from dxlwire.control_table import (
     find_table,
 )
 from dxlwire.modes import Mode
-from dxlwire.plan.line import listen
+from dxlwire.plan.line import listen_transaction
 from dxlwire.plan.mode_plan import mode_in
 from dxlwire.plan.reads import servo_read
 from dxlwire.plan.retry import ATTEMPTS, retry
-from dxlwire.transaction import Outcome, Program, Reply
+from dxlwire.transaction import Program, Reply, TransactionOutcome
 from dxlwire.wire.protocol1 import describe_error
 
 RETURN_ALL = 2  # Status Return Level: the servo answers every instruction
@@ -44,8 +44,8 @@ LISTEN_NS = 2_000_000
 up to 0.508 ms.
 """
 STATUS_ERROR = "status_error"
-"""Key under which `Inspected.values` holds the error byte of a Protocol 1.0 reply. In Protocol 2.0 an item
-has the hardware errors.
+"""Key under which `InspectedServo.values` holds the error byte of a Protocol 1.0 reply. In Protocol 2.0 an
+item has the hardware errors.
 """
 
 _IDENTITY = ("model_number", "firmware_version")
@@ -53,7 +53,7 @@ _MODES = {"operating_mode", "control_mode"}
 _MOST_NAMED = 4  # servos that one message names, to keep it readable
 
 
-class Inspected(msgspec.Struct, frozen=True):
+class InspectedServo(msgspec.Struct, frozen=True):
     """Register values of one servo at its inspection, and the plan with which they are compared."""
 
     plan: BusPlan
@@ -75,20 +75,20 @@ class Check(NamedTuple):
     """One row of CHECKS: applies to the value of one item, and yields a sentence if the value fails."""
 
     item: str  # the check applies if the servo has this item
-    fails: Callable[[Inspected, int], bool]  # predicate on the item's value
-    sentence: Callable[[Inspected, int], str]
+    fails: Callable[[InspectedServo, int], bool]  # predicate on the item's value
+    sentence: Callable[[InspectedServo, int], str]
     """Returns the problem and its fix, without the servo's name at the start."""
     refuses: bool = True  # True: the servo gets no torque. False: the difference is only reported
 
 
 def _limits(low: str, high: str, names: str) -> Check:
-    def fails(found: Inspected, lowest: int) -> bool:
+    def fails(found: InspectedServo, lowest: int) -> bool:
         servo, highest = found.servo, found.values[high]
         if servo.continuous or (found.plan.protocol == 1.0 and lowest >= highest):
             return False  # not in joint mode yet: start-up switches it
         return lowest > servo.lower_tick or highest < servo.upper_tick
 
-    def sentence(found: Inspected, lowest: int) -> str:
+    def sentence(found: InspectedServo, lowest: int) -> str:
         servo, highest = found.servo, found.values[high]
         ends = [servo.position_text(end) for end in sorted(map(servo.joint_position, (lowest, highest)))]
         return (
@@ -100,12 +100,12 @@ def _limits(low: str, high: str, names: str) -> Check:
     return Check(low, fails, sentence)
 
 
-def _newer(found: Inspected, firmware: int) -> list[ControlItem]:
+def _newer(found: InspectedServo, firmware: int) -> list[ControlItem]:
     declared = (found.items[name] for name in found.servo.declared)
     return [item for item in declared if item.firmware > firmware]
 
 
-def _newer_sentence(found: Inspected, firmware: int) -> str:
+def _newer_sentence(found: InspectedServo, firmware: int) -> str:
     newer = _newer(found, firmware)
     return (
         f"has firmware {firmware}, but {' and '.join(item.title for item in newer)}, which the robot file "
@@ -114,7 +114,7 @@ def _newer_sentence(found: Inspected, firmware: int) -> str:
     )
 
 
-def _return_delay_sentence(found: Inspected, raw: int) -> str:
+def _return_delay_sentence(found: InspectedServo, raw: int) -> str:
     plan = found.plan
     total_ns = plan.budget.total_ns + (raw * 2_000 - plan.return_delay_ns) * len(plan.servos)
     return (
@@ -125,12 +125,12 @@ def _return_delay_sentence(found: Inspected, raw: int) -> str:
     )
 
 
-def _watchdog_sentence(found: Inspected, raw: int) -> str:
+def _watchdog_sentence(found: InspectedServo, raw: int) -> str:
     item = found.items["bus_watchdog"]
     what = f"it would stop after {raw * 20} ms without an instruction"
     if tripped(item, raw):
         what = "it has stopped the servo"
-    return f"{item.title} is {shown(item, raw)}, {what}; it is cleared"
+    return f"{item.title} is {format_item(item, raw)}, {what}; it is cleared"
 
 
 CHECKS: tuple[Check, ...] = (
@@ -161,8 +161,8 @@ CHECKS: tuple[Check, ...] = (
             item,
             lambda found, raw: raw != 0 and not found.errors.is_warning(raw),
             lambda found, raw: (
-                f"reports in {found.title(found.errors.item)}: {found.errors.describe(raw)}; find the cause, "
-                "then reboot it"
+                f"reports in {found.title(found.errors.item)}: {found.errors.describe_errors(raw)}; "
+                "find the cause, then reboot it"
             ),
         )
         for item in ("hardware_error_status", "error_code")
@@ -170,7 +170,9 @@ CHECKS: tuple[Check, ...] = (
     Check(
         "error_code",
         lambda found, raw: found.errors.is_warning(raw),
-        lambda found, raw: f"reports in {found.title(found.errors.item)}: {found.errors.describe(raw)}",
+        lambda found, raw: (
+            f"reports in {found.title(found.errors.item)}: {found.errors.describe_errors(raw)}"
+        ),
         refuses=False,
     ),
     Check(  # Start-up clears a watchdog that an earlier run left armed; report it if this run arms none.
@@ -205,7 +207,7 @@ def survey(plan: BusPlan, take_over: bool, found: Findings) -> Program[None]:
     """Check that every servo of a bus is present and fit for torque; add the problems of all servos to
     `found`. Only reads.
     """
-    yield listen(LISTEN_NS)
+    yield listen_transaction(LISTEN_NS)
     every = [first_reach(plan, servo) for servo in plan.servos]
     if every and (yield from _echoes(every[0], found)):
         return
@@ -221,13 +223,13 @@ def survey(plan: BusPlan, take_over: bool, found: Findings) -> Program[None]:
         found.problems.insert(0, _silence(plan, silent))
     readable: list[tuple[Access, Mode]] = []
     for one in present:
-        mode = yield from inspect(one, found, take_over=take_over)
+        mode = yield from inspect_servo(one, found, take_over=take_over)
         if mode is not None:
             readable.append((one, mode))
     yield from inspect_states(readable, found)
 
 
-def inspect(one: Access, found: Findings, *, take_over: bool) -> Program[Mode | None]:
+def inspect_servo(one: Access, found: Findings, *, take_over: bool) -> Program[Mode | None]:
     """Read the registers of a servo that matter for a start, and add the problems, events and unusual
     settings to `found`.
 
@@ -254,15 +256,15 @@ def inspect(one: Access, found: Findings, *, take_over: bool) -> Program[Mode | 
     if plan.protocol == 1.0:
         values[STATUS_ERROR] = reply.error
     firmware = values["firmware_version"]
-    found.note(servo.joint, texts.servo_found(servo.model, servo.servo_id, plan.name, firmware))
-    inspected = Inspected(plan, servo, one.items, values, one.table.errors, take_over)
+    found.add_event(servo.joint, texts.servo_found(servo.model, servo.servo_id, plan.name, firmware))
+    inspected = InspectedServo(plan, servo, one.items, values, one.table.errors, take_over)
     for check in CHECKS:
         if check.item in values and check.fails(inspected, values[check.item]):
             sentence = check.sentence(inspected, values[check.item])
             if check.refuses:
                 found.problems.append(f"{one} {sentence}")
             else:
-                found.note(servo.joint, texts.register_check_failed(sentence))
+                found.add_event(servo.joint, texts.register_check_failed(sentence))
     # Torque control mode of Protocol 1.0 is in RAM, and only some models have it: it is not read here.
     mode = mode_in(servo, {"torque_ctrl_mode_enable": 0, **values})
     for each in deviations(one, values, mode, declared):
@@ -335,7 +337,7 @@ def inspect_states(servos: Sequence[tuple[Access, Mode]], found: Findings) -> Pr
             problem = ""
             if not reply.answered:
                 problem = "sends garbled replies when its state is read: do two servos have its ID?"
-                if reply.outcome is Outcome.TIMEOUT:
+                if reply.outcome is TransactionOutcome.TIMEOUT:
                     problem = f"does not answer any more: {choose_remedy(one.plan.port, CHECK)}"
             else:
                 raw = servo.state.position.tick(reply.parameters)
@@ -368,7 +370,7 @@ def _answers(one: Access, found: Findings) -> Program[bool | None]:
     answered = disturbed = 0
     for _ in range(PINGS):
         reply = yield one.line.ping(one.servo.servo_id)
-        after = yield listen(LISTEN_NS)
+        after = yield listen_transaction(LISTEN_NS)
         answered += reply.answered
         disturbed += bool(reply.strays or after.strays)
     problem = ""
@@ -417,11 +419,11 @@ def _unreadable(one: Access, title: str, reply: Reply) -> str:
 
     A timeout is not evidence against a certain register.
     """
-    if reply.outcome is Outcome.TIMEOUT:
+    if reply.outcome is TransactionOutcome.TIMEOUT:
         level = one.items["status_return_level"].title
         remedy = choose_remedy(one.plan.port, f"{CHECK}, and its {level}")
         return f"answered pings, but did not answer {ATTEMPTS} reads of {title}: {remedy}"
-    if reply.outcome is Outcome.REFUSED:
+    if reply.outcome is TransactionOutcome.REFUSED:
         return f"refuses to be read{one.reason(reply)}"
     remedy = choose_remedy(one.plan.port, " If not, check cable and ground", simulated="")
     return f"sends garbled replies to reads: do two servos have its ID?{remedy}"

@@ -15,16 +15,16 @@ from numpy.typing import NDArray
 
 from dxlrun.dynamixel import texts
 from dxlrun.dynamixel.findings import Findings
-from dxlrun.dynamixel.servo import modes
+from dxlrun.dynamixel.servo import mode_switches
 from dxlrun.dynamixel.servo.life import Life
 from dxlrun.dynamixel.servo.reboots import Reboots
-from dxlrun.dynamixel.servo.registers import merged, read_registers, settle
+from dxlrun.dynamixel.servo.registers import merged, read_registers, write_registers
 from dxlrun.dynamixel.servo.torque_limits import limits_positions, restore_torque_limit
 from dxlwire.bus_plan import RegisterValue
-from dxlwire.exchange.goals import GoalArrays
+from dxlwire.exchange.goal_writes import GoalArrays
 from dxlwire.exchange.idle import Urgency
 from dxlwire.modes import Mode
-from dxlwire.plan.line import listen
+from dxlwire.plan.line import listen_transaction
 from dxlwire.transaction import Program
 
 PAUSES_NS = (50_000_000, 150_000_000, 0)
@@ -135,15 +135,15 @@ class DesiredState:
         and then it would refuse the goal that it needs to hold in another mode. Its recovery switches it to
         the newest mode.
         """
-        life, one, mode = self._life, self._life.reach(index), self._modes[index]
+        life, one, mode = self._life, self._life.access_servo(index), self._modes[index]
         if life.offline(index):
             self._changing[index] = False
             return
-        problem = modes.STARTED_ANEW if (yield from self._reboots.watch(index)) else ""
+        problem = mode_switches.STARTED_ANEW if (yield from self._reboots.arm_detection(index)) else ""
         if not problem:
             rebooted = partial(self._reboots.tick, index)
             try:
-                problem = yield from modes.enter(one, mode, inward=True, rebooted=rebooted)
+                problem = yield from mode_switches.enter_mode(one, mode, inward=True, rebooted=rebooted)
             except LookupError as error:
                 problem = f"cannot follow: {error}"
         servo = self._servos[index]
@@ -153,83 +153,83 @@ class DesiredState:
             limits.log(life.events)
             problem = "; ".join(limits.problems)
         yield from self._reboots.unwatch(index)
-        if problem == modes.STARTED_ANEW:
+        if problem == mode_switches.STARTED_ANEW:
             self._changing[index] = False
             if not life.offline(index):
                 life.lose(index).rebooted = True
             return
         if problem:
-            mode = yield from modes.mode_now(one)
+            mode = yield from mode_switches.mode_now(one)
         life.give_torque(index)
         self._changing[index] = False
         if problem:
-            life.report(index, texts.mode_not_entered(life.name(index), problem, _words(mode)))
+            life.report_event(index, texts.mode_not_entered(life.servo_name(index), problem, _words(mode)))
             self._show(index, mode)
             self._modes[index] = mode or self._modes[index]
         elif self._modes[index] != mode:  # a newer request came during the change
             self._begin_change(index)
         else:
             self.entered(index, mode)
-            life.report(index, texts.mode_entered(life.name(index), _words(mode)))
+            life.report_event(index, texts.mode_entered(life.servo_name(index), _words(mode)))
 
     def read_limits(self, index: int) -> Program[None]:
         """Read a servo's limit registers, beyond which it refuses goals, and use them for its goals; the
         servo may have been replaced.
         """
-        self._goals.set_limits(index, (yield from modes.read_limits(self._life.reach(index))))
+        self._goals.set_limits(index, (yield from mode_switches.read_limits(self._life.access_servo(index))))
 
     def restore_torque_limit(self, index: int, mode: Mode, found: Findings) -> Program[None]:
         """Restore a servo's own torque limit in this mode, unless a policy reduced the torque of the
         robot."""
         if self._goals.fraction >= 1.0:
-            yield from restore_torque_limit(self._life.reach(index), mode, found)
+            yield from restore_torque_limit(self._life.access_servo(index), mode, found)
 
-    def read_register(self, index: int, item: str, done: RegisterDone) -> None:
+    def queue_read(self, index: int, item: str, done: RegisterDone) -> None:
         """Read an item of a servo in idle time; `done` receives the problem and the value."""
-        one = self._life.reach(index)
+        one = self._life.access_servo(index)
         entry = one.items.get(item)
         if entry is None:
             done(f"{one.servo.joint} has no register {item}", None)
             return
         register = RegisterValue(entry.address, entry.size, 0, item)
-        self._life.do(index, self._read(index, register, done), entry.title, Urgency.STEERED)
+        self._life.do(index, self._read_with_retries(index, register, done), entry.title, Urgency.STEERED)
 
-    def _read(self, index: int, register: RegisterValue, done: RegisterDone) -> Program[None]:
-        one = self._life.reach(index)
+    def _read_with_retries(self, index: int, register: RegisterValue, done: RegisterDone) -> Program[None]:
+        one = self._life.access_servo(index)
         for pause_ns in PAUSES_NS:
             found = (yield from read_registers(one, (register,)))[register.name]
             if found is not None or not pause_ns:
                 break
-            yield listen(pause_ns)
+            yield listen_transaction(pause_ns)
         title = one.items[register.name].title
         done("" if found is not None else f"{one} did not answer when {title} was read", found)
 
-    def write_register(self, index: int, item: str, value: int, done: RegisterDone) -> None:
+    def queue_write(self, index: int, item: str, value: int, done: RegisterDone) -> None:
         """Write a RAM item of a servo in idle time if it has another value, and keep the value as desired.
 
         `done` receives the problem and the previous value.
         """
-        one = self._life.reach(index)
+        one = self._life.access_servo(index)
         entry = one.items.get(item)
         if entry is None or entry.area != "RAM" or entry.access != "RW":
             done(f"{one.servo.joint} has no register {item} that could be written now", None)
             return
         register = RegisterValue(entry.address, entry.size, value, item)
-        self._life.do(index, self._write(index, register, done), entry.title, Urgency.STEERED)
+        self._life.do(index, self._write_with_retries(index, register, done), entry.title, Urgency.STEERED)
 
-    def _write(self, index: int, register: RegisterValue, done: RegisterDone) -> Program[None]:
+    def _write_with_retries(self, index: int, register: RegisterValue, done: RegisterDone) -> Program[None]:
         """Write one register with up to three attempts, with a pause after each in which the servo was
         silent.
         """
-        life, one = self._life, self._life.reach(index)
+        life, one = self._life, self._life.access_servo(index)
         for pause_ns in PAUSES_NS:
             found = Findings()
-            before = yield from settle(one, (register,), found)
+            before = yield from write_registers(one, (register,), found)
             if before or not pause_ns:
                 break
-            yield listen(pause_ns)
+            yield listen_transaction(pause_ns)
         if problem := "; ".join(found.problems):
-            life.events.emit(one.servo.joint, texts.register_not_written(problem))
+            life.events.emit_event(one.servo.joint, texts.register_not_written(problem))
         else:
             self._settings[index] = merged(self._settings[index], register)
         found.log(life.events)

@@ -46,10 +46,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from dxlrun.channels.cycle import Floats, Torque
-from dxlrun.channels.events import EventBody, EventSink
+from dxlrun.channels.event_records import EventBody, EventSink
 from dxlrun.dynamixel import texts
 from dxlrun.dynamixel.bus_part import BusPart
-from dxlrun.dynamixel.servo.access import Access, reach
+from dxlrun.dynamixel.servo.item_access import Access, access_servo
 from dxlrun.dynamixel.servo.watchdog import RETURN_SPEED
 from dxlwire.exchange.cyclic_reads import CyclicReads
 from dxlwire.exchange.idle import IdleScheduler, Urgency
@@ -199,7 +199,7 @@ class RequestedReboot(msgspec.Struct):
     done: Done  # receives the problem, or an empty text
 
 
-class Loss(msgspec.Struct):
+class OfflineServo(msgspec.Struct):
     """Record of one servo while it is OFFLINE; it decides about torque on the servo's return."""
 
     had_torque: bool
@@ -242,7 +242,7 @@ class Life:
         self.idle = idle
         self.reads = reads  # the cyclic reads, without OFFLINE servos
         self.states = [ServoState.LIMP] * count  # state of each servo
-        self.losses: dict[int, Loss] = {}  # record of each OFFLINE servo, by index
+        self.losses: dict[int, OfflineServo] = {}  # record of each OFFLINE servo, by index
         self.torqued: NDArray[np.bool_] = np.zeros(count, dtype=np.bool_)
         """True for servos that get goals, shape (servos,); memory shared with the exchange kernel."""
         self.torque: NDArray[np.uint8] = np.full(count, Torque.OFF, dtype=np.uint8)
@@ -264,7 +264,7 @@ class Life:
         after = TRANSITIONS[before].get(event)
         if after is None:
             raise IllegalTransition(
-                f"{self.name(index)} is {before.value}, where {event.value} cannot happen"
+                f"{self.servo_name(index)} is {before.value}, where {event.value} cannot happen"
             )
         self.states[index] = after
         self.torqued[index] = after in GETS_GOALS
@@ -275,7 +275,7 @@ class Life:
         loss = self.losses.get(index)
         if event is ServoEvent.LOST:
             self.losses[index] = self._loss(before, loss)
-            self.reads.leave(index)
+            self.reads.stop_reading(index)
         elif loss is not None and event is ServoEvent.RELEASE:
             loss.released = True
         elif loss is not None and after is not ServoState.OFFLINE:
@@ -294,7 +294,7 @@ class Life:
         elif self.states[index] not in POWERLESS:
             self.on(index, ServoEvent.TORQUE_GIVEN)
 
-    def lose(self, index: int, probe_after_ns: int = 0) -> Loss:
+    def lose(self, index: int, probe_after_ns: int = 0) -> OfflineServo:
         """Remove a servo from the cyclic reads and return its record. It is first probed after
         `probe_after_ns`.
         """
@@ -303,7 +303,7 @@ class Life:
         loss.probe_at_ns += probe_after_ns
         return loss
 
-    def reboot(self, index: int, request: RequestedReboot, probe_after_ns: int) -> Loss:
+    def begin_reboot(self, index: int, request: RequestedReboot, probe_after_ns: int) -> OfflineServo:
         """Remove a servo from the cyclic reads for a reboot that a client requested; the states show it as
         rebooting.
         """
@@ -321,12 +321,12 @@ class Life:
         self.torque[index] = torque
         self.torque_changed = True
 
-    def _loss(self, before: ServoState, earlier: Loss | None) -> Loss:
+    def _loss(self, before: ServoState, earlier: OfflineServo | None) -> OfflineServo:
         """Return the record of a servo that is lost in state `before`; `earlier` is its record if it was
         OFFLINE already.
         """
         powerless = before in POWERLESS if earlier is None else earlier.limp_reported
-        return Loss(
+        return OfflineServo(
             had_torque=not powerless,
             kept_goal=before is not ServoState.GIVEN if earlier is None else earlier.kept_goal,
             limp_reported=powerless,
@@ -349,11 +349,11 @@ class Life:
         """Return the time of the run's clock, ns."""
         return self.idle.now_ns()
 
-    def reach(self, index: int) -> Access:
+    def access_servo(self, index: int) -> Access:
         """Return access to a servo's items with the timeouts of the plan."""
-        return reach(self.plan, self.plan.servos[index])
+        return access_servo(self.plan, self.plan.servos[index])
 
-    def name(self, index: int) -> str:
+    def servo_name(self, index: int) -> str:
         """Return the label of a servo for messages: joint, ID and bus."""
         return self.plan.label(self.plan.servos[index])
 
@@ -361,13 +361,13 @@ class Life:
         """Schedule a program for a servo in idle time; `what` names its object in messages, such as `torque
         enable`.
         """
-        self.idle.add(program, urgency, f"{what} of {self.name(index)}", index)
+        self.idle.add(program, urgency, f"{what} of {self.servo_name(index)}", index)
 
-    def report(self, index: int, event: EventBody) -> None:
+    def report_event(self, index: int, event: EventBody) -> None:
         """Log an event of a servo; its source is the servo's joint."""
-        self.events.emit(self.plan.servos[index].joint, event)
+        self.events.emit_event(self.plan.servos[index].joint, event)
 
     def report_limp(self, index: int, enabled: int) -> None:
         """Log that a servo was found without torque; `enabled` is the value of its torque enable."""
         address = self.plan.servos[index].torque_address
-        self.report(index, texts.torque_lost(self.name(index), address, enabled))
+        self.report_event(index, texts.torque_lost(self.servo_name(index), address, enabled))

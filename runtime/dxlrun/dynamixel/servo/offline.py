@@ -15,17 +15,17 @@ from msgspec.structs import replace
 from dxlrun.dynamixel import texts
 from dxlrun.dynamixel.findings import Findings
 from dxlrun.dynamixel.remedies import CHECK, choose_remedy
-from dxlrun.dynamixel.servo import modes, watchdog
-from dxlrun.dynamixel.servo.access import Access
-from dxlrun.dynamixel.servo.checks import inspect, inspect_states
+from dxlrun.dynamixel.servo import mode_switches, watchdog
+from dxlrun.dynamixel.servo.checks import inspect_servo, inspect_states
 from dxlrun.dynamixel.servo.desired import DesiredState
-from dxlrun.dynamixel.servo.life import Done, Life, Loss, ServoEvent, ServoState
+from dxlrun.dynamixel.servo.item_access import Access
+from dxlrun.dynamixel.servo.life import Done, Life, OfflineServo, ServoEvent, ServoState
 from dxlrun.dynamixel.servo.reboots import Reboots
-from dxlrun.dynamixel.servo.registers import settle
+from dxlrun.dynamixel.servo.registers import write_registers
 from dxlwire.bus_plan import RegisterValue
 from dxlwire.modes import Mode
 from dxlwire.plan.retry import ATTEMPTS, limit_patience, retry
-from dxlwire.transaction import Outcome, Program, Reply
+from dxlwire.transaction import Program, Reply, TransactionOutcome
 
 PROBE_NS = 1_000_000_000  # probe period of an offline servo (failures.md)
 FIRST_PROBE_NS = 200_000_000
@@ -35,7 +35,7 @@ REBOOT_NS = 3_000_000_000
 """Timeout (ns) for a servo that a client rebooted to pass the checks again [i]."""
 
 
-class Offline:
+class OfflineRecovery:
     """Probes the offline servos of one bus and recovers those that answer. Servos are indices in the plan."""
 
     def __init__(self, life: Life, reboots: Reboots, desired: DesiredState) -> None:
@@ -60,21 +60,21 @@ class Offline:
             goal = self.desired.resting(index)
             if goal is None or not self.life.offline(index):
                 return
-            if (yield self.life.reach(index).writing(*goal)).answered:
+            if (yield self.life.access_servo(index).writing(*goal)).answered:
                 return
 
-    def look(self) -> None:
+    def schedule_probes(self) -> None:
         """Schedule a ping for each offline servo whose next probe is due; called once a cycle while a servo
         is offline.
         """
-        self.expire()
+        self.expire_reboots()
         now = self.life.now_ns()
         for index, loss in sorted(self.life.losses.items()):
             if not loss.probing and loss.probe_at_ns <= now:
                 loss.probing = True
                 self.life.do(index, self._probe(index, loss), "the return")
 
-    def expire(self) -> None:
+    def expire_reboots(self) -> None:
         """Report failure to the clients whose requested reboot did not bring the servo back in time."""
         now = self.life.now_ns()
         for index, loss in sorted(self.life.losses.items()):
@@ -92,7 +92,7 @@ class Offline:
         # In any other state a client requested torque since then, or the servo is lost; its return keeps it
         # limp.
         if self.life.states[index] is ServoState.RELEASED and not (yield from self.limp(index)):
-            problem = f"{self.life.name(index)} did not confirm torque off; it is tried again"
+            problem = f"{self.life.servo_name(index)} did not confirm torque off; it is tried again"
         done(problem)
 
     def limp(self, index: int) -> Program[bool]:
@@ -100,7 +100,7 @@ class Offline:
 
         A servo that does not confirm counts as lost, so its return switches its torque off.
         """
-        one = self.life.reach(index)
+        one = self.life.access_servo(index)
         for _ in range(ATTEMPTS):
             # The read-back decides, so the acknowledgement is not worth a long wait.
             yield replace(one.writing(one.servo.torque_address, b"\0"), patience_ns=0)
@@ -110,19 +110,19 @@ class Offline:
         self.life.lose(index)
         return False
 
-    def _probe(self, index: int, loss: Loss) -> Program[None]:
+    def _probe(self, index: int, loss: OfflineServo) -> Program[None]:
         """Ping an offline servo; if it answers, check and recover it, otherwise set the time of the next
         probe.
         """
-        life, one = self.life, self.life.reach(index)
+        life, one = self.life, self.life.access_servo(index)
         reply = yield one.line.ping(one.servo.servo_id)
-        if reply.answered and (read := self.reboots.read(index)) is not None:
+        if reply.answered and (read := self.reboots.tick_reading(index)) is not None:
             reply = yield from retry(read)
         event = None
-        if reply.outcome is Outcome.GARBLED:
+        if reply.outcome is TransactionOutcome.GARBLED:
             remedy = choose_remedy(life.plan.port, " If not, check its cable", simulated="")
-            event = texts.servo_garbled(life.name(index), remedy)
-        if reply.outcome not in (Outcome.TIMEOUT, Outcome.GARBLED):
+            event = texts.servo_garbled(life.servo_name(index), remedy)
+        if reply.outcome not in (TransactionOutcome.TIMEOUT, TransactionOutcome.GARBLED):
             found = Findings()
             torqued, mode = yield from self._rejoin(index, reply, found)
             if life.losses.get(index) is not loss:
@@ -134,19 +134,19 @@ class Offline:
                 self._take_back(index, loss, torqued, mode)
                 return
             problems = [each.removeprefix(f"{one} ") for each in found.problems]
-            event = texts.servo_unfit(life.name(index), problems)
+            event = texts.servo_unfit(life.servo_name(index), problems)
             self._answer(index, loss, texts.unfit_clause(problems))
         if event is not None and event.text != loss.problem:
             loss.problem = event.text
-            life.report(index, event)
+            life.report_event(index, event)
         loss.probing, loss.probe_at_ns = False, life.now_ns() + PROBE_NS
 
     def _rejoin(self, index: int, reply: Reply, found: Findings) -> Program[tuple[bool, Mode]]:
         """Bring a servo that answered a probe to its desired registers and mode; return (has torque, mode).
         Problems go to `found`.
         """
-        life, one, servo = self.life, self.life.reach(index), self.life.plan.servos[index]
-        if self.reboots.judge(index, reply) is None:
+        life, one, servo = self.life, self.life.access_servo(index), self.life.plan.servos[index]
+        if self.reboots.detect_reboot(index, reply) is None:
             enabled = yield from one.read_torque()
             loss = life.losses.get(index)
             if loss is not None and loss.had_torque and enabled.answered and not enabled.parameters[0]:
@@ -164,7 +164,7 @@ class Offline:
             loss = life.losses.get(index)
             if loss is not None and not loss.limp_reported:
                 loss.limp_reported = True
-                life.report(index, texts.turns_lost(life.name(index), servo.joint))
+                life.report_event(index, texts.turns_lost(life.servo_name(index), servo.joint))
         torqued = yield from rejoin(one, found, mode, self.desired.settings(index), torque=torque)
         if not found.problems:
             yield from self.desired.read_limits(index)
@@ -186,7 +186,7 @@ class Offline:
             return loss.reboot.had_torque
         return self.life.plan.servos[index].torque_on_return and not self.reboots.exhausted(index)
 
-    def _take_back(self, index: int, loss: Loss, torqued: bool, mode: Mode) -> None:
+    def _take_back(self, index: int, loss: OfflineServo, torqued: bool, mode: Mode) -> None:
         life, back = self.life, texts.servo_back_limp
         if loss.released or not torqued:
             life.on(index, ServoEvent.RETURNED_LIMP)
@@ -200,7 +200,7 @@ class Offline:
         if loss.rebooted and life.plan.servos[index].continuous:
             life.reads.samples.restart_count(index)
         self.desired.returned(index, mode)
-        life.report(index, back(life.name(index)))
+        life.report_event(index, back(life.servo_name(index)))
         if loss.released:
             life.on(index, ServoEvent.RELEASE)
             if torqued:
@@ -213,11 +213,11 @@ class Offline:
             problem = problem or f"is back, limp; `dxlrun torque on {joint}` gives it torque"
         self._answer(index, loss, problem)
 
-    def _answer(self, index: int, loss: Loss, problem: str) -> None:
+    def _answer(self, index: int, loss: OfflineServo, problem: str) -> None:
         request, loss.reboot = loss.reboot, None
         if request is not None:
             self.life.answered(index)
-            request.done(problem and f"{self.life.name(index)} {problem}")
+            request.done(problem and f"{self.life.servo_name(index)} {problem}")
 
 
 def ignore(problem: str) -> None:
@@ -245,22 +245,22 @@ def rejoin(
         True if torque enable was read as 1 and no problem was found.
     """
     seen = Findings()  # Drop the events, which a start has logged; but report settings that changed since.
-    if (present := (yield from inspect(one, seen, take_over=True))) is not None:
+    if (present := (yield from inspect_servo(one, seen, take_over=True))) is not None:
         yield from inspect_states([(one, present)], seen)
     if seen.problems:
         found.problems += seen.problems
         return False
     ours = {register.name for register in registers}
     found.deviations += (each for each in seen.deviations if each[2].item.name not in ours)
-    yield from settle(one, registers, found)
-    if not found.problems and (problem := (yield from modes.enter(one, mode, again=False))):
+    yield from write_registers(one, registers, found)
+    if not found.problems and (problem := (yield from mode_switches.enter_mode(one, mode, again=False))):
         found.problems.append(f"{one} {problem}")
     enabled = yield from one.read_torque()
     if not enabled.answered:
         found.problems.append(f"{one} did not answer when its torque was read")
     if found.problems or not torque:
         return not found.problems and enabled.parameters[0] == 1
-    held = yield from modes.hold(one, mode)
+    held = yield from mode_switches.hold_servo(one, mode)
     if held.problem:
         found.problems.append(f"{one} {held.problem}")
     return not held.problem

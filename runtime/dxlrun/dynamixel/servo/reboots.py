@@ -33,7 +33,7 @@ class TickReading(NamedTuple):
     half_ms: float  # the servo sampled the tick within this time around the middle
 
     @classmethod
-    def of(cls, reply: Reply) -> TickReading:
+    def from_reply(cls, reply: Reply) -> TickReading:
         """Return the reading in the reply to a read of Realtime Tick."""
         half_ns = (reply.last_ns - reply.asked_ns) // 2
         return cls(reply.word(), reply.asked_ns + half_ns, half_ns * 1e-6)
@@ -59,7 +59,7 @@ class RebootCount:
         self._times: deque[int] = deque(maxlen=TOO_MANY_REBOOTS)
         self.exhausted = False  # it has rebooted TOO_MANY_REBOOTS times within a minute
 
-    def add(self, now_ns: int) -> bool:
+    def count_reboot(self, now_ns: int) -> bool:
         """Count a reboot at this time; return True only for the one that reaches the limit."""
         times = self._times
         times.append(now_ns)
@@ -84,9 +84,9 @@ class Reboots:
         self._ticks: list[TickReading | None] = [None] * count
         self._counts = [RebootCount() for _ in range(count)]
 
-    def read(self, index: int) -> Transaction | None:
+    def tick_reading(self, index: int) -> Transaction | None:
         """Return the transaction that reads a servo's Realtime Tick; None if the model does not have it."""
-        one = self._life.reach(index)
+        one = self._life.access_servo(index)
         item = one.items.get("realtime_tick")
         return None if item is None else one.reading(item.address, item.size)
 
@@ -96,16 +96,16 @@ class Reboots:
 
         For a watched servo without Realtime Tick: return True if its LED is off.
         """
-        read = self.read(index)
+        read = self.tick_reading(index)
         if read is not None:
-            return bool(self.judge(index, (yield from retry(read))))
+            return bool(self.detect_reboot(index, (yield from retry(read))))
         if self._lit[index] is None or (yield from self._lamp_is(index)) != 0:
             return False
         self._lit[index] = None
         self.count(index)
         return True
 
-    def watch(self, index: int) -> Program[bool]:
+    def arm_detection(self, index: int) -> Program[bool]:
         """Read Realtime Tick, or light the LED, so that a later `tick` detects a reboot; return True if this
         read shows a reboot.
         """
@@ -113,7 +113,7 @@ class Reboots:
         if lamp is not None and self._lit[index] is None:
             self._lit[index] = yield from self._lamp_is(index)
             if self._lit[index] == 0:
-                yield from self._life.reach(index).write_bytes(lamp, b"\1")
+                yield from self._life.access_servo(index).write_bytes(lamp, b"\1")
                 if (yield from self._lamp_is(index)) != 1:
                     self._lit[index] = None
         return (yield from self.tick(index))
@@ -123,13 +123,13 @@ class Reboots:
         before, lamp = self._lit[index], self._lamp(index)
         self._lit[index] = None
         if before == 0 and lamp is not None:
-            yield from self._life.reach(index).write_bytes(lamp, b"\0")
+            yield from self._life.access_servo(index).write_bytes(lamp, b"\0")
 
     def _lamp(self, index: int) -> int | None:
         """Return the address of the LED that shows a reboot; None for a servo with Realtime Tick or without
         LED.
         """
-        one = self._life.reach(index)
+        one = self._life.access_servo(index)
         item = None if "realtime_tick" in one.items else one.items.get("led", one.items.get("led_red"))
         return None if item is None else item.address
 
@@ -138,16 +138,16 @@ class Reboots:
         lamp = self._lamp(index)
         if lamp is None:
             return None
-        reply = yield from self._life.reach(index).read_bytes(lamp, 1)
+        reply = yield from self._life.access_servo(index).read_bytes(lamp, 1)
         return reply.parameters[0] if reply.answered else None
 
-    def judge(self, index: int, reply: Reply) -> bool | None:
+    def detect_reboot(self, index: int, reply: Reply) -> bool | None:
         """Compare a reply with Realtime Tick with the last reading; return True for a reboot, which is
         counted, None if undecided.
         """
-        if self.read(index) is None or not reply.answered:
+        if self.tick_reading(index) is None or not reply.answered:
             return None
-        before, now = self._ticks[index], TickReading.of(reply)
+        before, now = self._ticks[index], TickReading.from_reply(reply)
         self._ticks[index] = now
         rebooted = now.rebooted(before)
         if rebooted:
@@ -160,13 +160,13 @@ class Reboots:
         if loss is not None:
             loss.rebooted, loss.had_torque = True, False
             if loss.reboot is not None:
-                life.report(index, texts.servo_rebooted_on_request(life.name(index)))
+                life.report_event(index, texts.servo_rebooted_on_request(life.servo_name(index)))
                 return
-        event = texts.servo_rebooted(life.name(index))
-        if self._counts[index].add(life.now_ns()):
+        event = texts.servo_rebooted(life.servo_name(index))
+        if self._counts[index].count_reboot(life.now_ns()):
             remedy = choose_remedy(life.plan.port, "check its supply")
-            event = texts.servo_reboots_repeatedly(life.name(index), remedy)
-        life.report(index, event)
+            event = texts.servo_reboots_repeatedly(life.servo_name(index), remedy)
+        life.report_event(index, event)
 
     def exhausted(self, index: int) -> bool:
         """Return True if a servo rebooted so often that no policy gives it torque any more in this run."""

@@ -11,7 +11,7 @@ from collections.abc import Sequence
 
 from dxlrun.dynamixel import texts
 from dxlrun.dynamixel.findings import Findings
-from dxlrun.dynamixel.servo.access import ItemAccess, first_reach
+from dxlrun.dynamixel.servo.item_access import ItemAccess, first_reach
 from dxlwire.bus_plan import BusPlan, RegisterValue
 from dxlwire.control_table import ControlItem, HardwareErrors
 from dxlwire.transaction import Program
@@ -31,7 +31,9 @@ def read_registers(one: ItemAccess, registers: Sequence[RegisterValue]) -> Progr
     return present
 
 
-def settle(one: ItemAccess, registers: Sequence[RegisterValue], found: Findings) -> Program[dict[str, int]]:
+def write_registers(
+    one: ItemAccess, registers: Sequence[RegisterValue], found: Findings
+) -> Program[dict[str, int]]:
     """Write the registers that differ from their desired values and read them back; return the values before,
     by name.
 
@@ -49,12 +51,12 @@ def settle(one: ItemAccess, registers: Sequence[RegisterValue], found: Findings)
         found.problems.append(f"{one} {problem}")
         return before
     for register in differing:
-        if problem := (yield from one.write(register.name, register.value)):
+        if problem := (yield from one.write_item(register.name, register.value)):
             found.problems.append(f"{one} {problem}")
         else:
             item = one.items[register.name]
-            was = shown(item, before[item.name])
-            found.note(one.name, texts.register_written(item.title, was, register.value))
+            was = format_item(item, before[item.name])
+            found.add_event(one.name, texts.register_written(item.title, was, register.value))
     return before
 
 
@@ -63,7 +65,7 @@ def settle_bus(plan: BusPlan, found: Findings) -> Program[None]:
     next servo.
     """
     for servo in plan.servos:
-        yield from settle(first_reach(plan, servo), servo.settings, found)
+        yield from write_registers(first_reach(plan, servo), servo.settings, found)
 
 
 def merged(registers: Sequence[RegisterValue], newer: RegisterValue) -> tuple[RegisterValue, ...]:
@@ -78,7 +80,7 @@ def tripped(item: ControlItem, raw: int) -> bool:
     return item.name == "bus_watchdog" and raw in (-1, (1 << 8 * item.size) - 1)
 
 
-def shown(item: ControlItem, raw: int) -> str:
+def format_item(item: ControlItem, raw: int) -> str:
     """Return a value of an item as text for messages; a tripped Bus Watchdog gives `255 (tripped)`.
 
     e-Manual XM430-W350, Bus Watchdog (98): -1 is "Bus Watchdog Error Status".
@@ -93,7 +95,7 @@ def meaning(item: ControlItem, value: int, errors: HardwareErrors) -> str:
     if tripped(item, value):
         return "tripped"
     if item.name == errors.item:
-        return errors.describe(value)
+        return errors.describe_errors(value)
     return _quantity(item, value) if item.unit or item.encoding == "float32" else ""
 
 

@@ -9,7 +9,7 @@ from __future__ import annotations
 
 from dxlrun.dynamixel import texts
 from dxlrun.dynamixel.findings import Findings
-from dxlrun.dynamixel.servo import modes, watchdog
+from dxlrun.dynamixel.servo import mode_switches, watchdog
 from dxlrun.dynamixel.servo.life import (
     IN_DOUBT,
     POWERLESS,
@@ -18,10 +18,10 @@ from dxlrun.dynamixel.servo.life import (
     ServoEvent,
     ServoState,
 )
-from dxlrun.dynamixel.servo.offline import FIRST_PROBE_NS, REBOOT_NS, Offline, rejoin
+from dxlrun.dynamixel.servo.offline import FIRST_PROBE_NS, REBOOT_NS, OfflineRecovery, rejoin
 from dxlwire.modes import Mode
 from dxlwire.plan.retry import retry
-from dxlwire.transaction import Outcome, Program
+from dxlwire.transaction import Program, TransactionOutcome
 from dxlwire.wire import protocol2
 
 
@@ -30,7 +30,7 @@ class Requests:
     each, once.
     """
 
-    def __init__(self, offline: Offline) -> None:
+    def __init__(self, offline: OfflineRecovery) -> None:
         self._offline = offline
         self._life = offline.life
         self._reboots = offline.reboots
@@ -43,7 +43,7 @@ class Requests:
         if self._life.on(index, ServoEvent.RELEASE) is ServoState.RELEASED:
             self._offline.switch_off(index, done)
         else:
-            done(f"{self._life.name(index)} does not answer: its torque stays off when it is back")
+            done(f"{self._life.servo_name(index)} does not answer: its torque stays off when it is back")
 
     def torque_on(self, index: int, done: Done) -> None:
         """Switch a limp servo's torque on at its present position; a servo that already has torque only
@@ -51,15 +51,15 @@ class Requests:
         """
         state = self._life.states[index]
         if state is ServoState.OFFLINE:
-            done(f"{self._life.name(index)} does not answer")
+            done(f"{self._life.servo_name(index)} does not answer")
             return
         if state in POWERLESS:
             self._life.on(index, ServoEvent.REQUESTED)
         self._life.do(index, self._torque_on(index, done), "torque on")
 
-    def reboot(self, index: int, done: Done) -> None:
+    def queue_reboot(self, index: int, done: Done) -> None:
         """Reboot a servo of Protocol 2.0; it gets torque again when it is back if it has torque now."""
-        one = self._life.reach(index)
+        one = self._life.access_servo(index)
         if "reboot" not in one.table.capabilities:
             done(f"{one} knows no reboot instruction: switch its power off and on")
         elif self._life.offline(index):
@@ -68,7 +68,7 @@ class Requests:
             self._life.do(index, self._reboot(index, done), "the reboot")
 
     def _torque_on(self, index: int, done: Done) -> Program[None]:
-        life, name = self._life, self._life.name(index)
+        life, name = self._life, self._life.servo_name(index)
         if life.states[index] is not ServoState.LIMP:
             done((yield from self._torqued(index)))
             return
@@ -81,20 +81,20 @@ class Requests:
         else:
             life.on(index, ServoEvent.TORQUE_GIVEN)
             self._desired.returned(index, mode)
-            life.report(index, texts.torque_on_as_requested(name))
+            life.report_event(index, texts.torque_on_as_requested(name))
         if problem:
-            life.report(index, texts.torque_refused(name, problem))
+            life.report_event(index, texts.torque_refused(name, problem))
         done(problem and f"{name} {problem}")
 
     def _torqued(self, index: int) -> Program[str]:
-        life, name = self._life, self._life.name(index)
+        life, name = self._life, self._life.servo_name(index)
         if life.offline(index):
             return f"{name} was lost during the request"
         if life.states[index] is ServoState.RELEASED:
             return f"{name} was switched off again during the request"
         if life.states[index] not in IN_DOUBT:
             return ""
-        back = yield from life.reach(index).read_torque()
+        back = yield from life.access_servo(index).read_torque()
         if back.answered and back.parameters[0] == 1:
             return ""
         return f"{name} did not confirm its torque; ask again when it answers"
@@ -103,7 +103,7 @@ class Requests:
         """Check a limp servo, write its registers and mode, and switch its torque on; return (problem without
         the servo's name, mode).
         """
-        one, name, found = self._life.reach(index), f"{self._life.name(index)} ", Findings()
+        one, name, found = self._life.access_servo(index), f"{self._life.servo_name(index)} ", Findings()
         yield from self._reboots.tick(index)
         yield from watchdog.disarm(one)
         mode = self._desired.mode(index)
@@ -113,11 +113,11 @@ class Requests:
             return "; ".join(problem.removeprefix(name) for problem in found.problems), mode
         if (yield from self._reboots.tick(index)):
             return "rebooted while it was checked; ask again", mode
-        problem = (yield from modes.hold(one, mode)).problem or (yield from watchdog.arm(one))
+        problem = (yield from mode_switches.hold_servo(one, mode)).problem or (yield from watchdog.arm(one))
         return problem.removeprefix(name), mode
 
     def _reboot(self, index: int, done: Done) -> Program[None]:
-        life, one = self._life, self._life.reach(index)
+        life, one = self._life, self._life.access_servo(index)
         if life.offline(index):
             done(f"{one} was lost before it was rebooted")
             return
@@ -125,12 +125,12 @@ class Requests:
         yield from self._reboots.tick(index)  # Read the tick now, so the next reading can show the reboot.
         servo_id = one.servo.servo_id
         reply = yield from retry(one.line.instruct(servo_id, protocol2.reboot(servo_id)))
-        if reply.outcome is Outcome.REFUSED:
+        if reply.outcome is TransactionOutcome.REFUSED:
             done(f"{one} refuses to reboot{one.reason(reply)}")
         elif not life.offline(index):
             # The acknowledgement may be lost: the servo's clock will show whether it rebooted.
             request = RequestedReboot(had_torque, life.now_ns() + REBOOT_NS, done)
-            loss = life.reboot(index, request, FIRST_PROBE_NS)
-            loss.rebooted = self._reboots.read(index) is None
+            loss = life.begin_reboot(index, request, FIRST_PROBE_NS)
+            loss.rebooted = self._reboots.tick_reading(index) is None
         else:
             done(f"{one} was lost while it was rebooted")

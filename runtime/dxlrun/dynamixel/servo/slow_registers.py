@@ -10,7 +10,7 @@ from dxlrun.dynamixel.servo.life import Life
 from dxlrun.dynamixel.servo.reboots import Reboots
 from dxlwire.bus_plan import SLOW_STATES, BusPlan
 from dxlwire.control_table import ControlItem, decoded, find_table, side_by_side
-from dxlwire.exchange.bus import NEVER
+from dxlwire.exchange.bus_engine import NEVER
 from dxlwire.exchange.idle import Urgency
 from dxlwire.transaction import Program
 
@@ -46,7 +46,7 @@ class SlowReads:
         """Time (ns) of the next read; NEVER while a read is waiting."""
         return NEVER if self._reading or not self._round else self._due_ns
 
-    def look(self) -> None:
+    def schedule_read(self) -> None:
         """Schedule the read of the next block in idle time if it is due; called once a cycle."""
         if self._life.now_ns() < self.due_ns:
             return
@@ -54,13 +54,13 @@ class SlowReads:
             index, block = self._round[self._next]
             self._next = (self._next + 1) % len(self._round)
             if not self._life.offline(index):
-                self._begin(index, block)
+                self._begin_read(index, block)
                 break
         self._due_ns = self._life.now_ns() + self._interval_ns
 
-    def _begin(self, index: int, block: _Block) -> None:
+    def _begin_read(self, index: int, block: _Block) -> None:
         self._reading = True
-        program = self._read(index, block) if block else self._read_tick(index)
+        program = self._read_block(index, block) if block else self._read_tick(index)
         self._life.do(index, program, "slow registers", Urgency.SLOW)
 
     def _read_tick(self, index: int) -> Program[None]:
@@ -69,9 +69,9 @@ class SlowReads:
         if rebooted and not self._life.offline(index):
             self._life.lose(index).rebooted = True
 
-    def _read(self, index: int, block: _Block) -> Program[None]:
+    def _read_block(self, index: int, block: _Block) -> Program[None]:
         start, end = block[0].address, block[-1].address + block[-1].size
-        reply = yield self._life.reach(index).reading(start, end - start)
+        reply = yield self._life.access_servo(index).reading(start, end - start)
         self._reading = False
         if reply.answered:
             values = decoded(block, start, reply.parameters)
@@ -89,27 +89,27 @@ class SlowReads:
         elif state == "voltage":
             states.voltage[row] = raw * item.scale
         elif before not in (None, raw) and item.name not in _LIMITS:
-            event = texts.register_changed(self._life.name(index), item.title, before, raw)
-            self._life.report(index, event)
+            event = texts.register_changed(self._life.servo_name(index), item.title, before, raw)
+            self._life.report_event(index, event)
 
     def _warm(self, index: int, celsius: float) -> None:
-        items = self._life.reach(index).items
+        items = self._life.access_servo(index).items
         item = next((items[name] for name in _LIMITS if name in items), None)
         if item is None:
             return
         raw = self._known.get((index, item.name))
         if raw is None:  # read once, after the first temperature
             if not self._reading:
-                self._begin(index, (item,))
+                self._begin_read(index, (item,))
             return
         limit = raw * item.scale
-        about = self._life.name(index), celsius, item.title, limit
+        about = self._life.servo_name(index), celsius, item.title, limit
         if celsius >= limit - WARN_BELOW and index not in self._hot:
             self._hot.add(index)
-            self._life.report(index, texts.servo_hot(*about))
+            self._life.report_event(index, texts.servo_hot(*about))
         elif celsius <= limit - WARN_BELOW - COOLED and index in self._hot:
             self._hot.remove(index)
-            self._life.report(index, texts.servo_cooled(*about))
+            self._life.report_event(index, texts.servo_cooled(*about))
 
 
 def _round(plan: BusPlan) -> list[tuple[int, _Block]]:

@@ -15,29 +15,29 @@ from typing import TypeAlias
 import msgspec
 
 from dxlrun.channels.cycle import Commands
-from dxlrun.channels.events import EventSink
+from dxlrun.channels.event_records import EventSink
 from dxlrun.dynamixel import texts
 from dxlrun.dynamixel.bus_part import BusStage
 from dxlrun.dynamixel.findings import Findings
 from dxlrun.dynamixel.remedies import choose_remedy, describe_late_start
-from dxlrun.dynamixel.servo import modes, watchdog
-from dxlrun.dynamixel.servo.access import Access, first_reach, reach
+from dxlrun.dynamixel.servo import mode_switches, watchdog
 from dxlrun.dynamixel.servo.checks import survey
+from dxlrun.dynamixel.servo.item_access import Access, access_servo, first_reach
 from dxlrun.dynamixel.servo.registers import settle_bus
-from dxlrun.dynamixel.servo.servos import Servos
+from dxlrun.dynamixel.servo.servo_supervision import Servos
 from dxlrun.errors import PortError, StartUpError
 from dxlrun.features import stages
 from dxlrun.features.feature import Feature
 from dxlwire.bus_plan import BusPlan, ServoPlan
 from dxlwire.control_table import find_table
-from dxlwire.exchange.bus import Lines
+from dxlwire.exchange.bus_engine import Lines
 from dxlwire.modes import Mode
-from dxlwire.plan.line import TIMEOUT_MARGIN_NS, listen
+from dxlwire.plan.line import TIMEOUT_MARGIN_NS, listen_transaction
 from dxlwire.plan.planning import plan_line
 from dxlwire.plan.reads import state_read
 from dxlwire.plan.retry import (
     LONGER_NS,
-    ReplyTimes,
+    ReplyLateness,
     extend_timeouts,
     limit_patience,
     retry,
@@ -59,7 +59,7 @@ findings.
 """
 
 
-class Probed(msgspec.Struct):
+class ProbeResult(msgspec.Struct):
     """Properties of the cyclic reads of one bus that start-up has measured."""
 
     return_delays: dict[int, int] = {}  # return delay of each servo, by ID, ns
@@ -83,10 +83,10 @@ class StartUp:
         self._servos = servos
         self._events = events
         self._features = features
-        self._times = [ReplyTimes() for _ in lines.plans]
+        self._times = [ReplyLateness() for _ in lines.plans]
         """Lateness of the replies on each bus, from which slow adapters are found."""
 
-    def look(self, take_over: bool) -> None:
+    def check_servos(self, take_over: bool) -> None:
         """Check every servo, write registers and modes as planned, and read the servos' return delays; torque
         is not switched on.
         """
@@ -98,14 +98,14 @@ class StartUp:
         # Refuse before any register is written.
         _refuse(self._late_replies(), for_replies=True)
         self.stage(settle_bus)
-        settled = self.stage(modes.settle_modes)
+        settled = self.stage(mode_switches.settle_modes)
         for servos, limits in zip(self._servos, settled, strict=True):
             for index, own in enumerate(limits):
                 servos.goals.set_limits(index, own)
         self._probe_reads()
         self.stage(watchdog.disarm_all)
 
-    def engage(self, goals: Commands) -> None:
+    def engage_servos(self, goals: Commands) -> None:
         """Switch torque on at the present position of every servo that starts with torque, and set `goals` to
         these positions.
         """
@@ -117,9 +117,9 @@ class StartUp:
             # Servos of one joint are adjacent; name the joint once.
             names = ", ".join(dict.fromkeys(servo.joint for servo in plan.servos if servo.torque_at_start))
             if names:
-                self._events.emit(plan.name, texts.torque_is_on(names))
+                self._events.emit_event(plan.name, texts.torque_is_on(names))
             if limp := ", ".join(servo.joint for servo in plan.servos if not servo.torque_at_start):
-                self._events.emit(plan.name, texts.joints_start_limp(limp))
+                self._events.emit_event(plan.name, texts.joints_start_limp(limp))
 
     def confirm(self) -> None:
         """Read torque enable of every servo again, and start sending goals to those with torque.
@@ -130,11 +130,13 @@ class StartUp:
         for servos in self._servos:
             servos.confirmed()
 
-    def watch(self) -> None:
+    def arm_watchdogs(self) -> None:
         """Arm the Bus Watchdogs, which stop the servos when the host sends no instruction for too long."""
         mine = dict(zip((plan.name for plan in self._plans), self._servos, strict=True))
         longer_ns = [watchdog.longer_ns(plan) or LONGER_NS for plan in self._plans]
-        self.stage(lambda plan, found: limit_patience(mine[plan.name].watch(found), any_age=True), longer_ns)
+        self.stage(
+            lambda plan, found: limit_patience(mine[plan.name].begin_watching(found), any_age=True), longer_ns
+        )
 
     def raise_failures(self) -> None:
         """Report lost lines, and raise PortError if there is one: a start needs every line."""
@@ -147,14 +149,14 @@ class StartUp:
         """
         probes = self.stage(_probe_reads)
         for plan, servos, probed in zip(self._plans, self._servos, probes, strict=True):
-            servos.reads.learn(probed.return_delays)
+            servos.reads.set_return_delays(probed.return_delays)
             for group in probed.refused:
                 servos.reads.plain(group)
             if probed.refused:
                 total_ns = plan.budget.total_ns + _extra_ns(plan, probed.refused)
                 why = "; ".join(probed.refused.values())
                 event = texts.fast_reads_refused(plan.name, why, total_ns, plan.budget.total_ns)
-                self._events.emit(plan.name, event)
+                self._events.emit_event(plan.name, event)
 
     def stage(self, stage: Stage[Result], most_ns: Sequence[int] = ()) -> list[Result]:
         """Run a stage on all lines and log its events; return its result on each line. Raise StartUpError if
@@ -182,7 +184,7 @@ class StartUp:
             extend_timeouts(stage(plan, one), most, times)
             for plan, one, most, times in zip(self._plans, found, most_ns, self._times, strict=True)
         ]
-        results = self._lines.run(slow)
+        results = self._lines.run_programs(slow)
         self.raise_failures()
         return [result for result in results if result is not None]
 
@@ -230,12 +232,12 @@ def _engage(plan: BusPlan, found: Findings) -> Program[list[int | None]]:
     goals: list[int | None] = []
     given = 0
     for servo in plan.servos:
-        one = reach(plan, servo)
+        one = access_servo(plan, servo)
         if servo.torque_at_start:
             # Let the supply recover from the inrush of one group before the next.
             if given and given % GROUP == 0:
-                yield listen(GROUP_PAUSE_NS)
-            held = yield from modes.hold(one, servo.start_mode)
+                yield listen_transaction(GROUP_PAUSE_NS)
+            held = yield from mode_switches.hold_servo(one, servo.start_mode)
             problem, given = held.problem, given + 1
             goals.append(held.goal)
         else:
@@ -260,7 +262,7 @@ def _confirm(plan: BusPlan, found: Findings) -> Program[None]:
     for servo in plan.servos:
         if not servo.torque_at_start:
             continue
-        reply = yield from reach(plan, servo).read_torque()
+        reply = yield from access_servo(plan, servo).read_torque()
         if not reply.answered:
             found.problems.append(f"{plan.label(servo)} did not answer after torque was switched on")
         elif reply.parameters[0] != 1:
@@ -271,9 +273,9 @@ def _confirm(plan: BusPlan, found: Findings) -> Program[None]:
             )
 
 
-def _probe_reads(plan: BusPlan, _: Findings) -> Program[Probed]:
+def _probe_reads(plan: BusPlan, _: Findings) -> Program[ProbeResult]:
     """Read the return delay of every servo, and try the fast read on every group that is planned with it."""
-    found = Probed()
+    found = ProbeResult()
     for servo in plan.servos:
         raw = yield from first_reach(plan, servo).read_one("return_delay_time")
         if raw is not None:

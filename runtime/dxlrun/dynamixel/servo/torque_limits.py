@@ -12,7 +12,7 @@ from collections.abc import Sequence
 
 from dxlrun.dynamixel import texts
 from dxlrun.dynamixel.findings import Findings
-from dxlrun.dynamixel.servo.access import Access, first_reach
+from dxlrun.dynamixel.servo.item_access import Access, first_reach
 from dxlwire.bus_plan import BusPlan, ModePlan, ServoPlan
 from dxlwire.modes import Mode
 from dxlwire.transaction import Program
@@ -56,10 +56,10 @@ def restore_torque_limit(one: Access, mode: Mode, found: Findings) -> Program[in
     if present != own and not shut_down and _limits(one.servo, mode):
         item = next(each for each in one.items.values() if each.address == place.address)
         value = min(own, item.maximum)  # the servo's reply may contain any value
-        if problem := (yield from one.write(item.name, value)):
+        if problem := (yield from one.write_item(item.name, value)):
             found.problems.append(f"{one} {problem}")
         else:
-            found.note(one.servo.joint, texts.torque_limit_restored(place.name, present, value))
+            found.add_event(one.servo.joint, texts.torque_limit_restored(place.name, present, value))
     return own
 
 

@@ -11,14 +11,14 @@ from collections.abc import Callable
 import msgspec
 from msgspec.structs import replace
 
-from dxlrun.dynamixel.servo import modes
-from dxlrun.dynamixel.servo.access import Access, reach
+from dxlrun.dynamixel.servo import mode_switches
+from dxlrun.dynamixel.servo.item_access import Access, access_servo
 from dxlwire.bus_plan import BusPlan, ServoPlan
-from dxlwire.exchange.bus import Lines
+from dxlwire.exchange.bus_engine import Lines
 from dxlwire.modes import Mode
-from dxlwire.plan.line import listen
+from dxlwire.plan.line import listen_transaction
 from dxlwire.plan.retry import limit_patience
-from dxlwire.transaction import Outcome, Program, Reply
+from dxlwire.transaction import Program, Reply, TransactionOutcome
 
 LONGER_NS = (0, 60_000_000, 180_000_000)
 """Additional timeout of the read-back in each attempt, ns.
@@ -61,7 +61,9 @@ def limp(lines: Lines, deadline_ns: int | None = None) -> tuple[LimpOutcome, ...
         deadline_ns: No servo is tried again after this time; None: one second from now.
     """
     end_ns = lines.clock.now_ns() + LIMIT_NS if deadline_ns is None else deadline_ns
-    results = lines.run([limit_patience(_limp(plan, lines.clock.now_ns, end_ns)) for plan in lines.plans])
+    results = lines.run_programs(
+        [limit_patience(_limp(plan, lines.clock.now_ns, end_ns)) for plan in lines.plans]
+    )
     outcomes: list[LimpOutcome] = []
     for plan, bus, result in zip(lines.plans, lines.buses, results, strict=True):
         gone = f"torque off could not be sent: {bus.failure}"
@@ -78,7 +80,7 @@ def stand(lines: Lines) -> tuple[str, ...]:
     Returns:
         A sentence for each such servo.
     """
-    found = lines.run([limit_patience(_stand(plan)) for plan in lines.plans])
+    found = lines.run_programs([limit_patience(_stand(plan)) for plan in lines.plans])
     return tuple(sentence for one in found for sentence in one or ())
 
 
@@ -89,10 +91,10 @@ def _limp(plan: BusPlan, now_ns: Callable[[], int], deadline_ns: int) -> Program
     A servo that did not confirm is tried again after the other servos. Each servo is tried at least once, but
     none again after `deadline_ns`.
     """
-    yield listen(SETTLE_NS)
+    yield listen_transaction(SETTLE_NS)
     for broadcast in plan.limp:
         _ = yield broadcast  # `yield from` would send the reply to a tuple
-    every = [reach(plan, servo) for servo in plan.servos]
+    every = [access_servo(plan, servo) for servo in plan.servos]
     details = dict.fromkeys(range(len(plan.servos)), "it was not tried")
     late = False
     for longer_ns in LONGER_NS:
@@ -103,16 +105,16 @@ def _limp(plan: BusPlan, now_ns: Callable[[], int], deadline_ns: int) -> Program
             details[index] = _detail(acknowledged, back)
             late = late or not (acknowledged.answered and back.answered)
     if late:
-        yield listen(LATE_NS)
+        yield listen_transaction(LATE_NS)
     return tuple(_outcome(plan, servo, details[index]) for index, servo in enumerate(plan.servos))
 
 
 def _stand(plan: BusPlan) -> Program[list[str]]:
-    yield listen(SETTLE_NS)
+    yield listen_transaction(SETTLE_NS)
     sentences: list[str] = []
     left: list[tuple[Access, str]] = []
     for servo in plan.servos:
-        one = reach(plan, servo)
+        one = access_servo(plan, servo)
         problem = yield from _stop(one)
         if problem is None:
             continue
@@ -137,7 +139,7 @@ def _stop(one: Access) -> Program[str | None]:
     """Stop a servo that follows no position; return the reason for a failure, empty on success, None if it
     needs no stop.
     """
-    mode = yield from modes.mode_now(one)
+    mode = yield from mode_switches.mode_now(one)
     if mode in _HOLD:
         return None
     torque = yield from one.read_torque()
@@ -145,7 +147,7 @@ def _stop(one: Access) -> Program[str | None]:
         return None
     if mode is Mode.UNKNOWN:
         return "its mode is not known"
-    return (yield from modes.hold(one, mode)).problem
+    return (yield from mode_switches.hold_servo(one, mode)).problem
 
 
 def _off(one: Access, longer_ns: int) -> Program[tuple[Reply, Reply]]:
@@ -169,7 +171,7 @@ def _detail(acknowledged: Reply, back: Reply) -> str:
         return "" if enabled == 0 else f"torque enable reads {enabled} after torque off was written"
     if acknowledged.answered:
         return "torque off was acknowledged, but the read-back got no answer"
-    if Outcome.GARBLED in (acknowledged.outcome, back.outcome):
+    if TransactionOutcome.GARBLED in (acknowledged.outcome, back.outcome):
         return "torque off was sent, but only garbled bytes came back"
     return "torque off was sent, but the servo does not answer"
 

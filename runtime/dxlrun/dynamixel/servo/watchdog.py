@@ -12,7 +12,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 
 from dxlrun.dynamixel.findings import Findings
-from dxlrun.dynamixel.servo.access import Access, reach
+from dxlrun.dynamixel.servo.item_access import Access, access_servo
 from dxlrun.dynamixel.servo.registers import tripped
 from dxlwire.bus_plan import BusPlan, ServoPlan
 from dxlwire.control_table import ControlItem, find_table
@@ -65,7 +65,7 @@ def disarm(one: Access) -> Program[str]:
     # At least 1: Profile Velocity 0 means no limit (e-Manual XM430-W350, Profile Velocity (112)).
     slow = max(1, round(RETURN_SPEED / speed.scale))
     yield from one.write_bytes(speed.address, slow.to_bytes(speed.size, "little"))
-    found = yield from one.read([mode.name])
+    found = yield from one.read_items([mode.name])
     if found is None:
         return f"{one} did not answer when its {mode.title} was read"
     problem = yield from _write(one, 0)
@@ -94,7 +94,7 @@ def longer_ns(plan: BusPlan) -> int:
 def disarm_all(plan: BusPlan, found: Findings) -> Program[None]:
     """Clear the Bus Watchdog of every servo of a bus before torque on; problems go to `found`."""
     for servo in plan.servos:
-        if problem := (yield from disarm(reach(plan, servo))):
+        if problem := (yield from disarm(access_servo(plan, servo))):
             found.problems.append(problem)
 
 
@@ -109,7 +109,7 @@ def release_all(plan: BusPlan) -> Program[list[str]]:
     """
     problems, all_answer = [], True
     armed = [
-        (reach(plan, servo), item)
+        (access_servo(plan, servo), item)
         for servo in plan.servos
         if plan.watchdog_ticks and (item := item_of(plan, servo))
     ]
@@ -151,5 +151,5 @@ def item_of(plan: BusPlan, servo: ServoPlan) -> ControlItem | None:
 
 
 def _write(one: Access, ticks: int) -> Program[str]:
-    problem = yield from one.write("bus_watchdog", ticks)
+    problem = yield from one.write_item("bus_watchdog", ticks)
     return problem and f"{one} {problem}"

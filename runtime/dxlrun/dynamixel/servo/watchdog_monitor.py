@@ -9,8 +9,8 @@ from dxlrun.dynamixel.findings import Findings
 from dxlrun.dynamixel.servo import watchdog
 from dxlrun.dynamixel.servo.desired import DesiredState
 from dxlrun.dynamixel.servo.life import Life, ServoEvent
-from dxlrun.dynamixel.servo.registers import settle
-from dxlwire.exchange.bus import ASKED_NS, SILENCE_NS
+from dxlrun.dynamixel.servo.registers import write_registers
+from dxlwire.exchange.bus_engine import ASKED_NS, SILENCE_NS
 from dxlwire.transaction import Program
 
 
@@ -43,7 +43,7 @@ class WatchdogMonitor:
         for index, servo in enumerate(plan.servos):
             if not plan.watchdog_ticks or (item := watchdog.item_of(plan, servo)) is None:
                 continue
-            one = life.reach(index)
+            one = life.access_servo(index)
             self.sent(life.now_ns())
             for packet in packets:
                 yield one.line.unanswered(packet)
@@ -82,18 +82,18 @@ class WatchdogMonitor:
                 self._reviving.add(index)
                 life.do(index, self._revive(index), "the Bus Watchdog")
         if armed:
-            life.events.emit(plan.name, texts.watchdog_stopped_servos(silent_ms))
+            life.events.emit_event(plan.name, texts.watchdog_stopped_servos(silent_ms))
 
     def _revive(self, index: int) -> Program[None]:
         """Program for one stopped servo: restore the desired registers that the stop reset, then clear and
         arm its watchdog.
         """
-        life, one, found = self._life, self._life.reach(index), Findings()
+        life, one, found = self._life, self._life.access_servo(index), Findings()
         ramp = [each for each in self._desired.settings(index) if each.name == watchdog.RAMP]
-        yield from settle(one, ramp, found)
+        yield from write_registers(one, ramp, found)
         found.log(life.events)
         problem = "; ".join(found.problems) or (yield from watchdog.revive(one))
         self._reviving.remove(index)
         if problem and not life.offline(index):
-            life.events.emit(one.servo.joint, texts.watchdog_not_cleared(problem))
+            life.events.emit_event(one.servo.joint, texts.watchdog_not_cleared(problem))
             life.lose(index)

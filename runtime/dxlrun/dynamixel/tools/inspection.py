@@ -10,13 +10,13 @@ from contextlib import contextmanager
 import msgspec
 from msgspec.structs import replace
 
-from dxlrun.channels.events import EventCode
+from dxlrun.channels.event_records import EventCode
 from dxlrun.contract.serial_line import open_serial
 from dxlrun.dynamixel.findings import Findings
 from dxlrun.dynamixel.remedies import choose_remedy
-from dxlrun.dynamixel.servo.access import Access, first_reach
-from dxlrun.dynamixel.servo.checks import LISTEN_NS, inspect, survey
-from dxlrun.dynamixel.servo.modes import read_limits, servo_limits
+from dxlrun.dynamixel.servo.checks import LISTEN_NS, inspect_servo, survey
+from dxlrun.dynamixel.servo.item_access import Access, first_reach
+from dxlrun.dynamixel.servo.mode_switches import read_limits, servo_limits
 from dxlrun.dynamixel.servo.registers import read_registers
 from dxlrun.dynamixel.tools.scanning import identity
 from dxlrun.dynamixel.tools.tool_line import ToolLine
@@ -25,12 +25,12 @@ from dxlrun.plan.loop_plan import JointPlan
 from dxlwire.bus_plan import BusPlan, RegisterValue, ServoPlan
 from dxlwire.clock import Clock, MonotonicClock
 from dxlwire.control_table import ControlTable, FoundDeviation, find_table, models_by_number
-from dxlwire.exchange.bus import Lines
+from dxlwire.exchange.bus_engine import Lines
 from dxlwire.packets import PacketSink
-from dxlwire.plan.line import listen
+from dxlwire.plan.line import listen_transaction
 from dxlwire.plan.retry import extend_timeouts, retry, setup_line
 from dxlwire.port.ports import Ports, SerialPort, SerialPorts
-from dxlwire.transaction import Outcome, Program, Reply, Result
+from dxlwire.transaction import Program, Reply, Result, TransactionOutcome
 
 NOWHERE: Mapping[str, PacketSink] = {}  # no bus logs its packets
 NO_JOINTS: Mapping[int, JointPlan] = {}
@@ -69,7 +69,7 @@ class DeviationRow(msgspec.Struct, frozen=True):
     effect: str  # effect of the value: a verb with its object
 
 
-class Found(msgspec.Struct):
+class InspectionResult(msgspec.Struct):
     """Result of an inspection of all servos of a robot, in the order of the plans."""
 
     compared: int = 0  # number of servos that were compared with the file
@@ -111,11 +111,11 @@ def read_models(
     return {joint: one.model for joint, one in found.items()}
 
 
-def look(
+def inspect_buses(
     buses: Sequence[BusPlan],
     packets: Mapping[str, PacketSink] = NOWHERE,
     joints: Mapping[int, JointPlan] = NO_JOINTS,
-) -> Found:
+) -> InspectionResult:
     """Check every servo and every declared register as a start does, without writing; open the ports and
     close them again.
 
@@ -130,7 +130,7 @@ def look(
     """
     with _lines(buses) as ports:
         found = _run([_look(plan, joints) for plan in buses], buses, ports, MonotonicClock(), packets)
-    together = Found()
+    together = InspectionResult()
     for one in found:
         together.compared += one.compared
         together.registers += one.registers
@@ -155,7 +155,7 @@ def compare_servos(tool: ToolLine, plan: BusPlan, servos: Sequence[ServoPlan]) -
         Findings whose `problems` name each servo that does not answer or differs.
     """
     tool.speak(plan.protocol, plan.baud_rate)
-    return tool.run(extend_timeouts(_compare_servos(plan, servos)))
+    return tool.run_program(extend_timeouts(_compare_servos(plan, servos)))
 
 
 def _compare_servos(plan: BusPlan, servos: Sequence[ServoPlan]) -> Program[Findings]:
@@ -164,10 +164,10 @@ def _compare_servos(plan: BusPlan, servos: Sequence[ServoPlan]) -> Program[Findi
         one = first_reach(plan, servo)
         reply = yield from retry(one.line.ping(servo.servo_id))
         if not reply.answered:
-            how = "does not answer" if reply.outcome is Outcome.TIMEOUT else "answers garbled"
+            how = "does not answer" if reply.outcome is TransactionOutcome.TIMEOUT else "answers garbled"
             survey.problems.append(f"{plan.label(servo)} {how} at {plan.baud_rate} bit/s")
             continue
-        if not (yield from inspect(one, survey, take_over=True)):
+        if not (yield from inspect_servo(one, survey, take_over=True)):
             continue
         table = find_table(servo.model, plan.protocol)
         stored = stored_registers(table, plan, servo)
@@ -224,18 +224,18 @@ def _run(
     """Run one program per bus with longer timeouts and return the results; raise PortError if a line is
     gone."""
     lines = Lines(plans, ports, clock, [packets.get(plan.name) or PacketSink() for plan in plans])
-    found = lines.run([extend_timeouts(program) for program in programs])
+    found = lines.run_programs([extend_timeouts(program) for program in programs])
     if lines.failure is not None:
         raise lines.failure
     return [one for one in found if one is not None]
 
 
-def _look(plan: BusPlan, joints: Mapping[int, JointPlan]) -> Program[Found]:
+def _look(plan: BusPlan, joints: Mapping[int, JointPlan]) -> Program[InspectionResult]:
     surveyed = Findings()
     yield from survey(plan, False, surveyed)
     remarks = [f"{joint}: {text}" for joint, text in surveyed.texts(EventCode.REGISTER_DIFFERS)]
     answered = {joint for joint, _ in surveyed.texts(EventCode.SETUP)}
-    found = Found(len(answered), problems=surveyed.problems, remarks=remarks)
+    found = InspectionResult(len(answered), problems=surveyed.problems, remarks=remarks)
     found.deviations = [_deviation(*one) for one in surveyed.deviations]
     for servo in plan.servos:
         present: dict[str, int | None] = {}
@@ -271,7 +271,7 @@ def _row(plan: BusPlan, servo: ServoPlan, wanted: RegisterValue, found: int | No
 
 def _identify(plan: BusPlan, joints: Collection[str]) -> Program[tuple[Identity, ...]]:
     line = setup_line(plan)
-    yield listen(LISTEN_NS)
+    yield listen_transaction(LISTEN_NS)
     identities: list[Identity] = []
     for servo in plan.servos:
         if servo.joint not in joints:
@@ -287,7 +287,7 @@ def _identity(plan: BusPlan, servo: ServoPlan, reply: Reply) -> Identity:
         remedy = choose_remedy(plan.port, "check power, cable, and ID", simulated="check its ID")
         how = (
             f"does not answer at {plan.baud_rate} bit/s: {remedy}"
-            if reply.outcome is Outcome.TIMEOUT
+            if reply.outcome is TransactionOutcome.TIMEOUT
             else "sends garbled replies: do two servos have its ID?"
         )
         problem = f"{name} {how}; its model is not known, so write it in the robot file"

@@ -10,17 +10,17 @@ from types import MappingProxyType
 from typing import ClassVar, TypeAlias
 
 from dxlrun.dynamixel.findings import Findings
-from dxlrun.dynamixel.servo.access import LONGEST_READ, ItemAccess
-from dxlrun.dynamixel.servo.registers import settle, shown
+from dxlrun.dynamixel.servo.item_access import LONGEST_READ, ItemAccess
+from dxlrun.dynamixel.servo.registers import format_item, write_registers
 from dxlrun.dynamixel.tools.scanning import FoundServo
 from dxlrun.dynamixel.tools.tool_line import ToolLine
 from dxlrun.errors import ServoFault
 from dxlwire.bus_plan import RegisterValue
-from dxlwire.control_table import ControlItem, FoundDeviation, Table, side_by_side
-from dxlwire.control_table.devices import device_table
+from dxlwire.control_table import BaseControlTable, ControlItem, FoundDeviation, side_by_side
+from dxlwire.control_table.device_models import device_table
 from dxlwire.plan.line import Line
 from dxlwire.plan.retry import extend_timeouts
-from dxlwire.transaction import Outcome, Program, Result
+from dxlwire.transaction import Program, Result, TransactionOutcome
 
 Confirm: TypeAlias = Callable[[str], bool]
 """Asks the user the question in its argument before a change; returns True if the change may be made."""
@@ -39,7 +39,7 @@ class OneNode:
     NOT_SET: ClassVar[Mapping[str, str]] = MappingProxyType({})
     """Items that a tool must not set as plain registers, by name, with the reason and the alternative."""
 
-    def __init__(self, tool: ToolLine, found: FoundServo, table: Table) -> None:
+    def __init__(self, tool: ToolLine, found: FoundServo, table: BaseControlTable) -> None:
         self.tool = tool
         self.found = found
         self.table = table
@@ -60,15 +60,15 @@ class OneNode:
         """Access to the node's items on the tool's line."""
         raise NotImplementedError
 
-    def fail(self, text: str) -> ServoFault:
+    def make_fault(self, text: str) -> ServoFault:
         """Return an error whose text starts with the node's name; the caller raises it."""
         return ServoFault(f"{self.called}: {text}")
 
-    def run(self, program: Program[Result]) -> Result:
+    def run_program(self, program: Program[Result]) -> Result:
         """Run a program on the tool's line and return its result, with longer timeouts than a scan: the node
         has answered before.
         """
-        return self.tool.run(extend_timeouts(program))
+        return self.tool.run_program(extend_timeouts(program))
 
     def register(self, name: str, value: int) -> RegisterValue:
         """Return a register for `write`: the item's address and size with a desired value, the integer on the
@@ -77,7 +77,7 @@ class OneNode:
         item = self.table.items[name]
         return RegisterValue(item.address, item.size, value, name, item.area == "EEPROM")
 
-    def read(self, names: Sequence[str], *, refused: bool = False) -> Mapping[str, int]:
+    def read_items(self, names: Sequence[str], *, refused: bool = False) -> Mapping[str, int]:
         """Read items and return their values by name: integers on the wire, signed if the item is, 0 or 1 for
         a bit.
 
@@ -87,7 +87,7 @@ class OneNode:
         """
         found: dict[str, int] = {}
         for block in side_by_side((self.table.items[name] for name in names), LONGEST_READ):
-            found |= self.run(self._read_block(block, refused=refused))
+            found |= self.run_program(self._read_block(block, refused=refused))
         return {name: found[name] for name in names if name in found}
 
     def deviations(self, values: Mapping[str, int]) -> tuple[FoundDeviation, ...]:
@@ -98,10 +98,10 @@ class OneNode:
         """Raise ServoFault, before anything is written, if one of the registers is in a closed EEPROM."""
         stored = [self.table.items[one.name].title for one in desired if one.eeprom]
         release = f"switch the torque off first: {self.command} torque off"
-        if stored and (problem := self.run(self.access.closed_eeprom(stored[0], release=release))):
-            raise self.fail(problem)
+        if stored and (problem := self.run_program(self.access.closed_eeprom(stored[0], release=release))):
+            raise self.make_fault(problem)
 
-    def write(self, desired: Sequence[RegisterValue]) -> tuple[str, ...]:
+    def write_registers(self, desired: Sequence[RegisterValue]) -> tuple[str, ...]:
         """Write the registers that differ from their desired values, in the given order, and read each back;
         return a text for each write.
         """
@@ -113,21 +113,21 @@ class OneNode:
         was not confirmed.
         """
         item = self.table.items[target.name]
-        before = self.read([target.name])[target.name]
+        before = self.read_items([target.name])[target.name]
         if before == target.value:
             # A servo ignores the goal that it already has while its Bus Watchdog is tripped: write it again.
-            done = () if target.eeprom else self.write([target])
+            done = () if target.eeprom else self.write_registers([target])
             return (f"{item.title} is {target.value} already", *done)
         if target.eeprom:
             self.writable([target])
-            change = f"{item.title} is {shown(item, before)} and becomes {target.value}"
+            change = f"{item.title} is {format_item(item, before)} and becomes {target.value}"
             if not confirm(f"{self.called}: {change} (EEPROM)"):
                 return ()
-        return self.write([target])
+        return self.write_registers([target])
 
     def _settle(self, desired: Sequence[RegisterValue]) -> tuple[str, ...]:
         found = Findings()
-        self.run(settle(self.access, desired, found))
+        self.run_program(write_registers(self.access, desired, found))
         written = [event.text for _, event in found.events]
         if found.problems:
             before = [f"written before that: {text}" for text in written]
@@ -145,10 +145,10 @@ class OneNode:
             reply = yield from self.access.read_bytes(item.address, item.size)
             if reply.answered:
                 found[item.name] = item.integer(reply.parameters)
-            elif reply.outcome is not Outcome.REFUSED:
-                raise self.fail(f"did not answer when {item.title} was read")
+            elif reply.outcome is not TransactionOutcome.REFUSED:
+                raise self.make_fault(f"did not answer when {item.title} was read")
             elif not refused:
-                raise self.fail(f"refuses to read {item.title}{self.access.reason(reply)}")
+                raise self.make_fault(f"refuses to read {item.title}{self.access.reason(reply)}")
         return found
 
 
@@ -165,7 +165,7 @@ class DeviceAccess(ItemAccess):
         return f"{self._called}:"
 
     @property
-    def table(self) -> Table:
+    def table(self) -> BaseControlTable:
         """Control table of the device's model."""
         return self._table
 

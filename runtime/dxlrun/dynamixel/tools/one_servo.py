@@ -15,10 +15,10 @@ from pathlib import Path
 from types import MappingProxyType
 
 from dxlrun.dynamixel.findings import Findings
-from dxlrun.dynamixel.servo import modes, watchdog
-from dxlrun.dynamixel.servo.access import Access, reach
+from dxlrun.dynamixel.servo import mode_switches, watchdog
 from dxlrun.dynamixel.servo.checks import deviations
-from dxlrun.dynamixel.servo.registers import read_registers, settle, shown, tripped
+from dxlrun.dynamixel.servo.item_access import Access, access_servo
+from dxlrun.dynamixel.servo.registers import format_item, read_registers, tripped, write_registers
 from dxlrun.dynamixel.tools.one_node import Confirm, OneNode, agree
 from dxlrun.dynamixel.tools.scanning import FoundServo
 from dxlrun.dynamixel.tools.tool_line import ToolLine
@@ -30,11 +30,11 @@ from dxlwire.control_table import (
     find_table,
 )
 from dxlwire.modes import Mode
-from dxlwire.plan.line import LONGEST_RETURN_DELAY_NS, listen
+from dxlwire.plan.line import LONGEST_RETURN_DELAY_NS, listen_transaction
 from dxlwire.plan.mode_plan import mode_in
 from dxlwire.plan.planning import Wiring, bus_plan
 from dxlwire.plan.retry import retry
-from dxlwire.transaction import Outcome, Program, Reply, Transaction
+from dxlwire.transaction import Program, Reply, Transaction, TransactionOutcome
 from dxlwire.wire import protocol1, protocol2
 from dxlwire.wire.protocol2 import Reset
 
@@ -100,12 +100,12 @@ class OneServo(OneNode):
         """Read registers and return those that differ from their desired values; raise ServoFault without an
         answer.
         """
-        present = self.run(read_registers(self.access, desired))
+        present = self.run_program(read_registers(self.access, desired))
         if silent := [self.table.items[name].title for name, found in present.items() if found is None]:
-            raise self.fail(f"did not answer when {', '.join(silent)} was read")
+            raise self.make_fault(f"did not answer when {', '.join(silent)} was read")
         return tuple(each for each in desired if each.value != present[each.name])
 
-    def write(self, desired: Sequence[RegisterValue]) -> tuple[str, ...]:
+    def write_registers(self, desired: Sequence[RegisterValue]) -> tuple[str, ...]:
         """Write the registers that differ from their desired values, in the given order, and read each back;
         return a text for each write.
 
@@ -133,25 +133,25 @@ class OneServo(OneNode):
         item = self.table.items.get("bus_watchdog")
         if item is None:
             return ()
-        raw = self.read([item.name], refused=True).get(item.name, 0)
+        raw = self.read_items([item.name], refused=True).get(item.name, 0)
         if not (tripped(item, raw) or (armed and raw)):
             return ()
         stopped = tripped(item, raw) and self.holds_torque()
         if stopped:
             self.torque(False)
-        if problem := self.run(watchdog.disarm(reach(self.plan, self._servo))):
+        if problem := self.run_program(watchdog.disarm(access_servo(self.plan, self._servo))):
             raise ServoFault(problem)
         why = "it had stopped the servo, as no instruction came"
         if not tripped(item, raw):
             why = f"it would have stopped the servo after {raw * 20} ms without an instruction"
-        done = f"cleared {item.title}, which was {shown(item, raw)}: {why}"
+        done = f"cleared {item.title}, which was {format_item(item, raw)}: {why}"
         return (done, self._hold()) if stopped else (done,)
 
     # Torque and LED
 
     def holds_torque(self) -> bool:
         """Read Torque Enable; return True if it is on."""
-        return bool(self.read(["torque_enable"])["torque_enable"])
+        return bool(self.read_items(["torque_enable"])["torque_enable"])
 
     def torque(self, on: bool) -> tuple[str, ...]:
         """Switch the servo's torque on at its present position, or off, and read it back; return a text for
@@ -160,7 +160,7 @@ class OneServo(OneNode):
         Before torque on, a Bus Watchdog that is armed or tripped is cleared.
         """
         if not on:
-            written = self.write([self.register("torque_enable", 0)])
+            written = self.write_registers([self.register("torque_enable", 0)])
             return ("is limp" + ("" if written else ", as before"),)
         cleared = self.clear_watchdog(armed=True)
         if not self.holds_torque():
@@ -169,10 +169,10 @@ class OneServo(OneNode):
 
     def _hold(self) -> str:
         mode = self._mode()
-        held = self.run(modes.hold(reach(self.plan, self._servo), mode))
+        held = self.run_program(mode_switches.hold_servo(access_servo(self.plan, self._servo), mode))
         if held.problem:
-            self.run(settle(self.access, [self.register("torque_enable", 0)], Findings()))
-            raise self.fail(f"{held.problem}; its torque is off")
+            self.run_program(write_registers(self.access, [self.register("torque_enable", 0)], Findings()))
+            raise self.make_fault(f"{held.problem}; its torque is off")
         where = "" if held.goal is None else f" at tick {held.goal}, where it stood"
         return f"holds torque in {mode.name.lower().replace('_', '-')} mode{where}"
 
@@ -180,16 +180,16 @@ class OneServo(OneNode):
         """Blink the LED `times` times and restore its state; return a text about it."""
         names = [name for name in _LEDS if name in self.table.items]
         if not names:
-            raise self.fail("this model has no LED that can be switched")
-        before = self.read(names)
+            raise self.make_fault("this model has no LED that can be switched")
+        before = self.read_items(names)
         bright = [self.register(name, self.table.items[name].maximum) for name in names]
         dark = [self.register(name, 0) for name in names]
         try:
             for state in (bright, dark) * times:
-                self.write(state)
-                self.tool.wait(BLINK_NS)
+                self.write_registers(state)
+                self.tool.wait_for_packets(BLINK_NS)
         finally:
-            self.write([self.register(name, value) for name, value in before.items()])
+            self.write_registers([self.register(name, value) for name, value in before.items()])
         return f"blinked {times} times"
 
     # Mode and plan
@@ -202,11 +202,11 @@ class OneServo(OneNode):
                 self.plan = self._plan(continuous)
             except ValueError:  # the model has no continuous mode
                 break
-            mode = self.run(modes.mode_now(reach(self.plan, self._servo)))
+            mode = self.run_program(mode_switches.mode_now(access_servo(self.plan, self._servo)))
             if mode is not Mode.UNKNOWN:
                 return mode
         self.plan = self._plan()
-        raise self.fail("is in a mode that dxlrun does not know, so its torque stays off")
+        raise self.make_fault("is in a mode that dxlrun does not know, so its torque stays off")
 
     def _plan(self, continuous: bool = False) -> BusPlan:
         table, name = self.table, self.tool.port.name
@@ -252,13 +252,16 @@ class OneServo(OneNode):
         # Two servos with one ID would both be unreachable.
         self._free(new)
         item = self.table.items["id"]
-        self._written(line.write(old, item.address, bytes((new,))), f"{item.title} = {new}")
-        if self._there(old) is not Outcome.TIMEOUT and self._there(new) is Outcome.TIMEOUT:
-            raise self.fail(f"was given {item.title} = {new}, but still answers under its old one")
+        self._send_change(line.write_range(old, item.address, bytes((new,))), f"{item.title} = {new}")
+        if (
+            self._there(old) is not TransactionOutcome.TIMEOUT
+            and self._there(new) is TransactionOutcome.TIMEOUT
+        ):
+            raise self.make_fault(f"was given {item.title} = {new}, but still answers under its old one")
         self.move_to(new, self.baud_rate)
         self._same()
-        if self._there(old) is not Outcome.TIMEOUT:
-            raise self.fail(f"has its new ID, but a servo still answers under ID {old}: there were two")
+        if self._there(old) is not TransactionOutcome.TIMEOUT:
+            raise self.make_fault(f"has its new ID, but a servo still answers under ID {old}: there were two")
         return f"has ID {new}; it had {old}"
 
     def change_rate(self, new: int, confirm: Confirm = agree) -> str:
@@ -281,7 +284,7 @@ class OneServo(OneNode):
         self.writable([self.register(self.rate_item(), value)])
         # Try the adapter first: at a rate that it lacks, the servo would be unreachable.
         if not self.tool.can_run_at(new):
-            raise self.fail(
+            raise self.make_fault(
                 f"the adapter at {self.tool.port.name} cannot run at {new} bit/s; nothing was changed"
             )
         old, item = self.baud_rate, self.table.items[self.rate_item()]
@@ -290,17 +293,17 @@ class OneServo(OneNode):
             self._free(self.servo_id)
         finally:
             self.tool.speak(self.table.protocol, old)
-        packet = self.tool.line.write(self.servo_id, item.address, value.to_bytes(item.size, "little"))
-        self._written(packet, f"{item.title} = {value}")
+        packet = self.tool.line.write_range(self.servo_id, item.address, value.to_bytes(item.size, "little"))
+        self._send_change(packet, f"{item.title} = {value}")
         self.move_to(self.servo_id, new)
-        if self._there(self.servo_id) is Outcome.TIMEOUT:
+        if self._there(self.servo_id) is TransactionOutcome.TIMEOUT:
             self.move_to(self.servo_id, old)
-            if self._there(self.servo_id) is Outcome.TIMEOUT:
+            if self._there(self.servo_id) is TransactionOutcome.TIMEOUT:
                 port = self.tool.port.name
-                raise self.fail(
+                raise self.make_fault(
                     f"answers neither at {old} nor at {new} bit/s now; look for it: dxlrun scan {port}"
                 )
-            raise self.fail(f"was given {item.title} = {value}, but still answers at {old} bit/s")
+            raise self.make_fault(f"was given {item.title} = {value}, but still answers at {old} bit/s")
         self._same()
         return f"runs at {new} bit/s; before that, at {old}"
 
@@ -315,16 +318,18 @@ class OneServo(OneNode):
         ):
             return ""
         if "reboot" not in self.table.capabilities:
-            raise self.fail("this model knows no reboot instruction; switch its power off and on")
+            raise self.make_fault("this model knows no reboot instruction; switch its power off and on")
         before_ns = self.tool.port.clock.now_ns()
-        self._written(self.tool.line.instruct(self.servo_id, protocol2.reboot(self.servo_id)), "the reboot")
+        self._send_change(
+            self.tool.line.instruct(self.servo_id, protocol2.reboot(self.servo_id)), "the reboot"
+        )
         self._await()
         if "realtime_tick" in self.table.items:
-            tick = self.read(["realtime_tick"])["realtime_tick"]
+            tick = self.read_items(["realtime_tick"])["realtime_tick"]
             passed_ms = (self.tool.port.clock.now_ns() - before_ns) // 1_000_000
             # After a turn of the counter the tick does not show a reboot.
             if tick > passed_ms + _TICK_SPARE_MS and passed_ms < _TICK_MODULUS:
-                raise self.fail(
+                raise self.make_fault(
                     f"did not reboot: its Realtime Tick is {tick} ms, {passed_ms} ms after the reboot"
                 )
         return f"rebooted, and {'holds torque' if self.holds_torque() else 'is limp'}"
@@ -351,7 +356,7 @@ class OneServo(OneNode):
             baud_rate = table.baud_rates[items[self.rate_item()].initial or 0]
         if (servo_id, baud_rate) != (self.servo_id, self.baud_rate):
             if not self.tool.can_run_at(baud_rate):
-                raise self.fail(
+                raise self.make_fault(
                     f"the adapter cannot run at the factory's {baud_rate} bit/s; nothing was changed"
                 )
             self.tool.speak(table.protocol, baud_rate)
@@ -362,7 +367,7 @@ class OneServo(OneNode):
         packet = (
             protocol1.factory_reset(self.servo_id) if old else protocol2.factory_reset(self.servo_id, keep)
         )
-        self._written(self.tool.line.instruct(self.servo_id, packet), "the factory reset")
+        self._send_change(self.tool.line.instruct(self.servo_id, packet), "the factory reset")
         self.move_to(servo_id, baud_rate)
         self._await()
         self._same()
@@ -373,9 +378,11 @@ class OneServo(OneNode):
         if not confirm(f"{self.called}: the backup that it keeps itself is overwritten"):
             return ""
         self._has_backup()
-        self._written(self.tool.line.instruct(self.servo_id, protocol2.back_up(self.servo_id)), "the backup")
-        if "backup_ready" in self.table.items and not self.read(["backup_ready"])["backup_ready"]:
-            raise self.fail("acknowledged the backup, but Backup Ready is 0: there is none")
+        self._send_change(
+            self.tool.line.instruct(self.servo_id, protocol2.back_up(self.servo_id)), "the backup"
+        )
+        if "backup_ready" in self.table.items and not self.read_items(["backup_ready"])["backup_ready"]:
+            raise self.make_fault("acknowledged the backup, but Backup Ready is 0: there is none")
         return "stored its control table in its own backup"
 
     def take_back(self, confirm: Confirm = agree) -> str:
@@ -383,7 +390,7 @@ class OneServo(OneNode):
         if not confirm(f"{self.called}: its EEPROM becomes that of the backup that it keeps itself"):
             return ""
         self._has_backup()
-        self._written(
+        self._send_change(
             self.tool.line.instruct(self.servo_id, protocol2.restore(self.servo_id)), "the restoring"
         )
         self._await()
@@ -400,58 +407,58 @@ class OneServo(OneNode):
         names = ", ".join(each.name for each in differing)
         if not confirm(f"{self.called}: {names} become as in {path}; its ID and its rate stay"):
             return ()
-        written = self.write(desired)
+        written = self.write_registers(desired)
         # A restored mode resets other registers, so compare again.
         if left := self.differences(desired):
             names = ", ".join(each.name for each in left)
-            raise self.fail(f"{names} changed again while others were written; try again")
+            raise self.make_fault(f"{names} changed again while others were written; try again")
         return written
 
     def _has_backup(self) -> None:
         if self.table.protocol == 1.0:
-            raise self.fail("servos of Protocol 1.0 have no backup of their own; give a file")
+            raise self.make_fault("servos of Protocol 1.0 have no backup of their own; give a file")
         if self.holds_torque():
-            raise self.fail(f"holds torque; switch it off first: {self.command} torque off")
+            raise self.make_fault(f"holds torque; switch it off first: {self.command} torque off")
 
-    def _written(self, transaction: Transaction, what: str) -> None:
+    def _send_change(self, transaction: Transaction, what: str) -> None:
         """Send an instruction that changes the servo; raise ServoFault if it is refused. A missing
         acknowledgement is not a failure: a read afterwards decides.
         """
 
         def program() -> Program[Reply]:
             reply = yield transaction
-            yield listen(_STORED_NS)
+            yield listen_transaction(_STORED_NS)
             return reply
 
-        reply = self.run(program())
-        if reply.outcome is Outcome.REFUSED:
-            raise self.fail(f"refuses {what}: {self.tool.line.dialect.describe_error(reply.error)}")
+        reply = self.run_program(program())
+        if reply.outcome is TransactionOutcome.REFUSED:
+            raise self.make_fault(f"refuses {what}: {self.tool.line.dialect.describe_error(reply.error)}")
 
-    def _there(self, servo_id: int) -> Outcome:
-        def program() -> Program[Outcome]:
+    def _there(self, servo_id: int) -> TransactionOutcome:
+        def program() -> Program[TransactionOutcome]:
             reply = yield from retry(self.tool.line.ping(servo_id))
             return reply.outcome
 
-        return self.tool.run(program())
+        return self.tool.run_program(program())
 
     def _free(self, servo_id: int) -> None:
-        if self._there(servo_id) is not Outcome.TIMEOUT:
+        if self._there(servo_id) is not TransactionOutcome.TIMEOUT:
             raise ServoFault(
                 f"{self.called}: another servo has ID {servo_id} at {self.tool.baud_rate} bit/s; nothing was "
                 "changed"
             )
 
     def _same(self) -> None:
-        number = self.read(["model_number"])["model_number"]
+        number = self.read_items(["model_number"])["model_number"]
         if number != self.table.model_number:
-            raise self.fail(f"the servo there is model number {number}, not {self.table.model_number}")
+            raise self.make_fault(f"the servo there is model number {number}, not {self.table.model_number}")
 
     def _await(self) -> None:
         end_ns = self.tool.port.clock.now_ns() + BOOT_NS
-        while self._there(self.servo_id) is not Outcome.OK:
+        while self._there(self.servo_id) is not TransactionOutcome.OK:
             if self.tool.port.clock.now_ns() > end_ns:
                 port = self.tool.port.name
-                raise self.fail(
+                raise self.make_fault(
                     f"does not answer since {BOOT_NS * 1e-9:g} s; look for it: dxlrun scan {port}"
                 )
-            self.tool.wait(_PINGED_EVERY_NS)
+            self.tool.wait_for_packets(_PINGED_EVERY_NS)

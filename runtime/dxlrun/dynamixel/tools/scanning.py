@@ -18,10 +18,10 @@ from msgspec.structs import replace
 from dxlrun.dynamixel.remedies import CHECK, choose_remedy
 from dxlrun.dynamixel.tools.tool_line import ToolLine, refuse_echo
 from dxlwire.control_table import ControlItem, ControlTable, all_tables, models_by_number
-from dxlwire.control_table.devices import devices_by_number
-from dxlwire.plan.line import MOST_SPARE, Line, listen
+from dxlwire.control_table.device_models import devices_by_number
+from dxlwire.plan.line import MOST_SPARE, Line, listen_transaction
 from dxlwire.plan.retry import ATTEMPTS, extend_timeouts, retry
-from dxlwire.transaction import BROADCAST_ID, Outcome, Program, Reply, Transaction
+from dxlwire.transaction import BROADCAST_ID, Program, Reply, Transaction, TransactionOutcome
 from dxlwire.wire.dialect import dialect_of
 
 SHORT_TIMEOUT_NS = 2_000_000
@@ -96,14 +96,14 @@ def known_rates(protocol: float) -> tuple[int, ...]:
     return tuple(sorted(rates, key=lambda rate: (rate not in _USUAL, -rate)))
 
 
-class Scanned(msgspec.Struct, frozen=True):
+class ScanResult(msgspec.Struct, frozen=True):
     """Result of a scan of one port."""
 
     servos: tuple[FoundServo, ...]
     left_out: tuple[int, ...]  # rates that the adapter does not support, bit/s
 
 
-def scan(tool: ToolLine, search: Search = EVERYWHERE, progress: Progress = lambda *_: None) -> Scanned:
+def scan(tool: ToolLine, search: Search = EVERYWHERE, progress: Progress = lambda *_: None) -> ScanResult:
     """Search a port for servos and devices; `progress` receives a text and the fraction done.
 
     Raises:
@@ -123,8 +123,8 @@ def scan(tool: ToolLine, search: Search = EVERYWHERE, progress: Progress = lambd
 
         ids = search.ids or tuple(range(dialect_of(protocol).HIGHEST_ID + 1))
         beat(0.0)
-        found += tool.run(_search(tool, ids, beat))
-    return Scanned(tuple(found), tuple(dict.fromkeys(left_out)))
+        found += tool.run_program(_search(tool, ids, beat))
+    return ScanResult(tuple(found), tuple(dict.fromkeys(left_out)))
 
 
 def find_servo(tool: ToolLine, servo_id: int, search: Search = EVERYWHERE) -> tuple[FoundServo, ...]:
@@ -134,14 +134,14 @@ def find_servo(tool: ToolLine, servo_id: int, search: Search = EVERYWHERE) -> tu
     tries = _TRIES_ALONE if len(lines) == 1 else _TRIES
     for protocol, baud_rate in lines:
         if servo_id <= dialect_of(protocol).HIGHEST_ID and tool.speak(protocol, baud_rate):
-            found += tool.run(_find(tool, servo_id, tries))
+            found += tool.run_program(_find(tool, servo_id, tries))
     return tuple(found)
 
 
 def _find(tool: ToolLine, servo_id: int, tries: int) -> Program[list[FoundServo]]:
     knocked = _knock(tool, servo_id, tries)
     if (yield from (extend_timeouts(knocked) if tries == _TRIES_ALONE else knocked)):
-        return [(yield from extend_timeouts(look(tool.line, servo_id, tool.port.name)))]
+        return [(yield from extend_timeouts(read_servo(tool.line, servo_id, tool.port.name)))]
     return []
 
 
@@ -149,15 +149,15 @@ def _knock(tool: ToolLine, servo_id: int, tries: int) -> Program[bool]:
     for _ in range(tries):
         reply = yield tool.line.ping(servo_id)
         refuse_echo(tool.port.name, reply)
-        if reply.outcome is not Outcome.TIMEOUT:
+        if reply.outcome is not TransactionOutcome.TIMEOUT:
             return True
     return False
 
 
 def _search(tool: ToolLine, ids: Sequence[int], beat: Callable[[float], None]) -> Program[list[FoundServo]]:
     line, heard = tool.line, tool.heard
-    yield listen(LATE_NS)  # replies that are still to come at the previous rate
-    heard.clear()
+    yield listen_transaction(LATE_NS)  # replies that are still to come at the previous rate
+    heard.clear_records()
     # Only Protocol 2.0, whose ping replies contain the model number, has a broadcast ping with slots.
     if line.dialect.PING_LENGTH >= _IDENTITY_LENGTH and len(ids) > FEW:
         slot_ns = line.wire_ns(line.dialect.OVERHEAD + line.dialect.PING_LENGTH) + SLOT_NS
@@ -176,7 +176,7 @@ def _search(tool: ToolLine, ids: Sequence[int], beat: Callable[[float], None]) -
         there |= yield from _one_by_one(tool, ids, None, beat)
     found: list[FoundServo] = []
     for servo_id in sorted(there):
-        found.append((yield from extend_timeouts(look(line, servo_id, tool.port.name))))
+        found.append((yield from extend_timeouts(read_servo(line, servo_id, tool.port.name))))
     return found
 
 
@@ -196,10 +196,10 @@ def _one_by_one(
         refuse_echo(tool.port.name, reply)
         if reply.answered:
             there.add(servo_id)
-        elif reply.outcome is not Outcome.TIMEOUT:
+        elif reply.outcome is not TransactionOutcome.TIMEOUT:
             suspected.append(servo_id)
         beat((index + 1) / len(ids))
-    yield listen(LATE_NS if len(ids) > FEW else LATE_OF_FEW_NS)
+    yield listen_transaction(LATE_NS if len(ids) > FEW else LATE_OF_FEW_NS)
     there |= yield from extend_timeouts(_answering(line, suspected))
     return there | (heard.ids & set(ids))
 
@@ -211,7 +211,7 @@ def _answering(line: Line, suspected: Sequence[int]) -> Program[set[int]]:
     there: set[int] = set()
     for servo_id in suspected:
         reply = yield from retry(line.ping(servo_id))
-        if reply.outcome is not Outcome.TIMEOUT:
+        if reply.outcome is not TransactionOutcome.TIMEOUT:
             there.add(servo_id)
     return there
 
@@ -227,10 +227,10 @@ def identity(line: Line, servo_id: int) -> Program[tuple[Reply, Reply]]:
     ping = yield from retry(line.ping(servo_id))
     if not ping.answered or line.dialect.PING_LENGTH >= _IDENTITY_LENGTH:
         return ping, ping
-    return ping, (yield from retry(line.read(servo_id, 0, _IDENTITY_LENGTH, MOST_SPARE)))
+    return ping, (yield from retry(line.read_range(servo_id, 0, _IDENTITY_LENGTH, MOST_SPARE)))
 
 
-def look(line: Line, servo_id: int, port: str) -> Program[FoundServo]:
+def read_servo(line: Line, servo_id: int, port: str) -> Program[FoundServo]:
     """Read model and settings of a servo or device that answered a ping; `port` is the port's name. Writes
     nothing.
     """
@@ -238,7 +238,7 @@ def look(line: Line, servo_id: int, port: str) -> Program[FoundServo]:
     servo = FoundServo(dialect.PROTOCOL, line.baud_rate, servo_id)
     ping, reply = yield from identity(line, servo_id)
     if not reply.answered:
-        garbled = Outcome.GARBLED in (ping.outcome, reply.outcome)
+        garbled = TransactionOutcome.GARBLED in (ping.outcome, reply.outcome)
         return replace(servo, garbled=garbled, remarks=(_mute(ping, reply, line, port),))
     number, firmware = reply.word(), reply.parameters[2]
     remarks = [dialect.describe_error(reply.error)] if reply.error else []
@@ -268,9 +268,9 @@ def _hardware_error(line: Line, servo_id: int, table: ControlTable) -> Program[s
     if item is None:
         return ""
     spare = table.spare(item.address + item.size, MOST_SPARE)
-    reply = yield from retry(line.read(servo_id, item.address, item.size, spare))
+    reply = yield from retry(line.read_range(servo_id, item.address, item.size, spare))
     value = reply.parameters[0] if reply.answered else 0
-    return f"{item.title} is {value}: {table.errors.describe(value)}" if value else ""
+    return f"{item.title} is {value}: {table.errors.describe_errors(value)}" if value else ""
 
 
 def _look_closer(
@@ -290,12 +290,12 @@ def _look_closer(
     garbled = False
     for item in items:
         more = spare(item.address + item.size, MOST_SPARE)
-        reply = yield from retry(line.read(servo.servo_id, item.address, item.size, more))
+        reply = yield from retry(line.read_range(servo.servo_id, item.address, item.size, more))
         if reply.answered:
             values[item.name] = item.decode(reply.parameters)
         else:
             silent.append(item.title)
-        garbled = garbled or reply.outcome is Outcome.GARBLED or bool(reply.strays)
+        garbled = garbled or reply.outcome is TransactionOutcome.GARBLED or bool(reply.strays)
     remarks = list(servo.remarks)
     if garbled:
         remedy = choose_remedy(port, " If not, check its cable", simulated="")
@@ -317,12 +317,12 @@ def _look_closer(
 
 
 def _mute(ping: Reply, reply: Reply, line: Line, port: str) -> str:
-    if Outcome.GARBLED in (ping.outcome, reply.outcome):
+    if TransactionOutcome.GARBLED in (ping.outcome, reply.outcome):
         remedy = choose_remedy(port, " If not, check cable and ground", simulated="")
         return f"sends garbled replies: do two servos have this ID?{remedy}"
     if not ping.answered:
         return f"answered once, and then no more: {choose_remedy(port, CHECK)}"
-    if reply.outcome is Outcome.REFUSED:
+    if reply.outcome is TransactionOutcome.REFUSED:
         return f"refuses to be read: {line.dialect.describe_error(reply.error)}"
     remedy = choose_remedy(port, f"{CHECK}, and its Status Return Level (16)")
     return f"answered a ping, but did not answer {ATTEMPTS} reads of its model number: {remedy}"

@@ -10,9 +10,9 @@ from dxlrun.contract.serial_line import open_serial
 from dxlrun.errors import PortError
 from dxlwire.bus_plan import Budget, BusPlan
 from dxlwire.clock import Clock, MonotonicClock
-from dxlwire.exchange.bus import Lines
+from dxlwire.exchange.bus_engine import Lines
 from dxlwire.packets import PacketKind, PacketSink
-from dxlwire.plan.line import LONGEST_RETURN_DELAY_NS, Line, listen
+from dxlwire.plan.line import LONGEST_RETURN_DELAY_NS, Line, listen_transaction
 from dxlwire.port.latency_timer import latency_timer, shorten
 from dxlwire.port.ports import Ports, SerialPort, SerialPorts
 from dxlwire.transaction import Program, Reply, Result
@@ -81,7 +81,7 @@ class TunablePort:
         return baud_rate not in self.other_rates
 
 
-class Heard(PacketSink):
+class RespondingIdSink(PacketSink):
     """Packet sink that records the IDs which answered on a line, expected or not, and counts noise; forwards
     packets to a log.
     """
@@ -91,7 +91,7 @@ class Heard(PacketSink):
         self.ids: set[int] = set()  # IDs in the intact status packets
         self.noise = 0  # bytes outside of intact packets
 
-    def clear(self) -> None:
+    def clear_records(self) -> None:
         """Forget the recorded IDs and the noise."""
         self.ids.clear()
         self.noise = 0
@@ -108,7 +108,7 @@ class Heard(PacketSink):
             self.noise += len(data)
 
 
-class OnBus(PacketSink):
+class BusPacketSink(PacketSink):
     """Packet sink that forwards packets to a log under a fixed bus index."""
 
     def __init__(self, log: PacketSink, index: int) -> None:
@@ -131,7 +131,7 @@ class ToolLine:
 
     def __init__(self, port: TunablePort, log: PacketSink | None = None) -> None:
         self.port = port
-        self.heard = Heard(log)
+        self.heard = RespondingIdSink(log)
         self.protocol = 0.0
         self.baud_rate = 0
         self.line: Line = Line(FIRST_RATE, port.most_latency_ns, LONGEST_RETURN_DELAY_NS)
@@ -167,7 +167,7 @@ class ToolLine:
         self.port.tune(self.baud_rate)
         return can
 
-    def run(self, program: Program[Result]) -> Result:
+    def run_program(self, program: Program[Result]) -> Result:
         """Run a program on the line to its end and return its result.
 
         Raises:
@@ -175,14 +175,14 @@ class ToolLine:
         """
         if self._lines is None:
             raise LookupError("speak a protocol first")
-        (result,) = self._lines.run([program])
+        (result,) = self._lines.run_programs([program])
         if result is None:
             raise self._lines.failure or PortError(f"{self.port.name}: its program did not end")
         return result
 
-    def wait(self, duration_ns: int) -> None:
+    def wait_for_packets(self, duration_ns: int) -> None:
         """Wait this long while packets that arrive are recorded."""
-        self.run(_wait(duration_ns))
+        self.run_program(_wait(duration_ns))
 
 
 def refuse_echo(name: str, reply: Reply) -> None:
@@ -197,5 +197,5 @@ def refuse_echo(name: str, reply: Reply) -> None:
 
 
 def _wait(duration_ns: int) -> Program[bool]:
-    yield listen(duration_ns)
+    yield listen_transaction(duration_ns)
     return True

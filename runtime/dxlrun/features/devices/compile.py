@@ -11,8 +11,8 @@ import msgspec
 from msgspec.structs import replace
 
 from dxlrun.compile.contribution import BusDevice, Compilation, CompileStage, Contribution
+from dxlrun.compile.joints.compiled_servos import check_bus
 from dxlrun.compile.joints.described_servos import described_servos
-from dxlrun.compile.joints.servos import check_bus
 from dxlrun.compile.problems import RobotFile
 from dxlrun.description.bus import Bus
 from dxlrun.description.document import KeyPath, read_file
@@ -24,10 +24,10 @@ from dxlrun.features.devices.plan import DeviceCommand
 from dxlrun.features.devices.simulate import simulated_states
 from dxlrun.plan.loop_plan import SourcePlan
 from dxlwire.bus_plan import DevicePlan
+from dxlwire.control_table.control_items import ControlItem
+from dxlwire.control_table.device_models import device_table, perhaps_meant_device
 from dxlwire.control_table.device_table import DeviceTable, read_device_table
-from dxlwire.control_table.devices import device_table, perhaps_meant_device
-from dxlwire.control_table.table import ControlItem
-from dxlwire.plan.devices import device_blocks
+from dxlwire.plan.device_reads import device_blocks
 from dxlwire.plan.line import Line
 from dxlwire.wire.dialect import dialect_of
 
@@ -38,7 +38,7 @@ def compile_devices(compilation: Compilation) -> Contribution:
     Columns of states and commands are counted from the start of the cycle's record.
     """
     file, body = compilation.file, compilation.body
-    described = form.STAGE.of(file.robot)
+    described = form.STAGE.section_of(file.robot)
     sources: list[SourcePlan] = []
     devices: list[BusDevice] = []
     texts: dict[str, str] = {}
@@ -104,7 +104,7 @@ def _check_place(file: RobotFile, name: str, device: Device) -> None:
     robot, marks = file.robot, file.marks
     check_bus(file, device, name, partial(marks.value, "devices", name), "ID")
     others = {(servo.bus, servo.id): servo.title for servo in described_servos(file.description)}
-    for each, other in form.STAGE.of(robot).items():
+    for each, other in form.STAGE.section_of(robot).items():
         if each == name:
             break
         others.setdefault((other.bus, other.id), each)
@@ -199,7 +199,7 @@ def _with_safe_values(
 ) -> tuple[DeviceCommand, ...]:
     """Return a device's commands with the values of `safe` in the file; check their names and ranges."""
     found = dict(commands)
-    for each, value in form.STAGE.of(file.robot)[name].safe.items():
+    for each, value in form.STAGE.section_of(file.robot)[name].safe.items():
         mark = file.at("devices", name, "safe", each)
         if (command := commands.get(each)) is None:
             fix = suggestion(each, tuple(commands)) if commands else "name its item under commands"

@@ -8,7 +8,7 @@ from typing import Annotated
 
 from pydantic import Field, PlainValidator, WithJsonSchema
 
-from dxlrun.description.form import Form, Name, key, refuse
+from dxlrun.description.base_form import Form, Name, key, validation_error
 from dxlrun.features.feature import Section
 
 _STATE = re.compile(r"[A-Za-z][A-Za-z0-9_]*(\.[A-Za-z0-9_]+)*", re.ASCII)
@@ -22,23 +22,25 @@ def _items(value: object) -> tuple[tuple[str, str], ...]:
     elif isinstance(value, dict) and value:
         pairs = [*value.items()]
     else:
-        raise refuse(
+        raise validation_error(
             "this names no item of the device's table", "write a list of items, or NAME: ITEM for each"
         )
     for name, item in pairs:
         if not isinstance(item, str) or not _ITEM.fullmatch(item):
-            raise refuse(f"{item!r} is not a name of an item", "`dxlrun models MODEL` lists the items")
+            raise validation_error(
+                f"{item!r} is not a name of an item", "`dxlrun models MODEL` lists the items"
+            )
         if name and not _STATE.fullmatch(name):
-            raise refuse(
+            raise validation_error(
                 f"{name!r} is not a name of a state",
                 "start with a letter, and use letters, digits and _, such as angular_velocity.x",
             )
         if name == "age":
-            raise refuse("every device has an age already", "give this another name")
+            raise validation_error("every device has an age already", "give this another name")
     items = [item for _, item in pairs]
     for item in items:
         if items.count(item) > 1:
-            raise refuse(f"{item} is named twice", "name each item once")
+            raise validation_error(f"{item} is named twice", "name each item once")
     return tuple(pairs)
 
 
@@ -68,12 +70,14 @@ Items = Annotated[
 
 def _numbers(value: object) -> dict[str, float]:
     if not isinstance(value, dict):
-        raise refuse("this gives no values of states", "write STATE: NUMBER for each, in SI units")
+        raise validation_error("this gives no values of states", "write STATE: NUMBER for each, in SI units")
     for name, number in value.items():
         if not isinstance(name, str) or isinstance(number, bool) or not isinstance(number, int | float):
-            raise refuse(f"{number!r} is not a value of a state", "write a number, in SI units")
+            raise validation_error(f"{number!r} is not a value of a state", "write a number, in SI units")
         if not math.isfinite(number):
-            raise refuse(f"{number!r} is not a value of a state", "write a finite number, in SI units")
+            raise validation_error(
+                f"{number!r} is not a value of a state", "write a finite number, in SI units"
+            )
     return {name: float(number) for name, number in value.items()}
 
 

@@ -11,7 +11,7 @@ import msgspec
 from dxlwire.bus_plan import SIGN
 
 if TYPE_CHECKING:  # the guardian reads no control tables
-    from dxlwire.control_table.table import ControlItem
+    from dxlwire.control_table.control_items import ControlItem
 
 HIGHEST_FLOAT32 = 3.4028234663852886e38
 

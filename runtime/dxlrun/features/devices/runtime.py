@@ -12,17 +12,17 @@ import msgspec
 from msgspec.structs import replace
 
 from dxlrun.channels.cycle import LOST_AGE_NS, LOST_CYCLES
-from dxlrun.channels.events import EventBody
+from dxlrun.channels.event_records import EventBody
 from dxlrun.dynamixel.bus_part import BusContext, BusStage
 from dxlrun.features.devices import texts
-from dxlrun.features.devices.checks import inspect_device, survey_devices
+from dxlrun.features.devices.device_checks import inspect_device, survey_devices
 from dxlrun.features.devices.plan import DeviceCommand, decode_devices
 from dxlwire.bus_plan import DevicePlan
 from dxlwire.exchange.cyclic_reads import MOST_BROKEN
 from dxlwire.exchange.idle import Urgency
 from dxlwire.plan.line import Line
 from dxlwire.plan.planning import plan_line
-from dxlwire.transaction import Outcome, Program, Transaction
+from dxlwire.transaction import Program, Transaction, TransactionOutcome
 from dxlwire.wire.dialect import dialect_of
 
 PROBE_NS = 1_000_000_000
@@ -42,7 +42,7 @@ class _Loss(msgspec.Struct):
     problem: str = ""  # last reported reason why it cannot be read again
 
 
-class _Written(msgspec.Struct):
+class _WrittenCommand(msgspec.Struct):
     data: bytes = b""  # last acknowledged data; empty: none
     at_ns: int = 0
     commanded: bool = False  # a controller commanded it in this run
@@ -72,7 +72,8 @@ class Devices:
         self._errors = [0] * len(plan.devices)  # last reported error byte of each
         commands = decode_devices(context.plan)
         self._written = [
-            [(command, _Written()) for command in commands.get(device.name, ())] for device in plan.devices
+            [(command, _WrittenCommand()) for command in commands.get(device.name, ())]
+            for device in plan.devices
         ]
         """Commands of each device, each with the bytes last written and their time."""
 
@@ -103,25 +104,25 @@ class Devices:
         if self._flaps[index] == MOST_BROKEN:
             for member in self._members[index]:
                 self._reads.apart[member] = True
-            self._report(index, texts.device_read_apart(label))
+            self._report_device(index, texts.device_read_apart(label))
         loss = _Loss(now_ns, now_ns)
         if not self._flaps[index]:
-            self._report(index, texts.reply_garbled(label) if garbled else texts.reply_missed(label))
+            self._report_device(index, texts.reply_garbled(label) if garbled else texts.reply_missed(label))
         elif self._flaps[index] >= 2 * MOST_BROKEN:
             loss.reported, loss.probe_at_ns = True, now_ns + PROBE_NS
-            self._report(index, texts.device_silent_in_cycles(label))
+            self._report_device(index, texts.device_silent_in_cycles(label))
         self._leave(index, loss)
 
     def _leave(self, index: int, loss: _Loss) -> None:
         self._losses[index] = loss
         for member in self._members[index]:
-            self._reads.leave(member)
+            self._reads.stop_reading(member)
 
     def _report_error(self, index: int, error: int) -> None:
         if error != self._errors[index]:
             self._errors[index] = error
             text = texts.error_byte_set if error else texts.error_byte_cleared
-            self._report(index, text(self._label(index), self._dialect.describe_error(error)))
+            self._report_device(index, text(self._label(index), self._dialect.describe_error(error)))
 
     # Idle time
 
@@ -130,7 +131,7 @@ class Devices:
         now_ns = self._idle.now_ns()
         for index, loss in enumerate(self._losses):
             if loss is None:
-                self._command(index, now_ns)
+                self._schedule_writes(index, now_ns)
             elif not loss.probing and loss.probe_at_ns <= now_ns:
                 loss.probing = True
                 name = f"the return of {self._label(index)}"
@@ -147,14 +148,16 @@ class Devices:
         probes = _probes(line, device)
         self._turns[index] += 1
         first = probes[self._turns[index] % len(probes)]
-        reads = (line.read(device.servo_id, block.address, block.length) for block in device.blocks)
+        reads = (line.read_range(device.servo_id, block.address, block.length) for block in device.blocks)
         problem = ""
         for request in (first, *reads):
             # Use a short timeout: a silent device must not take the idle time of the servos.
             brief_ns = request.due_ns + line.latency_ns + line.device_margin_ns
             reply = yield replace(request, timeout_ns=brief_ns)
             if not reply.answered:
-                problem = "refuses to be read" if reply.outcome is Outcome.REFUSED else "does not answer"
+                problem = (
+                    "refuses to be read" if reply.outcome is TransactionOutcome.REFUSED else "does not answer"
+                )
                 break
         if not problem and loss.reported:  # the device may have been replaced
             problem = yield from inspect_device(self._plan, device, line)
@@ -170,10 +173,10 @@ class Devices:
             loss.probe_at_ns += PROBE_NS
             if problem not in {loss.problem, "does not answer"}:
                 loss.problem = problem
-                self._report(index, texts.device_unfit(self._label(index), problem))
+                self._report_device(index, texts.device_unfit(self._label(index), problem))
         elif loss.missed >= LOST_CYCLES and now_ns - loss.since_ns >= LOST_AGE_NS:
             loss.reported = True
-            self._report(index, texts.device_lost(self._label(index), loss.missed))
+            self._report_device(index, texts.device_lost(self._label(index), loss.missed))
 
     def _take_back(self, index: int, loss: _Loss) -> None:
         self._losses[index] = None
@@ -183,13 +186,13 @@ class Devices:
         for _, written in self._written[index]:
             written.data = b""  # the device may have rebooted
         if loss.reported:
-            self._report(index, texts.device_back(self._label(index)))
+            self._report_device(index, texts.device_back(self._label(index)))
         elif not self._flaps[index]:
-            self._report(index, texts.device_answers_again(self._label(index), loss.missed))
+            self._report_device(index, texts.device_answers_again(self._label(index), loss.missed))
 
     # Commands
 
-    def _command(self, index: int, now_ns: int) -> None:
+    def _schedule_writes(self, index: int, now_ns: int) -> None:
         """Queue writes of a device's commands that changed or are older than `REPEAT_NS`.
 
         A command that no controller sends any more gets its safe value.
@@ -209,16 +212,18 @@ class Devices:
                 written.writing = True
                 name = f"{command.name} of {self._label(index)}"
                 urgency = Urgency.SLOW if data == written.data else Urgency.STEERED
-                self._idle.add(self._write(index, command, written, data), urgency, name)
+                self._idle.add(self._write_command(index, command, written, data), urgency, name)
 
-    def _write(self, index: int, command: DeviceCommand, written: _Written, data: bytes) -> Program[None]:
+    def _write_command(
+        self, index: int, command: DeviceCommand, written: _WrittenCommand, data: bytes
+    ) -> Program[None]:
         device = self._plan.devices[index]
-        reply = yield plan_line(self._plan).write(device.servo_id, command.address, data)
+        reply = yield plan_line(self._plan).write_range(device.servo_id, command.address, data)
         written.writing = False
-        refused = reply.outcome is Outcome.REFUSED
+        refused = reply.outcome is TransactionOutcome.REFUSED
         if refused and not written.refused:
             value, errors = int.from_bytes(data, "little"), self._dialect.describe_error(reply.error)
-            self._report(index, texts.command_refused(self._label(index), command.item, value, errors))
+            self._report_device(index, texts.command_refused(self._label(index), command.item, value, errors))
         written.refused = refused
         # Record a refused value as written, so that it is not tried again before it is due.
         written.data = data if reply.answered or refused else b""
@@ -227,8 +232,8 @@ class Devices:
     def _label(self, index: int) -> str:
         return self._plan.label(self._plan.devices[index])
 
-    def _report(self, index: int, event: EventBody) -> None:
-        self._events.emit(self._plan.devices[index].name, event)
+    def _report_device(self, index: int, event: EventBody) -> None:
+        self._events.emit_event(self._plan.devices[index].name, event)
 
 
 def attach_devices(context: BusContext) -> Devices | None:
@@ -245,7 +250,9 @@ def _probes(line: Line, device: DevicePlan) -> list[Transaction]:
     The lengths of their replies differ from each other and from those of its states.
     """
     block = device.blocks[0]
-    found = [line.read(device.servo_id, block.address, length) for length in (1, 2) if length < block.length]
+    found = [
+        line.read_range(device.servo_id, block.address, length) for length in (1, 2) if length < block.length
+    ]
     if block.length != line.dialect.PING_LENGTH or not found:
         found.append(line.ping(device.servo_id))
     return found

@@ -7,9 +7,9 @@ from collections.abc import Collection, Mapping
 from dxlrun.compile.problems import RobotFile
 from dxlrun.errors import suggestion
 from dxlrun.features.devices import form
-from dxlsim.simulation_plan import Shown
+from dxlsim.simulation_plan import DeviceReadings
+from dxlwire.control_table.control_items import ControlItem
 from dxlwire.control_table.device_table import DeviceTable
-from dxlwire.control_table.table import ControlItem
 
 
 def simulated_states(
@@ -18,7 +18,7 @@ def simulated_states(
     table: DeviceTable,
     read: Mapping[str, ControlItem],
     links: Collection[str] | None,
-) -> Shown:
+) -> DeviceReadings:
     """Return values, noise and link of a simulated device; add problems of its `simulation` keys to the file.
 
     Args:
@@ -28,7 +28,7 @@ def simulated_states(
         read: Item of each state, by the state's name.
         links: Links of the robot's URDF; None if it has none.
     """
-    keys = form.STAGE.of(file.robot)[name].simulation
+    keys = form.STAGE.section_of(file.robot)[name].simulation
     for key, numbers in (("values", keys.values), ("noise", keys.noise)):
         for state, number in numbers.items():
             mark = file.at("devices", name, "simulation", key, state)
@@ -44,7 +44,7 @@ def simulated_states(
         else:
             what = f"{name} is on link {keys.link}, which the URDF does not have"
             file.error(mark, what, suggestion(keys.link, tuple(links)))
-    return Shown(
+    return DeviceReadings(
         states={item.name: state for state, item in read.items()},
         values={read[state].name: value for state, value in keys.values.items() if state in read},
         noise={read[state].name: value for state, value in keys.noise.items() if state in read},

@@ -4,9 +4,9 @@ from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
 
-from dxlrun.compile.report import Row, TableStage
+from dxlrun.compile.check_report import Row, TableStage
 from dxlrun.output.quantity import names_with_units
-from dxlrun.output.table import Column, Columns, Table
+from dxlrun.output.text_table import Column, Columns, Table
 from dxlrun.plan.loop_plan import SourcePlan
 from dxlrun.plan.robot_plan import Plan
 from dxlwire.bus_plan import BusPlan, DevicePlan

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dxlrun.channels.events import EventCode, Severity, event_text
+from dxlrun.channels.event_records import EventCode, Severity, event_text
 
 
 @event_text(EventCode.SETUP, Severity.INFO)

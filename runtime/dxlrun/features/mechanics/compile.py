@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Mapping
 
 from dxlrun.compile.contribution import Compilation, CompileStage, Contribution
-from dxlrun.compile.joints.joints import CompiledJoint, moving_servos
+from dxlrun.compile.joints.compiled_joints import CompiledJoint, moving_servos
 from dxlrun.features.mechanics.drives import CoupledDrive
 from dxlrun.plan.mechanics_plan import CouplingPlan, MechanicsPlan
 

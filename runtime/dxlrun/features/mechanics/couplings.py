@@ -10,12 +10,12 @@ from collections.abc import Mapping, Sequence
 
 import msgspec
 
+from dxlrun.compile.joints.compiled_servos import CompiledServo
 from dxlrun.compile.joints.limits import Interval, degrees
-from dxlrun.compile.joints.servos import CompiledServo
 from dxlrun.compile.problems import Problems, RobotFile
 from dxlrun.description.document import KeyPath
-from dxlrun.description.joints.joints import JointEntry, ServoJoint, SharedJoint
-from dxlrun.description.joints.mechanics import LEAST_RATIO, MOST_RATIO, SERVO_TOLERANCES
+from dxlrun.description.joints.joint_forms import JointEntry, ServoJoint, SharedJoint
+from dxlrun.description.joints.joint_mechanics import LEAST_RATIO, MOST_RATIO, SERVO_TOLERANCES
 from dxlrun.description.units import plain
 from dxlrun.errors import Mark, suggestion
 from dxlrun.features.mechanics import form
@@ -87,7 +87,7 @@ def compile_couplings(file: RobotFile, servos: Mapping[str, CompiledServo]) -> l
             if _agree(file, coupling):
                 found.append(coupling)
     owners: dict[str, str] = {}
-    for name, transmission in form.STAGE.of(file.robot).items():
+    for name, transmission in form.STAGE.section_of(file.robot).items():
         good = _check_joints(file, name, transmission, owners)
         matrix = _matrix(file, name, transmission)
         known = tuple(servos[each] for key in transmission.servos if (each := f"{name}/{key}") in servos)
@@ -302,7 +302,7 @@ def allowed_limits(file: RobotFile, coupling: Coupling) -> tuple[Interval | None
             file.error(
                 file.at("joints", name, "servos"),
                 f"the servos of {name} have no angle of the joint in common: one reaches "
-                f"{coupling.servos[0].reach}, another {coupling.servos[-1].reach}",
+                f"{coupling.servos[0].position_range}, another {coupling.servos[-1].position_range}",
                 "check the reference and direction of each",
             )
             return (None,)
@@ -339,9 +339,9 @@ def _allowed(file: RobotFile, name: str, joint: JointEntry, reach: Interval, mod
 
 def shared_reach(coupling: Coupling) -> Interval | None:
     """Return the joint positions that all servos of one joint can reach; None if there are none."""
-    reach: Interval | None = coupling.servos[0].reach
+    reach: Interval | None = coupling.servos[0].position_range
     for servo in coupling.servos[1:]:
-        reach = None if reach is None else reach.meet(servo.reach)
+        reach = None if reach is None else reach.meet(servo.position_range)
     return reach
 
 
@@ -349,7 +349,7 @@ def joint_reaches(coupling: Coupling) -> tuple[Interval, ...]:
     """Return the widest range of each joint that its servos can reach, the others placed as needed."""
     if not coupling.transmission:
         return (shared_reach(coupling) or Interval(0.0, 0.0),)
-    return tuple(_image(row, [one.reach for one in coupling.servos]) for row in coupling.matrix)
+    return tuple(_image(row, [one.position_range for one in coupling.servos]) for row in coupling.matrix)
 
 
 def servo_ranges(coupling: Coupling, limits: Sequence[Interval]) -> tuple[Interval, ...]:
@@ -373,7 +373,7 @@ def box(
     share of the joint's reach.
     """
     reaches = joint_reaches(coupling)
-    ranges = [one.reach for one in coupling.servos]
+    ranges = [one.position_range for one in coupling.servos]
     middles = [
         sum(factor * (one.lower + one.upper) / 2 for factor, one in zip(row, ranges, strict=True))
         for row in coupling.matrix
@@ -418,7 +418,7 @@ def _fits(
     for row, servo, needed in zip(
         coupling.inverse, coupling.servos, servo_ranges(coupling, limits), strict=True
     ):
-        reach = servo.reach
+        reach = servo.position_range
         if reach.contains(needed):
             continue
         upper = needed.upper - reach.upper > reach.lower - needed.lower

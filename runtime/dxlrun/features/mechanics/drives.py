@@ -4,8 +4,8 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 
-from dxlrun.compile.joints.drives import DriveStage, JointDrive
-from dxlrun.compile.joints.servos import CompiledServo
+from dxlrun.compile.joints.compiled_servos import CompiledServo
+from dxlrun.compile.joints.joint_drives import DriveStage, JointDrive
 from dxlrun.compile.problems import RobotFile
 from dxlrun.features.mechanics.couplings import (
     Coupling,

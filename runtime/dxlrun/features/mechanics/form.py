@@ -7,9 +7,9 @@ from typing import Annotated, Literal
 
 from pydantic import Field
 
-from dxlrun.description.form import Form, Name, key, with_keys
-from dxlrun.description.joints.joints import section_servo
-from dxlrun.description.joints.mechanics import (
+from dxlrun.description.base_form import Form, Name, key, with_keys
+from dxlrun.description.joints.joint_forms import section_servo
+from dxlrun.description.joints.joint_mechanics import (
     Direction,
     GearRatio,
     MotorFile,

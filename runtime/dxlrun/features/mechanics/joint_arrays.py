@@ -30,7 +30,7 @@ _LEAST_SHARE = 0.05
 need not move."""
 
 
-class JointArrays:
+class CoupledJointArrays:
     """States and goals of all servos and all joints of a robot, with the conversion between them.
 
     The servos' arrays have one row per servo, in the order of the plan's `servos`. A joint's row is valid if
@@ -81,7 +81,7 @@ class JointArrays:
         self._last_speed: Floats = np.full((count, joints), np.nan)
         self._speeds: Floats = np.full((count, servos), np.nan)
 
-    def begin(self) -> None:
+    def fill_joint_goals(self) -> None:
         """Set the joints' goals at start-up such that every servo keeps the goal that it has.
 
         Small deviations of the servos are kept as offsets at first; `fade` removes them.
@@ -108,7 +108,7 @@ class JointArrays:
         self._offset[index] = np.nan_to_num(self.residual[index])
         self._fade[index] = 1.0
 
-    def read(self) -> None:
+    def fill_joint_states(self) -> None:
         """Compute the joints' states from the servos' states of this cycle."""
         to, of = self.states, self.servo_states
         joints, servos = self._direct_joints, self._direct_servos
@@ -158,7 +158,7 @@ class JointArrays:
         worst = np.take_along_axis(torque, ranks.argmax(axis=1)[:, None], axis=1)[:, 0]
         to.torque[self._rows] = worst[coupling]
 
-    def write(self) -> None:
+    def fill_servo_goals(self) -> None:
         """Compute the servos' goals from the joints' goals; if a joint has no goal, its servos have none."""
         to, of = self.servo_goals, self.goals
         to.values[:, self._direct_servos] = of.values[:, self._direct_joints]

@@ -10,11 +10,11 @@ import numpy as np
 from numpy.typing import NDArray
 
 from dxlrun.channels.cycle import LIMP, Torque
-from dxlrun.channels.events import EventSink
+from dxlrun.channels.event_records import EventSink
 from dxlrun.contract.hardware import Hardware
 from dxlrun.dynamixel.hardware_layer import HardwareLayer
 from dxlrun.features.mechanics import texts
-from dxlrun.features.mechanics.joint_arrays import JointArrays
+from dxlrun.features.mechanics.joint_arrays import CoupledJointArrays
 from dxlrun.plan.loop_plan import LimitedInterface, LoopPlan, ServoLimit
 from dxlrun.plan.mechanics_plan import CouplingPlan, MechanicsPlan
 from dxlwire.bus_plan import BusPlan, ServoPlan
@@ -29,7 +29,7 @@ Done = Callable[[str], None]
 RegisterDone = Callable[[str, int | None], None]
 
 
-class _Together(msgspec.Struct):
+class _CouplingRequest(msgspec.Struct):
     """A request (such as torque off) sent to all servos of a coupling, while some have not answered."""
 
     left: int
@@ -37,7 +37,7 @@ class _Together(msgspec.Struct):
     problems: list[str] = []
 
 
-class ServosTogether:
+class CouplingCheck:
     """Checks during a run that the servos of each coupling agree in position and torque; reports events."""
 
     def __init__(
@@ -45,7 +45,7 @@ class ServosTogether:
         plan: MechanicsPlan,
         loop: LoopPlan,
         buses: Sequence[BusPlan],
-        arrays: JointArrays,
+        arrays: CoupledJointArrays,
         events: EventSink,
     ) -> None:
         placed = {servo.row: (bus, servo) for bus in buses for servo in bus.servos}
@@ -66,7 +66,7 @@ class ServosTogether:
 
         Joints that stay limp at the start (`torque: off`) are not checked.
         """
-        self._arrays.read()
+        self._arrays.fill_joint_states()
         problems: list[str] = []
         for index, coupling in enumerate(self._plan.couplings):
             if any(self._servos[row].torque_at_start for row in coupling.servos):
@@ -87,7 +87,7 @@ class ServosTogether:
     def report_no_torque(self, index: int, problem: str) -> None:
         """Emit the event that torque was refused for a coupling, with the problem."""
         name = self._plan.couplings[index].name
-        self._events.emit(name, texts.torque_refused(name, problem))
+        self._events.emit_event(name, texts.torque_refused(name, problem))
 
     def unfit(self, index: int) -> list[str]:
         """Return why a coupling's servos must not get torque: disagreement, or a joint beyond its limits."""
@@ -112,7 +112,7 @@ class ServosTogether:
             )
         return problems
 
-    def watch(self) -> None:
+    def report_disagreement(self) -> None:
         """Emit an event when servos of a coupling start to disagree beyond the tolerance, or agree again."""
         for index, coupling in enumerate(self._plan.couplings):
             if not coupling.tolerance or not self._arrays.states.valid[coupling.joints[0]]:
@@ -121,12 +121,12 @@ class ServosTogether:
             if not apart and spread > coupling.tolerance:
                 self._apart[index] = True
                 event = texts.servos_disagree(self._disagreement(index, coupling))
-                self._events.emit(coupling.name, event)
+                self._events.emit_event(coupling.name, event)
             elif apart and spread < AGREES * coupling.tolerance:
                 self._apart[index] = False
                 first = self._servos[coupling.servos[0]]
                 event = texts.servos_agree_again(coupling.name, first.position_text(spread))
-                self._events.emit(coupling.name, event)
+                self._events.emit_event(coupling.name, event)
 
     def partners(self) -> list[tuple[int, tuple[int, ...], tuple[int, ...]]]:
         """Return couplings of which only some servos have torque: index, rows without it, rows with it."""
@@ -143,7 +143,7 @@ class ServosTogether:
         """Emit the event that servos lose torque because others of their coupling have none."""
         name, labels = self._plan.couplings[index].name, self._labels
         event = texts.partners_released(name, [labels[row] for row in limp], [labels[row] for row in pulling])
-        self._events.emit(name, event)
+        self._events.emit_event(name, event)
 
     def _spread(self, index: int, coupling: CouplingPlan) -> float:
         """Return by how much the servos of a coupling disagree, rad or m, at their outputs."""
@@ -175,8 +175,8 @@ class JointHardware(HardwareLayer):
         self,
         hardware: Hardware,
         plan: MechanicsPlan,
-        arrays: JointArrays,
-        together: ServosTogether,
+        arrays: CoupledJointArrays,
+        together: CouplingCheck,
         period_ns: int,
     ) -> None:
         super().__init__(hardware)
@@ -184,7 +184,7 @@ class JointHardware(HardwareLayer):
         self._arrays = arrays
         self._together = together
         self._fade_share = period_ns / FADE_NS
-        self._asked: dict[tuple[int, str], _Together] = {}
+        self._asked: dict[tuple[int, str], _CouplingRequest] = {}
         """Open requests by coupling index and kind (`on`, `off`, `reboot`) that some servos have not
         answered."""
         self._read_limits: Mapping[int, Sequence[ServoLimit]] | None = None
@@ -194,14 +194,14 @@ class JointHardware(HardwareLayer):
     def start(self, engaging: Callable[[], None] = lambda: None) -> None:
         """Start the servos' hardware, and set the joints' goals such that no servo moves.
 
-        `ServosTogether.at_start` refuses disagreeing servos of a joint before that.
+        `CouplingCheck.at_start` refuses disagreeing servos of a joint before that.
 
         Args:
             engaging: Called before any servo gets torque.
         """
         self._hardware.start(engaging)
-        self._arrays.begin()
-        self._arrays.read()
+        self._arrays.fill_joint_goals()
+        self._arrays.fill_joint_states()
 
     @property
     def servo_limits(self) -> Mapping[int, Sequence[ServoLimit]]:
@@ -237,32 +237,34 @@ class JointHardware(HardwareLayer):
                     tightest[limit.interface] = ServoLimit(limit.interface, value, text)
         return tuple(tightest.values())
 
-    def read(self) -> None:
+    def read_states(self) -> None:
         """Read servos, compute joint states; if one servo of a coupling is limp, release its other servos."""
-        self._hardware.read()
-        self._arrays.read()
-        self._together.watch()
+        self._hardware.read_states()
+        self._arrays.fill_joint_states()
+        self._together.report_disagreement()
         for index, limp, pulling in self._together.partners():
             if not any(coupling == index for coupling, _ in self._asked):
                 self._together.report_torque_off(index, limp, pulling)
                 self._ask(index, "off", pulling, lambda _: None)
 
-    def write(self) -> None:
+    def write_goals(self) -> None:
         """Convert the joints' goals into servo goals and send them."""
         self._arrays.fade(self._fade_share)
-        self._arrays.write()
-        self._hardware.write()
+        self._arrays.fill_servo_goals()
+        self._hardware.write_goals()
 
     def set_modes(self, modes: NDArray[np.uint8]) -> None:
         """Change the operating mode of joints; `modes` has one per joint, UNKNOWN for no change."""
         self._hardware.set_modes(self._arrays.joint_requests(modes))
 
-    def set_register(self, row: int, item: str, value: int, done: RegisterDone) -> None:
+    def write_register(self, row: int, item: str, value: int, done: RegisterDone) -> None:
         """Write an item of all servos of a joint; `done` gets the problem and the first servo's old value.
 
         A row after those of the joints is that of a single servo, here and in `read_register`.
         """
-        self._registers(row, lambda servo, each: self._hardware.set_register(servo, item, value, each), done)
+        self._registers(
+            row, lambda servo, each: self._hardware.write_register(servo, item, value, each), done
+        )
 
     def read_register(self, row: int, item: str, done: RegisterDone) -> None:
         """Read an item of all servos of a joint; `done` gets a problem, also if they differ, and a value."""
@@ -291,12 +293,12 @@ class JointHardware(HardwareLayer):
                 self._arrays.anchor(index)
         self._hardware.follow_goals([servo for row in rows for servo in self._plan.servo_rows(row)])
 
-    def reboot(self, row: int, done: Done) -> None:
+    def reboot_servo(self, row: int, done: Done) -> None:
         """Reboot all servos of a joint; `done` gets the problem, empty on success."""
         index = self._coupling(row)
         servos = self._plan.servo_rows(row)
         if index is None:
-            self._hardware.reboot(servos[0], done)
+            self._hardware.reboot_servo(servos[0], done)
         else:
             self._ask(index, "reboot", servos, done)
 
@@ -311,11 +313,11 @@ class JointHardware(HardwareLayer):
         if waiting is not None:  # for another joint of the same transmission
             waiting.answers.append(done)
             return
-        self._asked[index, what] = _Together(len(servos), [done])
+        self._asked[index, what] = _CouplingRequest(len(servos), [done])
         for servo in servos:
             answer = partial(self._answered, index, what)
             if what == "reboot":
-                self._hardware.reboot(servo, answer)
+                self._hardware.reboot_servo(servo, answer)
             else:
                 self._hardware.switch_torque(servo, what == "on", answer)
 

@@ -3,10 +3,10 @@
 from __future__ import annotations
 
 from dxlrun.channels.cycle import Commands, States
-from dxlrun.channels.events import EventSink
+from dxlrun.channels.event_records import EventSink
 from dxlrun.dynamixel.hardware_layer import LayerStage, PreparedLayer
-from dxlrun.features.mechanics.joint_arrays import JointArrays
-from dxlrun.features.mechanics.joint_hardware import JointHardware, ServosTogether
+from dxlrun.features.mechanics.joint_arrays import CoupledJointArrays
+from dxlrun.features.mechanics.joint_hardware import CouplingCheck, JointHardware
 from dxlrun.plan.robot_plan import Plan
 
 
@@ -14,8 +14,8 @@ def prepare_mechanics(plan: Plan, states: States, goals: Commands, events: Event
     """Return the layer that converts joints to servos; None if each joint has a servo of its own."""
     if not plan.mechanics.coupled:
         return None
-    arrays = JointArrays(plan.mechanics, states, goals)
-    together = ServosTogether(plan.mechanics, plan.loop, plan.buses, arrays, events)
+    arrays = CoupledJointArrays(plan.mechanics, states, goals)
+    together = CouplingCheck(plan.mechanics, plan.loop, plan.buses, arrays, events)
     return PreparedLayer(
         arrays.servo_states,
         arrays.servo_goals,

@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Iterator
 
 from dxlrun.compile.joints.described_servos import DescribedServo, ServoStage
-from dxlrun.description.joints.joints import servo_values
+from dxlrun.description.joints.joint_forms import servo_values
 from dxlrun.description.reading import Description
 from dxlrun.features.mechanics import form
 from dxlwire.joint_unit import ROTARY
@@ -14,7 +14,7 @@ from dxlwire.joint_unit import ROTARY
 def describe_servos(description: Description) -> Iterator[DescribedServo]:
     """Yield the servos of all transmissions in a robot file, in file order."""
     robot = description.robot
-    for name, transmission in form.STAGE.of(robot).items():
+    for name, transmission in form.STAGE.section_of(robot).items():
         moved = [robot.joints[joint] for joint in transmission.joints if joint in robot.joints]
         for key, servo in transmission.servos.items():
             place = ("transmissions", name, "servos", key)

@@ -13,7 +13,7 @@ _LEAST_BYTES, _LEAST_NS = 1_000_000, 1_000_000_000
 def compile_recording(compilation: Compilation) -> Contribution:
     """Return the log settings for the plan; add an error for tiny parts, or `keep` without `split`."""
     file, marks = compilation.file, compilation.file.marks
-    written = form.STAGE.of(file.robot)
+    written = form.STAGE.section_of(file.robot)
     amount = {} if written.split is None else dict([written.split])
     if amount.get("bytes", _LEAST_BYTES) < _LEAST_BYTES or amount.get("ns", _LEAST_NS) < _LEAST_NS:
         file.error(

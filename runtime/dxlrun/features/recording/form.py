@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dxlrun.description.form import Form, key
+from dxlrun.description.base_form import Form, key
 from dxlrun.description.units import SizeOrDuration
 from dxlrun.features.feature import Section
 

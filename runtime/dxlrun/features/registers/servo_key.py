@@ -7,13 +7,13 @@ from typing import Annotated
 
 from pydantic import BeforeValidator, WithJsonSchema
 
-from dxlrun.description.form import ItemName, key, refuse
+from dxlrun.description.base_form import ItemName, key, validation_error
 from dxlrun.features.feature import ServoKey
 
 
 def _register(value: object) -> object:
     if isinstance(value, bool) or not isinstance(value, int | str):
-        raise refuse(
+        raise validation_error(
             "this is not a value of a register", "write the raw integer, or a quantity with its unit: 500 us"
         )
     return value

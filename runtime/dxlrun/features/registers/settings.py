@@ -8,9 +8,9 @@ from __future__ import annotations
 from collections.abc import Iterator, Mapping
 from types import MappingProxyType
 
+from dxlrun.compile.joints.compiled_servos import SettingsStage
 from dxlrun.compile.joints.described_servos import DescribedServo, described_servos
 from dxlrun.compile.joints.register_values import UnfitRegister, any_value
-from dxlrun.compile.joints.servos import SettingsStage
 from dxlrun.compile.problems import RobotFile
 from dxlrun.description.reading import Description
 from dxlrun.errors import Mark, suggestion
@@ -72,7 +72,7 @@ def compile_registers(
     """
     found: list[RegisterValue] = []
     name = servo.title
-    for register, value in servo_key.STAGE.of(servo).items():
+    for register, value in servo_key.STAGE.value_of(servo).items():
         mark = servo.mark(file.marks, "registers", register)
         try:
             found.append(register_value(table, register, value))
@@ -195,7 +195,7 @@ def own_reason(table: ControlTable, item: ControlItem) -> tuple[str, str] | None
 def _check_meaning(item: ControlItem, raw: int) -> None:
     """Refuse a value that the servo would accept, but with which dxlrun would refuse every start."""
     rule, factory = item.deviation, item.initial
-    if rule is None or rule.planned or factory is None or rule.judge(raw, factory) != "refuse":
+    if rule is None or rule.planned or factory is None or rule.judge_value(raw, factory) != "refuse":
         return
     raise UnfitRegister(
         f"{item.title} cannot be {raw}, which {rule.effect_of(raw)}", f"write {factory}, or remove it"

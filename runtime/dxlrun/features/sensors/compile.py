@@ -10,7 +10,7 @@ from dxlrun.compile.controller_entry import PlugInCode, where_to_get
 from dxlrun.compile.controllers import report_entry
 from dxlrun.compile.problems import RobotFile
 from dxlrun.control.controllers.offers import DriverOffer
-from dxlrun.control.controllers.plugins import PlugIns
+from dxlrun.control.controllers.plugin_loading import PlugIns
 from dxlrun.description.bus import SIMULATED
 from dxlrun.errors import Mark, suggestion
 from dxlrun.features.sensors import form
@@ -28,7 +28,7 @@ def compile_sensors(compilation: Compilation) -> Contribution:
     """Return plans and sources of the sensors; those with a wrong type or parameters are missing."""
     file, body = compilation.file, compilation.body
     links = None if body is None else body.urdf.links
-    described = form.STAGE.of(file.robot)
+    described = form.STAGE.section_of(file.robot)
     found = (_compiled(file, name, entry, compilation.plugins, links) for name, entry in described.items())
     sensors = tuple(each for each in found if each is not None)
     return Contribution(

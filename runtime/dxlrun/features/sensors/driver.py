@@ -10,7 +10,7 @@ from typing import ClassVar, Generic, TypeVar
 import msgspec
 
 from dxlrun.channels.slot import Floats
-from dxlrun.description.form import ParametersModel
+from dxlrun.description.base_form import ParametersModel
 from dxlsim.motion.link_motion import Body
 
 P = TypeVar("P", bound=ParametersModel)

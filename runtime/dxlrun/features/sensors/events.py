@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from enum import IntEnum
 
-from dxlrun.channels.events import EventStage
+from dxlrun.channels.event_records import EventStage
 
 
 class SensorEvent(IntEnum):

@@ -7,7 +7,7 @@ from typing import Annotated, Literal
 from pydantic import Field
 
 from dxlrun.description import units
-from dxlrun.description.form import Name, PlugInEntry, key
+from dxlrun.description.base_form import Name, PlugInEntry, key
 from dxlrun.description.units import Duration
 from dxlrun.features.feature import Section
 

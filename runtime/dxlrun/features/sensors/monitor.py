@@ -6,7 +6,7 @@ from dataclasses import dataclass
 from typing import Self
 
 from dxlrun.channels.cycle import CycleRecord
-from dxlrun.control.monitors.monitor import MonitorStage
+from dxlrun.control.monitors.monitor_stage import MonitorStage
 from dxlrun.control.monitors.policy_actions import PolicyActions
 from dxlrun.features.sensors.plan import SensorPlan, decode_sensors
 from dxlrun.plan.loop_plan import LoopPlan
@@ -31,7 +31,7 @@ class NeededSensors:
         )
         return cls(needed, record, actions) if needed else None
 
-    def check(self, time_ns: int) -> None:
+    def check_cycle(self, time_ns: int) -> None:
         """End the run if a sensor's newest sample (without one: the run) is older than its timeout."""
         ages_ns = self.record.sources.age_ns
         for row, sensor in self.needed:

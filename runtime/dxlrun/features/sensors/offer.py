@@ -6,7 +6,7 @@ from collections.abc import Collection, Mapping
 from typing import cast
 
 from dxlrun.control.controllers.offers import Breach, OfferStage, is_model, methods_breach
-from dxlrun.description.form import ParametersModel
+from dxlrun.description.base_form import ParametersModel
 from dxlrun.features.sensors.driver import Sensor
 from dxlrun.features.sensors.form import SensorEntry
 

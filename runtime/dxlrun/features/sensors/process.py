@@ -7,8 +7,8 @@ from typing import Any
 
 import msgspec
 
-from dxlrun.control.controllers.plugins import PlugIns
-from dxlrun.control.source_process import ProcessStage, SampledSource, SourceContext, SourceProcess
+from dxlrun.control.controllers.plugin_loading import PlugIns
+from dxlrun.control.sampled_sources import ProcessStage, SampledSource, SourceContext, SourceProcess
 from dxlrun.errors import PlugInError
 from dxlrun.features.sensors.driver import Sensor, SensorContext
 from dxlrun.features.sensors.plan import SensorPlan, decode_sensors

@@ -7,9 +7,9 @@ import math
 import numpy as np
 
 from dxlrun.channels.cycle import CycleRecord
-from dxlrun.channels.events import EventSink
+from dxlrun.channels.event_records import EventSink
 from dxlrun.channels.slot import Floats, SlotReader, SlotState
-from dxlrun.control.source_process import ReaderContext, ReaderStage
+from dxlrun.control.sampled_sources import ReaderContext, ReaderStage
 from dxlrun.features.sensors import texts
 from dxlrun.features.sensors.plan import SensorPlan, decode_sensors
 
@@ -43,21 +43,21 @@ class Readings:
     def __init__(self, context: ReaderContext) -> None:
         self._now_ns = context.now_ns
         self._rows = tuple(
-            _Row(sensor, SlotReader(memory), context.record, context.events)
+            _SensorRow(sensor, SlotReader(memory), context.record, context.events)
             for sensor, memory in zip(decode_sensors(context.plan), context.slots, strict=True)
         )
 
-    def read(self) -> None:
+    def read_sources(self) -> None:
         """Copy each sensor's newest sample, age and validity into the cycle's record; never blocks."""
         now_ns = self._now_ns()
         for row in self._rows:
-            row.read(now_ns)
+            row.read_sample(now_ns)
 
 
 STAGE = ReaderStage(Readings)
 
 
-class _Row:
+class _SensorRow:
     def __init__(self, plan: SensorPlan, reader: SlotReader, record: CycleRecord, events: EventSink) -> None:
         if reader.values != len(plan.states):
             raise ValueError(f"the slot of sensor {plan.name} has {reader.values} values, not {plan.states}")
@@ -81,13 +81,13 @@ class _Row:
         self._finite = True
         self._lost = False
 
-    def read(self, now_ns: int) -> None:
+    def read_sample(self, now_ns: int) -> None:
         reader = self._reader
-        t_ns = reader.read()
+        t_ns = reader.read_sample()
         if t_ns is not None:
             self._finite = bool(np.isfinite(reader.sample, out=self._are_finite).all())
             if self._finite:
-                self._take(reader.sample, min(t_ns, now_ns))
+                self._store_sample(reader.sample, min(t_ns, now_ns))
         if self._begun_ns < 0:
             self._begun_ns = now_ns
         known = self._t_ns >= 0
@@ -96,18 +96,18 @@ class _Row:
         self._age_ns[self._place] = age_ns
         lost = silent or not self._finite or reader.state in _GONE
         self._valid[self._place] = known and not lost
-        if (reader.state in _GONE or now_ns >= self._quiet_ns) and (text := reader.hear()):
+        if (reader.state in _GONE or now_ns >= self._quiet_ns) and (text := reader.read_text()):
             self._quiet_ns = now_ns + QUIET_NS
             self._say(text)
         if lost != self._lost:
             self._lost = lost
-            self._report(silent, age_ns)
+            self._report_state(silent, age_ns)
 
     @property
     def _stuck(self) -> bool:
         return self._equal >= MOST_EQUAL and self._t_ns == self._since_ns
 
-    def _take(self, sample: Floats, t_ns: int) -> None:
+    def _store_sample(self, sample: Floats, t_ns: int) -> None:
         """Store a sample with its time; if the sensor is stuck, the time of its last change is stored."""
         noisy = self._noisy
         if noisy.size and np.array_equal(sample[noisy], self._values[noisy]):
@@ -126,12 +126,12 @@ class _Row:
 
     def _say(self, text: str) -> None:
         row = texts.sensor_failed if self._reader.state in _GONE else texts.sensor_says
-        self._events.emit(self._plan.name, row(self._plan.name, text))
+        self._events.emit_event(self._plan.name, row(self._plan.name, text))
 
-    def _report(self, silent: bool, age_ns: int) -> None:
+    def _report_state(self, silent: bool, age_ns: int) -> None:
         name = self._plan.name
         if not self._lost:
-            self._events.emit(name, texts.sensor_back(name))
+            self._events.emit_event(name, texts.sensor_back(name))
             return
         if not self._finite:
             values = zip(self._plan.states, self._reader.sample.tolist(), strict=True)
@@ -143,4 +143,4 @@ class _Row:
             event = texts.sensor_silent(name, age_ns) if age_ns >= 0 else texts.sensor_never_answered(name)
         else:
             event = texts.sensor_gone(name)
-        self._events.emit(name, event)
+        self._events.emit_event(name, event)

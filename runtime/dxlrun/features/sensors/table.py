@@ -4,10 +4,10 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterator, Sequence
 
-from dxlrun.compile.report import Row, TableStage
+from dxlrun.compile.check_report import Row, TableStage
 from dxlrun.features.sensors.plan import SensorPlan, decode_sensors
 from dxlrun.output.quantity import names_with_units
-from dxlrun.output.table import Column, Table, Value
+from dxlrun.output.text_table import Column, Table, Value
 from dxlrun.plan.robot_plan import Plan
 
 

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dxlrun.channels.events import Severity, event_text
+from dxlrun.channels.event_records import Severity, event_text
 from dxlrun.features.sensors.events import SensorEvent
 
 

@@ -7,11 +7,11 @@ from collections.abc import Sequence
 import numpy as np
 from numpy.typing import NDArray
 
-from dxlrun.channels.packets import BatchedPacket
+from dxlrun.channels.logged_packets import BatchedPacket
 from dxlrun.log.columns import PacketColumns
 from dxlrun.log.schemas import BUS_PACKETS
 from dxlrun.messages.cdr import Codec
-from dxlrun.messages.cdr_columns import Column, ColumnReader
+from dxlrun.messages.cdr_columns import ColumnReader, FieldColumn
 from dxlwire.packets import PacketKind
 
 _CODEC, _READER = Codec(BUS_PACKETS), ColumnReader(BUS_PACKETS)
@@ -45,13 +45,13 @@ def read_packets(
         size: Length of each message, bytes.
     """
     try:
-        whole, tree = _READER.read(data, start, size)
+        whole, tree = _READER.read_columns(data, start, size)
     # None of them is a valid message.
     except ValueError:
-        return PacketColumns.of(()), len(start)
+        return PacketColumns.from_packets(()), len(start)
     good = _consistent(tree)
     if not good.all():
-        whole, tree = whole[good], tree.take(np.flatnonzero(good))
+        whole, tree = whole[good], tree.select_rows(np.flatnonzero(good))
     cycle, first, took_ns, kind, servo_id, length, bodies = (tree.leaf(name).flat[1] for name in _FIELDS)
     count, size = tree.leaf("kind").flat[0], length.astype(np.int64)
     first_ns = _summed_up(count, first)
@@ -69,7 +69,7 @@ def read_packets(
     return packets, len(start) - len(whole)
 
 
-def _consistent(tree: Column) -> NDArray[np.bool_]:
+def _consistent(tree: FieldColumn) -> NDArray[np.bool_]:
     """Return which messages are consistent: equal field lengths, known packet kinds, enough bytes."""
     *counts, bytes_each = (tree.leaf(name).flat[0] for name in _FIELDS)
     good = np.all([one == counts[0] for one in counts], axis=0)

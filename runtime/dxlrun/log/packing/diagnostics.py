@@ -26,7 +26,7 @@ class Diagnostics:
         self._codec = Codec(DIAGNOSTICS)
         self._due_ns: int | None = None
 
-    def of(self, record: np.void, t_ns: int, stamp: tuple[int, int]) -> bytes | None:
+    def pack_diagnostics(self, record: np.void, t_ns: int, stamp: tuple[int, int]) -> bytes | None:
         """Return the encoded message of a cycle; None if the last one is younger than DIAGNOSTICS_NS.
 
         `stamp` has seconds since 1970 and the remaining nanoseconds.

@@ -26,7 +26,7 @@ class FrameMessages:
     """
 
     def __init__(self, urdf: str, plan: FramesPlan, header: LogHeader) -> None:
-        self._tree = FrameTree.of(urdf, plan)
+        self._tree = FrameTree.from_urdf(urdf, plan)
         self._rows = {name: row for row, name in enumerate(header.joints) if name in plan.moved}
         self._turns = {
             name: at
@@ -49,7 +49,7 @@ class FrameMessages:
         found = [(frame, self._tree.local(frame, {})) for frame in self._still]
         return _packed(stamp, [(frame, local) for frame, local in found if local is not None])
 
-    def of(self, record: np.void, stamp: Stamp) -> bytes | None:
+    def pack_frames(self, record: np.void, stamp: Stamp) -> bytes | None:
         """Return the encoded message of /tf for a cycle; None if none is due or no pose is known."""
         slot = int(record["scheduled_ns"]) // self._interval_ns
         if slot == self._slot:

@@ -8,7 +8,7 @@ import numpy as np
 import pyarrow as pa
 from numpy.typing import NDArray
 
-from dxlrun.messages.cdr_columns import Column, ColumnReader
+from dxlrun.messages.cdr_columns import ColumnReader, FieldColumn
 from dxlrun.messages.definition import (
     PRIMITIVES,
     Definitions,
@@ -28,7 +28,7 @@ def schema_of(reader: ColumnReader, fields: Sequence[str] | None) -> pa.Schema:
     return pa.schema([("t_ns", pa.int64()), *chosen])
 
 
-def batch_of(schema: pa.Schema, t_ns: NDArray[np.int64], tree: Column) -> pa.RecordBatch:
+def batch_of(schema: pa.Schema, t_ns: NDArray[np.int64], tree: FieldColumn) -> pa.RecordBatch:
     """Convert decoded messages and their times to an Arrow record batch."""
     columns = [_array(tree.leaf(name), schema.field(name).type) for name in schema.names[1:]]
     return pa.record_batch([pa.array(t_ns), *columns], schema=schema)
@@ -64,7 +64,7 @@ def _type_at(definitions: Definitions, message: str, place: str) -> pa.DataType:
     return pa.list_(inside) if one.sequence or one.length else inside
 
 
-def _array(column: Column, kind: pa.DataType) -> pa.Array:
+def _array(column: FieldColumn, kind: pa.DataType) -> pa.Array:
     if column.values is not None:
         return pa.array(column.values, type=kind)
     if column.counts is not None and column.elements is not None:

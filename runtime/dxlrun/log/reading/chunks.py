@@ -153,7 +153,7 @@ class McapFile:
     _room: int = 0
     """Bytes that may still be decompressed before the file counts as malicious."""
 
-    def begin(self, number: int) -> None:
+    def begin_file(self, number: int) -> None:
         """Reset for the next file of the same log, which is the `number`-th and has its own channels."""
         self._base, self.end, self.finished = number << 16, len(MAGIC), False
         self._anchor = self.end

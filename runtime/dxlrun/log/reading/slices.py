@@ -14,13 +14,13 @@ from numpy.typing import NDArray
 
 from dxlrun.channels.commands import TakenCommand, data_of
 from dxlrun.channels.cycle import CycleLayout
-from dxlrun.channels.events import Event
+from dxlrun.channels.event_records import Event
 from dxlrun.errors import LogError, counted, suggestion
 from dxlrun.log import schemas
 from dxlrun.log.columns import PacketColumns
 from dxlrun.log.packing.bus_messages import read_packets
 from dxlrun.log.reading.chunks import Messages
-from dxlrun.log.reading.topics import LoggedTopic
+from dxlrun.log.reading.logged_topics import LoggedTopic
 from dxlrun.log.reading.walk import LogWalk
 from dxlrun.log.schemas import CycleSpan, LoggedController, LogHeader
 from dxlrun.messages.cdr import ENCAPSULATION, Codec, Value
@@ -53,7 +53,7 @@ _MOST_HELD = 4096
 """Most cycles that wait for their packets, or packets for their cycles: recorders took up to 2000 records of
 one ring in turn."""
 _MOST_PACKETS_HELD = 1 << 18
-_NO_PACKETS = PacketColumns.of(())
+_NO_PACKETS = PacketColumns.from_packets(())
 
 
 @dataclass(frozen=True)
@@ -77,7 +77,7 @@ class Log:
     """A sentence for each missing or unreadable piece of the log."""
     being_written: bool = False
     """True if a run was still writing the file when it was read."""
-    packets: PacketColumns = field(default_factory=lambda: PacketColumns.of(()))
+    packets: PacketColumns = field(default_factory=lambda: PacketColumns.from_packets(()))
     """All packets, grouped by bus, each bus in the order of recording."""
     activation: NDArray[np.void] | None = None
     """States and goals when the controllers were activated, shape (1,), as `cycles`; None if the log lacks
@@ -150,7 +150,7 @@ class Slicer:
         self.wrong = 0
         """Number of damaged packet messages that were skipped."""
 
-    def take(self, messages: Messages) -> Log:
+    def add_messages(self, messages: Messages) -> Log:
         """Decode more messages; return all cycles that are complete now, with packets, events and topics.
 
         Raises ValueError for messages that cannot be decoded.
@@ -188,7 +188,7 @@ class Slicer:
         cycles = _cycles(self._layout, messages.data, messages.start[cycle_rows], messages.size[cycle_rows])
         for record in (activation, cycles[:1], cycles[-1:]):
             if record is not None and len(record):
-                self._span.add(record[0], self._header.period_ns)
+                self._span.extend_span(record[0], self._header.period_ns)
         cycles = joined_cycles([self._cycles, cycles])
         return replace(
             self._slice(cycles, packets, last=not self._with_packets),
@@ -198,7 +198,7 @@ class Slicer:
             topics=topics,
         )
 
-    def rest(self) -> Log:
+    def remaining_slice(self) -> Log:
         """Return the cycles and packets that were still waiting after the last message."""
         return self._slice(self._cycles, _NO_PACKETS, last=True)
 
@@ -242,11 +242,11 @@ class Slicer:
         found = [part for part in (self._packets, packets) if len(part)]
         joined = PacketColumns.joined(found)
         if len(found) > 1:
-            joined = joined.take(np.argsort(joined.bus, kind="stable"))
+            joined = joined.select_rows(np.argsort(joined.bus, kind="stable"))
         bound = _FOREVER if last else self._bound(cycles, joined)
         whole, ready = cycles["cycle"] < bound, joined.cycle < bound
-        self._cycles, self._packets = _chosen(cycles, ~whole), joined.take(~ready).compact()
-        return self._log(_chosen(cycles, whole), joined if ready.all() else joined.take(ready))
+        self._cycles, self._packets = _chosen(cycles, ~whole), joined.select_rows(~ready).compact()
+        return self._log(_chosen(cycles, whole), joined if ready.all() else joined.select_rows(ready))
 
     def _bound(self, cycles: NDArray[np.void], packets: PacketColumns) -> int:
         """Return the number of the first cycle that may still get packets; all below it are complete."""
@@ -321,7 +321,7 @@ def joined(about: Log, slices: Sequence[Log]) -> Log:
     """Join slices into one log; `about` supplies header, metadata and damage."""
     packets = PacketColumns.joined([part.packets.compact() for part in slices if len(part.packets)])
     if len(about.buses) > 1:
-        packets = packets.take(np.argsort(packets.bus, kind="stable"))
+        packets = packets.select_rows(np.argsort(packets.bus, kind="stable"))
     topics: dict[str, list[LoggedTopic]] = {name: [topic] for name, topic in about.topics.items()}
     for part in slices:
         for name, topic in part.topics.items():

@@ -9,7 +9,7 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import IO
 
-from dxlrun.description.mistakes.foreign import LONGEST_MAGIC, kind_of_bytes
+from dxlrun.description.mistakes.foreign_files import LONGEST_MAGIC, kind_of_bytes
 from dxlrun.errors import LogError
 from dxlrun.log.log_file import has_writer
 from dxlrun.log.parts import log_files, missing_parts
@@ -61,7 +61,7 @@ class LogWalk:
                 if number and not found.finished and refused is None:
                     found.damage.append(self.no_end)
                 self._part += 1
-                found.begin(self._part)
+                found.begin_file(self._part)
             self._file, found.name = file, "" if file == self.path else file.name
             try:
                 with _opened(file) as (stream, size):

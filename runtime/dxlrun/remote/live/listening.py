@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING
 import msgspec
 
 from dxlrun.errors import DxlrunError
-from dxlrun.remote.requests.replies import FRAME_LENGTH, Frame, Opened, Sample
+from dxlrun.remote.requests.replies import FRAME_LENGTH, Frame, StreamMessage, StreamTopic
 from dxlrun.remote.sockets import TIMEOUT_S, RobotLink
 
 if TYPE_CHECKING:
@@ -61,7 +61,7 @@ def _codec(kind: str, definition: str) -> Codec:
     return Codec(MessageType(kind, definition))
 
 
-class Listening:
+class MessageIterator:
     """Iterator over messages, from the newest one until the end of the run; then the connection is closed.
 
     `for` and `async for` both work. A stream of `newest` messages skips older messages when this client is
@@ -73,12 +73,12 @@ class Listening:
         self._name, self._link, self._end, self._newest = name, link, end, newest
         end.setblocking(False)
         self._bytes = bytearray(first)
-        self._topics: dict[int, Opened] = {}
+        self._topics: dict[int, StreamTopic] = {}
         self._last: dict[int, int] = {}
         """Topic's number in the stream -> sequence number of its newest received message."""
         self._ended = False
 
-    def __enter__(self) -> Listening:
+    def __enter__(self) -> MessageIterator:
         return self
 
     def __exit__(self, *_: object) -> None:
@@ -161,7 +161,7 @@ class Listening:
         self._bytes += more
         return more
 
-    def _samples(self) -> list[Sample]:
+    def _samples(self) -> list[StreamMessage]:
         """Remove and return the complete messages in the buffer; note new topics and the end of the run."""
         found, at = [], 0
         while len(self._bytes) - at >= FRAME_LENGTH.size:
@@ -171,9 +171,9 @@ class Listening:
                 break
             if end > begin:
                 frame = _decode(self._bytes[begin:end])
-                if isinstance(frame, Opened):
+                if isinstance(frame, StreamTopic):
                     self._topics[frame.place] = frame
-                elif isinstance(frame, Sample):
+                elif isinstance(frame, StreamMessage):
                     found.append(frame)
                 else:
                     self._ended = True

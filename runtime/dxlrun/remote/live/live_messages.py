@@ -7,7 +7,7 @@ from collections.abc import Callable, Collection
 import msgspec
 import numpy as np
 
-from dxlrun.channels.events import Event, EventCode
+from dxlrun.channels.event_records import Event, EventCode
 from dxlrun.log import schemas
 from dxlrun.log.run_messages import RunMessages
 from dxlrun.log.schemas import LogHeader
@@ -42,7 +42,7 @@ class LiveMessages(RunMessages):
         record: np.void = np.frombuffer(message.data[len(ENCAPSULATION) :], dtype=self._layout.dtype)[0]
         return record
 
-    def take(self, message: TopicMessage) -> None:
+    def handle_message(self, message: TopicMessage) -> None:
         """Convert a message of one of the topics that `heard` returns, and add it to the output."""
         if message.topic == schemas.LogTopic.CYCLE:
             self.cycle(message.data[len(ENCAPSULATION) :])

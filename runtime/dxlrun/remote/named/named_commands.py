@@ -23,7 +23,7 @@ from dxlrun.description.source_names import SOURCE_COMMANDS
 from dxlrun.errors import suggestion
 from dxlrun.plan.loop_plan import ControllerPlan, JointPlan, SourcePlan
 from dxlrun.remote import texts
-from dxlrun.remote.preparation import Known, invalid, plain_quantities, refused, travel_s
+from dxlrun.remote.preparation import ResolvedController, invalid, plain_quantities, refused, travel_s
 
 POINT_SPEED = 0.5
 """Speed of a move of named joints without a duration, rad/s or m/s; slower joints use their highest speed."""
@@ -43,7 +43,7 @@ class JointCommand:
 
 
 def joint_command(
-    known: Known,
+    known: ResolvedController,
     kind: str,
     body: bytes,
     record: CycleRecord,
@@ -112,7 +112,7 @@ def joint_command(
 
 
 def _numbers(
-    known: Known, kind: str, field: str, named: Mapping[str, object], units: bool
+    known: ResolvedController, kind: str, field: str, named: Mapping[str, object], units: bool
 ) -> dict[str, float]:
     """Return the values by joint in SI units; raises RefusedRequest for one that is not a finite number."""
     si = plain_quantities(named, field, known.joints) if units else named
@@ -123,7 +123,7 @@ def _numbers(
     return {joint: float(value) for joint, value in si.items() if isinstance(value, int | float)}
 
 
-def _command_for(known: Known, interface: str) -> tuple[str, tuple[str, ...] | None]:
+def _command_for(known: ResolvedController, interface: str) -> tuple[str, tuple[str, ...] | None]:
     """Return a controller's command for an interface, and the command's fields; None as fields for a
     trajectory.
 

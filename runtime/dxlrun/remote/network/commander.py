@@ -8,7 +8,7 @@ from typing import NamedTuple
 
 from dxlrun.channels.answers import Code
 from dxlrun.remote.preparation import refused
-from dxlrun.remote.requests.table import HALT, STOP, TAKE_OVER, Answer, Body, Request, Role
+from dxlrun.remote.requests.request_table import HALT, STOP, TAKE_OVER, Answer, Body, Request, Role
 
 LEASE_S = 5.0
 """Time, s, without a command after which a client is no longer the commander and another client may command.

@@ -56,7 +56,7 @@ class Listener(socket.socket):
         """
         return cls(address.host, address.port, server_context(address.name))
 
-    async def serve(self, make: Callable[[], asyncio.Protocol]) -> None:
+    async def serve_connections(self, make: Callable[[], asyncio.Protocol]) -> None:
         """Start to serve connections; `make` returns a protocol for each one after its TLS handshake."""
         await asyncio.get_running_loop().create_server(
             make, sock=self, ssl=self.tls, ssl_handshake_timeout=HANDSHAKE_S, ssl_shutdown_timeout=HANDSHAKE_S
@@ -90,7 +90,7 @@ def in_url(host: str) -> str:
     return f"[{host}]" if ":" in host else host
 
 
-class Place(NamedTuple):
+class ListenAddress(NamedTuple):
     """Host and port at which a server listens, as given with `--listen`."""
 
     host: str = LOOPBACK
@@ -98,7 +98,7 @@ class Place(NamedTuple):
     """None: the server's usual port, or a free port when the usual one is in use."""
 
     @classmethod
-    def parse(cls, text: str) -> Place:
+    def parse(cls, text: str) -> ListenAddress:
         """Parse `HOST:PORT`, `HOST` or `:PORT`; the default host is LOOPBACK. Raises InputError."""
         found = re.fullmatch(
             r"(\[[^\]]+\]|[^:]*)(?::(\d{1,5}))?|([\da-fA-F]*:[\da-fA-F:]*:[\da-fA-F.]*)", text
@@ -126,6 +126,6 @@ class Place(NamedTuple):
             return Listener(self.host, port, tls)
         except OSError as error:
             if self.port is None and error.errno == errno.EADDRINUSE:
-                return Place(self.host, 0).listener(usual, tls)
+                return ListenAddress(self.host, 0).listener(usual, tls)
             why = f"{in_url(self.host)}:{port} cannot be listened on: {error.strerror or error}"
             raise InputError(f"{why}; give another --listen HOST:PORT") from error

@@ -15,9 +15,9 @@ import msgspec
 import numpy as np
 
 from dxlrun.remote.live.states import RobotStates
-from dxlrun.remote.requests import table as requests
+from dxlrun.remote.requests import request_table as requests
 from dxlrun.remote.requests.replies import NotDone
-from dxlrun.remote.requests.table import REQUESTS, Request, Role
+from dxlrun.remote.requests.request_table import REQUESTS, Request, Role
 
 _JSON = "application/json"
 _TLS = "certificate"

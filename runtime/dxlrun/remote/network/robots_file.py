@@ -7,7 +7,7 @@ from typing import Annotated
 
 from pydantic import AfterValidator
 
-from dxlrun.description.form import Form, key, refuse
+from dxlrun.description.base_form import Form, key, validation_error
 from dxlrun.description.yaml_file import read_yaml
 from dxlrun.errors import InputError
 from dxlrun.remote.sockets import Address
@@ -18,7 +18,7 @@ def _address(text: str) -> str:
         Address.parse(text, "robot")
     except InputError as error:
         what, _, fix = str(error).partition("; ")
-        raise refuse(what, fix) from error
+        raise validation_error(what, fix) from error
     return text
 
 

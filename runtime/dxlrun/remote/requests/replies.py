@@ -206,7 +206,7 @@ class GoalState(msgspec.Struct, frozen=True):
         """True when the goal has ended with the result `reached`."""
         return self.status == "reached"
 
-    def describe(self) -> str:
+    def describe_outcome(self) -> str:
         """Return the result as a text: `goal 3 of left_arm reached after 1.02 s`."""
         # The controller's text already has the duration.
         timed = self.seconds is None or self.text.startswith("after ")
@@ -243,7 +243,7 @@ class Topics(msgspec.Struct, frozen=True):
     topics: tuple[TopicState, ...]
 
 
-class Opened(msgspec.Struct, frozen=True, array_like=True, tag_field="frame", tag=0):
+class StreamTopic(msgspec.Struct, frozen=True, array_like=True, tag_field="frame", tag=0):
     """Description of a topic in a stream, sent before its first message and when its publisher changes."""
 
     place: int
@@ -257,7 +257,7 @@ class Opened(msgspec.Struct, frozen=True, array_like=True, tag_field="frame", ta
     """Wall time minus the run's clock, ns."""
 
 
-class Sample(msgspec.Struct, frozen=True, array_like=True, tag_field="frame", tag=1):
+class StreamMessage(msgspec.Struct, frozen=True, array_like=True, tag_field="frame", tag=1):
     """One message of a topic in a stream."""
 
     place: int
@@ -273,7 +273,7 @@ class RunEnded(msgspec.Struct, frozen=True, array_like=True, tag_field="frame", 
     """End of a stream, sent when the run has ended normally."""
 
 
-Frame = Opened | Sample | RunEnded
+Frame = StreamTopic | StreamMessage | RunEnded
 """Payload of a stream: MessagePack, each frame preceded by its length (uint32, little-endian). Length 0 is
 a sign of life without content."""
 FRAME_LENGTH = struct.Struct("<I")

@@ -58,7 +58,7 @@ def second_servo_with_an_id(story: Story) -> None:
 
     def plug_in() -> None:
         servo = story.servo("left_elbow")
-        twin = ServoConfig(servo.servo_id, servo.registers.table.model, servo.position + 0.9, 100_000)
+        twin = ServoConfig(servo.servo_id, servo.registers.table.model, servo.shaft_angle + 0.9, 100_000)
         story.bus("left_elbow").add_servo(twin)
         story.evidence["twin"] += 1
 

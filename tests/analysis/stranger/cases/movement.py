@@ -41,10 +41,10 @@ def own_supply_sags(story: Story) -> None:
 
     def sag(t_s: float) -> None:
         servo = story.servo("left_knee")
-        servo.advance(story.bus("left_knee").now_ns)
+        servo.advance_to(story.bus("left_knee").now_ns)
         servo.voltage = max(10.2, 12.0 - 7.0 * abs(servo.shaft.duty * servo.shaft.current))
         story.evidence["sagged"] += servo.voltage < 10.8
-        servo.protect()
+        servo.apply_protection()
 
     story.every(0.01, sag, "left_knee", since_s=1.0)
 
@@ -60,7 +60,7 @@ def gear_jumps_a_tooth(story: Story) -> None:
 
     def slip(t_s: float) -> None:
         servo = story.servo("right_elbow")
-        servo.shaft.mechanics.place(servo.shaft.index, servo.position + 0.35)
+        servo.shaft.mechanics.move_shaft(servo.shaft.index, servo.shaft_angle + 0.35)
         story.evidence["slip"] += 1
 
     story.every(0.6, slip, "right_elbow", since_s=2.3)

@@ -9,7 +9,7 @@ from tests.analysis.stranger.kit import JOINTS, Broken, Story
 from tests.analysis.stranger.proof import seen, spread
 from tests.analysis.stranger.world import imu_gives, noisy_imu
 
-from dxlrun.log.reader import Log
+from dxlrun.log.log_reader import Log
 
 CASES: list[Case] = []
 case = collector(CASES)

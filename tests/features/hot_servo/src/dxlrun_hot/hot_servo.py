@@ -75,7 +75,7 @@ class HotServos:
     def build(cls, plan: LoopPlan, record: CycleRecord, actions: PolicyActions) -> Self | None:
         return cls(plan, record, actions) if NAME in plan.feature_plans else None
 
-    def check(self, time_ns: int) -> None:
+    def check_cycle(self, time_ns: int) -> None:
         hot = frozenset(np.flatnonzero(self._states.temperature > self._above).tolist())
         if hot == self._hot:
             return

@@ -21,7 +21,7 @@ class Overheat:
     def build(cls, plan: LoopPlan, record: CycleRecord, actions: PolicyActions) -> Self | None:
         return None if plan.policies.named(NAME).goes_on else cls(record, actions)
 
-    def check(self, time_ns: int) -> None:
+    def check_cycle(self, time_ns: int) -> None:
         if (self._states.temperature > 72.0).any():
             self._actions.end_run(NAME, "a servo is above 72 degC")
 

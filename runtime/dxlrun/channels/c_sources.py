@@ -1,0 +1,25 @@
+"""C sources of all packages, and the check that they were compiled."""
+
+from __future__ import annotations
+
+import ctypes
+from pathlib import Path
+
+from dxlwire.compiled import load_compiled
+from dxlwire.exceptions import NotCompiled
+
+SOURCES = tuple(
+    Path(__file__).parents[2] / name
+    for name in ("dxlrun/channels/shared_memory.c", "dxlrun/control/gate.c", "dxlwire/exchange/kernel.c")
+)
+"""Paths of the C files that must be compiled when dxlrun is installed."""
+
+
+def missing() -> str:
+    """Return a sentence about the first compiled C object that cannot be used; empty if all can."""
+    try:
+        for source in SOURCES:
+            load_compiled(source, ctypes.PyDLL)
+    except NotCompiled as error:
+        return f"{error}"
+    return ""

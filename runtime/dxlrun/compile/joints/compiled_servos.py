@@ -1,0 +1,266 @@
+"""Servos: compiles each servo of the robot file: its control table, registers and motor."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Iterable, Mapping
+from functools import partial
+from typing import ClassVar, Protocol
+
+import msgspec
+
+from dxlrun.compile.joints.described_servos import AUTO, DescribedServo, described_servos, used_features
+from dxlrun.compile.joints.limits import Interval, degrees
+from dxlrun.compile.joints.motors import Motors, compile_motor
+from dxlrun.compile.problems import RobotFile
+from dxlrun.description.joints.servo_model import ServoModel
+from dxlrun.errors import Mark, suggestion
+from dxlrun.features import stages
+from dxlsim.motor_model import MotorModel
+from dxlwire.bus_plan import BusPlan, RegisterValue
+from dxlwire.control_table import ControlTable, find_table, perhaps_meant, protocols_of
+from dxlwire.plan.mode_plan import mode_plans
+
+_USUAL = {1.0: "AX-12A", 2.0: "XM430-W350"}  # assumed model if none is known, by protocol
+MANY_TURNS = {1.0: 7, 2.0: 256}
+"""Turns that a goal position can be away from raw 0, by protocol. Multi-turn Mode of MX (e-Manual MX-64,
+Goal Position (30): -28,672..28,672), Extended Position Control Mode (e-Manual XM430-W350, Goal Position
+(116): -1,048,575..1,048,575)."""
+_TEMPERATURE_LIMITS = ("motor_temperature_limit", "temperature_limit")
+"""Items with the temperature limit of the motor: Y series, and all other models. Y also has a limit for its
+inverter."""
+
+
+class CompiledServo(msgspec.Struct, frozen=True):
+    """A servo with its control table, the registers to write at start, and its motor model."""
+
+    described: DescribedServo
+    table: ControlTable
+    settings: tuple[RegisterValue, ...]  # settings of features, in the order of writing
+    motor: MotorModel | None
+    known_bus: bool
+    certain: bool  # False while its model is not read yet; its mistakes are not errors yet
+
+    @property
+    def declared(self) -> dict[str, int]:
+        """Integers that the robot file sets in the servo's registers, by item."""
+        return {setting.name: setting.value for setting in self.settings}
+
+    @property
+    def position_range(self) -> Interval:
+        """Range of the servo's goals, rad or m, at its joint or at the input of its transmission."""
+        described = self.described
+        if described.continuous:
+            reach = many_turns(self.table.protocol, described.reference, described.direction)
+        else:
+            reach = joint_reach(servo_travel(self.table), described.reference, described.direction)
+        return reach.scaled(described.ratio, described.unit)
+
+    @property
+    def top_speed(self) -> float:
+        """Highest speed of the servo after its gear, rad/s or m/s; 0: not known."""
+        return self.table.top_speed * self.described.ratio
+
+    @property
+    def top_effort(self) -> float | None:
+        """Highest effort goal of the servo after its gear; None if the servo accepts none."""
+        table, continuous = self.table, self.described.continuous
+        scales = [plan.effort for plan in mode_plans(table, table.min_tick, table.max_tick, continuous)]
+        most = max((scale.per_tick * scale.most for scale in scales if scale is not None), default=None)
+        return most if most is None or table.effort_unit != "Nm" else most / self.described.ratio
+
+    @property
+    def servo_model(self) -> ServoModel:
+        """Figures of the servo's model from its manual, such as stall torque, after its gear."""
+        table, ratio = self.table, self.described.ratio
+        limit = next((table.items[name] for name in _TEMPERATURE_LIMITS if name in table.items), None)
+        raw = None if limit is None else self.declared.get(limit.name, limit.initial)
+        return ServoModel(
+            model=table.model,
+            label=self.described.servo,
+            effort_unit=table.effort_unit,
+            stall_torque=table.stall_torque / ratio or None,
+            stall_current=table.stall_current or None,
+            voltage=table.nominal_voltage or None,
+            no_load_speed=table.max_speed * ratio or None,
+            temperature_limit=None if limit is None or raw is None else raw * limit.scale,
+        )
+
+
+class SettingsStage(msgspec.Struct, frozen=True):
+    """Hook `STAGE` in a feature's `settings.py`: registers to write before a servo gets torque.
+
+    They are part of the servo's plan. Start-up writes those that differ, and so does the recovery of the
+    servo.
+    """
+
+    FILE: ClassVar[str] = "settings"
+
+    compile: Callable[[RobotFile, DescribedServo, ControlTable], Iterable[RegisterValue]]
+    """Returns the values to write into one servo, EEPROM first. If two features set an item, the later one
+    wins."""
+    check: Callable[[RobotFile, BusPlan], None] = lambda file, plan: None
+    """Adds a problem to the file if the values do not fit the compiled bus."""
+    change: Callable[[ControlTable, str, int | str], RegisterValue] | None = None
+    """Converts the integer or quantity that a client writes into an item during a run; raises UnfitRegister.
+    Only the first feature with this function is used."""
+
+
+def compile_servos(file: RobotFile, models: Mapping[str, str], motors: Motors) -> dict[str, CompiledServo]:
+    """Compile all servos whose control table is known, by name; `model: auto` gets an assumed model.
+
+    Args:
+        file: Robot file; collects the problems.
+        models: Models that were read from the servos of joints with `model: auto`, by joint.
+        motors: Motor files.
+    """
+    described, features = described_servos(file.description), used_features(file.description)
+    _unique_ids(file, described)
+    compiled: dict[str, CompiledServo] = {}
+    for servo in described:
+        known_bus = check_bus(file, servo, servo.title, partial(servo.mark, file.marks), "servo ID")
+        model = servo.model if servo.model != AUTO else models.get(servo.name)
+        if model is None:
+            model = _assumed_model(file, servo, described)
+        table = _table(file, servo, model)
+        if table is None:
+            continue
+        if not servo.continuous:
+            _check_reference(file, servo, table)
+        # The registers of a servo whose model is not read yet are unknown. Those that fit the assumed model
+        # are kept, because a simulated servo has exactly these; mistakes are not errors yet.
+        certain = (servo.model != AUTO or servo.name in models) and (known_bus or _one_table(model))
+        found = file if certain else RobotFile(file.description)
+        settings = {
+            setting.name: setting
+            for _, stage in stages(SettingsStage, features)
+            for setting in stage.compile(found, servo, table)
+        }
+        declared = {name: setting.value for name, setting in settings.items()}
+        motor = compile_motor(found, servo, table, declared, motors.of_servo(servo.name))
+        made = CompiledServo(servo, table, tuple(settings.values()), motor, known_bus, certain)
+        compiled[servo.name] = made
+    return compiled
+
+
+def _unique_ids(file: RobotFile, servos: list[DescribedServo]) -> None:
+    owners: dict[tuple[str, int], str] = {}
+    for servo in servos:
+        owner = owners.setdefault((servo.bus, servo.id), servo.name)
+        if owner != servo.name:
+            other = next(one.title for one in servos if one.name == owner)
+            if other == servo.title:  # two servos of one joint, which share its name
+                other = f"servo {owner.rpartition('/')[2]} of the same joint"
+            file.error(
+                servo.mark(file.marks, "id"),
+                f"servo ID {servo.id} of {servo.title} is taken by {other} on bus {servo.bus}",
+                "give every servo of a bus its own ID",
+            )
+
+
+class BusEntry(Protocol):
+    """An entry of the robot file with a bus and an ID: a servo or a device."""
+
+    @property
+    def bus(self) -> str:
+        """Name of the bus in the file."""
+
+    @property
+    def id(self) -> int:
+        """ID of the servo or device on its bus."""
+
+
+def check_bus(file: RobotFile, one: BusEntry, name: str, at: Callable[[str], Mark], called: str) -> bool:
+    """Check an entry's bus and ID, add errors; return True if the bus exists. `at` returns places of keys."""
+    bus = file.robot.buses.get(one.bus)
+    if bus is None:
+        what = f"{name} is on bus {one.bus}, which is not defined"
+        file.error(at("bus"), what, suggestion(one.bus, tuple(file.robot.buses)))
+    elif one.id > bus.highest_id:
+        what = f"{called} {one.id} of {name} is not valid in Protocol 2.0"
+        file.error(at("id"), what, f"give it one from 0 to {bus.highest_id}")
+    return bus is not None
+
+
+def _assumed_model(file: RobotFile, servo: DescribedServo, others: list[DescribedServo]) -> str:
+    """Return the model to assume for `model: auto` before the servo was asked: that of another on the bus."""
+    neighbours = [each.model for each in others if each.bus == servo.bus]
+    known = [model for model in neighbours if model != AUTO]
+    bus = file.robot.buses.get(servo.bus)
+    model = known[0] if known else _USUAL[1.0 if bus is None else bus.protocol]
+    mark = servo.mark(file.marks, "model")
+    if servo.name != servo.title or servo.name not in file.robot.joints:
+        file.error(
+            mark,
+            f"{servo.title} ({servo.servo}) moves its joint with others, so its model is not asked for",
+            f"write its model, such as {model}",
+        )
+        return model
+    file.warning(
+        mark,
+        f"the servo of {servo.title} reports its model at the start; until then it is taken for an {model}",
+        "write its model to have reach and time checked for certain",
+    )
+    return model
+
+
+def _table(file: RobotFile, servo: DescribedServo, model: str) -> ControlTable | None:
+    mark, name = servo.mark(file.marks, "model"), servo.title
+    bus = file.robot.buses.get(servo.bus)
+    protocol = None if bus is None else bus.protocol
+    try:
+        return find_table(model, protocol)
+    except LookupError:
+        protocols = protocols_of(model)
+    if not protocols:
+        file.error(mark, f"no control table for model {model} of {name}", perhaps_meant(model, protocol))
+        return None
+    if bus is not None:
+        file.error(
+            mark,
+            f"{model} of {name} speaks Protocol {protocols[0]}, bus {servo.bus} Protocol {bus.protocol}",
+            "put it on a bus of its own protocol; a bus cannot be mixed",
+        )
+    return find_table(model, protocols[0])
+
+
+def _one_table(model: str) -> bool:
+    """Return True if a model speaks one protocol only; an MX name stands for two firmwares."""
+    return len(protocols_of(model)) == 1
+
+
+def _check_reference(file: RobotFile, servo: DescribedServo, table: ControlTable) -> None:
+    travel = servo_travel(table)
+    if not travel.lower <= servo.reference <= travel.upper:
+        file.warning(
+            servo.mark(file.marks, "reference"),
+            f"reference {degrees(servo.reference)} deg of {servo.title} lies outside the travel of an "
+            f"{table.model} ({degrees(travel.lower)}..{degrees(travel.upper)} deg), so the joint can never "
+            "be at 0",
+            "check the reference: it is the servo's angle where the joint's is 0",
+        )
+
+
+def many_turns(protocol: float, reference: float, direction: int) -> Interval:
+    """Return the joint angles, rad, that a multi-turn servo can reach, centred on its raw 0."""
+    turns = 2 * math.pi * MANY_TURNS[protocol]
+    middle = -direction * reference
+    return Interval(middle - turns, middle + turns)
+
+
+def servo_travel(table: ControlTable) -> Interval:
+    """Return the angles that a servo's goal positions reach within a turn, rad from its raw 0.
+
+    From 0 upwards in Protocol 1.0 and on X and MX, to both sides of 0 on P, PRO and Y (e-Manual, Goal
+    Position).
+    """
+    return Interval(table.min_tick * table.rad_per_tick, table.max_tick * table.rad_per_tick)
+
+
+def joint_reach(travel: Interval, reference: float, direction: int) -> Interval:
+    """Convert a servo's range, rad from raw 0, into joint angles with its reference and direction.
+
+    s = direction * (theta - reference), theta in `travel` (thesis of M. Amarante Araujo, 2017, JointID).
+    """
+    ends = (direction * (travel.lower - reference), direction * (travel.upper - reference))
+    return Interval(min(ends), max(ends))
