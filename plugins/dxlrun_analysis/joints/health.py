@@ -153,8 +153,18 @@ class ServoHealth:
     def _supplies(
         self, bus: str, members: Numbers, least: Floats, mean: Floats, most: Floats
     ) -> Iterable[Finding]:
-        """Report a bad supply voltage of a bus, or of single servos on it; `members` are rows of joints,
-        voltages have shape (bins, members)."""
+        """Report bad supply voltages of a bus: one finding for each servo that differs, and at most one more.
+
+        A servo differs if its voltage dips while those of the others do not. That is not checked if most
+        voltages are too high or sag. The other finding is about the whole bus. It has the first cause that
+        applies to most servos: too high, sagging under load, or a reported error. If only a few servos
+        reported an error, it is about these.
+
+        Args:
+            bus: Name of the bus.
+            members: Rows of the joints on the bus.
+            least, mean, most: Supply voltages, V; shape (bins, members).
+        """
         lowest, highest = np.fmin.reduce(least, initial=np.inf), np.fmax.reduce(most, initial=-np.inf)
         reported = np.array(["voltage" in self._faults[index] for index in members])
         above = highest > np.array([self._joints[index].highest_volts for index in members]) + _STEP_V / 2

@@ -184,8 +184,9 @@ class Movement:
         """Report joints that stand still, oscillate, or follow worse than before, and positions that jumped.
 
         Args:
-            reached_off: Distance from the goal at which each joint's goal counted as reached, rad or m, by
-                joint name. Smaller errors, or those within the tolerance of the robot file, do not count.
+            reached_off: Largest distance from the target at the end of a reached goal, rad or m, by joint
+                name. Errors up to this distance or up to the joint's tolerance in the robot file, whichever
+                is larger, do not count.
         """
         allowed = [max(reached_off.get(one.name, 0.0), one.logged.tolerance or 0.0) for one in self._joints]
         short, windows = self._windows(0.0, allowed), self._windows(_WINDOW_S, allowed)

@@ -74,7 +74,8 @@ def output_per_need(motors: Sequence[MotorModel], interface: str) -> Floats:
     For `position` it is the offset, rad, at which the servo's own control outputs a duty of 1.
 
     Raises:
-        ValueError: A motor file lacks the figure, or the P gain of a servo is declared as 0.
+        ValueError: A motor file lacks `position_gain` (for `position`) or `torque_per_effort` (for `effort`),
+            or the P gain of a servo is declared as 0.
     """
     if interface == "position":
         per = [1.0 / (motor.stiffness or np.nan) for motor in motors]
@@ -83,7 +84,10 @@ def output_per_need(motors: Sequence[MotorModel], interface: str) -> Floats:
     else:
         per = [1.0] * len(motors)
     if not np.isfinite(per).all():
-        raise ValueError("a motor file lacks what is needed, or the P gain of a servo is declared as 0")
+        raise ValueError(
+            "a motor file lacks position_gain (for position) or torque_per_effort (for effort), or "
+            "the P gain of a servo is declared as 0"
+        )
     return np.array(per)
 
 

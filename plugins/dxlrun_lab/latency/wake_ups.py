@@ -61,9 +61,10 @@ def measure_wake_ups(deadlines: Deadlines, iterations: int, buffer: Buffer) -> N
 
 
 def run(job: WakeUpJob) -> None:
-    """Apply real-time settings, report the granted ones, and measure, or execute the C program instead.
+    """Apply real-time settings, report the granted ones, then measure.
 
-    Wake-ups and used processor time are stored in the shared memory.
+    With `yardstick` this process becomes the C program, which measures in its place. With 0 iterations
+    nothing is measured. Wake-ups and used processor time are stored in the shared memory.
     """
     buffer = Buffer(job.buffer)
     grants = realtime.apply_scheduler(job.scheduler)

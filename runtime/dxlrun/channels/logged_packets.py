@@ -166,28 +166,28 @@ def split_packets(payload: Payload) -> list[BatchedPacket]:
     """Return the packets of a logged batch as tuples, because the recorder handles thousands a second.
 
     Raises:
-        ValueError: The payload is not a batch.
+        ValueError: The payload is not a complete batch, as in a damaged log.
     """
     packets: list[BatchedPacket] = []
     start, end = _BATCH.size, len(payload)
     try:
         earlier, now = _BATCH.unpack_from(payload)
     except struct.error as error:
-        raise ValueError(f"a batch of packets has no cycle: {error}") from error
+        raise ValueError(f"a batch of logged packets has no cycle: {error}") from error
     mark = start + now % (1 << _MARK_BITS)
     earlier, number = earlier - 1, (now >> _MARK_BITS) - 1
     while start < end:
         try:
             bus, kind, servo_id, length, first_ns, last_ns = RECORD.unpack_from(payload, start)
         except struct.error as error:
-            raise ValueError(f"a batch of packets ends inside a header: {error}") from error
+            raise ValueError(f"a batch of logged packets ends inside a header: {error}") from error
         if kind not in _KINDS:
             raise ValueError(f"a packet is of kind {kind}, which is none")
         cycle = earlier if start < mark else number
         start += RECORD_HEADER
         data = bytes(payload[start : start + length])
         if len(data) != length:
-            raise ValueError("a batch of packets ends inside a packet")
+            raise ValueError("a batch of logged packets ends inside a packet")
         packets.append((cycle, bus, kind, servo_id, first_ns, last_ns, data))
         start += length
     return packets

@@ -78,7 +78,10 @@ class _Slot:
 
 
 class SlotWriter(_Slot):
-    """Writer of a slot. There is one at a time; a later writer continues the numbers."""
+    """Writer of a slot. A slot has one writer at a time.
+
+    The slot keeps the numbers of the last sample and text, so a later writer continues to count from them.
+    """
 
     __slots__ = ("_bytes", "_floats", "_sample")
 

@@ -216,7 +216,7 @@ def goal_failed(goal: int, outcome: str, reason: str) -> str:
     return f"goal {goal} {outcome}{f': {reason}' if reason else ''}"
 
 
-# Gate
+# Gate: `clamp` has the verb of the sentence, such as `lowered to the upper position limit`.
 
 
 @event_text(EventCode.GATE, Severity.WARNING)

@@ -268,8 +268,8 @@ class _Error:
     def meant(self) -> bool:
         """False if the error only follows from another error, and should not be reported.
 
-        A list is not too short because its items are invalid. It does not lack an item if one is a range:
-        `[-90..90 deg]`.
+        pydantic counts only valid items, so it also reports a list with invalid items as too short. It
+        reports a second item as missing if both are written as one range: `[-90..90 deg]`.
         """
         least = self.context.get("min_length")
         if self.missing and isinstance(self.input, list) and any(map(_is_range, self.input)):

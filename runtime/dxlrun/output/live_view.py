@@ -39,9 +39,9 @@ def show_live(table: Callable[[], Table], every_s: float) -> None:
 
 @contextmanager
 def keys_pressed() -> Iterator[QuitKey]:
-    """Context manager that reads single keys from the terminal; yields a function that waits for q.
+    """Context manager that switches the terminal to single keys and restores it at the end.
 
-    Without a terminal on stdin, the function only waits.
+    Yields a `QuitKey`. Without a terminal on stdin it only sleeps for the given time.
     """
     if not sys.stdin.isatty():
         yield QuitKey(None)
@@ -60,9 +60,10 @@ def keys_pressed() -> Iterator[QuitKey]:
 
 @dataclass(frozen=True, slots=True)
 class QuitKey:
-    """Waits for the key q on a keyboard; None: there is no terminal."""
+    """Callable that waits for the key q on a keyboard."""
 
     keyboard: int | None
+    """File descriptor of the terminal; None without a terminal."""
 
     def __call__(self, seconds: float) -> bool:
         """Wait up to `seconds`; return True at once if q is pressed or the terminal is gone."""

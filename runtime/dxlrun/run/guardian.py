@@ -427,7 +427,10 @@ class Guardian:
         self._safe_stop.report(texts.supervisor_gone(self._unsupervised))
 
     def _request(self) -> Literal["stop", "cut"] | None:
-        """Read the supervisor's messages; return `cut`, `stop` or None."""
+        """Read the supervisor's messages; return the strongest request in them, or None without a message.
+
+        `cut`: kill the loop and cut the servos' torque at once. `stop`: end the run by its exit policy.
+        """
         messages = self._control.receive_messages()
         if any(isinstance(message, Cut) for message in messages):
             return "cut"

@@ -263,8 +263,10 @@ def _position_gains(memory: Memory, motor: Motor) -> ServoCommand:
 
 
 def _velocity_gains(memory: Memory) -> ServoCommand:
-    """Return a command with the gains of velocity control, KVP / 128 and KVI / 65536, applied to the
-    integrated speed."""
+    """Return a command that controls the velocity as position control of the integrated setpoint.
+
+    The I gain of the velocity, KVI / 65536, is then the P gain of the position. The P gain of the velocity,
+    KVP / 128, is the D gain of the position."""
     table = memory.table
     if "goal_pwm" not in table.items or table.items["velocity_p_gain"].initial is None:
         p, i = UNKNOWN_VELOCITY_P / table.max_speed, UNKNOWN_VELOCITY_I / table.max_speed

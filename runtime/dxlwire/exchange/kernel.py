@@ -86,14 +86,14 @@ def library(path: Path | None = None) -> ctypes.CDLL:
 
 
 def polling_state(polling: ReplyPolling | None) -> ctypes.Structure:
-    """Return the `Polling` struct of kernel.c in its initial state; without `polling` it is disabled."""
+    """Return the `Polling` struct of kernel.c in its initial state. None disables polling for replies."""
     if polling is None:
         return STRUCTS["Polling"]()
     return STRUCTS["Polling"](
         share=polling.share,
         longest_ns=polling.longest_ns,
-        updated_ns=-1,
-        step_ns=polling.margin_ns,
+        updated_ns=-1,  # The credit was never updated
+        step_ns=polling.margin_ns,  # First step by which sleeps are shortened that end after the reply
         margin_ns=polling.margin_ns,
         saved_ns=50_000_000,  # Cap of the polling credit: a long pause must not pay for a burst of polling
         enabled=1,

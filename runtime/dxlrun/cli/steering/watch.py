@@ -143,7 +143,7 @@ def _print_lines(watched: WatchedRobot, *, once: bool) -> None:
 
 
 def _show_live(watched: WatchedRobot) -> None:
-    """Redraw the view until a key is pressed; raises DxlrunError when the robot is gone."""
+    """Redraw the view until the key q is pressed; raises DxlrunError when the robot is gone."""
     from rich.live import Live
 
     console = out()

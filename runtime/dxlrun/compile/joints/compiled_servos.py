@@ -183,7 +183,10 @@ def check_bus(file: RobotFile, one: BusEntry, name: str, at: Callable[[str], Mar
 
 
 def _assumed_model(file: RobotFile, servo: DescribedServo, others: list[DescribedServo]) -> str:
-    """Return the model to assume for `model: auto` before the servo was asked: that of another on the bus."""
+    """Return the model to assume for `model: auto` until the servo reports it: that of another on the bus.
+
+    `auto` is an error for a servo that moves its joint or joints together with others.
+    """
     neighbours = [each.model for each in others if each.bus == servo.bus]
     known = [model for model in neighbours if model != AUTO]
     bus = file.robot.buses.get(servo.bus)
@@ -192,7 +195,7 @@ def _assumed_model(file: RobotFile, servo: DescribedServo, others: list[Describe
     if servo.name != servo.title or servo.name not in file.robot.joints:
         file.error(
             mark,
-            f"{servo.title} ({servo.servo}) moves its joint with others, so its model is not asked for",
+            f"{servo.title} ({servo.servo}) moves its joint with others, so its model cannot be auto",
             f"write its model, such as {model}",
         )
         return model

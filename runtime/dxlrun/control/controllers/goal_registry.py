@@ -336,7 +336,11 @@ class GoalRegistry:
         self._judge(goal, goal.judgement)
 
     def _settling(self, settle_ns: int) -> tuple[int, int]:
-        """Return the deadlines for settling and for uncertain states, ns of the controllers' time."""
+        """Return two deadlines, counted from now, ns of the controllers' time; the second is never earlier.
+
+        The first is for joints to come within their tolerances. The second is for missing replies to arrive
+        and for torque to be confirmed.
+        """
         settled_ns = self.time_ns + settle_ns
         return settled_ns, max(
             settled_ns, self.time_ns + max(CERTAIN_NS, LOST_CYCLES * self._record.period_ns)

@@ -449,9 +449,12 @@ class Switching:
         self._events.emit_event(managed.plan.name, event)
 
     def _take_out_with_uppers(self, managed: ManagedController, fault: ControllerFault) -> _Failed:
-        """Deactivate a controller that broke its contract and those above it.
+        """Deactivate a controller that broke its contract, and then those above it, the farthest first.
 
-        Returns all of them, nearest first, and the reason.
+        A group that waits to activate one of them is dropped.
+
+        Returns:
+            All these controllers, the failed one first and the farthest last, and the text of the fault.
         """
         engaged = tuple(self.standing.engaged.values())
         uppers = [self.named[name] for name in above(engaged, managed.plan.name)]

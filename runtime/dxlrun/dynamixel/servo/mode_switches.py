@@ -294,8 +294,19 @@ def _read_back(one: Access, layout: GoalLayout, data: bytes) -> Program[str]:
 
 
 def _change(one: Access, desired: ModePlan, found: Mapping[str, int], *, enabled: bool) -> Program[str]:
-    """Change the mode registers of a servo with torque off, and restore the registers that the change resets;
-    return the problem.
+    """Change the mode registers of a servo with torque off, then restore the registers that this resets.
+
+    A register at its initial value is not restored, unless the robot file declares it. Torque is not
+    switched on again.
+
+    Args:
+        one: The servo.
+        desired: Mode to switch to.
+        found: Present values of the mode registers, by name.
+        enabled: True if the servo has torque, which is then switched off first.
+
+    Returns:
+        The problem; empty on success.
     """
     kept = yield from one.read_items(_forgotten(one, desired, found))
     if kept is None:
