@@ -53,8 +53,8 @@ def test_a_robot_without_a_urdf_has_no_frames() -> None:
         (
             '"right_arm"/></joint>',
             '"right_arm"/><mimic joint="left_arm_joint"/></joint>',
-            "right_arm_joint follows left_arm_joint in the URDF, but has a servo of its own, which is what "
-            "counts; remove the mimic from the URDF, or the joint out of this file",
+            "right_arm_joint follows left_arm_joint in the URDF, but has a servo of its own, and the "
+            "servo counts; remove the mimic from the URDF, or the joint out of this file",
         ),
         (
             '"right_arm_joint"',

@@ -51,10 +51,10 @@ def test_a_drive_is_finite_within_its_limit_and_never_leads_out(mode, position, 
 @pytest.mark.parametrize(
     ("mode", "value", "goal", "clamp", "what"),
     [
-        (Mode.VELOCITY, -9.0, -2.0, Clamp.VELOCITY, "held to the velocity limit"),
-        (Mode.VELOCITY, np.inf, 0.0, Clamp.NOT_FINITE, "was not finite"),
-        (Mode.EFFORT, 0.7, 0.5, Clamp.EFFORT, "held to the effort limit"),
-        (Mode.PWM, -1.5, -1.0, Clamp.PWM, "held to the full voltage"),
+        (Mode.VELOCITY, -9.0, -2.0, Clamp.VELOCITY, "goal held to the velocity limit"),
+        (Mode.VELOCITY, np.inf, 0.0, Clamp.NOT_FINITE, "goal not finite"),
+        (Mode.EFFORT, 0.7, 0.5, Clamp.EFFORT, "goal held to the effort limit"),
+        (Mode.PWM, -1.5, -1.0, Clamp.PWM, "goal held to the full voltage"),
     ],
 )
 def test_what_goes_too_far_is_cut_and_told(mode, value, goal, clamp, what):

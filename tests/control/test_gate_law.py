@@ -89,5 +89,5 @@ def test_a_gate_of_another_source_is_not_used(tmp_path, monkeypatch):
     with pytest.raises(NotCompiled, match=r"^the compiled gate is missing: install dxlrun again"):
         load_compiled(tmp_path / "gate.c", gate.ctypes.PyDLL)
     (tmp_path / "libgate.so").write_bytes(gate.SOURCE.with_name("libgate.so").read_bytes())
-    with pytest.raises(NotCompiled, match=r"^the compiled gate is of another source than gate\.c"):
+    with pytest.raises(NotCompiled, match=r"^the compiled gate was built from another gate\.c"):
         load_compiled(tmp_path / "gate.c", gate.ctypes.PyDLL)

@@ -182,7 +182,7 @@ def test_debug_shows_what_a_plug_in_prints_within_bounds(odd):
 
 @pytest.mark.parametrize("flags", [(), ("--debug",)])
 def test_a_fault_of_dxlrun_itself_is_a_sentence_and_a_traceback_only_for_debug(odd, all_limp, flags):
-    breaks = "import dxlrun.control.loop as loop; loop.Loop._next = None"
+    breaks = "import dxlrun.control.loop as loop; loop.ControlLoop._next = None"
     run = odd(*flags, configure=breaks)
     code, _, err = run.finish()
     assert code == 1

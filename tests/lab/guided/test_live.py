@@ -286,7 +286,7 @@ def test_without_a_yes_no_run_is_started(place, stage, monkeypatch, capsys, answ
             threading.Timer(0.3, os.kill, (os.getpid(), signal.SIGINT)).start()
         words, options = ["pair.yaml", "tilt"], ExperimentOptions(range=("tilt=-15deg..15deg",))
         if answer is None:
-            with pytest.raises(InputError, match="this is not a terminal, which could ask before they move"):
+            with pytest.raises(InputError, match="without a terminal nobody can confirm that they may move"):
                 run_on_robot(plays, words, options)
         else:
             ran = run_on_robot(plays, words, options)
