@@ -132,7 +132,7 @@ class Ramp:
 
     def next(self, target: float, dt: float) -> float:
         """Return the velocity after `dt` s on the way to the velocity `target`; the state only changes by
-        `set`.
+        `set_velocity`.
         """
         gap = target - self.velocity
         falling = self.velocity * gap < 0

@@ -39,7 +39,8 @@ class AgentApp:
         self._runs: list[subprocess.Popen[bytes]] = []
 
     async def __call__(self, scope: Scope, receive: Receive, send: Send) -> None:
-        """Answer one HTTP request with the status and text of `answer`, for the role of the client."""
+        """Answer one HTTP request with the status and text of `answer_request`, for the role of the
+        client."""
         status, text = self.answer_request(scope["method"], unquote(scope["path"]), scope["client"].role)
         await PlainTextResponse(text, status)(scope, receive, send)
 

@@ -33,7 +33,8 @@ class _Edit(NamedTuple):
 
 
 class RobotText:
-    """Text of a robot file and its included files; `put` plans changes of values, and `write` writes them.
+    """Text of a robot file and its included files; `plan_value` plans changes of values, and `write_files`
+    writes them.
 
     A key path such as `("joints", "pan", "reference")` names a value.
     """
@@ -72,7 +73,7 @@ class RobotText:
     def plan_value(self, path: KeyPath, value: str | Sequence[str]) -> None:
         """Plan a new value, or new items of a list, for a key path; a missing key is added.
 
-        Raises InputError as `check`.
+        Raises InputError as `check_path`.
         """
         self.check_path(path)
         source, at, node = self._own(path)

@@ -25,7 +25,7 @@ _FASTER = {Press.FASTER: 1.25, Press.SLOWER: 0.8}
 
 
 class Drive:
-    """Teleoperation of a running robot by one device and one active bank. Call `step` every PERIOD_S.
+    """Teleoperation of a running robot by one device and one active bank. Call `apply_input` every PERIOD_S.
 
     After the start and after a change of the bank, nothing moves until the dead-man's switch was released.
     """

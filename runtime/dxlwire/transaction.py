@@ -134,8 +134,8 @@ class ProgramJob(Generic[Result]):
         """Return value of the program; None until the program has ended."""
 
     def status(self, index: int, reply: Reply) -> None:
-        """Ignore the single status packet: `advance` receives the whole reply, and a program awaits one
-        status at a time."""
+        """Ignore the single status packet: `next_transaction` receives the whole reply, and a program awaits
+        one status at a time."""
 
     def next_transaction(self, reply: Reply | None) -> Transaction | None:
         """Resume the program with a copy of the reply; return its next transaction, None after the last

@@ -39,7 +39,7 @@ class MessageComparison(MessageSink):
     """
 
     def __init__(self, inputs: RecordedInputs) -> None:
-        """Create a comparison without recorded messages; `feed` adds them."""
+        """Create a comparison without recorded messages; `add_messages` adds them."""
         self.first: ReplayDifference | None = None
         self._first_ns = 0
         self.compared = 0

@@ -65,7 +65,7 @@ class WheelAngles:
         """Longest gap between two usable samples, ns. It is half the time of half a turn, because a base that
         is pushed can turn its wheels faster than their limit."""
         self.turned = np.zeros(wheels)
-        """Rotation of each wheel between the last two samples, rad; valid after a `take` that did not
+        """Rotation of each wheel between the last two samples, rad; valid after an `add_sample` that did not
         return None.
         """
         self._before = np.zeros(wheels)

@@ -90,7 +90,7 @@ class Situation(msgspec.Struct, frozen=True):
 
 
 class Experiment(Protocol[R_co]):
-    """Protocol of an experiment that `perform` runs. A procedure can yield any number of segments.
+    """Protocol of an experiment that `perform_experiment` runs. A procedure can yield any number of segments.
 
     If the run refuses the loop rate of a segment, or a servo lacks its mode, Refused is raised inside the
     procedure, which can then yield another segment. Any other refusal ends the experiment.

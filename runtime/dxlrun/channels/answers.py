@@ -1,8 +1,8 @@
 """Answers: results of client commands as data, and their texts.
 
-The loop's process answers each command by its number, with `Done` or `Refusal`. A command that takes longer
-is answered with `Acceptance` first. The gateway forwards answers as JSON, and the Python client decodes
-them to objects. Programs should use `code` and `fields`: the wording of the text may change.
+The loop's process answers each command by its number, with `Completion` or `Refusal`. A command that takes
+longer is answered with `Acceptance` first. The gateway forwards answers as JSON, and the Python client
+decodes them to objects. Programs should use `code` and `fields`: the wording of the text may change.
 """
 
 from __future__ import annotations

@@ -247,7 +247,7 @@ class MessageChannel(Generic[Received]):
     def send_message(self, message: object, descriptors: Sequence[int] = ()) -> None:
         """Send a message with open descriptors. Never raises.
 
-        `receive` detects a closed channel, after it has returned the last messages of the other end.
+        `receive_messages` detects a closed channel, after it has returned the last messages of the other end.
         """
         data = msgspec.json.encode(message) + b"\n"
         with suppress(OSError):

@@ -112,7 +112,7 @@ class SlotWriter(_Slot):
 
 
 class SlotReader(_Slot):
-    """Reader of a slot. No method waits, and `read` does not allocate memory that stays."""
+    """Reader of a slot. No method waits, and `read_sample` does not allocate memory that stays."""
 
     __slots__ = ("_bytes", "_sample", "_seen", "_spoken", "sample")
 
@@ -122,7 +122,7 @@ class SlotReader(_Slot):
         self._bytes = memoryview(self._sample.data).cast("B")[:-_WORD]
         self._seen = self._spoken = 0
         self.sample: Floats = self._sample[2:-1].view(np.float64)
-        """Values of the last sample; valid only if `read` returned a time."""
+        """Values of the last sample; valid only if `read_sample` returned a time."""
 
     @property
     def samples(self) -> int:

@@ -68,7 +68,7 @@ class Hardware(Protocol):
         """Read a control table item of a joint's servo in idle time. Returns at once.
 
         Args:
-            row: Row of the joint, as in `set_register`.
+            row: Row of the joint, as in `write_register`.
             item: Control table item.
             done: Called once with the problem (empty on success) and the value.
         """

@@ -10,8 +10,8 @@ from dxlwire.clock import Clock, MonotonicClock
 class Deadlines:
     """Periodic deadlines with the clock and schedule of the control loop.
 
-    Deadlines that passed before `wait` was called are skipped, as in a run with `overrun: skip`. The first
-    deadline is one period after the first call of `wait`.
+    Deadlines that passed before `wait_for_deadline` was called are skipped, as in a run with `overrun: skip`.
+    The first deadline is one period after the first call of `wait_for_deadline`.
 
     Args:
         period_ns: Period.

@@ -1,8 +1,8 @@
 """Real time: request scheduling, memory and power settings from the operating system, and report refusals.
 
-`apply` prepares the loop's process, `apply_to_guardian` the guardian's. `Pacing` measures the time for which
-the clock is polled before a deadline. The functions at the end of the module return the limits of this
-process and the commands that raise them.
+`apply_scheduler` prepares the loop's process, `apply_to_guardian` the guardian's. `Pacing` measures the time
+for which the clock is polled before a deadline. The functions at the end of the module return the limits of
+this process and the commands that raise them.
 """
 
 from __future__ import annotations
@@ -317,8 +317,8 @@ def raise_share(process: int, nice: int) -> None:
 # Memory
 
 HEAP = 8 << 20
-"""Bytes of heap that `touch` writes before the loop. A loop of 20 servos allocates and frees a few kB in a
-cycle [i]."""
+"""Bytes of heap that `touch_memory` writes before the loop. A loop of 20 servos allocates and frees a few kB
+in a cycle [i]."""
 _STACK_DEPTH = 800
 """Depth of nested lists for `repr`, which makes one C call a level: 800 levels touch some 100 kB of stack
 [measured]. Python's recursion limit is 1000."""

@@ -100,7 +100,7 @@ class SampledSource:
         self.is_open = False
         """True while the device is open."""
         self.reopen_ns = 0
-        """Time of the next attempt to open the device, ns; meaningful only while `open` is False."""
+        """Time of the next attempt to open the device, ns; meaningful only while `is_open` is False."""
         self._open_driver = open_driver
         self._period_ns = period_ns
         self._writer = context.writer

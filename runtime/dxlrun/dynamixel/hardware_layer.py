@@ -26,7 +26,7 @@ class HardwareLayer:
     """Base class of layers: forwards every call to the hardware below.
 
     A subclass overrides the methods whose behaviour it changes. A layer that converts only goals needs
-    `start`, after which the goals below equal the present positions, `write` and `follow_goals`.
+    `start`, after which the goals below equal the present positions, `write_goals` and `follow_goals`.
     """
 
     def __init__(self, hardware: Hardware) -> None:

@@ -31,8 +31,8 @@ def open_writer(path: Path, header: LogHeader, recording: RecordingPlan) -> LogW
 class PartWriter:
     """Writer of a log in several files (parts), with the interface of LogWriter.
 
-    `settle` ends a part that is full or old, and deletes expired parts according to the plan; the newest part
-    is never deleted.
+    `split_if_due` ends a part that is full or old, and deletes expired parts according to the plan; the
+    newest part is never deleted.
     """
 
     def __init__(self, path: Path, header: LogHeader, recording: RecordingPlan) -> None:

@@ -226,7 +226,7 @@ class KeptStateWriter(threading.Thread):
         self._ended = threading.Event()
 
     def run(self) -> None:
-        """Write states until `finish` is called and all records are read."""
+        """Write states until `write_remaining` is called and all records are read."""
         while not self._ended.wait(_POLL_S):
             self._drain()
         self._drain()

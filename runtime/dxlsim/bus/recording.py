@@ -34,8 +34,8 @@ class RecordedReply(NamedTuple):
 class BusRecording:
     """Instructions of a recorded bus, with the bytes that the host received after each.
 
-    `take` returns the recorded answers of an instruction one after the other, and then repeats the last
-    one. Bytes belong to the instruction before them.
+    `replay_answer` returns the recorded answers of an instruction one after the other, and then repeats the
+    last one. Bytes belong to the instruction before them.
 
     Raises:
         InputError: The packets contain no instruction.
@@ -68,8 +68,8 @@ class BusRecording:
         return tuple(self._exchanges)
 
     def newest(self, instruction: bytes) -> tuple[RecordedReply, ...]:
-        """Return the answer to an instruction that `take` returned last, or the first recorded one if
-        there was none."""
+        """Return the answer to an instruction that `replay_answer` returned last, or the first recorded one
+        if there was none."""
         return self._heard(self._exchanges[instruction][max(0, self._next[instruction] - 1)])
 
     def replay_answer(self, instruction: bytes) -> tuple[RecordedReply, ...] | None:

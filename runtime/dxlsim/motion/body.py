@@ -42,7 +42,7 @@ class _Step(msgspec.Struct, frozen=True):
 
 
 class SimulatedBody:
-    """Links of a URDF, moved by simulated shafts; `motion` shows them at the last `move`.
+    """Links of a URDF, moved by simulated shafts; `motion` shows them at the last `set_shafts`.
 
     Raises:
         InputError: The URDF is invalid.
@@ -66,7 +66,7 @@ class SimulatedBody:
         self._gain = self._matrix @ shafts.acceleration
 
     def motion(self, link: str) -> LinkMotion:
-        """Return pose, velocity and acceleration of a link at the last `move`.
+        """Return pose, velocity and acceleration of a link at the last `set_shafts`.
 
         Raises:
             KeyError: The URDF does not have the link.
@@ -151,7 +151,7 @@ class ShaftSink(Protocol):
     """Receiver of the newest angles, velocities and accelerations of all shafts."""
 
     values: int
-    """Length of the array that `write` receives: angle, velocity and acceleration of each shaft."""
+    """Length of the array that `write_sample` receives: angle, velocity and acceleration of each shaft."""
 
     def write_sample(self, t_ns: int, values: Floats) -> None:
         """Write an array with the angles, rad, then the velocities, rad/s, then the accelerations,

@@ -130,8 +130,8 @@ class Profiles:
 
 
 class ControlLaw:
-    """Controllers and motors of all servos; `step` computes their torques, as `drive` and `damping`, for
-    the plant."""
+    """Controllers and motors of all servos; `compute_drive` computes their torques, as `drive` and `damping`,
+    for the plant."""
 
     def __init__(self, commands: Floats, motor_damping: Floats, dt_s: float) -> None:
         size = len(motor_damping)

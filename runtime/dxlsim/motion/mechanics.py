@@ -27,7 +27,7 @@ STEP_NS = 2_000_000
 """Step of the time grid, ns. The shortest time constant in a servo is that of its motor: 13.6 ms or more."""
 
 EAGER_NS, EASY_NS = 4_000_000, 1_000_000_000
-"""Intervals (ns) at which `advance` is due in real time, while servos move and while they only cool.
+"""Intervals (ns) at which `step_to` is due in real time, while servos move and while they only cool.
 Catching up after a long pause of the host would delay the next reply."""
 
 STRAIN_NS = 100_000_000  # Interval at which heat and load are updated; a whole number of steps
@@ -217,7 +217,7 @@ class Mechanics:
         heapq.heappush(self._agenda, (t_ns, next(self._order), action))
 
     def due_ns(self) -> int | None:
-        """Return the time at which `advance` must be called in real time, even without requests of hosts;
+        """Return the time at which `step_to` must be called in real time, even without requests of hosts;
         None if nothing moves or cools."""
         if not self._motors:
             return None

@@ -80,7 +80,7 @@ class PseudoTerminal:
         return True
 
     def read_chunk(self) -> None:
-        """Read one chunk of bytes that the host has written, and keep it for `receive`."""
+        """Read one chunk of bytes that the host has written, and keep it for `deliver_bytes`."""
         data = b""
         with suppress(OSError):  # No data, or no host
             data = os.read(self._master, _CHUNK)

@@ -59,8 +59,8 @@ _GOAL_MODES = (3, 4, 5)
 
 
 class Server:
-    """Serves simulated buses on pseudo-terminals until its starter closes, or until the `stop` of `run` is
-    readable.
+    """Serves simulated buses on pseudo-terminals until its starter closes, or until the `stop` of
+    `serve_ports` is readable.
 
     Raises:
         InputError: A fault of the configuration can never happen, or its bodies cannot be moved.
@@ -324,8 +324,8 @@ class _ServedLine:
     def publish_received(self, count: int, now_ns: int) -> None:
         """Publish that `count` bytes of the host were received, even if a fault keeps them from the servos.
 
-        Call this after `serve`: a host that sees the bytes as received relies on the due time of the
-        reply."""
+        Call this after `publish_next_delivery`: a host that sees the bytes as received relies on the due time
+        of the reply."""
         duration_ns = count * _BITS_PER_BYTE * 1_000_000_000 // self._bus.baud_rate
         self._taken_ns = max(self._taken_ns, now_ns) + duration_ns
         self._progress.publish_received(self._taken_ns)

@@ -43,8 +43,8 @@ class ServoCounts(msgspec.Struct):
 
 
 class SimulatedNode(ABC):
-    """One servo or device on a simulated line. The bus calls `execute` and `reply_to_group_read`; faults and
-    tests call the rest.
+    """One servo or device on a simulated line. The bus calls `execute_packet` and `reply_to_group_read`;
+    faults and tests call the rest.
 
     `note` is called with a text about each refusal and each fault."""
 

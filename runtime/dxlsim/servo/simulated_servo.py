@@ -169,7 +169,7 @@ class SimulatedServo(SimulatedNode):
 
     @property
     def shaft_angle(self) -> float:
-        """Angle of the shaft, rad from raw 0, at the time of `advance` or of the last instruction."""
+        """Angle of the shaft, rad from raw 0, at the time of `advance_to` or of the last instruction."""
         return self.shaft.angle
 
     @property

@@ -134,7 +134,7 @@ class BusEngine:
         return self.words[LATE_NS]
 
     def load_job(self, job: Job, *, cyclic: bool = False, waits: bool = False) -> None:
-        """Load a job; the next `step` starts it. An unfinished job is dropped.
+        """Load a job; the next `process_due` starts it. An unfinished job is dropped.
 
         Args:
             job: The transactions to execute.
@@ -215,7 +215,8 @@ class BusEngine:
     # Time
 
     def read_and_process(self) -> int:
-        """Read the bytes that have arrived, match them to the current transaction, and continue like `step`.
+        """Read the bytes that have arrived, match them to the current transaction, and continue like
+        `process_due`.
 
         Called when the line is readable."""
         self._receive()
@@ -606,7 +607,7 @@ class Lines:
         packets: PacketSink | Sequence[PacketSink],
         beat: Callable[[], None] = lambda: None,
     ) -> None:
-        """Create a `Bus` for each line on ports that are open already.
+        """Create a `BusEngine` for each line on ports that are open already.
 
         Args:
             plans: One plan for each line.

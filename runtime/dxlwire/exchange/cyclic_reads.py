@@ -74,7 +74,7 @@ class CyclicReads:
         """True for each member whose newest loss came with garbled bytes and was the first loss of its
         read."""
         self.away = [False] * count
-        """True for a lost servo or device that is no longer read; see `leave`."""
+        """True for a lost servo or device that is no longer read; see `stop_reading`."""
         self.apart = [False] * count
         """True for a device that is read separately because it does not answer in a chain."""
         self.fast = list(plan.fast)  # True for each group that is read by a fast form; `plain` ends that

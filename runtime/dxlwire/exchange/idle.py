@@ -151,8 +151,8 @@ class IdleScheduler:
         return None
 
     def status(self, index: int, reply: Reply) -> None:
-        """Ignore the status of one servo in a reply: `advance` receives the whole reply, and a program
-        awaits one status at a time."""
+        """Ignore the status of one servo in a reply: `next_transaction` receives the whole reply, and a
+        program awaits one status at a time."""
 
     def abandon(self) -> None:
         """Run every program to its end while the line is lost: each transaction times out at once, and

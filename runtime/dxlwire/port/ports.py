@@ -136,8 +136,8 @@ class Ports(Protocol):
         """Request that a lost line is opened again; return True if it is open, with a new port in `ports`.
         Never waits.
 
-        From the first call on, the lost line is no longer part of `wait`. The devices on a reopened line
-        were without a host, and possibly without power, so all its servos are treated as rebooted."""
+        From the first call on, the lost line is no longer part of `wait_for_bytes`. The devices on a reopened
+        line were without a host, and possibly without power, so all its servos are treated as rebooted."""
         ...
 
 

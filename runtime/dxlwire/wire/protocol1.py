@@ -146,7 +146,7 @@ def _packet(servo_id: int, kind: int, parameters: bytes) -> bytes:
 
 
 def instruction_packet(servo_id: int, instruction: int, parameters: bytes = b"") -> bytes:
-    """Return an instruction packet with a code of `Instruction`.
+    """Return an instruction packet with a code of `Protocol1Instruction`.
 
     Raises:
         ValueError: `servo_id` is neither 0..253 nor broadcast, or the parameters do not fit.

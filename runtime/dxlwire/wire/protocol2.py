@@ -216,7 +216,7 @@ def _packet(address: int, body: bytes) -> bytes:
 
 
 def instruction_packet(servo_id: int, instruction: int, parameters: bytes = b"") -> bytes:
-    """Return an instruction packet with a code of `Instruction`.
+    """Return an instruction packet with a code of `Protocol2Instruction`.
 
     Raises:
         ValueError: `servo_id` is neither 0..252 nor broadcast, or the parameters do not fit.

@@ -265,7 +265,7 @@ class Watch:
         self._begin_ns = round(state.accepted * 1e9)
 
     def update_states(self, record: np.void) -> None:
-        """Update `newest` from the record of a cycle; ignored before `begin`."""
+        """Update `newest` from the record of a cycle; ignored before `start_timing`."""
         if self._begin_ns is None:
             return
         t_ns = int(record["read_ns"])

@@ -1,7 +1,7 @@
 """Actions of the page's buttons and sliders on a running robot: one class per type of JSON message.
 
-The fields of a class are those of the message. `perform` sends the request to the robot and returns the text
-for the page's message line; all raise DxlrunError if the robot refuses.
+The fields of a class are those of the message. `perform_on` sends the request to the robot and returns the
+text for the page's message line; all raise DxlrunError if the robot refuses.
 """
 
 from __future__ import annotations

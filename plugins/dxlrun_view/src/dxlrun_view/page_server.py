@@ -168,7 +168,7 @@ class Page:
         return Response(where.read_bytes(), media_type=_TYPES[name])
 
     async def serve_data(self, request: Request) -> Response:
-        """Answer a `ViewRequest` of the page with a `Seen`: moment, events, curves."""
+        """Answer a `ViewRequest` of the page with a `ViewResponse`: moment, events, curves."""
         asked = await _message(request, _LOOK)
         return _json(await run_in_threadpool(self._seen, asked, self._may_steer(request)))
 

@@ -28,7 +28,7 @@ class InputMistakes:
 
     @contextmanager
     def collected(self) -> Iterator[None]:
-        """Catch the InputError of a block and store it for `refuse`."""
+        """Catch the InputError of a block and store it for `raise_errors`."""
         try:
             yield
         except InputError as error:

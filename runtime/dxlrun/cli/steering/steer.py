@@ -49,7 +49,7 @@ class RobotChoice:
 
 
 ONLY_ONE = RobotChoice()
-"""Default of `Chosen`: the only robot that runs."""
+"""Default of `RobotChoice`: the only robot that runs."""
 
 
 def list_robots(

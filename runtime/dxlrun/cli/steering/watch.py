@@ -35,7 +35,7 @@ _TONES: Mapping[str, Tone] = {"on": "good", "doubt": "warning", "lost": "error",
 
 @dataclass(slots=True)
 class WatchedRobot:
-    """Newest states, controllers and events of a running robot, as requested by `look`."""
+    """Newest states, controllers and events of a running robot, as requested by `poll_robot`."""
 
     robot: RemoteRobot
     states: RobotStates = field(init=False)

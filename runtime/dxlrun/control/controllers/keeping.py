@@ -40,7 +40,7 @@ class StateKeeper:
         self._publisher: Publisher | None = None
         self.controllers: dict[str, Facts] = {}
         """Facts (servos, controllers below) that each controller's kept state depends on, by controller.
-        Empty: no controller keeps a state, and cycles skip `step`."""
+        Empty: no controller keeps a state, and cycles skip `publish_next`."""
         self._waiting: dict[str, bytes] = {}
         """Kept states whose publication has not begun, by controller."""
         self._newest: dict[str, bytes] = {}

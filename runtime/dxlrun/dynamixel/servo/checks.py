@@ -2,8 +2,8 @@
 loss.
 
 `CHECKS` is the table of comparisons with the plan: control item, predicate, sentence. The control table
-(`deviations.toml`) judges every other setting that differs from the factory's. `inspect` applies both to one
-servo; `survey` checks a whole bus: presence, registers, states. All of them only read.
+(`deviations.toml`) judges every other setting that differs from the factory's. `inspect_servo` applies both
+to one servo; `survey` checks a whole bus: presence, registers, states. All of them only read.
 """
 
 from __future__ import annotations

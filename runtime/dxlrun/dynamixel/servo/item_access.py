@@ -206,8 +206,8 @@ class ItemAccess:
 
 
 class Access(ItemAccess):
-    """One servo of a bus; `str` is its label in the plan. Create it with `reach` (timeouts of the plan) or
-    `first_reach` (longest timeouts).
+    """One servo of a bus; `str` is its label in the plan. Create it with `access_servo` (timeouts of the
+    plan) or `first_reach` (longest timeouts).
     """
 
     __slots__ = ("plan", "servo")

@@ -51,14 +51,14 @@ the profile velocity.
 
 
 class HoldResult(msgspec.Struct, frozen=True):
-    """Result of `hold`: torque on for one servo at its present position."""
+    """Result of `hold_servo`: torque on for one servo at its present position."""
 
     problem: str  # problem; empty on success
     goal: int | None = None  # goal position in ticks; None if the mode has none
 
 
 def never() -> Program[bool]:
-    """Default of `enter`: return False without a read, because at start-up no reboot is watched."""
+    """Default of `enter_mode`: return False without a read, because at start-up no reboot is watched."""
     yield from ()
     return False
 
@@ -78,7 +78,7 @@ def enter_mode(
         mode: Desired mode.
         again: True: a servo that already has torque in this mode gets a new holding goal. False: it is not
             changed.
-        inward: As in `hold`.
+        inward: As in `hold_servo`.
         rebooted: Finds out whether the servo rebooted during the switch. After a reboot the servo stays
             without torque.
 

@@ -72,15 +72,15 @@ class RebootCount:
 class Reboots:
     """Detects and counts the reboots of the servos of one bus; servos are indices in the plan.
 
-    Servos of Protocol 1.0 have no Realtime Tick. Between `watch` and `unwatch` their LED is lit instead: a
-    reboot switches it off.
+    Servos of Protocol 1.0 have no Realtime Tick. Between `arm_detection` and `unwatch` their LED is lit
+    instead: a reboot switches it off.
     """
 
     def __init__(self, life: Life) -> None:
         count = len(life.plan.servos)
         self._life = life
         self._lit: list[int | None] = [None] * count
-        """Value of each servo's LED before `watch` lit it; None: the servo is not watched."""
+        """Value of each servo's LED before `arm_detection` lit it; None: the servo is not watched."""
         self._ticks: list[TickReading | None] = [None] * count
         self._counts = [RebootCount() for _ in range(count)]
 
@@ -119,7 +119,7 @@ class Reboots:
         return (yield from self.tick(index))
 
     def unwatch(self, index: int) -> Program[None]:
-        """Switch off the LED of a servo that `watch` lit; a LED that was lit before stays lit."""
+        """Switch off the LED of a servo that `arm_detection` lit; a LED that was lit before stays lit."""
         before, lamp = self._lit[index], self._lamp(index)
         self._lit[index] = None
         if before == 0 and lamp is not None:

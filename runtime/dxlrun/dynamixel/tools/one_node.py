@@ -71,8 +71,8 @@ class OneNode:
         return self.tool.run_program(extend_timeouts(program))
 
     def register(self, name: str, value: int) -> RegisterValue:
-        """Return a register for `write`: the item's address and size with a desired value, the integer on the
-        wire.
+        """Return a register for `write_registers`: the item's address and size with a desired value, the
+        integer on the wire.
         """
         item = self.table.items[name]
         return RegisterValue(item.address, item.size, value, name, item.area == "EEPROM")
