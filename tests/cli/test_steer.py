@@ -550,7 +550,9 @@ def test_pose_that_is_printed_can_be_sent_and_looked_at(dxlrun, torso: RemoteRob
     assert dxlrun("frames", TORSO, "--of", "left_hand_link", "--at", *pose).code == 0
     found = result_of(dxlrun("get", "all", "--json").out)["pose"]
     assert [*found] == list(torso.states().joints)
-    assert found["left_elbow_joint"] == pytest.approx(torso.states().joint("left_elbow_joint")["position"])
+    # The joint may still settle by a tick between the two requests.
+    now = torso.states().joint("left_elbow_joint")["position"]
+    assert found["left_elbow_joint"] == pytest.approx(now, abs=0.02)
 
 
 def test_every_command_of_a_running_robot_answers_in_one_form(dxlrun, torso: RemoteRobot) -> None:

@@ -96,8 +96,11 @@ def certificate(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, Path]:
 
 
 def test_with_a_certificate_there_is_nothing_without_tls(
-    serve: Callable[..., Served], certificate: tuple[Path, Path]
+    serve: Callable[..., Served], certificate: tuple[Path, Path], monkeypatch: pytest.MonkeyPatch
 ) -> None:
+    monkeypatch.setattr(
+        "dxlrun_foxglove.foxglove_server.OPENING_S", 120.0
+    )  # a busy machine can need longer than 5 s
     cert, key = certificate
     served = serve(tls=tls_of(cert, key))
     known = ssl.create_default_context(cafile=cert)
