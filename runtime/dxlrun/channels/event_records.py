@@ -296,7 +296,7 @@ def event_text(code: IntEnum, severity: Severity) -> Callable[[Callable[Fields, 
     def loop_started(rate: float) -> str:
         return f"the loop has started at {rate:g} Hz"
 
-    events.emit("loop", loop_started(100.0))
+    events.emit_event("loop", loop_started(100.0))
     """
 
     def decorate(write: Callable[Fields, str]) -> EventText[Fields]:
