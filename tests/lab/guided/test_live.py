@@ -236,7 +236,7 @@ def test_a_run_that_cannot_begin_says_why(place, stage):
 
 def test_a_part_without_a_result_is_one_more_sentence(place, stage, capsys):
     class Asks(stage.Plays):
-        def finish(self, *_):
+        def evaluate_recordings(self, *_):
             raise InputError("too short")
 
     def gives_up(joint):
