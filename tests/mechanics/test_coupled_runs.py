@@ -248,7 +248,7 @@ def test_a_controller_for_one_joint_of_a_wrist_is_not_loaded_in_another_mode(pla
     part = replace(known, name="part", joints=("pitch",), command=("velocity",))
     refusal = robot.robot.manager.load_controller(part)
     assert isinstance(refusal, Refusal)
-    assert "another mode of pitch without roll" in str(refusal.fields["problem"])
+    assert "another mode of pitch, but not of roll" in str(refusal.fields["problem"])
     assert robot.robot.manager.load_controller(replace(part, command=("position",))) == 2
 
 

@@ -67,6 +67,6 @@ def require_right(setups: Sequence[Setup], plan: Plan) -> None:
     refused = " and ".join(one.name for one in real_time)
     normal = ",".join(one.name for one in SETUPS if not one.real_time)
     raise InputError(
-        f"{refused} needs real-time priority, and this user has no right to it: allow it with "
+        f"real-time priority is needed for {refused}, and this user has no right to it: allow it with "
         f"`{missing[0]}` and log in again, or measure the others with --setups {normal}"
     )
