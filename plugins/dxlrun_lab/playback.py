@@ -75,7 +75,8 @@ class Playback(msgspec.Struct, frozen=True):
             f"first pose: {joint.plan.label} has the longest way, {math.degrees(ways[joint.name]):.1f} deg, "
             f"at up to {math.degrees(speed):.0f} deg/s",
             f"then {motion.begin_s:.3f} s to {end_s:.3f} s of {motion.path} at speed {rows.speed:g}, "
-            f"{rows.duration_s:.1f} s: {goals} joints as they were sent, {states} as measured",
+            f"{rows.duration_s:.1f} s: {counted(goals, 'joint', 'joints')} as they were sent, "
+            f"{states} as measured",
         )
 
     def procedure(self, situation: Situation) -> Procedure:

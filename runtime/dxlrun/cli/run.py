@@ -166,7 +166,7 @@ def _page_beside(*, shown: bool) -> Iterator[None]:
         yield
         return
     if "view" not in packaged():
-        show_parts("to see the robot in 3-D install dxlrun-view, the page of `dxlrun view`")
+        show_parts("to see the robot in 3-D on the page of `dxlrun view`: pip install dxlrun-view")
         yield
         return
     # Imported here because the import takes 5 ms.
