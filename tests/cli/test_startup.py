@@ -111,3 +111,20 @@ def test_a_virtual_run_imports_neither_gateway_nor_physics() -> None:
     assert "dxlsim.serving.simulation_server" not in ran
     assert beneath(ran, "mujoco", "starlette", "uvicorn", "matplotlib", "rich", "dxlrun.remote") == set()
     assert "dxlrun.run.virtual_run" in ran
+
+
+LOOP = """
+import json, sys
+import dxlrun.run.loop_process
+from dxlrun.control.monitors.monitor_stage import MonitorStage
+from dxlrun.features import FEATURES, stages
+assert list(stages(MonitorStage, FEATURES))
+print(json.dumps(sorted(sys.modules)))
+"""
+
+
+def test_monitors_bring_no_compiler_into_the_process_of_the_loop() -> None:
+    """A policy of one module has its monitor next to what `check` needs of it."""
+    imported = {str(name) for name in printed(LOOP)}
+    assert beneath(imported, "dxlrun.compile") == {"dxlrun.compile", "dxlrun.compile.contribution"}
+    assert beneath(imported, "yaml", "rich", "cyclopts", "dxlrun.cli", "dxlrun.remote.gateway") == set()

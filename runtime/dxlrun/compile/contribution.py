@@ -3,20 +3,22 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Iterable, Mapping
-from typing import ClassVar
+from typing import TYPE_CHECKING, ClassVar
 
 import msgspec
 
-from dxlrun.compile.joints.compiled_joints import CompiledJoint
-from dxlrun.compile.joints.compiled_urdf import CompiledUrdf
-from dxlrun.compile.problems import RobotFile
-from dxlrun.control.controllers.plugin_loading import PlugIns
-from dxlrun.plan.loop_plan import ControllerPlan, SourcePlan
-from dxlrun.plan.mechanics_plan import MechanicsPlan
-from dxlrun.plan.recording_plan import RecordingPlan
-from dxlsim.simulation_plan import DeviceReadings
-from dxlwire.bus_plan import DevicePlan
-from dxlwire.control_table.device_table import DeviceTable
+# Only names of types: a monitor in the same module brings this one into the loop's process.
+if TYPE_CHECKING:
+    from dxlrun.compile.joints.compiled_joints import CompiledJoint
+    from dxlrun.compile.joints.compiled_urdf import CompiledUrdf
+    from dxlrun.compile.problems import RobotFile
+    from dxlrun.control.controllers.plugin_loading import PlugIns
+    from dxlrun.plan.loop_plan import ControllerPlan, SourcePlan
+    from dxlrun.plan.mechanics_plan import MechanicsPlan
+    from dxlrun.plan.recording_plan import RecordingPlan
+    from dxlsim.simulation_plan import DeviceReadings
+    from dxlwire.bus_plan import DevicePlan
+    from dxlwire.control_table.device_table import DeviceTable
 
 
 class Compilation(msgspec.Struct, frozen=True):

@@ -9,13 +9,12 @@ import math
 import re
 from collections.abc import Iterator, Mapping
 from contextlib import suppress
-from typing import Annotated, Optional, Self, TypeAlias, TypeVar, get_args
+from typing import TYPE_CHECKING, Annotated, Optional, Self, TypeAlias, TypeVar, get_args
 
 from msgspec.structs import replace
 from pydantic import BeforeValidator, Discriminator, Field, Tag, WithJsonSchema, model_validator
 
 from dxlrun.description.base_form import Form, key, validation_error, with_keys
-from dxlrun.description.document import KeyPath
 from dxlrun.description.joints.joint_mechanics import (
     Direction,
     GearRatio,
@@ -43,6 +42,9 @@ from dxlrun.description.units import (
 from dxlrun.features import installed_features, stages
 from dxlrun.features.feature import JointKey, ServoKey
 from dxlwire.joint_unit import LINEAR, ROTARY, JointUnit
+
+if TYPE_CHECKING:  # it imports yaml, which a monitor in the module of a policy does not need
+    from dxlrun.description.document import KeyPath
 
 F = TypeVar("F", bound=Form)
 LONGEST_RESPONSE_DELAY_NS, LONGEST_WRITE_TIME_NS = 1_000_000_000, 100_000_000
