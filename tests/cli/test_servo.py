@@ -78,7 +78,7 @@ def test_a_tripped_bus_watchdog_is_shown_named_and_cleared(one):
     done = servo(1, "set", "goal_position", "1400", *NEW)
     assert done.code == 0, done.err
     assert "cleared Bus Watchdog (98), which was 255 (tripped): it had stopped the servo" in done.out
-    assert done.out.strip().endswith("is 1400")
+    assert done.out.strip().endswith("to 1400")
     servo(1, "set", "bus_watchdog", "1", *NEW)
     time.sleep(0.2)
     asked = servo(1, "torque", "on", "--json", *NEW)
