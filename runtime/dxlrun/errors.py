@@ -28,7 +28,7 @@ from importlib.util import find_spec
 from types import MappingProxyType
 
 from dxlwire.exceptions import DxlError as DxlrunError
-from dxlwire.exceptions import InputError, Mark, PortError, Problem, counted, near, suggestion
+from dxlwire.exceptions import InputError, Mark, PortError, Problem, counted, help_link, near, suggestion
 
 __all__ = [
     "ControllerFault",
@@ -46,6 +46,7 @@ __all__ = [
     "ServoFault",
     "StartUpError",
     "counted",
+    "help_link",
     "missing_extra",
     "near",
     "suggestion",

@@ -9,6 +9,7 @@ from typing import Literal
 
 import msgspec
 
+from dxlwire.exceptions import help_link
 from dxlwire.joint_unit import ROTARY, JointUnit
 from dxlwire.modes import Mode
 from dxlwire.transaction import Transaction
@@ -238,7 +239,8 @@ class ServoPlan(msgspec.Struct, frozen=True):
         lower = self.position_text(first).partition(" ")[0]  # the unit follows the upper limit
         return (
             f"is at {self.position_text(self.joint_position(raw))}, outside its limits "
-            f"{lower}..{self.position_text(last)}: move the joint inside by hand"
+            f"{lower}..{self.position_text(last)}: move the joint inside by hand; "
+            f"{help_link('a-joint-is-outside-its-limits')}"
         )
 
     def step_text(self, step: float) -> str:

@@ -10,7 +10,7 @@ from types import MappingProxyType
 from typing import TypeVar
 from zlib import crc32
 
-from dxlwire.exceptions import NotCompiled
+from dxlwire.exceptions import NotCompiled, help_link
 
 _HINT = "install dxlrun again"  # The distribution that contains dxlwire
 Library = TypeVar("Library", bound=ctypes.CDLL)
@@ -35,7 +35,7 @@ def load_compiled(source: Path, kind: type[Library], path: Path | None = None) -
     if known != crc32(source.read_bytes()):
         raise NotCompiled(
             f"the compiled {source.stem} was built from another {source.name} than the one next to "
-            f"it: {_HINT}"
+            f"it: {_HINT}; {help_link('a-compiled-part-is-missing-or-old')}"
         )
     return library
 

@@ -16,6 +16,10 @@ from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 from typing import Literal
 
+HELP = "https://example.org/dxlrun/how-to/it-does-not-work"
+"""Address of the page "It does not work": a placeholder that a maintainer sets here, as `Issues` in
+pyproject.toml. A constant, because messages are also made in the loop, which reads no files."""
+
 
 @dataclass(frozen=True, slots=True, order=True)
 class Mark:
@@ -160,3 +164,13 @@ def counted(number: int, one: str, many: str) -> str:
     """Return a number with its noun, such as `1 period` or `2 periods`: `one` for exactly one, `many`
     otherwise, including zero."""
     return f"{number} {one if number == 1 else many}"
+
+
+def help_link(heading: str) -> str:
+    """Return `see ADDRESS#HEADING` for the end of a message: the address of the symptom on the page "It does
+    not work".
+
+    Args:
+        heading: Anchor of a heading of docs/how-to/it-does-not-work.md, such as `no-servo-answers`.
+    """
+    return f"see {HELP}#{heading}"

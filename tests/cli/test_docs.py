@@ -39,6 +39,7 @@ from dxlsim.faults.fault import parse_fault
 from dxlsim.messages import SimulationJob, SimulationMessage
 from dxlsim.simulation_plan import BusConfig, ServoConfig, SimulationConfig
 from dxlwire.control_table import find_table
+from dxlwire.exceptions import HELP
 
 ROOT = Path(__file__).parents[2]
 ROOTS = (ROOT, ROOT / "runtime", ROOT / "runtime/dxlrun", ROOT / "plugins")
@@ -465,9 +466,32 @@ def test_it_does_not_work_md_quotes_messages_of_the_program() -> None:
                 assert part in written, quoted
 
 
-def test_address_for_reports_is_in_one_place() -> None:
+def test_messages_name_the_symptom_that_quotes_them() -> None:
+    page = PAGES["it-does-not-work.md"]
+    symptoms = re.split(r"^### ", page, flags=re.MULTILINE)[1:]
+    quotes = {
+        anchor: "\n> " in text for text in symptoms for anchor in anchors("### " + text.partition("\n")[0])
+    }
+    product = [path for path in SOURCES if path.suffix == ".py" and "tests" not in path.parts]
+    named = {
+        node.args[0].value
+        for path in product
+        for node in ast.walk(ast.parse(path.read_text()))
+        if isinstance(node, ast.Call) and getattr(node.func, "id", "") == "help_link" and len(node.args) == 1
+        if isinstance(node.args[0], ast.Constant)
+    }
+    assert named <= set(quotes)
+    # the first is the shell's message; the other is the refusal of a request, which has its own remedy
+    assert {anchor for anchor, quoted in quotes.items() if quoted} - named == {
+        "the-command-is-not-found",
+        "one-joint-is-limp",
+    }
+
+
+def test_addresses_are_in_one_place() -> None:
     address = tomllib.loads(PROJECT)["project"]["urls"]["Issues"]
     assert [path.name for path in PATHS if address in path.read_text()] == []
+    assert [path.name for path in (*PATHS, *SOURCES) if HELP in path.read_text()] == ["exceptions.py"]
     for page in ("README.md", "CONTRIBUTING.md", "it-does-not-work.md"):
         assert re.search(r"`Issues`\s+in\s+\[pyproject.toml\]", PAGES[page]), page
 

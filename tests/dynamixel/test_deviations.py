@@ -15,7 +15,7 @@ from dxlrun.dynamixel.findings import Findings
 from dxlrun.dynamixel.servo.checks import inspect_servo
 from dxlrun.dynamixel.servo.item_access import first_reach
 from dxlrun.dynamixel.servo.torque_limits import restore_torque_limits
-from dxlrun.errors import StartUpError
+from dxlrun.errors import StartUpError, help_link
 from dxlrun.features.registers.settings import register_value
 from dxlwire.bus_plan import BusPlan, RegisterValue
 from dxlwire.control_table import (
@@ -287,7 +287,8 @@ def test_a_refused_setting_comes_with_the_command_that_writes_it_on_a_real_port_
         lines.run_programs([inspect_servo(first_reach(other, other.servos[0]), found, take_over=False)])
         (problem,) = found.problems
         assert problem.startswith(f"arm_4_joint (ID 4 on bus arm) {sentence}")
-        assert problem.endswith(f": write {factory} there{command}")
+        link = help_link("a-setting-of-another-program-is-refused")
+        assert problem.endswith(f": write {factory} there{command}; {link}")
 
 
 def plan_item(plan: BusPlan, name: str) -> ControlItem:

@@ -20,7 +20,7 @@ from dxlrun.channels.cycle import Commands, States
 from dxlrun.compile.robot_compiler import compile_files
 from dxlrun.dynamixel.dynamixel_hardware import DynamixelHardware, ServoArrays
 from dxlrun.dynamixel.tools.tool_line import TunablePort
-from dxlrun.errors import PortError
+from dxlrun.errors import PortError, help_link
 from dxlrun.plan.robot_plan import to_json
 from dxlrun.process_table import robot_of
 from dxlsim.simulation_plan import BusConfig, ServoConfig
@@ -246,7 +246,7 @@ def test_the_run_that_has_the_line_is_named_and_how_to_end_it(terminal):
             dxlrun.open_serial(path, 1_000_000)
     assert str(refused.value) == (
         f"{path} is in use by a run of pan_tilt; `dxlrun stop --robot pan_tilt` ends it, or Ctrl-C in its "
-        "terminal"
+        f"terminal; {help_link('the-port-is-in-use')}"
     )
 
 

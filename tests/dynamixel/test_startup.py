@@ -9,7 +9,7 @@ from tests.kit.rigs import make_plan, make_rig, make_x, start_rig
 from dxlrun.channels.event_records import EventCode, Severity
 from dxlrun.dynamixel.remedies import INJECTED
 from dxlrun.dynamixel.servo.checks import _silence
-from dxlrun.errors import PortError, StartUpError
+from dxlrun.errors import PortError, StartUpError, help_link
 from dxlsim.bus.simulated_bus import PacketFault
 from dxlsim.bus.simulated_line import flipped
 from dxlsim.simulation_plan import ServoConfig
@@ -34,7 +34,7 @@ def test_a_servo_that_is_not_there_is_named_with_all_the_others():
     assert "ID 6 on bus main" in other
     assert silent == (
         "2 servos on bus main do not answer: main_3_joint (ID 3), main_20_joint (ID 20): "
-        "check the IDs, and that it runs at 1000000 bit/s"
+        f"check the IDs, and that it runs at 1000000 bit/s; {help_link('one-servo-does-not-answer')}"
     )
     rig = make_rig()
     rig.servo(3).silence()

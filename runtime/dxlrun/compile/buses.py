@@ -17,7 +17,7 @@ from dxlrun.compile.problems import RobotFile
 from dxlrun.description.bus import HIGHEST_BAUD_RATE, SIMULATED
 from dxlrun.description.reading import Description
 from dxlrun.dynamixel.servo.watchdog import LEAST_PERIODS, MOST_TICKS, UNIT_NS, has_one
-from dxlrun.errors import suggestion
+from dxlrun.errors import help_link, suggestion
 from dxlrun.features import stages
 from dxlwire.bus_plan import Budget, BusPlan
 from dxlwire.control_table import ControlTable, find_table
@@ -172,13 +172,14 @@ def _check_budget(file: RobotFile, plan: BusPlan) -> None:
     mark = file.at("loop", "rate")
     origin = file.marks.origins.get(("loop", "rate"))
     given = f" (argument {origin})" if origin else ""
+    link = help_link("the-rate-is-too-high-for-the-bus")
     cycle = f"one cycle on bus {plan.name} takes {budget.total_ns * 1e-6:.1f} ms"
     if share > 1.0:
         file.error(
             mark,
             f"{cycle}, but {rate:g} Hz{given} leave {1e3 / rate:.3g} ms; the highest possible rate is "
             f"{_floor(budget.highest_rate_hz)} Hz",
-            "; ".join(["lower the rate", *_improvements(plan)]),
+            "; ".join(["lower the rate", *_improvements(plan), link]),
         )
     elif share > _COMFORTABLE:
         file.warning(

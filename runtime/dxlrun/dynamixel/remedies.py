@@ -11,7 +11,7 @@ from collections.abc import Iterable, Sequence
 from pathlib import Path
 
 from dxlrun.plan.machine_load import MachineLoad
-from dxlwire.exceptions import counted
+from dxlwire.exceptions import counted, help_link
 from dxlwire.port.latency_timer import SYSTEM, fix, is_simulated, is_timer, latency_timer
 
 CHECK = "check its cable and power"
@@ -100,4 +100,5 @@ def describe_late_start(
     timer = None if is_simulated(port) else latency_timer(port, system)
     if timer is None or timer.found_ms * 1_000_000 <= planned_ns:
         return observed
-    return f"{observed}; its latency timer is {timer.found_ms} ms: `{timer.fix}` shortens it"
+    link = help_link("replies-come-late")
+    return f"{observed}; its latency timer is {timer.found_ms} ms: `{timer.fix}` shortens it; {link}"

@@ -11,7 +11,7 @@ from collections.abc import Callable, Iterable
 from contextlib import suppress
 from pathlib import Path
 
-from dxlwire.exceptions import PortError
+from dxlwire.exceptions import PortError, help_link
 from dxlwire.port.adapters import serial_devices
 from dxlwire.port.latency_timer import is_simulated
 from dxlwire.port.rights import command_for_access
@@ -183,10 +183,11 @@ def _sentence(path: str, baud_rate: int, error: OSError, describe_holder: Descri
     if number in (errno.EACCES, errno.EPERM) and not os.access(path, os.R_OK | os.W_OK):
         return (
             f"this user may not open {path}: "
-            f"`{command_for_access(Path(os.path.realpath(path)), os.path.realpath(path), '$USER')}`"
+            f"`{command_for_access(Path(os.path.realpath(path)), os.path.realpath(path), '$USER')}`; "
+            f"{help_link('the-port-may-not-be-opened')}"
         )
     if number in (errno.EBUSY, errno.EAGAIN, errno.EWOULDBLOCK):
-        return f"{path} is in use by {_holder(path, describe_holder)}"
+        return f"{path} is in use by {_holder(path, describe_holder)}; {help_link('the-port-is-in-use')}"
     if number == errno.ENOTTY:
         return f"{path} is not a serial line"
     if number == errno.EINVAL:
@@ -197,7 +198,7 @@ def _sentence(path: str, baud_rate: int, error: OSError, describe_holder: Descri
 def _what_exists() -> str:
     devices = serial_devices()
     if not devices:
-        return "this machine has no serial adapter now: is it plugged in?"
+        return f"this machine has no serial adapter now: plug it in; {help_link('there-is-no-port')}"
     return f"there are: {', '.join(devices)}"
 
 

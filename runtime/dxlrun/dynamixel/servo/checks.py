@@ -29,6 +29,7 @@ from dxlwire.control_table import (
     find_deviations,
     find_table,
 )
+from dxlwire.exceptions import help_link
 from dxlwire.modes import Mode
 from dxlwire.plan.line import listen_transaction
 from dxlwire.plan.mode_plan import mode_in
@@ -144,7 +145,7 @@ CHECKS: tuple[Check, ...] = (
         lambda found, number: number != found.servo.model_number,
         lambda found, number: (
             f"is model number {number}, not a {found.servo.model} ({found.servo.model_number}): correct "
-            "`model` or the ID in the robot file"
+            f"`model` or the ID in the robot file; {help_link('the-model-is-another-one')}"
         ),
     ),
     Check("firmware_version", lambda found, firmware: bool(_newer(found, firmware)), _newer_sentence),
@@ -162,7 +163,7 @@ CHECKS: tuple[Check, ...] = (
             lambda found, raw: raw != 0 and not found.errors.is_warning(raw),
             lambda found, raw: (
                 f"reports in {found.title(found.errors.item)}: {found.errors.describe_errors(raw)}; "
-                "find the cause, then reboot it"
+                f"find the cause, then reboot it; {help_link('a-servo-reports-an-error')}"
             ),
         )
         for item in ("hardware_error_status", "error_code")
@@ -186,7 +187,8 @@ CHECKS: tuple[Check, ...] = (
         lambda found, enabled: enabled != 0 and not found.take_over,
         lambda *_: (
             "holds torque already, so another program may be moving it: stop that one and switch the torque "
-            "off, or take the robot over as it is with --take-over"
+            "off, or take the robot over as it is with --take-over; "
+            f"{help_link('a-servo-holds-torque-already')}"
         ),
     ),
     Check(
@@ -317,7 +319,8 @@ def _refusal(one: Access, found: FoundDeviation) -> str:
     item = found.item
     command = f"dxlrun servo {one.plan.port} {one.servo.servo_id} set {item.name} {found.factory}"
     how = "" if one.plan.port == SIMULATED else f" (`{command}`)"
-    return f"has {item.title} = {found.found}, which {found.effect}: write {found.factory} there{how}"
+    link = help_link("a-setting-of-another-program-is-refused")
+    return f"has {item.title} = {found.found}, which {found.effect}: write {found.factory} there{how}; {link}"
 
 
 def inspect_states(servos: Sequence[tuple[Access, Mode]], found: Findings) -> Program[None]:
@@ -358,7 +361,7 @@ def _echoes(one: Access, found: Findings) -> Program[bool]:
     if reply.echoed:
         found.problems.append(
             f"bus {one.plan.name}: the adapter at {one.plan.port} echoes what it sends; use one that "
-            "switches its receiver off while it sends"
+            f"switches its receiver off while it sends; {help_link('the-adapter-echoes')}"
         )
     return reply.echoed
 
@@ -377,7 +380,7 @@ def _answers(one: Access, found: Findings) -> Program[bool | None]:
     if disturbed > 1:
         problem = (
             f"answers {disturbed} of {PINGS} pings garbled or twice: do two servos have its ID? "
-            "Connect them one by one and give each its own"
+            f"Connect them one by one and give each its own; {help_link('two-servos-have-one-id')}"
         )
     elif answered == 0:
         return None
@@ -399,7 +402,7 @@ def _silence(plan: BusPlan, silent: Sequence[ServoPlan]) -> str:
         remedy = choose_remedy(
             plan.port, f"check power, cable, ID, and {rate}", simulated=f"check its ID, and {rate}"
         )
-        return f"{plan.label(silent[0])} does not answer: {remedy}"
+        return f"{plan.label(silent[0])} does not answer: {remedy}; {help_link('one-servo-does-not-answer')}"
     named = [f"{servo.own_name} (ID {servo.servo_id})" for servo in silent[:_MOST_NAMED]]
     more = ", ".join(str(servo.servo_id) for servo in silent[_MOST_NAMED:])
     names = ", ".join(named) + (f" and those with the IDs {more}" if more else "")
@@ -407,11 +410,13 @@ def _silence(plan: BusPlan, silent: Sequence[ServoPlan]) -> str:
         remedy = choose_remedy(
             plan.port, f"check its power, cable and port, and {rate}", simulated=f"check {rate}"
         )
-        return f"none of the {len(silent)} servos on bus {plan.name} answers: {remedy}: {names}"
+        link = help_link("no-servo-answers")
+        return f"none of the {len(silent)} servos on bus {plan.name} answers: {remedy}: {names}; {link}"
     remedy = choose_remedy(
         plan.port, f"check power, cables, IDs, and {rate}", simulated=f"check the IDs, and {rate}"
     )
-    return f"{len(silent)} servos on bus {plan.name} do not answer: {names}: {remedy}"
+    link = help_link("one-servo-does-not-answer")
+    return f"{len(silent)} servos on bus {plan.name} do not answer: {names}: {remedy}; {link}"
 
 
 def _unreadable(one: Access, title: str, reply: Reply) -> str:

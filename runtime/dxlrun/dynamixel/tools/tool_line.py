@@ -7,7 +7,7 @@ import termios
 
 from dxlrun.channels.ring import Payload
 from dxlrun.contract.serial_line import open_serial
-from dxlrun.errors import PortError
+from dxlrun.errors import PortError, help_link
 from dxlwire.bus_plan import Budget, BusPlan
 from dxlwire.clock import Clock, MonotonicClock
 from dxlwire.exchange.bus_engine import Lines
@@ -192,7 +192,7 @@ def refuse_echo(name: str, reply: Reply) -> None:
     if reply.echoed:
         raise PortError(
             f"the adapter at {name} echoes what it sends; use one that switches its receiver off while it "
-            "sends"
+            f"sends; {help_link('the-adapter-echoes')}"
         )
 
 

@@ -18,6 +18,7 @@ from dxlrun.features.mechanics.joint_arrays import CoupledJointArrays
 from dxlrun.plan.loop_plan import LimitedInterface, LoopPlan, ServoLimit
 from dxlrun.plan.mechanics_plan import CouplingPlan, MechanicsPlan
 from dxlwire.bus_plan import BusPlan, ServoPlan
+from dxlwire.exceptions import help_link
 
 FADE_NS = 1_000_000_000
 """Time in which deviations between servos at the start are removed from their goals, ns: at most 1.5 deg per
@@ -108,7 +109,7 @@ class CouplingCheck:
             problems.append(
                 f"{joint.label} is at {first.position_text(position)}, outside its limits "
                 f"{first.position_text(joint.lower)}..{first.position_text(joint.upper)}: move the joint "
-                "inside by hand"
+                f"inside by hand; {help_link('a-joint-is-outside-its-limits')}"
             )
         return problems
 
