@@ -16,6 +16,7 @@ from dxlrun.dynamixel.servo.watchdog import RETURN_SPEED
 from dxlrun.errors import StartUpError
 from dxlwire.bus_plan import RegisterValue
 from dxlwire.control_table import find_table
+from dxlwire.plan.bus_watchdog import UNIT_NS
 from dxlwire.transaction import Reply, TransactionOutcome
 from dxlwire.wire import protocol2
 
@@ -132,7 +133,7 @@ class TestWhileOthersAreArmed:
         once_armed(rig, 11, lambda one: [truncate_next(rig.buses[0], one, 0) for _ in range(3)])
         begin_ns = rig.clock.now_ns()
         rig.hardware.start()
-        assert rig.clock.now_ns() - begin_ns > 10 * watchdog.UNIT_NS, "its answers are awaited for longer"
+        assert rig.clock.now_ns() - begin_ns > 10 * UNIT_NS, "its answers are awaited for longer"
         rig.cycles(100)
         assert armed(rig) == [10]
         assert rig.events.of(EventCode.WATCHDOG) == []

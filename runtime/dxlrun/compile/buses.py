@@ -16,13 +16,13 @@ from dxlrun.compile.joints.limits import Interval, limits_of
 from dxlrun.compile.problems import RobotFile
 from dxlrun.description.bus import HIGHEST_BAUD_RATE, SIMULATED
 from dxlrun.description.reading import Description
-from dxlrun.dynamixel.servo.watchdog import LEAST_PERIODS, MOST_TICKS, UNIT_NS, has_one
 from dxlrun.errors import help_link, suggestion
 from dxlrun.features import stages
 from dxlwire.bus_plan import Budget, BusPlan
 from dxlwire.control_table import ControlTable, find_table
 from dxlwire.control_table.device_table import DeviceTable
 from dxlwire.modes import Mode
+from dxlwire.plan.bus_watchdog import LEAST_PERIODS, MOST_TICKS, UNIT_NS, has_watchdog
 from dxlwire.plan.planning import Wiring, bus_plan
 from dxlwire.plan.reads import slow_items
 
@@ -254,7 +254,7 @@ def _device_margin_ns(description: Description, plan: BusPlan) -> int:
 
 def slowest_period_ns(buses: Sequence[BusPlan]) -> int:
     """Return the longest loop period, ns, at which no servo's Bus Watchdog trips; 0: no watchdog is armed."""
-    armed = [bus.watchdog_ticks for bus in buses if any(has_one(bus, servo) for servo in bus.servos)]
+    armed = [bus.watchdog_ticks for bus in buses if any(has_watchdog(bus, servo) for servo in bus.servos)]
     return min(armed) * UNIT_NS // LEAST_PERIODS if armed else 0
 
 

@@ -15,12 +15,10 @@ from dxlrun.dynamixel.findings import Findings
 from dxlrun.dynamixel.servo.item_access import Access, access_servo
 from dxlrun.dynamixel.servo.registers import tripped
 from dxlwire.bus_plan import BusPlan, ServoPlan
-from dxlwire.control_table import ControlItem, find_table
+from dxlwire.plan.bus_watchdog import UNIT_NS, has_watchdog, watchdog_item
 from dxlwire.transaction import Program
 from dxlwire.wire.dialect import dialect_of, sync_writes
 
-UNIT_NS = 20_000_000  # one step of the register (e-Manual XM430-W350, Bus Watchdog (98))
-MOST_TICKS = 127  # longest timeout; higher values mean that it has tripped
 RAMP = "profile_acceleration"
 """Register of a servo that a watchdog stop sets to 0, as it does Profile Velocity (e-Manual XM430-W350, Bus
 Watchdog (98), step 4 of the example).
@@ -33,14 +31,13 @@ _FOLLOWED = {0: "goal_current", 1: "goal_velocity", 16: "goal_pwm"}
 """Goal register that a servo follows in the modes without a position goal, by value of Operating Mode
 (e-Manual XM430-W350, (11)).
 """
-LEAST_PERIODS = 3  # the timeout must be longer than two lost cycles (failures.md)
 
 
 def arm(one: Access) -> Program[str]:
     """Write the planned timeout to a servo's Bus Watchdog; return the problem. Empty on success, or if plan
     or model has none.
     """
-    if not has_one(one.plan, one.servo):
+    if not has_watchdog(one.plan, one.servo):
         return ""
     return (yield from _write(one, one.plan.watchdog_ticks))
 
@@ -54,7 +51,7 @@ def disarm(one: Access) -> Program[str]:
     continue with its old velocity or effort: its goal becomes 0 right after the clear, or else its torque is
     switched off.
     """
-    if (item := item_of(one.plan, one.servo)) is None:
+    if (item := watchdog_item(one.plan, one.servo)) is None:
         return ""
     reply = yield from one.read_bytes(item.address, item.size)
     if reply.answered and reply.word(item.size) == 0:
@@ -111,7 +108,7 @@ def release_all(plan: BusPlan) -> Program[list[str]]:
     armed = [
         (access_servo(plan, servo), item)
         for servo in plan.servos
-        if plan.watchdog_ticks and (item := item_of(plan, servo))
+        if plan.watchdog_ticks and (item := watchdog_item(plan, servo))
     ]
     while armed:
         if all_answer:
@@ -135,19 +132,9 @@ def to_all(plan: BusPlan, servos: Sequence[ServoPlan], ticks: int) -> list[bytes
     """
     if not plan.watchdog_ticks:
         return []
-    items = [(servo.servo_id, item) for servo in servos if (item := item_of(plan, servo))]
+    items = [(servo.servo_id, item) for servo in servos if (item := watchdog_item(plan, servo))]
     writes = ((servo_id, item.address, ticks.to_bytes(item.size, "little")) for servo_id, item in items)
     return sync_writes(dialect_of(plan.protocol), writes)
-
-
-def has_one(plan: BusPlan, servo: ServoPlan) -> bool:
-    """Return True if the plan arms the Bus Watchdog of this servo, which then has one."""
-    return bool(plan.watchdog_ticks) and item_of(plan, servo) is not None
-
-
-def item_of(plan: BusPlan, servo: ServoPlan) -> ControlItem | None:
-    """Return the Bus Watchdog item of a servo's control table; None if the model has none."""
-    return find_table(servo.model, plan.protocol).items.get("bus_watchdog")
 
 
 def _write(one: Access, ticks: int) -> Program[str]:

@@ -11,6 +11,7 @@ from dxlrun.dynamixel.servo.desired import DesiredState
 from dxlrun.dynamixel.servo.life import Life, ServoEvent
 from dxlrun.dynamixel.servo.registers import write_registers
 from dxlwire.exchange.bus_engine import ASKED_NS, SILENCE_NS
+from dxlwire.plan.bus_watchdog import UNIT_NS, has_watchdog, watchdog_item
 from dxlwire.transaction import Program
 
 
@@ -23,7 +24,7 @@ class WatchdogMonitor:
         self._life = life
         self._desired = desired
         self._words = life.idle.bus.words
-        self._words[SILENCE_NS] = life.plan.watchdog_ticks * watchdog.UNIT_NS
+        self._words[SILENCE_NS] = life.plan.watchdog_ticks * UNIT_NS
         self._reviving: set[int] = set()
         """Indices of servos whose revival already waits for idle time; a second late cycle must not schedule
         it again.
@@ -39,9 +40,9 @@ class WatchdogMonitor:
         life, plan = self._life, self._life.plan
         self._words[ASKED_NS] = life.now_ns()
         packets = watchdog.to_all(plan, plan.servos, plan.watchdog_ticks)
-        alone = sum(watchdog.has_one(plan, servo) for servo in plan.servos) == 1
+        alone = sum(has_watchdog(plan, servo) for servo in plan.servos) == 1
         for index, servo in enumerate(plan.servos):
-            if not plan.watchdog_ticks or (item := watchdog.item_of(plan, servo)) is None:
+            if not plan.watchdog_ticks or (item := watchdog_item(plan, servo)) is None:
                 continue
             one = life.access_servo(index)
             self.sent(life.now_ns())
@@ -74,7 +75,7 @@ class WatchdogMonitor:
         armed = [
             index
             for index, servo in enumerate(plan.servos)
-            if watchdog.has_one(plan, servo) and not life.offline(index)
+            if has_watchdog(plan, servo) and not life.offline(index)
         ]
         for index in armed:
             life.on(index, ServoEvent.WATCHDOG)
