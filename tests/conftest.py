@@ -21,6 +21,7 @@ from typing import NamedTuple, TypeVar
 
 import pytest
 from hypothesis import settings
+from tests.kit import campaigns
 
 settings.register_profile("fixed", derandomize=True, print_blob=True)
 settings.register_profile("search", derandomize=False, print_blob=True, max_examples=2000)
@@ -236,8 +237,13 @@ class Extras:
             terminalreporter.write_line(f"not run: {'; '.join(parts)}")
 
 
+def pytest_addoption(parser: pytest.Parser) -> None:
+    campaigns.add_options(parser)
+
+
 def pytest_configure(config: pytest.Config) -> None:
     config.pluginmanager.register(Extras())
+    config.pluginmanager.register(campaigns.Campaigns(config))
     # a shell ignores Ctrl-C for what it starts in the background, and what that starts inherits it
     if signal.getsignal(signal.SIGINT) is signal.SIG_IGN:
         signal.signal(signal.SIGINT, signal.default_int_handler)
