@@ -54,7 +54,7 @@ class AgentApp:
         if role < Role.ADMIN:
             return 403, "only a client with the role admin may start robots"
         if method not in ("GET", "POST") or name not in self._agent.starts:
-            return 404, f"this agent starts {', '.join(self._agent.starts)}"
+            return 404, f"the agent does not start {name}; it starts {', '.join(self._agent.starts)}"
         self._runs = [run for run in self._runs if run.poll() is None]
         path_out = self._directory / f"{name.replace('/', '_')}.out"
         with os.fdopen(os.open(path_out, os.O_RDWR | os.O_CREAT, 0o600), "r+b") as output:
@@ -62,12 +62,12 @@ class AgentApp:
                 # The run inherits this file as its output, and with it the lock, which outlives the agent.
                 fcntl.flock(output, fcntl.LOCK_EX | fcntl.LOCK_NB)
             except BlockingIOError:
-                return (409, "it runs already") if method == "POST" else (200, "it runs")
+                return (409, "already running") if method == "POST" else (200, "running")
             if method == "GET":
                 output.seek(max(0, os.fstat(output.fileno()).st_size - _MOST_TOLD))
                 told = output.read().decode(errors="replace").split("\n")[output.tell() > _MOST_TOLD :]
                 last = [line for line in told if line.strip()][-_LINES_TOLD:] or ["nothing"]
-                return 410, "\n  ".join([f"it does not run; {path_out} ends with:", *last])
+                return 410, "\n  ".join([f"not running; {path_out} ends with:", *last])
             output.truncate(0)
             self._runs.append(
                 subprocess.Popen(
@@ -81,7 +81,7 @@ class AgentApp:
                     start_new_session=True,
                 )
             )
-        return 200, "it was started"
+        return 200, "started"
 
 
 async def serve_agent(agent: Agent, directory: Path) -> None:

@@ -97,9 +97,11 @@ def issue(name: str, role: Role | None, days: int, to: Path) -> IssuedCertificat
     root = issuer.public_bytes(Encoding.PEM)
     held = there.exists() and _is_named(there, name)
     if not held and (there.exists() or (kept.exists() and to == keys_place())):
-        raise InputError(f"{there} is not of {name}: give --output DIRECTORY for another computer's files")
+        raise InputError(
+            f"{there} is not the certificate of {name}; give --output DIRECTORY for another computer's files"
+        )
     if (to / "ca.crt").exists() and (to / "ca.crt").read_bytes() != root:
-        raise InputError(f"{to / 'ca.crt'} is of another authority: give another directory")
+        raise InputError(f"{to / 'ca.crt'} belongs to another authority; give another directory")
     key = ec.generate_private_key(ec.SECP256R1())
     unit = [] if role is None else [_attribute(NameOID.ORGANIZATIONAL_UNIT_NAME, role.name.lower())]
     usage = ExtendedKeyUsageOID.SERVER_AUTH if role is None else ExtendedKeyUsageOID.CLIENT_AUTH
@@ -132,7 +134,9 @@ def _authority() -> tuple[x509.Certificate, ec.EllipticCurvePrivateKey]:
     certificate, path = keys_place() / "ca.crt", authority_directory() / "ca.key"
     if not path.exists():
         if certificate.exists():
-            raise InputError(f"{certificate} is of another computer's authority: make certificates there")
+            raise InputError(
+                f"{certificate} belongs to another computer's authority; create certificates there"
+            )
         (authority_directory() / "issued").mkdir(parents=True, mode=0o700)
         key = ec.generate_private_key(ec.SECP256R1())
         name = x509.Name([_attribute(NameOID.COMMON_NAME, "dxlrun")])
@@ -158,7 +162,7 @@ def _authority() -> tuple[x509.Certificate, ec.EllipticCurvePrivateKey]:
     signer = load_pem_private_key(path.read_bytes(), None)
     if not isinstance(signer, ec.EllipticCurvePrivateKey):
         raise InputError(
-            f"{path} is not a key of this version; move {authority_directory()} away to start over"
+            f"{path} is not an elliptic-curve key; move {authority_directory()} away to start over"
         )
     return x509.load_pem_x509_certificate(certificate.read_bytes()), signer
 

@@ -70,7 +70,9 @@ def fleet(
 
 def _serve(fleet: Fleet, name: str) -> int:
     if name not in fleet.agents:
-        raise InputError(f"the file has no agent {name}; it has {', '.join(fleet.agents) or 'none'}")
+        raise InputError(
+            f"the fleet file has no agent {name}; its agents: {', '.join(fleet.agents) or 'none'}"
+        )
     import asyncio
 
     from dxlrun_fleet.agent import serve_agent
@@ -78,8 +80,10 @@ def _serve(fleet: Fleet, name: str) -> int:
     agent = fleet.agents[name]
     for robot, words in agent.starts.items():
         if not (fleet.directory / words[0]).is_file():
-            raise InputError(f"there is no {fleet.directory / words[0]}, by which {robot} is started")
-    show_parts(f"{agent.address} starts {', '.join(agent.starts)}; Ctrl-C ends it, and no robot")
+            raise InputError(
+                f"robot file {fleet.directory / words[0]} of {robot} not found; correct it under `starts`"
+            )
+    show_parts(f"{agent.address} starts {', '.join(agent.starts)}; Ctrl-C ends the agent, not the robots")
     try:
         asyncio.run(serve_agent(agent, fleet.directory))
     except KeyboardInterrupt:
@@ -128,9 +132,12 @@ def _start(fleet: Fleet, name: str) -> str:
         until = time.monotonic() + _START_S
         while status == 200:
             if robot.alive:
-                return f"{name} runs"
+                return f"{name} is running"
             if time.monotonic() > until:
-                raise DxlrunError(f"it was started, but {fleet.robots[name]} takes no connection")
+                raise DxlrunError(
+                    f"started, but {fleet.robots[name]} accepts no connection; "
+                    "check --listen in the fleet file"
+                )
             time.sleep(_POLL_S)
             status, text = agent.exchange("GET", path, None)
     raise DxlrunError(text.decode(errors="replace"))

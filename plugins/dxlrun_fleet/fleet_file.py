@@ -21,10 +21,10 @@ def _line(text: str) -> str:
         words = shlex.split(text)
     except ValueError as error:
         raise validation_error(
-            f"{text!r} is not a command line: {error}", "write it like the words after `dxlrun`"
+            f"{text!r} is not a command line: {error}", "write arguments of `dxlrun`"
         ) from error
     if not words or not words[0].endswith((".yaml", ".yml")):
-        raise validation_error(f"{text!r} begins with no robot file", "write ROBOT.yaml and what follows it")
+        raise validation_error(f"{text!r} does not begin with a robot file", "write ROBOT.yaml first")
     return text
 
 
@@ -41,8 +41,10 @@ class AgentForm(Form):
 class FleetForm(Form):
     """Top level of the file: robots, and the agents that start them."""
 
-    robots: dict[str, ListedAddress] = key("Addresses by the names of certificates.", "{torso: lab3:7660}")
-    agents: dict[str, AgentForm] = key("Agents by the names of their certificates.", "{lab3: {}}", {})
+    robots: dict[str, ListedAddress] = key(
+        "Address of each robot, by the name in its certificate.", "{torso: lab3:7660}"
+    )
+    agents: dict[str, AgentForm] = key("Agents, by the names in their certificates.", "{lab3: {}}", {})
 
 
 class Agent(NamedTuple):
@@ -70,13 +72,15 @@ class Fleet(NamedTuple):
         for agent in self.agents.values():
             if robot in agent.starts:
                 return agent
-        raise InputError(f"no agent of the file starts {robot}; name it under agents: NAME: starts")
+        raise InputError(f"no agent starts {robot}; add it to `starts` of an agent in the fleet file")
 
     def require_robots(self, names: tuple[str, ...]) -> None:
         """Raise InputError for the first name that is not a robot of the fleet file."""
         for name in names:
             if name not in self.robots:
-                raise InputError(f"the file has no robot {name}; {suggestion(name, tuple(self.robots))}")
+                raise InputError(
+                    f"the fleet file has no robot {name}; {suggestion(name, tuple(self.robots))}"
+                )
 
 
 def read_fleet(path: Path) -> Fleet:

@@ -64,7 +64,7 @@ class RobotView:
         if seen.state != "unreachable" and silent <= SILENT_S:
             return seen
         since = datetime.fromtimestamp(time.time() - silent).astimezone().isoformat(timespec="seconds")
-        reason = seen.reason or "it does not answer"
+        reason = seen.reason or "no answer"
         return msgspec.structs.replace(
             seen, state="unreachable", since=since, reason=reason, voltage=None, temperature=None, hottest=""
         )

@@ -65,27 +65,32 @@ def keys(
             )
         days = 365 if days is None else days
         if not 0 < days <= MOST_DAYS:
-            raise InputError(f"--days {days} is not a time from 1 to {MOST_DAYS}")
+            raise InputError(f"--days {days} is out of range; give 1 to {MOST_DAYS}")
         known = {one.name: one for one in authority.issued()}
         directory = keys_place() if output is None else output
         if action in ("robot", "client"):
             if name in known:
                 raise InputError(
-                    f"{name} has a certificate: `dxlrun keys renew {name}`, or take another name"
+                    f"{name} already has a certificate; run `dxlrun keys renew {name}`, or give another name"
                 )
             chosen = None if action == "robot" else Role[(role or "observe").upper()]
         elif name not in known:
-            raise InputError(f"{name} has no certificate; there are: {', '.join(known) or 'none'}")
+            raise InputError(
+                f"{name} has no certificate; existing certificates: {', '.join(known) or 'none'}"
+            )
         else:
             chosen = None if known[name].role == "robot" else Role[known[name].role.upper()]
         if action == "revoke":
             authority.revoke(known[name])
             sentence = (
-                f"{name} is refused by the robots of this computer; copy {keys_place() / 'revoked'} to others"
+                f"robots of this computer refuse {name} now; "
+                f"copy {keys_place() / 'revoked'} to other computers"
             )
         else:
             one = authority.issue(name, chosen, days, directory)
-            where = "" if output is None else f"; copy it to ~/.config/dxlrun/keys of {name}'s computer"
+            where = (
+                "" if output is None else f"; copy its files to ~/.config/dxlrun/keys of {name}'s computer"
+            )
             sentence = f"{directory} has the certificate of {name} ({one.role}, {days} days){where}"
         if not as_json:
             show_parts(sentence)
@@ -107,7 +112,7 @@ def keys(
     show_parts(
         Table.from_rows("Certificates", columns, ([*row.values()][:4] for row in rows))
         if rows
-        else "no certificate yet; `dxlrun keys robot NAME` and `dxlrun keys client NAME` make some"
+        else "no certificates; create one with `dxlrun keys robot NAME` or `dxlrun keys client NAME`"
     )
     return 0
 
@@ -125,7 +130,7 @@ def _refuse_unused(action: str, given: Mapping[str, object]) -> None:
     for option, value in given.items():
         if value is not None and action not in _ACTIONS_WITH[option]:
             actions = " and ".join(_ACTIONS_WITH[option])
-            raise InputError(f"`dxlrun keys {action}` does not use {option}, only {actions}; omit it")
+            raise InputError(f"`dxlrun keys {action}` does not accept {option}, only {actions}; omit it")
 
 
 def _state(one: IssuedCertificates, refused: frozenset[str]) -> str:

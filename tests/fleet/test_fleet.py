@@ -108,9 +108,9 @@ def test_a_robot_is_started_seen_killed_and_seen_again_beside_one_that_hangs(
     fleet = read_fleet(lab)
     closed(socket.create_server(fleet.robots["hung"][1:], backlog=1))
     said = dxlrun("fleet", lab, "--start", "joint")
-    assert (said.code, said.out) == (0, "joint runs\n"), said.err
+    assert (said.code, said.out) == (0, "joint is running\n"), said.err
     said = dxlrun("fleet", lab, "--start", "joint")
-    assert (said.code, said.errors) == (1, ["joint: it runs already"])
+    assert (said.code, said.errors) == (1, ["joint: already running"])
 
     views = {name: closed(RobotView(name, address)) for name, address in fleet.robots.items()}
     row = until(lambda: (seen := views["joint"].seen()).voltage and seen, "a row")
@@ -133,7 +133,7 @@ def test_a_robot_is_started_seen_killed_and_seen_again_beside_one_that_hangs(
     assert "Connection refused" in said.errors[0]
 
     said = dxlrun("fleet", lab, "--start", "joint")
-    assert (said.code, said.out) == (0, "joint runs\n"), said.err
+    assert (said.code, said.out) == (0, "joint is running\n"), said.err
     until(lambda: views["joint"].seen().state == "running", "it runs again")
     said = dxlrun("fleet", lab, "--stop", "joint", "--json")
     assert result_of(said.out) == [{"robot": "joint", "done": True, "text": "joint has ended"}]
@@ -189,7 +189,7 @@ def test_the_last_error_stays_and_warnings_are_none(lab: Path) -> None:
                 None,
             )
         view._replied = time.monotonic() - 1.01 * SILENT_S
-        assert (view.seen().state, view.seen().reason) == ("unreachable", "it does not answer")
+        assert (view.seen().state, view.seen().reason) == ("unreachable", "no answer")
 
 
 def test_what_an_agent_answers(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -210,22 +210,22 @@ def test_what_an_agent_answers(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) 
     ):
         assert first.answer_request(method, path, role)[0] == status, (method, path)
     assert [path.name for path in tmp_path.iterdir()] == ["wait.py"]
-    assert first.answer_request("POST", START + "arm", Role.ADMIN) == (200, "it was started")
+    assert first.answer_request("POST", START + "arm", Role.ADMIN) == (200, "started")
     out = tmp_path / "arm.out"
     until(lambda: "EOFError" in out.read_text(), "its end")
     status, text = until(
         lambda: (one := second.answer_request("GET", START + "arm", Role.ADMIN))[0] == 410 and one
     )
     head, *_, last = text.split("\n  ")
-    assert (head, last) == (f"it does not run; {out} ends with:", "EOFError: EOF when reading a line")
+    assert (head, last) == (f"not running; {out} ends with:", "EOFError: EOF when reading a line")
     assert out.read_text().startswith("['arm.yaml', 'port:=x']\n")
 
     monkeypatch.setattr("dxlrun_fleet.agent._MAIN", "import time; time.sleep(20)")
     assert first.answer_request("POST", START + "arm", Role.ADMIN)[0] == 200
     assert out.read_text() == ""
     for starter in (first, second):
-        assert starter.answer_request("GET", START + "arm", Role.ADMIN) == (200, "it runs")
-        assert starter.answer_request("POST", START + "arm", Role.ADMIN) == (409, "it runs already")
+        assert starter.answer_request("GET", START + "arm", Role.ADMIN) == (200, "running")
+        assert starter.answer_request("POST", START + "arm", Role.ADMIN) == (409, "already running")
     (run,) = first._runs
     assert os.getsid(run.pid) == run.pid
     run.kill()
@@ -269,15 +269,15 @@ def test_of_fuzzed_requests_without_the_role_admin_an_agent_starts_nothing(
         (
             "robots: {}\nagents: {a: {address: h:1, starts: {arm: servo /dev/ttyUSB0 1}}}",
             (),
-            "begins with no robot file",
+            "does not begin with a robot file",
         ),
-        ("robots: {arm: lab3:7}", ("--start", "arm"), "no agent of the file starts arm"),
+        ("robots: {arm: lab3:7}", ("--start", "arm"), "no agent starts arm; add it to"),
         ("robots: {arm: lab3:7}", ("--stop", "amr"), "did you mean arm?"),
-        ("robots: {arm: lab3:7}", ("--serve", "lab3"), "the file has no agent lab3; it has none"),
+        ("robots: {arm: lab3:7}", ("--serve", "lab3"), "the fleet file has no agent lab3; its agents: none"),
         (
             "robots: {}\nagents: {a: {address: h:1, starts: {arm: arm.yaml}}}",
             ("--serve", "a"),
-            "there is no ",
+            "robot file ",
         ),
     ],
 )
