@@ -62,16 +62,14 @@ def foxglove(
 
     place = ListenAddress.parse(listen)
     if cert is None and key is not None:
-        raise InputError(f"--key {key}: add its certificate, --cert FILE")
+        raise InputError(f"--key {key} has no certificate; add --cert FILE")
     if place.host != "127.0.0.1" and cert is None:
-        raise InputError(
-            f"--listen {listen}: only 127.0.0.1 is served without TLS; add --cert FILE --key FILE"
-        )
+        raise InputError(f"--listen {listen} needs TLS; add --cert FILE --key FILE, or listen at 127.0.0.1")
     leave_real_time()
     try:
         from dxlrun_foxglove.foxglove_server import FoxgloveServer
     except ImportError as error:
-        raise InputError("Foxglove needs the extra of this name: pip install 'dxlrun[foxglove]'") from error
+        raise InputError("`dxlrun foxglove` needs websockets: pip install 'dxlrun[foxglove]'") from error
     with connect(robot, "dxlrun foxglove") as running:
         name = running.name
     served = FoxgloveServer(name, (APP, *origin), control=control)
@@ -93,7 +91,7 @@ async def _serve(served: FoxgloveServer, listener: Listener, tls: ssl.SSLContext
         host, taken = listener.getsockname()[:2]
         url = f"{'wss' if tls else 'ws'}://{in_url(host)}:{taken}/?token={served.token}"
         app = f"{APP}/~/view?ds=foxglove-websocket&ds.url={quote(url, safe='')}"
-        show_parts(f"{served.name}: {url}", f"In a browser: {app}", "Ctrl-C ends this, not the robot.")
+        show_parts(f"{served.name}: {url}", f"In a browser: {app}", "Ctrl-C ends the server, not the robot.")
         await ended.wait()
 
 
@@ -111,6 +109,6 @@ def tls_of(cert: Path | None, key: Path | None) -> ssl.SSLContext | None:
     except OSError as error:
         raise InputError(
             f"--cert {cert} with --key {key or cert} cannot be used: {error.strerror or error}; "
-            "give a certificate and its private key, both PEM"
+            "give a certificate and its private key as PEM files"
         ) from error
     return context

@@ -39,7 +39,7 @@ PING_S = 10.0
 MOST_BYTES = 1 << 16
 """Largest frame that a viewer may send, bytes."""
 GOING_AWAY, TRY_AGAIN = 1001, 1013  # Close codes of RFC 6455 and its IANA registry: run ended, no run
-ONLY_SHOWN = "this only shows the robot: start `dxlrun foxglove --control` to change it"
+ONLY_SHOWN = "the server is read-only; start `dxlrun foxglove --control` to change the robot"
 _SILENT = logging.Logger("dxlrun foxglove", logging.CRITICAL)
 
 
@@ -94,10 +94,10 @@ class FoxgloveServer:
         given = parse_qs(urlsplit(request.path).query).get("token", [""])[0]
         # A constant-time comparison does not reveal a partly correct token.
         if not secrets.compare_digest(given.encode(), self.token.encode()):
-            why = "open the address that `dxlrun foxglove` printed: it has the token\n"
+            why = "invalid token; open the address printed by `dxlrun foxglove`\n"
             return connection.respond(HTTPStatus.UNAUTHORIZED, why)
         if len(self._viewers) >= MOST_VIEWERS:
-            why = f"{MOST_VIEWERS} viewers look already\n"
+            why = f"{MOST_VIEWERS} viewers are connected already; close one\n"
             return connection.respond(HTTPStatus.SERVICE_UNAVAILABLE, why)
         return None
 
@@ -179,7 +179,7 @@ class FoxgloveServer:
         try:
             received = protocol.received(frame)
         except ValueError as error:
-            viewer.reply(status(ERROR, f"no frame of this protocol: {error}"))
+            viewer.reply(status(ERROR, f"invalid frame: {error}"))
             return
         if isinstance(received, Call):
             self._ask(viewer, run, received)
@@ -208,7 +208,7 @@ class FoxgloveServer:
         is refused while the viewer has MOST_REQUESTS unanswered, a halt while it has twice as many."""
         halts = isinstance(request, Call) and request.service == HALT
         if len(viewer.requests) >= MOST_REQUESTS * (1 + halts):
-            viewer.reply(protocol.failure(request, "too many requests at once; wait for the answers"))
+            viewer.reply(protocol.failure(request, "too many requests at once; wait for earlier answers"))
             return
         task = asyncio.create_task(self._answer_request(viewer, run, request))
         viewer.requests.add(task)
@@ -244,7 +244,7 @@ class FoxgloveServer:
 def _subscribe(viewer: Viewer, one: Subscription, channel: Channel | None) -> None:
     known = viewer.subscriptions
     if channel is None or one.channel_id in known or one.id in known.values():
-        why = f"channel {one.channel_id} is not there, or subscribed to already"
+        why = f"channel {one.channel_id} does not exist, or this subscription exists already"
         viewer.reply(status(ERROR, why))
         return
     known[one.channel_id] = one.id

@@ -88,7 +88,7 @@ def received(frame: str | bytes) -> ViewerFrame | Call:
         except (msgspec.MsgspecError, RecursionError) as error:
             raise ValueError(str(error)) from error
     if len(frame) < _CALL_HEAD.size or frame[0] != CALL:
-        raise ValueError("a binary frame that is not a call of a service")
+        raise ValueError("the binary frame is not a service call")
     _, service, number, length = _CALL_HEAD.unpack_from(frame)
     content = frame[_CALL_HEAD.size :]
     return Call(service, number, content[:length].decode(errors="replace"), content[length:])

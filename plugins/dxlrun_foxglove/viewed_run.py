@@ -107,7 +107,7 @@ class ViewedRun(LiveMessages):
     def handle_message(self, message: TopicMessage) -> None:
         """Forward a message to the viewers; warn them if messages of its topic were lost before it."""
         if message.lost:
-            lost = f"{message.lost} messages of {message.topic} were lost before they came here"
+            lost = f"{message.lost} messages of {message.topic} were lost on the way here"
             for viewer in self.viewers:
                 viewer.reply(status(WARNING, lost))
         super().handle_message(message)
@@ -161,7 +161,7 @@ class ViewedRun(LiveMessages):
         Raises DxlrunError if the call is invalid or the robot refuses it.
         """
         if call.service >= len(SERVICES) or call.encoding != ENCODING:
-            raise InputError(f"there is no service {call.service} that takes {call.encoding}")
+            raise InputError(f"service {call.service} with encoding {call.encoding} not found")
         name, kind = SERVICES[call.service]
         try:
             body = msgspec.json.decode(call.body, type=kind)

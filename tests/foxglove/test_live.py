@@ -123,9 +123,9 @@ def may_not_change(only_looks: ForeignViewer, steers: ForeignViewer) -> None:
     only_looks.say(op="setParameters", parameters=[{"name": SPEED, "value": 0.25}], id="no")
     assert "--control" in only_looks.words("status")["message"]
     only_looks.say(op="advertise", channels=[{"id": 1, "topic": "/commands", "encoding": "cdr"}])
-    assert "no frame of this protocol" in only_looks.words("status")["message"]
+    assert "invalid frame" in only_looks.words("status")["message"]
     only_looks.socket.send(struct.pack("<BI", 1, 1) + b"x")
-    assert "no frame of this protocol" in only_looks.words("status")["message"]
+    assert "invalid frame" in only_looks.words("status")["message"]
 
 
 def nothing_comes_of_noise(looks: Started) -> None:
