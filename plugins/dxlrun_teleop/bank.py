@@ -127,9 +127,11 @@ def banks_of(robot: RemoteRobot, targets: Sequence[str], axes: int) -> list[Bank
     chosen: dict[str, dict[int, Bank]] = {}
     for target in targets or own or ("its joints",):
         if target not in words:
-            commands = "positions, velocities, twists or trajectories"
-            hint = suggestion(target, words, "`dxlrun switch --activate NAME` activates one")
-            raise InputError(f"no active controller of {robot.name} takes {commands} for {target}; {hint}")
+            hint = suggestion(target, words, "activate one with `dxlrun switch --activate NAME`")
+            raise InputError(
+                f"no active controller of {robot.name} accepts positions, velocities, twists or trajectories "
+                f"for {target}; {hint}"
+            )
         for bank, index in words[target]:
             chosen.setdefault(bank.controller, {})[index] = bank
     return [

@@ -125,6 +125,6 @@ def _present(robot: RemoteRobot, bank: Bank) -> list[float]:
         known += [float(states.goal_position[row]), float(states.position[row])]
         finite = [value for value in known if math.isfinite(value)]
         if not finite:
-            raise Refused(f"where {slot.name} is has not been read yet")
+            raise Refused(f"the position of {slot.name} has not been read yet")
         found.append(finite[0])
     return found

@@ -43,7 +43,7 @@ position, whatever the layout), and the arrows"""
 class Gamepad:
     """Gamepad with sticks and a directional pad. A shoulder button is the dead-man's switch."""
 
-    help = "shoulder button held: moves, released: holds; A: next controller; Start: end"
+    help = "hold a shoulder button to move; A: next controller; Start: end"
     pressing = BUTTONS
 
     def __init__(self, device: InputDevice[str]) -> None:
@@ -66,7 +66,9 @@ class Gamepad:
             axes, enabled = self._driven(held)
         except (OSError, SystemError) as error:
             name = f"{self._device.name} ({self._device.path})"
-            raise DxlrunError(f"{name} is gone, the robot holds; plug it in, and start again") from error
+            raise DxlrunError(
+                f"{name} was unplugged, and the robot holds; plug it in, and start again"
+            ) from error
         fresh, self._held = held - self._held, held
         return InputState(
             axes, enabled, frozenset(self.pressing[key] for key in fresh & self.pressing.keys())
@@ -93,7 +95,7 @@ class KeyboardDevice(Gamepad):
     The keyboard is grabbed once all keys are released. Otherwise another program would miss a release.
     """
 
-    help = "held: moves, released: holds; Tab: next controller; = -: speed; Esc: end"
+    help = "hold a key to move; Tab: next controller; = -: speed; Esc: end"
     pressing = KEYS
 
     def __init__(self, device: InputDevice[str]) -> None:
@@ -143,9 +145,9 @@ def chosen(path: str | None) -> Gamepad:
             device.close()
     if source is not None:
         return source
-    what = f"{path} is not a gamepad or keyboard that can be read" if path else "no gamepad can be read"
-    what = "several gamepads are there, choose one by --device" if pads and not path else what
-    more = "; `sudo usermod -aG input $USER` and a new log-in show others"
+    what = f"{path} is not a readable gamepad or keyboard" if path else "no readable gamepad found"
+    what = "several gamepads found; choose one with --device" if pads and not path else what
+    more = "; allow more with `sudo usermod -aG input $USER` and a new log-in"
     hint = more if len(devices) < len(paths) else ""
     listed = "".join(f"\n  {device.path}  {device.name}" for device in devices if device.path in able)
-    raise InputError(f"{what}; gamepads and keyboards{hint}:{listed or ' none'}")
+    raise InputError(f"{what}{hint}; gamepads and keyboards:{listed or ' none'}")

@@ -35,13 +35,13 @@ class TerminalKeyboard:
     """
 
     axes = AXES
-    help = "held: moves, released: holds; Tab: next controller; + -: speed; Ctrl-C: end"
+    help = "hold a key to move; Tab: next controller; + -: speed; Ctrl-C: end"
 
     def __init__(self) -> None:
         if not (sys.stdin.isatty() and sys.stdout.isatty()):
             raise InputError(
-                "`dxlrun teleop` reads keys from a terminal, and this is none; start it in one, or give it "
-                "a device: --gamepad, or --device /dev/input/eventN"
+                "`dxlrun teleop` needs a terminal or an input device; start it in a terminal, or give "
+                "--gamepad or --device /dev/input/eventN"
             )
         self._input = sys.stdin.fileno()
         self._before = termios.tcgetattr(self._input)

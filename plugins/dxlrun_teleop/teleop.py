@@ -50,7 +50,7 @@ def teleop(
 
     lowest, highest = FACTORS
     if not lowest <= speed <= highest:  # also rejects NaN
-        raise InputError(f"--speed {speed:g} is not a factor from {lowest:g} to {highest:g}")
+        raise InputError(f"--speed {speed:g} is out of range; give a factor from {lowest:g} to {highest:g}")
     with connect_robot(robot, "teleop") as running:
         source: InputSource = chosen(device) if gamepad or device else TerminalKeyboard()
         with terminated_as_interrupted(), closing(source):

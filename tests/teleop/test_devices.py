@@ -105,7 +105,7 @@ def test_a_gamepad_that_is_unplugged_is_gone(error: BaseException) -> None:
     device = pad()
     source = Gamepad(device)
     device.gone = error
-    with pytest.raises(DxlrunError, match=r"^Pad \(/dev/input/event3\) is gone, the robot holds; plug it in"):
+    with pytest.raises(DxlrunError, match=r"^Pad \(/dev/input/event3\) was unplugged, and the robot holds"):
         source.read_input(0.0)
     source.close()
     assert device.closed
@@ -171,13 +171,13 @@ def test_a_device_is_chosen_by_its_path(plugged_in: Callable[..., list[Fake]]) -
 @pytest.mark.parametrize(
     ("path", "pads", "said"),
     [
-        (None, 0, "no gamepad can be read; gamepads and keyboards: none"),
-        (None, 2, "several gamepads are there, choose one by --device; gamepads and keyboards:\n  /dev/in"),
-        ("/dev/input/event1", 1, "/dev/input/event1 is not a gamepad or keyboard that can be read; gamepads"),
+        (None, 0, "no readable gamepad found; gamepads and keyboards: none"),
+        (None, 2, "several gamepads found; choose one with --device; gamepads and keyboards:\n  /dev/in"),
+        ("/dev/input/event1", 1, "/dev/input/event1 is not a readable gamepad or keyboard; gamepads"),
         (
             "pad",
             1,
-            "pad is not a gamepad or keyboard that can be read; gamepads and keyboards:\n  /dev/input/e",
+            "pad is not a readable gamepad or keyboard; gamepads and keyboards:\n  /dev/input/e",
         ),
     ],
 )
@@ -193,7 +193,7 @@ def test_what_cannot_be_chosen_is_refused_with_what_there_is(
 
 def test_a_user_who_may_not_open_them_is_given_the_way(plugged_in: Callable[..., list[Fake]]) -> None:
     plugged_in(None)
-    with pytest.raises(InputError, match=r"`sudo usermod -aG input \$USER` and a new log-in show others"):
+    with pytest.raises(InputError, match=r"allow more with `sudo usermod -aG input \$USER` and a new log-in"):
         chosen(None)
 
 

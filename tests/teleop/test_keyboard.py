@@ -106,5 +106,5 @@ def test_the_terminal_is_as_it_was(terminal: Terminal) -> None:
 
 def test_without_a_terminal_a_device_is_asked_for(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(sys, "stdin", io.StringIO())
-    with pytest.raises(InputError, match=r"reads keys from a terminal, and this is none; .*--gamepad"):
+    with pytest.raises(InputError, match=r"needs a terminal or an input device; .*--gamepad"):
         TerminalKeyboard()
