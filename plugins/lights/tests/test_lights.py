@@ -164,7 +164,7 @@ def test_light_that_is_not_confirmed_off_is_a_warning(tmp_path: Path) -> None:
     run.run(0.1)
     run.link.close()
     texts = [event.text for event in read_log(log).events if event.text.startswith("light ")]
-    assert texts == ["light left (ID 1 on bus main) did not confirm that it is off"]
+    assert texts == ["light left (ID 1 on bus main) may still be on: no answer"]
 
 
 def test_plan_and_log_name_the_package(tmp_path: Path) -> None:
@@ -195,12 +195,12 @@ def test_check_lists_the_lights(capsys: pytest.CaptureFixture[str], monkeypatch:
     [
         (
             "lights: {left: {joint: pan}}\n",
-            "light left is on pan, which is not a joint; known: pan_joint, tilt_joint",
+            "light left: pan is not a joint; known: pan_joint, tilt_joint",
         ),
         ("lights: {left: {}}\n", "lights.left has no joint"),
         (
             "lights: {left: {joint: pan_joint}, right: {joint: pan_joint}}\n",
-            "light right is on pan_joint, whose LED is light left; name another joint",
+            "light right: light left already uses the LED of pan_joint; name another joint",
         ),
     ],
 )

@@ -20,18 +20,16 @@ def compile_lights(compilation: Compilation) -> Contribution:
     for name, light in lights.items():
         mark = file.at("lights", name, "joint")
         if light.joint not in file.robot.joints:
-            what = f"light {name} is on {light.joint}, which is not a joint"
+            what = f"light {name}: {light.joint} is not a joint"
             file.error(mark, what, suggestion(light.joint, tuple(file.robot.joints)))
         elif (joint := compilation.joints.get(light.joint)) is not None:
             servo = joint.servos[0]
             place = (servo.described.bus, servo.described.id)
             if (led := servo.table.items.get("led")) is None:
-                what = f"light {name} is on {light.joint}, whose {servo.table.model} has no item led"
-                file.error(
-                    mark, what, "name a joint whose servo has one; `dxlrun models MODEL` lists the items"
-                )
+                what = f"light {name}: the {servo.table.model} of {light.joint} has no item led"
+                file.error(mark, what, "name another joint; `dxlrun models MODEL` lists the items of a model")
             elif (other := owners.setdefault(place, name)) != name:
-                what = f"light {name} is on {light.joint}, whose LED is light {other}"
+                what = f"light {name}: light {other} already uses the LED of {light.joint}"
                 file.error(mark, what, "name another joint, or remove one of the lights")
             else:
                 found[name] = LightPlan(light.joint, *place, led.address)

@@ -13,5 +13,5 @@ class Light(Form):
 
 
 STAGE: Section[dict[str, Light]] = Section(
-    "lights", dict[Name, Light], key("LEDs of servos, by name.", "{left: {joint: pan_joint}}", {})
+    "lights", dict[Name, Light], key("Lights by name: LEDs of servos.", "{left: {joint: pan_joint}}", {})
 )

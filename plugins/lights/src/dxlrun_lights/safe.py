@@ -25,7 +25,7 @@ def _switch_off(bus: BusPlan, lights: dict[str, LightPlan]) -> Program[list[str]
         reply = yield from retry(plan_line(bus).write_range(light.servo_id, light.address, b"\0"))
         if not reply.answered:
             failures.append(
-                f"light {name} (ID {light.servo_id} on bus {bus.name}) did not confirm that it is off"
+                f"light {name} (ID {light.servo_id} on bus {bus.name}) may still be on: no answer"
             )
     return failures
 
