@@ -36,17 +36,17 @@ class PhidgetSpatialParameters(ParametersModel):
     """Selection of the unit"""
 
     serial_number: Annotated[int, Field(ge=1)] | None = Field(
-        default=None, description="Serial number of the unit, or of its VINT hub. Default: any."
+        default=None, description="Serial number of the unit, or of its VINT hub. Default: any unit."
     )
     hub_port: Annotated[int, Field(ge=0, le=5)] | None = Field(
-        default=None, description="Port of the VINT hub. Default: any."
+        default=None, description="Port of the VINT hub. Default: any port."
     )
     magnetometer: bool = Field(
-        default=True, description="If true, the states of the magnetometer are provided as well."
+        default=True, description="If true, also provide the states of the magnetometer."
     )
     attach_timeout: Annotated[Duration, Field(gt=0)] = Field(
         default=5_000_000_000,
-        description="Timeout for the attachment of the unit at the start.",
+        description="Time to wait for the unit at the start.",
         examples=["5 s"],
     )
 
@@ -102,7 +102,7 @@ class PhidgetSpatial(Sensor[PhidgetSpatialParameters]):
             self._news.wait_for(lambda: self._sample is not None or self._detached, _LOOK_S)
             sample, self._sample = self._sample, None
             if self._detached:
-                raise OSError("the Phidget Spatial was detached")
+                raise OSError("the Phidget Spatial was detached; plug it in again")
         if sample is None:
             return None
         t_ns, found = sample
