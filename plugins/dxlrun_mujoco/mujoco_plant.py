@@ -80,11 +80,11 @@ def mujoco_plant(bodies: UrdfBodies) -> PlantMaker:
         _compiled(text, _NOTHING_MOVED, ())
     except (ValueError, SyntaxError) as error:  # A ParseError of XML is a SyntaxError
         reason = " ".join(str(error).split())
-        raise InputError(f"MuJoCo cannot take the URDF: {reason}; correct it") from error
+        raise InputError(f"MuJoCo cannot load the URDF: {reason}; correct the URDF") from error
     if not moved.joint_names:
         raise InputError(
-            "physics: mujoco turns no joint: no hinge of the URDF has the name of a joint of the robot file; "
-            "give them the same names, or take physics: independent"
+            "physics: mujoco moves nothing, because hinges of the URDF and joints of the robot file have "
+            "different names; use the same names, or physics: independent"
         )
 
     def make_plant(joints: Sequence[PlantJoint]) -> Plant:
