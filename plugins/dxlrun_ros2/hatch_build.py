@@ -124,7 +124,7 @@ def _compile(name: str, place: Path, prefix: Path, library: Path, libraries: Pat
     RuntimeError without compilers, or if one fails."""
     include = sysconfig.get_paths()["include"]
     if not (shutil.which("gcc") and shutil.which("g++") and (Path(include) / "Python.h").exists()):
-        raise RuntimeError(f"{name} has no wheel and is built here; that needs {NEEDED}")
+        raise RuntimeError(f"{name} has no wheel and is built here; install {NEEDED}")
     import numpy as np
 
     headers = prefix / "include"

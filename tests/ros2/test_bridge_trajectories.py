@@ -72,18 +72,18 @@ print(json.dumps([[one.start_in, *one.times.tolist()] for one in plans]
     + [why(lambda: wanted(trajectory(["pan"], *points, stamp=100), JOINTS, 104.0))]))""")
     assert ahead == [2.0, 1.0, 3.0]
     assert late == [0.0, 1.0]
-    assert past == "all its points are in the past"
+    assert past == "all points are in the past"
 
 
 WRONG = {
-    'trajectory(["nose"], at(1, positions=[0]))': "nose: not among its joints, pan, tilt, roll",
-    'trajectory(["pan", "pan"], at(1, positions=[0, 0]))': "each joint once",
-    "trajectory([], at(1, positions=[]))": "at least one",
+    'trajectory(["nose"], at(1, positions=[0]))': "has no joint nose; its joints: pan, tilt, roll",
+    'trajectory(["pan", "pan"], at(1, positions=[0, 0]))': "repeat a joint",
+    "trajectory([], at(1, positions=[]))": "must not be empty",
     'trajectory(["pan"], at(1, positions=[0, 1]))': "point 1 has 2 positions for 1 joints",
     'trajectory(["pan"], at(1, velocities=[0]))': "point 1 has 0 positions",
     'trajectory(["pan"], at(1, positions=[0], accelerations=[0, 1]))': "2 accelerations",
-    'trajectory(["pan"], at(1, positions=[float("nan")]))': "not finite",
-    'trajectory(["pan"], at(1, positions=[0]), at(1, positions=[0]))': "grow from point to point",
+    'trajectory(["pan"], at(1, positions=[float("nan")]))': "NaN or infinite",
+    'trajectory(["pan"], at(1, positions=[0]), at(1, positions=[0]))': "increase from point to point",
     'trajectory(["pan"], at(-1, positions=[0]))': "at least 0",
 }
 
@@ -104,7 +104,7 @@ print(json.dumps([goal_fields(goal, JOINTS), goal_fields(FollowJointTrajectory.G
     tolerances = {"pan": {"position": 0.1}, "tilt": {"position": "inf", "velocity": 0.5}}
     assert fields == {"goal_tolerance": tolerances, "goal_time_tolerance": 0.5}
     assert none == {}
-    assert unknown == "a tolerance names tilt, which is not moved"
+    assert unknown == "the trajectory does not move tilt; remove the tolerance"
 
 
 def test_the_desired_state_is_that_of_the_controllers_spline() -> None:

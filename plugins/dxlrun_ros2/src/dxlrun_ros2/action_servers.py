@@ -128,12 +128,12 @@ class Action:
         why, cancelled, seen = "", False, time.monotonic()
         while (state := robot.goal_state(goal.number, FEEDBACK_S)).status == "running":
             if self.run.ended.is_set():
-                raise DxlrunError(self.run.why or "the bridge ends")
+                raise DxlrunError(self.run.why or "the bridge is shutting down")
             why = why or look(state)
             if self.node.count_clients(self._clients):
                 seen = time.monotonic()
             elif time.monotonic() > seen + CLIENT_S:
-                why = why or "no client of the action is left"
+                why = why or "the client of the action has exited"
             if (why or handle.is_cancel_requested) and not cancelled:
                 cancelled = True
                 try:
@@ -158,7 +158,9 @@ class FollowTrajectory(Action):
     def check_goal(self, request: FollowJointTrajectory.Goal) -> None:
         """Check trajectory and tolerances before a goal is accepted. Raises InputError with the reason."""
         if request.multi_dof_trajectory.points:
-            raise InputError("it has no joints with several degrees of freedom")
+            raise InputError(
+                "the controller has no joints with several degrees of freedom; omit multi_dof_trajectory"
+            )
         goal_fields(request, self.controller.joints)
         if request.trajectory.points:
             self._wanted(request)
@@ -244,7 +246,7 @@ def _sent(
 ) -> RemoteGoal:
     goal = robot.send(controller.name, kind, command).goal
     if goal is None:
-        raise DxlrunError(f"{controller.name} takes no {kind} as a goal")
+        raise DxlrunError(f"{controller.name} does not accept {kind} as a goal")
     return goal
 
 

@@ -34,7 +34,7 @@ def arguments(words: list[str]) -> argparse.Namespace:
         "--lease",
         type=float,
         default=0.5,
-        help="time without a message after which the joints of a publisher are held, s; default 0.5",
+        help="time from the last message of a publisher until its joints hold, s; default 0.5",
     )
     found = parser.parse_args(words)
     if not 0.01 <= found.lease <= 60:
@@ -74,7 +74,7 @@ def main() -> int:
 def _bridge(bridge: Bridge, name: str, stopped: threading.Event) -> None:
     """Serve a run until it ends or `stopped` is set; then close the bridge. Raises DxlrunError."""
     try:
-        print(f"{name} is in ROS 2; Ctrl-C ends this, not the robot.", flush=True)
+        print(f"{name} is in ROS 2; Ctrl-C ends the bridge, not the robot.", flush=True)
         bridge.spin(stopped)
     finally:
         bridge.close()

@@ -169,7 +169,7 @@ class ControllerManagerServices:
         if "type" not in entry:
             raise InputError(
                 f"{name} has no type; set the parameter {name}.type of controller_manager, "
-                "or give a file of parameters"
+                "or give a parameter file"
             )
         for own, other in TYPES.items():
             if entry["type"] == other:
@@ -184,7 +184,7 @@ def _parameters(path: Path, name: str) -> dict[str, object]:
         found = yaml.safe_load(path.read_text(encoding="utf-8"))
         return dict(found[name]["ros__parameters"]) if name in found else {}
     except (OSError, yaml.YAMLError, TypeError, KeyError) as error:
-        raise InputError(f"{path} has no parameters of {name}: {error}") from error
+        raise InputError(f"{path} has no parameters for {name}: {error}") from error
 
 
 @contextmanager
@@ -211,7 +211,7 @@ def _known(robot: RemoteRobot, name: str) -> ControllerInfo:
     """Return the description of a loaded controller. Raises InputError if it is not loaded."""
     known = {one.name: one for one in info_of(robot).controllers}
     if name not in known:
-        raise InputError(f"there is no controller {name}; there are {', '.join(known)}")
+        raise InputError(f"controller {name} is not loaded; loaded controllers: {', '.join(known)}")
     return known[name]
 
 

@@ -76,7 +76,9 @@ class PublishedRun(LiveMessages):
         name = topic if topic in GLOBAL else topic.removeprefix("/")
         kind = message_class(message.name)
         if kind is None and topic not in LOGGED and not topic.startswith(BUS_PREFIX):
-            self._node.get_logger().warning(f"{topic} is not published: {message.name} is not installed here")
+            self._node.get_logger().warning(
+                f"{topic} is not published: its type {message.name} is not installed"
+            )
         opened = None if kind is None else self._node.create_publisher(kind, name, quality)
         self._publishers_of.append(opened)
         return len(self._publishers_of) - 1

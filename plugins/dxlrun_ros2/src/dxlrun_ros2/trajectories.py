@@ -82,9 +82,9 @@ def wanted(message: JointTrajectory, joints: Sequence[str], now: float) -> Valid
     """
     named = tuple(message.joint_names)
     if unknown := [name for name in named if name not in joints]:
-        raise InputError(f"{', '.join(unknown)}: not among its joints, {', '.join(joints)}")
+        raise InputError(f"the controller has no joint {', '.join(unknown)}; its joints: {', '.join(joints)}")
     if not named or len({*named}) < len(named):
-        raise InputError("joint_names must name each joint once, at least one")
+        raise InputError("joint_names must not be empty or repeat a joint")
     points, times = np.zeros((len(message.points), 3, len(named))), np.zeros(len(message.points))
     orders = []
     for index, point in enumerate(message.points):
@@ -98,9 +98,9 @@ def wanted(message: JointTrajectory, joints: Sequence[str], now: float) -> Valid
             points[index, row] = values if len(values) else 0.0
         orders.append(LINEAR if not given[1] else QUINTIC if given[2] else CUBIC)
     if not np.isfinite(points).all():
-        raise InputError("it has numbers that are not finite")
+        raise InputError("the points have NaN or infinite numbers")
     if (np.diff(times, prepend=-1e-12) <= 0).any():
-        raise InputError("time_from_start must be at least 0, and grow from point to point")
+        raise InputError("time_from_start must not be negative, and must increase from point to point")
     stamp = seconds_of(message.header.stamp)
     start_in = stamp - now if stamp else 0.0
     if start_in < 0:
@@ -108,7 +108,7 @@ def wanted(message: JointTrajectory, joints: Sequence[str], now: float) -> Valid
     ahead = times > 0
     if not ahead.any():
         if stamp:
-            raise InputError("all its points are in the past")
+            raise InputError("all points are in the past")
         ahead[-1] = True
     chosen = tuple(order for order, is_ahead in zip(orders, ahead, strict=True) if is_ahead)
     return ValidatedTrajectory(named, times[ahead], points[ahead], chosen, start_in)
@@ -125,12 +125,12 @@ def tolerances(given: Sequence[JointTolerance], joints: Sequence[str]) -> dict[s
     """
     rows: Mapping[str, JointTolerance] = {one.name: one for one in given}
     if unknown := [name for name in rows if name not in joints]:
-        raise InputError(f"a tolerance names {', '.join(unknown)}, which is not moved")
+        raise InputError(f"the trajectory does not move {', '.join(unknown)}; remove the tolerance")
     found: dict[str, dict[str, float | str]] = {}
     for name, one in rows.items():
         written = {"position": float(one.position), "velocity": float(one.velocity)}
         if not np.isfinite(list(written.values())).all():
-            raise InputError(f"the tolerance of {name} has a number that is not finite")
+            raise InputError(f"the tolerance of {name} is NaN or infinite")
         if values := {key: "inf" if value < 0 else value for key, value in written.items() if value}:
             found[name] = values
     return found
