@@ -53,5 +53,15 @@ def test_running_robot_lists_the_same_properties() -> None:
 
 def test_order_of_a_robots_description_is_that_of_its_documentation() -> None:
     names = ["robot", "rate", "paused", "began", "cycles", "skipped", "joints", "groups", "units"]
-    names += ["effort_units", "limits", "speeds", "joint_keys", "controllers", "sources", "file", "log"]
+    names += [
+        "effort_units",
+        "limits",
+        "speeds",
+        "joint_keys",
+        "controllers",
+        "sources",
+        "file",
+        "log",
+        "servos",
+    ]
     assert [one.name for one in dataclasses.fields(RobotInfo)] == names

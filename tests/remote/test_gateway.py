@@ -548,6 +548,7 @@ def test_the_robot_is_shown_with_the_commands_of_its_controllers(desk):
         "sources": [],
         "file": str(Path("pair.yaml").absolute()),
         "log": "/logs/pair.mcap",
+        "servos": {},
     }
 
 

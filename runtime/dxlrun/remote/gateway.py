@@ -65,6 +65,7 @@ from dxlrun.remote.named.named_commands import INTERFACES, joint_command, source
 from dxlrun.remote.named.named_joints import (
     effort_units,
     joint_row,
+    joint_servos,
     named_joints,
     position_unit,
     prepared_reading,
@@ -268,6 +269,7 @@ class GatewayApp:
             sources=plan.loop.sources,
             file=str(Path(plan.source_file).absolute()),
             log=self._log,
+            servos=joint_servos(plan),
         )
 
     def _shown(self, loaded: LoadedController) -> ControllerInfo:

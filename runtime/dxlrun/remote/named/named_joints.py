@@ -21,6 +21,7 @@ from dxlrun.plan.robot_plan import Plan
 from dxlrun.remote import texts
 from dxlrun.remote.live.states import RobotStates
 from dxlrun.remote.preparation import refused
+from dxlrun.remote.requests.replies import JointServo
 from dxlwire.bus_plan import ServoPlan
 from dxlwire.control_table import ControlTable, find_table
 from dxlwire.modes import Mode
@@ -83,6 +84,17 @@ def effort_units(plan: Plan) -> dict[str, str]:
         joint: servo.unit.effort_unit(find_table(servo.model, bus.protocol).effort_unit).replace("1", "")
         for joint, servos in plan.servos_by_joint.items()
         for bus, servo in servos[:1]
+    }
+
+
+def joint_servos(plan: Plan) -> dict[str, JointServo]:
+    """Return the first servo of each joint; its temperature limit is unknown if other servos help it."""
+    models = {joint.name: joint.servo_model for joint in plan.loop.joints}
+    return {
+        joint: JointServo(servo.model, bus.protocol, model.temperature_limit if model else None)
+        for joint, servos in plan.servos_by_joint.items()
+        for bus, servo in servos[:1]
+        for model in (models.get(joint),)
     }
 
 

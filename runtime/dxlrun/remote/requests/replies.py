@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import struct
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from typing import Generic, TypeVar
 
 import msgspec
@@ -60,6 +60,15 @@ class RunInfo:
     groups: dict[str, tuple[str, ...]]
 
 
+class JointServo(msgspec.Struct, frozen=True):
+    """The first servo of a joint: its control table by model and protocol, and its temperature limit."""
+
+    model: str
+    protocol: float
+    temperature_limit: float | None
+    """Temperature above which the servo cuts its torque, degrees C; null: not known."""
+
+
 # Dataclasses, because a Struct cannot have the fields of two bases; the fields are in the order of the JSON.
 @dataclass(frozen=True)
 class RobotInfo(JointValues, RunInfo):
@@ -71,6 +80,8 @@ class RobotInfo(JointValues, RunInfo):
     file: str
     """Absolute path of the robot file."""
     log: str | None
+    servos: dict[str, JointServo] = field(default_factory=dict)
+    """First servo of each joint that servos move."""
 
 
 class Frames(msgspec.Struct, frozen=True):
