@@ -72,7 +72,7 @@ def bundle(source: Path, place: Path, target: Path) -> None:
     try:
         if npm(["ci", "--ignore-scripts", "--no-audit", "--no-fund", "--loglevel=error"]):
             raise RuntimeError(
-                "npm could not fetch the libraries of page/package-lock.json; is there a network?"
+                "npm could not download the libraries of page/package-lock.json; check the network"
             )
         options = ["--bundle", "--minify", "--format=esm", "--target=es2020", "--legal-comments=eof"]
         # `--ignore-scripts` skips esbuild's install script. Its start script then finds the binary by
@@ -83,6 +83,6 @@ def bundle(source: Path, place: Path, target: Path) -> None:
         texts = [f"{one.parent.name}\n\n{one.read_text()}" for one in licenses]
         (target / "licenses.txt").write_text("\n\n".join(texts))
     except subprocess.SubprocessError as error:
-        raise RuntimeError(f"the page's bundle could not be made: {error}") from error
+        raise RuntimeError(f"the page could not be bundled: {error}") from error
     finally:
         os.chdir(before)

@@ -16,7 +16,7 @@ from tests.view.served import Served
 from dxlrun_view.curves import Curve, Moment
 from dxlrun_view.live_robot import LiveRobot
 from dxlrun_view.recorded_robot import RecordedRobot
-from dxlrun_view.shown import LiveEvent, SourceProperties, ViewedController, ViewedRobot
+from dxlrun_view.shown import LiveEvent, SourceProperties, ViewedController, ViewedRobot, ViewedServo
 
 Serve = Callable[..., Served]
 VISIBLE = "(selector => document.querySelector(selector).offsetParent !== null)"
@@ -148,7 +148,10 @@ class Scripted:
         arm = ViewedController("arm", "position_controller", True, ("elbow_joint",), ("position",))
         began = bool(self.values)
         limits = dict.fromkeys(self.names, (-2.6, 0.17))
-        info = ViewedRobot("arm", 50.0, 0.0, joints=self.names, limits=limits, controllers=(arm,))
+        servos = {"wrist_joint": ViewedServo("XM430-W350", 2.0, 80.0)}
+        info = ViewedRobot(
+            "arm", 50.0, 0.0, joints=self.names, limits=limits, controllers=(arm,), servos=servos
+        )
         return SourceProperties(
             info=info if began else ViewedRobot("arm"),
             live=True,
@@ -229,10 +232,34 @@ def test_header_shows_voltage_hottest_servo_and_errors_first(serve: Serve, brows
     robot.events_ = (LiveEvent(1, 50.0, 40, "loop", "the bus was silent", 50.0),)
     browser.until(f"{figures}[2] === 'Errors 1 event'")
     robot.begin(hardware_error=(0, 32), torque=(1, 1))
-    browser.until(f"{figures}[2] === 'Errors Error 0x20 wrist'")
+    browser.until(f"{figures}[2] === 'Errors Overload error wrist'")
+    # The control table of the elbow's servo is unknown.
+    robot.begin(hardware_error=(33, 0), torque=(1, 1))
+    browser.until(f"{figures}[2] === 'Errors Error 0x21 elbow'")
     browser.click("#figures div:nth-child(3)")
     assert browser.value(f"{VISIBLE}('#events')")
     assert errors(browser) == []
+
+
+def test_hot_servo_is_marked_near_its_own_temperature_limit(serve: Serve, browser: Browser) -> None:
+    robot = Scripted()
+    browser.open(serve(robot).address)
+    hot = "[...document.querySelectorAll('#joints .hot')].length"
+    figure = "document.querySelectorAll('#figures b')[1]?.className"
+    for temperatures, number in (((64, 69), 0), ((64, 70), 1), ((65, 69), 1)):
+        robot.begin(temperature=temperatures)
+        browser.until(f"{hot} === {number} && {figure} === '{'bad' * number}'")
+
+
+def test_page_of_a_log_waits_for_no_robot(recorded: RecordedRobot, serve: Serve, browser: Browser) -> None:
+    browser.open(serve(recorded).address.partition("?")[0])  # without the token, it gets no data
+    browser.until("document.querySelector('#banner')?.textContent.includes('token')")
+    assert browser.value("document.querySelector('#phase').textContent") == "Reading"
+    for place in ("#no-scene", "#joints", "#controllers"):
+        assert browser.value(f"document.querySelector('{place}').textContent") == "Reading the log …"
+    assert len(errors(browser)) > 0
+    browser.open(serve(Scripted()).address)
+    browser.until("document.querySelector('#no-scene')?.textContent === 'Waiting for the robot …'")
 
 
 def test_labels_are_in_sentence_case(recorded: RecordedRobot, serve: Serve, browser: Browser) -> None:

@@ -120,7 +120,7 @@ def test_a_wrong_message_is_refused_with_a_sentence(live: LiveRobot, serve: Serv
     for raw in (b"", b"{", b"\xff\xfe", b'{"verb": "goal", "joint": "\xed\xa0\x80"}', b"[" * 60_000):
         for path in ("/act", "/look"):
             status, answer = served.ask(path, raw)
-            assert (status, b"this is not a request of this page" in answer) == (409, True), raw[:20]
+            assert (status, b"invalid request" in answer) == (409, True), raw[:20]
     for look in ({"time": "now"}, {"spans": [{"names": ["x"]}]}, {"after": 1.5}, {"spans": {}}):
         assert served.ask("/look", look)[0] == 409, look
     for span in ({"points": -1}, {"points": 0}, {"begin": 9.0, "end": -9.0}, {"begin": -1e308, "end": 1e308}):
@@ -191,7 +191,7 @@ def test_a_robot_that_ends_and_comes_back(live: LiveRobot, serve: Serve, run: Ru
     until(lambda: column(served, "loop/cycle"))
     before = until(lambda: served.look(after=0)["events"])
     run.end()
-    assert "start it, and this page continues" in until(lambda: served.look(shown=True)["shown"]["problem"])
+    assert "is not running; start it again" in until(lambda: served.look(shown=True)["shown"]["problem"])
     assert served.ask("/act", {"verb": "stop"})[0] == 409
     assert served.ask("/urdf")[1].startswith(b"<?xml")  # its last state is still shown
     run.start()
@@ -232,4 +232,4 @@ def test_stop_ends_the_run_where_torque_off_is_refused(refused: bool) -> None:
 
     said = StopAction().perform_on(cast("RemoteRobot", Robot())).said
     assert asked == ["torque of all: False", *(["stop"] if refused else [])]
-    assert ("The run ends" in said) is refused
+    assert ("the run ends" in said) is refused

@@ -77,7 +77,7 @@ export class Body {
         if (ghost) fade(robot);
         if (!this.touched) this.fit();
         this.dirty = true;
-      }).catch((error) => { this.missing(path, error); done(new Group()); });
+      }).catch((error) => { this.missing(error); done(new Group()); });
     };
     loader.workingPath = "";
     loader.packages = (name) => `package://${name}`;
@@ -141,7 +141,7 @@ function fade(robot) {
 function meshOf(path, data) {
   if (/\.dae$/i.test(path)) return new ColladaLoader().parse(new TextDecoder().decode(data)).scene;
   if (/\.stl$/i.test(path)) return new Mesh(new STLLoader().parse(data), new MeshStandardMaterial({ color: 0x9aa4b0 }));
-  throw new Error("only .stl and .dae are shown");
+  throw new Error(`mesh ${path} has an unsupported format; convert it to .stl or .dae`);
 }
 
 // Return the link of the IMU and the object that its orientation rotates: the joint between odom and this link,

@@ -1,5 +1,6 @@
 // Graph of the controllers and of the references that they command, with buttons to switch and tune them.
 import { isNew, make } from "./dom.js";
+import { waitingText } from "./state.js";
 
 const SVG = "http://www.w3.org/2000/svg";
 
@@ -39,7 +40,7 @@ export function drawControllers(element, { shown, graph: controllers }, act) {
     }
     nodes[controller.name] = node;
   }
-  element.append(names.length ? graph : make("p", { className: "empty", textContent: shown?.columns.length ? "No controllers" : "Waiting for the robot …" }));
+  element.append(names.length ? graph : make("p", { className: "empty", textContent: shown?.columns.length ? "No controllers" : waitingText() }));
   const lines = graph.appendChild(document.createElementNS(SVG, "svg"));
   const draw = () => connect(lines, graph, nodes, controllers);
   new ResizeObserver(draw).observe(graph);

@@ -29,7 +29,7 @@ export function drawTimeline() {
       return mark;
     }));
     const warnings = severe.slice(0, 40).map(({ time, text }) => ({ time, what: text }));
-    $("jump").replaceChildren(new Option("Jump to …", ""), ...[["Latest wake-ups", marks], ["Warnings", warnings]].filter(([, places]) => places.length).map(([label, places]) =>
+    $("jump").replaceChildren(new Option("Jump to …", ""), ...[["Most delayed wake-ups", marks], ["Warnings and errors", warnings]].filter(([, places]) => places.length).map(([label, places]) =>
       make("optgroup", { label }, ...places.map(({ time, what }) => new Option(`${time.toFixed(2)} s: ${what}`.slice(0, 70), time)))));
   }
   if (document.activeElement !== $("time")) $("time").value = state.time;

@@ -1,7 +1,7 @@
 // Header of the page: name and phase, what a user needs first, buttons, and why there are no fresh values.
 import { $, isNew, make, setText } from "./dom.js";
 import { act, stop } from "./requests.js";
-import { HOT_C, conditionOf, errorEvents, extreme, isLog, rateOf, shortOf, state, value } from "./state.js";
+import { conditionOf, errorEvents, extreme, isHot, isLog, opensLog, rateOf, shortOf, state, value } from "./state.js";
 
 const ALL = ["all"];
 
@@ -10,9 +10,9 @@ export function drawHeader(phase, reason) {
   const { robot = "dxlrun", paused = false } = shown?.info ?? {};
   document.title = shown ? `${robot} – dxlrun` : "dxlrun";
   setText($("robot"), robot);
-  setText($("phase"), phase === "loading" ? "Waiting" : phase === "gone" ? "Gone" : isLog() ? "Log" : paused ? "Paused" : "Live");
-  setText($("kind"), isLog() ? (shown.every > 1 ? `Every ${shown.every}th cycle` : "") : shown?.control ? "Control" : shown ? "View only" : "");
-  $("kind").title = shown?.live && !shown.control ? "To steer the robot from this page, start `dxlrun view --control`" : "";
+  setText($("phase"), phase === "loading" ? (opensLog() ? "Reading" : "Waiting") : phase === "gone" ? "No data" : isLog() ? "Log" : paused ? "Paused" : "Live");
+  setText($("kind"), isLog() ? (shown.every > 1 ? `1 of ${shown.every} cycles` : "") : shown?.control ? "Control" : shown ? "View only" : "");
+  $("kind").title = shown?.live && !shown.control ? "To control the robot from this page, start `dxlrun view --control`" : "";
   setText($("banner"), reason);
   $("banner").hidden = !reason;
   const due = message && performance.now() < message.until;
@@ -24,13 +24,14 @@ export function drawHeader(phase, reason) {
 
 function drawFigures() {
   const [lowest, hottest] = [extreme("voltage", -1), extreme("temperature")];
+  const hot = [...state.joints.keys()].filter(isHot);
   const faults = [...state.joints.keys()].map((name) => [name, ...conditionOf(name)]).filter(([, , isFault]) => isFault);
   const events = errorEvents();
   const { rate = 0, skipped = 0 } = state.shown?.info ?? {};
   const late = value("loop/late"), measured = isLog() ? null : rateOf();
   const figures = [
     { name: "Voltage", text: lowest ? `${lowest[1].toFixed(1)} V` : "–", title: lowest && `Lowest: ${lowest[0]}` },
-    { name: "Hottest servo", text: hottest ? `${hottest[1].toFixed(0)} °C` : "–", about: hottest && shortOf(hottest[0]), tone: hottest?.[1] >= HOT_C && "bad", title: hottest?.[0] },
+    { name: "Hottest servo", text: hottest ? `${hottest[1].toFixed(0)} °C` : "–", about: hottest && shortOf(hottest[0]), tone: hot.length && "bad", title: hot.length ? `Near the temperature limit: ${hot.join(", ")}` : hottest?.[0] },
     { name: "Errors", ...errorsOf(faults, events) },
     { name: "Rate", text: rate ? `${measured === null ? "" : `${measured.toFixed(0)} of `}${rate.toFixed(0)} Hz` : "–" },
     { name: "Late wake-up", text: late === null ? "–" : `${(late * 1e3).toFixed(2)} ms` },

@@ -1,7 +1,7 @@
 // Table of the joints, with a slider for the goal of each joint where the page may steer.
 import { $, isNew, make, setText } from "./dom.js";
 import { act, lead } from "./requests.js";
-import { HOT_C, conditionOf, isCommanded, scaleOf, shortOf, state, value } from "./state.js";
+import { conditionOf, isCommanded, isHot, scaleOf, shortOf, state, value, waitingText } from "./state.js";
 
 const COLUMNS = [["Joint", "joint"], ["", "reach"], ["Position", ""], ["Goal", "goal"], ["Load", "load"], ["°C", ""], ["V", "wide"], ["Torque", ""]];
 // The slider follows the goal again after this time, when the new goal has taken effect, ms.
@@ -16,7 +16,7 @@ export function drawJoints(draw) {
     rows = joints.map((joint) => rowOf(joint, steer, draw));
     const head = make("tr", {}, ...COLUMNS.map(([textContent, className]) => make("th", { textContent, className })));
     const table = make("table", {}, make("thead", {}, head), make("tbody", {}, ...rows.map((row) => row.element)));
-    $("joints").replaceChildren(rows.length ? table : make("p", { className: "empty", textContent: "Waiting for the robot …" }));
+    $("joints").replaceChildren(rows.length ? table : make("p", { className: "empty", textContent: waitingText() }));
   }
   rows.forEach(drawRow);
 }
@@ -51,19 +51,19 @@ function drawRow({ joint, slider, bar, position, goal, load, heat, volts, tag })
   const of = (column) => value(`${joint.name}/${column}`);
   const show = (cell, shown, factor, digits, unit = "") => setText(cell, shown === null ? "–" : `${fixed(shown * factor, digits)}${unit}`);
   const [factor, unit] = scaleOf(`${joint.name}/position`), [effortFactor, effortUnit] = scaleOf(`${joint.name}/effort`);
-  const is = of("position"), to = of("goal_position"), heated = of("temperature");
+  const is = of("position"), to = of("goal_position");
   show(position, is, factor, 1, unit === "deg" ? " °" : ` ${unit}`);
   show(goal, to, factor, 1);
   show(load, of("effort"), effortFactor, 1, ` ${effortUnit}`);
-  show(heat, heated, 1, 0);
+  show(heat, of("temperature"), 1, 0);
   show(volts, of("voltage"), 1, 1);
   goal.classList.toggle("hot", is !== null && to !== null && Math.abs(to - is) > (unit === "deg" ? 0.09 : 0.005));
-  heat.classList.toggle("hot", heated >= HOT_C);
+  heat.classList.toggle("hot", isHot(joint.name));
   const [word, isFault] = conditionOf(joint.name);
   setText(tag, word);
   tag.className = `tag ${isFault ? "bad" : word}`;
   if (slider) {
-    tag.title = word === "on" ? "Switch the torque of this joint off" : "Switch the torque of this joint on";
+    tag.title = word === "on" ? "Switch off the torque of this joint" : "Switch on the torque of this joint";
     // Without a known position, a slider would be drawn somewhere; without a controller, it would move nothing.
     slider.hidden = is === null && to === null;
     slider.disabled = !isCommanded(joint.name);

@@ -8,14 +8,14 @@ import { drawEvents, drawTimeline } from "./events.js";
 import { drawHeader } from "./header.js";
 import { drawJoints } from "./joints.js";
 import { act, ask, say, stop } from "./requests.js";
-import { isLog, note, phaseOf, reasonOf, scaleOf, state, value } from "./state.js";
+import { isLog, note, phaseOf, reasonOf, scaleOf, state, value, waitingText } from "./state.js";
 
 const LOOK_MS = 40, CURVES_MS = 100, SHOWN_MS = 500, RETRY_MS = 1000;
 const POSITION = ["position", "goal_position"];
 
 const body = hasWebgl() && new Body($("scene"),
   async (path) => (await ask(`mesh?name=${encodeURIComponent(path)}`)).arrayBuffer(),
-  (path) => say(`The mesh ${path} of the URDF is missing next to the robot file; this part is not drawn.`, true));
+  (error) => say(`A link is not drawn: ${error.message}`, true));
 const charts = new Charts($("charts"), scaleOf);
 charts.zoomed = () => freeze(charts.zoom !== null);
 let curvesDue = 0, shownDue = 0, clock = 0, drawn = "";
@@ -73,8 +73,8 @@ function drawBody() {
 async function loadBody() {
   const { shown, places } = state;
   const urdf = shown?.columns.length ? await (await ask("urdf")).text() : "";
-  const why = !shown?.columns.length ? "Waiting for the robot …" : !body ? "This browser draws no 3-D, because WebGL is off. Curves and tables work."
-    : urdf ? "" : "This robot has no URDF, so there is no 3-D. To add one: model: {urdf: FILE} in the robot file.";
+  const why = !shown?.columns.length ? waitingText() : !body ? "No 3-D view, because WebGL is off in this browser. Curves and tables work."
+    : urdf ? "" : "No 3-D view, because the robot has no URDF. Add model: {urdf: FILE} to the robot file.";
   $("no-scene").textContent = why;
   $("no-scene").hidden = !why;
   if (!why) body.load(urdf, `${shown.imu}/orientation.w` in places && shown.imu_link);
@@ -106,6 +106,7 @@ async function look() {
 
 // Look for new data until the page is closed. A hidden page sends no requests.
 async function follow() {
+  draw();
   for (;;) {
     if (document.hidden) {
       await new Promise((awake) => document.addEventListener("visibilitychange", awake, { once: true }));
@@ -144,7 +145,7 @@ $("time").oninput = () => jump(Number($("time").value));
 $("jump").onchange = () => { if ($("jump").value) jump(Number($("jump").value)); $("jump").value = ""; };
 $("pick").onchange = () => {
   const name = $("pick").value.trim();
-  if (name in state.places || state.shown?.fields.includes(name)) { charts.toggle(name); $("pick").value = ""; } else if (name) say(`There is no curve ${name}; choose one of the list.`, true);
+  if (name in state.places || state.shown?.fields.includes(name)) { charts.toggle(name); $("pick").value = ""; } else if (name) say(`Curve ${name} not found; choose one from the list.`, true);
 };
 for (const tab of document.querySelectorAll("#tabs button")) {
   tab.onclick = () => {

@@ -1,7 +1,9 @@
 // State of the page. The server's answers and the clicks change it; everything on the page is drawn from it.
 export const TORQUE = ["unknown", "on", "doubt", "limp", "limp", "lost", "rebooting", "given"];
-// A servo shuts down at 65 °C (XL-320) to 80 °C (X series).
-export const HOT_C = 65;
+// A servo is hot from this difference to its temperature limit on, °C. The run warns from the same temperature.
+const HOT_BELOW_C = 10;
+// Temperature from which a servo with an unknown limit is hot, °C: the lowest limit of all models (XL-320).
+const HOT_C = 65;
 // Time without a new cycle after which the values are stale: longer than any pause of a run on a busy machine, ms.
 const STALE_MS = 2000;
 const RATE_S = 2;
@@ -16,10 +18,17 @@ export const state = {
   message: null, // result of the last action: {text, bad, until}
   time: null, playing: false, // position on the time line of a log, s
   touching: null, // joint whose slider is held
+  errors: {}, // hardware errors in words, by joint
   places: {}, joints: new Map(), cycles: [], graph: [],
 };
 
 export const isLog = () => state.shown?.live === false;
+
+// Return true if the page opens a log; known before the first response, because the server writes it into the page.
+export const opensLog = () => document.body.dataset.opens === "log";
+
+// Return the text in place of data before the first values.
+export const waitingText = () => (opensLog() ? "Reading the log …" : "Waiting for the robot …");
 
 // Return "loading" before the first values, "live" while they are fresh, and "gone" when no new ones arrive.
 export function phaseOf(now) {
@@ -33,12 +42,12 @@ export function phaseOf(now) {
 export function reasonOf(phase) {
   const { shown, failure } = state;
   if (phase === "live") return "";
-  return failure || shown?.problem || (phase === "gone" ? `${shown.info.robot} sends no new cycle; look at its terminal.` : "");
+  return failure || shown?.problem || (phase === "gone" ? `No new cycles from ${shown.info.robot}; check its terminal.` : "");
 }
 
 // Note a response of the server to `look`.
-export function note({ shown, moment, events }, now) {
-  state.failure = "";
+export function note({ shown, moment, events, errors }, now) {
+  Object.assign(state, { failure: "", errors });
   if (shown) {
     if (state.shown?.run !== shown.run || state.shown.columns.join() !== shown.columns.join()) begin(shown);
     state.shown = shown;
@@ -96,10 +105,16 @@ export function extreme(column, sign = 1) {
   return known.reduce((best, one) => (best && best[1] * sign >= one[1] * sign ? best : one), null);
 }
 
-// Return the word of a joint's hardware error or torque state, and true if it is a fault.
+// Return a joint's hardware errors or its torque state in words, and true if it is a fault.
 export function conditionOf(joint) {
-  const error = value(`${joint}/hardware_error`), torque = TORQUE[value(`${joint}/torque`) ?? 0];
-  return error ? [`error 0x${error.toString(16).padStart(2, "0")}`, true] : [torque, torque === "lost"];
+  const error = state.errors[joint], torque = TORQUE[value(`${joint}/torque`) ?? 0];
+  return error ? [error, true] : [torque, torque === "lost"];
+}
+
+// Return true if a joint's servo is near its temperature limit.
+export function isHot(joint) {
+  const limit = state.shown?.info.servos[joint]?.temperature_limit ?? null;
+  return value(`${joint}/temperature`) >= (limit === null ? HOT_C : limit - HOT_BELOW_C);
 }
 
 // Return the events of severity ERROR of this run; in a log, those up to the position on the time line.

@@ -47,7 +47,7 @@ class StopAction(_Message, frozen=True, tag="stop"):
             robot.torque("all", on=False, release=True)
         except DxlrunError as error:
             robot.stop(wait=False)
-            return ActionResult(f"The run ends, because torque off was refused ({error})")
+            return ActionResult(f"STOP: the run ends, because the robot refused torque off ({error})")
         return ActionResult("STOP: all joints are limp")
 
 
@@ -177,8 +177,8 @@ def perform_action(source: ViewSource, action: Action) -> ActionResult:
         DxlrunError: The page shows a log, the motion file is not offered, or the robot refuses.
     """
     if not isinstance(source, LiveRobot):
-        raise InputError("this is a log; start the robot to steer it")
+        raise InputError("the page shows a log; start the robot to control it")
     if isinstance(action, PlayAction) and action.motion not in source.describe_page().motions:
-        raise InputError("the page plays only motions next to the robot file; use `dxlrun play`")
+        raise InputError("the page plays only motions next to the robot file; play others with `dxlrun play`")
     with source.asking() as robot:
         return action.perform_on(robot)

@@ -155,8 +155,9 @@ class LiveRobot:
                 self._note_topics(self._robot, now_s)
         except DxlrunError as error:
             self._looked_slowly_s = now_s
-            start = f"dxlrun {self._info.file or 'ROBOT.yaml'}"
-            waits = f"{self._name} does not run; start it, and this page continues: {start}"
+            waits = (
+                f"{self._name} is not running; start it again with `dxlrun {self._info.file or 'ROBOT.yaml'}`"
+            )
             self._gone(str(error) if self._name in running() else waits)
 
     def _begun(self) -> RemoteRobot:

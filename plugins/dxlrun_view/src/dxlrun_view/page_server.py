@@ -30,7 +30,7 @@ from dxlrun import DxlrunError, InputError
 from dxlrun.tooling.live import Listener, Role, in_url, serve_clients
 from dxlrun_view.actions import Action, ParameterListAction, perform_action
 from dxlrun_view.curves import Curve, Moment
-from dxlrun_view.shown import LiveEvent, SourceProperties, ViewSource
+from dxlrun_view.shown import LiveEvent, SourceProperties, ViewSource, describe_error
 
 if TYPE_CHECKING:
     from collections.abc import Iterator
@@ -96,6 +96,8 @@ class ViewResponse(msgspec.Struct, frozen=True):
     """Curves of each plot"""
     shown: SourceProperties | None = None
     """Properties that rarely change; None if not requested"""
+    errors: Mapping[str, str] = {}
+    """Hardware errors in words, for each joint that has one"""
 
 
 _LOOK: Decoder[ViewRequest] = Decoder(ViewRequest)
@@ -145,7 +147,7 @@ class Page:
                 return _refused(403, "this page accepts requests only from itself, not from other web sites")
             given = request.headers.get(HEADER, "")
             if token and not secrets.compare_digest(given.encode(), self.token.encode()):
-                return _refused(401, "open the address that `dxlrun view` printed: it has the page's token")
+                return _refused(401, "invalid token; open the address printed by `dxlrun view`")
             if token and request.client and self.listener.tls is None:
                 self.listener.admit(request.client)
             try:
@@ -163,9 +165,13 @@ class Page:
         where = files("dxlrun_view").joinpath("page", *(("build", name) if name else ("page.html",)))
         if not where.is_file():
             return _refused(
-                404, "the page has no bundle: install it again, pip install ./plugins/dxlrun_view"
+                404, "the page has no bundle; install it again: pip install ./plugins/dxlrun_view"
             )
-        return Response(where.read_bytes(), media_type=_TYPES[name])
+        # The page needs the kind of source before its first request has an answer.
+        kind = b"live" if self.source.describe_page().live else b"log"
+        content = where.read_bytes()
+        content = content if name else content.replace(b'data-opens=""', b'data-opens="%s"' % kind)
+        return Response(content, media_type=_TYPES[name])
 
     async def serve_data(self, request: Request) -> Response:
         """Answer a `ViewRequest` of the page with a `ViewResponse`: moment, events, curves."""
@@ -174,14 +180,14 @@ class Page:
 
     def _seen(self, asked: ViewRequest, may_steer: bool) -> ViewResponse:
         moment = self.source.moment_at(asked.time)
-        shown = None
-        if asked.shown:
-            shown = msgspec.structs.replace(self.source.describe_page(), control=may_steer)
+        found = self.source.describe_page()
+        shown = msgspec.structs.replace(found, control=may_steer) if asked.shown else None
         return ViewResponse(
             moment,
             self.source.events(asked.after),
             tuple(self._curves(span) for span in asked.spans),
             shown,
+            _hardware_errors(found, moment),
         )
 
     def _curves(self, span: Span) -> tuple[Curve, ...]:
@@ -202,7 +208,7 @@ class Page:
         name = request.query_params.get("name", "")
         path = await run_in_threadpool(self._mesh, name)
         if path is None:
-            return _refused(404, f"there is no mesh {name} next to the robot file")
+            return _refused(404, f"mesh {name} not found next to the robot file")
         return Response(path.read_bytes(), media_type="application/octet-stream")
 
     def _mesh(self, name: str) -> Path | None:
@@ -219,9 +225,11 @@ class Page:
         """
         action = await _message(request, _ACTION)
         if not isinstance(action, ParameterListAction) and self._role(request) < Role.COMMAND:
-            return _refused(403, "the certificate of this browser has the role observe; it may only look")
+            return _refused(
+                403, "this browser's certificate has the role observe; use one with the role command"
+            )
         if not action.always and not self.control:
-            return _refused(403, "this page only shows the robot: start `dxlrun view --control` to steer it")
+            return _refused(403, "this page is read-only; start `dxlrun view --control` to control the robot")
         return _json(await run_in_threadpool(perform_action, self.source, action))
 
     def _may_steer(self, request: Request) -> bool:
@@ -233,6 +241,14 @@ class Page:
             return Role.ADMIN
         role: Role = request.scope["client"].role
         return role
+
+
+def _hardware_errors(found: SourceProperties, moment: Moment) -> dict[str, str]:
+    """Return the hardware errors of joints at a moment in words; joints without an error are omitted."""
+    values = dict(zip(found.columns, moment.values, strict=False))  # no values before the first cycle
+    errors = {name: int(values.get(f"{name}/hardware_error") or 0) for name in found.info.joints}
+    servos = found.info.servos
+    return {name: describe_error(servos.get(name), value) for name, value in errors.items() if value}
 
 
 def mesh_file(folder: Path, name: str) -> Path | None:
@@ -310,11 +326,11 @@ async def _message(request: Request, decoder: Decoder[Message]) -> Message:
     async for piece in request.stream():
         data += piece
         if len(data) > MOST_BYTES:
-            raise InputError(f"a request has at most {MOST_BYTES} bytes")
+            raise InputError(f"the request exceeds {MOST_BYTES} bytes")
     try:
         return decoder.decode(data)
     except (msgspec.MsgspecError, ValueError, RecursionError) as error:
-        raise InputError(f"this is not a request of this page: {error}") from error
+        raise InputError(f"invalid request: {error}") from error
 
 
 def _json(content: object) -> Response:

@@ -25,7 +25,14 @@ from dxlrun_view.curves import (
     numbers_in,
     thinned,
 )
-from dxlrun_view.shown import LiveEvent, SourceProperties, TimelineMark, ViewedController, ViewedRobot
+from dxlrun_view.shown import (
+    LiveEvent,
+    SourceProperties,
+    TimelineMark,
+    ViewedController,
+    ViewedRobot,
+    ViewedServo,
+)
 
 MOST_CYCLES = 100_000
 """Cycles that are at least kept of a log: at twice this number, every second one is dropped. With 20 joints,
@@ -59,7 +66,7 @@ class RecordedRobot:
         """
         reader = open_log(path)
         if reader.header is None:
-            raise LogError(f"{path}: an MCAP file of another program; `dxlrun view` shows logs of dxlrun")
+            raise LogError(f"{path} is an MCAP file of another program; give a log of dxlrun")
         self._reader = reader
         self._header = reader.header
         read = _CycleReader()
@@ -69,7 +76,7 @@ class RecordedRobot:
             progress(reader.share)
         cycles = read.cycles
         if not len(cycles):
-            raise LogError(f"{path}: a log without a cycle; there is nothing to show")
+            raise LogError(f"{path} has no cycles; give the log of a longer run")
         self._begin_ns = int(cycles["woken_ns"][0])
         self._every, self._skipped = read.every, read.skipped
         self._marks = self._worst(read.worst)
@@ -223,6 +230,12 @@ class RecordedRobot:
                 if joint.servo_model is not None
             },
             limits={joint.name: (joint.lower, joint.upper) for joint in joints if joint.bounded},
+            servos={
+                joint.name: ViewedServo(servo.model, bus.protocol, model.temperature_limit if model else None)
+                for joint in joints
+                for model in (joint.servo_model,)
+                for bus, servo in plan.servos_by_joint.get(joint.name, ())[:1]
+            },
             controllers=tuple(
                 msgspec.convert(controllers.get(row.name, row), ViewedController, from_attributes=True)
                 for row in info.controllers

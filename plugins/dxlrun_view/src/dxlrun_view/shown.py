@@ -6,12 +6,14 @@ The structs are sent to the page as JSON. Times are s on the clock of the curves
 from __future__ import annotations
 
 from collections.abc import Mapping
+from contextlib import suppress
 from pathlib import Path
 from typing import Protocol
 
 import msgspec
 
 from dxlrun_view.curves import Curve, Moment
+from dxlwire import find_table
 
 
 class ViewedController(msgspec.Struct, frozen=True):
@@ -29,6 +31,15 @@ class ViewedController(msgspec.Struct, frozen=True):
     """Controller that takes over when this one fails; empty without one"""
     goals: tuple[str, ...] = ()
     """Kinds of its commands that are goals, which end when they are reached"""
+
+
+class ViewedServo(msgspec.Struct, frozen=True):
+    """First servo of a joint, as in RobotInfo"""
+
+    model: str
+    protocol: float
+    temperature_limit: float | None = None
+    """Temperature above which the servo cuts its torque, degrees C; None if unknown"""
 
 
 class ViewedRobot(msgspec.Struct, frozen=True):
@@ -53,6 +64,8 @@ class ViewedRobot(msgspec.Struct, frozen=True):
     controllers: tuple[ViewedController, ...] = ()
     file: str = ""
     """Path of the robot file"""
+    servos: Mapping[str, ViewedServo] = {}
+    """First servo of each joint"""
 
 
 class LiveEvent(msgspec.Struct, frozen=True):
@@ -76,6 +89,15 @@ class TimelineMark(msgspec.Struct, frozen=True):
     time: float
     what: str
     """Label of the mark"""
+
+
+def describe_error(servo: ViewedServo | None, value: int) -> str:
+    """Return a hardware error in the words of the servo's control table, such as `overload error`."""
+    if servo is not None:
+        # A model of a plug-in that is not installed here has no table.
+        with suppress(LookupError):
+            return find_table(servo.model, servo.protocol).errors.describe_errors(value)
+    return f"error 0x{value:02x}"
 
 
 class SourceProperties(msgspec.Struct, frozen=True, kw_only=True):

@@ -18,6 +18,6 @@ def other_version() -> str | None:
     if found == own:
         return None
     return (
-        f"dxlrun-view {own} fits dxlrun {own} only, and dxlrun {found} is installed; "
+        f"dxlrun-view {own} needs dxlrun {own}, but dxlrun {found} is installed; run "
         f"`pip install dxlrun-view=={found}`, or in a clone of dxlrun `pip install . ./plugins/dxlrun_view`"
     )

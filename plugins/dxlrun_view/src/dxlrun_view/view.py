@@ -89,7 +89,7 @@ def _source(what: str | None) -> ViewSource:
     if what is None:
         names = running()
         if not names:
-            raise DxlrunError("no robot runs; start one (`dxlrun ROBOT.yaml`), or name a log")
+            raise DxlrunError("no robot is running; start one with `dxlrun ROBOT.yaml`, or name a log")
         if len(names) > 1:
             raise InputError(f"several robots run; name one: {', '.join(names)}")
         return LiveRobot(names[0])
@@ -98,7 +98,7 @@ def _source(what: str | None) -> ViewSource:
         from dxlrun_view.recorded_robot import RecordedRobot
 
         if not path.exists():
-            raise InputError(f"there is no log {path}; a run prints the path of its log when it ends")
+            raise InputError(f"log {path} not found; a run prints the path of its log when it ends")
         with progress_bar(hidden=False) as draw:
             return RecordedRobot(path, lambda share: draw(f"reading {path.name}", share))
     if path.suffix in (".yaml", ".yml"):
@@ -106,10 +106,10 @@ def _source(what: str | None) -> ViewSource:
 
         name = read_robot(path, {}).robot.name
         if name not in running():
-            raise DxlrunError(f"{name} of {path} does not run; start it in another terminal: dxlrun {path}")
+            raise DxlrunError(f"{name} of {path} is not running; start it in another terminal: dxlrun {path}")
         return LiveRobot(name)
     if what not in running():
-        raise InputError(f"no robot {what} runs; {suggestion(what, running())}")
+        raise InputError(f"robot {what} is not running; {suggestion(what, running())}")
     return LiveRobot(what)
 
 
