@@ -44,7 +44,7 @@ def calibrate(place: Path) -> Frame:
     from tests.kit.hands import LiveRobot, Screen
 
     words = ("calibrate", "arm.yaml", f"port:={place / 'line'}")
-    turns = {"hold what": 0, "zero pose": -20, "positive": -30, "other end": 70}
+    turns = {"hold the joints": 0, "zero pose": -20, "positive": -30, "negative": 70}
     with LiveRobot(place, place / "arm.yaml", runs=False) as servos, Screen(place, *words) as screen:
         for question, turn in turns.items():
             screen.sees(question)
@@ -61,9 +61,9 @@ def teach(place: Path) -> Frame:
     from tests.kit.hands import LiveRobot, Screen
 
     words = ("teach", "wave.yaml")
-    answers = (("Hold them", "", 0), ("0 shown", "", 30), ("1 shown", "", 40), ("2 shown", "s", 0))
+    answers = (("Hold them", "", 0), ("0 taught", "", 30), ("1 taught", "", 40), ("2 taught", "s", 0))
     with LiveRobot(place, place / "arm.yaml") as servos, Screen(place, *words) as screen:
-        for question, answer, turn in (*answers, ("comes back", "", 0), ("Play it", "y", 0)):
+        for question, answer, turn in (*answers, ("be switched on", "", 0), ("Play the", "y", 0)):
             screen.sees(question)
             servos.turn(lambda: None, 0.3, id3=turn)
             screen.types(f"{answer}\n")
@@ -96,8 +96,8 @@ def draw_setup() -> str:
 
 
 def draw_calibrate() -> str:
-    """Draw where hands move a joint: the zero pose, its positive end, its other end."""
-    ends = ((0, "1. zero pose, Enter"), (70, "2. positive end, Enter"), (-50, "3. other end, Enter"))
+    """Draw where hands move a joint: the zero pose, its positive end, its negative end."""
+    ends = ((0, "1. zero pose, Enter"), (70, "2. positive end, Enter"), (-50, "3. negative end, Enter"))
     panels = []
     for angle, caption in ends:
         way = [] if not angle else [*_arm(0, ghost=True), *_arc(0, angle, RED if angle > 0 else BLUE)]

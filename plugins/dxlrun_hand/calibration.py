@@ -81,22 +81,20 @@ class HandJoint:
         found = find_servo(tool, servo.servo_id, search)
         if not found:
             remedy = choose_remedy(plan.port)
-            raise ServoFault(f"{self._label} does not answer at {plan.baud_rate} bit/s: {remedy}")
+            raise ServoFault(f"{self._label} does not answer at {plan.baud_rate} bit/s; {remedy}")
         self._one = OneServo(tool, found[0])
         self.table: ControlTable = self._one.table
         if self.table.model_number != servo.model_number:
             raise ServoFault(
-                f"{self._label} is an {self.table.model}, not an {servo.model}: correct the robot "
-                "file, or set the servos up with `dxlrun setup`"
+                f"{self._label} is an {self.table.model}, not an {servo.model}; correct the robot "
+                "file, or set up the servo with `dxlrun setup`"
             )
         names = [name for name in _SHIFTING if name in self.table.items]
         for name, value in self._one.read_items(names).items():
             bits, only = _SHIFTING[name]
             if value & bits != only:
                 title = self.table.items[name].title
-                raise ServoFault(
-                    f"{self._label} has {title} = {value}, which shifts its angles: write {only}"
-                )
+                raise ServoFault(f"{self._label}: {title} = {value} shifts its angles; write {only}")
         self._turn = round(math.tau / self.table.rad_per_tick)
         self._raw = self._travelled = 0
         self.limp = False
@@ -144,10 +142,9 @@ class HandJoint:
         least, most = self.table.min_tick * tick, self.table.max_tick * tick
         if not self.servo.continuous and (lowest < least - tick or highest > most + tick):
             raise TurnRangeFault(
-                f"{self.name} went beyond the turn of its {self.table.model}, whose goals are from "
-                f"{_degrees(least)} to {_degrees(most)} deg: its servo was at {_degrees(lowest)} "
-                f"to {_degrees(highest)} deg. If the joint must go there, turn the servo's horn "
-                "first. Bring it back."
+                f"{self.name} left the range of its {self.table.model}: goals are {_degrees(least)} to "
+                f"{_degrees(most)} deg, and its servo was at {_degrees(lowest)} to {_degrees(highest)} deg. "
+                "If the joint needs this range, turn the servo's horn first. Move the joint back."
             )
 
     @property
@@ -159,7 +156,7 @@ class HandJoint:
             return self._one.read_items(["present_position"])["present_position"]
         except ServoFault:
             remedy = choose_remedy(self._port)
-            raise ServoFault(f"{self._label} does not answer any more: {remedy}") from None
+            raise ServoFault(f"{self._label} no longer answers; {remedy}") from None
 
 
 def measure_joints(joints: Sequence[HandJoint], dialogue: Dialogue) -> list[JointCalibration]:
@@ -170,7 +167,7 @@ def measure_joints(joints: Sequence[HandJoint], dialogue: Dialogue) -> list[Join
     Raises:
         ServoFault: A servo does not answer any more.
     """
-    dialogue.ask_question("The torque goes off now: hold what could fall, and press Enter ")
+    dialogue.ask_question("The torque will be switched off: hold the joints, and press Enter ")
     for joint in joints:
         joint.let_go()
     names = ", ".join(joint.name for joint in joints)
@@ -191,7 +188,7 @@ def _measure(joint: HandJoint, zero: float, dialogue: Dialogue) -> JointCalibrat
         way = positive - (zero if servo.continuous else negative)
         if abs(way) >= LEAST_WAY:
             break
-        dialogue.print_lines(f"{joint.name} moved by {_degrees(abs(way))} deg only: move it further.")
+        dialogue.print_lines(f"{joint.name} moved only {_degrees(abs(way))} deg; move it further.")
     direction = 1 if way > 0 else -1
     limits = None
     if not servo.continuous:
@@ -216,15 +213,17 @@ def _ends(joint: HandJoint, dialogue: Dialogue) -> tuple[float, float, float, fl
         nonlocal now
         now = joint.read_angle()
         seen[:] = min(seen[0], now), max(seen[1], now)
-        return f"  its servo is at {_degrees(now)} deg, was at {_degrees(seen[0])} to {_degrees(seen[1])} deg"
+        return f"  its servo is at {_degrees(now)} deg; range {_degrees(seen[0])} to {_degrees(seen[1])} deg"
 
-    way = "on in its positive direction" if joint.servo.continuous else "in its positive direction to the end"
+    way = "in its positive direction" if joint.servo.continuous else "to its end in the positive direction"
     dialogue.ask_while(f"Move {joint.name} {way}, and press Enter", show_angle)
     show_angle()
     joint.check_turn(*seen)
     positive = now
     if not joint.servo.continuous:
-        dialogue.ask_while(f"Move {joint.name} to its other end, and press Enter", show_angle)
+        dialogue.ask_while(
+            f"Move {joint.name} to its end in the negative direction, and press Enter", show_angle
+        )
         show_angle()
         joint.check_turn(*seen)
     return positive, now, seen[0], seen[1]

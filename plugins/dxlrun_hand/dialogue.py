@@ -48,8 +48,7 @@ class Dialogue:
         self._input = sys.stdin.fileno() if sys.stdin.isatty() else -1
         if self._input < 0 or not sys.stdout.isatty():
             raise InputError(
-                f"`dxlrun {verb}` is a dialogue, and this is not a terminal; nothing was done: start it "
-                "in one"
+                f"`dxlrun {verb}` needs a terminal, and nothing was done; start it in a terminal"
             )
         self._typed = b""
 

@@ -43,13 +43,11 @@ def find_port(bus: str, dialogue: Dialogue, devices: Devices) -> str:
             dialogue.print_lines(f"Bus {bus} is at {names[0]}.")
             return names[0]
         dialogue.print_lines(
-            f"{len(adapters)} adapters appeared ({', '.join(names)}): plug in the one of bus {bus} alone."
+            f"{len(adapters)} adapters appeared ({', '.join(names)}); plug in only the adapter of bus {bus}."
             if adapters
-            else "No adapter appeared: was it unplugged before the first Enter, and is it plugged in now?"
+            else "No adapter appeared; unplug it before the first Enter, and plug it in before the second."
         )
-    raise PortError(
-        f"the adapter of bus {bus} was not found; `dxlrun doctor` lists those that are plugged in"
-    )
+    raise PortError(f"the adapter of bus {bus} was not found; list all adapters with `dxlrun doctor`")
 
 
 class BusLines:
@@ -73,8 +71,8 @@ class BusLines:
         for bus, port in ports.items():
             if port == SIMULATED:
                 raise InputError(
-                    f"bus {bus} is simulated, and has no port where servos could be: give one, such as "
-                    "port:=/dev/ttyUSB0; `dxlrun sim ROBOT.yaml --link line` has simulated ones at ./line"
+                    f"bus {bus} is simulated and has no port; give a port, such as port:=/dev/ttyUSB0, or "
+                    "start simulated servos with `dxlrun sim ROBOT.yaml --link line` and give port:=./line"
                 )
         self._opened = opened
         self._names = {bus: lasting_name(port) or port for bus, port in ports.items()}

@@ -59,16 +59,16 @@ class RobotText:
         """
         source, at, node = self._own(path)
         if not os.access(source.path.resolve(), os.W_OK):
-            raise InputError(f"{source.path} cannot be written: it is read-only; change that first")
+            raise InputError(f"{source.path} is read-only; make it writable")
         if self._uses[self._sources.index(source)][id(node)] > 1:
             what = f"{_words(path)} is shared by an alias"
-            raise _refuse_node(source, node, what, "write it out for each")
+            raise _refuse_node(source, node, what, "write the value at each place")
         if at == path and any("${" in str(one.value) for one in _nodes(node)):
             raise _refuse_node(
-                source, node, f"{_words(path)} is made of an argument", "write the value itself"
+                source, node, f"{_words(path)} comes from an argument", "write the value itself"
             )
         if at != path and not isinstance(node, yaml.MappingNode):
-            raise _refuse_node(source, node, f"{_words(at)} is not a mapping", "write its keys below it")
+            raise _refuse_node(source, node, f"{_words(at)} is not a mapping", "write it as a mapping")
 
     def plan_value(self, path: KeyPath, value: str | Sequence[str]) -> None:
         """Plan a new value, or new items of a list, for a key path; a missing key is added.
@@ -97,7 +97,7 @@ class RobotText:
         lines: list[str] = []
         for path in [path for path, edits in self._edits.items() if edits]:
             old, new = (data.decode().splitlines() for data in (self._before[path], self._after(path)))
-            names = f"{path} as it is", f"{path} as it will be"
+            names = f"{path} (now)", f"{path} (new)"
             lines += difflib.unified_diff(old, new, *names, lineterm="", n=1)
         return lines
 
@@ -111,7 +111,7 @@ class RobotText:
         for place, path in changed.items():
             if place.read_bytes() != self._before[path]:
                 raise InputError(
-                    f"{path} was changed by another program, so nothing was written; begin again"
+                    f"{path} was changed by another program, and nothing was written; start again"
                 )
         # Complete all new files before the first old one is replaced.
         besides = {place: place.with_name(f".{place.name}.{os.getpid()}") for place in changed}

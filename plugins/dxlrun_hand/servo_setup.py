@@ -60,11 +60,11 @@ class ServoSetup:
                     *(f"{joint}: {text}" for joint, text in found.describe_deviations())
                 )
                 if not found.problems:
-                    count = "1 servo is" if len(servos) == 1 else f"{len(servos)} servos are"
-                    self.dialogue.print_lines(f"Bus {plan.name}: {count} as in the robot file.")
+                    count = "1 servo matches" if len(servos) == 1 else f"{len(servos)} servos match"
+                    self.dialogue.print_lines(f"Bus {plan.name}: {count} the robot file.")
                     break
                 self.dialogue.print_lines(*found.problems)
-                if not yes(self.dialogue, "Look again?"):
+                if not yes(self.dialogue, "Compare again?"):
                     return False
         return True
 
@@ -107,22 +107,22 @@ class ServoSetup:
         found = scan(tool, Search((plan.protocol,), tuple(rates))).servos
         if not found:
             self.dialogue.print_lines(
-                "  not at its usual rates; every other one is tried, which takes half a minute"
+                "  no servo at the usual baud rates; trying all others for half a minute"
             )
             found = scan(tool).servos
         if not found:
             remedy = choose_remedy(tool.port.name, "check its power and its cable")
-            raise ServoFault(f"No servo answers at {tool.port.name}: {remedy}.")
+            raise ServoFault(f"No servo answers at {tool.port.name}; {remedy}.")
         one = found[0]
         if len(found) > 1 or one.garbled:
-            shown = [f"ID {each.servo_id} at {each.baud_rate} bit/s" for each in found]
-            how = "garbled, as two servos of one ID do" if len(found) == 1 else "so nothing was changed"
-            what = "Several servos answer" if len(found) > 1 else "Not one servo answers"
-            raise ServoFault(f"{what} ({', '.join(shown)}), {how}: connect one alone.")
+            shown = ", ".join(f"ID {each.servo_id} at {each.baud_rate} bit/s" for each in found)
+            if len(found) > 1:
+                raise ServoFault(f"Several servos answer ({shown}); nothing was changed. Connect only one.")
+            raise ServoFault(f"Two servos with the same ID seem to answer ({shown}); connect only one.")
         if one.protocol != plan.protocol:
             raise ServoFault(
-                f"The servo speaks Protocol {one.protocol}, bus {plan.name} Protocol {plan.protocol}: "
-                "connect another one, or change its firmware by the maker's tool."
+                f"The servo uses Protocol {one.protocol}, and bus {plan.name} Protocol {plan.protocol}; "
+                "connect another servo, or change its firmware with DYNAMIXEL Wizard."
             )
         if (
             one.device
@@ -130,10 +130,10 @@ class ServoSetup:
             or (servo.own_name not in self._unknown and servo.model not in one.models)
         ):
             called = one.model or f"model number {one.model_number}"
-            wanted = "a servo" if servo.own_name in self._unknown else f"the {servo.model}"
+            wanted = "a servo" if servo.own_name in self._unknown else servo.model
             raise ServoFault(
-                f"What answers is {called} (ID {one.servo_id}), not {wanted} that the robot file has for "
-                f"{servo.own_name}: connect that, or correct the file."
+                f"ID {one.servo_id} is {called}, but {servo.own_name} needs {wanted} in the robot file; "
+                "connect another servo, or correct the file."
             )
         return one
 
@@ -159,7 +159,7 @@ def bring(one: OneServo, plan: BusPlan, servo: ServoPlan) -> list[str]:
     if one.baud_rate != plan.baud_rate:
         if plan.baud_rate not in one.table.baud_rates.values():
             raise ServoFault(
-                f"{one.table.model} has no rate of {plan.baud_rate} bit/s; correct the robot file"
+                f"{one.table.model} does not support {plan.baud_rate} bit/s; correct the robot file"
             )
         done.append(one.change_rate(plan.baud_rate))
     if one.servo_id != servo.servo_id:
@@ -172,7 +172,7 @@ def bring(one: OneServo, plan: BusPlan, servo: ServoPlan) -> list[str]:
         if each.refused and each.item.name not in declared:
             desired = (*desired, one.register(each.item.name, each.factory))
     done += one.write_registers(desired)
-    return done or ["was as the robot file has it"]
+    return done or ["already matches the robot file"]
 
 
 def _named(plan: BusPlan, name: str) -> ServoPlan:

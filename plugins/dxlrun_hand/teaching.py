@@ -21,7 +21,7 @@ from dxlrun_hand.taught_motion import TaughtJoints, TaughtMotion
 
 LONGEST_AGE_NS = 1_000_000_000
 """Age of a joint's newest position above which its servo counts as lost, ns."""
-HELP = "Enter: take this pose; r: record a motion; u: undo; limp NAME, hold NAME; s: save; q: quit"
+HELP = "Enter: add this pose; r: record a motion; u: undo; limp NAME, hold NAME; s: save; q: quit"
 
 
 class Teaching:
@@ -54,12 +54,14 @@ class Teaching:
         if lacking := [joint for joint, player in players.items() if player is None]:
             if words:
                 raise InputError(
-                    f"no active controller of {robot.name} takes motions for {', '.join(lacking)}; activate "
-                    "one by `dxlrun switch`, or name other joints"
+                    f"no active controller of {robot.name} plays motions for {', '.join(lacking)}; activate "
+                    "one with `dxlrun switch`, or name other joints"
                 )
             asked.difference_update(lacking)
         if not asked:
-            raise InputError(f"no active controller of {robot.name} takes motions; `dxlrun list` shows them")
+            raise InputError(
+                f"no active controller of {robot.name} plays motions; activate one with `dxlrun switch`"
+            )
         moved = {joint for plan in self._plans if plan.name in players.values() for joint in plan.joints}
         joints = tuple(joint for joint in info["joints"] if joint in moved)
         ends = [info["limits"].get(joint, (-math.inf, math.inf)) for joint in joints]
@@ -85,7 +87,7 @@ class Teaching:
         self._let_go(self._asked)
         shown: list[TaughtMotion] = []
         while True:
-            typed = self._dialogue.ask_while(f"{len(shown)} shown. {HELP}", self._positions)
+            typed = self._dialogue.ask_while(f"{len(shown)} taught. {HELP}", self._positions)
             verb, *names = typed.split() or [""]
             if verb in ("limp", "hold"):
                 self._switch(verb, names)
@@ -101,7 +103,9 @@ class Teaching:
                 return []
             else:
                 self._dialogue.print_lines(
-                    f"  {typed!r} does nothing here" if shown else "  nothing was shown yet"
+                    f"  {typed!r} is not a command"
+                    if shown
+                    else "  nothing was taught yet; add a pose with Enter"
                 )
 
     def save(self, shown: Sequence[TaughtMotion], target: Path) -> None:
@@ -112,13 +116,15 @@ class Teaching:
         """
         taught = self._taught
         for joint in taught.beyond(shown):
-            self._dialogue.print_lines(f"  {joint} was shown beyond its limits: the motion keeps it at them.")
+            self._dialogue.print_lines(
+                f"  {joint} was moved beyond its limits; the motion stops at the limits."
+            )
         motion, longer = taught.slowed(taught.joined(shown, target))
         if longer > 1.0:
             self._dialogue.print_lines(
-                f"  It was shown faster than the joints may move, and takes {longer:.2g} times as long."
+                f"  The motion was faster than the joints may move; it now takes {longer:.2g} times as long."
             )
-        origin = f"Shown by hand to {self._robot.name}.\nWritten by `dxlrun teach`."
+        origin = f"Taught by hand on {self._robot.name}.\nWritten by `dxlrun teach`."
         text = taught.text_of(motion, self._plans, origin)
         write_target(target, text)
         self._dialogue.print_lines(f"{target}: {motion.duration_s:.1f} s of {len(taught.joints)} joints")
@@ -130,7 +136,7 @@ class Teaching:
         """
         while self.limp:
             self._dialogue.ask_question(
-                "The torque comes back where the joints are: hold them, and press Enter "
+                "The torque will be switched on at the present positions: hold the joints, and press Enter "
             )
             self._try(self._hold, list(self.limp))
         self._robot.switch(activate=self.released)
@@ -153,12 +159,14 @@ class Teaching:
 
     def left(self) -> str:
         """Return a sentence with limp joints and deactivated controllers that remain; empty without any."""
-        parts = [f"{', '.join(self.limp)} limp still: `dxlrun torque on {' '.join(self.limp)}`"] * bool(
-            self.limp
-        )
+        parts = []
+        if self.limp:
+            parts.append(f"still limp: {', '.join(self.limp)} (`dxlrun torque on {' '.join(self.limp)}`)")
         if self.released:
             names = " ".join(self.released)
-            parts.append(f"deactivated: {', '.join(self.released)}: `dxlrun switch --activate {names}`")
+            parts.append(
+                f"still deactivated: {', '.join(self.released)} (`dxlrun switch --activate {names}`)"
+            )
         return "; ".join(parts)
 
     # Joints
@@ -187,8 +195,8 @@ class Teaching:
     def _switch(self, verb: str, names: Sequence[str]) -> None:
         wrong = [name for name in names if name not in self._groups]
         if wrong or not names:
-            what = f"no joint {', '.join(wrong)}" if wrong else "name joints or groups"
-            self._dialogue.print_lines(f"  {what}: {', '.join(self._groups)}")
+            what = f"no joint or group {', '.join(wrong)}" if wrong else "no joint or group given"
+            self._dialogue.print_lines(f"  {what}; choose from {', '.join(self._groups)}")
             return
         self._try(self._let_go if verb == "limp" else self._hold, names)
 
@@ -213,7 +221,7 @@ class Teaching:
         ages = states.age_ns[rows].tolist()
         for joint, age_ns in zip(self._taught.joints, ages, strict=True):
             if not 0 <= age_ns <= LONGEST_AGE_NS:
-                raise ServoFault(f"{joint} does not answer any more; nothing was saved")
+                raise ServoFault(f"{joint} no longer answers; nothing was saved")
         return states.time_ns * 1e-9, states.position[rows]
 
     def _positions(self) -> str:
@@ -240,7 +248,7 @@ class Teaching:
         show_time()
         shown = TaughtMotion(np.array(times) - times[0], np.array(positions))
         shown = self._taught.smoothed(self._taught.trimmed(shown))
-        self._dialogue.print_lines(f"  {shown.time_s[-1]:.1f} s without the standstill at both ends")
+        self._dialogue.print_lines(f"  {shown.time_s[-1]:.1f} s, without the pauses at both ends")
         return shown
 
 
@@ -268,7 +276,7 @@ def taught(
         if not shown:
             dialogue.print_lines("Nothing was saved.")
             return 1
-        if not yes(dialogue, f"Play it on {robot.name}? It begins slowly."):
+        if not yes(dialogue, f"Play the motion on {robot.name}? It starts slowly."):
             return 0
         return 0 if task.play_motion(target) else 1
 

@@ -172,7 +172,7 @@ def test_random_robots_are_set_up_and_calibrated(number: int, tmp_path: Path) ->
     for one, servo in zip(world.joints, line.bus.servos, strict=True):
         assert servo.servo_id == one.servo_id
         assert one.table.baud_rates[servo.registers["baud_rate"]] == world.rate
-    steps: list[tuple[str, str | Callable[..., str | None]]] = [("hold what", "")]
+    steps: list[tuple[str, str | Callable[..., str | None]]] = [("hold the joints", "")]
 
     def to_zero() -> None:
         for index, one in enumerate(world.joints):
@@ -180,7 +180,7 @@ def test_random_robots_are_set_up_and_calibrated(number: int, tmp_path: Path) ->
 
     steps.append(("zero pose", to_zero))
     for index, one in enumerate(world.joints):
-        for question, end in (("positive", one.upper), ("other end", one.lower)):
+        for question, end in (("positive", one.upper), ("negative", one.lower)):
             there, wander = one.at(end), chance.choice((0.0, 0.2 * one.direction * end))
 
             def move(
@@ -239,12 +239,12 @@ def test_random_robots_are_taught(number: int, tmp_path: Path, monkeypatch: pyte
         shown = dict(begins)
         steps = [
             ("become limp", ""),
-            ("shown", pose("")),
-            ("shown", pose("r")),
+            ("taught", pose("")),
+            ("taught", pose("r")),
             ("Recording", pose("")),
-            ("shown", "s"),
+            ("taught", "s"),
         ]
-        script = Script(*steps, ("comes back", ""), ("Play", "y"))
+        script = Script(*steps, ("be switched on", ""), ("Play", "y"))
         assert taught(running, script, (), target, 1.0) == 0, script.text
         for name, position in positions(running).items():
             assert position == pytest.approx(shown[name], abs=3.0)

@@ -87,8 +87,8 @@ def test_what_an_included_file_has_is_changed_there(tmp_path: Path) -> None:
     text = RobotText(main)
     text.plan_value(REFERENCE, "2 deg")
     assert [line for line in text.diff() if line.startswith(("+", "-"))] == [
-        f"--- {fragment} as it is",
-        f"+++ {fragment} as it will be",
+        f"--- {fragment} (now)",
+        f"+++ {fragment} (new)",
         "-joints: {elbow: {id: 1, reference: 1 deg}}  # arm",
         "+joints: {elbow: {id: 1, reference: 2 deg}}  # arm",
     ]
@@ -104,10 +104,10 @@ def test_what_an_included_file_has_is_changed_there(tmp_path: Path) -> None:
 @pytest.mark.parametrize(
     ("joints", "said"),
     [
-        ('{elbow: {reference: "${zero}"}}', "joints.elbow.reference is made of an argument; write the value"),
+        ('{elbow: {reference: "${zero}"}}', "joints.elbow.reference comes from an argument; write the value"),
         ("{elbow: {reference: &r 1 deg}, wrist: {reference: *r}}", "reference is shared by an alias"),
         ("{elbow: &j {reference: 1 deg}, wrist: *j}", "joints.elbow.reference is shared by an alias"),
-        ("{elbow: 3}", "joints.elbow is not a mapping; write its keys below it"),
+        ("{elbow: 3}", "joints.elbow is not a mapping; write it as a mapping"),
     ],
 )
 def test_what_cannot_be_replaced_is_refused_at_its_place(tmp_path: Path, joints: str, said: str) -> None:
@@ -123,7 +123,7 @@ def test_a_file_that_was_changed_meanwhile_is_left_alone(tmp_path: Path) -> None
     text = RobotText(path)
     text.plan_value(REFERENCE, "2 deg")
     path.write_text("name: other\n")
-    with pytest.raises(InputError, match="was changed by another program, so nothing was written"):
+    with pytest.raises(InputError, match="was changed by another program, and nothing was written"):
         text.write_files()
     assert path.read_text() == "name: other\n"
     assert list(tmp_path.iterdir()) == [path]
@@ -134,7 +134,7 @@ def test_a_file_that_cannot_be_written_is_refused_before_anything_is_measured(
 ) -> None:
     path = written(tmp_path, HEAD + "joints: {elbow: {reference: 1 deg}}\n")
     monkeypatch.setattr("os.access", lambda *_: False)  # root may write everything
-    with pytest.raises(InputError, match="it is read-only"):
+    with pytest.raises(InputError, match="is read-only; make"):
         RobotText(path).check_path(REFERENCE)
 
 

@@ -83,14 +83,14 @@ def test_new_servos_get_id_rate_and_registers_and_are_compared(bench: Bench) -> 
     assert bench.servo(1) == (1, 3, 10, 80)
     assert bench.line.bus.servos[1].registers["position_p_gain"] != 700  # RAM: each run writes it
     assert "elbow: has ID 5; it had 1" in script.text
-    assert "Bus main: 2 servos are as in the robot file." in script.text
+    assert "Bus main: 2 servos match the robot file." in script.text
     again = Bench.do(
         bench,
         ("Connect the servo for elbow", bench.connect(0)),
         ("Connect the servo for wrist", "s"),
         ("Connect all", bench.connect(0, 1)),
     )
-    assert "elbow: was as the robot file has it" in again.text
+    assert "elbow: already matches the robot file" in again.text
     assert bench.code == 0
 
 
@@ -121,21 +121,19 @@ def test_two_servos_at_two_rates_are_refused(bench: Bench) -> None:
 
 def test_two_servos_of_one_id_are_refused(tmp_path: Path) -> None:
     bench = Bench(tmp_path, servos=(NEW[0], ServoConfig(1, "XL430-W250", math.radians(20))))
-    refused(
-        bench, bench.connect(0, 1), "Not one servo answers (ID 1 at 57600 bit/s), garbled, as two servos of"
-    )
+    refused(bench, bench.connect(0, 1), "Two servos with the same ID seem to answer (ID 1 at 57600")
 
 
 def test_another_model_is_refused(bench: Bench) -> None:
     refused(
         bench,
         bench.connect(1),
-        "What answers is XM430-W350 (ID 1), not the XL430-W250 that the robot file has",
+        "ID 1 is XM430-W350, but elbow needs XL430-W250 in the robot file; connect",
     )
 
 
 def test_no_servo_is_said_so(bench: Bench) -> None:
-    refused(bench, bench.connect(), "No servo answers at /dev/null: check its power and its cable.")
+    refused(bench, bench.connect(), "No servo answers at /dev/null; check its power and its cable.")
 
 
 def test_another_protocol_is_refused(tmp_path: Path) -> None:
@@ -145,13 +143,13 @@ def test_another_protocol_is_refused(tmp_path: Path) -> None:
     script = bench.do(
         ("for elbow", bench.connect(0)), ("for elbow", "s"), ("all", ""), ("again", ""), joints=("elbow",)
     )
-    assert "The servo speaks Protocol 1.0, bus main Protocol 2.0: connect another one" in script.text
+    assert "The servo uses Protocol 1.0, and bus main Protocol 2.0; connect another servo" in script.text
 
 
 def test_a_servo_at_any_rate_is_found(bench: Bench) -> None:
     bench.line.bus.servos[0].poke("baud_rate", 4)
     script = bench.do(("for elbow", bench.connect(0)), ("all", ""), joints=("elbow",))
-    assert "every other one is tried" in script.text
+    assert "trying all others" in script.text
     assert (bench.code, bench.servo(0)) == (0, (5, 3, 10, 70))
 
 
@@ -159,7 +157,7 @@ def test_the_model_of_auto_is_that_of_the_servo(tmp_path: Path) -> None:
     bench = Bench(tmp_path, ROBOT.replace("XL430-W250", "auto"))
     script = bench.do(("for elbow (any model)", bench.connect(1)), ("all", ""), joints=("elbow",))
     assert (bench.code, bench.servo(1)) == (0, (5, 3, 10, 70))
-    assert "as in the robot file" in script.text
+    assert "the robot file." in script.text
 
 
 def test_what_changed_again_is_found_at_the_end(bench: Bench) -> None:
@@ -194,9 +192,9 @@ def test_a_servo_that_dies_in_the_middle_is_set_up_again(
 @pytest.mark.parametrize(
     ("steps", "said"),
     [
-        ([interrupt], "no servo was set up; all others are unchanged\n"),
-        ([(0,), interrupt], "set up: elbow; all others are unchanged\n"),
-        ([(0,), (1,), interrupt], "set up: elbow, wrist; all others are unchanged\n"),
+        ([interrupt], "no servo was changed\n"),
+        ([(0,), interrupt], "set up: elbow; no other servo was changed\n"),
+        ([(0,), (1,), interrupt], "set up: elbow, wrist; no other servo was changed\n"),
     ],
 )
 def test_after_ctrl_c_it_is_said_what_was_done(
@@ -214,7 +212,7 @@ def test_ctrl_c_while_a_servo_is_written_to_is_said_so(
     monkeypatch.setattr(OneServo, "change_id", interrupt)
     with pytest.raises(KeyboardInterrupt):
         bench.do(("for elbow", bench.connect(0)))
-    assert "the one for elbow may have its new ID or rate already: set it up again" in capsys.readouterr().err
+    assert "the servo of elbow may have its new ID or rate already; set it up" in capsys.readouterr().err
 
 
 def test_each_servo_opens_the_port_again_as_a_board_on_usb_drops_out(
@@ -343,7 +341,7 @@ def test_a_port_that_is_not_there_is_looked_for(bench: Bench, desk: Desk) -> Non
         ("all", ""),
         joints=("elbow",),
     )
-    assert f"Bus main: there is no {desk.directory}/none now." in script.said
+    assert f"Bus main: port {desk.directory}/none not found." in script.said
     assert bench.line.name == str(desk.directory / "a-id7")
     assert f"port: {desk.directory}/a-id7  , protocol" in bench.path.read_text()
 
@@ -357,7 +355,7 @@ def test_a_port_of_an_argument_is_told(bench: Bench, desk: Desk) -> None:
         ("all", ""),
     )
     script = bench.do(*steps, joints=("elbow",), search=True)
-    assert f"as argument of the robot file: {desk.directory}/a-id7" in script.text
+    assert f"as an argument: {desk.directory}/a-id7" in script.text
     assert bench.path.read_text() == ROBOT
 
 

@@ -86,16 +86,16 @@ def test_poses_and_a_recorded_motion_are_saved_and_played(
     before, target = positions(robot), tmp_path / "wave.yaml"
     script = Script(
         ("These joints become limp: elbow, wrist.", ""),
-        ("0 shown", after(live, POSE, id5=30, id2=-20)),
-        ("1 shown", after(live, "hold elbow")),
-        ("1 shown", after(live, "limp elbow hand")),
-        ("1 shown", POSE),
-        ("2 shown", "u"),
-        ("1 shown", RECORD),
+        ("0 taught", after(live, POSE, id5=30, id2=-20)),
+        ("1 taught", after(live, "hold elbow")),
+        ("1 taught", after(live, "limp elbow hand")),
+        ("1 taught", POSE),
+        ("2 taught", "u"),
+        ("1 taught", RECORD),
         ("Recording", after(live, "", id5=-50, id2=40)),
-        ("2 shown", DONE),
-        ("The torque comes back", after(live, "")),
-        ("Play it on arm? It begins slowly.", "y"),
+        ("2 taught", DONE),
+        ("The torque will be switched on", after(live, "")),
+        ("Play the motion on arm? It starts slowly.", "y"),
     )
     assert taught(robot, script, (), target, SPEED) == 0
     motion = read_motion(target).motion
@@ -116,38 +116,38 @@ def test_a_joint_beyond_its_limits_is_kept_at_them(
     target, there = tmp_path / "far.yaml", positions(robot)["elbow"]
     script = Script(
         ("These joints become limp: elbow.", ""),
-        ("0 shown", after(live, POSE, id5=70 - there)),
-        ("1 shown", "hold elbow"),
-        ("1 shown", DONE),
-        ("The torque comes back", ""),
-        ("The torque comes back", after(live, "", id5=-50)),
+        ("0 taught", after(live, POSE, id5=70 - there)),
+        ("1 taught", "hold elbow"),
+        ("1 taught", DONE),
+        ("The torque will be switched on", ""),
+        ("The torque will be switched on", after(live, "", id5=-50)),
         ("Play", ""),
     )
     assert taught(robot, script, ("arm",), target, SPEED) == 0
     assert points(read_motion(target).motion)["elbow"][-1][1] == pytest.approx(60.0, abs=0.1)
-    assert "elbow was shown beyond its limits: the motion keeps it at them" in script.text
+    assert "elbow was moved beyond its limits; the motion stops at the limits" in script.text
     assert script.text.count("outside its limits") == 2
 
 
 def test_giving_up_saves_nothing_and_gives_the_torque_back(robot: RemoteRobot, tmp_path: Path) -> None:
-    asked = (("0 shown", DONE), ("0 shown", "limp x"), ("0 shown", "q"))
-    steps = (("become limp", ""), *asked, ("comes back", ""))
+    asked = (("0 taught", DONE), ("0 taught", "limp x"), ("0 taught", "q"))
+    steps = (("become limp", ""), *asked, ("be switched on", ""))
     script = Script(*steps)
     assert taught(robot, script, ("hand",), tmp_path / "none.yaml", SPEED) == 1
     assert script.said[-1] == "Nothing was saved."
-    assert "no joint x: all, arm, grip, hand, elbow, wrist" in script.text
-    assert "nothing was shown yet" in script.text
+    assert "no joint or group x; choose from all, arm, grip, hand, elbow, wrist" in script.text
+    assert "nothing was taught yet" in script.text
     assert set(robot.states().torque) == {"on"}
     assert list(tmp_path.iterdir()) == []
 
 
 @pytest.mark.parametrize(
-    ("at", "limp"), [("become limp", False), ("0 shown", True), ("comes back", True), ("Play", False)]
+    ("at", "limp"), [("become limp", False), ("0 taught", True), ("be switched on", True), ("Play", False)]
 )
 def test_after_ctrl_c_it_is_said_what_is_limp(
     robot: RemoteRobot, tmp_path: Path, at: str, limp: bool, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    steps = [("become limp", ""), ("0 shown", ""), ("1 shown", "s"), ("comes back", ""), ("Play", "y")]
+    steps = [("become limp", ""), ("0 taught", ""), ("1 taught", "s"), ("be switched on", ""), ("Play", "y")]
     with pytest.raises(KeyboardInterrupt):
         taught(
             robot,
@@ -156,10 +156,11 @@ def test_after_ctrl_c_it_is_said_what_is_limp(
             tmp_path / "a.yaml",
             1,
         )
-    left = "elbow limp still: `dxlrun torque on elbow`; deactivated: arm: `dxlrun switch --activate arm`\n"
+    left = "still limp: elbow (`dxlrun torque on elbow`); "
+    left += "still deactivated: arm (`dxlrun switch --activate arm`)\n"
     assert capsys.readouterr().err == (left if limp else "")
     assert (robot.states().joint("elbow")["torque"] != "on") is limp
-    assert (tmp_path / "a.yaml").exists() is (at in ("comes back", "Play"))
+    assert (tmp_path / "a.yaml").exists() is (at in ("be switched on", "Play"))
 
 
 def test_a_refusal_that_deactivated_a_controller_names_it(
@@ -175,7 +176,7 @@ def test_a_refusal_that_deactivated_a_controller_names_it(
     monkeypatch.setattr(RemoteRobot, "torque", refuse)
     with pytest.raises(Refused):
         taught(robot, Script(("become limp", "")), ("elbow",), tmp_path / "a.yaml", SPEED)
-    assert "deactivated: arm: `dxlrun switch --activate arm`" in capsys.readouterr().err
+    assert "still deactivated: arm (`dxlrun switch --activate arm`)" in capsys.readouterr().err
 
 
 def test_a_servo_that_falls_silent_ends_it(
@@ -187,8 +188,8 @@ def test_a_servo_that_falls_silent_ends_it(
         monkeypatch.setattr(RemoteRobot, "states", lambda _: old)
         look()
 
-    script = Script(("become limp", ""), ("0 shown", silent))
-    with pytest.raises(ServoFault, match="elbow does not answer any more; nothing was"):
+    script = Script(("become limp", ""), ("0 taught", silent))
+    with pytest.raises(ServoFault, match="elbow no longer answers; nothing was"):
         taught(robot, script, ("elbow",), tmp_path / "a.yaml", SPEED)
     assert list(tmp_path.iterdir()) == []
 
@@ -197,10 +198,10 @@ def test_what_cannot_be_taught_is_refused(robot: RemoteRobot) -> None:
     with pytest.raises(InputError, match="arm has no joint elbo; did you mean elbow"):
         Teaching(robot, Script(), ("elbo",), SPEED)
     robot.switch(deactivate=["grip"])
-    with pytest.raises(InputError, match="no active controller of arm takes motions for wrist"):
+    with pytest.raises(InputError, match="no active controller of arm plays motions for wrist"):
         Teaching(robot, Script(), ("wrist",), SPEED)
     robot.switch(deactivate=["arm"])
-    with pytest.raises(InputError, match="no active controller of arm takes motions; `dxlrun list`"):
+    with pytest.raises(InputError, match="no active controller of arm plays motions; activate one with"):
         Teaching(robot, Script(), (), SPEED)
 
 

@@ -45,17 +45,17 @@ def test_the_commands_of_the_page_lead_from_a_new_servo_to_a_motion(robot: Path,
         with Screen(tmp_path, *words(setup, link)) as screen:
             screen.sees("Connect the servo for elbow (XL430-W250) alone to bus main")
             screen.types("\n")
-            screen.sees("was as the robot file has it")
+            screen.sees("already matches the robot file")
             screen.sees("Connect all servos")
             screen.types("\n")
-            screen.sees("1 servo is as in the robot file")
+            screen.sees("1 servo matches the robot file")
             assert screen.ended() == 0
         with Screen(tmp_path, *words(calibrate, link)) as screen:
             for question, turn in (
-                ("hold what", 0),
+                ("hold the joints", 0),
                 ("zero pose", -20),
                 ("positive", -30),
-                ("other end", 70),
+                ("negative direction", 70),
             ):
                 screen.sees(question)
                 servos.turn(lambda: None, 0.3, id1=turn)
@@ -76,10 +76,10 @@ def test_the_commands_of_the_page_lead_from_a_new_servo_to_a_motion(robot: Path,
         with Screen(tmp_path, *words(teach, link)) as screen:
             for question, answer in (
                 ("Hold them", ""),
-                ("0 shown", ""),
-                ("1 shown", "s"),
-                ("comes back", ""),
-                ("Play it", "y"),
+                ("0 taught", ""),
+                ("1 taught", "s"),
+                ("be switched on", ""),
+                ("Play the", "y"),
             ):
                 screen.sees(question)
                 screen.types(f"{answer}\n")
@@ -94,7 +94,7 @@ def test_ctrl_c_and_the_end_of_input_leave_the_file_as_it_was(robot: Path, tmp_p
         LiveRobot(tmp_path, robot, runs=False),
         Screen(tmp_path, *words(COMMANDS[2], tmp_path / "line")) as screen,
     ):
-        for question in ("hold what", "zero pose"):
+        for question in ("hold the joints", "zero pose"):
             screen.sees(question)
             screen.types("\n")
         screen.sees("its servo is at 180 deg")  # the live line
@@ -114,4 +114,4 @@ def test_what_was_typed_before_a_question_does_not_answer_it(robot: Path, tmp_pa
         screen.sees("(s: skip it)")
         screen.types("\x03")
         assert screen.ended() == 130
-        assert "no servo was set up; all others are unchanged" in screen.text
+        assert "no servo was changed" in screen.text

@@ -87,7 +87,7 @@ def calibrated(
             limits = None if written is None else (float(written[0]), float(written[1]))
             changes += replacements(text, servos[each.joint][1], limits, each)
         if not changes:
-            dialogue.print_lines(f"All is as {robot} has it; nothing is to be written.")
+            dialogue.print_lines(f"{robot} has these values already; nothing was written.")
             return 0
         for change in changes:
             text.plan_value(
@@ -97,13 +97,13 @@ def calibrated(
         try:
             compile_robot(read_robot(robot, parse_assignments(assignments), changes), [])
         except InputError as error:
-            dialogue.print_lines("With these values the robot file has other mistakes:", *error.sentences)
+            dialogue.print_lines("The robot file with these values has mistakes:", *error.sentences)
         if not yes(dialogue, f"Write this into {robot}?"):
             dialogue.print_lines(f"{robot} is unchanged.")
             return 1
         text.write_files()
     dialogue.print_lines(
-        f"{robot} is written; the joints are limp. `dxlrun check {robot}` checks the whole file."
+        f"{robot} is written; the joints are limp. Check the whole file: `dxlrun check {robot}`."
     )
     return 0
 
@@ -127,9 +127,7 @@ def _joints(result: CompiledRobot, words: Sequence[str], dialogue: Dialogue) -> 
     names = chosen_names(words, tuple(every), result.plan.groups)
     left = {name: every[name] for name in names if every[name].drive.own}
     if others := ", ".join(name for name in names if name not in left):
-        dialogue.print_lines(
-            f"Not calibrated, because several servos move them; measure them yourself: {others}"
-        )
+        dialogue.print_lines(f"Several servos move {others}: not calibrated; measure these joints yourself.")
     if not left:
-        raise InputError("no joint is left to be calibrated; choose one with a servo of its own")
+        raise InputError("several servos move each of these joints; choose a joint with one servo")
     return left

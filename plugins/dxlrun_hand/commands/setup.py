@@ -91,8 +91,8 @@ def _left(task: ServoSetup) -> str:
     """Return a sentence for an early end of the dialogue: servos that were set up, and one half-changed."""
     done = f"set up: {', '.join(task.done)}" if task.done else "no servo was set up"
     if not task.changing:
-        return f"{done}; all others are unchanged"
-    return f"{done}; the one for {task.changing} may have its new ID or rate already: set it up again"
+        return f"{done}; no other servo was changed" if task.done else "no servo was changed"
+    return f"{done}; the servo of {task.changing} may have its new ID or rate already; set it up again"
 
 
 def _port(task: ServoSetup, plan: BusPlan, devices: Devices, *, search: bool) -> str:
@@ -107,13 +107,13 @@ def _port(task: ServoSetup, plan: BusPlan, devices: Devices, *, search: bool) ->
     if not search:
         if plan.port == SIMULATED or os.path.exists(plan.port):
             return plan.port
-        dialogue.print_lines(f"Bus {plan.name}: there is no {plan.port} now.")
+        dialogue.print_lines(f"Bus {plan.name}: port {plan.port} not found.")
     found = find_port(plan.name, dialogue, devices)
     text = RobotText(robot)
     try:
         text.plan_value(("buses", plan.name, "port"), found)
     except InputError:  # The port comes from an argument
-        dialogue.print_lines(f"Give it to other commands, as argument of the robot file: {found}")
+        dialogue.print_lines(f"{robot} is unchanged; give other commands this port as an argument: {found}")
         return found
     dialogue.print_lines(*text.diff())
     if yes(dialogue, f"Write this into {robot}?"):

@@ -44,7 +44,7 @@ def teach(
     from dxlrun_hand.teaching import taught
 
     if motion.suffix not in (".yaml", ".yml"):
-        raise InputError(f"a motion file is YAML, so its name ends in .yaml, not as {motion} does")
+        raise InputError(f"{motion} does not end in .yaml; give the name of a YAML file")
     check_target(motion)
     try:
         way_speed = angular_velocity(velocity)
