@@ -59,13 +59,13 @@ def _parser() -> argparse.ArgumentParser:
         "--protocol",
         type=float,
         metavar="1.0|2.0",
-        help="protocol; required only for models that exist with both",
+        help="protocol; required only for models available with 1.0 and 2.0",
     )
     add(
         "--link",
         type=Path,
         metavar="PATH",
-        help="symbolic link to the pseudo-terminal, whose own name changes at each start",
+        help="symbolic link to the pseudo-terminal, as a fixed name for its port",
     )
     add(
         "--fault",
@@ -91,7 +91,7 @@ def _parser() -> argparse.ArgumentParser:
     add(
         "--latency-timer",
         metavar="TIME",
-        help='time for which the adapter holds replies back, as FTDI adapters do, such as "4 ms"',
+        help='latency timer of the adapter, such as "4 ms"; default: none',
     )
     return parser
 
@@ -108,7 +108,7 @@ def main(words: Sequence[str] | None = None) -> int:
         print("\n".join(fault_help()))
         return 0
     if not given.servo:
-        parser.error("there is nothing to simulate; give servos such as --servo XL430-W250:1-3")
+        parser.error("--servo is missing; give servos such as --servo XL430-W250:1-3")
     try:
         bus = _with_latency(bus_of_servos(given.servo, given.baud, given.protocol), given.latency_timer)
         links = {} if given.link is None else {bus.name: str(given.link)}
@@ -137,7 +137,7 @@ def _with_latency(bus: BusConfig, text: str | None) -> BusConfig:
     try:
         timer_ns = parse_duration(text)
     except ValueError as error:
-        raise InputError(f"--latency-timer: {error}; write one such as 4 ms") from None
+        raise InputError(f"--latency-timer: {error}; write a time such as 4 ms") from None
     return replace(bus, adapter=replace(bus.adapter, latency_timer_ns=timer_ns))
 
 

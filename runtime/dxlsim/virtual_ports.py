@@ -37,7 +37,7 @@ class VirtualPort:
 
     def failure(self, code: int) -> PortError:
         """Return the exception for a failed write; the only cause is an unplugged adapter."""
-        return PortError(f"the adapter of bus {self._bus.name} is gone")
+        return PortError(f"the adapter of bus {self._bus.name} is unplugged")
 
     def extend_deadline(self, deadline_ns: int, off_wire_ns: int, heard_ns: int, now_ns: int) -> int:
         """Return `deadline_ns`: virtual time waits for the servos, so none is stalled."""

@@ -92,7 +92,7 @@ def test_a_mistake_in_the_urdf_refuses_the_robot_at_its_line() -> None:
     (error,) = [each for each in found if each.severity == "error"]
 
     assert (Path(error.mark.file).name, error.mark.line, error.mark.column) == ("pair.urdf", 7, 3)
-    assert error.what == "joint thumb_joint mimics left, which does not exist"
+    assert error.what == "joint thumb_joint mimics the unknown joint left"
 
 
 LINEAR = """\

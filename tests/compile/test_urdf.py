@@ -67,7 +67,7 @@ def test_a_speed_above_that_of_the_urdf_is_a_warning():
         (
             '<?xml version="1.0"?>\n <!DOCTYPE r [<!ENTITY e SYSTEM "file:///etc/passwd">]><robot>&e;</robot>',
             (2, 2),
-            "a DOCTYPE is refused; remove it",
+            "DOCTYPE is not allowed; remove it",
         ),
         ("<robot>\x01</robot>", (1, 8), "the character U+0001 cannot stand in URDF; remove it"),
     ],

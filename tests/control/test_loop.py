@@ -93,12 +93,12 @@ def test_a_lost_port_ends_the_loop_with_a_sentence(robot, step):
     def fail(*_):
         calls.append(step)
         if len(calls) == 3:
-            raise PortError("the adapter of bus main is gone")
+            raise PortError("the adapter of bus main is unplugged")
 
     setattr(robot.hardware, step, fail)
     result = robot.loop.run()
     assert (result.reason, result.cycles) == ("fault", 2)
-    assert result.detail == "the adapter of bus main is gone"
+    assert result.detail == "the adapter of bus main is unplugged"
     assert robot.calls[-1].step == "deactivate"
     assert robot.events.seen[-1][:2] == (EventCode.LOOP_STOPPED, Severity.FATAL)
 

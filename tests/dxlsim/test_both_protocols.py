@@ -124,7 +124,7 @@ def test_a_pause_inside_an_instruction_ends_it(both):
         both.bus.receive_bytes(ping[3:], at_ns + 30_000 + pause_ns)
         at_ns += 10**9
         assert (both.bus.drain_bytes(at_ns) != b"") == answered
-    assert both.notes() == ["an instruction of 3 bytes was broken off"]
+    assert both.notes() == ["incomplete instruction of 3 bytes discarded"]
 
 
 def test_reg_write_waits_for_action(both):

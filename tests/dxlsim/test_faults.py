@@ -262,7 +262,7 @@ def test_a_hand_gives_way_to_a_servo_with_torque(line2, mode, goal):
     line2.wait(0.5)
     moved = line2.servo(1).shaft_angle - before
     assert moved == pytest.approx(0.0, abs=0.002) if goal is None else moved > 0.01
-    way = "servo 1: holds or drives its shaft, so the hand that turns it yields after 0.0 of -30 deg"
+    way = "servo 1: turned by hand only 0.0 of -30 deg, because the servo has torque"
     assert way in line2.notes()
 
 
@@ -281,8 +281,8 @@ def test_torque_that_comes_on_midway_ends_the_turning(line):
     line.write(1, 30, *line.servo(1).registers.data("present_position"))  # the goal where it is: torque on
     line.clock.wait_until(2000 * MS)
     assert math.degrees(line.servo(1).shaft_angle - 2.0) == pytest.approx(15.0, abs=1.0)
-    (way,) = [note for note in line.notes() if "yields" in note]
-    assert way.startswith("servo 1: holds or drives its shaft, so the hand that turns it yields after 15.")
+    (way,) = [note for note in line.notes() if "turned by hand" in note]
+    assert way.startswith("servo 1: turned by hand only 15.")
 
 
 def test_a_servo_that_lost_its_power_is_still_turned(line2):

@@ -51,11 +51,11 @@ def test_all_that_could_never_happen_is_reported_at_once_and_nothing_is_planned(
     with pytest.raises(InputError) as refused:
         script.attach(buses, now_ns=2_000 * MS)
     assert refused.value.sentences == (
-        "lose servo=1: there are 3 buses; choose one: bus=left or bus=right or bus=bare",
-        "lose bus=middle servo=1: there is no bus 'middle'; write bus=left or bus=right or bus=bare",
+        "lose servo=1: bus= is missing with 3 buses; write bus=left or bus=right or bus=bare",
+        "lose bus=middle servo=1: unknown bus 'middle'; write bus=left or bus=right or bus=bare",
         "lose bus=left servo=3: bus left has no servo 3; its servos are 1, 2",
-        "storm bus=bare faults=3 within=1s: bus bare has no servos; name another one with bus=",
-        "unplug bus=right at=1s: it is 2.000 s after the start already; omit at= for now",
+        "storm bus=bare faults=3 within=1s: bus bare has no servos; name another bus with bus=",
+        "unplug bus=right at=1s: at= is in the past, 2.000 s after the start; omit at= to start it now",
     )
     assert all(bus.next_due_ns() is None for bus in buses)
     assert script.waiting == ()

@@ -70,14 +70,14 @@ def test_a_line_can_be_written_in_other_ways_and_has_one_canonical_text():
 @pytest.mark.parametrize(
     ("line", "message"),
     [
-        ("", "a fault is missing; write one such as: lose servo=3 at=2s"),
-        ("losee servo=3", "there is no fault 'losee'; did you mean lose?"),
-        ("explode", "there is no fault 'explode'; the faults are lose, corrupt, truncate"),
+        ("", "the fault is empty; write a fault such as: lose servo=3 at=2s"),
+        ("losee servo=3", "unknown fault 'losee'; did you mean lose?"),
+        ("explode", "unknown fault 'explode'; the faults are lose, corrupt, truncate"),
         ("lose 3", "lose: '3' is not key=value; write it as in: lose [servo=ID] [from=host]"),
         ("lose servos=3", "lose takes no 'servos'; did you mean servo?"),
-        ("lose servo=3 servo=4", "lose: servo= is there twice; omit one of them"),
-        ("lose", "lose needs either servo=ID, for its reply, or from=host, for an instruction"),
-        ("lose servo=3 from=host", "lose needs either servo=ID, for its reply, or from=host"),
+        ("lose servo=3 servo=4", "lose: servo= is given twice; give it once"),
+        ("lose", "lose needs servo=ID (alters a reply) or from=host (alters an instruction)"),
+        ("lose servo=3 from=host", "lose needs servo=ID (alters a reply) or from=host"),
         ("lose from=me", "lose: from=me: write from=host for an instruction, servo=ID for a reply"),
         ("lose servo=254", "lose: servo=254: write a whole number from 0 to 253"),
         ("lose servo=x", "lose: servo=x: write a whole number from 0 to 253"),
@@ -103,8 +103,8 @@ def test_a_line_can_be_written_in_other_ways_and_has_one_canonical_text():
             "by=36001deg: write an angle such as 30deg or -0.5rad, of at most 100 turns",
         ),
         ("delay servo=3 by=30deg", "delay: by=30deg: write a time longer than 0, such as 500ms"),
-        ("storm faults=3 within=1s kinds=storm", "storm: kinds=storm: a storm has no 'storm'"),
-        ("storm faults=3 within=1s kinds=los", "a storm has no 'los'; did you mean lose?"),
+        ("storm faults=3 within=1s kinds=storm", "storm: kinds=storm: unknown kind 'storm' in a storm"),
+        ("storm faults=3 within=1s kinds=los", "unknown kind 'los' in a storm; did you mean lose?"),
     ],
 )
 def test_a_wrong_line_is_refused_with_one_sentence_that_corrects_it(line, message):

@@ -163,7 +163,7 @@ def test_program_serves_until_a_signal(tmp_path: Path, number: signal.Signals) -
 @pytest.mark.parametrize(
     ("words", "sentence"),
     [
-        ((), "there is nothing to simulate"),
+        ((), "--servo is missing"),
         (("--servo", "XL430-W250"), "this is not MODEL:IDS"),
         (("--servo", "XL430-W250:1", "--fault", "lose servo=7"), "has no servo 7"),
         (("--servo", "XL430-W250:1", "--latency-timer", "4"), "--latency-timer: '4' is not a duration"),

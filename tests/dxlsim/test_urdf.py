@@ -52,55 +52,65 @@ def test_each_joint_stands_behind_the_one_above_it() -> None:
     assert urdf.links == tuple(f"l{number}" for number in range(2999, -1, -1))
 
 
-TWO_ROOTS = "2 links have no parent: base, lonely; join them to one tree; a fixed joint moves nothing"
-CIRCLE = "links form a circle: upper -> thumb -> upper; remove one of the joints between them"
+TWO_ROOTS = "2 links have no parent: base, lonely; connect all links to one tree, for example by fixed joints"
+CIRCLE = "links form a circle: upper -> thumb -> upper; remove one joint of this circle"
 
 
 @pytest.mark.parametrize(
     ("right", "wrong", "place", "expected"),
     [
         ('<link name="upper"/>', "<link/>", (2, 22), 'a link has no name; write <link name="...">'),
-        ('name="thumb"', 'name="upper"', (2, 63), "there are two links upper; give each a name of its own"),
-        ('"thumb_slide" type', '"elbow" type', (8, 3), "there are two joints elbow; give each"),
+        ('name="thumb"', 'name="upper"', (2, 63), "link upper is defined twice; rename one of the links"),
+        ('"thumb_slide" type', '"elbow" type', (8, 3), "joint elbow is defined twice; rename one"),
         (' name="elbow"', "", (3, 3), 'a joint has no name; write <joint name="..." type="...">'),
-        ("revolute", "hinge", (3, 3), "joint elbow has the type hinge; write one of revolute, continuous"),
-        ("revolute", "floating", (3, 3), "joint elbow is floating: it has several coordinates"),
-        ("revolute", "planar", (3, 3), "joint elbow is planar: it has several coordinates"),
+        (
+            "revolute",
+            "hinge",
+            (3, 3),
+            "joint elbow has the unknown type hinge; write one of revolute, continuous",
+        ),
+        ("revolute", "floating", (3, 3), "joint elbow is floating, with several degrees of freedom"),
+        ("revolute", "planar", (3, 3), "joint elbow is planar, with several degrees of freedom"),
         (
             '<parent link="base"/>',
             "",
             (3, 3),
-            'joint elbow has no parent; write <parent link="..."/> into it',
+            'joint elbow has no parent; add <parent link="..."/>',
         ),
         (
             'link="base"',
             'link="bas"',
             (4, 5),
-            "the parent of joint elbow is the link bas, which does not exist; did you mean base?",
+            "link bas, the parent of joint elbow, is not defined; did you mean base?",
         ),
-        ('xyz="0 3 4"', 'xyz="0 0 0"', (5, 44), "the axis of joint elbow has no length; write"),
+        ('xyz="0 3 4"', 'xyz="0 0 0"', (5, 44), "the axis of joint elbow has zero length; write"),
         ('xyz="1 2 3"', 'xyz="1 2"', (5, 5), "xyz of the origin of joint elbow is '1 2', not three"),
         ('rpy="0.1', 'rpy="nan', (5, 5), "rpy of the origin of joint elbow is 'nan 0.2 0.3', not"),
         ('lower="-1"', 'lower="low"', (6, 5), "lower of the limit of joint elbow is 'low', not a number"),
-        ('lower="-1"', 'lower="5"', (6, 5), "the lower limit of joint elbow is 5, above its upper one"),
-        ('joint="finger_slide"', "", (9, 48), 'joint thumb_slide mimics nothing; write <mimic joint="..."/>'),
+        ('lower="-1"', 'lower="5"', (6, 5), "the lower limit of joint elbow, 5, is above the upper limit"),
+        (
+            'joint="finger_slide"',
+            "",
+            (9, 48),
+            'the mimic of joint thumb_slide names no joint; write <mimic joint="..."/>',
+        ),
         (
             'joint="finger_slide"',
             'joint="finger_slid"',
             (8, 3),
-            "joint thumb_slide mimics finger_slid, which does not exist; did you mean finger_slide?",
+            "joint thumb_slide mimics the unknown joint finger_slid; did you mean finger_slide?",
         ),
         (
             'joint="finger_slide"',
             'joint="thumb_slide"',
             (8, 3),
-            "joint thumb_slide mimics itself: thumb_slide -> thumb_slide; remove the mimic of one of them",
+            "joint thumb_slide mimics itself: thumb_slide -> thumb_slide; remove one mimic of this circle",
         ),
         (
             '<joint name="finger_slide" type="prismatic">',
             '<joint name="finger_slide" type="fixed">',
             (8, 3),
-            "joint thumb_slide mimics finger_slide, which is fixed; name one that moves",
+            "joint thumb_slide mimics the fixed joint finger_slide; name a moving joint",
         ),
         ('<link name="thumb"/>', '<link name="thumb"/><link name="lonely"/>', (2, 83), TWO_ROOTS),
         ('link="base"/><child', 'link="thumb"/><child', (3, 3), CIRCLE),
@@ -108,10 +118,10 @@ CIRCLE = "links form a circle: upper -> thumb -> upper; remove one of the joints
             '<child link="finger"/>',
             '<child link="thumb"/>',
             (11, 3),
-            "link thumb has two parents, by thumb_slide and finger_slide; give each joint a child of its own",
+            "link thumb is the child of two joints, thumb_slide and finger_slide; change one child",
         ),
         ("robot", "model", (1, 1), "the top element is model, not robot; name a URDF file"),
-        (ARM, "<robot/>", (1, 1), "the URDF has no links; give it at least one"),
+        (ARM, "<robot/>", (1, 1), "the URDF has no links; add at least one link"),
     ],
 )
 def test_a_mistake_is_named_at_its_place(

@@ -64,7 +64,7 @@ def test_an_unplugged_adapter_is_a_port_error():
     _, ports, virtual = two_buses()
     virtual.ports[0].unplug()
     assert ports.wait_for_bytes(10**9) == [0]
-    with pytest.raises(PortError, match="bus left is gone"):
+    with pytest.raises(PortError, match="bus left is unplugged"):
         ports.ports[0].write_packet(PING_1)
     with pytest.raises(PortError):
         read(ports, 0)

@@ -87,7 +87,7 @@ def test_a_board_that_waits_in_a_chain_is_read_alone_and_asked_again_at_the_star
     assert run.events.errors == ()
     assert run.record.sources.valid.all()
     notes = [entry.note for entry in bus.ledger.entries]
-    assert "device 200: waits for the status of 9, and obeys nothing" in notes
+    assert "device 200: ignores instructions until 9 has replied" in notes
     sent = [entry.data for entry in bus.ledger.entries if entry.direction == "in"]
     assert sum(data[4:8] == b"\xc8\x07\x00\x02" for data in sent) > 90, "reads of its own"
     assert not [data for data in sent if data[7] in (0x82, 0x8A, 0x92, 0x9A) and b"\xc8" in data[8:-2]]
@@ -131,7 +131,7 @@ def test_a_broken_table_is_named_at_the_robot_file(robot):
     from dxlrun.errors import InputError
 
     (robot.parent / "boards" / "mine.toml").write_text(BOARD.replace("bit = 5", "bit = 2"))
-    with pytest.raises(InputError, match="bit 2 of address 32 has another name already; correct that file"):
+    with pytest.raises(InputError, match="bit 2 of address 32 is defined twice; correct that file"):
         simulated_robot(robot)
 
 

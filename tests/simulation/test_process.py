@@ -141,7 +141,7 @@ def test_what_does_not_fit_into_the_terminal_is_lost_and_noted():
     for now in range(10**9, 10**11, 10**9):  # 400 kB, and no host reads
         bus.inject_noise(bytes(4000), now - 10**8)
         terminal.deliver(now)
-    assert any("it does not read" in entry.note for entry in bus.ledger.entries)
+    assert any("the host does not read" in entry.note for entry in bus.ledger.entries)
     terminal.read_chunk()  # the host has sent nothing
     terminal.deliver_bytes(10**11)
     terminal.close()
@@ -333,7 +333,7 @@ def test_real_time_is_requested_and_what_was_granted_is_reported(tmp_path):
     path = tmp_path / "bus.jsonl"
     with talking(SimulationConfig(BUSES), priority=1, core=1023, ledger=str(path)) as (_, first):
         assert "priority 1" in first["real_time"]
-        assert "no core of its own" in first["real_time"]
+        assert "no dedicated core" in first["real_time"]
     assert read_ledger(path)[0].note == f"real time: {first['real_time']}"
 
 

@@ -175,7 +175,7 @@ def test_registers_that_the_recording_has_are_read_and_nothing_is_made_up(run):
     assert host.ask(packet1(9, 1)) == b""  # a servo that was not there
     assert host.ask(packet1(1, 2, 50, 2)) == b""  # registers that nothing read
     assert host.ask(packet1(1, 3, 25, 1)) == b""  # the LED, which nothing wrote
-    assert [note.split(":")[0] for note in host.notes] == ["not in the recording"] * 3
+    assert [note.split(":")[0] for note in host.notes] == ["instruction not in the recording"] * 3
     assert host.ask(packet1(0xFE, 3, 25, 1)) == b""  # nothing was to answer
     assert len(host.notes) == 3
     assert Host(log.path, 1.0, baud_rate=57600).ask(packet1(1, 1)) == b""

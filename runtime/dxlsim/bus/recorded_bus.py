@@ -59,7 +59,7 @@ class RecordedBus(SimulatedBus):
             if heard is None:
                 heard = self._known(packet)
             if heard is None and (packet.servo_id != BROADCAST or self._codec.group_read(packet)):
-                self.add_note(f"not in the recording: {packet.raw.hex(' ')}")
+                self.add_note(f"instruction not in the recording: {packet.raw.hex(' ')}")
             for reply in self._transmissions(heard or (), end_ns):
                 self._send_reply(packet.servo_id, reply)
         self._count_packet()

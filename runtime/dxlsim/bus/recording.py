@@ -48,7 +48,7 @@ class BusRecording:
         data, asked = packets.data, packets.is_instruction[order]
         rows = np.flatnonzero(asked)
         if not len(rows):
-            raise InputError("no instruction was sent on the recorded bus, so there is nothing to answer")
+            raise InputError("the recorded bus has no instructions; use another log")
         wire_ns = length[rows] * 10_000_000_000 // baud_rate
         behind = np.cumsum(wire_ns)
         # Several instructions in one write pass the wire one after the other.

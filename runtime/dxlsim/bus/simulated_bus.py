@@ -118,11 +118,11 @@ class SimulatedBus:
         self._pass_time(at_ns)
         self.ledger.add(at_ns, self.name, "in", sent)
         if self._wedged or not self.plugged:
-            self.add_note(f"{len(sent)} bytes of the host do not reach the line")
+            self.add_note(f"{len(sent)} bytes from the host are lost")
             return
         start_ns = max(at_ns, self.host_free_ns)
         if self._receiver.pending and start_ns - self.host_free_ns > self._codec.longest_pause_ns:
-            self.add_note(f"an instruction of {self._receiver.pending} bytes was broken off")
+            self.add_note(f"incomplete instruction of {self._receiver.pending} bytes discarded")
             self._receiver.discard_packet()
         self.host_free_ns = start_ns + self._line.duration_ns(len(sent))
         self._transmit(sent, start_ns)
@@ -142,7 +142,7 @@ class SimulatedBus:
 
     def change_rate(self, baud_rate: int) -> None:
         """Change the baud rate of the host's adapter, bit/s, and note it in the ledger."""
-        self.add_note(f"the host's rate is {baud_rate} bit/s")
+        self.add_note(f"host baud rate set to {baud_rate} bit/s")
         self.baud_rate = baud_rate
 
     def next_due_ns(self) -> int | None:
@@ -292,7 +292,7 @@ class SimulatedBus:
 
     def set_latency_timer(self, timer_ns: int) -> None:
         """Set the adapter's latency timer, ns; 0: none."""
-        self.add_note(f"adapter's latency timer {timer_ns} ns")
+        self.add_note(f"adapter latency timer set to {timer_ns} ns")
         self._adapter.set_timer(timer_ns, self.now_ns)
 
     def wedge(self, on: bool = True) -> None:
@@ -326,7 +326,7 @@ class SimulatedBus:
         if not self.plugged or self._wedged:
             self.add_note(f"{len(each.data)} bytes to the host are lost: {each.data.hex(' ')}")
         elif not self._adapter.accept_transmission(each):
-            self.add_note(f"{len(each.data)} bytes to the host are lost: it does not read")
+            self.add_note(f"{len(each.data)} bytes to the host are lost: the host does not read")
         if not each.note and not each.broken and each.data.startswith(self._codec.header):
             for device in self.devices:
                 device.overhear(each.data[len(self._codec.header)], each.due_ns)
@@ -338,7 +338,7 @@ class SimulatedBus:
         elif group.has_slots:
             self._send_turns(group, max(each.due_ns, each.turn_end_ns))
         else:
-            self.add_note("a broken reply: the servos after it wait for it in vain")
+            self.add_note("broken reply: the following servos do not reply")
             self._group = None
 
     def _withdraw_waiting(self) -> None:
@@ -369,7 +369,7 @@ class SimulatedBus:
 
     def _execute_altered(self, packet: InstructionPacket, end_ns: int) -> None:
         fault = self._instruction_faults.popleft()
-        self.add_note(f"the servos receive another instruction: {fault.text}")
+        self.add_note(f"instruction altered by a fault: {fault.text}")
         received = fault.alter(packet.raw)
         position = 0
         while (other := self._receiver.feed_bytes(received, position)) is not None:
@@ -453,7 +453,7 @@ class SimulatedBus:
             if sent and not plain:
                 return
             if not sent and not group.has_slots:
-                self.add_note(f"servo {turn.servo_id} does not reply: those after it wait for it in vain")
+                self.add_note(f"servo {turn.servo_id} does not reply, so the following servos do not reply")
                 break
             sent_any = sent_any or sent
             free_ns = due_ns if sent else end_ns

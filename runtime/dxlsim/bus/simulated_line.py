@@ -79,14 +79,14 @@ class SimulatedLine:
         collision."""
         passing = self.passing
         if len(passing) >= MOST_PASSING:
-            self._note(f"{len(new.data)} bytes to the host are lost: too many are on their way")
+            self._note(f"{len(new.data)} bytes to the host are lost: too many transmissions overlap")
             return
         if not passing or passing[-1].due_ns <= new.first_ns:  # Almost always true: the line is free by then
             passing.append(new)
             return
         for other in [each for each in passing if each.overlaps(new.first_ns, new.due_ns)]:
             passing.remove(other)
-            self._note(f"collision: {other.data.hex(' ')} and {new.data.hex(' ')} at once")
+            self._note(f"collision: {other.data.hex(' ')} overlaps {new.data.hex(' ')}")
             new = self._mixed(other, new)
         insort(passing, new, key=_due)
 
@@ -115,7 +115,7 @@ class SimulatedLine:
             last = min(len(sent), -(-(each.due_ns - start_ns) // byte_ns))
             sent[first:last] = bytes(last - first)
             kept = max(0, (begin_ns - each.first_ns) // byte_ns)
-            self._note(f"collision: the host sends into {each.data.hex(' ')}, {kept} bytes arrive")
+            self._note(f"collision: the host sends during {each.data.hex(' ')}; reply cut to {kept} bytes")
             self.passing.remove(each)
             if kept:
                 due_ns = each.first_ns + self.duration_ns(kept)

@@ -87,7 +87,7 @@ class SimulatedDevice(SimulatedNode):
         if self._silent or now_ns < self._deaf_until_ns:
             return False
         if self._awaited_id is not None and now_ns < self._waits_until_ns:
-            self.note(f"{self.called}: waits for the status of {self._awaited_id}, and obeys nothing")
+            self.note(f"{self.called}: ignores instructions until {self._awaited_id} has replied")
             return False
         self._awaited_id = None
         self.advance_to(now_ns)
@@ -201,7 +201,7 @@ class SimulatedDevice(SimulatedNode):
             return (by, 0.0) if share >= 1.0 else (by * share, by * 1e9 / for_ns)
 
         self.world.tip(axis, angle)
-        self.note(f"{self.called}: tips by {math.degrees(by):g} deg about {axis}")
+        self.note(f"{self.called}: tilted by {math.degrees(by):g} deg about {axis}")
 
     def set_voltage(self, volts: float) -> None:
         """Change the device's supply voltage, V."""

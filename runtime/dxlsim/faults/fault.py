@@ -59,12 +59,12 @@ def parse_fault(text: str) -> Fault:
     """
     words = text.split()
     if not words:
-        raise InputError("a fault is missing; write one such as: lose servo=3 at=2s")
+        raise InputError("the fault is empty; write a fault such as: lose servo=3 at=2s")
     name = words[0]
     kind = KINDS.get(name)
     if kind is None:
         known = suggestion(name, tuple(KINDS), f"the faults are {', '.join(KINDS)}")
-        raise InputError(f"there is no fault {name!r}; {known}")
+        raise InputError(f"unknown fault {name!r}; {known}")
     given: dict[str, Value] = {}
     for word in words[1:]:
         key, equals, value = word.partition("=")
@@ -74,7 +74,7 @@ def parse_fault(text: str) -> Fault:
             known = suggestion(key, tuple(kind.readers), f"it takes {', '.join(kind.readers)}")
             raise InputError(f"{name} takes no {key!r}; {known}")
         if key in given:
-            raise InputError(f"{name}: {key}= is there twice; omit one of them")
+            raise InputError(f"{name}: {key}= is given twice; give it once")
         try:
             given[key] = kind.readers[key].read(value)
         except ValueError as error:
@@ -104,14 +104,16 @@ def _check(name: str, kind: Kind, given: Mapping[str, Value]) -> None:
         if one in given and other in given:
             raise InputError(f"{name} has both {one}= and {other}=; omit one of them")
     if "from" in kind.readers and ("servo" in given) == ("from" in given):
-        raise InputError(f"{name} needs either servo=ID, for its reply, or from=host, for an instruction")
+        raise InputError(f"{name} needs servo=ID (alters a reply) or from=host (alters an instruction)")
     low, high = given.get("low"), given.get("high")
     if isinstance(low, float) and isinstance(high, float) and low >= high:
-        raise InputError(f"{name} has low= above high=; exchange them")
+        raise InputError(f"{name} has low= above high=; exchange the values")
     stormy = given.get("kinds")
     if isinstance(stormy, tuple):
         possible = [each for each, one in KINDS.items() if one.of != DEVICE and each != "storm"]
         unknown = [each for each in stormy if each not in possible]
         if unknown:
-            near = suggestion(unknown[0], possible, f"write some of {', '.join(possible)}")
-            raise InputError(f"{name}: kinds={','.join(stormy)}: a storm has no {unknown[0]!r}; {near}")
+            near = suggestion(unknown[0], possible, f"choose from {', '.join(possible)}")
+            raise InputError(
+                f"{name}: kinds={','.join(stormy)}: unknown kind {unknown[0]!r} in a storm; {near}"
+            )

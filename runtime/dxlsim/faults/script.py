@@ -91,7 +91,9 @@ class FaultScript:
         text alone reproduces it. Without `at=` a storm starts at `since_ns`."""
         buses = _chosen(fault, self._buses)
         if fault.at_ns is not None and fault.at_ns < since_ns:
-            raise InputError(f"it is {since_ns / 1e9:.3f} s after the start already; omit at= for now")
+            raise InputError(
+                f"at= is in the past, {since_ns / 1e9:.3f} s after the start; omit at= to start it now"
+            )
         random = self._random(fault, index)
         if fault.kind != "storm":
             return [(fault, Happening(fault.kind, str(fault), buses[0], random, self._holds))]
@@ -132,9 +134,9 @@ def _chosen(fault: Fault, buses: Sequence[SimulatedBus]) -> Sequence[SimulatedBu
     names = " or ".join(f"bus={bus.name}" for bus in buses)
     chosen = [bus for bus in buses if fault.bus in (None, bus.name)]
     if not chosen:
-        raise InputError(f"there is no bus {fault.bus!r}; write {names}")
+        raise InputError(f"unknown bus {fault.bus!r}; write {names}")
     if len(chosen) > 1 and fault.kind != "storm":
-        raise InputError(f"there are {len(chosen)} buses; choose one: {names}")
+        raise InputError(f"bus= is missing with {len(chosen)} buses; write {names}")
     of = KINDS[fault.kind].of
     for bus in chosen:
         ids = sorted({servo.servo_id for servo in bus.servos})
@@ -142,12 +144,12 @@ def _chosen(fault: Fault, buses: Sequence[SimulatedBus]) -> Sequence[SimulatedBu
         if (fault.servo in others and of == SERVO) or (fault.servo in ids and of == DEVICE):
             what = "not a servo" if of == SERVO else "a servo"
             raise InputError(
-                f"{fault.servo} on bus {bus.name} is {what}, so {fault.kind} cannot happen to it"
+                f"{fault.kind} is not possible: {fault.servo} on bus {bus.name} is {what}; choose another ID"
             )
         if fault.servo is not None and fault.servo not in (*ids, *others):
-            known = f"its servos are {', '.join(map(str, ids))}" if ids else "it has none"
+            known = f"its servos are {', '.join(map(str, ids))}" if ids else "the bus has no servos"
             known += f", its other devices {', '.join(map(str, others))}" if others else ""
             raise InputError(f"bus {bus.name} has no servo {fault.servo}; {known}")
         if fault.kind == "storm" and not ids:
-            raise InputError(f"bus {bus.name} has no servos; name another one with bus=")
+            raise InputError(f"bus {bus.name} has no servos; name another bus with bus=")
     return chosen

@@ -136,7 +136,7 @@ def _parsed(text: str, file: str) -> _Element:
     def doctype(*_: object) -> None:
         before = text.encode()[: parser.CurrentByteIndex].rpartition(b"<!DOCTYPE")[0].decode()
         mark = Mark(file, before.count("\n") + 1, len(before.rpartition("\n")[2]) + 1)
-        raise InputError([Problem(mark, "a DOCTYPE is refused", "remove it")])
+        raise InputError([Problem(mark, "DOCTYPE is not allowed", "remove it")])
 
     parser.StartElementHandler, parser.EndElementHandler = start, close_element
     parser.StartDoctypeDeclHandler = doctype
@@ -167,7 +167,7 @@ class _UrdfReader:
         for element in self._robot.all("link"):
             self._link(element)
         if not self._links:
-            self._add(self._robot.mark, "the URDF has no links", "give it at least one")
+            self._add(self._robot.mark, "the URDF has no links", "add at least one link")
         for element in self._robot.all("joint"):
             joint = self._joint(element)
             if joint is not None:
@@ -190,7 +190,7 @@ class _UrdfReader:
         if not name:
             self._add(element.mark, "a link has no name", 'write <link name="...">')
         elif name in self._links:
-            self._add(element.mark, f"there are two links {name}", "give each a name of its own")
+            self._add(element.mark, f"link {name} is defined twice", "rename one of the links")
         else:
             self._links[name] = element.mark
 
@@ -200,7 +200,7 @@ class _UrdfReader:
             self._add(element.mark, "a joint has no name", 'write <joint name="..." type="...">')
             return None
         if name in self._joints:
-            self._add(element.mark, f"there are two joints {name}", "give each a name of its own")
+            self._add(element.mark, f"joint {name} is defined twice", "rename one of the joints")
             return None
         kind = self._type(element, name)
         parent, child = self._find_link(element, name, "parent"), self._find_link(element, name, "child")
@@ -214,10 +214,10 @@ class _UrdfReader:
         if kind in _TYPES:
             return cast("JointType", kind)
         if kind in _FREE:
-            what = f"joint {name} is {kind}: it has several coordinates, and a servo has one"
-            self._add(element.mark, what, "make it fixed, or one revolute or prismatic joint per coordinate")
+            what = f"joint {name} is {kind}, with several degrees of freedom; a servo has one"
+            self._add(element.mark, what, "make it fixed, or split it into revolute and prismatic joints")
         else:
-            what = f"joint {name} has the type {kind}" if kind else f"joint {name} has no type"
+            what = f"joint {name} has the unknown type {kind}" if kind else f"joint {name} has no type"
             self._add(element.mark, what, f"write one of {', '.join(_TYPES)}")
         return "fixed"
 
@@ -227,9 +227,9 @@ class _UrdfReader:
         link = "" if found is None else found.attributes.get("link", "")
         mark = element.mark if found is None else found.mark
         if not link:
-            self._add(mark, f"joint {name} has no {tag}", f'write <{tag} link="..."/> into it')
+            self._add(mark, f"joint {name} has no {tag}", f'add <{tag} link="..."/>')
         elif link not in self._links:
-            what = f"the {tag} of joint {name} is the link {link}, which does not exist"
+            what = f"link {link}, the {tag} of joint {name}, is not defined"
             self._add(mark, what, suggestion(link, tuple(self._links)))
         return link
 
@@ -242,7 +242,7 @@ class _UrdfReader:
         if len(numbers) == 3 and None not in numbers:
             return cast("Vector", tuple(numbers))
         what = f"{key} of the {tag} of joint {name} is {text!r}, not three numbers"
-        self._add(found.mark, what, f'write {key}="0 0 1" or the like')
+        self._add(found.mark, what, f'write three numbers such as {key}="0 0 1"')
         return default
 
     def _axis(self, element: _Element, name: str) -> Vector:
@@ -253,7 +253,7 @@ class _UrdfReader:
             found = element.first("axis")
             mark = element.mark if found is None else found.mark
             self._add(
-                mark, f"the axis of joint {name} has no length", 'write <axis xyz="0 0 1"/> or the like'
+                mark, f"the axis of joint {name} has zero length", 'write an axis such as <axis xyz="0 0 1"/>'
             )
             return 1.0, 0.0, 0.0
         return x / length, y / length, z / length
@@ -274,8 +274,8 @@ class _UrdfReader:
             self._scalar(found, name, key) for key in ("lower", "upper", "velocity", "effort")
         )
         if lower is not None and upper is not None and lower > upper:
-            what = f"the lower limit of joint {name} is {lower:g}, above its upper one, {upper:g}"
-            self._add(found.mark, what, "exchange them")
+            what = f"the lower limit of joint {name}, {lower:g}, is above the upper limit, {upper:g}"
+            self._add(found.mark, what, "exchange the limits")
         return UrdfLimits(lower, upper, velocity, effort)
 
     def _mimic(self, element: _Element, name: str) -> Mimic | None:
@@ -284,7 +284,7 @@ class _UrdfReader:
             return None
         joint = found.attributes.get("joint", "")
         if not joint:
-            self._add(found.mark, f"joint {name} mimics nothing", 'write <mimic joint="..."/>')
+            self._add(found.mark, f"the mimic of joint {name} names no joint", 'write <mimic joint="..."/>')
             return None
         multiplier, offset = self._scalar(found, name, "multiplier"), self._scalar(found, name, "offset")
         return Mimic(joint, 1.0 if multiplier is None else multiplier, offset or 0.0)
@@ -296,10 +296,10 @@ class _UrdfReader:
             name, mark = joint.mimic.joint, joint.mark
             followed = self._joints.get(name)
             if followed is None:
-                what = f"joint {joint.name} mimics {name}, which does not exist"
+                what = f"joint {joint.name} mimics the unknown joint {name}"
                 self._add(mark, what, suggestion(name, [each for each in self._joints if each != joint.name]))
             elif not followed.moves:
-                self._add(mark, f"joint {joint.name} mimics {name}, which is fixed", "name one that moves")
+                self._add(mark, f"joint {joint.name} mimics the fixed joint {name}", "name a moving joint")
         self._check_circles_of_mimics()
 
     def _check_circles_of_mimics(self) -> None:
@@ -314,7 +314,7 @@ class _UrdfReader:
             if following is not None and following.name in way:  # Otherwise this circle was already reported
                 circle = [*way][[*way].index(following.name) :]
                 what = f"joint {circle[0]} mimics itself: {' -> '.join((*circle, circle[0]))}"
-                self._add(following.mark, what, "remove the mimic of one of them")
+                self._add(following.mark, what, "remove one mimic of this circle")
 
     def _root(self) -> str:
         """Return the link without a parent; report an error unless the links form one tree."""
@@ -322,8 +322,8 @@ class _UrdfReader:
         for joint in self._joints.values():
             other = above.setdefault(joint.child, joint)
             if other is not joint:
-                what = f"link {joint.child} has two parents, by {other.name} and {joint.name}"
-                self._add(joint.mark, what, "give each joint a child of its own")
+                what = f"link {joint.child} is the child of two joints, {other.name} and {joint.name}"
+                self._add(joint.mark, what, "change one child")
         if self._problems:
             return ""
         roots = [link for link in self._links if link not in above]
@@ -331,7 +331,7 @@ class _UrdfReader:
             self._add(
                 self._links[roots[1]],
                 f"{len(roots)} links have no parent: {', '.join(roots)}",
-                "join them to one tree; a fixed joint moves nothing",
+                "connect all links to one tree, for example by fixed joints",
             )
         reached = {joint.child for root in roots for joint in _downwards(root, tuple(self._joints.values()))}
         lost = [link for link in self._links if link not in reached and link in above]
@@ -341,7 +341,7 @@ class _UrdfReader:
                 way.append(above[way[-1]].parent)
             circle = way[way.index(way[-1]) :][::-1]
             what = f"links form a circle: {' -> '.join(circle)}"
-            self._add(above[circle[-1]].mark, what, "remove one of the joints between them")
+            self._add(above[circle[-1]].mark, what, "remove one joint of this circle")
         return roots[0] if roots else ""
 
 

@@ -76,7 +76,7 @@ class PseudoTerminal:
             try:
                 self._publish()
             except OSError as error:
-                self.bus.add_note(f"the link does not follow the adapter: {error}")
+                self.bus.add_note(f"the link to the port was not updated: {error}")
         return True
 
     def read_chunk(self) -> None:
@@ -124,7 +124,7 @@ class PseudoTerminal:
         except BlockingIOError:
             written = 0
         if written < len(data):
-            self.bus.add_note(f"{len(data) - written} bytes to the host are lost: it does not read")
+            self.bus.add_note(f"{len(data) - written} bytes to the host are lost: the host does not read")
 
     def close(self) -> None:
         """Close the terminal and remove its link."""
@@ -167,7 +167,7 @@ class DeviceLink:
             OSError: The link cannot be created.
         """
         if os.path.lexists(self._path) and not self._path.is_symlink():
-            raise FileExistsError(f"{self._path} is not a link; it is not replaced")
+            raise FileExistsError(f"{self._path} exists and is not a symbolic link; choose another path")
         # A rename replaces the link atomically, so the path always leads to a terminal.
         new = self._path.with_name(f"{self._path.name}.{os.getpid()}")
         new.symlink_to(target)

@@ -39,15 +39,15 @@ def prepare_process(priority: int, core: int) -> str:
 def _take_core(core: int) -> str:
     allowed = os.sched_getaffinity(0)
     if core < 0:
-        return "no core of its own was requested"
+        return "no dedicated core was requested"
     if len(allowed) < 2:
-        return "no core of its own: there is only one"
+        return "no dedicated core: only one core is allowed"
     if core not in allowed:
-        return f"no core of its own: core {core} is not among those it may use"
+        return f"no dedicated core: core {core} is not allowed"
     try:
         os.sched_setaffinity(0, {core})
     except OSError as error:
-        return f"no core of its own: {error.strerror}"
+        return f"no dedicated core: {error.strerror}"
     return f"core {core}"
 
 

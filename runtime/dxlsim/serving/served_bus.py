@@ -125,7 +125,7 @@ class ServedBus:
 
     def _check(self) -> None:
         if self._failure is not None:
-            raise RuntimeError(f"the simulated bus has ended: {self._failure}") from self._failure
+            raise RuntimeError(f"the simulated bus has stopped: {self._failure}") from self._failure
 
     def inject(self, fault: str) -> None:
         """Inject a fault, now or at its time: `silence servo=1 for=500ms`.

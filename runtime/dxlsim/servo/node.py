@@ -290,13 +290,13 @@ class SimulatedNode(ABC):
     def connect(self, contact: Callable[[], bool]) -> None:
         """Undo `interrupt` with the same function."""
         self._contacts.remove(contact)
-        self.note(f"{self.called}: cable has contact")
+        self.note(f"{self.called}: cable connected")
 
     def reply_later(self, by_ns: int) -> None:
         """Delay each reply by an additional time, ns; 0 ends this."""
         self._later_ns = by_ns
         self._set_delay()
-        self.note(f"{self.called}: replies {by_ns} ns later")
+        self.note(f"{self.called}: replies delayed by {by_ns} ns")
 
     def cut_power(self, until_ns: int) -> None:
         """Cut the node's power until `until_ns`: RAM is lost, and the node receives nothing before."""

@@ -152,7 +152,7 @@ class SimulatedServo(SimulatedNode):
         """React to a new temperature, in whole degrees, or to an overload, which the mechanics report."""
         if not self.overload and self.shaft.mechanics.overloaded(self.shaft.index):
             self.overload = True
-            self.note(f"servo {self.servo_id}: overload, it does not hold its load")
+            self.note(f"servo {self.servo_id}: overload: the load turns the shaft")
         self.apply_protection()
 
     def power_up(self) -> None:
@@ -237,8 +237,8 @@ class SimulatedServo(SimulatedNode):
         torque."""
 
         def gives_way(turned: float) -> None:
-            came = f"yields after {math.degrees(turned):.1f} of {math.degrees(by):g} deg"
-            self.note(f"servo {self.servo_id}: holds or drives its shaft, so the hand that turns it {came}")
+            angles = f"{math.degrees(turned):.1f} of {math.degrees(by):g} deg"
+            self.note(f"servo {self.servo_id}: turned by hand only {angles}, because the servo has torque")
 
         self.shaft.mechanics.turn_shaft(self.shaft.index, by, duration_ns, gives_way)
 

@@ -87,18 +87,16 @@ def _ids(text: str) -> list[int]:
     for part in text.split(","):
         low, _, high = part.partition("-")
         if max(len(low), len(high)) > _MOST_DIGITS or int(high or low) > max(_HIGHEST_ID.values()):
-            raise ValueError(
-                f"{part} is not an ID of a servo; IDs go from 0 to 252, with Protocol 1.0 to 253"
-            )
+            raise ValueError(f"{part} is not a servo ID; write an ID from 0 to 252 (Protocol 1.0: to 253)")
         if high and int(high) < int(low):
-            raise ValueError(f"{part} is empty; write the lower ID first")
+            raise ValueError(f"{part} is reversed; write the lower ID first")
         ids += range(int(low), int(high or low) + 1)
     return ids
 
 
 def _unknown(models: Sequence[str]) -> list[str]:
     return [
-        f"--servo: there is no model {model}; {perhaps_meant(model)}"
+        f"--servo: unknown model {model}; {perhaps_meant(model)}"
         for model in dict.fromkeys(models)
         if not protocols_of(model)
     ]
@@ -107,14 +105,14 @@ def _unknown(models: Sequence[str]) -> list[str]:
 def _protocol(models: Sequence[str], chosen: float | None) -> float:
     """Return the chosen protocol, or the common protocol of all models. Raises InputError if none fits."""
     if chosen not in (None, 1.0, 2.0):
-        raise InputError(f"there is no Protocol {chosen:g}; --protocol is 1.0 or 2.0")
+        raise InputError(f"unknown protocol {chosen:g}; write --protocol 1.0 or 2.0")
     spoken = {model: protocols_of(model) for model in models}
     if chosen is not None:
         strange = [model for model, protocols in spoken.items() if chosen not in protocols]
         if strange:
             raise InputError(
                 "\n".join(
-                    f"{model} speaks Protocol {spoken[model][0]:.1f}, not {chosen:.1f}; omit --protocol"
+                    f"{model} uses Protocol {spoken[model][0]:.1f}, not {chosen:.1f}; omit --protocol"
                     for model in strange
                 )
             )
@@ -124,15 +122,13 @@ def _protocol(models: Sequence[str], chosen: float | None) -> float:
         first = next(model for model, protocols in spoken.items() if protocols == (1.0,))
         second = next(model for model, protocols in spoken.items() if protocols == (2.0,))
         raise InputError(
-            f"{first} speaks Protocol 1.0 and {second} Protocol 2.0; a bus has one protocol, "
-            "write a robot file with two buses or start two simulations"
+            f"{first} uses Protocol 1.0, but {second} uses Protocol 2.0; "
+            "simulate each protocol on its own bus, with a robot file or two commands"
         )
     if len(common) > 1:
         names = " and ".join(spoken)
-        exist = "exists" if len(spoken) == 1 else "exist"
-        raise InputError(
-            f"{names} {exist} with Protocol 1.0 and with 2.0; choose one by --protocol 1.0 or 2.0"
-        )
+        support = "supports" if len(spoken) == 1 else "support"
+        raise InputError(f"{names} {support} Protocol 1.0 and 2.0; choose with --protocol 1.0 or 2.0")
     return common[0]
 
 
@@ -143,11 +139,14 @@ def _check_ids(models: Sequence[tuple[str, Sequence[int]]], protocol: float) -> 
     for model, ids in models:
         for servo_id in ids:
             if servo_id > highest:
-                wrong.append(f"{model} cannot have ID {servo_id}; Protocol {protocol:.1f} goes to {highest}")
+                wrong.append(
+                    f"ID {servo_id} of {model} is too high for Protocol {protocol:.1f}; "
+                    f"write an ID up to {highest}"
+                )
             elif servo_id in owners:
                 wrong.append(
                     f"ID {servo_id} is given to {owners[servo_id]} and to {model}; "
-                    f"give every servo its own, the fault `duplicate_id servo={servo_id}` adds a second one"
+                    f"give each ID once (for a second servo: --fault 'duplicate_id servo={servo_id}')"
                 )
             else:
                 owners[servo_id] = model
@@ -162,12 +161,12 @@ def _baud_rate(tables: Sequence[ControlTable], chosen: int | None) -> int:
         if len(rates) > 1 or None in rates:
             rated = ", ".join(f"{model} {rate or 'an unknown rate'}" for model, rate in shipped.items())
             raise InputError(
-                f"the servos are shipped with different baud rates ({rated}); give one by --baud"
+                f"the servos have different factory baud rates ({rated}); choose a rate with --baud"
             )
         return next(rate for rate in rates if rate is not None)
     wrong = [
-        f"an {table.model} has no baud rate of {chosen} bit/s; "
-        f"it has {', '.join(str(rate) for rate in sorted(table.baud_rates.values()))}"
+        f"{table.model} does not support {chosen} bit/s; "
+        f"choose from {', '.join(str(rate) for rate in sorted(table.baud_rates.values()))}"
         for table in tables
         if not table.has_baud_rate(chosen)
     ]
