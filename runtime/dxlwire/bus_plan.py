@@ -79,7 +79,7 @@ class GoalLayout(msgspec.Struct, frozen=True):
         for place in (self.position, self.speed, self.effort, self.pwm):
             if place is not None:
                 return place
-        raise LookupError("no goal stands in this block")
+        raise LookupError("the block has no goal")
 
 
 class TorqueLimit(msgspec.Struct, frozen=True):
@@ -239,7 +239,7 @@ class ServoPlan(msgspec.Struct, frozen=True):
         lower = self.position_text(first).partition(" ")[0]  # the unit follows the upper limit
         return (
             f"is at {self.position_text(self.joint_position(raw))}, outside its limits "
-            f"{lower}..{self.position_text(last)}: move the joint inside by hand; "
+            f"{lower}..{self.position_text(last)}; move the joint inside by hand; "
             f"{help_link('a-joint-is-outside-its-limits')}"
         )
 

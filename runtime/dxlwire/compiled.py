@@ -31,11 +31,11 @@ def load_compiled(source: Path, kind: type[Library], path: Path | None = None) -
         library = kind(str(path or source.with_name(f"lib{source.stem}.so")))
         known = library.dxl_source() & 0xFFFFFFFF
     except (OSError, AttributeError):
-        raise NotCompiled(f"the compiled {source.stem} is missing: {_HINT}") from None
+        raise NotCompiled(f"the compiled {source.stem} is missing; {_HINT}") from None
     if known != crc32(source.read_bytes()):
         raise NotCompiled(
-            f"the compiled {source.stem} was built from another {source.name} than the one next to "
-            f"it: {_HINT}; {help_link('a-compiled-part-is-missing-or-old')}"
+            f"the compiled {source.stem} does not match {source.name}; {_HINT}; "
+            f"{help_link('a-compiled-part-is-missing-or-old')}"
         )
     return library
 

@@ -91,7 +91,7 @@ class JointUnit(Enum):
         for unit in cls:
             if si_unit in {unit.si, unit.speed, unit.acceleration, unit.torque}:
                 return unit
-        raise LookupError(f"no joint has a quantity in {si_unit}")
+        raise LookupError(f"{si_unit} is not a unit of a joint")
 
 
 ROTARY, LINEAR = JointUnit.ROTARY, JointUnit.LINEAR

@@ -48,5 +48,5 @@ def mode_of(names: Collection[str]) -> Mode:
     """
     mode = _MODES.get(frozenset(names))
     if mode is None:
-        raise ValueError(f"no servo follows {' and '.join(names) or 'nothing'} together")
+        raise ValueError(f"no servo mode combines {' and '.join(names) or 'no interfaces'}")
     return mode

@@ -168,7 +168,7 @@ def test_invalid_states_are_those_of_the_first_servo_without_a_reply(
 @pytest.mark.parametrize("spoilt", ["", "noise", "another_host"])
 def test_positions_that_the_loop_did_not_believe_are_named_where_replies_are_intact(spoilt: str) -> None:
     plan = LoggedPlan(buses=[LoggedBus(name="main", servos=[LoggedServo("elbow", 1, row=0)])])
-    text = "elbow jumped by 60 deg in 10 ms, faster than it can turn: the value is not used"
+    text = "elbow jumped by 60 deg in 10 ms, faster than it can turn: value discarded"
     events = (EventGroup(EventCode.IMPLAUSIBLE, Severity.WARNING, "elbow", 3, 5 * 10**9, text),)
     other = (accusing(spoilt, "main", share=9.0),) * bool(spoilt)
     run = totals(plan=plan, events=events, servos=on_bus("elbow", bus="main"), findings=other)

@@ -62,7 +62,7 @@ def test_the_version_shows_that_the_kernel_is_missing(dxlrun, monkeypatch, tmp_p
     monkeypatch.setattr(c_sources, "SOURCES", [tmp_path / "kernel.c"])
     said = dxlrun("--version")
     assert said.code == 0
-    assert said.out.endswith(", but the compiled kernel is missing: install dxlrun again\n")
+    assert said.out.endswith(", but the compiled kernel is missing; install dxlrun again\n")
 
 
 def test_help_names_every_command_and_option(dxlrun):

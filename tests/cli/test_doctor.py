@@ -443,7 +443,7 @@ def test_on_another_system_the_exit_code_is_one(
 
 
 def test_an_exchange_that_is_not_compiled_is_missing(look: Look) -> None:
-    found = look(compiled="its kernel is missing: install dxlrun again")["exchange"]
+    found = look(compiled="its kernel is missing; install dxlrun again")["exchange"]
     assert found.state == "missing"
     assert found.fix == "install dxlrun again"
 
@@ -452,4 +452,4 @@ def test_an_exchange_that_is_not_compiled_is_missing(look: Look) -> None:
 def test_each_compiled_part_is_looked_for(what: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     sources = [tmp_path / path.name if path.stem == what else path for path in c_sources.SOURCES]
     monkeypatch.setattr(c_sources, "SOURCES", sources)
-    assert Machine.this().compiled == f"the compiled {what} is missing: install dxlrun again"
+    assert Machine.this().compiled == f"the compiled {what} is missing; install dxlrun again"

@@ -88,7 +88,7 @@ def test_the_error_byte_in_words():
     ],
 )
 def test_what_cannot_be_said_is_refused(build):
-    with pytest.raises(ValueError, match=r"not an ID|fit|announced"):
+    with pytest.raises(ValueError, match=r"not an ID|fit|instead of"):
         build()
 
 

@@ -110,9 +110,9 @@ def test_what_came_before_an_absent_servo_can_be_used():
     broken = bytearray(FAST_SYNC)
     broken[18] ^= 1
     assert [one.servo_id for one in p2.fast_answers(broken, (4, 4, 4))] == [3]
-    with pytest.raises(ValueError, match="fast form"):
+    with pytest.raises(ValueError, match="fast read"):
         p2.fast_answers(p2.status_packet(1), (4,))
-    with pytest.raises(ValueError, match="fast form"):
+    with pytest.raises(ValueError, match="fast read"):
         p2.fast_answers(p2.sync_read(126, 10, (1, 2)), (4,))
 
 

@@ -100,7 +100,7 @@ def test_a_line_that_is_back_is_locked_against_every_other_program(adapters, kep
 
 def test_of_two_lines_of_which_one_is_missing_neither_is_kept(adapters):
     left = str(adapters[0].link)
-    with pytest.raises(PortError, match="there is no /dev/ttyNOPE"):
+    with pytest.raises(PortError, match="port /dev/ttyNOPE not found"):
         KeptLines([LineSettings(left, 1_000_000, 0), LineSettings("/dev/ttyNOPE", 1_000_000, 0)])
     KeptLines([LineSettings(left, 1_000_000, 0)]).close()
 

@@ -262,7 +262,7 @@ def test_a_number_that_is_none_is_not_believed():
     (event,) = rig.events.of(EventCode.IMPLAUSIBLE)
     assert event == (
         "device_0",
-        "device_0 (ID 101 on bus main) sent values that are not finite (warm): they are not used",
+        "device_0 (ID 101 on bus main) sent non-finite values (warm): values discarded",
     )
     assert rig.states.valid.all()
 

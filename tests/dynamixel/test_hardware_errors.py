@@ -155,10 +155,9 @@ def test_a_second_error_is_named_besides_the_first():
     errors = find_table("XL-320").errors
     assert errors.describe_errors(0x03) == "overload error; overheating error"
     assert errors.describe_errors(0) == "no hardware error"
-    assert errors.describe_errors(0x28) == "bits 28, which the control table does not define"
+    assert errors.describe_errors(0x28) == "bits 28, not defined in the control table"
     assert (
-        find_table("YM070-210-M001").errors.describe_errors(6)
-        == "code 6, which the control table does not define"
+        find_table("YM070-210-M001").errors.describe_errors(6) == "code 6, not defined in the control table"
     )
 
 
@@ -188,8 +187,8 @@ def test_a_warning_neither_takes_the_goals_nor_marks_the_joint_as_broken():
 
 
 WRONG = {
-    "overload = 3": "overload = 3 is not one bit of a byte",
-    "overload = 256": "overload = 256 is not one bit of a byte",
+    "overload = 3": "overload = 3 is not a single bit from 1 to 128",
+    "overload = 256": "overload = 256 is not a single bit from 1 to 128",
     "overload = 1\noverheating = 1": "two errors have the same value",
     'overload = "1"': "overload is not a whole number",
 }
@@ -203,7 +202,7 @@ def test_errors_that_cannot_be_are_refused(entries, plain_table):
 
 def test_a_table_without_errors_names_none(plain_table):
     errors = read_control_table(plain_table).errors
-    assert errors.describe_errors(0x20) == "bits 20, which the control table does not define"
+    assert errors.describe_errors(0x20) == "bits 20, not defined in the control table"
 
 
 @pytest.fixture

@@ -128,7 +128,7 @@ def test_what_is_urgent_is_done_at_last_in_a_gap_too_short_and_what_is_slow_neve
     if done:
         ((source, text),) = told
         assert source == rounds.rig.plans[0].servos[0].joint
-        assert text.startswith(f"{name} waits for idle time: it may take 0.4 ms, and a cycle leaves 0.3 ms")
+        assert text.startswith(f"{name} needs up to 0.4 ms of idle time, but a cycle leaves only 0.3 ms")
 
 
 def test_every_program_of_a_line_that_is_gone_ends_with_time_outs(rounds):

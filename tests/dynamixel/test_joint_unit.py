@@ -30,7 +30,7 @@ def test_a_unit_is_found_by_each_of_its_quantities(unit: JointUnit) -> None:
 
 
 def test_no_joint_has_a_quantity_of_another_unit() -> None:
-    with pytest.raises(LookupError, match="no joint has a quantity in A"):
+    with pytest.raises(LookupError, match="A is not a unit of a joint"):
         JointUnit.find_by_quantity("A")
 
 

@@ -76,7 +76,7 @@ def test_a_timer_that_this_user_may_not_set_is_one_sentence_with_the_command(
     monkeypatch.setattr("pathlib.Path.write_text", forbidden)
     done, wrong = shortened(line, MS, tmp_path)
     assert done == ""
-    assert f"{line} keeps replies back for 16 ms, and 1 ms were planned: `echo 1 | sudo tee " in wrong
+    assert f"{line} delays replies by 16 ms instead of the planned 1 ms; run `echo 1 | sudo tee " in wrong
     assert f"`echo 1 | sudo tee {timer}`" in wrong
     with pytest.raises(PortError, match="sudo tee"):
         KeptLines([LineSettings(line, 1_000_000, MS)], tmp_path)

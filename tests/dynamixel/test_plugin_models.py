@@ -96,7 +96,7 @@ def test_a_table_is_taken_as_a_path_or_as_a_text(
         ('[Path("/nowhere.toml")]', "a servo model (/nowhere.toml) that cannot be used (FileNotFoundError"),
         ('["model = "]', "that cannot be used (TOMLDecodeError"),
         ('["model = 1"]', "that cannot be used (ValueError: the entry 'items' is missing)"),
-        ("[TAKEN]", "has a name or the number of the AX-12A, which is known already"),
+        ("[TAKEN]", "is already used by the AX-12A"),
     ],
 )  # fmt: skip
 def test_a_servo_model_that_cannot_be_used_is_told_in_one_sentence(
@@ -166,5 +166,5 @@ def test_a_robot_with_a_device_of_a_plug_in_runs_in_simulation(
     last = read_log(log).cycles["source_state"][-1]
     assert last.tolist() == [25.0]
     taken = BOARD.replace("60002", "12")
-    with pytest.raises(ValueError, match="Theirs-1 has the model number 12 of the AX-12A"):
+    with pytest.raises(ValueError, match="model number 12 of Theirs-1 is already used by the servo AX-12A"):
         dxlwire.control_table.device_models.add_device_table(taken)

@@ -225,7 +225,7 @@ def test_each_servo_opens_the_port_again_as_a_board_on_usb_drops_out(
         nonlocal opened
         opened += 1
         if not line.bus.plugged:
-            raise PortError(f"there is no {path}")
+            raise PortError(f"port {path} not found")
         line.ports = VirtualPorts(line.clock, [line.bus])
         return line
 
@@ -241,7 +241,7 @@ def test_each_servo_opens_the_port_again_as_a_board_on_usb_drops_out(
         ("Connect all servos of bus main", bench.connect(0, 1)),
     )
     assert (bench.code, opened) == (0, 5)  # when it begins, for each servo and once more, and at the end
-    assert "there is no /dev/null" in script.text
+    assert "port /dev/null not found" in script.text
     assert bench.servo(0) == (5, 3, 10, 70)
 
 

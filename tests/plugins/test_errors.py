@@ -126,7 +126,7 @@ ASKED = {
     ),
     ', ("position",))': (
         ', ("position", "pwm"))',
-        "asks for command interfaces that do not go together: no servo follows position and pwm together; "
+        "asks for command interfaces that do not go together: no servo mode combines position and pwm; "
         "report it to its author: ask for position (with velocity or effort in addition), or for "
         "velocity, effort or pwm alone",
     ),

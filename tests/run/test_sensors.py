@@ -240,7 +240,7 @@ def test_a_device_that_is_not_there_at_the_start_is_a_sentence(tmp_path):
     plan = plan_of(robot)
     memory = create_memory(plan)
     child = start_only(plan, memory)
-    with pytest.raises(PortError, match=r"sensor imu cannot be opened: there is no /dev/no_imu; "):
+    with pytest.raises(PortError, match=r"sensor imu cannot be opened: port /dev/no_imu not found; "):
         child.ready()
     assert child.process.wait(20) == 1
     child.kill()

@@ -230,7 +230,7 @@ def _exchange(machine: Machine) -> CheckResult:
     )
     if not machine.compiled:
         return check.good("compiled")
-    what, _, how = machine.compiled.rpartition(": ")
+    what, _, how = machine.compiled.partition("; ")
     return check.missing(what, how)
 
 

@@ -73,7 +73,7 @@ class ControlItem(msgspec.Struct, frozen=True):
         wire = raw
         if self.encoding == "sign_magnitude":
             if abs(raw) >= 1 << SIGN_BIT:
-                raise ValueError(f"{self.name}: {raw} does not fit into {SIGN_BIT} bits and a direction")
+                raise ValueError(f"{self.name}: {raw} does not fit into {SIGN_BIT} bits and a direction bit")
             wire = abs(raw) | (raw < 0) << SIGN_BIT
         try:
             return wire.to_bytes(self.size, "little", signed=self.encoding == "twos_complement")
@@ -226,10 +226,10 @@ CAPABILITIES: Mapping[str, str] = {
     "fast_sync_read": "fast sync read and fast bulk read, from `fast_sync_read_firmware` on",
     "indirect": "indirect addresses",
     "hardware_error": "hardware error status or error code, and the alert bit in its replies",
-    "operating_mode": "operating modes chosen by an item instead of by the angle limits",
-    "posvel": "goal speed and goal position stand side by side: one write sets both",
+    "operating_mode": "operating modes selected by an item, not by the angle limits",
+    "posvel": "goal speed and goal position are adjacent: one write sets both",
     "reboot": "the reboot instruction",
-    "state_block": "effort, speed and position stand side by side: one read gets all three",
+    "state_block": "effort, speed and position are adjacent: one read gets all three",
     "sync_read": "sync read",
     "sync_write": "sync write",
 }

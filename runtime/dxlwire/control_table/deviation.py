@@ -56,7 +56,7 @@ class Deviation(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
         return effect.replace("{value}", str(value)).replace("{bits}", bits)
 
 
-UNDESCRIBED = Deviation("report", "has an effect that its control table does not describe")
+UNDESCRIBED = Deviation("report", "is not described in its control table")
 """Rule for an item of a plug-in's model that neither its own file nor `deviations.toml` judges: report it."""
 
 

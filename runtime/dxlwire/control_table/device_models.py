@@ -28,11 +28,11 @@ def device_table(model: str, protocol: float | None = None) -> DeviceTable:
     found = [table for table in device_tables() if _key(model) in map(_key, (table.model, *table.aliases))]
     if not found:
         names = ", ".join(table.model for table in device_tables()) or "none"
-        raise LookupError(f"no control table of the device {model!r}; known devices: {names}")
+        raise LookupError(f"no control table for the device {model!r}; known devices: {names}")
     for table in found:
         if protocol in (None, table.protocol):
             return table
-    raise LookupError(f"{model} speaks Protocol {found[0].protocol}, not Protocol {protocol}")
+    raise LookupError(f"{model} uses Protocol {found[0].protocol}, not Protocol {protocol}")
 
 
 def device_tables() -> tuple[DeviceTable, ...]:
@@ -85,18 +85,21 @@ def _refuse_twins(table: DeviceTable, known: Iterable[DeviceTable]) -> None:
     keys = set(map(_key, names))
     for each in known:
         if keys & set(map(_key, (each.model, *each.aliases))):
-            raise ValueError(f"{table.model} has a name of the device {each.model}, which is known already")
+            raise ValueError(f"a name of {table.model} is already used by the device {each.model}")
         if table.model_number is not None and _number(table) == _number(each):
             raise ValueError(
-                f"{table.model} has the model number {table.model_number} of the device {each.model}, "
-                "which is known already"
+                f"model number {table.model_number} of {table.model} is already used by the device "
+                f"{each.model}"
             )
     for name in names:
         if protocols_of(name):
-            raise ValueError(f"{name} is the name of a servo model, which is known already")
+            raise ValueError(f"{name} is already the name of a servo model")
     if table.model_number is not None:
         for servo in models_by_number(table.model_number, table.protocol):
-            raise ValueError(f"{table.model} has the model number {table.model_number} of the {servo.model}")
+            raise ValueError(
+                f"model number {table.model_number} of {table.model} is already used by the servo "
+                f"{servo.model}"
+            )
 
 
 def _number(table: DeviceTable) -> tuple[int | None, float]:

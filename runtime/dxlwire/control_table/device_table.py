@@ -45,7 +45,7 @@ CAPABILITIES: Mapping[str, str] = {
         for name in ("bulk_read", "bulk_write", "fast_sync_read", "reboot", "sync_read", "sync_write")
     },
     "broadcast_ping": "a reply to a ping to all IDs",
-    WAITS: "in a sync or bulk read it waits for the status ahead of its own, and executes nothing until then",
+    WAITS: "in a sync or bulk read, a missing status before its own blocks the device",
 }
 """Words that a device's data file may list under `capabilities`, with their meaning. Every device supports
 ping, read and write."""
@@ -104,7 +104,7 @@ def read_device_table(text: str) -> DeviceTable:
 def build_device_table(data: Entry) -> DeviceTable:
     """Return the control table of a device from its parsed data file; raises as `read_device_table`."""
     if data.get("kind") != "device":
-        raise ValueError('the table of a device has kind = "device"')
+        raise ValueError('kind must be "device"')
     written = section(data["items"])
     protocol, firmware = protocol_in(data["protocol"]), data.get("fast_sync_read_firmware")
     entries = _with_identity(written, protocol)
@@ -117,12 +117,12 @@ def build_device_table(data: Entry) -> DeviceTable:
     cyclic = tuple(words(data.get("cyclic", [])))
     for name in cyclic:
         if name not in by_name:
-            raise ValueError(f"cyclic: {name} is not one of the items")
+            raise ValueError(f"cyclic: unknown item {name}")
     capabilities = frozenset(words(data.get("capabilities", [])))
     if wrong := capabilities - CAPABILITIES.keys():
-        raise ValueError(f"capabilities that a device cannot have: {', '.join(sorted(wrong))}")
+        raise ValueError(f"capabilities not allowed for a device: {', '.join(sorted(wrong))}")
     if "model_number" in data and _place(by_name["model_number"]) != _MODEL_NUMBER:
-        raise ValueError("model_number: one that is checked stands at address 0 and has 2 bytes")
+        raise ValueError("model_number: a checked model number must be at address 0 with 2 bytes")
     return DeviceTable(
         model=str(data["model"]),
         aliases=tuple(words(data.get("aliases", []))),
@@ -158,12 +158,10 @@ def _check_places(items: Sequence[ControlItem]) -> None:
             continue
         if before.bit is None or item.bit is None or _place(before) != _place(item):
             raise ValueError(
-                f"{item.name}: address {item.address} lies in {before.name}, and only bits share a place"
+                f"{item.name}: address {item.address} overlaps {before.name} (only bits may share an address)"
             )
         if any(each.bit == item.bit for each in items if each is not item and _place(each) == _place(item)):
-            raise ValueError(
-                f"{item.name}: bit {item.bit} of address {item.address} has another name already"
-            )
+            raise ValueError(f"{item.name}: bit {item.bit} of address {item.address} is defined twice")
 
 
 def _place(item: ControlItem) -> tuple[int, int]:
@@ -172,15 +170,15 @@ def _place(item: ControlItem) -> tuple[int, int]:
 
 def _item(name: str, entry: Entry, units: Collection[str]) -> ControlItem:
     if wrong := entry.keys() - _KEYS:
-        raise ValueError(f"{name}: an item of a device has no {', '.join(sorted(wrong))}")
+        raise ValueError(f"{name}: keys not allowed in an item of a device: {', '.join(sorted(wrong))}")
     unit, offset = parse_quantity(name, entry, "offset", units) if "offset" in entry else ("", 0.0)
     defaults = {"access": "R", "area": "RAM", "encoding": "unsigned", "page": "", "state": name}
     ends = {key: entry.get(key, 0) for key in ("minimum", "maximum")}
     item = read_item(name, {**defaults, **ends, **entry, "offset": offset}, units)
     if item.size not in _SIZES or (item.encoding == "float32" and item.size != 4):
-        raise ValueError(f"{name}: an item has 1, 2 or 4 bytes, a float32 4, not {item.size}")
+        raise ValueError(f"{name}: the size must be 1, 2 or 4 (float32: 4), not {item.size}")
     if item.encoding == "float32" and entry.keys() & {"minimum", "maximum"}:
-        raise ValueError(f"{name}: minimum and maximum are of whole numbers, a float32 has none")
+        raise ValueError(f"{name}: a float32 cannot have minimum and maximum")
     lowest, highest = _range(item.encoding, item.size)
     item = replace(
         item,
@@ -190,36 +188,38 @@ def _item(name: str, entry: Entry, units: Collection[str]) -> ControlItem:
     if not lowest <= item.minimum <= item.maximum <= highest:
         raise ValueError(f"{name}: {item.minimum}..{item.maximum} does not fit into its bytes")
     if "offset" in entry and unit != item.unit:
-        raise ValueError(f"{name}: its offset is in {unit or 'no unit'}, its tick in {item.unit or 'none'}")
+        raise ValueError(
+            f"{name}: offset and tick have different units, {unit or 'none'} and {item.unit or 'none'}"
+        )
     _check_item(item)
     return item
 
 
 def _check_item(item: ControlItem) -> None:
     if not 0 <= item.address <= _HIGHEST_ADDRESS:
-        raise ValueError(f"{item.name}: address {item.address} is none; they are 0..{_HIGHEST_ADDRESS}")
+        raise ValueError(f"{item.name}: the address must be 0..{_HIGHEST_ADDRESS}, not {item.address}")
     for key, value in (("initial value", item.initial), ("safe value", item.safe)):
         if value is not None and not item.minimum <= value <= item.maximum:
             raise ValueError(f"{item.name}: the {key} {value} is outside its range")
     if item.safe is not None and (item.access == "R" or item.area == "EEPROM"):
-        raise ValueError(f"{item.name}: only an item in RAM that can be written has a safe value")
+        raise ValueError(f"{item.name}: a safe value needs a writable item in RAM")
     if item.encoding == "float32" and (item.initial or item.safe):
-        raise ValueError(f"{item.name}: the only initial and safe value of a float32 is 0")
+        raise ValueError(f"{item.name}: initial and safe value of a float32 must be 0")
     if item.state == "age":
-        raise ValueError(f"{item.name}: a state is not called age, as every device has an age already")
+        raise ValueError(f"{item.name}: the state name age is reserved")
     if item.scale == 0:
-        raise ValueError(f"{item.name}: a tick of 0 would mean nothing")
+        raise ValueError(f"{item.name}: the tick must not be 0")
     if not STATE_NAME.fullmatch(item.state):
         raise ValueError(
-            f"{item.name}: {item.state!r} is not a name of a state; start with a letter, and use letters, "
-            "digits and _, such as angular_velocity.x"
+            f"{item.name}: {item.state!r} is not a state name (letters, digits and _ after a letter, "
+            "such as angular_velocity.x)"
         )
     if item.bit is None:
         return
     if not 0 <= item.bit < 8 * item.size:
-        raise ValueError(f"{item.name}: bit {item.bit} is not one of its {8 * item.size} bits")
+        raise ValueError(f"{item.name}: the bit must be 0..{8 * item.size - 1}, not {item.bit}")
     if item.access != "R" or item.unit or item.encoding != "unsigned":
-        raise ValueError(f"{item.name}: a bit is unsigned, has no unit, and cannot be written alone")
+        raise ValueError(f"{item.name}: a bit must be unsigned, read-only and without unit")
 
 
 def _range(encoding: str, size: int) -> tuple[int, int]:

@@ -49,9 +49,9 @@ class HardwareErrors(msgspec.Struct, frozen=True):
         names = self.names(value)
         words = [(name if is_warning(name) else f"{name} error").replace("_", " ") for name in names]
         if self.has_codes:
-            return words[0] if words else f"code {value}, which the control table does not define"
+            return words[0] if words else f"code {value}, not defined in the control table"
         if unknown := value & ~self.mask:
-            words.append(f"bits {unknown:02x}, which the control table does not define")
+            words.append(f"bits {unknown:02x}, not defined in the control table")
         return "; ".join(words)
 
     def is_warning(self, value: int) -> bool:

@@ -36,15 +36,15 @@ def find_table(model: str, protocol: float | None = None) -> ControlTable:
     spoken = protocols_of(model)
     if not spoken:
         raise LookupError(
-            f"no control table of the model {model!r}; known models: {', '.join(model_names())}"
+            f"no control table for the model {model!r}; known models: {', '.join(model_names())}"
         )
     if protocol is not None and protocol not in spoken:
-        raise LookupError(f"{model} speaks Protocol {spoken[0]}, not Protocol {protocol}")
+        raise LookupError(f"{model} uses Protocol {spoken[0]}, not Protocol {protocol}")
     if protocol is None and len(spoken) > 1:
-        raise LookupError(f"{model} exists with Protocol 1.0 and with Protocol 2.0: say which one")
+        raise LookupError(f"{model} supports Protocol 1.0 and 2.0; give the protocol")
     listing = understood(model, spoken[0] if protocol is None else protocol)
     if listing is None:  # Unreachable, because protocols_of has just found it
-        raise LookupError(f"no control table of the model {model!r}")
+        raise LookupError(f"no control table for the model {model!r}")
     return listing.build()
 
 
@@ -136,8 +136,8 @@ def add_control_table(text: str) -> ControlTable:
             if listing.build() == table:
                 return table  # A process may load its plug-ins twice
             raise ValueError(
-                f"{table.model} with model number {table.model_number} has a name or the number of the "
-                f"{listing.names[0]}, which is known already"
+                f"a name of {table.model}, or its model number {table.model_number}, is already used by the "
+                f"{listing.names[0]}"
             )
     _ADDED[table.protocol].append(Listing(names, table.model_number, table.firmware, lambda: table))
     _TEXTS.update(dict.fromkeys(names, text))

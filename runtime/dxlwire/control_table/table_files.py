@@ -110,7 +110,7 @@ def _chain(name: str, entries: Mapping[str, Entry]) -> list[str]:
     chain = [name]
     while (parent := entries[chain[-1]].get("extends")) is not None:
         if not isinstance(parent, str) or parent not in entries or parent in chain:
-            raise ValueError(f"{chain[-1]}: it cannot extend {parent!r}")
+            raise ValueError(f"{chain[-1]}: extends = {parent!r} is not another control table")
         chain.append(parent)
     return chain
 
@@ -207,8 +207,8 @@ def _hardware_errors(data: Entry, items: Mapping[str, ControlItem]) -> HardwareE
     errors = HardwareErrors(item, MappingProxyType(values))
     for name, value in values.items():
         if not 0 < value < 0x100 or (not errors.has_codes and value & (value - 1)):
-            kind = "a code" if errors.has_codes else "one bit"
-            raise ValueError(f"errors: {name} = {value} is not {kind} of a byte")
+            kind = "a code from 1 to 255" if errors.has_codes else "a single bit from 1 to 128"
+            raise ValueError(f"errors: {name} = {value} is not {kind}")
     if len(set(values.values())) < len(values):
         raise ValueError("errors: two errors have the same value")
     return errors
@@ -219,13 +219,13 @@ def _figure(data: Entry, key: str, unit: str) -> float:
     negative or has another unit."""
     found, value = quantity(str(data[key]))
     if found != unit or not value >= 0:
-        raise ValueError(f"{key}: {data[key]!r} is not a quantity in {unit} from 0 on")
+        raise ValueError(f"{key}: {data[key]!r} is not a quantity in {unit}, 0 or more")
     return value
 
 
 def _ratio(value: object) -> float:
     if not isinstance(value, int | float) or isinstance(value, bool) or not value >= 0:
-        raise ValueError(f"gear_ratio is a number from 0 on, not {value!r}")
+        raise ValueError(f"gear_ratio must be a number, 0 or more, not {value!r}")
     return float(value)
 
 
@@ -248,7 +248,7 @@ def whole(entry: Entry, key: str) -> int:
 def words(value: object) -> list[str]:
     """Return a value of a data file that must be a list of strings. Raises ValueError otherwise."""
     if not isinstance(value, list) or not all(isinstance(word, str) for word in value):
-        raise ValueError(f"{value!r} is not a list of words")
+        raise ValueError(f"{value!r} is not a list of strings")
     return value
 
 
@@ -321,7 +321,7 @@ def _first(items: Mapping[str, ControlItem], *names: str) -> str:
     for name in names:
         if name in items:
             return name
-    raise ValueError(f"none of {', '.join(names)} is among the items")
+    raise ValueError(f"one of the items {', '.join(names)} is missing")
 
 
 def _effort_unit(item: ControlItem) -> EffortUnit:
@@ -331,20 +331,20 @@ def _effort_unit(item: ControlItem) -> EffortUnit:
         return "Nm"
     if item.unit == "1":
         return "1"
-    raise ValueError(f"{item.name}: its unit is neither a fraction nor A nor Nm")
+    raise ValueError(f"{item.name}: the unit must be a fraction, A or Nm, not {item.unit or 'none'}")
 
 
 def protocol_in(value: object) -> float:
     """Return the value of the key `protocol`. Raises ValueError if it is neither 1.0 nor 2.0."""
     if value not in (1.0, 2.0) or not isinstance(value, float):
-        raise ValueError(f"protocol is 1.0 or 2.0, not {value!r}")
+        raise ValueError(f"protocol must be 1.0 or 2.0, not {value!r}")
     return value
 
 
 def _capabilities(data: Entry) -> frozenset[str]:
     named = frozenset(words(data.get("capabilities", [])))
     if wrong := named - (CAPABILITIES.keys() - DERIVED):
-        raise ValueError(f"capabilities that a data file cannot name: {', '.join(sorted(wrong))}")
+        raise ValueError(f"capabilities not allowed in a data file: {', '.join(sorted(wrong))}")
     return named
 
 
@@ -352,11 +352,11 @@ def _check(items: tuple[ControlItem, ...]) -> None:
     end = 0
     for item in items:
         if item.address < end:
-            raise ValueError(f"{item.name}: address {item.address} lies in the item before it")
+            raise ValueError(f"{item.name}: address {item.address} overlaps the previous item")
         if item.size not in (1, 2, 4):
-            raise ValueError(f"{item.name}: an item has 1, 2 or 4 bytes, not {item.size}")
+            raise ValueError(f"{item.name}: the size must be 1, 2 or 4, not {item.size}")
         if item.encoding == "float32":
-            raise ValueError(f"{item.name}: no servo has a float32")
+            raise ValueError(f"{item.name}: float32 is not possible in a servo")
         bits = 8 * item.size - item.signed
         if not -item.signed << bits <= item.minimum <= item.maximum < 1 << bits:
             raise ValueError(f"{item.name}: {item.minimum}..{item.maximum} does not fit into its bytes")

@@ -544,5 +544,5 @@ def _data(array: NDArray[np.generic]) -> int:
         ValueError: The array is not contiguous.
     """
     if not array.flags.c_contiguous:
-        raise ValueError("the kernel takes contiguous arrays only")
+        raise ValueError("the kernel requires contiguous arrays")
     return array.ctypes.data

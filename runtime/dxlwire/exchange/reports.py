@@ -23,18 +23,18 @@ class Reason(Enum):
 def jumped(joint: str, jump: str, elapsed_ns: int) -> str:
     """Return the text for a position that its servo cannot have reached; `jump` is the distance with unit."""
     time = f"{elapsed_ns * 1e-6:.0f} ms"
-    return f"{joint} jumped by {jump} in {time}, faster than it can turn: the value is not used"
+    return f"{joint} jumped by {jump} in {time}, faster than it can turn: value discarded"
 
 
 def not_finite(device: str, states: Sequence[str]) -> str:
     """Return the text for values of a device that are NaN or infinite; `states` are their names."""
-    return f"{device} sent values that are not finite ({', '.join(states)}): they are not used"
+    return f"{device} sent non-finite values ({', '.join(states)}): values discarded"
 
 
 def idle_time_short(program: str, needed_ns: int, left_ns: int) -> str:
     """Return the text for a program that needs more idle time than a cycle has."""
     return (
-        f"{program} waits for idle time: it may take {needed_ns * 1e-6:.1f} ms, and a cycle leaves "
+        f"{program} needs up to {needed_ns * 1e-6:.1f} ms of idle time, but a cycle leaves only "
         f"{left_ns * 1e-6:.1f} ms; periods may be skipped"
     )
 

@@ -50,11 +50,11 @@ position control."""
 
 LACKS: Mapping[Mode, str] = MappingProxyType(
     {
-        Mode.POSITION: "has no mode that counts turns, so no position of a continuous joint",
-        Mode.VELOCITY: "has no mode that turns at a speed",
-        Mode.EFFORT: "has no mode that follows a torque or a current",
-        Mode.PWM: "has no mode that follows a PWM",
-        Mode.EFFORT_POSITION: "has no position control with a limit of the effort",
+        Mode.POSITION: "has no multi-turn mode for a continuous joint",
+        Mode.VELOCITY: "has no velocity mode",
+        Mode.EFFORT: "has no torque or current mode",
+        Mode.PWM: "has no PWM mode",
+        Mode.EFFORT_POSITION: "has no position mode with an effort limit",
     }
 )
 """Text for a model that does not have a mode; it follows the model's name."""

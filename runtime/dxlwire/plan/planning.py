@@ -256,7 +256,9 @@ def _state_layout(table: ControlTable, *, counts_turns: bool) -> StateLayout:
     start = min(item.address for item in items)
     end = max(item.address + item.size for item in items)
     if not table.readable(start, end):
-        raise ValueError(f"{table.model}: {', '.join(names)} do not stand in one block, so no read gets all")
+        raise ValueError(
+            f"{table.model}: {', '.join(names)} are not in one block, so one read cannot get all"
+        )
     position, velocity, effort = (field(item, start) for item in items)
     if counts_turns:
         # Negative turns are in two's complement, also in the 16 bits of multi-turn mode.

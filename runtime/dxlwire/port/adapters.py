@@ -45,7 +45,7 @@ def disturbances(root: Path = ROOT) -> Iterator[Disturbance]:
         yield Disturbance(
             "ModemManager",
             "it runs",
-            "it may open a new port for seconds, and send to it, to find out whether it is a modem",
+            "it may send bytes to a new port for some seconds, in search of a modem",
             "sudo systemctl disable --now ModemManager",
         )
     rules = [path for folder in _RULES for path in root.glob(f"{folder}/*brltty*.rules")]
@@ -54,7 +54,7 @@ def disturbances(root: Path = ROOT) -> Iterator[Disturbance]:
             "brltty",
             "it runs" if "brltty" in programs else "it is installed",
             "it takes adapters with a CH340 or CP210x chip for Braille displays: their port disappears",
-            "sudo apt remove brltty  # where nobody uses a Braille display",
+            "sudo apt remove brltty  # if nobody uses a Braille display",
         )
     for port in ports:
         control = _power_control(root / "sys/class/tty" / port / "device")
@@ -62,7 +62,7 @@ def disturbances(root: Path = ROOT) -> Iterator[Disturbance]:
             yield Disturbance(
                 f"autosuspend of {port}",
                 "its USB device may be suspended (power/control is auto)",
-                "an adapter that was suspended answers late, or loses the first bytes",
+                "a suspended adapter responds late, or loses the first bytes",
                 f"echo on | sudo tee /{control.relative_to(root.resolve())}",
             )
 

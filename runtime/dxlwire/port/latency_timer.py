@@ -100,7 +100,7 @@ def shorten(descriptor: int, path: str, most_ns: int, system: Path = SYSTEM) -> 
         now = latency_timer(path, system) or now
     if now.found_ms * 1_000_000 > most_ns:
         return "", (
-            f"{path} keeps replies back for {now.found_ms} ms, and {most_ns * 1e-6:g} ms were planned: "
-            f"`{now.fix}` shortens that, or write `adapter: {{latency: {now.found_ms} ms}}` at its bus"
+            f"{path} delays replies by {now.found_ms} ms instead of the planned {most_ns * 1e-6:g} ms; "
+            f"run `{now.fix}`, or write `adapter: {{latency: {now.found_ms} ms}}` at its bus"
         )
     return f"{path}: latency timer set from {before.found_ms} ms to {now.found_ms} ms", ""

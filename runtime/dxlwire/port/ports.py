@@ -219,13 +219,13 @@ class SerialPort(OwnProcessors):
         """Return the exception for a failed write, given its errno, or -1 if the line accepts no more
         bytes."""
         if code < 0:
-            return PortError(f"{self.name} takes no more bytes: is the adapter stuck, or the line held?")
+            return PortError(f"{self.name} accepts no more bytes; check for a stuck adapter or a held line")
         return self._gone(OSError(code, os.strerror(code)))
 
     def _gone(self, error: OSError | None) -> PortError:
         # EBADF: the descriptor was set aside
         why = f" ({error.strerror})" if error is not None and error.errno != errno.EBADF else ""
-        return PortError(f"{self.name} is gone{why}: was the adapter unplugged?")
+        return PortError(f"{self.name} is gone{why}; check that the adapter is plugged in")
 
 
 class StallCounter:

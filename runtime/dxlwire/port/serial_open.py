@@ -152,8 +152,8 @@ def open_serial(
         except OSError as error:
             line.close()
             raise PortError(
-                f"the driver of {path} has no RS-485 mode ({error.strerror}): omit `adapter: {{rs485: "
-                "true}`, and use an adapter that switches the direction itself"
+                f"the driver of {path} has no RS-485 mode ({error.strerror}); omit `adapter: {{rs485: "
+                "true}`, and use an adapter with automatic direction control"
             ) from error
     if line.set_dtr and boot_ns:
         time.sleep(boot_ns * 1e-9)
@@ -171,18 +171,18 @@ def rate_remark(line: SerialLine, baud_rate: int) -> str:
         return ""
     error = line.baud_rate / baud_rate - 1.0
     return (
-        f"{line.path} was asked for {baud_rate} bit/s, and its driver set {line.baud_rate} ({error:+.1%}): "
-        "servos may not receive what is sent; choose a rate that the adapter has"
+        f"{line.path} runs at {line.baud_rate} bit/s instead of {baud_rate} ({error:+.1%}), so servos may "
+        "miss packets; choose a baud rate of the adapter"
     )
 
 
 def _sentence(path: str, baud_rate: int, error: OSError, describe_holder: DescribeProcess) -> str:
     number = error.errno
     if number in (errno.ENOENT, errno.ENODEV, errno.ENXIO):
-        return f"there is no {path}; {_what_exists()}"
+        return f"port {path} not found; {_what_exists()}"
     if number in (errno.EACCES, errno.EPERM) and not os.access(path, os.R_OK | os.W_OK):
         return (
-            f"this user may not open {path}: "
+            f"this user may not open {path}; run "
             f"`{command_for_access(Path(os.path.realpath(path)), os.path.realpath(path), '$USER')}`; "
             f"{help_link('the-port-may-not-be-opened')}"
         )
@@ -198,8 +198,8 @@ def _sentence(path: str, baud_rate: int, error: OSError, describe_holder: Descri
 def _what_exists() -> str:
     devices = serial_devices()
     if not devices:
-        return f"this machine has no serial adapter now: plug it in; {help_link('there-is-no-port')}"
-    return f"there are: {', '.join(devices)}"
+        return f"plug in a serial adapter; {help_link('there-is-no-port')}"
+    return f"choose from {', '.join(devices)}"
 
 
 def _holder(path: str, describe: DescribeProcess) -> str:
@@ -214,7 +214,8 @@ def _holder(path: str, describe: DescribeProcess) -> str:
     if described := next(filter(None, map(describe, found)), ""):
         return described
     named = [f"{_command(process)} (process {process.name})" for process in found]
-    return f"{' and '.join(named) or 'another process, which this user may not see'}; stop that first"
+    them = "them" if len(named) > 1 else "it"
+    return f"{' and '.join(named) or 'a process of another user'}; stop {them} first"
 
 
 def _processes() -> Iterable[Path]:

@@ -71,9 +71,9 @@ _SENTENCES: Mapping[StatusError, str] = {
     StatusError.INPUT_VOLTAGE: "input voltage error: the voltage is out of the range of the control table",
     StatusError.ANGLE_LIMIT: "angle limit error: the goal position is outside the CW and CCW angle limits",
     StatusError.OVERHEATING: "overheating error: the temperature is out of the range of the control table",
-    StatusError.RANGE: "range error: a written value is out of its range of use",
+    StatusError.RANGE: "range error: a written value is out of range",
     StatusError.CHECKSUM: "checksum error: the checksum of the instruction packet was wrong",
-    StatusError.OVERLOAD: "overload error: the load cannot be controlled by the set torque",
+    StatusError.OVERLOAD: "overload error: the load exceeds the set torque",
     StatusError.INSTRUCTION: "instruction error: an undefined instruction, or action without reg write",
 }
 
@@ -82,7 +82,7 @@ def describe_error(error: int) -> str:
     """Return the e-Manual's words for every bit of an error byte; `no error` for 0."""
     words = [sentence for bit, sentence in _SENTENCES.items() if error & bit]
     if error & 0x80:
-        words.append("bit 7, which Protocol 1.0 does not define")
+        words.append("bit 7, not defined in Protocol 1.0")
     return "; ".join(words) or "no error"
 
 
@@ -140,7 +140,9 @@ def checksum(body: Bytes) -> int:
 
 def _packet(servo_id: int, kind: int, parameters: bytes) -> bytes:
     if len(parameters) > _MOST_PARAMETERS:
-        raise ValueError(f"{len(parameters)} parameter bytes do not fit one packet, {_MOST_PARAMETERS} do")
+        raise ValueError(
+            f"{len(parameters)} parameter bytes do not fit one packet; send at most {_MOST_PARAMETERS}"
+        )
     body = bytes((servo_id, len(parameters) + 2, kind)) + parameters
     return HEADER + body + bytes((checksum(body),))
 
@@ -152,7 +154,7 @@ def instruction_packet(servo_id: int, instruction: int, parameters: bytes = b"")
         ValueError: `servo_id` is neither 0..253 nor broadcast, or the parameters do not fit.
     """
     if not (0 <= servo_id <= HIGHEST_ID or servo_id == BROADCAST_ID):
-        raise ValueError(f"{servo_id} is not an ID: a servo has 0..{HIGHEST_ID}, broadcast is {BROADCAST_ID}")
+        raise ValueError(f"{servo_id} is not an ID (servo: 0..{HIGHEST_ID}, broadcast: {BROADCAST_ID})")
     return _packet(servo_id, instruction, parameters)
 
 
@@ -217,7 +219,7 @@ def sync_write(address: int, length: int, data: Mapping[int, bytes]) -> bytes:
     """
     for one, chunk in data.items():
         if len(chunk) != length:
-            raise ValueError(f"servo {one} gets {len(chunk)} bytes where {length} are announced")
+            raise ValueError(f"servo {one} gets {len(chunk)} bytes instead of {length}")
     records = b"".join(bytes((one,)) + chunk for one, chunk in data.items())
     return instruction_packet(
         BROADCAST_ID, Protocol1Instruction.SYNC_WRITE, bytes((address, length)) + records

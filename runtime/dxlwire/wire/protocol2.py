@@ -88,8 +88,8 @@ _NUMBERS: Mapping[int, str] = {
     ErrorNumber.INSTRUCTION: "instruction error: an undefined instruction, or action without reg write",
     ErrorNumber.CRC: "CRC error: the CRC of the instruction packet was wrong",
     ErrorNumber.RANGE: "data range error: a written value is out of the range of the control table",
-    ErrorNumber.LENGTH: "data length error: fewer bytes than the item has",
-    ErrorNumber.LIMIT: "data limit error: a written value is beyond a limit that the servo is set to",
+    ErrorNumber.LENGTH: "data length error: fewer bytes than the item needs",
+    ErrorNumber.LIMIT: "data limit error: a written value is beyond a limit set in the servo",
     ErrorNumber.ACCESS: "access error: the address cannot be written or read, or EEPROM while torque is on",
 }
 
@@ -100,7 +100,7 @@ def describe_error(error: int) -> str:
     if error & ALERT:
         words.append("alert: the servo has a hardware error")
     if number := error & ~ALERT:
-        words.append(_NUMBERS.get(number, f"error number {number}, which Protocol 2.0 does not define"))
+        words.append(_NUMBERS.get(number, f"error number {number}, not defined in Protocol 2.0"))
     return "; ".join(words) or "no error"
 
 
@@ -192,7 +192,7 @@ def fast_answers(packet: Bytes, lengths: Sequence[int]) -> list[Status]:
     """
     data = bytes(packet)
     if len(data) < 8 or data[:4] != HEADER or data[4] != BROADCAST_ID or data[7] != STATUS:
-        raise ValueError(f"no status of a fast form: {data.hex(' ')}")
+        raise ValueError(f"not a status packet of a fast read: {data.hex(' ')}")
     found: list[Status] = []
     start = 8
     for length in lengths:
@@ -210,7 +210,9 @@ def _tail(data: bytes) -> bytes:
 
 def _packet(address: int, body: bytes) -> bytes:
     if len(body) > _MOST_PARAMETERS + 1:
-        raise ValueError(f"{len(body) - 1} parameter bytes do not fit one packet, {_MOST_PARAMETERS} do")
+        raise ValueError(
+            f"{len(body) - 1} parameter bytes do not fit one packet; send at most {_MOST_PARAMETERS}"
+        )
     data = HEADER + bytes((address,)) + _word(len(body) + 2) + body
     return data + _tail(data)
 
@@ -222,7 +224,7 @@ def instruction_packet(servo_id: int, instruction: int, parameters: bytes = b"")
         ValueError: `servo_id` is neither 0..252 nor broadcast, or the parameters do not fit.
     """
     if not (0 <= servo_id <= HIGHEST_ID or servo_id == BROADCAST_ID):
-        raise ValueError(f"{servo_id} is not an ID: a servo has 0..{HIGHEST_ID}, broadcast is {BROADCAST_ID}")
+        raise ValueError(f"{servo_id} is not an ID (servo: 0..{HIGHEST_ID}, broadcast: {BROADCAST_ID})")
     return _packet(servo_id, stuffed(bytes((instruction,)) + parameters))
 
 
@@ -304,7 +306,7 @@ def sync_write(address: int, length: int, data: Mapping[int, bytes]) -> bytes:
     """
     for servo_id, chunk in data.items():
         if len(chunk) != length:
-            raise ValueError(f"servo {servo_id} gets {len(chunk)} bytes where {length} are announced")
+            raise ValueError(f"servo {servo_id} gets {len(chunk)} bytes instead of {length}")
     records = b"".join(bytes((servo_id,)) + chunk for servo_id, chunk in data.items())
     parameters = _word(address) + _word(length) + records
     return instruction_packet(BROADCAST_ID, Protocol2Instruction.SYNC_WRITE, parameters)

@@ -89,7 +89,7 @@ def test_a_reply_of_the_wrong_length_is_refused() -> None:
 @pytest.mark.parametrize(
     ("old", "new", "complaint"),
     [
-        ("address = 3,", "address = 2,", "id: address 2 lies in the item before it"),
+        ("address = 3,", "address = 2,", "id: address 2 overlaps the previous item"),
         ("maximum = 253", "maximum = 256", "id: 0..256 does not fit"),
         ("initial = 250", "initial = 255", "return_delay_time: the initial value 255"),
         (
@@ -98,7 +98,7 @@ def test_a_reply_of_the_wrong_length_is_refused() -> None:
             "model_number: encoding: Invalid enum value 'gray'; known are unsigned",
         ),
         ("address = 5,", 'address = "5",', "return_delay_time: address: Expected `int`, got `str`"),
-        ("size = 2", "size = 3", "model_number: an item has 1, 2 or 4 bytes"),
+        ("size = 2", "size = 3", "model_number: the size must be 1, 2 or 4, not 3"),
         ("59 rpm", "59 turns", "the unit is not one of"),
     ],
 )

@@ -64,37 +64,41 @@ def test_a_table_without_a_model_number_is_one_that_is_not_checked() -> None:
 @pytest.mark.parametrize(
     ("before", "after", "sentence"),
     [
-        ('kind = "device"\n', "", 'the table of a device has kind = "device"'),
-        ("protocol = 2.0", "protocol = 2", "protocol is 1.0 or 2.0, not 2"),
-        ('["sync_read"]', '["sync_raed"]', "capabilities that a device cannot have: sync_raed"),
-        ('["pressure", ', '["presure", ', "cyclic: presure is not one of the items"),
-        ("address = 31", "address = 30", "pressure: address 30 lies in st"),
-        ("bit = 3", "bit = 0", "bit 0 of address 30 has another name already"),
-        ("bit = 3", "bit = 8", "stop: bit 8 is not one of its 8 bits"),
-        ("size = 1, bit = 3", 'size = 1, access = "RW", bit = 3', "stop: a bit is unsigned, has no unit"),
+        ('kind = "device"\n', "", 'kind must be "device"'),
+        ("protocol = 2.0", "protocol = 2", "protocol must be 1.0 or 2.0, not 2"),
+        ('["sync_read"]', '["sync_raed"]', "capabilities not allowed for a device: sync_raed"),
+        ('["pressure", ', '["presure", ', "cyclic: unknown item presure"),
+        ("address = 31", "address = 30", "pressure: address 30 overlaps st"),
+        ("bit = 3", "bit = 0", "bit 0 of address 30 is defined twice"),
+        ("bit = 3", "bit = 8", "stop: the bit must be 0..7, not 8"),
+        ("size = 1, bit = 3", 'size = 1, access = "RW", bit = 3', "stop: a bit must be unsigned, read-only"),
         (
             'tick = "-0.1 mN"',
             'tick = "0.1 lbf"',
             "pressure: tick: '0.1 lbf': the unit is not one of rad, deg",
         ),
-        ('"-0.1 mN"', '"0 mN"', "pressure: a tick of 0 would mean nothing"),
-        ('offset = "2 N"', 'offset = "2 V"', "pressure: its offset is in V, its tick in N"),
-        ("address = 36, size = 4", "address = 36, size = 2", "yaw: an item has 1, 2 or 4 bytes, a float32 4"),
+        ('"-0.1 mN"', '"0 mN"', "pressure: the tick must not be 0"),
+        ('offset = "2 N"', 'offset = "2 V"', "pressure: offset and tick have different units, V and N"),
+        (
+            "address = 36, size = 4",
+            "address = 36, size = 2",
+            "yaw: the size must be 1, 2 or 4 (float32: 4), not 2",
+        ),
         ("address = 36, ", "", "yaw: missing required field `address`"),
-        ("address = 36", "adress = 36, address = 36", "yaw: an item of a device has no adress"),
+        ("address = 36", "adress = 36, address = 36", "yaw: keys not allowed in an item of a device: adress"),
         ("address = 36", 'address = "36"', "yaw: address: Expected `int`, got `str`"),
         ("safe = 0", "safe = 8", "lamp: the safe value 8 is outside its range"),
         ("initial = 0", "initial = 9", "lamp: the initial value 9 is outside its range"),
         ("maximum = 7", "maximum = 256", "lamp: 0..256 does not fit into its bytes"),
-        ('access = "RW"', 'access = "R"', "lamp: only an item in RAM that can be written has a safe value"),
-        ('"force.z"', '"force z"', "pressure: 'force z' is not a name of a state; start with a letter"),
-        ('"force.z"', '"age"', "pressure: a state is not called age"),
-        ("protocol = 2.0", "protocol = [2.0]", "protocol is 1.0 or 2.0, not [2.0]"),
+        ('access = "RW"', 'access = "R"', "lamp: a safe value needs a writable item in RAM"),
+        ('"force.z"', '"force z"', "pressure: 'force z' is not a state name (letters"),
+        ('"force.z"', '"age"', "pressure: the state name age is reserved"),
+        ("protocol = 2.0", "protocol = [2.0]", "protocol must be 1.0 or 2.0, not [2.0]"),
         ('"-0.1 mN"', '"1/0 mN"', "pressure: tick: '1/0 mN' divides by 0"),
         ('"2 N"', '"inf N"', "pressure: offset: 'inf N' is not a finite number"),
-        ('tick = "1 rad"', "maximum = 1", "yaw: minimum and maximum are of whole numbers"),
-        ('tick = "1 rad"', "initial = 1", "yaw: the only initial and safe value of a float32 is 0"),
-        ("{address = 0, size = 2", "{address = 4, size = 2", "one that is checked stands at address 0"),
+        ('tick = "1 rad"', "maximum = 1", "yaw: a float32 cannot have minimum and maximum"),
+        ('tick = "1 rad"', "initial = 1", "yaw: initial and safe value of a float32 must be 0"),
+        ("{address = 0, size = 2", "{address = 4, size = 2", "a checked model number must be at address 0"),
     ],
 )
 def test_a_mistake_is_named(before: str, after: str, sentence: str) -> None:
@@ -107,10 +111,10 @@ def test_a_mistake_is_named(before: str, after: str, sentence: str) -> None:
 @pytest.mark.parametrize(
     ("before", "after", "sentence"),
     [
-        ('"Board-1"', '"board"', "board has a name of the device Board-1"),
-        ("60_001", "60_001 # Board-2", "Board-2 has the model number 60001 of the device Board-1"),
-        ('"Board-1"', '"AX12"', "AX12 is the name of a servo model"),
-        ("60_001", "1020", "has the model number 1020 of the XM430-W350"),
+        ('"Board-1"', '"board"', "a name of board is already used by the device Board-1"),
+        ("60_001", "60_001 # Board-2", "model number 60001 of Board-2 is already used by the device Board-1"),
+        ('"Board-1"', '"AX12"', "AX12 is already the name of a servo model"),
+        ("60_001", "1020", "is already used by the servo XM430-W350"),
     ],
 )
 def test_names_and_numbers_belong_to_one_model(before: str, after: str, sentence: str) -> None:
@@ -124,7 +128,7 @@ def test_names_and_numbers_belong_to_one_model(before: str, after: str, sentence
         other = other.replace('aliases = ["BOARD"]\n', "")
     if "1020" in other:
         other = other.replace('"Board-1"', '"Board-3"')
-    with pytest.raises(ValueError, match=r"is the|has (a|the)") as error:
+    with pytest.raises(ValueError, match="already") as error:
         add_device_table(other)
     assert sentence in str(error.value)
     assert add_device_table(BOARD) is device_table("BOARD"), "a process may load its plug-ins twice"
@@ -179,5 +183,5 @@ def test_boards_are_found_by_name_and_by_number() -> None:
     assert [each.model for each in devices_by_number(0x7400, 1.0)] == ["CM-740"]
     assert [each.model for each in devices_by_number(0x7400, 2.0)] == ["OpenCR"]
     assert devices_by_number(0, 2.0) == (), "the foot's number is none"
-    with pytest.raises(LookupError, match=r"speaks Protocol 1\.0, not Protocol 2\.0"):
+    with pytest.raises(LookupError, match=r"uses Protocol 1\.0, not Protocol 2\.0"):
         device_table("CM-730", 2.0)

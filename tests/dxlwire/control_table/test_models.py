@@ -30,7 +30,7 @@ def test_a_model_of_both_protocols_is_chosen_by_the_protocol() -> None:
     assert find_table("MX-28", 1.0).model_number == 29
     assert find_table("MX-28", 2.0).model_number == 30
     assert find_table("MX-28(2.0)").model_number == 30
-    with pytest.raises(LookupError, match=r"Protocol 1\.0 and with Protocol 2\.0: say which"):
+    with pytest.raises(LookupError, match=r"Protocol 1\.0 and 2\.0; give the protocol"):
         find_table("MX-28")
 
 
@@ -56,14 +56,14 @@ def test_names_that_mean_one_model_are_understood(name: str, model: str) -> None
 
 @pytest.mark.parametrize("name", ["XM430", "XL330", "XL", "XL-3", "AX", "XL430-W250-B", "T", "-", ""])
 def test_names_that_mean_several_models_or_none_are_not(name: str) -> None:
-    with pytest.raises(LookupError, match="no control table of the model"):
+    with pytest.raises(LookupError, match="no control table for the model"):
         find_table(name)
 
 
 def test_a_protocol_that_a_model_does_not_speak_is_named() -> None:
-    with pytest.raises(LookupError, match=r"AX-12A speaks Protocol 1\.0, not Protocol 2\.0"):
+    with pytest.raises(LookupError, match=r"AX-12A uses Protocol 1\.0, not Protocol 2\.0"):
         find_table("AX-12A", 2.0)
-    with pytest.raises(LookupError, match="no control table of the model 'AX-12B'"):
+    with pytest.raises(LookupError, match="no control table for the model 'AX-12B'"):
         find_table("AX-12B", 1.0)
 
 
@@ -87,15 +87,19 @@ def test_a_table_of_a_plug_in_is_found_by_name_and_number(mine: str) -> None:
 @pytest.mark.parametrize(
     ("old", "new", "complaint"),
     [
-        ('model = "Mine-1"', 'model = "AX-12+"', "name or the number of the AX-12A"),
-        ("model_number = 60001\n", "model_number = 12\n", "name or the number of the AX-12A"),
+        ('model = "Mine-1"', 'model = "AX-12+"', "is already used by the AX-12A"),
+        ("model_number = 60001\n", "model_number = 12\n", "is already used by the AX-12A"),
         ("model_number = 60001\n", "", "the entry 'model_number' is missing"),
-        ("protocol = 1.0\n", "protocol = 3.0\n", "protocol is 1.0 or 2.0, not 3.0"),
-        ('capabilities = ["sync_write"]', 'capabilities = ["telepathy"]', "cannot name: telepathy"),
+        ("protocol = 1.0\n", "protocol = 3.0\n", "protocol must be 1.0 or 2.0, not 3.0"),
+        (
+            'capabilities = ["sync_write"]',
+            'capabilities = ["telepathy"]',
+            "not allowed in a data file: telepathy",
+        ),
         (
             'tick = "1/1023 fraction", page = "Present Load',
             'tick = "1 V", page = "Present Load',
-            "present_load: its unit",
+            "present_load: the unit must be a fraction, A or Nm, not V",
         ),
     ],
 )
@@ -131,5 +135,5 @@ def test_a_file_takes_over_what_it_does_not_say() -> None:
 
 @pytest.mark.parametrize("entries", [{"a": {"extends": "b"}}, {"a": {"extends": "b"}, "b": {"extends": "a"}}])
 def test_a_file_that_extends_nothing_or_itself_is_refused(entries: dict[str, dict[str, str]]) -> None:
-    with pytest.raises(ValueError, match="cannot extend"):
+    with pytest.raises(ValueError, match="is not another control table"):
         resolve("a", entries)

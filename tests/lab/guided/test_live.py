@@ -226,7 +226,7 @@ def test_a_run_that_cannot_begin_says_why(place, stage):
         ROBOT.replace("port: sim", "port: /dev/no_such_port, adapter: {latency: 1 ms}")
     )
     plays = stage.Plays(lambda joint: iter([stage.sine(joint)]))
-    with pytest.raises(DxlrunError, match=r"^there is no /dev/no_such_port"):
+    with pytest.raises(DxlrunError, match=r"^port /dev/no_such_port not found"):
         run_on_robot(plays, ["gone.yaml", "pan"], ExperimentOptions(yes=True))
     (place / "wrong.yaml").write_text(ROBOT.replace("rate: 100", "rat: 100").replace("id: 7", "id: 3"))
     with pytest.raises(InputError) as caught:

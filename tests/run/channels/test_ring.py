@@ -162,7 +162,7 @@ def test_without_the_compiled_functions_there_is_no_ring(tmp_path, make, monkeyp
     shared_memory.library.cache_clear()
     for end in RingWriter, RingReader:
         with pytest.raises(
-            NotCompiled, match=r"^the compiled shared_memory is missing: install dxlrun again"
+            NotCompiled, match=r"^the compiled shared_memory is missing; install dxlrun again"
         ):
             end(descriptor)
 
