@@ -12,7 +12,7 @@ import pytest
 
 ROOT = Path(__file__).parents[1]
 MADE_UP = """
-from hypothesis import given, strategies as st
+from hypothesis import given, settings, strategies as st
 from tests.kit.campaigns import campaign
 
 EXAMPLES = []
@@ -34,8 +34,16 @@ def test_amount(amount):
 def test_property(value):
     EXAMPLES.append(value)
 
+@campaign(ci=5, night=6, release=7)
+@settings(deadline=None)
+@given(st.integers())
+def test_property_with_settings(value):
+    assert settings().deadline is None
+    EXAMPLES.append(value)
+
 def test_examples():
     print("examples", len(EXAMPLES))
+    print("drawn", EXAMPLES)
 """
 
 
@@ -60,7 +68,8 @@ def _run(tmp_path: Path):
 
 
 @pytest.mark.parametrize(
-    ("level", "passed", "amount", "examples"), [("ci", 5, 1.5, 5), ("night", 7, 2, 6), ("release", 8, 2, 7)]
+    ("level", "passed", "amount", "examples"),
+    [("ci", 6, 1.5, 10), ("night", 8, 2, 12), ("release", 9, 2, 14)],
 )
 def test_level_decides_the_counts(run, level: str, passed: int, amount: float, examples: int) -> None:
     output = run(f"--campaign={level}")
@@ -72,7 +81,7 @@ def test_level_decides_the_counts(run, level: str, passed: int, amount: float, e
 def test_seed_decides_what_is_drawn(run) -> None:
     drawn = [re.findall(r"^drawn .*", run(*words), re.MULTILINE) for words in ((), (), ("--seed", "2"))]
     assert drawn[0] == drawn[1]
-    assert len({*drawn[0], *drawn[2]}) == 4
+    assert len({*drawn[0], *drawn[2]}) == 6
 
 
 def test_table_has_every_campaign_and_runs_nothing(run) -> None:
@@ -83,5 +92,6 @@ def test_table_has_every_campaign_and_runs_nothing(run) -> None:
         ("2", "3", "4", "numbered"),
         ("0", "1", "1", "only_at_night"),
         ("5", "6", "7", "property"),
+        ("5", "6", "7", "property_with_settings"),
     ]
     assert "passed" not in output

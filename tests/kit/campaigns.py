@@ -4,8 +4,9 @@
     def test_storm_breaks_no_promise(number: int, chance: random.Random) -> None:
 
 A test with the argument `number` is one test for each number below the count. `amount` is the count itself,
-for a test that loops, or the length of a run. A property of hypothesis has so many examples. `chance` is a
-random generator that depends on the seed, the test and its parameters.
+for a test that loops, or the length of a run. A property of hypothesis has so many examples, drawn from the
+seed; `@settings` may have anything but their number. `chance` is a random generator that depends on the seed,
+the test and its parameters.
 
     pytest --campaign=night --seed 7 tests/simulation    # ci, night or release
     pytest --campaigns                                   # the table of all campaigns
@@ -21,7 +22,7 @@ from enum import StrEnum
 from typing import TypeVar
 
 import pytest
-from hypothesis import is_hypothesis_test, settings
+from hypothesis import is_hypothesis_test, seed, settings
 
 
 class Level(StrEnum):
@@ -34,7 +35,8 @@ class Level(StrEnum):
 
 Test = TypeVar("Test", bound=Callable[..., object])
 _LEVEL = [Level.CI]
-"""Level of this run, which is known before the tests are imported."""
+_SEED = [1]
+"""Level and seed of this run, which are known before the tests are imported."""
 
 
 def campaign(*, ci: float, night: float, release: float) -> Callable[[Test], Test]:
@@ -43,7 +45,11 @@ def campaign(*, ci: float, night: float, release: float) -> Callable[[Test], Tes
 
     def decorate(test: Test) -> Test:
         if is_hypothesis_test(test):
-            test = settings(max_examples=max(1, int(counts[_LEVEL[0]])))(test)
+            # `settings` refuses a test that has some, so its attribute is set
+            others = getattr(test, "_hypothesis_internal_use_settings", None)
+            examples = settings(others, max_examples=max(1, int(counts[_LEVEL[0]])))
+            vars(test)["_hypothesis_internal_use_settings"] = examples
+            test = seed(_SEED[0])(test)
         return pytest.mark.campaign(ci=ci, night=night, release=release)(test)
 
     return decorate
@@ -64,7 +70,7 @@ def count_of(node: pytest.Item | pytest.Metafunc, level: Level) -> float | None:
     """Return the count of a campaign at a level; None for a test that is not a campaign."""
     owner = node if isinstance(node, pytest.Item) else node.definition
     mark = owner.get_closest_marker("campaign")
-    return mark.kwargs[level.value] if mark else None
+    return mark.kwargs[level.value] if mark and mark.kwargs else None
 
 
 class Campaigns:
@@ -75,7 +81,7 @@ class Campaigns:
         self._seed: int = config.getoption("--seed")
         self._rows: dict[str, pytest.Item] = {}
         self._asked: bool = config.getoption("--campaigns")
-        _LEVEL[0] = self._level
+        _LEVEL[0], _SEED[0] = self._level, self._seed
         if self._asked:
             config.option.numprocesses = 0  # one process collects all
 
