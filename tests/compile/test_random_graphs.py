@@ -1,16 +1,16 @@
 """Random graphs: each accepted one runs as it is drawn, each refused one is refused for the reason there is.
 
-CI takes 50 from a fixed seed. The full campaign before a release:
+CI takes 50. The full campaign before a release:
 
-    DXLRUN_GRAPHS=10000 python -m pytest tests/compile/test_random_graphs.py -q --timeout 3600
+    pytest --campaign=release tests/compile/test_random_graphs.py
 
-What is right or wrong, the order, and what reaches the servos are computed here anew, from the lists that the
-robot file is written from, by brute force and without a line of the runtime's graph.
+What is right or wrong, the order, and what reaches the servos are computed here again, from the lists that
+the robot file is written from, by brute force and without a line of the runtime's graph.
 """
 
 from __future__ import annotations
 
-import os
+import random
 import re
 import struct
 from collections import Counter
@@ -21,9 +21,10 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from hypothesis import HealthCheck, Phase, settings
+from hypothesis import HealthCheck, Phase, seed, settings
 from hypothesis import given as given_
 from hypothesis import strategies as st
+from tests.kit.campaigns import campaign
 
 from dxlrun.compile.robot_compiler import compile_files
 from dxlrun.control.controllers.claims import ControllerSnapshot
@@ -32,7 +33,6 @@ from dxlrun.errors import InputError
 from dxlrun.plan.loop_plan import ControllerPlan
 from dxlrun.run.virtual_run import VirtualRobot
 
-GRAPHS = int(os.environ.get("DXLRUN_GRAPHS", "50"))
 CYCLES = 12
 RATE = 100
 JOINTS = ("j1", "j2", "j3")
@@ -521,17 +521,18 @@ def judge_run(graph: Graph, path: Path, own: dict[str, int], read: dict[str, lis
         assert 0 <= min(moved) <= max(moved) <= last
 
 
-@pytest.mark.campaign
-@pytest.mark.timeout(120 if GRAPHS <= 1000 else 7200)
-def test_a_graph_runs_as_it_is_drawn_or_is_refused_for_its_reason(part_plugins) -> None:
+@campaign(ci=50, night=1000, release=10_000)
+@pytest.mark.timeout(120)
+def test_a_graph_runs_as_it_is_drawn_or_is_refused_for_its_reason(
+    part_plugins, amount: float, chance: random.Random
+) -> None:
     path = Path("robot.yaml")
     outcomes = Counter[str]()
 
+    @seed(chance.getrandbits(64))
     @settings(
-        max_examples=GRAPHS,
+        max_examples=int(amount),
         deadline=None,
-        derandomize=True,
-        database=None,
         phases=[Phase.generate],  # a smaller find would take some hundred runs more
         suppress_health_check=list(HealthCheck),
     )
@@ -551,7 +552,7 @@ def test_a_graph_runs_as_it_is_drawn_or_is_refused_for_its_reason(part_plugins) 
 
     judge()
     print("\n" + "\n".join(f"{count:6d} {what}" for what, count in sorted(outcomes.items())))
-    assert outcomes["accepted"] > GRAPHS / 5
-    assert outcomes["refused"] > GRAPHS / 10
-    if GRAPHS >= 10_000:  # some are rare
+    assert outcomes["accepted"] > amount / 5
+    assert outcomes["refused"] > amount / 10
+    if amount >= 10_000:  # some are rare
         assert set(SENTENCES) <= set(outcomes)

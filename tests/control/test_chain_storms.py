@@ -1,24 +1,22 @@
 """Random graphs of controllers, switched at random while some of them fail: the invariants of every cycle.
 
-CI tries 120 graphs; `DXLRUN_CHAIN_STORMS=10000 pytest tests/control/test_chain_storms.py` tries more.
+CI tries 120 graphs; `pytest --campaign=release tests/control/test_chain_storms.py` tries more.
 """
 
 from __future__ import annotations
 
-import os
 import random
 
 import numpy as np
-import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
+from tests.kit.campaigns import campaign
 from tests.kit.loops import PERIOD_NS, Robot
 
 from dxlrun.channels.answers import Code, Completion
 from dxlrun.channels.event_records import EventCode
 from dxlwire.modes import Mode
 
-GRAPHS = int(os.environ.get("DXLRUN_CHAIN_STORMS", "120"))
 CYCLES = 40
 LATE = (Code.RUN_ENDING, Code.MODE_NOT_ENTERED, Code.SWITCHED_AGAIN, Code.CONTROLLER_FAULT)
 """Refusals of a switch that was begun."""
@@ -248,14 +246,14 @@ def storm(seed: int) -> Judge:
     return judge
 
 
-@pytest.mark.campaign
-@settings(max_examples=GRAPHS, deadline=None, derandomize=GRAPHS <= 1000, database=None)
+@campaign(ci=120, night=1000, release=10_000)
+@settings(deadline=None)
 @given(seed=st.integers(0, 10**9))
-def test_no_cycle_of_a_random_graph_breaks_the_invariants(seed):
+def test_each_cycle_of_a_random_graph_keeps_the_invariants(seed):
     storm(seed)
 
 
-def test_the_storms_do_what_they_are_there_for():
+def test_storms_have_switches_waits_refusals_and_faults():
     """Among some of them are switches that were done, that waited, that were refused, and fallbacks."""
     done = waited = refused = faults = 0
     for seed in range(40):

@@ -1,15 +1,14 @@
 """Long runs on an injected clock: the phase, the account of all periods, each controller's own rate, memory.
 
-CI runs a sample; `DXLRUN_CYCLES=1000000 python -m pytest tests/control/test_long_runs.py` runs them whole.
+CI runs 12 000 cycles; `pytest --campaign=release tests/control/test_long_runs.py` runs a million.
 """
 
 import gc
-import os
-import random
 import sys
 
 import numpy as np
 import pytest
+from tests.kit.campaigns import campaign
 from tests.kit.loops import PERIOD_NS, Robot, commanding, idle, on_update
 
 from dxlrun.control.schedule import MOST_CAUGHT_UP
@@ -20,7 +19,6 @@ from dxlrun_controllers.motions.joint_trajectory_controller import (
     TrajectoryParameters,
 )
 
-CYCLES = int(os.environ.get("DXLRUN_CYCLES", "12000"))
 RATES = (25.0, 50.0, 100.0, 200.0)
 OWN_NS = {"half": 80_000_000, "tenth": 200_000_000}
 """Periods of controllers with rates of their own: 12.5 and 5 Hz divide all of RATES."""
@@ -49,10 +47,11 @@ class Grid:
         self.before = (record.cycle, record.scheduled_ns, record.written_ns, paused)
 
 
-@pytest.mark.campaign
+@campaign(ci=12_000, night=100_000, release=1_000_000)
 @pytest.mark.parametrize("policy", ["skip", "catch_up"])
-def test_the_phase_is_kept_exactly_through_overruns_rates_and_pauses(policy):
-    robot, chance, last, grid = Robot(joints=3), random.Random(11), {}, Grid()
+def test_the_phase_is_kept_exactly_through_overruns_rates_and_pauses(policy, amount, chance):
+    robot, last, grid = Robot(joints=3), {}, Grid()
+    cycles = int(amount)
     counts = {"cycles": 0, "skipped": 0}
 
     def judge_period(context, time_ns, period_ns):
@@ -79,13 +78,13 @@ def test_the_phase_is_kept_exactly_through_overruns_rates_and_pauses(policy):
             robot.ask("rate", rate=chance.choice(RATES))
         elif dice < 0.004:
             robot.ask("resume" if robot.loop.steering.paused else "pause")
-        if counts["cycles"] == CYCLES:
+        if counts["cycles"] == cycles:
             robot.stop.request()
 
     robot.sink.append_cycle, robot.hardware.idle = append, before
     robot.hardware.work_ns = lambda: int(chance.expovariate(1 / 3e7)) if chance.random() < 0.05 else 1000
-    assert robot.loop.run().cycles == counts["cycles"] == CYCLES + 1
-    assert counts["skipped"] > CYCLES // 200
+    assert robot.loop.run().cycles == counts["cycles"] == cycles + 1
+    assert counts["skipped"] > cycles // 200
     assert grid.before[0] + 1 == counts["cycles"] + counts["skipped"]
 
 
@@ -123,11 +122,11 @@ def standard():
     return robot, idle
 
 
-@pytest.mark.campaign
+@campaign(ci=12_000, night=100_000, release=1_000_000)
 @pytest.mark.parametrize("made", [steered, standard])
-def test_memory_is_flat_and_nothing_is_collected(made):
+def test_memory_is_flat_and_nothing_is_collected(made, amount):
     robot, before = made()
-    cycles, marks = max(CYCLES, 12_000), []
+    cycles, marks = int(amount), []
     robot.build().keep_nothing()
 
     def idle_time(deadline_ns, time_ns):

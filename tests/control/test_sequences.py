@@ -1,17 +1,14 @@
 """Random sequences of steering: what is never allowed to happen, whatever a client asks for.
 
-CI runs a sample; `DXLRUN_SEQUENCES=10000 python -m pytest tests/control/test_sequences.py` runs them all.
+CI runs a sample; `pytest --campaign=release tests/control/test_sequences.py` runs them all.
 """
 
-import os
-
 import numpy as np
-import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
+from tests.kit.campaigns import campaign
 from tests.kit.loops import PERIOD_NS, Robot
 
-SEQUENCES = int(os.environ.get("DXLRUN_SEQUENCES", "60"))
 NAMES = ("a", "b", "c", "d", "none_such")
 JOINTS = {"a": ("j0",), "b": ("j1", "j2"), "c": ("j0", "j1", "j2"), "d": ("j2",), "x": ("j0",), "y": ("j1",)}
 
@@ -142,10 +139,10 @@ class Run:
         return {"c"} if self.broken else set()
 
 
-@pytest.mark.campaign
-@settings(max_examples=SEQUENCES, deadline=None, derandomize=SEQUENCES < 1000, database=None)
+@campaign(ci=60, night=1000, release=10_000)
+@settings(deadline=None)
 @given(sequence=sequences, overrun=st.sampled_from(["skip", "catch_up", "stop"]))
-def test_whatever_is_asked_claims_stay_single_and_only_active_controllers_command(sequence, overrun):
+def test_only_active_controllers_command_and_each_joint_has_one(sequence, overrun):
     run = Run(overrun)
     result = run.run(sequence)
     asked, answered = run.robot._asked, run.robot.refusals
