@@ -6,11 +6,11 @@ import os
 import re
 import subprocess
 import sys
-import threading
-import time
+from collections.abc import Callable
 from pathlib import Path
 
 import pytest
+from tests.kit import awaited
 
 ROOT = Path(__file__).parents[1]
 README = (ROOT / "README.md").read_text()
@@ -21,7 +21,6 @@ OWN_ROBOT = README[
     README.index("## Your own robot in five minutes") : README.index("## A robot file by hand")
 ]
 STEPS = [line.strip() for line in OWN_ROBOT.splitlines() if line.startswith("    dxlrun")]
-DEADLINE_S = 60.0
 
 
 def shell(line: str, directory: Path) -> subprocess.CompletedProcess[str]:
@@ -114,12 +113,11 @@ def test_a_robot_of_ones_own_from_scan_to_stop(clone: Path) -> None:
     def began(line: str) -> subprocess.Popen[str]:
         return subprocess.Popen(["/bin/bash", "-c", f"{ACTIVATE} && exec {line}"], **terminal(clone))
 
-    def until(done: object, process: subprocess.Popen[str]) -> None:
-        tick, give_up = threading.Event(), time.monotonic() + DEADLINE_S
-        while not done():
+    def until(done: Callable[[], object], process: subprocess.Popen[str]) -> None:
+        def lives() -> None:
             assert process.poll() is None, process.communicate()
-            assert time.monotonic() < give_up
-            tick.wait(0.05)
+
+        awaited.until(done, check=lives)
 
     def typed(step: str) -> str:
         done = shell(f"{ACTIVATE} && {step}", clone)
@@ -141,13 +139,13 @@ def test_a_robot_of_ones_own_from_scan_to_stop(clone: Path) -> None:
             assert "all_joints" in typed(listed)
             assert "all_joints" in typed(send)
             typed(stop)
-            out, err = robot.communicate(timeout=DEADLINE_S)
+            out, err = robot.communicate(timeout=awaited.DEADLINE_S)
         finally:
             robot.kill()
         assert robot.returncode == 0, (out, err)
     finally:
         servos.terminate()
-        servos.communicate(timeout=DEADLINE_S)
+        servos.communicate(timeout=awaited.DEADLINE_S)
 
 
 def test_the_robot_file_runs(clone: Path) -> None:

@@ -23,7 +23,7 @@ from platform import machine
 from types import ModuleType
 
 import pytest
-from tests.kit.awaited import until
+from tests.kit.awaited import DEADLINE_S, until
 from tests.kit.loaded import loaded
 
 pytestmark = pytest.mark.needs("release")
@@ -199,7 +199,7 @@ def test_demo_runs_from_the_wheels_in_an_empty_environment(
     (core,) = [path for path in built if path.stem.endswith(f"manylinux_2_17_{machine()}")]
 
     def install(wheel: Path) -> None:
-        subprocess.run([python, "-m", "pip", "install", "--quiet", wheel], check=True, timeout=400)
+        subprocess.run([python, "-m", "pip", "install", "--quiet", wheel], check=True, timeout=DEADLINE_S)
 
     def demo(*words: str) -> subprocess.Popen[str]:
         command = [python.with_name("dxlrun"), "demo", *words]
@@ -208,7 +208,7 @@ def test_demo_runs_from_the_wheels_in_an_empty_environment(
         )
 
     install(core)
-    said, _ = demo("--virtual").communicate(timeout=120)
+    said, _ = demo("--virtual").communicate(timeout=DEADLINE_S)
     assert "3 of 3 goals reached" in said, said
 
     install(built[-1])

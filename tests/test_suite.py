@@ -46,6 +46,73 @@ def test_every_test_has_a_limit(pytestconfig: pytest.Config) -> None:
     assert 0 < float(pytestconfig.getini("timeout")) <= 120
 
 
+CLOCKS = {"monotonic", "monotonic_ns", "perf_counter", "time", "time_ns"}
+DURATIONS = {
+    "tests/kit/awaited.py": "the deadline",
+    "tests/kit/hands.py": "a hand turns a servo for so long",
+    "tests/ros2/foreign.py": "runs in a ROS environment, without the kit",
+    "tests/run/test_pairs.py": "a pause that ends early; what is left is then ended by `dxlrun stop`",
+}
+"""Files with a loop that looks at a clock, and why."""
+
+
+def reads_clock(node: ast.AST) -> bool:
+    """Check for a call such as `time.monotonic()`."""
+    return any(
+        isinstance(call, ast.Call)
+        and isinstance(call.func, ast.Attribute)
+        and call.func.attr in CLOCKS
+        and getattr(call.func.value, "id", "") == "time"
+        for call in ast.walk(node)
+    )
+
+
+def deadlines(source: str) -> list[int]:
+    """Return the lines of loops that compare a clock, and of processes that are awaited for some seconds."""
+    found = []
+    for node in ast.walk(ast.parse(source)):
+        if isinstance(node, ast.While):
+            found += [
+                node.lineno for one in ast.walk(node) if isinstance(one, ast.Compare) and reads_clock(one)
+            ]
+        if isinstance(node, ast.Call) and isinstance(node.func, ast.Attribute):
+            given = {one.arg: one.value for one in node.keywords}
+            timeout = (
+                given.get("timeout") if node.func.attr in {"communicate", "run", "check_output"} else None
+            )
+            if node.func.attr == "wait" and re.search(r"process|child|ran\b", ast.unparse(node.func.value)):
+                timeout = node.args[0] if node.args else given.get("timeout")
+            if isinstance(timeout, ast.Constant) and timeout.value is not None:
+                found.append(node.lineno)
+    return found
+
+
+def test_deadlines_are_in_the_kit() -> None:
+    """A deadline of its own makes a test fail on a busy machine: `until` and DEADLINE_S of kit/awaited.py."""
+    texts = {
+        str(path.relative_to(ROOT)): path.read_text()
+        for path in ROOT.glob("tests/**/*.py")
+        if "bench" not in path.parts
+    }
+    found = {path: lines for path, text in texts.items() if (lines := deadlines(text))}
+    assert {path: lines for path, lines in found.items() if path not in DURATIONS} == {}
+    assert set(found) == set(DURATIONS)
+
+
+@pytest.mark.parametrize(
+    "source",
+    [
+        "while not ready() and time.monotonic() < end:\n    pass",
+        "while True:\n    assert time.time() < give_up",
+        "process.communicate(timeout=60)",
+        "run.process.wait(20)",
+        "subprocess.run(words, timeout=5.0)",
+    ],
+)
+def test_deadline_is_found(source: str) -> None:
+    assert deadlines(source) == [1]
+
+
 def test_packages_that_the_import_linter_does_not_see_import_only_the_faces() -> None:
     """They are distributions of their own, with a folder `src`, and need not be installed here."""
     house = loaded(ROOT / "tests/bench/house.py")

@@ -13,6 +13,7 @@ import zipfile
 from pathlib import Path
 
 import pytest
+from tests.kit.awaited import DEADLINE_S
 
 ROOT = Path(__file__).parents[1]
 NAMES = ("dxlrun_view", "dxlrun_ros2")
@@ -23,7 +24,9 @@ HATCHLING = (sys.executable, "-m", "hatchling")
 def hatchling(folder: Path, target: str, output: Path) -> Path:
     """Build a package; return the file."""
     command = [*HATCHLING, "build", "-t", target, "-d", str(output)]
-    built = subprocess.run(command, cwd=folder, capture_output=True, text=True, check=False, timeout=100)
+    built = subprocess.run(
+        command, cwd=folder, capture_output=True, text=True, check=False, timeout=DEADLINE_S
+    )
     assert built.returncode == 0, built.stdout + built.stderr
     return output / Path((built.stdout + built.stderr).split()[-1]).name
 
@@ -80,7 +83,7 @@ def test_an_sdist_keeps_the_version_without_its_tree(tmp_path: Path) -> None:
     sdist = hatchling(copy / "plugins/dxlrun_view", "sdist", tmp_path / "dist")
     shutil.unpack_archive(sdist, tmp_path / "elsewhere", filter="data")
     (unpacked,) = (tmp_path / "elsewhere").iterdir()
-    found = json.loads(subprocess.check_output([*HATCHLING, "metadata"], cwd=unpacked, timeout=100))
+    found = json.loads(subprocess.check_output([*HATCHLING, "metadata"], cwd=unpacked, timeout=DEADLINE_S))
     assert (found["version"], found["dependencies"]) == (OTHER, [f"dxlrun=={OTHER}"])
 
 
@@ -97,7 +100,7 @@ def pip_install(wheel: Path, site: Path, *options: str) -> subprocess.CompletedP
         *options,
         str(wheel),
     ]
-    return subprocess.run(command, capture_output=True, text=True, check=False, timeout=100)
+    return subprocess.run(command, capture_output=True, text=True, check=False, timeout=DEADLINE_S)
 
 
 def test_pip_does_not_install_a_package_without_its_version_of_dxlrun(
@@ -117,7 +120,7 @@ def started(name: str, site: Path) -> subprocess.CompletedProcess[str]:
     command = [sys.executable, "-P", "-c", f"import sys; {code}"]
     environment = os.environ | {"PYTHONPATH": str(site), "COLUMNS": "200"}
     return subprocess.run(
-        command, capture_output=True, text=True, check=False, env=environment, timeout=100, cwd=site
+        command, capture_output=True, text=True, check=False, env=environment, timeout=DEADLINE_S, cwd=site
     )
 
 

@@ -6,6 +6,7 @@ from importlib import metadata
 
 import pytest
 from tests.kit.answers import read_answer
+from tests.kit.awaited import DEADLINE_S
 
 from dxlrun.channels import c_sources
 from dxlrun.cli import inputs
@@ -217,7 +218,7 @@ def test_the_package_is_run_as_the_program() -> None:
         capture_output=True,
         text=True,
         check=False,
-        timeout=60,
+        timeout=DEADLINE_S,
     )
     assert ran.returncode == 2
     assert "none.yaml" in ran.stderr

@@ -11,7 +11,6 @@ import shutil
 import signal
 import subprocess
 import sys
-import time
 from collections.abc import Callable
 from contextlib import nullcontext, suppress
 from pathlib import Path
@@ -21,6 +20,7 @@ import numpy as np
 import pytest
 from msgspec.structs import replace
 from tests.kit.answers import read_answer, result_of
+from tests.kit.awaited import DEADLINE_S, until
 from tests.kit.pages import page_text
 
 from dxlrun.log.log_reader import read_log
@@ -183,15 +183,13 @@ def test_what_was_measured_is_kept(tmp_path: Path, kill: bool) -> None:
     with subprocess.Popen(
         [sys.executable, "-c", COMMAND, *words], stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True
     ) as running:
-        limit = time.monotonic() + 60
-        while not measuring(running.pid) and time.monotonic() < limit:
-            time.sleep(0.02)
+        until(lambda: measuring(running.pid))
         if kill:
             children = Path(f"/proc/{running.pid}/task/{running.pid}/children").read_text().split()
             os.kill(int(children[0]), signal.SIGKILL)
         else:
             os.kill(running.pid, signal.SIGTERM)  # as Ctrl-C
-        shown, errors = running.communicate(timeout=60)
+        shown, errors = running.communicate(timeout=DEADLINE_S)
     result = result_of(shown)
     (one,) = result["conditions"]
     assert one["wake_ups"] > 10

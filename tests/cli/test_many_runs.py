@@ -11,6 +11,7 @@ from types import ModuleType
 
 import numpy as np
 import pytest
+from tests.kit.awaited import DEADLINE_S
 from tests.kit.pages import page_text
 
 from dxlrun.testing import read_log, simulated_robot
@@ -27,7 +28,12 @@ def test_program_ranks_the_runs_by_tracking_error(tmp_path: Path) -> None:
     assert count == 1
     (tmp_path / "gains.py").write_text(small)
     ran = subprocess.run(
-        [sys.executable, "gains.py"], cwd=tmp_path, capture_output=True, text=True, timeout=100, check=False
+        [sys.executable, "gains.py"],
+        cwd=tmp_path,
+        capture_output=True,
+        text=True,
+        timeout=DEADLINE_S,
+        check=False,
     )
     assert ran.returncode == 0, ran.stderr
     refused = [line for line in ran.stdout.splitlines() if line.startswith("{")]

@@ -13,6 +13,7 @@ import sys
 from pathlib import Path
 
 import pytest
+from tests.kit.awaited import DEADLINE_S
 from tests.kit.pages import PATHS
 
 ROOT = Path(__file__).parents[2]
@@ -38,7 +39,7 @@ def words(path: Path) -> list[str]:
 @pytest.mark.parametrize("name", [*SAME, *OTHERS])
 def test_picture_can_be_made(tmp_path: Path, name: str) -> None:
     make = [sys.executable, PICTURES / "make.py", name, "--into", tmp_path, "--virtual"]
-    ran = subprocess.run(make, check=False, capture_output=True, text=True, timeout=280)
+    ran = subprocess.run(make, check=False, capture_output=True, text=True, timeout=DEADLINE_S)
     assert ran.returncode == 0, ran.stderr
     made = words(tmp_path / f"{name}.svg")
     assert made

@@ -20,6 +20,7 @@ from pathlib import Path
 
 import pytest
 from tests.kit.answers import read_answer, result_of
+from tests.kit.awaited import DEADLINE_S
 from tests.kit.pages import page_text
 
 from dxlsim.bus.ledger import read_ledger
@@ -27,7 +28,6 @@ from dxlsim.bus.ledger import read_ledger
 CODE = "import sys; from dxlrun.cli import main; sys.exit(main(sys.argv[1:]))"
 OWN_TERMINAL = "import fcntl, termios; fcntl.ioctl(0, termios.TIOCSCTTY, 0)"
 """As a shell does it, so that Ctrl-C is a signal."""
-PATIENCE_S = 60.0
 """How long a test waits for what must come; it decides nothing but when to give up."""
 PING_1 = bytes.fromhex("ff ff fd 00 01 03 00 01 19 4e")
 PONG_1 = bytes.fromhex("ff ff fd 00 01 07 00 55 00 24 04 2d")
@@ -60,7 +60,7 @@ class Sim:
     def line(self) -> str:
         """Return the next line that it says."""
         while b"\n" not in self._said:
-            assert select.select([self._out], [], [], PATIENCE_S)[0], f"it says no more after {self._said!r}"
+            assert select.select([self._out], [], [], DEADLINE_S)[0], f"it says no more after {self._said!r}"
             piece = os.read(self._out.fileno(), 65536)
             assert piece, self.process.communicate()[1]
             self._said += piece
@@ -73,7 +73,7 @@ class Sim:
 
     def end(self) -> tuple[int, str, str]:
         """Return exit code, what was not read yet, and the errors, when it has ended."""
-        out, err = self.process.communicate(timeout=PATIENCE_S)
+        out, err = self.process.communicate(timeout=DEADLINE_S)
         return self.process.returncode, (self._said + out).decode(), err.decode()
 
     def stop(self, number: signal.Signals = signal.SIGINT) -> tuple[int, str, str]:
@@ -107,7 +107,7 @@ def hear(path: Path | str, ask: bytes, size: int) -> bytes:
         os.write(port, ask)
         heard = b""
         while len(heard) < size:
-            assert select.select([port], [], [], PATIENCE_S)[0], f"only {heard.hex(' ')} came"
+            assert select.select([port], [], [], DEADLINE_S)[0], f"only {heard.hex(' ')} came"
             heard += os.read(port, 256)
         return heard
     finally:
@@ -264,7 +264,7 @@ def test_a_front_that_is_killed_leaves_no_link(start, tmp_path):
     ended = os.pidfd_open(int(child))
     sim.process.kill()
 
-    assert select.select([ended], [], [], PATIENCE_S)[0]
+    assert select.select([ended], [], [], DEADLINE_S)[0]
     os.close(ended)
     assert not os.path.lexists(tmp_path / "robot")
 
@@ -299,7 +299,7 @@ def test_on_a_terminal_a_table_lives_and_letters_are_shown(tmp_path):
         def until(pattern: str) -> None:
             nonlocal shown
             while not re.search(pattern, shown):
-                assert select.select([terminal], [], [], PATIENCE_S)[0], shown
+                assert select.select([terminal], [], [], DEADLINE_S)[0], shown
                 shown += re.sub(r"\x1b\[[0-9;?]*[A-Za-z]", "", os.read(terminal, 65536).decode())
 
         until(r"2 +XL430-W250 +limp +\S+ +180\.0")
@@ -317,5 +317,5 @@ def test_on_a_terminal_a_table_lives_and_letters_are_shown(tmp_path):
         until(r"2 +XL430-W250 .* 0x20")
         os.write(terminal, b"\x03")  # Ctrl-C is a signal here as everywhere
         until("simulation: ended after")
-        assert process.wait(PATIENCE_S) == 0
+        assert process.wait(DEADLINE_S) == 0
         assert termios.tcgetattr(terminal)[3] & termios.ECHO  # as it was before

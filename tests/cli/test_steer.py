@@ -10,13 +10,12 @@ import shutil
 import signal
 import subprocess
 import sys
-import threading
-import time
 from collections.abc import Iterator
 from pathlib import Path
 
 import pytest
 from tests.kit.answers import read_answer, result_of
+from tests.kit.awaited import DEADLINE_S, until
 from tests.kit.pages import page_text
 
 from dxlrun import DxlrunError, GoalState, GoalTimeout, RemoteRobot, connect, running
@@ -27,7 +26,6 @@ ROOT = Path(__file__).parents[2]
 PAGE = page_text("steering.md")
 TORSO = ROOT / "robots" / "bioloid_torso.yaml"
 CODE = "import sys; from dxlrun.cli import main; sys.exit(main())"
-DEADLINE_S = 60.0
 
 
 class Stage:
@@ -54,11 +52,12 @@ class Stage:
                 stdout=said,
                 stderr=said,
             )
-        tick, give_up = threading.Event(), time.monotonic() + DEADLINE_S
-        while not running():
-            assert self.process.poll() is None, self.said
-            assert time.monotonic() < give_up, self.said
-            tick.wait(0.05)
+        process = self.process
+
+        def lives() -> None:
+            assert process.poll() is None, self.said
+
+        until(running, lambda: self.said, check=lives)
 
     def ended(self) -> int:
         """Return the exit code of the torso that ran."""
@@ -111,15 +110,10 @@ def controllers(robot: RemoteRobot) -> dict[str, dict[str, object]]:
     return {one["name"]: one for one in printed}
 
 
-def until(robot: RemoteRobot, joint: str, goal: float) -> None:
+def until_sent(robot: RemoteRobot, joint: str, goal: float) -> None:
     """Wait until a joint is sent to `goal`, rad, within half a tick."""
-    tick, give_up, joints = threading.Event(), time.monotonic() + DEADLINE_S, None
-    while time.monotonic() < give_up:
-        joints = robot.states()
-        if joints.joint(joint)["goal_position"] == pytest.approx(goal, abs=0.003):
-            return
-        tick.wait(0.01)
-    raise AssertionError(f"{joint} was never sent to {goal}: {joints}")
+    near = pytest.approx(goal, abs=0.003)
+    until(lambda: robot.states().joint(joint)["goal_position"] == near, robot.states)
 
 
 # Looking
@@ -174,8 +168,8 @@ def test_a_robot_that_has_ended_is_an_error(
 def test_send_moves_the_joints_that_are_named_with_units(dxlrun, torso: RemoteRobot) -> None:
     said = dxlrun("send", "head", "posvel", "positions=[20 deg, -30 deg]", "velocities=[1 rad/s, 30 rpm]")
     assert said == (0, "bioloid_torso: head accepted posvel\n", "")
-    until(torso, "head_yaw_joint", -0.5236)
-    until(torso, "head_pitch_joint", 0.3491)
+    until_sent(torso, "head_yaw_joint", -0.5236)
+    until_sent(torso, "head_pitch_joint", 0.3491)
 
 
 def test_a_register_is_set_while_the_robot_runs(dxlrun, torso: RemoteRobot) -> None:
@@ -225,10 +219,7 @@ def test_ctrl_c_at_a_terminal_that_waits_cancels_the_goal(torso: RemoteRobot, st
     waiting = subprocess.Popen(
         [sys.executable, "-P", "-c", CODE, *words], stderr=subprocess.PIPE, stdout=subprocess.PIPE, text=True
     )
-    tick, give_up = threading.Event(), time.monotonic() + DEADLINE_S
-    while len(torso.goals()) == before:
-        assert time.monotonic() < give_up
-        tick.wait(0.02)
+    until(lambda: len(torso.goals()) > before)
     goal = torso.goals()[-1]
     assert (goal.status, goal.controller) == ("running", "left_arm")
     waiting.send_signal(signal.SIGINT)
@@ -259,7 +250,7 @@ def test_a_motion_is_played_into_a_robot_that_runs(dxlrun, torso: RemoteRobot, t
     said = dxlrun("play", file, "--json")
     result = result_of(said.out)
     assert (said.code, result["status"], result["controller"]) == (0, "reached", "head")
-    until(torso, "head_yaw_joint", 0.1745)
+    until_sent(torso, "head_yaw_joint", 0.1745)
     torso.switch(deactivate=["head"])
     said = dxlrun("play", file)
     assert (said.code, said.errors) == (
@@ -333,7 +324,7 @@ def test_send_takes_a_file(dxlrun, torso: RemoteRobot, tmp_path: Path) -> None:
     done = result_of(said.out)
     assert (said.code, said.err, done["robot"]) == (0, "", "bioloid_torso")
     assert done["cycle"] > 0
-    until(torso, "left_elbow_joint", 0.1745)
+    until_sent(torso, "left_elbow_joint", 0.1745)
 
 
 def test_a_command_is_one_request(dxlrun, torso: RemoteRobot, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -486,10 +477,7 @@ def test_the_log_names_the_command_of_the_terminal(dxlrun, torso: RemoteRobot) -
     last = torso.events()["last"]
     assert dxlrun("rate", "60").code == 0
 
-    tick, give_up, texts = threading.Event(), time.monotonic() + DEADLINE_S, []
-    while not texts and time.monotonic() < give_up:
-        texts = [one["text"] for one in torso.events(last)["events"] if one["name"] == "steered"]
-        tick.wait(0.01)
+    texts = until(lambda: [one["text"] for one in torso.events(last)["events"] if one["name"] == "steered"])
     assert len(texts) == 1
     assert texts[0].endswith("from dxlrun rate")
 

@@ -19,7 +19,7 @@ from typing import Any
 
 import numpy as np
 import pytest
-from tests.kit.awaited import until
+from tests.kit.awaited import DEADLINE_S, until
 from tests.kit.pages import page_text
 
 from dxlrun.testing import read_log
@@ -101,7 +101,7 @@ class Reader:
             self.printed = [PROGRESS.sub("", said.err + said.out)]  # a warning is above the result
             if words == ["stop"]:
                 robot = self.running.pop()
-                out, _ = robot.communicate(timeout=100)
+                out, _ = robot.communicate(timeout=DEADLINE_S)
                 assert robot.returncode == 0 or any(delay in out for delay in DELAYS), out
                 self.printed.append(None if robot.returncode else out)
             return said.out + said.err

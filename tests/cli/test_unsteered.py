@@ -11,6 +11,7 @@ from contextlib import ExitStack
 from pathlib import Path
 
 import pytest
+from tests.kit.awaited import DEADLINE_S
 
 from dxlrun.channels.heartbeat import GatewayAvailability, Phase
 
@@ -56,7 +57,7 @@ def test_a_loop_without_the_rest_of_its_run_is_named_and_ended(dxlrun, orphan: B
     assert dxlrun("halt", "--robot", "lonely_arm") == (1, "", named)
     ended = f"lonely_arm has ended; it could not be steered: {problem}\n"
     assert dxlrun("stop") == (0, ended, "")
-    assert loop.wait(60) == 0
+    assert loop.wait(DEADLINE_S) == 0
     assert "no robot runs" in dxlrun("list").out
 
 
@@ -118,7 +119,7 @@ def test_a_stopped_loop_is_continued_to_its_end(dxlrun, orphan: Begin) -> None:
     said = dxlrun("stop", "--robot", "held_arm")
     assert said.code == 0, said.err
     assert f"its loop (process {loop.pid}) is stopped" in said.out
-    assert loop.wait(60) == 0
+    assert loop.wait(DEADLINE_S) == 0
 
 
 STOPPED_SUPERVISOR = """\
@@ -163,7 +164,7 @@ def test_a_run_of_another_runtime_directory_is_ended_by_name_only(
     assert "no robot runs that can be steered" in dxlrun("stop").err
     assert "far_arm" not in dxlrun("list").err
     assert dxlrun("stop", "--robot", "far_arm").code == 0
-    assert loop.wait(60) == 0
+    assert loop.wait(DEADLINE_S) == 0
 
 
 def test_several_runs_are_not_ended_without_a_name(dxlrun, orphan: Begin) -> None:

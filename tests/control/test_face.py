@@ -4,6 +4,7 @@ import subprocess
 import sys
 
 import pytest
+from tests.kit.awaited import DEADLINE_S
 
 import dxlrun
 
@@ -24,6 +25,6 @@ def test_an_unknown_name_is_an_attribute_error():
 def test_importing_it_loads_neither_numpy_nor_pydantic(module):
     script = f"import sys, {module}; print([m for m in ('numpy', 'pydantic', 'pluggy') if m in sys.modules])"
     done = subprocess.run(
-        [sys.executable, "-c", script], capture_output=True, text=True, check=True, timeout=60
+        [sys.executable, "-c", script], capture_output=True, text=True, check=True, timeout=DEADLINE_S
     )
     assert done.stdout.strip() == "[]"

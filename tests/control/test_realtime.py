@@ -12,6 +12,7 @@ import sys
 import threading
 
 import pytest
+from tests.kit.awaited import DEADLINE_S
 
 from dxlrun.control import realtime_grants
 from dxlrun.control.realtime_grants import Pacing, overshoot_ns
@@ -264,7 +265,7 @@ def test_a_sleep_never_wakes_early():
 def outcome(script):
     """Run a script in a process of its own; return what it printed as JSON."""
     done = subprocess.run(
-        [sys.executable, "-c", script], capture_output=True, text=True, check=False, timeout=60
+        [sys.executable, "-c", script], capture_output=True, text=True, check=False, timeout=DEADLINE_S
     )
     assert done.stderr == ""
     return json.loads(done.stdout)

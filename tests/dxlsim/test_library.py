@@ -11,13 +11,13 @@ import re
 import signal
 import subprocess
 import sys
-import time
 from importlib import import_module
 from pathlib import Path
 from types import FunctionType
 
 import pytest
 import serial
+from tests.kit.awaited import DEADLINE_S, until
 
 import dxlsim
 from dxlsim import ServedBus, read_ledger, serve_bus
@@ -122,9 +122,7 @@ def test_device_of_an_unplugged_adapter_has_no_path_until_it_is_back() -> None:
     with serve_bus("XL430-W250:1") as bus:
         before = bus.path
         bus.inject("unplug for=50ms")
-        deadline = time.monotonic() + 20.0
-        while bus.path in ("", before) and time.monotonic() < deadline:
-            time.sleep(0.01)
+        until(lambda: bus.path not in ("", before))
         assert len(ping(bus)) == 14
 
 
@@ -138,7 +136,7 @@ def test_fault_that_cannot_happen_is_refused(fault: str) -> None:
 
 def program(*words: str) -> subprocess.CompletedProcess[str]:
     command = [sys.executable, "-m", "dxlsim", *words]
-    return subprocess.run(command, capture_output=True, text=True, timeout=60, check=False)
+    return subprocess.run(command, capture_output=True, text=True, timeout=DEADLINE_S, check=False)
 
 
 @pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
@@ -155,7 +153,7 @@ def test_program_serves_until_a_signal(tmp_path: Path, number: signal.Signals) -
             port.write(PING_1)
             assert len(port.read(14)) == 14
         served.send_signal(number)
-        assert served.wait(60) == 0
+        assert served.wait(DEADLINE_S) == 0
     assert not link.is_symlink()
     assert [entry.data for entry in read_ledger(ledger) if entry.direction == "in"] == [PING_1]
 

@@ -4,12 +4,11 @@ import os
 import select
 
 import pytest
+from tests.kit.awaited import DEADLINE_S
 
 from dxlwire.exceptions import PortError
 from dxlwire.port.ports import SerialPort, SerialPorts
 from dxlwire.port.reopening import KeptLines, LineSettings, lasting_name
-
-PATIENCE_S = 60.0
 
 
 class Adapter:
@@ -30,7 +29,7 @@ class Adapter:
         self._point()
 
     def heard(self):
-        assert select.select([self.master], [], [], PATIENCE_S)[0]
+        assert select.select([self.master], [], [], DEADLINE_S)[0]
         return os.read(self.master, 100)
 
     def _point(self):
@@ -53,7 +52,7 @@ def kept(adapters):
 
 
 def returned(lines):
-    assert select.select([lines], [], [], PATIENCE_S)[0]
+    assert select.select([lines], [], [], DEADLINE_S)[0]
     return [one.index for one in lines.returned()]
 
 

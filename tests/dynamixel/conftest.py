@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 
 import pytest
+from tests.kit.awaited import DEADLINE_S
 from tests.kit.bus_process import started
 
 from dxlsim.bus.ledger import read_ledger
@@ -23,7 +24,7 @@ def simulated_line(tmp_path):
 
         def finish():
             ours.close()
-            assert child.wait(60) == 0
+            assert child.wait(DEADLINE_S) == 0
             return read_ledger(ledger)
 
         return json.loads(ours.recv(4096))["ports"][bus.name], finish

@@ -14,7 +14,7 @@ from typing import Any
 
 import pytest
 from dynamixel_sdk import PortHandler
-from tests.foreign.patience import PATIENCE_S
+from tests.kit.awaited import DEADLINE_S
 from tests.kit.bus_process import started
 
 from dxlsim.bus.ledger import LedgerEntry, read_ledger
@@ -29,7 +29,7 @@ class Simulation:
         self._refusals: Counter[str] = Counter()
         self._hasty: set[str] = set()
         self._child, self._control = started(buses, ledger=str(ledger))
-        self._control.settimeout(PATIENCE_S)
+        self._control.settimeout(DEADLINE_S)
         self._said = self._control.makefile("rb")
         first = self._said.readline()
         self.ports: dict[str, str] = json.loads(first)["ports"] if first else {}
@@ -57,7 +57,7 @@ class Simulation:
         try:
             self._said.close()
             self._control.close()
-            assert self._child.wait(PATIENCE_S) == 0
+            assert self._child.wait(DEADLINE_S) == 0
         finally:
             self._child.kill()
             self._child.wait()
@@ -95,7 +95,7 @@ class PatientPort(PortHandler):
 
     def __init__(self, port_name: str) -> None:
         super().__init__(port_name)
-        self.patience_ms = PATIENCE_S * 1000
+        self.patience_ms = DEADLINE_S * 1000
         """How long it waits for an answer; a test of silence makes it short."""
         self.wanted: int | None = None
         """So many bytes end the next wait for all that may answer, which lasts 0.8 s otherwise."""

@@ -5,7 +5,6 @@ A terminal has the rate that a host gives it, and servos at another one hear not
 
 from __future__ import annotations
 
-import time
 from typing import Any
 
 import pytest
@@ -18,7 +17,7 @@ from dynamixel_sdk import (
     Protocol1PacketHandler,
     Protocol2PacketHandler,
 )
-from tests.foreign.patience import PATIENCE_S
+from tests.kit.awaited import DEADLINE_S, until
 
 from dxlsim.simulation_plan import AdapterConfig, BusConfig, ServoConfig
 
@@ -79,18 +78,18 @@ def test_an_echo_passes_for_an_answer_in_protocol_1(open_port: Any) -> None:
 
 @pytest.mark.parametrize("kind", [each for each in ADAPTERS if each != "echo"])
 def test_rustypot_reads_and_writes_in_both_protocols(simulation: Any, kind: str) -> None:
-    x_bus = rustypot.Xl430PyController(simulation.ports[f"{kind} 2"], RATE, PATIENCE_S)
+    x_bus = rustypot.Xl430PyController(simulation.ports[f"{kind} 2"], RATE, DEADLINE_S)
     assert x_bus.sync_read_register(list(range(1, 7)), "model_number") == [1020] * 6
     assert x_bus.write_register_with_error(1, "led", 1) == 0
     x_bus.close()
-    mx_bus = rustypot.MxPyController(simulation.ports[f"{kind} 1"], RATE, PATIENCE_S)
+    mx_bus = rustypot.MxPyController(simulation.ports[f"{kind} 1"], RATE, DEADLINE_S)
     assert mx_bus.read_register_with_error(2, "model_number") == (29, 0)
     assert mx_bus.write_register_with_error(2, "led", 1) == 0
     mx_bus.close()
 
 
 def test_after_an_absent_servo_the_others_are_silent(simulation: Any) -> None:
-    with serial.Serial(simulation.ports["silent"], RATE, timeout=PATIENCE_S) as port:
+    with serial.Serial(simulation.ports["silent"], RATE, timeout=DEADLINE_S) as port:
         port.write(SYNC_READ_OF_1_9_2)
         assert port.read(13)[4] == 1
         port.timeout = 0.05
@@ -98,7 +97,7 @@ def test_after_an_absent_servo_the_others_are_silent(simulation: Any) -> None:
 
 
 def test_after_an_absent_servo_the_others_answer_in_their_slots(simulation: Any) -> None:
-    with serial.Serial(simulation.ports["slot"], RATE, timeout=PATIENCE_S) as port:
+    with serial.Serial(simulation.ports["slot"], RATE, timeout=DEADLINE_S) as port:
         port.write(SYNC_READ_OF_1_9_2)
         answers = port.read(26)
         assert (answers[4], answers[17]) == (1, 2)
@@ -111,7 +110,6 @@ def ask_again(port: serial.Serial) -> bytes:
 
 
 def test_a_host_at_another_rate_is_not_heard_until_it_finds_the_right_one(simulation: Any) -> None:
-    deadline = time.monotonic() + PATIENCE_S
     with serial.Serial(simulation.ports["strange"], 38_400, timeout=0.05) as port:
         answers = []
         for rate in (38_400, 1_000_000, 4_500_000):
@@ -121,8 +119,7 @@ def test_a_host_at_another_rate_is_not_heard_until_it_finds_the_right_one(simula
         assert answers == [b"", b"", b""]
         simulation.expect_haste("strange")  # what it wrote last may be read at the next rate
         port.baudrate = 57_600
-        while (answer := ask_again(port)) == b"":
-            assert time.monotonic() < deadline
+        answer = until(lambda: ask_again(port))
         assert answer.startswith(b"\xff\xff\xfd\x00\x01")
 
 
@@ -133,6 +130,6 @@ def test_a_host_that_sets_no_rate_has_that_of_the_bus(simulation: Any) -> None:
 
 
 def test_a_rate_within_three_percent_is_near_enough(simulation: Any) -> None:
-    with serial.Serial(simulation.ports["odd"], 56_500, timeout=PATIENCE_S) as port:
+    with serial.Serial(simulation.ports["odd"], 56_500, timeout=DEADLINE_S) as port:
         port.write(PING)
         assert len(port.read(14)) == 14

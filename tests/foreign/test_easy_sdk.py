@@ -16,7 +16,7 @@ from dynamixel_easy_sdk import (
     ProfileConfiguration,
     connector,
 )
-from tests.foreign.patience import PATIENCE_S, until
+from tests.kit.awaited import DEADLINE_S, until
 
 from dxlsim.simulation_plan import BusConfig, ServoConfig
 from dxlwire.control_table import all_tables, find_table
@@ -166,5 +166,5 @@ def test_a_factory_reset_but_for_id_and_rate_leaves_the_servo_there(connect: Any
             return False
 
     assert until(answers)
-    bus._port_handler.patience_ms = PATIENCE_S * 1000
+    bus._port_handler.patience_ms = DEADLINE_S * 1000
     assert motor.getMinPositionLimit() == 0

@@ -12,7 +12,7 @@ from dynamixel_sdk import (
     Protocol1PacketHandler,
     Protocol2PacketHandler,
 )
-from tests.foreign.patience import PATIENCE_S, until
+from tests.kit.awaited import DEADLINE_S, until
 
 from dxlsim.simulation_plan import BusConfig, ServoConfig
 
@@ -80,7 +80,7 @@ def test_a_reboot_ends_a_shutdown(open_port: Any, simulation: Any) -> None:
     assert sdk.reboot(port, 2)[0] == COMM_SUCCESS
     port.patience_ms = 30.0
     assert until(lambda: sdk.ping(port, 2) == (1020, COMM_SUCCESS, 0))
-    port.patience_ms = PATIENCE_S * 1000
+    port.patience_ms = DEADLINE_S * 1000
     assert sdk.write1ByteTxRx(port, 2, TORQUE, 1) == (COMM_SUCCESS, 0)
 
 
@@ -123,5 +123,5 @@ def test_one_spoilt_answer_is_seen_and_the_next_is_good(
     if fault != "corrupt servo=1":
         port.patience_ms = 30.0 if result == COMM_RX_TIMEOUT else 300.0
     assert sdk.readTxRx(port, 1, 3 if protocol == 1 else 7, 1)[1] == result
-    port.patience_ms = PATIENCE_S * 1000
+    port.patience_ms = DEADLINE_S * 1000
     assert sdk.readTxRx(port, 1, 3 if protocol == 1 else 7, 1) == ([1], COMM_SUCCESS, 0)

@@ -7,13 +7,12 @@ answered; what is answered never depends on the pieces.
 from __future__ import annotations
 
 import random
-import time
 from collections.abc import Iterator
 from typing import Any
 
 import pytest
 import serial
-from tests.foreign.patience import PATIENCE_S
+from tests.kit.awaited import DEADLINE_S, until
 from tests.kit.packets import crc, packet1, packet2
 
 from dxlsim.simulation_plan import BusConfig, ServoConfig
@@ -55,7 +54,7 @@ def open_serial(simulation: Any) -> Iterator[Any]:
     opened: list[serial.Serial] = []
 
     def open_bus(name: str) -> serial.Serial:
-        opened.append(serial.Serial(simulation.ports[name], RATE, timeout=PATIENCE_S))
+        opened.append(serial.Serial(simulation.ports[name], RATE, timeout=DEADLINE_S))
         return opened[-1]
 
     yield open_bus
@@ -75,16 +74,16 @@ def status2(port: serial.Serial) -> bytes:
 
 def insist(port: serial.Serial, data: bytes, size: int, count: int) -> bytes:
     """Send bytes in pieces of a size until so many bytes answer them, and nothing more."""
-    deadline = time.monotonic() + PATIENCE_S
     port.timeout = 0.1
-    while time.monotonic() < deadline:
+
+    def answered() -> bytes | None:
         port.reset_input_buffer()
         for start in range(0, len(data), size):
             port.write(data[start : start + size])
         answer = bytes(port.read(count))
-        if len(answer) == count:
-            return answer
-    raise AssertionError("no answer")
+        return answer if len(answer) == count else None
+
+    return until(answered, "the answer")
 
 
 @pytest.mark.parametrize("size", [1, 2, 3, 7, 9])

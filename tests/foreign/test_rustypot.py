@@ -7,7 +7,7 @@ from typing import Any
 
 import pytest
 import rustypot
-from tests.foreign.patience import PATIENCE_S, until
+from tests.kit.awaited import DEADLINE_S, until
 
 from dxlsim.simulation_plan import BusConfig, ServoConfig
 from dxlwire.control_table import find_table
@@ -52,7 +52,7 @@ def connect(simulation: Any) -> Iterator[Callable[[str, str], Any]]:
 
     def open_bus(name: str, kind: str) -> Any:
         controller = getattr(rustypot, f"{kind}PyController")
-        opened.append(controller(simulation.ports[name], RATE, PATIENCE_S))
+        opened.append(controller(simulation.ports[name], RATE, DEADLINE_S))
         return opened[-1]
 
     yield open_bus
@@ -150,18 +150,18 @@ def test_a_reboot_and_a_factory_reset_are_answered(connect: Any, simulation: Any
     assert servo.reboot(1)
     servo.set_timeout(0.05)
     assert until(lambda: bool(servo.ping(1)))
-    servo.set_timeout(PATIENCE_S)
+    servo.set_timeout(DEADLINE_S)
     assert (servo.read_register(1, "led"), servo.read_register(1, "return_delay_time")) == (0, 0)
     servo.factory_reset(1)
     servo.set_timeout(0.05)
     assert until(lambda: bool(servo.ping(1)))
-    servo.set_timeout(PATIENCE_S)
+    servo.set_timeout(DEADLINE_S)
     assert servo.read_register(1, "return_delay_time") == 250
 
 
 def test_servos_of_two_kinds_share_a_line(simulation: Any) -> None:
     kinds = {1: rustypot.Xl430PyController.definition(), 2: rustypot.Xl330PyController.definition()}
-    with rustypot.Bus(simulation.ports["mixed"], RATE, PATIENCE_S, kinds) as bus:
+    with rustypot.Bus(simulation.ports["mixed"], RATE, DEADLINE_S, kinds) as bus:
         assert all(abs(each - 1304) <= 1 for each in bus.sync_read_register([1, 2], "present_position"))
         assert bus.set_torque([1, 2], True) == {}
         bus.sync_write_register([1, 2], "goal_position", [1400, 1200])
@@ -173,7 +173,7 @@ def test_servos_of_two_kinds_share_a_line(simulation: Any) -> None:
 def test_a_servo_is_given_a_new_id_and_a_new_rate_and_is_found_there(simulation: Any) -> None:
     simulation.expect_haste("moved")
     one, other = rustypot.Xl430PyController.definition(), rustypot.Xl330PyController.definition()
-    with rustypot.Bus(simulation.ports["moved"], RATE, PATIENCE_S, {1: one, 2: other}) as bus:
+    with rustypot.Bus(simulation.ports["moved"], RATE, DEADLINE_S, {1: one, 2: other}) as bus:
         bus.change_id(one, 1, 17)
         bus.change_baudrate(one, 17, 57_600)
         bus.set_timeout(0.05)

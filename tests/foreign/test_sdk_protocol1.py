@@ -9,7 +9,7 @@ from typing import Any
 
 import pytest
 from dynamixel_sdk import COMM_RX_TIMEOUT, COMM_SUCCESS, GroupBulkRead, GroupSyncWrite, Protocol1PacketHandler
-from tests.foreign.patience import PATIENCE_S, until
+from tests.kit.awaited import DEADLINE_S, until
 
 from dxlsim.simulation_plan import BusConfig, ServoConfig
 
@@ -172,7 +172,7 @@ def test_a_new_id_answers_where_the_old_one_is_silent(open_port: Any, sdk: Any) 
     assert sdk.ping(port, 200) == (AX12, COMM_SUCCESS, 0)
     port.patience_ms = 30.0
     assert sdk.ping(port, 1)[1] == COMM_RX_TIMEOUT
-    port.patience_ms = PATIENCE_S * 1000
+    port.patience_ms = DEADLINE_S * 1000
     assert good(sdk.write1ByteTxRx(port, 200, ID, 1))
 
 

@@ -18,7 +18,7 @@ from dynamixel_sdk import (
     GroupSyncWrite,
     Protocol2PacketHandler,
 )
-from tests.foreign.patience import until
+from tests.kit.awaited import until
 
 from dxlsim.simulation_plan import BusConfig, ServoConfig
 

@@ -11,7 +11,7 @@ from typing import Any
 
 import pytest
 from dynamixel_sdk import COMM_SUCCESS, GroupSyncRead, GroupSyncWrite, Protocol2PacketHandler
-from tests.foreign.patience import until
+from tests.kit.awaited import until
 
 from dxlsim.simulation_plan import BusConfig, ServoConfig
 from dxlwire.control_table import ControlItem, find_table

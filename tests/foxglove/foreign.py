@@ -5,15 +5,14 @@ from __future__ import annotations
 import json
 import ssl
 import struct
-import time
 from contextlib import ExitStack
 from typing import Any
 
+from tests.kit.awaited import DEADLINE_S, until
 from websockets.sync.client import connect
 from websockets.typing import Origin, Subprotocol
 
 SUBPROTOCOL = "foxglove.websocket.v1"
-ANSWER_S = 30.0
 
 
 class ForeignViewer:
@@ -73,7 +72,7 @@ class ForeignViewer:
         head = struct.pack("<BIII", 2, self.services[service]["id"], number, len(encoding))
         self.socket.send(head + encoding + json.dumps(body).encode())
 
-    def take(self, timeout: float = ANSWER_S) -> None:
+    def take(self, timeout: float = DEADLINE_S) -> None:
         """Take one frame."""
         frame = self.socket.recv(timeout)
         if isinstance(frame, str):
@@ -101,11 +100,9 @@ class ForeignViewer:
 
     def until(self, found: Any) -> Any:
         """Take frames until something is found; return it."""
-        give_up = time.monotonic() + ANSWER_S
-        while not (result := found()):
-            assert time.monotonic() < give_up, (self.told[-3:], self.failures, list(self.channels))
-            self.take()
-        return result
+        return until(
+            found, lambda: (self.told[-3:], self.failures, list(self.channels)), check=self.take, pause_s=0.0
+        )
 
     def words(self, operation: str) -> dict[str, Any]:
         """Take frames until there is one of an operation; return the newest, and forget all of it."""

@@ -12,12 +12,12 @@ from collections.abc import Iterator, Sequence
 from typing import Any
 
 import msgspec
+from tests.kit.awaited import DEADLINE_S
 
 from dxlrun.channels import child_processes
 from dxlsim.messages import SimulationJob
 from dxlsim.simulation_plan import BusConfig, SimulationConfig
 
-PATIENCE_S = 60.0
 """How long a test waits for what must come; it decides nothing but when to give up."""
 
 
@@ -62,7 +62,7 @@ def opened(path: str) -> Iterator[int]:
 def receive(port: int, size: int) -> bytes:
     received = b""
     while len(received) < size:
-        assert select.select([port], [], [], PATIENCE_S)[0], f"only {received.hex(' ')} came"
+        assert select.select([port], [], [], DEADLINE_S)[0], f"only {received.hex(' ')} came"
         arrived = os.read(port, 256)
         assert arrived, f"the terminal is gone after {received.hex(' ')}"
         received += arrived

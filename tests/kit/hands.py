@@ -14,6 +14,7 @@ from contextlib import AbstractContextManager
 from pathlib import Path
 from typing import Self, cast
 
+from tests.kit import awaited
 from tests.kit.rigs import VirtualLine
 
 from dxlrun import running
@@ -114,7 +115,6 @@ def written(directory: Path, text: str, name: str = "arm.yaml") -> Path:
 
 
 CODE = "import sys; from dxlrun.cli import main; sys.exit(main())"
-DEADLINE_S = 60.0
 ENDING_S = 15.0
 
 
@@ -174,13 +174,15 @@ class LiveRobot:
 
     def until(self, done: Callable[[], bool]) -> None:
         """Wait for something, while servos and robot run."""
-        tick, give_up = threading.Event(), time.monotonic() + DEADLINE_S
-        while not done():
-            said = self._said.read_text() if self._said.exists() else ""
-            assert self._servos.poll() is None, said
-            assert self._run is None or self._run.poll() is None, said
-            assert time.monotonic() < give_up, said
-            tick.wait(0.05)
+
+        def said() -> str:
+            return self._said.read_text() if self._said.exists() else ""
+
+        def live() -> None:
+            assert self._servos.poll() is None, said()
+            assert self._run is None or self._run.poll() is None, said()
+
+        awaited.until(done, said, check=live)
 
 
 class Screen:
@@ -210,10 +212,13 @@ class Screen:
 
     def sees(self, words: str) -> None:
         """Wait until the terminal shows words behind those that were waited for before."""
-        give_up = time.monotonic() + DEADLINE_S
-        while words not in self.text:
-            assert time.monotonic() < give_up, self.text
-            assert self._read() or words in self.text, self.text
+
+        def seen() -> bool:
+            # The terminal's end is a failure, unless it showed the words last
+            return words in self.text or not (self._read() or words in self.text)
+
+        awaited.until(seen, lambda: self.text, pause_s=0.0)
+        assert words in self.text, self.text
         self.text = self.text.partition(words)[2]
 
     def types(self, text: str) -> None:
@@ -232,10 +237,10 @@ class Screen:
         """Return the exit code; `text` has all that was shown until then."""
         while self._read():
             pass
-        return self._process.wait(DEADLINE_S)
+        return self._process.wait(awaited.DEADLINE_S)
 
     def _read(self) -> bool:
-        if not select.select([self._master], [], [], DEADLINE_S)[0]:
+        if not select.select([self._master], [], [], awaited.DEADLINE_S)[0]:
             return False
         try:
             data = os.read(self._master, 4096)

@@ -6,11 +6,10 @@ import os
 import signal
 import subprocess
 import sys
-import time
-from collections.abc import Callable
 from pathlib import Path
 
 import pytest
+from tests.kit.awaited import until
 
 from dxlrun.errors import ProcessFault
 from dxlrun_lab import stress
@@ -29,13 +28,6 @@ def small(monkeypatch, tmp_path):
 def children(process: int) -> set[int]:
     text = Path(f"/proc/{process}/task/{process}/children").read_text()
     return set(map(int, text.split()))
-
-
-def soon(true: Callable[[], bool], timeout_s: float = 20.0) -> bool:
-    limit = time.monotonic() + timeout_s
-    while not true() and time.monotonic() < limit:
-        time.sleep(0.02)
-    return true()
 
 
 def alive(process: int) -> bool:
@@ -63,8 +55,8 @@ def test_two_processes_load_the_machine_and_end_with_the_block(tmp_path):
         assert load.text == f"1 busy process, 1 that allocates 0.016 GB and writes to {tmp_path}"
         started = children(os.getpid()) - before
         assert len(started) == 2
-        assert soon(lambda: all(cpu_ticks(one) > 10 for one in started))
-        assert soon(lambda: max(map(most_resident, started)) > SMALL)
+        until(lambda: all(cpu_ticks(one) > 10 for one in started))
+        until(lambda: max(map(most_resident, started)) > SMALL)
         assert load.ended() == ()
     assert not any(map(alive, started))
     assert load.ended() == ()
@@ -78,7 +70,7 @@ def test_stress_ng_takes_the_place_of_both_where_it_is_installed(tmp_path):
     with Stress() as load:
         assert load.text.startswith(f"stress-ng, {cores} busy process")
         words = tmp_path / "words"
-        assert soon(lambda: words.is_file() and words.read_text().endswith("\n"))
+        until(lambda: words.is_file() and words.read_text().endswith("\n"))
         assert words.read_text().split() == [
             "--quiet", "--cpu", str(cores), "--vm", "2", "--vm-bytes", str(SMALL), "--hdd", "1",
             "--temp-path", str(tmp_path),
@@ -103,14 +95,14 @@ def test_it_ends_when_the_process_that_entered_the_block_is_killed():
         started = children(parent.pid)
         assert started
         parent.kill()
-        assert soon(lambda: not any(map(alive, started)))
+        until(lambda: not any(map(alive, started)))
 
 
 def test_a_part_that_is_killed_is_reported():
     before = children(os.getpid())
     with Stress() as load:
         os.kill(min(children(os.getpid()) - before), signal.SIGKILL)
-        assert soon(lambda: load.ended() == ("the load ended before the measurement did",))
+        until(lambda: load.ended() == ("the load ended before the measurement did",))
 
 
 def test_a_disk_that_cannot_be_written_is_one_sentence_and_nothing_stays(tmp_path, monkeypatch):

@@ -9,6 +9,7 @@ from hashlib import sha256
 from pathlib import Path
 
 import pytest
+from tests.kit.awaited import DEADLINE_S
 
 from dxlrun.log import identity
 from dxlrun.log.identity import IDENTITY_NAME, code_hashes, git_state, module_files, package_of
@@ -22,7 +23,7 @@ def git(folder: Path, *arguments: str) -> str:
     """Run git as a person would."""
     names = ("-c", "user.name=a", "-c", "user.email=a@b")
     command = ["git", *names, *arguments]
-    done = subprocess.run(command, cwd=folder, check=True, capture_output=True, text=True, timeout=20)
+    done = subprocess.run(command, cwd=folder, check=True, capture_output=True, text=True, timeout=DEADLINE_S)
     return done.stdout.strip()
 
 

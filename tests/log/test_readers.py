@@ -18,6 +18,7 @@ from mcap.reader import make_reader
 from mcap_ros2.decoder import DecoderFactory
 from msgspec.structs import replace
 from rosbags.highlevel import AnyReader
+from tests.kit.awaited import DEADLINE_S
 
 from dxlrun.log.log_reader import open_log
 from dxlrun.plan.recording_plan import RecordingPlan
@@ -53,7 +54,7 @@ def run(*words: str | Path) -> subprocess.CompletedProcess[str]:
         [sys.executable, *map(str, words)],
         capture_output=True,
         text=True,
-        timeout=100,
+        timeout=DEADLINE_S,
         env=environment,
         check=False,
     )

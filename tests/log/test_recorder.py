@@ -19,6 +19,7 @@ from typing import Any
 import msgspec
 import numpy as np
 import pytest
+from tests.kit.awaited import DEADLINE_S
 
 from dxlrun.channels import ring
 from dxlrun.channels.child_processes import LateMetadata, LoopRuns, MessageChannel
@@ -140,7 +141,7 @@ def test_what_the_rings_carry_is_in_the_log_byte_for_byte(start: Start, cycle: C
         recording.packets.commit_packets()
     recording.events.emit_event("loop", EventBody(EventCode.TORQUE_OFF, Severity.INFO, "every servo is limp"))
     summary = recording.finish()
-    assert recording.process.wait(60) == 0
+    assert recording.process.wait(DEADLINE_S) == 0
     log = read_log(recording.path)
     assert log.cycles.tobytes() == b"".join(cycle(number) for number in range(30))
     assert [packet.data for packet in log.packets] == sent
@@ -180,7 +181,7 @@ def test_what_was_overwritten_is_declared_and_counted(start: Start, cycle: Cycle
     (event,) = log.events
     assert event.code == EventCode.RECORDER_GAP
     assert "90 records of loop/cycles" in event.text
-    assert recording.process.wait(60) == 1
+    assert recording.process.wait(DEADLINE_S) == 1
 
 
 def test_recorder_measures_the_machine_from_the_loop_s_begin_to_its_end(
@@ -308,7 +309,7 @@ def test_it_ignores_ctrl_c_and_finishes_the_file_at_its_end(start: Start, cycle:
         assert recording.summary()["gaps"] == 0
     else:
         recording.control.shutdown(socket.SHUT_RDWR)
-    assert recording.process.wait(60) == 0
+    assert recording.process.wait(DEADLINE_S) == 0
     log = read_log(recording.path)
     assert (len(log.cycles), log.complete) == (1, True)
 
@@ -329,7 +330,7 @@ def test_a_full_disk_is_reported_once_and_the_rings_are_drained_on(start: Start,
     assert summary["messages"] == 0
     assert summary["unwritten"] > 0
     assert next(recording.lines, None) is None
-    assert recording.process.wait(60) == 1
+    assert recording.process.wait(DEADLINE_S) == 1
     assert not read_log(recording.path).complete
 
 
@@ -338,5 +339,5 @@ def test_a_log_that_cannot_be_created_is_reported(start: Start, tmp_path: Path) 
     path.write_bytes(b"precious")
     recording = start(path=path)
     assert "cannot be written" in next(recording.lines)["sentence"]
-    assert recording.process.wait(60) == 1
+    assert recording.process.wait(DEADLINE_S) == 1
     assert path.read_bytes() == b"precious"

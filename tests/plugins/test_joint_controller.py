@@ -14,7 +14,7 @@ import numpy as np
 import pytest
 from jsonschema import Draft202012Validator
 from tests.kit.answers import result_of
-from tests.kit.awaited import until
+from tests.kit.awaited import DEADLINE_S, until
 from tests.kit.stages import Stage
 
 from dxlrun import Floats, InputError, JointController, connect, reading, running
@@ -146,7 +146,7 @@ def test_loop_gateway_and_a_replay_of_a_whole_run_have_it(
             changed = robot.set_parameters("head", {"amplitude": "0.2 rad"})
             assert changed == {"amplitude": ("0.3 rad", "0.2 rad")}
             robot.stop()
-        assert ran.wait(30) == 0, Path("said").read_text()
+        assert ran.wait(DEADLINE_S) == 0, Path("said").read_text()
     assert replay_log(next(Path("logs").glob("*.mcap")), code="log").same
 
 
@@ -408,7 +408,7 @@ def test_the_first_output_of_a_controller_starts_no_thread_in_its_call(
     words = [sys.executable, "-c", program, "robot.yaml", "--virtual", "--duration", "0.1"]
     if to == "terminal":
         main_end, end = os.openpty()
-        ran = subprocess.run(words, stdout=end, stderr=end, check=False, timeout=60)
+        ran = subprocess.run(words, stdout=end, stderr=end, check=False, timeout=DEADLINE_S)
         os.close(end)
         os.close(main_end)
     else:
@@ -418,7 +418,7 @@ def test_the_first_output_of_a_controller_starts_no_thread_in_its_call(
                 stdout=subprocess.PIPE if to == "pipe" else said,
                 stderr=subprocess.STDOUT,
                 check=False,
-                timeout=60,
+                timeout=DEADLINE_S,
             )
     assert ran.returncode == 0, ran.stdout or Path("said").read_text()
 

@@ -8,13 +8,13 @@ import signal
 import socket
 import subprocess
 import sys
-import threading
 import time
 from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import Any
 
 import pytest
+from tests.kit.awaited import DEADLINE_S, until
 
 import dxlrun
 from dxlrun.log.log_reader import read_log
@@ -85,7 +85,6 @@ def dxlrun_controllers():
 """
 CODE = "import sys; from dxlrun.cli import main; sys.exit(main())"
 LISTENER = "import dxlrun; [print(one.number, flush=True) for one in dxlrun.connect().listen('/cycle')]"
-DEADLINE_S = 60.0
 
 
 class Link:
@@ -274,11 +273,10 @@ def running(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[subproc
 def test_messages_come_live_until_the_run_ends_and_are_all_in_the_log(
     running: subprocess.Popen[bytes], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    tick, give_up = threading.Event(), time.monotonic() + DEADLINE_S
-    while not dxlrun.running():
+    def lives() -> None:
         assert running.poll() is None
-        assert time.monotonic() < give_up
-        tick.wait(0.02)
+
+    until(dxlrun.running, check=lives)
     with dxlrun.connect() as robot:
         (state,) = [one for one in robot.topics() if one.name == "/count/state"]
         assert (state.type, state.joints) == ("my_robotics/msg/Count", ("pan",))

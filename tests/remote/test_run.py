@@ -7,14 +7,13 @@ import signal
 import socket
 import subprocess
 import sys
-import threading
-import time
 from collections.abc import Iterator
 from contextlib import suppress
 from pathlib import Path
 
 import numpy as np
 import pytest
+from tests.kit.awaited import DEADLINE_S, until
 
 import dxlrun
 from dxlrun.channels.event_records import EventCode
@@ -38,17 +37,6 @@ controllers:
   hold: {type: joint_group_position_controller, joints: [pan, tilt]}
   solo: {type: joint_group_position_controller, joints: [pan], active: false}
 """
-DEADLINE_S = 60.0
-
-
-def await_truth(look, what):
-    """Return what `look` finds; fails when it finds nothing for a minute."""
-    tick, give_up = threading.Event(), time.monotonic() + DEADLINE_S
-    while time.monotonic() < give_up:
-        if found := look():
-            return found
-        tick.wait(0.02)
-    raise AssertionError(f"waited {DEADLINE_S} s for {what}")
 
 
 class Run:
@@ -64,7 +52,7 @@ class Run:
             stdout=subprocess.PIPE,
             stderr=subprocess.PIPE,
         )
-        await_truth(lambda: "pair" in dxlrun.running(), "the gateway")
+        until(lambda: "pair" in dxlrun.running(), "the gateway")
         self.robot = dxlrun.connect(client="anna")
         self.log_path = Path(str(self.robot.info()["log"]))
 
@@ -119,7 +107,7 @@ def steered(tmp_path_factory, place):
         for step in range(5):
             assert stream.send({"positions": [0.01 * step]}) == 0
         assert stream.clamped == 1
-    await_truth(lambda: robot.info()["controllers"][1]["held"], "the end of the stream's lease")
+    until(lambda: robot.info()["controllers"][1]["held"], "the end of the stream's lease")
     misbehave(place / "pair.sock")
     robot.rate(100.0)
     refused(robot.load, "more", {"type": "joint_group_position_controller", "joints": ["tilt"]})
@@ -197,10 +185,10 @@ def test_without_its_gateway_the_run_continues_with_a_remark(tmp_path_factory, p
     pid = gateway_of(run.process.pid)
     before = run.robot.info()["cycles"]
     os.kill(pid, signal.SIGKILL)
-    await_truth(lambda: not list(place.iterdir()), "the removal of the dead socket")
+    until(lambda: not list(place.iterdir()), "the removal of the dead socket")
     with pytest.raises(dxlrun.DxlrunError, match="pair no longer answers"):
         run.robot.pause()
-    await_truth(lambda: len(read_log(run.log_path).cycles) > before + 25, "more cycles")
+    until(lambda: len(read_log(run.log_path).cycles) > before + 25, "more cycles")
     run.process.send_signal(signal.SIGINT)
     run.finish()
     assert run.process.returncode == 130, run.out + run.err

@@ -8,6 +8,7 @@ import subprocess
 from typing import Any
 
 import pytest
+from tests.kit.awaited import DEADLINE_S
 
 PYTHON = os.getenv("DXLRUN_ROS2_PYTHON", "")
 pytestmark = pytest.mark.skipif(
@@ -45,7 +46,7 @@ JOINTS = ("pan", "tilt", "roll")
 def result_of(code: str) -> Any:
     """Run code in the environment of ROS; return what it prints as JSON."""
     ran = subprocess.run(
-        [PYTHON, "-c", BEGIN + code], capture_output=True, text=True, check=False, timeout=60
+        [PYTHON, "-c", BEGIN + code], capture_output=True, text=True, check=False, timeout=DEADLINE_S
     )
     assert ran.returncode == 0, ran.stderr
     return json.loads(ran.stdout)

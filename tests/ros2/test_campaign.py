@@ -13,7 +13,7 @@ import numpy as np
 import pytest
 from mcap.reader import make_reader
 from mcap_ros2.decoder import DecoderFactory
-from tests.kit.awaited import until
+from tests.kit.awaited import DEADLINE_S, until
 from tests.ros2.started import ROBOTS, Foreign, Place, Robot, seconds, stamp_ns
 
 ABORTED = 6
@@ -70,7 +70,7 @@ def test_either_side_restarts_and_every_stamp_is_the_logs(empty: Place) -> None:
         commanded(robot, foreign, 0.1)
         assert bridge.poll() is None, empty.said()
     bridge.send_signal(signal.SIGINT)
-    assert bridge.wait(20) == 0
+    assert bridge.wait(DEADLINE_S) == 0
     assert "Traceback" not in empty.said()
 
 

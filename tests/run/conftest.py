@@ -7,15 +7,14 @@ import shlex
 import signal
 import subprocess
 import sys
-import threading
-import time
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 from pathlib import Path
 from types import SimpleNamespace
-from typing import Any, TypeVar
+from typing import Any
 
 import pytest
+from tests.kit.awaited import DEADLINE_S, until
 from tests.kit.stories import plugin_folder
 from tests.kit.wire import all_writes
 
@@ -45,22 +44,6 @@ controllers:
   states: {type: "${type}"}
   hold: {type: joint_group_position_controller, joints: [pan, tilt]}
 """
-DEADLINE_S = 60.0
-T = TypeVar("T")
-
-
-def await_truth(look: Callable[[], T | None], what: str) -> T:
-    """Return what `look` finds; fails when it finds nothing for a minute."""
-    tick = threading.Event()
-    give_up = time.monotonic() + DEADLINE_S
-    while time.monotonic() < give_up:
-        found = look()
-        if found:
-            return found
-        tick.wait(0.02)
-    raise AssertionError(f"waited {DEADLINE_S} s for {what}")
-
-
 PAIR: Any = SimpleNamespace(protocol=1.0, servos=[SimpleNamespace(servo_id=3), SimpleNamespace(servo_id=7)])
 """What the wire of `pair` is judged by."""
 
@@ -125,18 +108,18 @@ class Running:
             sent = [entry.data[4:5] for entry in self.ledger() if entry.direction == "in"]
             return b"\x83" in sent and len(sent) - sent.index(b"\x83") >= 30
 
-        await_truth(goals, "goals in the ledger")
+        until(goals, "goals in the ledger")
 
     def child(self, module: str) -> int:
         """Return the process ID of one of dxlrun's own processes, once it is there."""
-        return await_truth(lambda: self.processes().get(module.removeprefix("dxlrun.")), module)
+        return until(lambda: self.processes().get(module.removeprefix("dxlrun.")), module)
 
     def signal(self, number: signal.Signals) -> None:
         self.process.send_signal(number)
 
     def finish(self) -> tuple[int, str, str]:
         """Return exit code, standard output, standard error."""
-        out, err = self.process.communicate(timeout=DEADLINE_S + 30)
+        out, err = self.process.communicate(timeout=DEADLINE_S)
         return self.process.returncode, out, err
 
 
@@ -184,7 +167,7 @@ def start(tmp_path):
             running.process.kill()
         running.process.communicate()
     for running in started:
-        await_truth(running.gone, "the end of every process of the run")
+        until(running.gone, "the end of every process of the run")
 
 
 PLUGIN = """\
@@ -308,4 +291,4 @@ def wire_equals_log_but_for_what_was_held(wire_and_log):
 @pytest.fixture
 def wait_for():
     """Wait until something is true."""
-    return await_truth
+    return until

@@ -14,6 +14,7 @@ from pathlib import Path
 from typing import Any
 
 import pytest
+from tests.kit.awaited import DEADLINE_S
 
 from dxlrun.channels.event_records import EventCode, Severity
 from dxlrun_analysis.report import analyze
@@ -460,7 +461,7 @@ def test_no_reader_of_the_output_keeps_a_signal_from_the_robot(start, all_limp, 
         wait_for(lambda: run.ledger()[-1].t_ns - begin_ns > 5_500_000_000, "the first line of progress")
     asked_ns = time.monotonic_ns()
     run.signal(signal.SIGTERM)
-    assert run.process.wait(15) == 130
+    assert run.process.wait(DEADLINE_S) == 130
     off_ns = max(entry.t_ns for entry in run.ledger() if entry.direction == "in")
     assert off_ns - asked_ns < 2_000_000_000
     assert all_limp(run)

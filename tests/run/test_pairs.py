@@ -24,6 +24,7 @@ from pathlib import Path
 from typing import Any, NamedTuple
 
 import pytest
+from tests.kit.awaited import DEADLINE_S
 
 from dxlrun.remote.sockets import sockets
 
@@ -191,7 +192,7 @@ def end_what_is_left(run: Any, wait_for: Callable[..., Any]) -> str:
     if left := run.processes():
         name = f"pair_{os.getpid()}"
         done = subprocess.run(
-            [DXLRUN, "stop", "--robot", name], capture_output=True, text=True, timeout=60, check=False
+            [DXLRUN, "stop", "--robot", name], capture_output=True, text=True, timeout=DEADLINE_S, check=False
         )
         print(f"left: {', '.join(sorted(left))}; dxlrun stop: {done.stdout.strip()} {done.stderr.strip()}")
         assert done.returncode == 0, done.stderr

@@ -22,6 +22,7 @@ from typing import Any
 
 import numpy as np
 import pytest
+from tests.kit.awaited import DEADLINE_S, until
 
 from dxlrun.channels import slot
 from dxlrun.channels.child_processes import RunMemory
@@ -133,14 +134,12 @@ def test_a_sensor_that_dies_sends_nan_or_stops_and_comes_back(tmp_path, unit, mo
     sensor = supervisor._SourceProcess(plan, only_process(plan), memory, start_only(plan, memory))
 
     def read_until(valid, *, value=0.25):
-        give_up = time.monotonic() + 60
-        while True:
+        def is_read():
             sensor.supervise_process()
             readings.read_sources()
-            assert time.monotonic() < give_up, events
-            time.sleep(0.01)
-            if record.sources.valid[0] == valid and record.sources.values[0] == value:
-                return
+            return record.sources.valid[0] == valid and record.sources.values[0] == value
+
+        until(is_read, events)
 
     try:
         sensor.child.ready()
@@ -182,12 +181,10 @@ def test_a_sensor_that_dies_sends_nan_or_stops_costs_the_run_nothing_but_its_row
     start, tmp_path, unit, number
 ):
     def wait_for(look):
-        give_up = time.monotonic() + 60
-        while not (found := look()):
+        def lives():
             assert run.process.poll() is None, run.finish()
-            assert time.monotonic() < give_up
-            time.sleep(0.05)
-        return found
+
+        return until(look, check=lives)
 
     robot = tmp_path / "pair.yaml"
     text = robot.read_text().replace("name: pair", "name: pair_imu")
@@ -242,7 +239,7 @@ def test_a_device_that_is_not_there_at_the_start_is_a_sentence(tmp_path):
     child = start_only(plan, memory)
     with pytest.raises(PortError, match=r"sensor imu cannot be opened: port /dev/no_imu not found; "):
         child.ready()
-    assert child.process.wait(20) == 1
+    assert child.process.wait(DEADLINE_S) == 1
     child.kill()
 
 
@@ -295,7 +292,7 @@ def test_a_driver_that_does_not_close_ends_also_without_a_supervisor(tmp_path, m
     try:
         child.ready()
         child.process.terminate()  # as the kernel does when the supervisor is gone
-        assert child.process.wait(20) == -signal.SIGALRM
+        assert child.process.wait(DEADLINE_S) == -signal.SIGALRM
     finally:
         child.kill()
 
@@ -327,10 +324,8 @@ def test_a_sensor_that_spoils_its_memory_costs_only_itself_and_its_children_end(
     sensor = supervisor._SourceProcess(plan, only_process(plan), memory, child)
     child.ready()
     reader = SlotReader(mapped(memory.slots["sensors"][0]))
-    until = time.monotonic() + 20
-    while not (restarted := child.process.poll() is not None) and reader.state is not SlotState.FAILED:
-        assert time.monotonic() < until
-        time.sleep(0.01)
+    until(lambda: child.process.poll() is not None or reader.state is SlotState.FAILED)
+    restarted = child.process.poll() is not None
     (grandchild,) = map(
         int, Path(f"/proc/{child.process.pid}/task/{child.process.pid}/children").read_text().split()
     )
@@ -339,13 +334,11 @@ def test_a_sensor_that_spoils_its_memory_costs_only_itself_and_its_children_end(
     assert os.fstat(memory.slots["sensors"][0]).st_size >= slot.size(1)
     if killed:
         os.kill(child.process.pid, signal.SIGKILL)
-        while sensor.child is not None:
-            assert time.monotonic() < until
-            sensor.supervise_process()
+        until(lambda: sensor.child is None, check=sensor.supervise_process)
         assert (reader.state, reader.read_text()[:17]) == (SlotState.ENDED, "its process ended")
     else:
         sensor.end_process()
-    assert select.select([pidfd], [], [], 20)[0]
+    assert select.select([pidfd], [], [], DEADLINE_S)[0]
     os.close(pidfd)
 
 

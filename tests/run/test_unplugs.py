@@ -27,6 +27,7 @@ from typing import Any
 
 import pytest
 from tests.kit.answers import result_of
+from tests.kit.awaited import DEADLINE_S
 
 from dxlrun.channels.event_records import EventCode
 from dxlsim.bus.ledger import LedgerEntry, read_ledger
@@ -89,7 +90,7 @@ class Servos:
     def end(self) -> None:
         """End the process; the ledger is whole then."""
         self.process.terminate()
-        self.process.communicate(timeout=60)
+        self.process.communicate(timeout=DEADLINE_S)
 
     def entries(self) -> tuple[LedgerEntry, ...]:
         return read_ledger(self.ledger) if self.ledger.exists() else ()

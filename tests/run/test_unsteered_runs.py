@@ -8,6 +8,7 @@ from pathlib import Path
 from typing import Any
 
 import pytest
+from tests.kit.awaited import DEADLINE_S
 from tests.kit.commands import command_line
 from tests.kit.wire import all_writes
 from tests.run.conftest import PAIR, ROBOT, Running, Start
@@ -92,7 +93,7 @@ def test_stop_ends_the_run_that_listens_under_the_name(
     assert steered.finish()[0] == 0
     assert bare.process.poll() is None
     assert dxlrun("stop", "--robot", name).out.startswith("twin_arm has ended")  # the only one of that name
-    assert bare.process.wait(60) == 0
+    assert bare.process.wait(DEADLINE_S) == 0
 
 
 def test_stop_refuses_a_name_of_several_runs_that_cannot_be_steered(

@@ -8,7 +8,6 @@ import random
 import signal
 import subprocess
 import sys
-import time
 
 import numpy as np
 import pytest
@@ -157,8 +156,7 @@ def test_a_reader_beside_a_writer_that_never_rests_gets_whole_samples_only():
     child = subprocess.Popen([sys.executable, "-c", HAMMER, str(descriptor)], pass_fds=[descriptor])
     try:
         got, heard, last = 0, 0, 0
-        give_up = time.monotonic() + 30
-        while (got < 2000 or heard < 100) and time.monotonic() < give_up:
+        while got < 2000 or heard < 100:
             t_ns = reader.read_sample()
             if t_ns is not None:
                 assert reader.sample.tolist() == [t_ns] * VALUES
@@ -167,7 +165,6 @@ def test_a_reader_beside_a_writer_that_never_rests_gets_whole_samples_only():
             if text := reader.read_text():
                 assert len(set(text.split())) == 1
                 heard += 1
-        assert got >= 2000
     finally:
         os.kill(child.pid, signal.SIGKILL)
         child.wait()

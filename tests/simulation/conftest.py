@@ -12,7 +12,8 @@ from pathlib import Path
 from typing import IO, Any
 
 import pytest
-from tests.kit.bus_process import PATIENCE_S, bare
+from tests.kit.awaited import DEADLINE_S
+from tests.kit.bus_process import bare
 from tests.kit.simulated_line import Line2, build_line
 
 from dxlsim.bus.ledger import LedgerEntry, read_ledger
@@ -38,7 +39,7 @@ class Running:
     def hang_up(self) -> int:
         self.sent.close()
         self.control.close()
-        return self.child.wait(PATIENCE_S)
+        return self.child.wait(DEADLINE_S)
 
     def ledger(self) -> tuple[LedgerEntry, ...]:
         return read_ledger(self.path)
@@ -52,7 +53,7 @@ def start_buses(tmp_path: Path) -> Iterator[Callable[[Sequence[BusConfig]], Runn
         def run(buses: Sequence[BusConfig]) -> Running:
             path = tmp_path / "bus.jsonl"
             child, control = stack.enter_context(bare(buses, ledger=str(path)))
-            control.settimeout(PATIENCE_S)
+            control.settimeout(DEADLINE_S)
             sent = stack.enter_context(control.makefile("rb"))
             return Running(child, control, sent, json.loads(sent.readline())["ports"], path)
 

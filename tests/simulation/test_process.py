@@ -16,7 +16,8 @@ from typing import IO, Any
 import pytest
 import rustypot
 import serial
-from tests.kit.bus_process import PATIENCE_S, bare, opened, receive
+from tests.kit.awaited import DEADLINE_S
+from tests.kit.bus_process import bare, opened, receive
 
 from dxlsim.bus.ledger import Ledger, read_ledger
 from dxlsim.bus.simulated_bus import SimulatedBus
@@ -104,13 +105,13 @@ def test_a_terminal_without_a_host_is_reported_once():
         with opened(terminal.path) as port:
             waiting.register(terminal.fileno(), _WRITTEN)
             os.write(port, PING_1)
-            assert waiting.poll(PATIENCE_S) == [(terminal.fileno(), select.EPOLLIN)]
+            assert waiting.poll(DEADLINE_S) == [(terminal.fileno(), select.EPOLLIN)]
             terminal.read_chunk()
-        waiting.poll(PATIENCE_S)  # the host is gone
+        waiting.poll(DEADLINE_S)  # the host is gone
         assert waiting.poll(0) == []
         with opened(terminal.path) as port:
             os.write(port, PING_1)
-            assert waiting.poll(PATIENCE_S)
+            assert waiting.poll(DEADLINE_S)
 
 
 def test_interrupt_is_left_to_the_front_process_and_sigterm_ends_in_order(start):
@@ -120,7 +121,7 @@ def test_interrupt_is_left_to_the_front_process_and_sigterm_ends_in_order(start)
         os.write(port, PING_1)
         assert receive(port, 6) == PONG_1
     os.kill(running.child.pid, signal.SIGTERM)
-    assert running.child.wait(PATIENCE_S) == 0
+    assert running.child.wait(DEADLINE_S) == 0
     assert [entry.data for entry in running.ledger()] == [PING_1, PONG_1]
 
 
@@ -182,7 +183,7 @@ def test_a_foreign_driver_finds_every_item_where_the_servo_holds_it(start):
     """rustypot, written by others in Rust, talks to our servo: its addresses, its packets, its units."""
     running = start()
     table = find_table("AX-12A")
-    foreign = rustypot.AxPyController(running.ports["main"], 1_000_000, PATIENCE_S)
+    foreign = rustypot.AxPyController(running.ports["main"], 1_000_000, DEADLINE_S)
     values = {"id": 1, "baud_rate": 1, "cw_angle_limit": 10, "moving_speed": 300, "punch": 40, "led": 1}
     for name, wire in values.items():
         foreign.write_register(1, {"baud_rate": "baudrate"}.get(name, name), wire)
@@ -204,9 +205,9 @@ def test_a_foreign_driver_finds_every_item_where_the_servo_holds_it(start):
 
 def test_a_starter_that_ends_before_it_has_read_the_ports_ends_it():
     with bare(BUSES) as (child, control):
-        assert select.select([control], [], [], PATIENCE_S)[0]
+        assert select.select([control], [], [], DEADLINE_S)[0]
         control.close()  # with the ports unread: the other end sees a reset, not an end
-        assert child.communicate(timeout=PATIENCE_S)[1] == b""
+        assert child.communicate(timeout=DEADLINE_S)[1] == b""
         assert child.returncode == 0
 
 
@@ -216,7 +217,7 @@ def test_a_full_disk_does_not_stop_it_and_is_reported_at_the_end():
             os.write(port, PING_1)
             assert receive(port, 6) == PONG_1
         control.close()
-        assert b"No space left" in child.communicate(timeout=PATIENCE_S)[1]
+        assert b"No space left" in child.communicate(timeout=DEADLINE_S)[1]
         assert child.returncode == 1
 
 
@@ -240,12 +241,12 @@ class Talk:
 def talking(config: SimulationConfig, **options: object) -> Iterator[tuple[Talk, dict[str, Any]]]:
     """Start it and give what it sends first; it must end in order."""
     with bare(config, **options) as (child, control):
-        control.settimeout(PATIENCE_S)
+        control.settimeout(DEADLINE_S)
         with control.makefile("rb") as sent:
             talk = Talk(control, sent)
             yield talk, talk.next()
         control.close()
-        assert child.communicate(timeout=PATIENCE_S)[1] == b""
+        assert child.communicate(timeout=DEADLINE_S)[1] == b""
         assert child.returncode == 0
 
 
@@ -273,7 +274,7 @@ def test_a_starter_that_reads_nothing_does_not_stop_it():
         with opened(first["ports"]["main"]) as port:
             os.write(port, PING_1)
             assert receive(port, 6) == PONG_1
-        talk.control.settimeout(PATIENCE_S)
+        talk.control.settimeout(DEADLINE_S)
 
 
 def test_faults_by_hand_happen_and_are_reported():
@@ -300,7 +301,7 @@ def test_what_cannot_be_served_is_refused_with_a_sentence(config, reason):
     with bare(config) as (child, control):
         with control.makefile("rb") as sent:
             assert reason in json.loads(sent.readline())["error"]
-        assert child.communicate(timeout=PATIENCE_S)[1] == b""
+        assert child.communicate(timeout=DEADLINE_S)[1] == b""
         assert child.returncode == 2
 
 
@@ -317,7 +318,7 @@ def test_an_unplugged_adapter_hangs_up_and_comes_back_under_another_name(tmp_pat
             while talk.next() != {"ports": {**first["ports"], "main": ""}}:
                 pass
             assert not link.is_symlink()
-            assert select.select([port], [], [], PATIENCE_S)[0]
+            assert select.select([port], [], [], DEADLINE_S)[0]
             with contextlib.suppress(OSError):  # EIO on Linux
                 assert os.read(port, 10) == b""
             after = talk.next()["ports"]["main"]

@@ -8,15 +8,14 @@ from __future__ import annotations
 import re
 import subprocess
 import sys
-import threading
-import time
 from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import Any, cast
 
 import pytest
+from tests.kit.awaited import until
 from tests.kit.driven import changes
-from tests.kit.hands import CODE, DEADLINE_S, Screen
+from tests.kit.hands import CODE, Screen
 
 from dxlrun import RemoteRobot, connect, running
 from dxlrun.testing import plan_of
@@ -24,13 +23,6 @@ from dxlsim.bus.ledger import read_ledger
 
 ROBOT = Path(__file__).parents[2] / "robots" / "diff_drive.yaml"
 GOAL_VELOCITY = 104
-
-
-def until(done: Callable[[], bool]) -> None:
-    tick, give_up = threading.Event(), time.monotonic() + DEADLINE_S
-    while not done():
-        assert time.monotonic() < give_up
-        tick.wait(0.02)
 
 
 @pytest.fixture

@@ -9,6 +9,7 @@ from collections.abc import Callable, Iterator
 from pathlib import Path
 
 import pytest
+from tests.kit.awaited import DEADLINE_S
 from tests.kit.torso import Run
 from tests.view.served import Served
 
@@ -33,7 +34,7 @@ def log(tmp_path_factory: pytest.TempPathFactory) -> Path:
         "--duration",
         "12",
     ]
-    done = subprocess.run(command, cwd=place, capture_output=True, text=True, timeout=100, check=False)
+    done = subprocess.run(command, cwd=place, capture_output=True, text=True, timeout=DEADLINE_S, check=False)
     assert done.returncode == 0, done.stderr
     (found,) = (place / "logs").glob("*.mcap")
     return found

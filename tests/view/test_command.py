@@ -16,6 +16,7 @@ from pathlib import Path
 from typing import Any
 
 import pytest
+from tests.kit.awaited import DEADLINE_S
 from tests.kit.pages import page_text
 
 ROOT = Path(__file__).resolve().parents[2]
@@ -53,7 +54,7 @@ def view(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[View]:
 
 def refused(process: subprocess.Popen[str]) -> tuple[int, str]:
     """Return exit code and sentence."""
-    _, said = process.communicate(timeout=60)
+    _, said = process.communicate(timeout=DEADLINE_S)
     assert "Traceback" not in said
     return process.returncode, said
 
@@ -79,7 +80,7 @@ def test_a_log_is_served_until_ctrl_c(view: View, log: Path, tmp_path: Path, hos
     assert b"page.js" in answer.read()
     connection.close()
     process.send_signal(signal.SIGINT)
-    assert process.wait(30) == 0
+    assert process.wait(DEADLINE_S) == 0
 
 
 @pytest.mark.parametrize("command", [one for one in COMMANDS if not one.endswith(".mcap")])

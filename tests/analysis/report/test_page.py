@@ -14,6 +14,7 @@ from typing import Any
 
 import numpy as np
 import pytest
+from tests.kit.awaited import DEADLINE_S
 from tests.kit.made_logs import Cycle, Said, Wire, made_log
 
 from dxlrun.channels.event_records import EventCode, Severity
@@ -241,7 +242,7 @@ def test_no_display_is_needed_and_nothing_is_warned_of(run: Path) -> None:
         capture_output=True,
         text=True,
         check=False,
-        timeout=120,
+        timeout=DEADLINE_S,
     )
     assert (ran.returncode, ran.stderr) == (0, "")
     assert int(ran.stdout) > 100_000

@@ -22,6 +22,7 @@ from typing import Any
 import numpy as np
 import pytest
 from msgspec.structs import replace
+from tests.kit.awaited import DEADLINE_S
 
 from dxlrun.channels.commands import CommandMessage, QueueInbox
 from dxlrun.channels.cycle import Torque
@@ -555,7 +556,7 @@ class Story:
         ) as process:
             try:
                 self.evidence[disturb(process)] += 1
-                said, _ = process.communicate(timeout=60)
+                said, _ = process.communicate(timeout=DEADLINE_S)
             finally:
                 process.kill()
         logs = list(self.directory.glob("*.mcap"))

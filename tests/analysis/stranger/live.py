@@ -12,6 +12,8 @@ from collections.abc import Iterator
 from contextlib import ExitStack, contextmanager
 from pathlib import Path
 
+from tests.kit.awaited import DEADLINE_S, until
+
 KERNEL = Path(__file__).parents[3] / "runtime/dxlwire/exchange/kernel.c"
 _COMPILE = "while cc -O3 -g -fPIC -Wall -c {kernel} -o {out}; do :; done"
 _HOG = "while True: pass"
@@ -37,15 +39,14 @@ def descendants(pid: int) -> Iterator[tuple[int, str]]:
             continue
 
 
-def process_of(run: Run, what: str, wait_s: float = 30.0) -> int:
+def process_of(run: Run, what: str) -> int:
     """Return the process of a run with a word in its command line, once it is there; 0: the run is over."""
-    until = time.monotonic() + wait_s
-    while time.monotonic() < until and run.poll() is None:
-        for pid, words in descendants(run.pid):
-            if what in words:
-                return pid
-        time.sleep(0.05)
-    return 0
+
+    def found() -> list[int]:
+        pids = [pid for pid, words in descendants(run.pid) if what in words]
+        return pids or ([] if run.poll() is None else [0])
+
+    return until(found, what)[0]
 
 
 @contextmanager
@@ -84,7 +85,7 @@ def core_of(pid: int) -> int:
 def compile_jobs(run: Run, count: int) -> str:
     """Compile beside a run until it is over."""
     with compiling(count):
-        run.wait(60)
+        run.wait(DEADLINE_S)
     return "compiled"
 
 
@@ -94,7 +95,7 @@ def hog_on_the_core_of_the_loop(run: Run) -> str:
     assert loop, "there is no loop"
     time.sleep(1.0)
     with hogging(core_of(loop)):
-        run.wait(60)
+        run.wait(DEADLINE_S)
     return "hogged"
 
 

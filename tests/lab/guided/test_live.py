@@ -18,6 +18,7 @@ from typing import Any
 
 import numpy as np
 import pytest
+from tests.kit.awaited import DEADLINE_S, until
 from tests.kit.experiments import ROOT
 
 import dxlrun
@@ -36,7 +37,6 @@ from dxlrun_lab.guided.segment import Segment
 
 INTERRUPTS = int(os.environ.get("DXLRUN_EXPERIMENT_INTERRUPTS", "0"))
 CODE = "import sys; from dxlrun.cli import main; sys.exit(main())"
-DEADLINE_S = 60.0
 ROBOT = """\
 name: pair
 buses:
@@ -67,11 +67,11 @@ def robot(place):
     words = [sys.executable, "-P", "-c", CODE, "pair.yaml", "--duration", "300"]
     with (place / "said").open("wb") as said:
         process = subprocess.Popen(words, stdout=said, stderr=said)
-    tick, give_up = threading.Event(), time.monotonic() + DEADLINE_S
-    while not dxlrun.running():
+
+    def lives() -> None:
         assert process.poll() is None, (place / "said").read_text()
-        assert time.monotonic() < give_up
-        tick.wait(0.05)
+
+    until(dxlrun.running, check=lives)
     with dxlrun.connect() as robot:
         yield robot
     process.terminate()  # its gateway may be gone
@@ -336,11 +336,14 @@ def test_a_signal_at_any_time_ends_the_run_of_its_own_in_order(place, seed):
     _, said = process.communicate(timeout=DEADLINE_S)
     assert process.returncode in (0, 130, -ends), said
     assert "Traceback" not in said
-    tick, give_up = threading.Event(), time.monotonic() + DEADLINE_S
-    while set(sockets()) != others or not all(map(whole, set(place.glob("logs/*.mcap")) - before)):
-        assert process.returncode == -signal.SIGKILL, "of any other end it waits itself"
-        assert time.monotonic() < give_up
-        tick.wait(0.05)
+
+    def tidy() -> bool:
+        logs = set(place.glob("logs/*.mcap")) - before
+        return set(sockets()) == others and all(map(whole, logs))
+
+    if process.returncode == -signal.SIGKILL:
+        until(tidy)
+    assert tidy(), "of any other end it waits itself"
 
 
 def whole(log: Path) -> bool:
